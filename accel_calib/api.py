@@ -163,11 +163,11 @@ class Calibration(_Calibration):
             If the file cannot be written.
 
         """
-        from .report import check_matplotlib, write_page
+        from .report import check_matplotlib, refinement_page, write_page
 
         check_matplotlib()
         result = find_effects(self.used_poses, self.units, base=self)
-        write_page(Path(path), result, '')
+        write_page(Path(path), refinement_page(result, ''))
         return result
 
 

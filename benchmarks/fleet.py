@@ -44,14 +44,14 @@ import accel_calib as ac  # noqa: E402
 from accel_calib.fleet import (  # noqa: E402
     cluster, Input, Options, recordings, run, Store, Summary)
 from accel_calib.fleet.overview import not_agreeing  # noqa: E402
-from accel_calib.fleet.task import Row  # noqa: E402
+from accel_calib.fleet.recording import Row  # noqa: E402
 from accel_calib.logs import write_table  # noqa: E402
 import accel_calib.pipeline as pipeline  # noqa: E402
 from figures import Line, processor, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 
-RUN, SENSORS, TASK = (import_module(f'accel_calib.fleet.{name}')
-                      for name in ('run', 'sensors', 'task'))
+RUN, SENSORS, ROWS = (import_module(f'accel_calib.fleet.{name}')
+                      for name in ('run', 'sensors', 'recording'))
 
 MERGED, DIGESTED = 'merge and compare on the workers', 'digests on the workers'
 ALONE = {'rows of the sensors': 'write_sensors', 'typical values': 'priors_of',
@@ -299,21 +299,21 @@ def timed(spent: dict[str, float], stages: dict[str, tuple[Any, str]],
 def costs(found: Sequence[Input], options: Options, folder: Path) -> dict[str, float]:
     """Return the cost by stage in one process [ms of processor per recording]."""
     spent: dict[str, float] = Counter()
-    here = mock.patch.object(TASK.WorkerProcess, 'call_within',
+    here = mock.patch.object(RUN.WorkerProcess, 'call_within',
                              lambda self, limit_s, function, *given: function(*given))
     with TemporaryDirectory(dir=folder) as out, here:
         store = Store(Path(out))
         first = Store(store.folder / 'first')
-        TASK.calibrate_recording(found[0], options, first, RUN.LIMIT_S)  # imports
+        RUN.calibrate_recording(found[0], options, first, RUN.LIMIT_S)  # imports
         with timed(spent, {
-                'all': (TASK, 'calibrate_recording'), 'hash': (TASK, 'content_hash'),
-                'read and capture': (TASK, 'poses_of'), 'fit': (pipeline, 'fit_poses'),
+                'all': (RUN, 'calibrate_recording'), 'hash': (RUN, 'content_hash'),
+                'read and capture': (ROWS, 'poses_of'), 'fit': (pipeline, 'fit_poses'),
                 'refine': (pipeline, 'refine'), 'rate': (pipeline, 'rate'),
-                'fit for the prior': (TASK, 'fit_poses'),
-                'write the calibration': (TASK, 'write_calibration'),
+                'fit for the prior': (ROWS, 'fit_poses'),
+                'write the calibration': (RUN, 'write_calibration'),
                 'write the row': (Store, 'add')}, time.process_time):
             for each in found:
-                TASK.calibrate_recording(each, options, store, RUN.LIMIT_S)
+                RUN.calibrate_recording(each, options, store, RUN.LIMIT_S)
         spent['other'] = 2.0 * spent['all'] - sum(spent.values())
         with timed(spent, {'merge': (Store, 'merge'), 'compare': (SENSORS, '_compared'),
                            'read the calibrations': (SENSORS, 'read_calibration'),

@@ -48,14 +48,14 @@ from accel_calib.effects.thermal import Lag, low_passed, rate_of
 from accel_calib.estimate import believable, kinds, originals, unseen_mistakes
 from accel_calib.estimate.equations import equations, measured
 from accel_calib.findings.rules import number
-from accel_calib.fleet.inputs import as_folder, content_hash, date_of, on_disk, sensor_of
 from accel_calib.fleet.overview import (
-    digest, digest_of, Months, not_agreeing, odd_sensors, overview, shared_effects)
+    digest, digest_of, estimated, Months, not_agreeing, odd_sensors, overview, priors_of,
+    shared_effects, typical_of)
 from accel_calib.fleet.page import write_fleet_page
+from accel_calib.fleet.recording import (
+    as_folder, content_hash, date_of, on_disk, schema, sensor_of)
 from accel_calib.fleet.run import mapped
-from accel_calib.fleet.sensors import (
-    alike, drift_of, estimated, merge_sensor, priors_of, typical_of)
-from accel_calib.fleet.task import schema, write_parquet
+from accel_calib.fleet.sensors import alike, drift_of, merge_sensor, write_parquet
 from accel_calib.geometry import (
     attitude_words, distinct, OVER_THE_SPHERE, quaternion_of, rotation_from_rpy, spread_directions,
     unit, words_of)
@@ -85,11 +85,11 @@ from accel_calib.refine.plan import _levels as levels_of, NOTHING as NOTHING_TO_
 from accel_calib.refine.search import _is_better as is_better_than_walk, search as search_effects
 from accel_calib.refine.sets import accepted, explored, Near, probabilities, simpler
 from accel_calib.refine.words import advice_for, verdict_words
-from accel_calib.report.drawings import all_drawings, curve_parts
-from accel_calib.report.page import calibration_page, linear_figures, page as refinement_page
-from accel_calib.report.repeats import comparison_page
+from accel_calib.report.page import axis_figures, snippets
+from accel_calib.report.refinement import all_drawings, curve_parts
 from accel_calib.report.residuals import residuals_of, residuals_of_refinement
-from accel_calib.report.sheet import sheet, snippets
+from accel_calib.report.sheet import sheet
+from accel_calib.report.stability import comparison_page, history_page
 from accel_calib.ros.run import own_domain
 from accel_calib.session import answered, store as session_store, worker
 from accel_calib.session.guidance import Guide, next_action, Plan, plan_for

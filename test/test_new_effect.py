@@ -18,8 +18,9 @@ from accel_calib.effects import AXES, by_axis, Effect, EFFECTS, ONE
 from accel_calib.errors import InputError
 from accel_calib.logs import layout_of
 from accel_calib.messages import Rewriter
+from accel_calib.report import refinement_page
 from bag_files import header, IMU, imu
-from inside import COMMAND, main, refinement_page
+from inside import COMMAND, main
 import numpy as np
 import pandas as pd
 import pytest

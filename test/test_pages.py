@@ -13,11 +13,11 @@ from accel_calib.compare import compare, history_of
 from accel_calib.errors import InputError
 from accel_calib.finding import Finding, NextStep
 from accel_calib.findings import rate, rate_verification, Rating
-from accel_calib.report import write_history_page
+from accel_calib.report import calibration_page, refinement_page
 from accel_calib.text import milli
 from inside import (
-    calibration_page, comparison_page, linear_figures, refinement_page, residuals_of,
-    residuals_of_refinement, sheet, snippets)
+    axis_figures, comparison_page, history_page, residuals_of, residuals_of_refinement, sheet,
+    snippets)
 from live_bench import chromium, PATIENCE
 import numpy as np
 from page_parser import parsed
@@ -184,7 +184,7 @@ def test_values_and_their_deviations_are_those_of_the_calibration(calibration, t
         cell = re.search(rf'<td>offset {axis}</td><td>([^<]*) ± ([^<]*) mg</td>', text)
         assert float(cell[1].replace('−', '-')) == pytest.approx(value, abs=sd / 2.0)
         assert float(cell[2]) == pytest.approx(sd, rel=0.06)
-    found = linear_figures(calibration.model.vector, calibration.model.effects)
+    found = axis_figures(calibration.model.vector, calibration.model.effects)
     gains = [float(cell) for cell in re.findall(r'<td>gain .</td><td>([-+][\d.]+)',
                                                 text.replace('−', '-'))]
     np.testing.assert_allclose(gains, (found[3:6] - 1.0) * 100.0, atol=0.01)
@@ -205,7 +205,7 @@ def test_figures_by_axis_are_those_of_the_axes():
         vec[-1] *= -1.0
     np.testing.assert_allclose(with_vector(effects, vec).linear_part[0], mat, atol=1e-12)
     angle = np.degrees(np.arccos(mat[0] @ mat[1] / np.linalg.norm(mat[0])))
-    np.testing.assert_allclose(linear_figures(vec, effects),
+    np.testing.assert_allclose(axis_figures(vec, effects),
                                [0.1, 0.2, 0.3, 1.01, 1.0, 0.99, angle, 90.0, 90.0])
     assert angle == pytest.approx(89.0, abs=0.02)
 
@@ -321,11 +321,8 @@ def test_history_refuses_what_it_cannot_compare(dated):
         history_of(dated[:1])
 
 
-def test_history_has_a_page(dated, tmp_path):
-    history = history_of(dated)
-    path = tmp_path / 'history.html'
-    write_history_page(path, history, [Path(f'{k}.yaml') for k in range(5)], dated)
-    text = path.read_text(encoding='utf-8')
+def test_history_has_a_page(dated):
+    text = history_page(history_of(dated), [Path(f'{k}.yaml') for k in range(5)], dated)
     found = parsed(text)
     assert not found.open
     assert len(found.named('svg')) == 3

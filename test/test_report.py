@@ -6,8 +6,9 @@
 import re
 
 from accel_calib.refine import refine
+from accel_calib.report import refinement_page
 from accel_calib.units import Units
-from inside import all_drawings, curve_parts, model_with, refinement_page, simulate_poses
+from inside import all_drawings, curve_parts, model_with, simulate_poses
 import numpy as np
 from page_parser import parsed
 import pytest

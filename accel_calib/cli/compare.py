@@ -41,12 +41,12 @@ def run_verify(args: argparse.Namespace) -> Done:
         verification = verify(calibration, poses)
     rating = rate_verification(verification, calibration, poses)
     if args.report is not None:
-        from ..report import write_calibration_page
+        from ..report import calibration_page, write_page
 
         with working('drawing the page'):
-            write_calibration_page(args.report, calibration, rating, str(args.poses),
-                                   verification=(verification, poses),
-                                   stored=str(args.calibration), notes=found.lines)
+            write_page(args.report, calibration_page(
+                calibration, rating, str(args.poses), verification=(verification, poses),
+                stored=str(args.calibration), notes=found.lines))
     result = {'file': args.poses, 'poses': len(poses), **asdict(verification),
               **rated(rating, args), 'read_as': found.read_as, 'read_lines': found.lines,
               'rating_lines': rating_lines(rating, args)}
@@ -81,10 +81,11 @@ def run_compare(args: argparse.Namespace) -> Done:
     comparison = compare(calibrations)
     rating = rate_comparison(comparison)
     if args.report is not None:
-        from ..report import write_comparison_page
+        from ..report import write_page
+        from ..report.stability import comparison_page
 
         with working('drawing the page'):
-            write_comparison_page(args.report, comparison, rating, paths, calibrations)
+            write_page(args.report, comparison_page(comparison, rating, paths, calibrations))
     models = [calibration.name for calibration in calibrations]
     return Done({**_comparison_result(paths, models, comparison), **rated(rating, args)},
                 [*_comparison_lines(paths, models, comparison), *rating_lines(rating, args)],
@@ -140,10 +141,11 @@ def run_history(args: argparse.Namespace) -> Done:
     calibrations = [read_calibration(path) for path in args.calibrations]
     history = history_of(calibrations)
     if args.report is not None:
-        from ..report import write_history_page
+        from ..report import write_page
+        from ..report.stability import history_page
 
         with working('drawing the page'):
-            write_history_page(args.report, history, args.calibrations, calibrations)
+            write_page(args.report, history_page(history, args.calibrations, calibrations))
     return Done(_history_result(args, history), _history_lines(args, history))
 
 

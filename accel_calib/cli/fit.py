@@ -41,12 +41,12 @@ def run_fit(args: argparse.Namespace) -> Done:
     ahead = outlook(calibration, args.model)
     stored = [] if args.output is None else [_store(args, calibration, rating)]
     if args.report is not None:
-        from ..report import write_calibration_page
+        from ..report import calibration_page, write_page
 
         with working('drawing the page'):
-            write_calibration_page(args.report, calibration, rating, str(args.poses),
-                                   stored=str(args.output or 'calibration.yaml'),
-                                   notes=found.lines)
+            write_page(args.report, calibration_page(
+                calibration, rating, str(args.poses), notes=found.lines,
+                stored=str(args.output or 'calibration.yaml')))
         stored.append(f'stored in {args.report}')
     return Done({'file': args.poses, **calibration_json(calibration, ahead),
                  **rated(rating, args), 'read_as': found.read_as, 'read_lines': found.lines},
@@ -102,7 +102,7 @@ def run_calibrate(args: argparse.Namespace) -> Done:
 
 def _stored_outcome(args: argparse.Namespace, found: Intake, outcome: Outcome) -> list[str]:
     """Write the calibration and the page; return lines about them."""
-    from ..report import has_matplotlib, write_calibration_page
+    from ..report import calibration_page, has_matplotlib, write_page
 
     line = _store(args, outcome.calibration, outcome.rating)
     if str(args.output) == STANDARD_OUTPUT:
@@ -112,9 +112,9 @@ def _stored_outcome(args: argparse.Namespace, found: Intake, outcome: Outcome) -
         return [line, f'no page {page}: matplotlib is not installed']
     try:
         with working('drawing the page'):
-            write_calibration_page(page, outcome.calibration, outcome.rating, str(args.log),
-                                   refinement=outcome.refinement, stored=str(args.output),
-                                   notes=found.lines)
+            write_page(page, calibration_page(
+                outcome.calibration, outcome.rating, str(args.log), stored=str(args.output),
+                refinement=outcome.refinement, notes=found.lines))
     except OSError as err:  # the calibration is stored
         return [line, f'no page {page}: {system_error(err)}']
     return [line, f'page: {page}']

@@ -131,13 +131,14 @@ def run_simulate(args: argparse.Namespace) -> Done:
 def run_noise(args: argparse.Namespace) -> Done:
     """Find a long rest, and compute the figures of its noise."""
     from ..noise import check_allantools, to_json
-    from ..report.noise_page import write_noise_page
+    from ..report import write_page
+    from ..report.stability import noise_page
 
     check_allantools()
     found, lines = _noise(args)
     if args.report is not None:
         with working('drawing the page'):
-            write_noise_page(args.report, found, str(args.recording))
+            write_page(args.report, noise_page(found, str(args.recording)))
         stored = [f'stored in {args.report}']
     else:
         stored = []
@@ -196,7 +197,7 @@ def _corrected_rest(recording: Recording, units: Units, calibration: Calibration
 def _noise_lines(found: NoiseFigures) -> Iterator[str | Table]:
     """Yield the figures by axis, the notes, and the figures for Kalibr."""
     from ..noise import duration
-    from ..report.noise_page import figure_rows, kalibr_lines, need_lines
+    from ..report.stability import figure_rows, kalibr_lines, need_lines
 
     yield (f'rest of {duration(found.seconds)}: {counted(found.samples, "sample")} at '
            f'{found.rate:.5g} Hz')
@@ -211,7 +212,7 @@ def _noise_lines(found: NoiseFigures) -> Iterator[str | Table]:
 
 def _noise_table(kind: str, axes: tuple[AxisNoise, ...]) -> Table:
     """Return the table of one sensor, at most 60 columns wide."""
-    from ..report.noise_page import figure_rows
+    from ..report.stability import figure_rows
 
     table = Table(title=kind, box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     table.add_column('')

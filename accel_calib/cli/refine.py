@@ -20,7 +20,7 @@ from ..findings import rate_refinement, refinement_json
 from ..intake import Intake
 from ..refine import refine, refine_with_fleet, Refinement
 from ..refine.words import base_words, chance, residual_words, verdict_words
-from ..report import write_figures, write_page
+from ..report import refinement_page, write_figures, write_page
 from ..stored import write_calibration
 from ..stored.exports import write_plan
 from ..text import counted, listed, now, short
@@ -65,7 +65,7 @@ def _stored(args: argparse.Namespace, result: Refinement) -> Iterator[Path]:
 
 def _draw(page: Path, args: argparse.Namespace, result: Refinement) -> None:
     with working('drawing the page'):
-        write_page(page, result, str(args.poses))
+        write_page(page, refinement_page(result, str(args.poses)))
 
 
 def _shown(args: argparse.Namespace, result: Refinement, stored: list[Path]) -> Iterator[Any]:

@@ -19,28 +19,43 @@ sensors finds some by chance.
 **Drift of the fleet.** The difference of each calibration from the median of its sensor, by month.
 A month keeps a random sample of `_SAMPLE` differences, from which its quantiles are computed.
 
+**Typical values.** Each sensor has the values x of model 10 (the mean over its calibrations) with
+the covariance C. Over the fleet, x is distributed about m with P + C. `estimated` computes m and P
+by expectation maximisation. The distribution over sensors is Student's t, so that a few sensors
+unlike the others have little weight.
+
+The correlations of few sensors are mostly chance, and would make some combinations of values seem
+certain. They are reduced by n / (n + `_SURE`). The mean of n sensors is uncertain itself, which
+adds P / n to the covariance for another sensor. At last P is enlarged, if necessary, until half of
+the sensors are within the distance that contains half of a normal distribution.
+
 """
 
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TypeVar
 from urllib.parse import unquote
 
 import numpy as np
 
-from .inputs import UNKNOWN
-from .sensors import alike, FEWEST, Typical, typical_of
-from .task import Row, Store
+from .recording import Row, UNKNOWN
+from .sensors import alike, Store
+from ..calibrate import FleetPrior
 from ..compare import NAMES
-from ..effects import LADDER
+from ..effects import LADDER, MODELS, parameter_names
+from ..estimate import Prior
 from ..findings import rate_fleet, Rating, scale_of
 from ..table import Floats
 from ..text import counted, short
 
 MOST_ERRORS = 200
 """Largest number of errors that are kept."""
+
+FEWEST = 5
+"""Smallest number of sensors of a model, or calibrations of a month, for statistics."""
 
 _FALSE = 0.05
 _CHANCE = 0.01
@@ -57,6 +72,12 @@ COLUMNS = ('key', 'sensor_model', 'recording', 'date', 'status', 'error', 'advic
            'calibration', 'determined', 'effects', 'parameters', 'prior_values',
            'prior_covariance', *(column for name in NAMES for column in (name, f'{name}.sd')))
 """Columns of the rows of recordings from which a digest is made."""
+
+
+_Item = TypeVar('_Item')
+
+Odd = tuple[str, str, float, float]
+"""Sensor, name of a value, the value, and its distance from the median in spreads."""
 
 
 class Months:
@@ -89,16 +110,9 @@ class Values:
     """
     The calibrations of a sensor that can be compared.
 
-    Parameters
-    ----------
-    mean, deviation : (9,) array
-        Mean of `NAMES` over the calibrations, and its standard deviation.
-    effects : dict
-        Values of the newest calibration beyond V and W.
-    months : list of str
-        Months of the calibrations, for those with a date; none of a single calibration.
-    differences : (n, 9) array
-        Their differences from the median of the sensor.
+    `mean` (9,) of `NAMES` has the standard `deviation` (9,). `effects` are the values beyond V and
+    W of the newest calibration. `differences` (n, 9) from the median of the sensor are those of
+    calibrations with a date, in `months`; there are none of a single calibration.
 
     """
 
@@ -126,20 +140,9 @@ class Digest:
     """
     What the statistics need of a sensor.
 
-    Parameters
-    ----------
-    sensor : str
-        Its name.
-    counts : mapping of str to int
-        Recordings by rating, or by status without a rating.
-    errors : list of dict
-        The first `MOST_ERRORS` rows with an error.
-    left_out : int
-        Recordings with a calibration whose values are not compared.
-    values : mapping of str to Values
-        The calibrations that are compared, by model of sensor.
-    typical : list of Typical
-        What the typical values need.
+    `counts` are recordings by rating, or by status without a rating. `errors` are the first
+    `MOST_ERRORS` rows with an error. `left_out` recordings have a calibration that is not
+    compared; `values` are those that are, by model of sensor. `typical` is for `priors_of`.
 
     """
 
@@ -151,6 +154,14 @@ class Digest:
     typical: list[Typical]
 
 
+def _grouped(items: Iterable[_Item], key: Callable[[_Item], str]) -> dict[str, list[_Item]]:
+    """Return the items by their key, in the order in which they are."""
+    found: dict[str, list[_Item]] = defaultdict(list)
+    for each in items:
+        found[key(each)].append(each)
+    return found
+
+
 def digest_of(name: str, store: Store) -> Digest:
     """Return the digest of a sensor by the name of its folder; it runs on a worker."""
     return digest(unquote(name), store.of_sensor(name, COLUMNS))
@@ -158,10 +169,8 @@ def digest_of(name: str, store: Store) -> Digest:
 
 def digest(sensor: str, rows: Sequence[Row]) -> Digest:
     """Return the digest of the rows of a sensor, in order of date."""
-    by_model: dict[str, list[Row]] = defaultdict(list)
-    for row in rows:
-        if row['status'] == 'ok' and row['calibration']:
-            by_model[row['sensor_model'] or ''].append(row)
+    by_model = _grouped((row for row in rows if row['status'] == 'ok' and row['calibration']),
+                        lambda row: row['sensor_model'] or '')
     compared = {model: alike(of_model) for model, of_model in by_model.items()}
     return Digest(
         sensor, Counter(row['rating'] or row['status'] for row in rows),
@@ -173,16 +182,9 @@ def digest(sensor: str, rows: Sequence[Row]) -> Digest:
 @dataclass(frozen=True)
 class OfModel:
     """
-    What is known of the sensors of one model.
+    What is known of the sensors of one model: the fields of `Values`, by sensor.
 
-    Parameters
-    ----------
-    values, deviations : mapping of str to (9,) array
-        Mean of `NAMES` over the calibrations of a sensor, and its standard deviation, by sensor.
-    effects : mapping of str to dict
-        Values of the newest calibration beyond V and W, by sensor.
-    months : Months
-        Drift of all sensors together.
+    `values` are the means, and `months` has the differences of all sensors.
 
     """
 
@@ -202,20 +204,9 @@ class OfModel:
 @dataclass
 class Overview:
     """
-    Statistics over a fleet.
+    Statistics over a fleet: the fields of `Digest` for all sensors, and the sensors by model.
 
-    Parameters
-    ----------
-    models : mapping of str to OfModel
-        The sensors by their model.
-    errors : list of dict
-        The first `MOST_ERRORS` rows with an error.
-    counts : mapping of str to int
-        Recordings by rating, or by status without a rating.
-    left_out : int
-        Recordings with a calibration whose values are not compared.
-    typical : list of Typical
-        What the typical values need.
+    `errors` are the first `MOST_ERRORS`.
 
     """
 
@@ -247,7 +238,7 @@ def table_of(rows: Sequence[Row]) -> tuple[Floats, Floats]:
 
 
 def odd_sensors(values: Mapping[str, Floats], deviations: Mapping[str, Floats] | None = None
-                ) -> list[tuple[str, str, float, float]]:
+                ) -> list[Odd]:
     """
     Return the sensors of one model that are far from the others, the farthest first.
 
@@ -255,11 +246,6 @@ def odd_sensors(values: Mapping[str, Floats], deviations: Mapping[str, Floats] |
     ----------
     values, deviations : mapping of str to (9,) array
         Values by sensor, and their standard deviations; by default 0.
-
-    Returns
-    -------
-    list of (str, str, float, float)
-        Sensor, name of the value, the value, and its distance in spreads.
 
     """
     from scipy.special import stdtrit
@@ -280,12 +266,14 @@ def odd_sensors(values: Mapping[str, Floats], deviations: Mapping[str, Floats] |
 
 def not_agreeing(sensors: Iterable[Row]) -> list[Row]:
     """Return the sensors whose calibrations differ, with a false discovery rate of `_FALSE`."""
+    from scipy.stats import false_discovery_control
+
     tested = sorted((row for row in sensors if row['p_value'] is not None),
                     key=lambda row: float(row['p_value']))
-    count = len(tested)
-    last = max((k for k, row in enumerate(tested, 1) if row['p_value'] <= _FALSE * k / count),
-               default=0)
-    return tested[:last]
+    if not tested:
+        return []
+    adjusted = false_discovery_control([row['p_value'] for row in tested])
+    return [row for row, p_value in zip(tested, adjusted, strict=True) if p_value <= _FALSE]
 
 
 def rating_of(known: Overview, sensors: Sequence[Row]) -> Rating:
@@ -296,16 +284,98 @@ def rating_of(known: Overview, sensors: Sequence[Row]) -> Rating:
 
 def shared_effects(effects: Mapping[str, Mapping[str, float]]) -> list[str]:
     """Return a line per value beyond V and W that two or more sensors have, with its range."""
-    found: dict[str, list[float]] = defaultdict(list)
-    for values in effects.values():
-        for name, value in values.items():
-            found[name].append(value)
+    found = _grouped((each for values in effects.values() for each in values.items()),
+                     lambda each: each[0])
     lines = []
     for name, known in sorted(found.items(), key=lambda each: -len(each[1])):
-        if len(known) < 2:
-            continue
-        low, high = np.quantile(known, [0.1, 0.9])
+        low, high = np.quantile([value for _, value in known], [0.1, 0.9])
         _, factor, unit = scale_of(name)
-        lines.append(f'{len(known)} of {counted(len(effects), "sensor")}: {name} '
-                     f'{short(low * factor)} to {short(high * factor)} {unit}')
+        if len(known) > 1:
+            lines.append(f'{len(known)} of {counted(len(effects), "sensor")}: {name} '
+                         f'{short(low * factor)} to {short(high * factor)} {unit}')
     return lines
+
+
+# ----------------------------------------------------------------------------- typical values
+
+Typical = tuple[str, Floats, Floats]
+"""Model of a sensor, the mean of its values over its recordings, and its covariance."""
+
+_SURE = 50.0
+
+_DOF = 4.0
+"""Degrees of freedom of the distribution over sensors; few give odd sensors little weight."""
+
+_STEPS = 200
+_CONVERGED = 1e-8
+_LEAST_SPREAD_G = 1e-5
+"""Smallest spread over sensors [g], far below that of any sensors."""
+
+
+def typical_of(rows: Iterable[Row]) -> list[Typical]:
+    """Return what `priors_of` needs of a sensor, by model; rows without values are left out."""
+    size = len(parameter_names(MODELS['10'].effects))
+    by_model = _grouped((row for row in rows if row['prior_values']),
+                        lambda row: row['sensor_model'] or '')
+    return [(model, np.mean([row['prior_values'] for row in good], axis=0),
+             np.sum([row['prior_covariance'] for row in good], axis=0).reshape(size, size)
+             / len(good) ** 2) for model, good in by_model.items()]
+
+
+def priors_of(sensors: Iterable[Typical]) -> dict[str, FleetPrior]:
+    """Return the typical values of the models with at least `FEWEST` sensors."""
+    by_model = _grouped(sensors, lambda each: each[0])
+    return {model: FleetPrior(model, len(chosen), estimated(
+        np.array([values for _, values, _ in chosen]),
+        np.array([covariance for _, _, covariance in chosen])))
+        for model, chosen in sorted(by_model.items()) if len(chosen) >= FEWEST}
+
+
+def estimated(values: Floats, covariances: Floats) -> Prior:
+    """
+    Return mean and covariance for another sensor of the fleet.
+
+    Parameters
+    ----------
+    values : (n, p) array
+        Values of n sensors.
+    covariances : (n, p, p) array
+        Their covariances.
+
+    """
+    from scipy.special import chdtri
+
+    count, size = values.shape
+    mean = np.median(values, axis=0)
+    spread = np.median(np.abs(values - mean), axis=0) / 0.6745 + _LEAST_SPREAD_G
+    covariance: Floats = np.diag(spread ** 2)
+    for _ in range(_STEPS):
+        before = covariance
+        mean, covariance = _step(values, covariances, mean, covariance)
+        if np.max(np.abs(covariance - before)) <= _CONVERGED * np.max(covariance):
+            break
+    share = count / (count + _SURE)
+    shrunk = share * covariance + (1.0 - share) * np.diag(np.diag(covariance))
+    shrunk = (shrunk + _LEAST_SPREAD_G ** 2 * np.eye(size)) * (1.0 + 1.0 / count)
+    median = float(np.median(_squared(values - mean, shrunk + covariances)))
+    return Prior(mean, shrunk * max(median / chdtri(size, 0.5), 1.0))
+
+
+def _squared(away: Floats, covariances: Floats) -> Floats:
+    """Return the (n,) squared distances, per (n, p, p) covariance."""
+    solved = np.linalg.solve(covariances, away[:, :, np.newaxis])[:, :, 0]
+    return np.einsum('np,np->n', away, solved)
+
+
+def _step(values: Floats, covariances: Floats, mean: Floats, covariance: Floats
+          ) -> tuple[Floats, Floats]:
+    """Return mean and covariance after a step of expectation maximisation."""
+    away = values - mean
+    gain = covariance @ np.linalg.inv(covariance + covariances)  # (n, p, p)
+    likely = np.einsum('npq,nq->np', gain, away)
+    weight = (_DOF + values.shape[1]) / (_DOF + _squared(away, covariance + covariances))
+    left = covariance - gain @ covariance
+    centre = mean + weight @ likely / np.sum(weight)
+    off = mean + likely - centre
+    spread = np.einsum('n,np,nq->pq', weight, off, off) + np.sum(left, axis=0)
+    return centre, (spread + spread.T) / (2.0 * len(values))

@@ -5,34 +5,36 @@
 The page of a fleet: values over the fleet, odd sensors, changes, shared effects, errors.
 
 The size of the page does not grow with the number of sensors: tables end after `_MOST` lines and
-lists of figures after `_MOST_CHANGED`, `_MOST_ODD` and `_NEWEST` sensors. The page says how many
-it does not show; `sensors.parquet` and the rows of the recordings have all of them.
+lists of figures after `_MOST_CHANGED`, `_MOST_ODD` and `_NEWEST` sensors. The values are drawn as
+histograms, and the drift of all sensors as bands of quantiles. The page says how many sensors it
+does not show; `sensors.parquet` and the rows of the recordings have all of them.
 
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from datetime import datetime, timezone
 from itertools import islice
+from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
 
-from .charts import (
-    change_words, drift_words, lasting_words, Odd, odd_words, of_months, of_sensor, of_values)
-from .overview import not_agreeing, odd_sensors, OfModel, Overview, rating_of, shared_effects
-from .sensors import alike
-from .task import Row, Store
-from .. import __version__
+from .overview import (
+    not_agreeing, Odd, odd_sensors, OfModel, Overview, rating_of, shared_effects, table_of)
+from .recording import Row
+from .sensors import alike, Store
 from ..calibrate import FleetPrior
 from ..compare import NAMES
 from ..effects import MODELS, parameter_names
-from ..findings import Rating, scale_of
-from ..report.charts import Drawing, has_matplotlib
-from ..report.repeats import spoken
+from ..findings import change_in_words, CROSS, in_words, scale_of
 from ..report.sheet import (
-    figures, heading, listing, paragraph, rated_sheet, scroll_table, section, verdict_box,
-    write_sheet)
+    ACCENT, add_band, AFTER, BAND, BEFORE, Drawing, drawn, EDGE, FAINT, figures, has_matplotlib,
+    legend_below, listing, Mark, Marks, paragraph, rated_sheet, scroll_table, section, THIRD,
+    write_page)
+from ..report.stability import GROUPS, label_dates, places_of, spoken
+from ..table import Floats
 from ..text import counted, short
 
 PAGE = 'fleet.html'
@@ -49,6 +51,9 @@ _MOST_MODELS = 6
 _MOST_CHANGED, _MOST_ODD, _NEWEST = 6, 4, 2
 """Largest numbers of sensors whose calibrations are drawn over time."""
 
+_LASTING = {True: 'for good', False: 'this calibration only', None: 'newest'}
+"""Words for whether a change lasts."""
+
 _DRIFTS = 0.05
 """Probability below which a drift is stated."""
 
@@ -56,17 +61,16 @@ _DRIFTS = 0.05
 def write_fleet_page(store: Store, known: Overview, sensors: Sequence[Row],
                      priors: Mapping[str, FleetPrior]) -> None:
     """Write the page of all sensors, with typical values by model; raise OSError if it fails."""
-    rating = rating_of(known, sensors)
-    write_sheet(store.folder / PAGE, rated_sheet('Fleet', rating, _body(
-        store, known, sensors, priors, rating), script=False))
+    body = _body(store, known, sensors, priors)
+    write_page(store.folder / PAGE, rated_sheet(
+        'Fleet', (), rating_of(known, sensors), body, heading='Calibrations of a fleet',
+        script=False))
 
 
 def _body(store: Store, known: Overview, sensors: Sequence[Row],
-          priors: Mapping[str, FleetPrior], rating: Rating) -> Iterator[str]:
+          priors: Mapping[str, FleetPrior]) -> Iterator[str]:
     """Yield the parts of the page."""
     differ = not_agreeing(sensors)
-    yield heading('Calibrations of a fleet', [f'accel_calib {__version__}'])
-    yield verdict_box(rating)
     if not has_matplotlib():
         yield paragraph('This page has no figures, because matplotlib is not installed.')
     yield paragraph(f'Not compared: {counted(known.left_out, "recording")} whose poses do not '
@@ -78,7 +82,7 @@ def _body(store: Store, known: Overview, sensors: Sequence[Row],
         odd = odd_sensors(of_model.values, of_model.deviations)
         odd_names += [sensor for sensor, _, _, _ in odd]
         yield from _of_model(model, of_model, odd, f'model{number}', priors.get(model),
-                             drawn=number < _MOST_MODELS)
+                             shown=number < _MOST_MODELS)
     yield paragraph(f'Figures of the {_MOST_MODELS} models with the most sensors are shown, of '
                     f'{len(models)} models.' if len(models) > _MOST_MODELS else '', 'soft')
     yield _changes(differ)
@@ -87,20 +91,20 @@ def _body(store: Store, known: Overview, sensors: Sequence[Row],
 
 
 def _of_model(model: str, known: OfModel, odd: Sequence[Odd], prefix: str,
-              prior: FleetPrior | None, *, drawn: bool) -> Iterator[str]:
-    """Yield the sections of a model of sensor."""
-    drawn = drawn and has_matplotlib()
+              prior: FleetPrior | None, *, shown: bool) -> Iterator[str]:
+    """Yield the sections of a model of sensor; its figures if `shown` is set."""
+    shown = shown and has_matplotlib()
     name = f' (model {model})' if model else ''
-    values = _figures(of_values(f'{prefix}_values', known, odd)) if drawn else ''
+    values = _figures(_of_values(f'{prefix}_values', known, odd)) if shown else ''
     yield section(f'Values{name}', values, values and paragraph(
         'Histograms over the sensors. Line: median. Triangles: odd sensors.', 'soft'),
         _distribution(known.values))
     yield section(f'Odd sensors{name}', listing(
-        odd_words(known, each) for each in odd[:_MOST]),
+        _odd_words(known, each) for each in odd[:_MOST]),
         _not_shown(len(odd) - _MOST, 'odd value'))
     yield section(f'Effects that several sensors share{name}',
                   listing(shared_effects(known.effects)))
-    drift = _figures(of_months(f'{prefix}_months', known)) if drawn else ''
+    drift = _figures(_of_months(f'{prefix}_months', known)) if shown else ''
     yield section(f'Drift of all sensors{name}', drift and paragraph(
         'Difference of each calibration from the median of its sensor, by month: the median, and '
         'bands with 50 % and 90 % of the calibrations.'), drift)
@@ -115,8 +119,8 @@ def _distribution(values: Mapping[str, object]) -> str:
         zero, factor, unit = scale_of(name)
         parts = (np.quantile(column, [0.0, 0.1, 0.5, 0.9, 1.0]) - zero) * factor
         rows.append((f'{spoken(name)} [{unit}]', *map(short, parts)))
-    return scroll_table((counted(len(values), 'sensor'), 'smallest', '10 %', 'median', '90 %',
-                         'largest'), rows, 'whole-cells', 'Distribution')
+    return scroll_table('Distribution', (counted(len(values), 'sensor'), 'smallest', '10 %',
+                                         'median', '90 %', 'largest'), rows)
 
 
 def _typical(fleet: FleetPrior) -> str:
@@ -130,8 +134,8 @@ def _typical(fleet: FleetPrior) -> str:
                      short(sd * factor), unit))
     words = (f'Model 10, from {counted(fleet.sensors, "sensor")}, in fleet.yaml for --prior of '
              'fit and refine.')
-    return paragraph(words) + scroll_table(('value', 'typical', 'spread', 'unit'), rows,
-                                           'whole-cells', 'Typical values')
+    return paragraph(words) + scroll_table(
+        'Typical values', ('value', 'typical', 'spread', 'unit'), rows)
 
 
 def _changes(sensors: Sequence[Row]) -> str:
@@ -143,8 +147,8 @@ def _changes(sensors: Sequence[Row]) -> str:
         f'The calibrations of {counted(len(sensors), "sensor")} differ by more than their '
         'uncertainty. A change is for good if the next calibration differs from the values before '
         'it, too.'), scroll_table(
-        ('sensor', 'first recording after it', 'change', 'lasts'), rows[:_MOST], '',
-        'Sensors that changed', long=len(rows) > _LONG), _not_shown(len(rows) - _MOST, 'line'))
+        'Sensors that changed', ('sensor', 'first recording after it', 'change', 'lasts'),
+        rows[:_MOST], '', long=len(rows) > _LONG), _not_shown(len(rows) - _MOST, 'line'))
 
 
 def _change_lines(row: Row) -> Iterator[tuple[str, str, str, str]]:
@@ -152,10 +156,11 @@ def _change_lines(row: Row) -> Iterator[tuple[str, str, str, str]]:
     sensor, drift = row['sensor'], row.get('drift')
     for change in row['changes']:
         date, path = (change['date'] or '')[:10], change.get('recording') or ''
-        words, _, _ = change_words(change).rpartition(', ')
-        yield sensor, f'{date} {path}'.strip(), words, lasting_words(change['for_good'])
+        yield (sensor, f'{date} {path}'.strip(), _change_words(change),
+               _LASTING[change['for_good']])
     if drift and drift['p_value'] < _DRIFTS:
-        yield sensor, '', f'{spoken(drift["parameter"])} {drift_words(drift)}', 'drift'
+        words = change_in_words(drift['parameter'], drift['per_year'], drift['sd'])
+        yield sensor, '', f'{spoken(drift["parameter"])} {words} per year', 'drift'
     elif not row['changes']:
         yield sensor, '', 'no step or drift that is significant alone', ''
 
@@ -177,32 +182,204 @@ def _over_time(store: Store, sensors: Sequence[Row], differ: Sequence[Row],
             most))
     significant = {row['sensor'] for row in differ}
     folders = {unquote(folder): folder for folder in store.sensors()}
-    drawn = [of_sensor(f'sensor{number}', name, alike(store.of_sensor(folders[name])),
-                       by_name[name]['changes'] if name in significant else [])
-             for number, name in enumerate(chosen)]
+    drawings = [_of_sensor(f'sensor{number}', name, alike(store.of_sensor(folders[name])),
+                           by_name[name]['changes'] if name in significant else [])
+                for number, name in enumerate(chosen)]
     return section('Sensors over time', paragraph(
         'Difference of each calibration from the median of its sensor, with 95 % band. '
         'Line: the sensor changed for good at this recording. Dotted line: only this calibration '
         'differs, or it is the newest one. Sensors that changed, odd sensors, and the newest '
-        'recordings.'), _figures(drawn),
-        _not_shown(len(by_name) - len(chosen), 'other sensor')) if drawn else ''
+        'recordings.'), _figures(drawings),
+        _not_shown(len(by_name) - len(chosen), 'other sensor')) if drawings else ''
 
 
 def _errors(known: Overview) -> str:
     """Return a table of the recordings without a calibration."""
-    if not known.errors:
-        return ''
     rows = [(row['recording'], row['error'], row['advice']) for row in known.errors[:_MOST]]
     count = sum(known.counts[status] for status in ('error', 'unread'))
-    return scroll_table(('recording', 'error', 'what to do'), rows, '', 'Errors',
+    return scroll_table('Errors', ('recording', 'error', 'what to do'), rows, '',
                         long=len(rows) > _LONG) + _not_shown(count - len(rows), 'recording')
 
 
-def _figures(drawn: Iterable[Drawing]) -> str:
+def _figures(drawings: Iterable[Drawing]) -> str:
     """Return figures; the browser shows the text of a marker that is pointed at."""
-    return figures(drawn, 'pair', script=False)
+    return figures(drawings, script=False)
 
 
 def _not_shown(count: int, what: str) -> str:
     """Return how many are not shown; nothing if all are."""
     return paragraph(f'{counted(count, what)} not shown.', 'soft') if count > 0 else ''
+
+
+# ----------------------------------------------------------------------------- figures
+
+_PARTS = (0.05, 0.25, 0.5, 0.75, 0.95)
+"""Quantiles of the drift of a fleet."""
+
+_MOST_BARS = 40
+_ROOM = 6.0
+"""Range of a histogram, in distances of the 10 % and 90 % quantiles from the median."""
+
+_NAMED = 3
+"""Largest number of odd sensors whose name is written beside a histogram."""
+
+_LONGEST_NAME = 24
+_MOST_DATES = 40
+"""Largest number of calibrations in the figure of a sensor: the newest ones."""
+
+_FEW = 12
+"""Number of calibrations up to which each has a marker."""
+
+_FEWEST_MONTHS = 3
+_COLOURS = (AFTER, THIRD, BEFORE)
+
+
+def _of_values(prefix: str, known: OfModel, odd: Sequence[Odd]) -> Iterator[Drawing]:
+    """Yield histograms of each value over the sensors of a model, with the odd sensors."""
+    table = np.array(list(known.values.values()))
+    for key, words, names in GROUPS:
+        hover = {}
+        with drawn(3.6, f'{words} [{scale_of(names[0])[2]}]', 3, grid='') as (figure, panels):
+            for panel, name in zip(panels, names, strict=True):
+                own = [each for each in odd if each[1] == name]
+                _draw_histogram(panel, name, table[:, NAMES.index(name)], own)
+                if own:
+                    hover[name] = tuple(Mark(_odd_words(known, each)) for each in own)
+            panels[1].set_ylabel('sensors')
+        yield Drawing(f'{prefix}_{key}', f'{words} over the sensors; triangles: odd sensors',
+                      figure, hover)
+
+
+def _draw_histogram(panel: Any, name: str, column: Floats, odd: Sequence[Odd]) -> None:
+    zero, factor, _ = scale_of(name)
+    values = (column - zero) * factor
+    low, middle, high = np.quantile(values, [0.1, 0.5, 0.9])
+    reach = _ROOM * max(high - middle, middle - low) or float(np.max(np.abs(values - middle)))
+    shown = values[np.abs(values - middle) <= reach]
+    bars = int(np.clip(2.0 * np.sqrt(len(shown)), 5, _MOST_BARS))
+    heights, edges = np.histogram(shown, bars)
+    panel.stairs(heights, edges, fill=True, color=AFTER, alpha=0.45)
+    panel.axvline(middle, color=BEFORE, linewidth=1.2)
+    panel.text(0.01, 0.95, name.partition('.')[2], transform=panel.transAxes, va='top')
+    panel.locator_params(axis='y', integer=True, nbins=3)
+    if odd:
+        _draw_odd(panel, name, odd, middle, reach, 0.12 * max(float(np.max(heights)), 1.0))
+
+
+def _draw_odd(panel: Any, name: str, odd: Sequence[Odd], middle: float, reach: float,
+              height: float) -> None:
+    """Mark the odd sensors, at the edge if they are farther than `reach` from the middle."""
+    zero, factor, _ = scale_of(name)
+    at = (np.array([each[2] for each in odd]) - zero) * factor
+    places = np.clip(at, middle - reach, middle + reach)
+    panel.plot(places, np.full(len(at), height), 'v', color=ACCENT, gid=name, markersize=7.0,
+               clip_on=False, **EDGE)
+    for k, (place, value, each) in enumerate(zip(places[:_NAMED], at, odd, strict=False)):
+        beyond = '' if place == value else f' {short(value)} →' if value > place else (
+            f' ← {short(value)}')
+        panel.annotate(f'{_short_name(each[0])}{beyond}', (place, height), (0.0, 6.0 + 10.0 * k),
+                       textcoords='offset points', fontsize=8.0, parse_math=False,
+                       ha='right' if place > middle else 'left')
+
+
+def _odd_words(known: OfModel, odd: Odd) -> str:
+    """Return an odd sensor with its value."""
+    sensor, name, value, far = odd
+    sd = float(known.deviations[sensor][NAMES.index(name)])
+    return (f'{sensor}: {spoken(name)} {in_words(name, value, sd)}, {far:.0f} spreads '
+            'from the median')
+
+
+def _short_name(name: str) -> str:
+    """Return the end of a long name, where the names of a fleet differ most."""
+    return name if len(name) <= _LONGEST_NAME else f'…{name[1 - _LONGEST_NAME:]}'
+
+
+def _of_months(prefix: str, known: OfModel) -> Iterator[Drawing]:
+    """Yield the drift of all sensors of a model together, as bands of quantiles by month."""
+    months, found = known.months.quantiles(_PARTS)
+    if len(months) < _FEWEST_MONTHS:
+        return
+    days = np.array([f'{month}-15' for month in months], 'datetime64[D]').astype(float)
+    for key, words, names in GROUPS:
+        with drawn(3.9, f'{words} minus its median [{scale_of(names[0])[2]}]', 3, sharex=True
+                   ) as (figure, panels):
+            for panel, name in zip(panels, names, strict=True):
+                _draw_months(panel, name, days, found[:, :, NAMES.index(name)])
+            label_dates(panels[-1], days, 'month of the recording', dated=True)
+        yield Drawing(f'{prefix}_{key}', f'{words}: difference from the median of the sensor, by '
+                      'month, with bands of 50 % and 90 % of the calibrations', figure)
+
+
+def _draw_months(panel: Any, name: str, days: Floats, quantiles: Floats) -> None:
+    """Draw the (months, `_PARTS`) quantiles of a value."""
+    lines = quantiles.T * scale_of(name)[1]
+    panel.axhline(0.0, color=FAINT, linewidth=1.2)
+    add_band(panel, days, lines[0], lines[4], AFTER, 0.18)
+    add_band(panel, days, lines[1], lines[3], AFTER, 0.35)
+    panel.plot(days, lines[2], color=AFTER)
+    panel.set_ylabel(name.partition('.')[2])
+
+
+def _of_sensor(name: str, sensor: str, rows: Sequence[Row], changes: Sequence[Mapping[str, Any]]
+               ) -> Drawing:
+    """Draw the newest of the dated `rows` of a sensor, with bands and its changes."""
+    shown = rows[-_MOST_DATES:]
+    places = {row['key']: place for place, row in enumerate(shown)}
+    marked = [(places[change['key']], change) for change in changes if change['key'] in places]
+    values, deviations = table_of(shown)
+    cross = np.any(deviations[:, [NAMES.index(name) for name in CROSS]])
+    groups = [(key, names) for key, _, names in GROUPS if cross or names is not CROSS]
+    at, dated = places_of([_stamp(row['date']) for row in shown])
+    with drawn(0.9 + 1.15 * len(groups), _short_name(sensor), len(groups), sharex=True
+               ) as (figure, panels):
+        for panel, (key, names) in zip(panels, groups, strict=True):
+            columns = [NAMES.index(name) for name in names]
+            unit = _draw_group(panel, names, at, values[:, columns], deviations[:, columns])
+            panel.set_ylabel(f'{key.replace("_", "-")}\n[{unit}]')
+            for place, change in marked:
+                panel.axvline(at[place], color=ACCENT, linewidth=1.4, linestyle='-'
+                              if change['for_good'] else (0, (2, 3)))
+        hover = _mark_changes(panels[0], shown, at, marked)
+        label_dates(panels[-1], at, 'date of the recording', dated=dated)
+        legend_below(figure, 3, *panels[0].get_legend_handles_labels())
+    return Drawing(name, f'{sensor}: calibrations over time with 95 % band', figure, hover)
+
+
+def _draw_group(panel: Any, names: Sequence[str], at: Floats, values: Floats, deviations: Floats
+                ) -> str:
+    """Draw three values over time, minus their medians, with bands; return their unit."""
+    for k, name in enumerate(names):
+        _, factor, unit = scale_of(name)
+        middle = (values[:, k] - np.median(values[:, k])) * factor
+        band = BAND * deviations[:, k] * factor
+        add_band(panel, at, middle - band, middle + band, _COLOURS[k])
+        panel.plot(at, middle, color=_COLOURS[k], linewidth=1.2, label='xyz'[k],
+                   marker='o' if len(at) <= _FEW else None, markersize=2.5)
+    return unit
+
+
+def _mark_changes(panel: Any, rows: Sequence[Row], at: Floats,
+                  changes: Sequence[tuple[int, Mapping[str, Any]]]) -> dict[str, Marks]:
+    """Mark the recordings with changes; return the texts of the marks."""
+    if not changes:
+        return {}
+    places = [place for place, _ in changes]
+    panel.plot(at[places], np.full(len(places), panel.get_ylim()[1]), 'v', color=ACCENT,
+               gid='changes', clip_on=False, **EDGE)
+    return {'changes': tuple(Mark(f'{rows[place]["recording"]}: {_change_words(change)}, '
+                                  f'{_LASTING[change["for_good"]]}') for place, change in changes)}
+
+
+def _change_words(change: Mapping[str, Any]) -> str:
+    """Return a change with its standard deviation."""
+    words = change_in_words(change['parameter'], change['change'], change['sd'])
+    return f'{spoken(change["parameter"])} {words}'
+
+
+def _stamp(date: str | None) -> float | None:
+    """Return a date as seconds since 1970; None without a date."""
+    if not date:
+        return None
+    when = datetime.fromisoformat(date.replace('Z', '+00:00'))
+    return when.replace(tzinfo=when.tzinfo or timezone.utc).timestamp()

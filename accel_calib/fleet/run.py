@@ -18,21 +18,25 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
+from pathlib import Path
+import threading
 import time
 from typing import Any, TYPE_CHECKING, TypeVar
 
-from .inputs import Input
-from .overview import digest_of, Overview, overview, rating_of
+from .overview import digest_of, Overview, overview, priors_of, rating_of
 from .page import write_fleet_page
-from .sensors import merge_sensor, PRIOR_FILE, priors_of, read_sensors, write_sensors
-from .task import (
-    calibrate_recording, Done, is_damaged, Options, Row, SENSORS_FILE, Store, UNREAD, unread_row)
-from ..calibrate import FleetPrior
+from .recording import (
+    as_folder, as_text, content_hash, Input, key_of, on_disk, Options, Row, row_of, unread_row)
+from .sensors import is_damaged, merge_sensor, read_parquet, Store, UNREAD, write_sensors
+from ..calibrate import Calibration, FleetPrior
+from ..disk import write_atomically
 from ..effects import know_code, known_code
-from ..errors import InputError, needing
+from ..errors import AccelCalibError, InputError, needing, system_error
 from ..findings import Rating
 from ..logs import Progress
-from ..stored import write_priors
+from ..session import WorkerProcess
+from ..stored import write_calibration, write_priors
+from ..stored.exports import export
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -54,6 +58,11 @@ _NEWEST = 0.2
 """Weight of the newest task in the mean duration of a recording."""
 
 _CONNECT_S = 30.0
+
+STATUS = ('ok', 'error', 'unread', 'skipped')
+"""What can happen to a recording; unread: it could not be read, and is tried again."""
+
+PRIOR_FILE = 'fleet.yaml'
 
 LIMIT_S = 900.0
 """Longest time of one recording [s], far above that of a day at 100 Hz."""
@@ -172,13 +181,12 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
     with store.locked():
         damaged = tuple(_set_aside(client, store))
         _merge(client, store)  # what an interrupted run left
-        counts: Counter[str] = Counter()
-        unread: list[Row] = []
-        for item, result in mapped(client, calibrate_recording, found, options, store,
-                                   limit_s):
-            done = _of_dead(item, options, result) if isinstance(result, Exception) else result
-            counts[done.status] += 1
-            unread += [] if done.row is None else [done.row]
+        counts, unread = Counter[str](), list[Row]()
+        for item, status in mapped(client, calibrate_recording, found, options, store, limit_s):
+            if isinstance(status, Exception):
+                unread.append(_row_of_unread(item, options, status))
+                status = 'unread'
+            counts[status] += 1
             progress(sum(counts.values()), len(found))
         store.replace_unread(unread)
         sensors = tuple(_merge(client, store))
@@ -210,10 +218,10 @@ def _set_aside(client: Client, store: Store) -> Iterator[str]:
 def _merge(client: Client, store: Store) -> list[Row]:
     """Merge all pending rows, and compare the calibrations; return the rows of all sensors."""
     names = store.waiting()
-    if not (store.folder / SENSORS_FILE).exists():
+    if not store.sensors_file.exists():
         names = sorted({*names, *store.sensors()})
     if not names:
-        return read_sensors(store)
+        return read_parquet(store.sensors_file)
     found = write_sensors(store, list(_by_sensor(client, merge_sensor, names, store)))
     for _ in _by_sensor(client, _finish, names, store):
         pass
@@ -237,15 +245,17 @@ def _by_sensor(client: Client, function: Callable[[str, Store], _Result], names:
             yield early.pop(due.popleft())
 
 
-def _of_dead(item: Input, options: Options, error: Exception) -> Done:
-    """Return the result of a recording on which workers died; raise other errors."""
+def _row_of_unread(item: Input, options: Options, error: Exception) -> Row:
+    """Return the row of a recording that was not read; raise an error that is not its own."""
     from distributed import KilledWorker
 
-    if not isinstance(error, KilledWorker):
-        raise error
-    return Done('unread', unread_row(item, options, InputError(
-        'the workers that calibrated this recording died, expected them to finish',
-        'give the workers more memory, and run again')))
+    if isinstance(error, KilledWorker):
+        return unread_row(item, options, InputError(
+            'the workers that calibrated this recording died, expected them to finish',
+            'give the workers more memory, and run again'))
+    if isinstance(error, UnreadError):
+        return unread_row(item, options, error)
+    raise error
 
 
 def mapped(client: Client, function: Callable[..., Any], items: Iterable[_Item], *others: Any
@@ -324,3 +334,81 @@ class _Pace:
         """Add a task of this many items; the newest tasks count most."""
         self._seconds += _NEWEST * (seconds / count - self._seconds)
         self.size = max(1, min(_MOST_TOGETHER, int(_TASK_S / max(self._seconds, 1e-9))))
+
+
+# ----------------------------------------------------------------------------- one recording
+
+class UnreadError(AccelCalibError):
+    """A recording could not be read; the next run tries it again."""
+
+
+class _Apart(threading.local):
+    """The process of each thread in which recordings are calibrated, so that it can be ended."""
+
+    def __init__(self) -> None:
+        self.process = WorkerProcess(idle=False)  # ends with this process
+
+
+_apart = _Apart()
+
+
+def calibrate_recording(found: Input, options: Options, store: Store, limit_s: float) -> str:
+    """
+    Calibrate one recording, add the result to the store, and return what happened to it.
+
+    Raises
+    ------
+    UnreadError
+        If it cannot be read, or takes longer than `limit_s` [s].
+    OSError
+        If the result cannot be written.
+
+    """
+    begin = time.perf_counter()
+    with _reading(found.path, limit_s), on_disk(found.path) as path:
+        content = content_hash(path)
+        key = key_of(content, found, options)
+        if store.has(key):
+            return 'skipped'
+        row, calibration = _apart.process.call_within(limit_s, row_of, found, path, options)
+    row |= {'key': key, 'content': content, 'seconds': time.perf_counter() - begin}
+    if calibration is not None:
+        name = f'calibrations/{as_folder(row["sensor"])}/{key}.yaml'
+        (store.folder / name).parent.mkdir(parents=True, exist_ok=True)
+        write_calibration(store.folder / name, calibration, keep_before=False)
+        row['calibration'] = name
+        row['warnings'] += _exported(calibration, store.folder / name, options.exports)
+    store.add(row)
+    return str(row['status'])
+
+
+@contextmanager
+def _reading(name: str, limit_s: float) -> Iterator[None]:
+    """Raise UnreadError for the errors of reading a recording."""
+    try:
+        if (written := as_text(name)) != name:
+            raise InputError(f'the name {written} is not UTF-8, expected UTF-8', 'rename it')
+        yield
+    except TimeoutError as err:
+        raise UnreadError(f'{name} takes longer than {limit_s:g} s, expected less',
+                          'raise --time-limit, or leave it out') from err
+    except (OSError, EOFError) as err:
+        error = system_error(err if isinstance(err, OSError) else OSError(str(err)))
+        raise UnreadError(error.message, error.advice) from err
+    except AccelCalibError as err:  # an address without its package, or a missing match
+        raise UnreadError(err.message, err.advice) from err
+
+
+def _exported(calibration: Calibration, path: Path, formats: Sequence[str]) -> list[str]:
+    """Write exports beside a calibration; return what they do not hold, or why there is none."""
+    found = []
+    for name in formats:
+        try:
+            made = export(calibration, name)
+        except AccelCalibError as err:
+            found.append(f'no export to {name}: {err}')
+            continue
+        end = Path(made.suffix).suffix or made.suffix  # two formats have the same suffix
+        write_atomically(path.with_name(f'{path.stem}_{name}{end}'), made.write)
+        found += [f'{name}: {line}' for line in made.losses]
+    return found

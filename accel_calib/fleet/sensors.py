@@ -2,7 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The calibrations of single sensors over time, and the typical values of a model of sensor.
+The rows on a disk: a Parquet data set with each result once; and each sensor over time.
+
+**Store.** A worker writes a row to ``pending/<sensor>/<key>.json``. `Store.merge` adds the rows of
+a sensor to its Parquet file, and then marks their keys as done. `Store.finish` removes the pending
+rows when all that depends on them is written. Each step replaces files atomically, and the rows
+are merged by content. So a run can stop anywhere, and the next run merges the same rows again.
+Errors of the store, such as a full disk, are raised: they concern all recordings.
 
 **Calibrations that are compared.** A calibration is compared as if its effects were known to be
 right. A search in few poses sometimes names another effect than in the other recordings, and
@@ -19,39 +25,222 @@ if it remains significant when the drift is subtracted. The drift of a value is 
 its rates over the steps, which few large steps do not move. At last a line with a step at each
 lasting change is fitted to each value, and the row has the most significant slope.
 
-**Typical values.** Each sensor has the values x of model 10 (the mean over its calibrations) with
-the covariance C. Over the fleet, x is distributed about m with P + C. `estimated` computes m and P
-by expectation maximisation. The distribution over sensors is Student's t, so that a few sensors
-unlike the others have little weight.
-
-The correlations of few sensors are mostly chance, and would make some combinations of values seem
-certain. They are reduced by n / (n + `_CHANCE`). The mean of n sensors is uncertain itself, which
-adds P / n to the covariance for another sensor. At last P is enlarged, if necessary, until half of
-the sensors are within the distance that contains half of a normal distribution.
-
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+import errno
+import fcntl
+import json
+from pathlib import Path
+import time
 from typing import Any, TYPE_CHECKING
 from urllib.parse import unquote
 
 import numpy as np
 
-from .task import Row, SENSORS_FILE, Store, write_parquet
-from ..calibrate import Calibration, FleetPrior
+from .recording import as_folder, Row, schema
+from ..calibrate import Calibration
 from ..compare import History, history_of, LEVEL
-from ..effects import LADDER, MODELS, parameter_names
-from ..errors import AccelCalibError
-from ..estimate import Prior
+from ..disk import write_atomically
+from ..effects import LADDER
+from ..errors import AccelCalibError, InputError
 from ..stored import read_calibration
 from ..table import Floats
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
+UNREAD = '~unread'
+"""Folder of the rows of recordings that could not be read; no sensor has this folder."""
+
+_DATA = 'data.parquet'
+_SENSORS = 'sensors.parquet'
+
+
+@dataclass(frozen=True)
+class Store:
+    """
+    The folder of the results.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder; all workers must see it under this name.
+
+    """
+
+    folder: Path
+
+    @property
+    def rows(self) -> Path:
+        """Return the folder of the Parquet data set."""
+        return self.folder / 'recordings'
+
+    @property
+    def sensors_file(self) -> Path:
+        """Return the file of the rows of all sensors."""
+        return self.folder / _SENSORS
+
+    @property
+    def pending(self) -> Path:
+        """Return the folder of the rows that are not in the data set yet."""
+        return self.folder / 'pending'
+
+    def data(self, name: str) -> Path:
+        """Return the Parquet file of a sensor, by the name of its folder."""
+        return self.rows / f'sensor={name}' / _DATA
+
+    def has(self, key: str) -> bool:
+        """Return whether the result with this key is in the data set."""
+        return self._mark(key).exists()
+
+    def add(self, row: Row) -> None:
+        """Write a row, to be merged into the data set; raise OSError if it fails."""
+        folder = self.pending / as_folder(row['sensor'])
+        folder.mkdir(parents=True, exist_ok=True)
+        write_atomically(folder / f'{row["key"]}.json', lambda file: json.dump(row, file))
+
+    def waiting(self) -> list[str]:
+        """Return the folders of sensors with pending rows, in order."""
+        return sorted(each.name for each in self.pending.glob('*') if each.is_dir())
+
+    def merge(self, name: str) -> None:
+        """
+        Add the pending rows of a sensor, by the name of its folder, to its Parquet file.
+
+        Raises
+        ------
+        OSError
+            If a file cannot be written. The next `merge` completes it.
+
+        """
+        folder = self.pending / name
+        paths = sorted(folder.glob('*.json'), key=lambda path: path.stat().st_mtime)
+        new = [json.loads(path.read_text(encoding='utf-8')) for path in paths]
+        old = self.of_sensor(name)
+        rows, replaced = _merged(old, new)
+        if new:
+            write_parquet(self.data(name), rows, schema())
+        for key in replaced:
+            self._mark(key).unlink(missing_ok=True)
+        for row in new:
+            mark = self._mark(row['key'])
+            mark.parent.mkdir(parents=True, exist_ok=True)
+            mark.write_text(name, encoding='utf-8')
+
+    def finish(self, name: str) -> None:
+        """Remove the pending rows of a sensor that are in the data set."""
+        folder = self.pending / name
+        if not folder.exists():
+            return
+        for path in folder.iterdir():  # with temporary files of killed workers
+            if path.suffix != '.json' or self.has(path.stem):
+                path.unlink(missing_ok=True)
+        if not any(folder.iterdir()):  # a worker of a killed program may still write
+            folder.rmdir()
+
+    def files(self) -> Iterator[Path]:
+        """Yield all files with rows."""
+        for pattern in (_SENSORS, f'recordings/*/{_DATA}', 'pending/*/*.json'):
+            yield from sorted(self.folder.glob(pattern))
+
+    def set_aside(self, path: Path) -> Path:
+        """Move a file with rows away, so that they are made again; return its new path."""
+        moved = self.folder / 'damaged' / str(time.time_ns()) / path.relative_to(self.folder)
+        moved.parent.mkdir(parents=True)
+        if path.name == _DATA:
+            sensor = path.parent.name.partition('=')[2]
+            for mark in self.folder.glob('done/*/*'):
+                if mark.read_text(encoding='utf-8') in ('', sensor):  # '': of older versions
+                    mark.unlink()
+        path.rename(moved)
+        return moved
+
+    def replace_unread(self, rows: list[Row]) -> None:
+        """Replace the rows of the recordings that could not be read."""
+        if rows or self.data(UNREAD).exists():
+            write_parquet(self.data(UNREAD), rows, schema())
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Make the folder, and hold it for this program; raise InputError if another has it."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with (self.folder / 'lock').open('w') as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as err:
+                if err.errno not in (errno.EAGAIN, errno.EACCES):
+                    raise
+                raise InputError(f'another program writes to {self.folder}, expected no other',
+                                 'wait for it, or choose another folder') from err
+            yield
+
+    def of_sensor(self, name: str, columns: Sequence[str] | None = None) -> list[Row]:
+        """Return the rows of a sensor by the name of its folder, with all columns or these."""
+        return read_parquet(self.data(name), columns)
+
+    def sensors(self) -> list[str]:
+        """Return the folders of all sensors in the data set, in order."""
+        names = (each.name.partition('=')[2] for each in self.rows.glob('sensor=*'))
+        return sorted(name for name in names if name != UNREAD)
+
+    def _mark(self, key: str) -> Path:
+        return self.folder / 'done' / key[:2] / key
+
+
+def write_parquet(path: Path, rows: list[Row], columns: pa.Schema) -> None:
+    """Write rows as Parquet, completely or not at all; raise OSError if it fails."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    table = pa.Table.from_pylist(rows, columns)
+    write_atomically(path, lambda file: pq.write_table(table, file.buffer))
+
+
+def read_parquet(path: Path, columns: Sequence[str] | None = None) -> list[Row]:
+    """Return the rows of a Parquet file, with all columns or these; none without a file."""
+    import pyarrow.parquet as pq
+
+    return pq.ParquetFile(path).read(columns).to_pylist() if path.exists() else []
+
+
+def is_damaged(path: Path) -> bool:
+    """Return whether a file of `Store.files` cannot be read; raise OSError of the disk."""
+    import pyarrow as pa
+
+    try:
+        if path.suffix != '.json':
+            read_parquet(path)
+            return False
+        row = json.loads(path.read_text(encoding='utf-8'))
+        pa.Table.from_pylist([row], schema())
+        return not row.keys() >= {'sensor', 'key', 'content', 'date', 'recording'}
+    except OSError as err:
+        if err.errno is not None:
+            raise
+        return True
+    except (ValueError, TypeError, AttributeError, pa.ArrowException):
+        return True
+
+
+def _merged(old: list[Row], new: list[Row]) -> tuple[list[Row], list[str]]:
+    """Return the rows in order of date, and the keys of old rows that new ones replace."""
+    newest = {row['content']: row for row in new}
+    kept = [row for row in old if row['content'] not in newest]
+    keys = {row['key'] for row in newest.values()}
+    replaced = [row['key'] for row in (*old, *new)
+                if row['content'] in newest and row['key'] not in keys]
+    return sorted((*kept, *newest.values()),
+                  key=lambda row: (row['date'] or '', row['recording'])), replaced
+
+
+# ----------------------------------------------------------------------------- over time
 
 _MOST_COMPARED = 100
 """Largest number of calibrations of a sensor that are compared: the newest ones."""
@@ -59,25 +248,6 @@ _MOST_COMPARED = 100
 _YEAR_S = 365.25 * 86400.0
 _FEWEST_STEPS = 3
 """Smallest number of steps that distinguish a drift from a change."""
-
-FEWEST = 5
-"""Smallest number of sensors of a model whose typical values are computed."""
-
-PRIOR_FILE = 'fleet.yaml'
-
-Typical = tuple[str, Floats, Floats]
-"""Model of a sensor, the mean of its values over its recordings, and its covariance."""
-
-_CHANCE = 50.0
-
-_DOF = 4.0
-"""Degrees of freedom of the distribution over sensors; few give odd sensors little weight."""
-
-_STEPS = 200
-_CONVERGED = 1e-8
-_NAMES = parameter_names(MODELS['10'].effects)
-_LEAST_SPREAD_G = 1e-5
-"""Smallest spread over sensors [g], far below that of any sensors."""
 
 
 def alike(rows: Iterable[Row]) -> list[Row]:
@@ -104,17 +274,16 @@ def sensors_schema() -> pa.Schema:
     """Return the columns of the row of a sensor."""
     import pyarrow as pa
 
-    change = pa.struct([('key', pa.string()), ('date', pa.string()), ('p_value', pa.float64()),
-                        ('parameter', pa.string()), ('change', pa.float64()),
-                        ('sd', pa.float64()), ('for_good', pa.bool_()),
-                        ('recording', pa.string())])
-    drift = pa.struct([('parameter', pa.string()), ('per_year', pa.float64()),
-                       ('sd', pa.float64()), ('p_value', pa.float64())])
+    text, number, count = pa.string(), pa.float64(), pa.int64()
+    change = pa.struct([
+        ('key', text), ('date', text), ('p_value', number), ('parameter', text),
+        ('change', number), ('sd', number), ('for_good', pa.bool_()), ('recording', text)])
+    drift = pa.struct([('parameter', text), ('per_year', number), ('sd', number),
+                       ('p_value', number)])
     return pa.schema([
-        ('sensor', pa.string()), ('sensor_model', pa.string()), ('recordings', pa.int64()),
-        ('errors', pa.int64()), ('calibrations', pa.int64()), ('agree', pa.bool_()),
-        ('p_value', pa.float64()), ('first', pa.string()), ('last', pa.string()),
-        ('changes', pa.list_(change)), ('drift', drift), ('note', pa.string())])
+        ('sensor', text), ('sensor_model', text), ('recordings', count), ('errors', count),
+        ('calibrations', count), ('agree', pa.bool_()), ('p_value', number), ('first', text),
+        ('last', text), ('changes', pa.list_(change)), ('drift', drift), ('note', text)])
 
 
 def merge_sensor(name: str, store: Store) -> Row:
@@ -156,11 +325,8 @@ def _compared(calibrations: Sequence[Calibration], rows: Sequence[Row]) -> Row:
     steady = _Steady.of(history)
     for k, change in enumerate(history.changes):
         name = steady.changed(k, k + 1, limit)
-        if change.comparison.p_value >= limit or name is None:
-            back = False
-            continue
-        if back:  # from the odd one back to the others
-            back = False
+        if back or name is None or change.comparison.p_value >= limit:
+            back = False  # no change, or from the odd one back to the others
             continue
         lasting[k + 1] = for_good = _stays(history, steady, k, limit)
         back = for_good is False
@@ -222,9 +388,8 @@ def _stays(history: History, steady: _Steady, before: int, limit: float) -> bool
     """Return whether the calibration after the next differs, too; None if there is none."""
     if before + 2 >= len(history.runs):
         return None
-    if steady.changed(before, before + 2, limit) is None:
-        return False
-    return history.between(before, before + 2).p_value < limit
+    return (steady.changed(before, before + 2, limit) is not None
+            and history.between(before, before + 2).p_value < limit)
 
 
 def years_of(history: History) -> Floats | None:
@@ -241,13 +406,8 @@ def drift_of(history: History, changes: Mapping[int, bool | None] = {}) -> Row |
     the values scatter more about it, the standard deviation of the slope is enlarged accordingly.
     The probability is that some value drifts so much by chance; the drift is per year [g].
 
-    Parameters
-    ----------
-    history : History
-        The calibrations.
-    changes : mapping of int to bool or None
-        Whether a change is for good, by the index of the first calibration after it. If it is not
-        for good, this calibration is left out.
+    `changes` state whether a change is for good, by the index of the first calibration after it. A
+    calibration whose change is not for good is left out.
 
     """
     from scipy.special import stdtr
@@ -279,89 +439,7 @@ def drift_of(history: History, changes: Mapping[int, bool | None] = {}) -> Row |
 
 def write_sensors(store: Store, rows: Sequence[Row]) -> list[Row]:
     """Add or replace the rows of sensors, and return the rows of all of them."""
-    known = {row['sensor']: row for row in (*read_sensors(store), *rows)}
+    known = {row['sensor']: row for row in (*read_parquet(store.sensors_file), *rows)}
     found = [known[name] for name in sorted(known)]
-    write_parquet(store.folder / SENSORS_FILE, found, sensors_schema())
+    write_parquet(store.sensors_file, found, sensors_schema())
     return found
-
-
-def read_sensors(store: Store) -> list[Row]:
-    """Return the rows of all sensors; none if there is no file."""
-    import pyarrow.parquet as pq
-
-    path = store.folder / SENSORS_FILE
-    return pq.ParquetFile(path).read().to_pylist() if path.exists() else []
-
-
-# ----------------------------------------------------------------------------- typical values
-
-def typical_of(rows: Iterable[Row]) -> list[Typical]:
-    """Return what `priors_of` needs of a sensor, by model; rows without values are left out."""
-    size, by_model = len(_NAMES), dict[str, list[Row]]()
-    for row in rows:
-        if row['prior_values']:
-            by_model.setdefault(row['sensor_model'] or '', []).append(row)
-    return [(model, np.mean([row['prior_values'] for row in good], axis=0),
-             np.sum([row['prior_covariance'] for row in good], axis=0).reshape(size, size)
-             / len(good) ** 2) for model, good in by_model.items()]
-
-
-def priors_of(sensors: Iterable[Typical]) -> dict[str, FleetPrior]:
-    """Return the typical values of the models with at least `FEWEST` sensors."""
-    by_model: dict[str, list[Typical]] = {}
-    for each in sensors:
-        by_model.setdefault(each[0], []).append(each)
-    return {model: FleetPrior(model, len(chosen), estimated(
-        np.array([values for _, values, _ in chosen]),
-        np.array([covariance for _, _, covariance in chosen])))
-        for model, chosen in sorted(by_model.items()) if len(chosen) >= FEWEST}
-
-
-def estimated(values: Floats, covariances: Floats) -> Prior:
-    """
-    Return mean and covariance for another sensor of the fleet.
-
-    Parameters
-    ----------
-    values : (n, p) array
-        Values of n sensors.
-    covariances : (n, p, p) array
-        Their covariances.
-
-    """
-    from scipy.special import chdtri
-
-    count, size = values.shape
-    mean = np.median(values, axis=0)
-    spread = np.median(np.abs(values - mean), axis=0) / 0.6745 + _LEAST_SPREAD_G
-    covariance: Floats = np.diag(spread ** 2)
-    for _ in range(_STEPS):
-        before = covariance
-        mean, covariance = _step(values, covariances, mean, covariance)
-        if np.max(np.abs(covariance - before)) <= _CONVERGED * np.max(covariance):
-            break
-    share = count / (count + _CHANCE)
-    shrunk = share * covariance + (1.0 - share) * np.diag(np.diag(covariance))
-    shrunk = (shrunk + _LEAST_SPREAD_G ** 2 * np.eye(size)) * (1.0 + 1.0 / count)
-    median = float(np.median(_squared(values - mean, shrunk + covariances)))
-    return Prior(mean, shrunk * max(median / chdtri(size, 0.5), 1.0))
-
-
-def _squared(away: Floats, covariances: Floats) -> Floats:
-    """Return the (n,) squared distances, per (n, p, p) covariance."""
-    solved = np.linalg.solve(covariances, away[:, :, np.newaxis])[:, :, 0]
-    return np.einsum('np,np->n', away, solved)
-
-
-def _step(values: Floats, covariances: Floats, mean: Floats, covariance: Floats
-          ) -> tuple[Floats, Floats]:
-    """Return mean and covariance after a step of expectation maximisation."""
-    away = values - mean
-    gain = covariance @ np.linalg.inv(covariance + covariances)  # (n, p, p)
-    likely = np.einsum('npq,nq->np', gain, away)
-    weight = (_DOF + values.shape[1]) / (_DOF + _squared(away, covariance + covariances))
-    left = covariance - gain @ covariance
-    centre = mean + weight @ likely / np.sum(weight)
-    off = mean + likely - centre
-    spread = np.einsum('n,np,nq->pq', weight, off, off) + np.sum(left, axis=0)
-    return centre, (spread + spread.T) / (2.0 * len(values))

@@ -32,7 +32,7 @@ from ..errors import AccelCalibError, InputError, system_error
 from ..findings import rate, residual_figures
 from ..geometry import words_of
 from ..messages.one_reading import Triple
-from ..report.page import calibration_page, STORED
+from ..report import calibration_page, STORED
 from ..session import (
     Answer, BATCH, CalibratorSettings, CallSoon, checks, Compute, Level, Log, LogFilter, Progress,
     Session, Severity, ShowPoses, state, Task, title, words_of_state, Worker)

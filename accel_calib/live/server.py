@@ -32,7 +32,7 @@ from aiohttp import web
 from .viewer import (
     announce, Connection, HISTORY_S, LARGEST, Message, not_bound, reachable, secured, STUCK_S,
     text_of, TooManyError, Viewer, welcome)
-from ..report.sheet import policy
+from ..report import policy
 from ..session import Log, LogFilter
 from ..stored.exports import FORMATS
 

@@ -2,21 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Figures, and the pages of calibrations: self-contained HTML files.
+Figures, and the pages of results: self-contained HTML files.
 
-`page` makes the pages of one calibration: of `fit`, `calibrate`, `verify` and `refine`. `repeats`
-makes those of several calibrations: of `compare` and `history`. `noise_page` is that of `noise`.
-`sheet` is the skeleton of all pages, with the style sheet and the script of the folder ``page``.
-
-`charts` has the style of all figures and the figures of `residuals`; `drawings` has those of a
-refinement. matplotlib is imported only when a figure is drawn.
+`page` has the page of one calibration, for `fit`, `calibrate`, `verify` and `refine`, with the
+figures of `residuals` and of `refinement`. `stability` has those of `noise`, `compare` and
+`history`; it is imported by itself, because a fit does not need the libraries of noise. `sheet` is
+the skeleton and the style of all pages and figures, with the style sheet and the script of the
+folder ``page``. matplotlib is imported only when a figure is drawn.
 
 """
 
-from .charts import check_matplotlib, has_matplotlib, plot_residuals
-from .drawings import write_figures
-from .page import write_calibration_page, write_page
-from .repeats import write_comparison_page, write_history_page
+from .page import calibration_page, refinement_page, STORED
+from .refinement import write_figures
+from .residuals import plot_residuals
+from .sheet import check_matplotlib, has_matplotlib, policy, write_page
 
-__all__ = ['check_matplotlib', 'has_matplotlib', 'plot_residuals', 'write_calibration_page',
-           'write_comparison_page', 'write_figures', 'write_history_page', 'write_page']
+__all__ = ['STORED', 'calibration_page', 'check_matplotlib', 'has_matplotlib', 'plot_residuals',
+           'policy', 'refinement_page', 'write_figures', 'write_page']

@@ -16,34 +16,32 @@ standard deviations follow from the covariance of the calibration.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from html import escape
 from pathlib import Path
+import shlex
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .charts import of_before_after, of_coverage, of_remainder
-from .drawings import ladder, of_curve, of_step
-from .residuals import Residuals, residuals_of, residuals_of_refinement, since_first
+from .refinement import refusal_lines, search_sections
+from .residuals import of_before_after, of_coverage, of_remainder, Residuals, residuals_of
 from .sheet import (
-    block, code, figures, heading, HINT, how_to_read, listing, numbers, paragraph, rated_sheet,
-    scroll_table, section, snippets, verdict_box, write_sheet)
-from .. import __version__
+    block, figures, HINT, how_to_read, listing, numbers, paragraph, rated_sheet, scroll_table,
+    section)
 from ..calibrate import Calibration, mounting_figures, outlook
 from ..effects import (
     AXES, effect_named, EMPIRICAL, empirical_parts, REFERENCE_TEMPERATURE, value_unit,
     variable_words, with_vector)
 from ..findings import effect_figures, Figure, rate_refinement, residual_figures
 from ..geometry import coverage
-from ..refine.words import chance, percent, values_of, verdict_words
-from ..table import Floats
+from ..refine.words import verdict_words
+from ..table import COLUMNS, Floats
 from ..text import counted, milli, percentage, short, signed, with_minus
 from ..units import MG
 
 if TYPE_CHECKING:
     from ..calibrate import Verification
     from ..findings import Rating
-    from ..refine import Refinement, Step
+    from ..refine import Refinement
     from ..table import Poses
 
 STORED = 'calibration.yaml'
@@ -80,54 +78,11 @@ _SMALL = 1e-3
 _LONG_TABLE = 25
 """Number of poses above which their table scrolls."""
 
-_NOT_USED = 'The calibration of this page does not contain these effects.'
 
-_SAME_RESIDUAL = 0.01
-
-
-def write_page(path: Path, result: Refinement, source: str) -> None:
-    """
-    Write the page of a refinement.
-
-    Parameters
-    ----------
-    path : Path
-        File of the page.
-    result : Refinement
-        The refinement.
-    source : str
-        Name of the file of the poses.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written. An earlier file is then unchanged.
-
-    """
-    write_sheet(path, page(result, source))
-
-
-def page(result: Refinement, source: str) -> str:
-    """Return the page of a refinement as HTML."""
+def refinement_page(result: Refinement, source: str) -> str:
+    """Return the page of a refinement of the poses in the file `source`, as HTML."""
     return calibration_page(result.calibration, rate_refinement(result), source,
                             refinement=result)
-
-
-def write_calibration_page(path: Path, calibration: Calibration, rating: Rating, source: str, *,
-                           refinement: Refinement | None = None,
-                           verification: tuple[Verification, Poses] | None = None,
-                           stored: str = STORED, notes: Sequence[str] = ()) -> None:
-    """
-    Write the page of a calibration; the parameters are those of `calibration_page`.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written. An earlier file is then unchanged.
-
-    """
-    write_sheet(path, calibration_page(calibration, rating, source, refinement=refinement,
-                                       verification=verification, stored=stored, notes=notes))
 
 
 def calibration_page(calibration: Calibration, rating: Rating, source: str, *,
@@ -162,23 +117,22 @@ def calibration_page(calibration: Calibration, rating: Rating, source: str, *,
     name = calibration.sensor or Path(source).name
     title = f'{what} of {name}' if name else what
     about = [source, f'sensor {calibration.sensor}' if calibration.sensor else '',
-             f'fitted {calibration.date}' if calibration.date else '',
-             f'accel_calib {__version__}']
-    body = [heading(title, about),
-            verdict_box(rating, '' if used is None else verdict_words(used)),
-            _key_numbers(calibration, residuals, checked), _values(calibration),
+             f'fitted {calibration.date}' if calibration.date else '']
+    body = [_key_numbers(calibration, residuals, checked), _values(calibration),
             _covered(calibration, residuals, plan=refinement is None and checked is None),
             section('Before and after', figures([of_before_after(
                 residuals, (checked or calibration.quality).noise_floor_mg)], 'wide')),
             *_remarks(calibration, residuals, used),
-            section('What remains', figures(of_remainder(residuals), 'pair')),
-            *([] if refinement is None else _search(refinement, residuals, used=used is not None)),
+            section('What remains', figures(of_remainder(residuals))),
+            *([] if refinement is None else search_sections(
+                refinement, residuals, used=used is not None)),
             _pose_table(residuals, calibration),
             '' if used is not None and used.refusal else section('Use it', *(
                 block(title, text) for title, text in snippets(calibration, stored))),
             section('How the log was read', listing(notes)),
-            how_to_read((*_HOW_TO_READ, *(_HOW_TO_READ_STEPS if refinement else ())))]
-    return rated_sheet(title, rating, body)
+            how_to_read(*_HOW_TO_READ, *(_HOW_TO_READ_STEPS if refinement else ()))]
+    return rated_sheet(title, about, rating, body,
+                       more='' if used is None else verdict_words(used))
 
 
 def _is_refined(calibration: Calibration, refinement: Refinement | None) -> bool:
@@ -219,7 +173,7 @@ def _covered(calibration: Calibration, residuals: Residuals, *, plan: bool) -> s
 def _remarks(calibration: Calibration, residuals: Residuals, used: Refinement | None
              ) -> Iterator[str]:
     """Yield the sections with warnings, advice and the poses left out."""
-    refusal, advice = ((), ()) if used is None else (_refusal(used), used.advice)
+    refusal, advice = ((), ()) if used is None else (refusal_lines(used), used.advice)
     yield section('Warnings', listing((*refusal, *calibration.warnings)))
     yield section('What to do', listing(advice))
     yield section('Poses left out', listing(
@@ -239,12 +193,12 @@ def _values(calibration: Calibration) -> str:
     note = f'The values hold at {REFERENCE_TEMPERATURE:g} °C.' if thermal else ''
     words = f'{calibration.name}: {calibration.reason}'.replace('ideal: ideal', 'ideal')
     return section('The calibration', paragraph(f'Model {words}'),
-                   scroll_table(('', 'value ± deviation', 'usual'), rows,
-                                'whole-cells values', 'Values of the calibration'),
+                   scroll_table('Values of the calibration', ('', 'value ± deviation', 'usual'),
+                                rows, 'whole-cells values'),
                    paragraph(note, 'soft'), paragraph(_SOURCE, 'soft'))
 
 
-def linear_figures(vec: Floats, effects: tuple[str, ...]) -> Floats:
+def axis_figures(vec: Floats, effects: tuple[str, ...]) -> Floats:
     """Return V [g], the sensitivities of the axes, and their angles [°], (9,), of model values."""
     mat_w, vec_v = with_vector(effects, vec).linear_part
     length = np.linalg.norm(mat_w, axis=1)
@@ -254,13 +208,13 @@ def linear_figures(vec: Floats, effects: tuple[str, ...]) -> Floats:
 
 
 def _with_deviations(calibration: Calibration) -> tuple[Floats, Floats]:
-    """Return `linear_figures` of a calibration and their standard deviations."""
+    """Return `axis_figures` of a calibration and their standard deviations."""
     effects, vec = calibration.model.effects, calibration.model.vector
-    slope = np.array([(linear_figures(vec + step, effects) - linear_figures(vec - step, effects))
+    slope = np.array([(axis_figures(vec + step, effects) - axis_figures(vec - step, effects))
                       / (2.0 * _STEP) for step in _STEP * np.eye(len(vec))]).reshape(-1, 9)
     variance = np.einsum('pi,pq,qi->i', slope, calibration.covariance, slope)
     deviation = np.sqrt(np.maximum(variance, 0.0))
-    return linear_figures(vec, effects), np.where(deviation > _SAME, deviation, 0.0)
+    return axis_figures(vec, effects), np.where(deviation > _SAME, deviation, 0.0)
 
 
 def _linear_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
@@ -317,106 +271,85 @@ def _with_typical(figure: Figure, effect: str, parameter: str) -> tuple[str, str
 
 def _pose_table(residuals: Residuals, calibration: Calibration) -> str:
     """Return the section with the table of all poses, in order of rows."""
-    head, rows = _pose_rows(residuals, calibration)
-    return section('Poses', paragraph(f'{counted(len(rows), "pose")}, with the residual before '
-                                      'and after.'),
-                   scroll_table(head, [cells for _, cells in rows], 'whole-cells', 'Poses',
-                                long=len(rows) > _LONG_TABLE, poses=[row for row, _ in rows]))
-
-
-def _pose_rows(residuals: Residuals, calibration: Calibration
-               ) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Return the head of the table of poses, and each row with its number."""
-    kept = residuals.poses_g
-    optional = [key for key in ('label', 'time', 'temperature') if key in kept]
-    names = {'label': 'label', 'time': 'time [s]', 'temperature': '°C'}
-    head = ['row', *(names[key] for key in optional),
-            *(f'{axis} [{calibration.units.symbol}]' for axis in AXES),
+    kept, out = residuals.poses_g, residuals.left_out
+    context: dict[str, list[str]] = {}
+    if 'label' in kept:
+        context['label'] = [str(each) for each in kept['label']]
+    if 'time' in kept:
+        context['time [s]'] = [f'{each:.1f}' for each in kept['time'] - np.min(kept['time'])]
+    if 'temperature' in kept:
+        context['°C'] = [f'{each:.1f}' for each in kept['temperature']]
+    sizes = ([milli(each, signed=residuals.signed) for each in values]
+             for values in (residuals.before_mg, residuals.after_mg))
+    cells = zip(*context.values(), *_axis_cells(calibration.units.from_g(kept.reading)), *sizes,
+                strict=True)
+    rows = dict(zip(kept.row.tolist(), cells, strict=True))
+    rows |= {row: (*[''] * len(context), *reading, '', '', f'left out: {residuals.reasons[row]}')
+             for row, *reading in zip(out.row.tolist(), *_axis_cells(out.reading), strict=True)}
+    head = ['row', *context, *(f'{axis} [{calibration.units.symbol}]' for axis in AXES),
             'before [mg]', 'after [mg]', *(['note'] if residuals.reasons else [])]
-    rows = []
-    since = since_first(kept) if 'time' in kept else None
-    for k, reading in enumerate(calibration.units.from_g(kept.reading)):
-        context = [str(kept[key][k]) if key == 'label' else
-                   f'{since[k]:.1f}' if key == 'time' and since is not None else
-                   f'{kept[key][k]:.1f}' for key in optional]
-        rows.append((int(kept.row[k]), [
-            str(kept.row[k]), *context, *(f'{part:.6g}' for part in reading),
-            milli(residuals.before_mg[k], signed=residuals.signed),
-            milli(residuals.after_mg[k], signed=residuals.signed)]))
-    for row, reading in zip(residuals.left_out.row, residuals.left_out.reading, strict=True):
-        rows.append((int(row), [str(row), *('' for _ in optional),
-                                *(f'{part:.6g}' for part in reading), '', '', 'left out: '
-                                + residuals.reasons[int(row)]]))
-    return head, sorted(rows, key=lambda each: each[0])
+    return section('Poses', paragraph(
+        f'{counted(len(rows), "pose")}, with the residual before and after.'),
+        scroll_table('Poses', head, [(str(row), *rows[row]) for row in sorted(rows)],
+                     long=len(rows) > _LONG_TABLE, poses=sorted(rows)))
 
 
-# ----------------------------------------------------------------------------- the search
-
-def _search(result: Refinement, residuals: Residuals, *, used: bool) -> Iterator[str]:
-    """
-    Yield the sections about a search for effects.
-
-    What the refinement leaves is shown if the calibration of the page leaves something else. They
-    differ for effects that a calibration cannot correct, such as a slow change of the offset, and
-    for poses of known or shared orientation, whose residual is the vector error.
-
-    """
-    if result.steps:
-        note = '' if used else ' '.join((_NOT_USED, *_refusal(result)))
-        yield section('Effects that were found', paragraph(note), paragraph(verdict_words(result)),
-                      figures([ladder(result)], 'wide'), _overview(result))
-    for number, step in enumerate(result.steps, 1):
-        yield _step(result, number, step)
-    left = residuals_of_refinement(result)
-    if not np.isclose(left.rms_mg, residuals.rms_mg, rtol=_SAME_RESIDUAL):
-        yield section('What remains after the refinement',
-                      figures(of_remainder(left, 'refined'), 'pair'))
-    rows = [(f'{effect_named(name).words} ({name})', needs)
-            for name, needs in result.not_testable]
-    yield section('What these data cannot show', scroll_table(
-        ('effect', 'to see it, record'), rows, '', 'Effects that cannot be tested')
-        if rows else '')
+def _axis_cells(reading: Floats) -> list[list[str]]:
+    """Return (n, 3) readings as a column of cells for each axis."""
+    return [[f'{each:.6g}' for each in column] for column in reading.T]
 
 
-def _step(result: Refinement, number: int, step: Step) -> str:
-    """Return the section of a step, from 1."""
-    shown = values_of(step)
-    table = '' if not shown else scroll_table(
-        [name for name, _ in shown], [[value for _, value in shown]], 'whole-cells',
-        f'Values of step {number}')
-    curve = figures([of_curve(result, number - 1)], 'wide') if step.effect == EMPIRICAL else ''
-    title = f'{number}. {effect_named(step.name).words.capitalize()}'
-    return section(title, f'<p>{_story(step)}</p>\n', table,
-                   figures(of_step(result, number - 1), 'pair'), curve)
+# ----------------------------------------------------------------------------- lines of code
+
+def snippets(calibration: Calibration, stored: str) -> tuple[tuple[str, str], ...]:
+    """Return titles and lines of code that use the calibration in the file `stored`."""
+    return (('ROS 2', _ros(calibration, stored)),
+            ('ROS 2 launch file', _launch(calibration, stored)),
+            ('Python', _python(calibration, stored)), ('C', _c(calibration)),
+            ('C header, Arduino, PX4, ArduPilot and others',
+             f'accel-calib export {shlex.quote(stored)} --to c -o calibration.h'))
 
 
-def _overview(result: Refinement) -> str:
-    """Return the table of steps."""
-    head = ('step', 'effect', 'residual [mg]', 'held out [mg]', 'chance', 'rivals')
-    rows = [(str(number), step.effect,
-             f'{short(step.gap_before_mg)} → {short(step.gap_after_mg)}',
-             f'{short(step.held_out_before_mg)} → {short(step.held_out_after_mg)}',
-             chance(step.p_value), ', '.join(step.likely_rivals) or 'none')
-            for number, step in enumerate(result.steps, 1)]
-    return scroll_table(head, rows, 'whole-but-last', 'Steps')
+def _ros(calibration: Calibration, stored: str) -> str:
+    path = shlex.quote(stored) if Path(stored).is_absolute() else f'"$PWD"/{shlex.quote(stored)}'
+    return ('ros2 launch accel_calib calibrator.launch.py imu:=imu/data_raw \\\n'
+            f'  units:={calibration.units.name} calibration_file:={path}')
 
 
-def _story(step: Step) -> str:
-    """Return a text about the location of the disagreement, and the effect on the residual."""
-    rivals = ', '.join(f'{code(name)} ({percent(step.probabilities[name])})'
-                       for name in step.rivals)
-    return (f'{code(step.effect)} ({escape(effect_named(step.name).term)}). Found '
-            f'{escape(step.where)}. With this effect the residual decreases from '
-            f'{short(step.gap_before_mg)} to <strong>{short(step.gap_after_mg)} mg</strong>, '
-            f'and the held-out residual from {short(step.held_out_before_mg)} to '
-            f'{short(step.held_out_after_mg)} mg; '
-            f'<span class="whole">{escape(chance(step.p_value))}</span>.'
-            + (f' These poses cannot distinguish it from {rivals}.' if rivals else ''))
+def _launch(calibration: Calibration, stored: str) -> str:
+    return ("Node(package='accel_calib', executable='calibrator',\n"
+            f"     parameters=[{{'calibration_file': {stored!r},\n"
+            f"                  'units': {calibration.units.name!r}}}],\n"
+            "     remappings=[('imu/data_raw', 'imu/data_raw')])")
 
 
-def _refusal(result: Refinement) -> tuple[str, ...]:
-    """Return the reason why the calibration must not be used, if there is one."""
-    if not result.refusal:
-        return ()
-    found, advice = result.refusal
-    return (f'the refined calibration must not be used: {found}; {advice}',)
+def _python(calibration: Calibration, stored: str) -> str:
+    known = ''.join(f', {key}={key}' for key in calibration.model.needs if key in COLUMNS
+                    and key in ('time', 'temperature', 'supply_voltage', 'rate'))
+    unit, force = calibration.units.symbol, calibration.units.symbol
+    if calibration.units.is_native:
+        unit, force = 'native units', 'g'
+    return ('import accel_calib as ac\n\n'
+            f'calibration = ac.load({stored!r})\n'
+            f'force = calibration.apply(readings{known})  # (n, 3), {unit} -> {force}')
+
+
+def _c(calibration: Calibration) -> str:
+    """Return a C99 function with offset, gain and mounting."""
+    mat = calibration.rotation.T @ calibration.matrix
+    rows = ',\n'.join(f'  {{{_floats(row)}}}' for row in mat)
+    beyond = [name for name in calibration.model.effects if not effect_named(name).linear]
+    note = '' if not beyond else (
+        f'/* Without {", ".join(beyond)}:\n'
+        '   accel-calib export --to c writes the terms that C can hold. */\n')
+    return (f'{note}static const float B[3] = {{{_floats(calibration.offset)}}};\n'
+            f'static const float M[3][3] = {{\n{rows}}};\n\n'
+            'static void accel_correct(const float raw[3], float a[3])\n{\n'
+            '  for (int i = 0; i < 3; ++i)\n'
+            '    a[i] = M[i][0] * (raw[0] - B[0]) + M[i][1] * (raw[1] - B[1])\n'
+            '         + M[i][2] * (raw[2] - B[2]);\n}')
+
+
+def _floats(numbers: Floats) -> str:
+    """Return float constants of C."""
+    return ', '.join(f'{value:.8e}f' for value in numbers)

@@ -1,20 +1,31 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The residual of each pose before and after a calibration, and the variables it is drawn over."""
+"""
+The residual of each pose before and after a calibration, and its figures.
+
+**Sphere map.** Two hemispheres in Lambert's equal-area projection. A direction u is at the radius
+√(1 - |u_z|) from the pole. Equal areas of the sphere have equal areas on the map.
+
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
+from .sheet import (
+    ACCENT, add_bar, AFTER, BEFORE, check_matplotlib, DISC, DIVERGING, Drawing, drawn, EDGE, FAINT,
+    HEIGHT_INCHES, INK, legend_below, Mark, Marks, PAPER, RIM, SEQUENTIAL)
 from ..calibrate import Calibration, errors_after, errors_before, in_g, with_history
 from ..effects import acting_temperature, AXES, effect_named, rate_at, sensor_force
-from ..geometry import unit
+from ..geometry import uncovered, unit
 from ..table import column_of, Floats, Poses
+from ..text import milli, percentage, short, with_minus
 from ..units import MG
 
 if TYPE_CHECKING:
@@ -30,6 +41,9 @@ _LABELS = {
     'supply_voltage': ('supply [V]', 1.0), 'std': ('standard deviation of the samples [mg]', MG),
     'rate': ('angular rate [rad/s]', 1.0), 'force': ('force along the axis [g]', 1.0)}
 """Label and factor of each variable."""
+
+_SPANS = (('h', 3600.0), ('min', 60.0), ('s', 1.0))
+"""Units of time [s]; a range of more than three of a unit is drawn in it."""
 
 
 @dataclass(frozen=True)
@@ -103,26 +117,14 @@ def recorded(poses_g: Poses) -> list[Variable]:
 def variable_of(key: str, values: Floats) -> Variable:
     """Return a variable for the horizontal axis: (n,) values, or the (n, 3) ones of a vector."""
     if key == 'time':
-        return _time(values)
+        since = values - np.min(values)
+        name, size = next((each for each in _SPANS if np.max(since) > 3.0 * each[1]), _SPANS[-1])
+        return Variable(f'time since the first pose [{name}]', since / size)
     if values.ndim > 1:
         mean = np.mean if key == 'std' else np.sum
         values = np.sqrt(mean(values ** 2, axis=1))
     label, factor = _LABELS.get(key) or (column_of(key).meaning, 1.0)
     return Variable(label, values * factor)
-
-
-def since_first(poses: Poses) -> Floats:
-    """Return the (n,) time of each pose since the first [s]."""
-    return poses['time'] - np.min(poses['time'])
-
-
-def _time(seconds: Floats) -> Variable:
-    since = seconds - np.min(seconds)
-    span = np.max(since)
-    for name, size in (('h', 3600.0), ('min', 60.0)):
-        if span > 3.0 * size:
-            return Variable(f'time since the first pose [{name}]', since / size)
-    return Variable('time since the first pose [s]', since)
 
 
 @dataclass(frozen=True)
@@ -209,3 +211,209 @@ def residuals_of_refinement(result: Refinement) -> Residuals:
         result.poses_g, result.force, before * MG, result.stages[-1].residual_mg, out, unit(force),
         {int(row): reasons.get(int(row), 'disagrees with the other poses') for row in out.row},
         signed)
+
+
+# ----------------------------------------------------------------------------- figures
+
+_INK_PER_POSE = 3500.0
+"""Total area of the markers [points²]; markers are larger for fewer poses."""
+
+_LEAST_MG = 1e-3
+"""Smallest residual of a logarithmic axis [mg]."""
+
+_ROOM = 1.08
+_FEW_DIRECTIONS = 6
+_LEAST_LIMIT_MG = 1e-9
+
+
+def limit_mg(*residuals: Residuals) -> float:
+    """Return the end of a scale for residuals [mg]."""
+    largest = max(float(np.max(np.abs(found.after_mg))) for found in residuals)
+    return max(largest, _LEAST_LIMIT_MG) * _ROOM
+
+
+def are_spread(force: Floats) -> bool:
+    """Return whether the poses have enough different directions for a map."""
+    return len(np.unique(np.round(force, 1), axis=0)) >= _FEW_DIRECTIONS
+
+
+def of_remainder(residuals: Residuals, prefix: str = 'remaining') -> Iterator[Drawing]:
+    """Yield figures of the final residuals, over the sphere and against the context."""
+    limit = limit_mg(residuals)
+    title = f'Remaining residual: {short(residuals.rms_mg)} mg RMS'
+    if are_spread(residuals.force):
+        yield sphere_map(residuals, f'{prefix}_sphere', title, limit, more=', by direction')
+    poses_g = residuals.poses_g
+    variables = (recorded(poses_g) or variables_of('quadratic', poses_g, residuals.force))[:3]
+    yield against(residuals, variables, f'{prefix}_variables', title, limit, AFTER)
+
+
+def sphere_map(residuals: Residuals, name: str, title: str, limit: float, *, more: str = ''
+               ) -> Drawing:
+    """Draw residuals over the sphere; `limit` is the end of the colour scale [mg]."""
+    force, values, signed = residuals.force, residuals.after_mg, residuals.signed
+    marks, hover = _marks(residuals, values), dict[str, Marks]()
+    with drawn(HEIGHT_INCHES, title, columns=2, grid='') as (figure, discs):
+        for disc, half, up in _hemispheres(discs):
+            here = _inside(force, up)
+            here = here[np.argsort(np.abs(values[here]))]
+            scattered = disc.scatter(
+                *_equal_area(force[here]).T, c=values[here], edgecolors=INK, linewidths=0.5,
+                s=min(_INK_PER_POSE / max(len(force), 12), 130.0), gid=half, zorder=3,
+                cmap=DIVERGING if signed else SEQUENTIAL,
+                vmin=-limit if signed else 0.0, vmax=limit)
+            hover[half] = tuple(marks[k] for k in here)
+            hover[f'out_{half}'] = _draw_left_out(disc, residuals, f'out_{half}', up)
+        add_bar(figure, scattered, discs, _label(signed=signed), orientation='horizontal',
+                shrink=0.8, pad=0.03)
+    return Drawing(name, f'{title}{more}', figure, hover)
+
+
+def _hemispheres(discs: Sequence[Any]) -> Iterator[tuple[Any, str, bool]]:
+    """Yield the disc and the name of each hemisphere, and whether its pole is +z."""
+    for disc, (name, up) in zip(discs, (('up', True), ('down', False)), strict=True):
+        _draw_disc(disc, up=up)
+        yield disc, name, up
+
+
+def _inside(force: Floats, up: bool) -> NDArray[np.intp]:
+    """Return the indices of the (n, 3) directions in a hemisphere."""
+    return np.flatnonzero((force[:, 2] >= 0.0) == up)
+
+
+def _draw_disc(disc: Any, *, up: bool) -> None:
+    """Draw the map of the hemisphere +z or -z with the sensor axes."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 181)
+    disc.fill(np.cos(angle), np.sin(angle), facecolor=DISC, edgecolor=RIM, zorder=0)
+    middle = np.sqrt(1.0 - np.sqrt(0.5))
+    disc.plot(middle * np.cos(angle), middle * np.sin(angle), color=FAINT, linewidth=0.8, zorder=1)
+    disc.plot([-1, 1], [0, 0], [0, 0], [-1, 1], color=FAINT, linewidth=0.8, zorder=1)
+    for name, x, y in (('+x', 1, 0), ('-x', -1, 0), ('+y', 0, 1), ('-y', 0, -1)):
+        disc.text(1.13 * x, 1.12 * y, with_minus(name), ha='center', va='center', fontsize=8.5)
+    disc.text(-1.22, 1.08, '+z up' if up else '−z up', fontsize=9.5)
+    disc.set(xlim=(-1.24, 1.24), ylim=(-1.22, 1.22), aspect='equal')
+    disc.axis('off')
+
+
+def _equal_area(force: Floats) -> Floats:
+    """Return the (n, 2) positions of (n, 3) directions on the maps, which are unit discs."""
+    unit = force / np.linalg.norm(force, axis=1, keepdims=True)
+    flat = unit[:, :2]
+    across = np.linalg.norm(flat, axis=1, keepdims=True)
+    radius = np.sqrt(1.0 - np.abs(unit[:, 2:]))
+    return flat / np.where(across > 0.0, across, 1.0) * radius
+
+
+def _draw_left_out(disc: Any, residuals: Residuals, name: str, up: bool) -> Marks:
+    """Draw the poses left out as hollow squares with their rows, and return their texts."""
+    here = _inside(residuals.left_out_force, up)
+    places, rows = _equal_area(residuals.left_out_force[here]), residuals.left_out.row[here]
+    disc.plot(*places.T, linestyle='none', marker='s', markersize=8, fillstyle='none',
+              color=ACCENT, zorder=4, gid=name)
+    for place, row in zip(places, rows, strict=True):
+        disc.annotate(str(row), place, (5, 4), textcoords='offset points', fontsize=8.5,
+                      color=ACCENT, zorder=4)
+    return tuple(Mark(f'row {row}, left out', int(row)) for row in rows)
+
+
+def against(residuals: Residuals, variables: Sequence[Variable], name: str, title: str,
+            limit: float, colour: str) -> Drawing:
+    """Draw residuals against variables, one panel per variable; `limit` is of the axis [mg]."""
+    values, signed, count = residuals.after_mg, residuals.signed, len(variables)
+    size = float(np.clip(5.5 - len(values) / 80.0, 2.5, 5.5))
+    height = 1.0 + 1.45 * count + (0.8 if count == 1 else 0.0)
+    with drawn(height, title, count, sharey=True) as (figure, panels):
+        for k, (panel, variable) in enumerate(zip(panels, variables, strict=True)):
+            panel.axhline(0.0, color=ACCENT, linewidth=1.0)
+            panel.plot(variable.values, values, 'o', color=colour, markersize=size,
+                       gid=f'panel{k}', **EDGE)
+            panel.set_xlabel(variable.label)
+            if variable.unit_range:
+                panel.set(xlim=(-1.06, 1.06), xticks=(-1.0, -0.5, 0.0, 0.5, 1.0))
+            panel.set_ylim(-limit if signed else -0.04 * limit, limit)
+        figure.supylabel(_label(signed=signed), fontsize=10.0)
+    along = ' and '.join(variable.label for variable in variables)
+    return Drawing(name, f'{title}, against {along}', figure,
+                   dict.fromkeys((f'panel{k}' for k in range(count)), _marks(residuals)))
+
+
+def of_coverage(residuals: Residuals, share: float, next_pose: Floats | None) -> Drawing:
+    """Draw the poses over the sphere, the directions that they do not cover, and the next pose."""
+    title = f'{percentage(share)} of the sphere is within 45° of a pose'
+    force, marks, hover = residuals.force, _marks(residuals), dict[str, Marks]()
+    open_ = uncovered(force)
+    with drawn(HEIGHT_INCHES, title, columns=2, grid='') as (figure, discs):
+        for disc, half, up in _hemispheres(discs):
+            here = _inside(force, up)
+            hover[half] = tuple(marks[k] for k in here)
+            disc.plot(*_equal_area(open_[_inside(open_, up)]).T, 'x', color=ACCENT,
+                      markersize=3.5, label='not covered', zorder=2)
+            disc.plot(*_equal_area(force[here]).T, 'o', color=AFTER, markeredgecolor=PAPER,
+                      markersize=7, label='pose', zorder=3, gid=half)
+            if next_pose is not None:
+                asked = next_pose[np.newaxis]
+                disc.plot(*_equal_area(asked[_inside(asked, up)]).T, '*', color=ACCENT,
+                          markersize=14, label='next pose', zorder=4)
+        legend_below(figure, 3, *discs[0].get_legend_handles_labels())
+    return Drawing('coverage', title, figure, hover)
+
+
+def of_before_after(residuals: Residuals, floor_mg: float | None) -> Drawing:
+    """Draw the size of the residual of each pose without and with the calibration."""
+    title = _before_after_title(residuals)
+    with drawn(HEIGHT_INCHES, title, grid='y') as (figure, (panel,)):
+        _draw_before_after(panel, residuals, floor_mg)
+        legend_below(figure, 3)
+    return Drawing('before_after', title, figure, {
+        'before': _marks(residuals, residuals.before_mg), 'after': _marks(residuals)})
+
+
+def _before_after_title(residuals: Residuals) -> str:
+    before = float(np.sqrt(np.mean(residuals.before_mg ** 2)))
+    return f'Each pose before and after: {short(before)} and {short(residuals.rms_mg)} mg RMS'
+
+
+def _draw_before_after(panel: Any, residuals: Residuals, floor_mg: float | None) -> None:
+    for name, values, colour in (('before', residuals.before_mg, BEFORE),
+                                 ('after', residuals.after_mg, AFTER)):
+        panel.plot(residuals.poses_g.row, np.maximum(np.abs(values), _LEAST_MG), 'o',
+                   color=colour, gid=name, label=name, **EDGE,
+                   markersize=float(np.clip(7.0 - len(values) / 60.0, 3.0, 7.0)))
+    if floor_mg:
+        panel.axhline(floor_mg, color=ACCENT, linestyle=(0, (5, 3)), label='noise floor')
+    panel.set_yscale('log')
+    panel.yaxis.set_major_formatter(lambda value, _: f'{value:g}')
+    panel.locator_params(axis='x', integer=True)
+    panel.margins(y=0.1)
+    panel.set(xlabel='row of the pose', ylabel=(
+        'size of |force| − 1 g [mg]' if residuals.signed else _label(signed=False)))
+
+
+def plot_residuals(calibration: Calibration, axes: Any = None) -> Any:
+    """Draw the poses before and after into axes of matplotlib, by default new ones of pyplot."""
+    check_matplotlib()
+    from matplotlib import pyplot
+
+    residuals = residuals_of(calibration)
+    panel = pyplot.subplots()[1] if axes is None else axes
+    panel.grid(visible=True, axis='y')
+    _draw_before_after(panel, residuals, calibration.quality.noise_floor_mg)
+    panel.set_title(_before_after_title(residuals))
+    panel.legend()
+    return panel
+
+
+def _label(*, signed: bool) -> str:
+    """Return the label of the axis of residuals."""
+    return '|force| − 1 g [mg]' if signed else 'size of the vector error [mg]'
+
+
+def _marks(residuals: Residuals, values: Floats | None = None) -> Marks:
+    """Return row, residual and temperature of each pose, such as ``row 11, +0.4 mg, 31 °C``."""
+    poses = residuals.poses_g
+    values = residuals.after_mg if values is None else values
+    warm = poses.columns.get('temperature', np.full(len(poses), np.nan))
+    return tuple(Mark(
+        f'row {row}, {milli(value, signed=residuals.signed)} mg'
+        + (with_minus(f', {degrees:.0f} °C') if np.isfinite(degrees) else ''), int(row))
+        for row, value, degrees in zip(poses.row, values, warm, strict=True))

@@ -2,104 +2,113 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The skeleton of every page: one self-contained HTML file, and its building blocks.
+What all pages have in common: one self-contained HTML file, its building blocks, and its figures.
 
-The folder ``page`` has the style sheet and the script, which each page contains. The colours of a
-figure become variables of the style sheet, so that it follows the page in dark mode. A marker
-with a name in `Drawing.hover` gets the text that the page shows when the marker is pointed at.
+The folder ``page`` has the style sheet and the script, which each page contains.
+
+**Figures.** A figure has half the width of the page: a phone shows one column, a desktop two
+columns, with the same text size. The colours are from Okabe and Ito's palette and from RdBu, which
+people with colour blindness can distinguish. On a page they become variables of the style sheet,
+so that a figure follows the page in dark mode. A marker with a name in `Drawing.hover` gets the
+text that the page shows when the marker is pointed at. matplotlib is imported only when a figure
+is drawn.
 
 """
 
 from __future__ import annotations
 
 from base64 import b64encode
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from functools import cache
 from hashlib import sha256
 from html import escape
 from importlib.resources import files
+from importlib.util import find_spec
 import io
 from pathlib import Path
-import shlex
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 from xml.etree import ElementTree
 
-from .charts import (
-    ACCENT, AFTER, AXIS, BEFORE, DISC, Drawing, FAINT, GRID, INK, Marks, PAPER, RIM, styled, THIRD)
+from .. import __version__
 from ..disk import write_atomically
-from ..effects import effect_named
-from ..table import COLUMNS, Floats
+from ..errors import InputError
+from ..table import Floats
 from ..text import table
 
 if TYPE_CHECKING:
-    from ..calibrate import Calibration
-    from ..findings import Rating
+    from matplotlib.figure import Figure
 
-_VARIABLES = {INK: 'ink', AXIS: 'axis', GRID: 'grid', FAINT: 'faint', DISC: 'disc', RIM: 'rim',
-              PAPER: 'paper', BEFORE: 'before', AFTER: 'after', ACCENT: 'accent', THIRD: 'third'}
-"""CSS variable of each colour of a figure on a page."""
+    from ..findings import Rating
 
 HINT = ('<p class="soft hint">Point at a marker to see its values, or select a figure with the '
         'tab key and move with the arrow keys.</p>\n')
 
 
-def write_sheet(path: Path, text: str) -> None:
+def write_page(path: Path, text: str) -> None:
     """Write a page; raise OSError if it fails. An earlier file is then unchanged."""
     write_atomically(path, lambda file: file.write(text))
+
+
+def rated_sheet(title: str, about: Iterable[str], rating: Rating, body: Iterable[str], *,
+                more: str = '', heading: str = '', script: bool = True) -> str:
+    """
+    Return a page as HTML, which begins with its heading and its verdict.
+
+    Parameters
+    ----------
+    title : str
+        Title; the browser shows the verdict before it.
+    about : iterable of str
+        Where the content comes from; empty parts are left out.
+    rating : Rating
+        The verdict.
+    body : iterable of str
+        The sections.
+    more : str
+        Text of the verdict, beside its reason.
+    heading : str
+        Heading, if it is not the title.
+    script : bool
+        Whether figures show the texts of their markers themselves, not the browser.
+
+    """
+    line = ' · '.join(part for part in (*about, f'accel_calib {__version__}') if part)
+    return sheet(f'{rating.name.capitalize()}: {title[0].lower()}{title[1:]}', (
+        f'<h1>{escape(heading or title)}</h1>\n<p class="about">{escape(line)}</p>\n',
+        _verdict(rating, more), *body), script=script)
 
 
 def sheet(title: str, body: Iterable[str], *, script: bool = True) -> str:
     """Return a page with this title and these parts, as HTML; the title is escaped."""
     live = ('<div id="tip" role="status" aria-live="polite"></div>\n'
-            f'<script>{part_of_page("script.js")}</script>\n') if script else ''
+            f'<script>{_part_of_page("script.js")}</script>\n') if script else ''
     return ('<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
             f'<meta http-equiv="Content-Security-Policy" content="{policy(script=script)}">\n'
             '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-            f'<title>{escape(title)}</title>\n<style>{part_of_page("style.css")}</style>\n</head>'
+            f'<title>{escape(title)}</title>\n<style>{_part_of_page("style.css")}</style>\n</head>'
             f'\n<body>\n<main>\n{"".join(body)}</main>\n{live}</body>\n</html>\n')
 
 
 @cache
 def policy(*, script: bool = True) -> str:
     """Return the Content-Security-Policy of a page: its own script, and nothing from outside."""
-    digest = b64encode(sha256(part_of_page('script.js').encode()).digest()).decode()
+    digest = b64encode(sha256(_part_of_page('script.js').encode()).digest()).decode()
     own = f"script-src 'sha256-{digest}'; " if script else ''
     return (f"default-src 'none'; {own}style-src 'unsafe-inline'; img-src data:; "
             "base-uri 'none'; form-action 'none'")
 
 
-def rated_sheet(title: str, rating: Rating, body: Iterable[str], *, script: bool = True) -> str:
-    """Return a page whose title in the browser begins with the verdict."""
-    return sheet(f'{rating.name.capitalize()}: {title[0].lower()}{title[1:]}', body, script=script)
-
-
 @cache
-def part_of_page(name: str) -> str:
+def _part_of_page(name: str) -> str:
     """Return the style sheet or the script of all pages, without its licence."""
     text = (files(__package__) / 'page' / name).read_text(encoding='utf-8')
     return text.partition('\n\n')[2]
 
 
-def heading(title: str, about: Iterable[str]) -> str:
-    """Return the heading of a page, with a line about its source; empty parts are left out."""
-    line = ' · '.join(part for part in about if part)
-    return f'<h1>{escape(title)}</h1>\n<p class="about">{escape(line)}</p>\n'
-
-
-def section(title: str, *parts: str, kind: str = '') -> str:
-    """Return a section with its heading; nothing if all parts are empty."""
-    body = ''.join(parts)
-    opening = f'<section class="{kind}">' if kind else '<section>'
-    return f'{opening}\n<h2>{escape(title)}</h2>\n{body}</section>\n' if body else ''
-
-
-def how_to_read(lines: Iterable[str]) -> str:
-    """Return the section that explains the page."""
-    return section('How to read this', listing(lines), kind='reading')
-
-
-def verdict_box(rating: Rating, more: str = '') -> str:
-    """Return the verdict: its name and figures, the reason, and what to do next."""
+def _verdict(rating: Rating, more: str) -> str:
+    """Return the name and figures of a verdict, its reason, and what to do next."""
     return (f'<div class="verdict {escape(rating.name)}" role="note">\n'
             f'<p><strong>{escape(rating.name)}</strong> '
             f'{escape(rating.figures.replace("->", "→"))}</p>\n'
@@ -112,6 +121,18 @@ def _sentence(text: str) -> str:
     return text and f'{text[0].upper()}{text[1:].rstrip(".")}.'
 
 
+def section(title: str, *parts: str, kind: str = '') -> str:
+    """Return a section with its heading; nothing if all parts are empty."""
+    body = ''.join(parts)
+    opening = f'<section class="{kind}">' if kind else '<section>'
+    return f'{opening}\n<h2>{escape(title)}</h2>\n{body}</section>\n' if body else ''
+
+
+def how_to_read(*lines: str) -> str:
+    """Return the section that explains the page."""
+    return section('How to read this', listing(lines), kind='reading')
+
+
 def numbers(pairs: Iterable[tuple[str, str]]) -> str:
     """Return names and values as a row of large numbers."""
     parts = [f'<div><dt>{escape(name)}</dt><dd class="whole">{escape(value)}</dd></div>'
@@ -119,11 +140,29 @@ def numbers(pairs: Iterable[tuple[str, str]]) -> str:
     return f'<dl class="numbers">{"".join(parts)}</dl>\n'
 
 
-def scroll_table(head: Iterable[str], rows: Iterable[Iterable[str]], kind: str = '',
-                 name: str = 'Table', *, long: bool = False, poses: Sequence[int] = ()) -> str:
-    """Return a table that scrolls inside of the page; `poses` are the rows of its poses."""
+def scroll_table(name: str, head: Iterable[str], rows: Sequence[Iterable[str]],
+                 kind: str = 'whole-cells', *, long: bool = False, poses: Sequence[int] = ()
+                 ) -> str:
+    """
+    Return a table that scrolls inside of the page; nothing without rows.
+
+    Parameters
+    ----------
+    name : str
+        Name for those who do not see the table.
+    head, rows : iterable of str, sequence of iterable of str
+        Names of the columns, and the cells.
+    kind : str
+        CSS class of the table.
+    long : bool
+        Whether it also scrolls up and down.
+    poses : sequence of int
+        Row of the pose of each line, which a marker highlights.
+
+    """
     return (f'<div class="scroll{" long" if long else ""}" tabindex="0" role="region" '
-            f'aria-label="{escape(name)}">{table(head, rows, kind, poses)}</div>\n')
+            f'aria-label="{escape(name)}">{table(head, rows, kind, poses)}</div>\n'
+            ) if rows else ''
 
 
 def listing(lines: Iterable[str]) -> str:
@@ -133,7 +172,7 @@ def listing(lines: Iterable[str]) -> str:
 
 
 def paragraph(text: str, kind: str = '') -> str:
-    """Return a paragraph of the CSS class `kind`; the text is escaped."""
+    """Return a paragraph of the CSS class `kind`; nothing without text."""
     opening = f'<p class="{kind}">' if kind else '<p>'
     return f'{opening}{escape(text)}</p>\n' if text else ''
 
@@ -148,11 +187,175 @@ def block(title: str, text: str) -> str:
     return f'<h3>{escape(title)}</h3>\n<pre tabindex="0"><code>{escape(text)}</code></pre>\n'
 
 
-# ----------------------------------------------------------------------------- figures
+# ----------------------------------------------------------------------------- drawing figures
 
-def figures(drawn: Iterable[Drawing], kind: str, *, script: bool = True) -> str:
+BEFORE = '#8c8c8c'
+AFTER = '#0072b2'
+ACCENT = '#d55e00'
+THIRD = '#009e73'
+INK = '#222222'
+FAINT = '#d9d9d9'
+DISC = '#fafafa'
+RIM = '#888888'
+PAPER = '#ffffff'
+_AXIS = '#666666'
+_GRID = '#e6e6e6'
+_VARIABLES = {INK: 'ink', _AXIS: 'axis', _GRID: 'grid', FAINT: 'faint', DISC: 'disc', RIM: 'rim',
+              PAPER: 'paper', BEFORE: 'before', AFTER: 'after', ACCENT: 'accent', THIRD: 'third'}
+"""CSS variable of each colour of a figure on a page."""
+
+DIVERGING = 'RdBu_r'
+SEQUENTIAL = 'Blues'
+THERMAL = 'coolwarm'
+AXIS_COLOURS = (AFTER, ACCENT, THIRD)
+"""Colours of what belongs to x, y and z."""
+
+HEIGHT_INCHES = 3.3
+WIDTH_INCHES = 4.8
+
+BAND = 1.96
+"""Half the width of a band, in standard deviations: 95 %."""
+
+EDGE: Any = {'markeredgecolor': PAPER, 'markeredgewidth': 0.4}
+"""Edge of a filled marker."""
+
+_PNG_DPI = 160
+_LEGEND_INCHES, _LEGEND_ROW_INCHES = 0.12, 0.18
+"""Height of the frame and of a row of a legend."""
+
+_STYLE: Any = {
+    'font.family': ['sans-serif'], 'font.sans-serif': ['DejaVu Sans', 'Verdana', 'Arial'],
+    'font.size': 10.0, 'axes.titlesize': 10.5, 'axes.labelsize': 10.0,
+    'axes.edgecolor': _AXIS, 'axes.labelcolor': INK, 'axes.spines.top': False,
+    'axes.spines.right': False, 'axes.axisbelow': True, 'text.color': INK, 'xtick.color': INK,
+    'ytick.color': INK, 'xtick.labelsize': 9.0, 'ytick.labelsize': 9.0, 'legend.frameon': False,
+    'legend.fontsize': 9.0, 'grid.color': _GRID, 'svg.fonttype': 'none',
+    'svg.hashsalt': 'accel_calib', 'axes.unicode_minus': True,
+}
+
+
+@dataclass(frozen=True)
+class Mark:
+    """The text that the page shows for a marker, and the row of its pose; 0 if it is none."""
+
+    words: str
+    row: int = 0
+
+
+Marks = tuple[Mark, ...]
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """
+    A figure of a page.
+
+    Parameters
+    ----------
+    name : str
+        Name of the file, without suffix; unique on the page.
+    title : str
+        Description for those who do not see the figure.
+    figure : Figure
+        The figure.
+    hover : mapping of str to tuple of Mark
+        For each named group of markers, one text per marker, in the order in which they are
+        drawn.
+
+    """
+
+    name: str
+    title: str
+    figure: Figure
+    hover: Mapping[str, Marks] = field(default_factory=dict)
+
+
+def has_matplotlib() -> bool:
+    """Return whether figures can be drawn."""
+    return find_spec('matplotlib') is not None
+
+
+def check_matplotlib() -> None:
+    """Raise InputError if matplotlib is not installed."""
+    if not has_matplotlib():
+        raise InputError('matplotlib is not installed, but figures need it',
+                         'run pip install matplotlib')
+
+
+def _styled() -> Any:
+    """Return the context manager for drawing and saving figures."""
+    from matplotlib import rc_context
+
+    return rc_context(_STYLE)
+
+
+@contextmanager
+def drawn(height_inches: float, title: str = '', rows: int = 1, columns: int = 1, *,
+          width_inches: float = WIDTH_INCHES, grid: str = 'both', **shared: Any
+          ) -> Iterator[tuple[Figure, Any]]:
+    """
+    Yield a new figure and its panels, to be drawn in the style of all figures.
+
+    Parameters
+    ----------
+    height_inches, width_inches : float
+        Size.
+    title : str
+        Title, in which $ is no mathematics.
+    rows, columns : int
+        Number of panels.
+    grid : {'both', 'x', 'y', ''}
+        Axes with a grid.
+    **shared
+        Axes that the panels share, as in ``Figure.subplots``.
+
+    """
+    from matplotlib.figure import Figure
+
+    with _styled():
+        figure = Figure(figsize=(width_inches, height_inches), layout='constrained')
+        if title:
+            figure.suptitle(title, x=0.02, ha='left', fontsize=10.5, parse_math=False)
+        panels = figure.subplots(rows, columns, squeeze=False, **shared).ravel()
+        for panel in panels if grid else ():
+            panel.grid(visible=True, axis=grid)
+        yield figure, panels
+
+
+def legend_below(figure: Figure, columns: int, *entries: Any) -> None:
+    """Draw a legend below the panels; the location 'outside' needs matplotlib 3.7."""
+    legend = figure.legend(*entries, loc='lower center', ncols=columns)
+    rows = -(-len(legend.get_texts()) // columns)
+    part = (_LEGEND_INCHES + _LEGEND_ROW_INCHES * rows) / figure.get_figheight()
+    engine: Any = figure.get_layout_engine()
+    engine.set(rect=(0.0, part, 1.0, 1.0 - part))
+
+
+def add_bar(figure: Figure, scattered: Any, panels: Iterable[Any], label: str, **options: Any
+            ) -> None:
+    """Add a bar with the colours of scattered markers."""
+    bar: Any = figure.colorbar(scattered, ax=list(panels), aspect=40, **options)
+    bar.set_label(label)
+    bar.outline.set_visible(False)
+
+
+def add_band(panel: Any, at: Floats, low: Floats, high: Floats, colour: str, alpha: float = 0.2
+             ) -> None:
+    """Fill the band between two lines."""
+    panel.fill_between(at, low, high, color=colour, alpha=alpha, linewidth=0.0)
+
+
+def save(drawing: Drawing, path: Path) -> None:
+    """Write a figure to a file; the suffix sets the format."""
+    with _styled():
+        drawing.figure.savefig(path, dpi=_PNG_DPI, facecolor='white')
+
+
+# ----------------------------------------------------------------------------- figures on a page
+
+def figures(drawings: Iterable[Drawing], kind: str = 'pair', *, script: bool = True) -> str:
     """Return figures, in a grid of the CSS class `kind`: ``wide`` or ``pair``."""
-    parts = [_figure(drawing, script=script) for drawing in drawn]
+    parts = [_figure(drawing, script=script) for drawing in drawings]
     return f'<div class="figures {kind}">\n' + '\n'.join(parts) + '\n</div>\n' if parts else ''
 
 
@@ -167,7 +370,7 @@ def _figure(drawing: Drawing, *, script: bool) -> str:
 def _inline_svg(drawing: Drawing) -> str:
     """Return a figure as SVG, for a page with several."""
     buffer = io.StringIO()
-    with styled():
+    with _styled():
         drawing.figure.savefig(buffer, format='svg', transparent=True,
                                metadata={'Date': None, 'Creator': None})
     root = ElementTree.fromstring(buffer.getvalue())
@@ -212,59 +415,3 @@ def _add_marks(root: ElementTree.Element, name: str, marks: Marks) -> None:
         if mark.row:
             marker.set('data-row', str(mark.row))
         ElementTree.SubElement(marker, 'title').text = mark.words
-
-
-# ----------------------------------------------------------------------------- lines of code
-
-def snippets(calibration: Calibration, stored: str) -> tuple[tuple[str, str], ...]:
-    """Return titles and lines of code that use the calibration in the file `stored`."""
-    return (('ROS 2', _ros(calibration, stored)),
-            ('ROS 2 launch file', _launch(calibration, stored)),
-            ('Python', _python(calibration, stored)), ('C', _c(calibration)),
-            ('C header, Arduino, PX4, ArduPilot and others',
-             f'accel-calib export {shlex.quote(stored)} --to c -o calibration.h'))
-
-
-def _ros(calibration: Calibration, stored: str) -> str:
-    path = shlex.quote(stored) if Path(stored).is_absolute() else f'"$PWD"/{shlex.quote(stored)}'
-    return ('ros2 launch accel_calib calibrator.launch.py imu:=imu/data_raw \\\n'
-            f'  units:={calibration.units.name} calibration_file:={path}')
-
-
-def _launch(calibration: Calibration, stored: str) -> str:
-    return ("Node(package='accel_calib', executable='calibrator',\n"
-            f"     parameters=[{{'calibration_file': {stored!r},\n"
-            f"                  'units': {calibration.units.name!r}}}],\n"
-            "     remappings=[('imu/data_raw', 'imu/data_raw')])")
-
-
-def _python(calibration: Calibration, stored: str) -> str:
-    known = ''.join(f', {key}={key}' for key in calibration.model.needs if key in COLUMNS
-                    and key in ('time', 'temperature', 'supply_voltage', 'rate'))
-    unit, force = calibration.units.symbol, calibration.units.symbol
-    if calibration.units.is_native:
-        unit, force = 'native units', 'g'
-    return ('import accel_calib as ac\n\n'
-            f'calibration = ac.load({stored!r})\n'
-            f'force = calibration.apply(readings{known})  # (n, 3), {unit} -> {force}')
-
-
-def _c(calibration: Calibration) -> str:
-    """Return a C99 function with offset, gain and mounting."""
-    mat = calibration.rotation.T @ calibration.matrix
-    rows = ',\n'.join(f'  {{{_floats(row)}}}' for row in mat)
-    beyond = [name for name in calibration.model.effects if not effect_named(name).linear]
-    note = '' if not beyond else (
-        f'/* Without {", ".join(beyond)}:\n'
-        '   accel-calib export --to c writes the terms that C can hold. */\n')
-    return (f'{note}static const float B[3] = {{{_floats(calibration.offset)}}};\n'
-            f'static const float M[3][3] = {{\n{rows}}};\n\n'
-            'static void accel_correct(const float raw[3], float a[3])\n{\n'
-            '  for (int i = 0; i < 3; ++i)\n'
-            '    a[i] = M[i][0] * (raw[0] - B[0]) + M[i][1] * (raw[1] - B[1])\n'
-            '         + M[i][2] * (raw[2] - B[2]);\n}')
-
-
-def _floats(numbers: Floats) -> str:
-    """Return float constants of C."""
-    return ', '.join(f'{value:.8e}f' for value in numbers)

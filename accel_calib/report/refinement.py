@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The figures of a refinement: its ladder, its steps and its curves.
+A refinement on the page: its steps, its ladder and its curves.
 
 The ladder shows the residual of each step, from the base to the noise floor. An empirical curve is
 shown relative to its mean over the poses, because offset and gain contain the mean. Its band is
@@ -14,34 +14,106 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from .charts import (
-    ACCENT, AFTER, against, are_spread, BAND, BEFORE, Drawing, FAINT, HEIGHT_INCHES, INK, limit_mg,
-    new_figure, of_remainder, PAPER, save, sphere_map, styled, THIRD)
-from .residuals import residuals_of_refinement, Variable, variable_of, variables_of, with_thermal
+from .residuals import (
+    against, are_spread, limit_mg, of_remainder, Residuals, residuals_of_refinement, sphere_map,
+    Variable, variable_of, variables_of, with_thermal)
+from .sheet import (
+    ACCENT, add_band, AFTER, AXIS_COLOURS, BAND, BEFORE, code, Drawing, drawn, FAINT, figures,
+    HEIGHT_INCHES, INK, PAPER, paragraph, save, scroll_table, section)
 from ..effects import (
     AXES, CARRIERS, curve_unit, effect_named, EMPIRICAL, empirical_parts, parameter_names,
     variable_words)
-from ..refine.words import base_words
+from ..refine.words import base_words, chance, percent, values_of, verdict_words
 from ..table import Floats, Poses
 from ..text import short
 from ..units import MG
 
 if TYPE_CHECKING:
-    from ..refine import Refinement
+    from ..refine import Refinement, Step
 
-_COLOURS = (AFTER, ACCENT, THIRD)
-"""Colours of the parts of a curve."""
+_NOT_USED = 'The calibration of this page does not contain these effects.'
+
+_SAME_RESIDUAL = 0.01
 
 _GRID = 201
 """Number of points of a curve."""
 
-_SUFFIXES = ('.svg', '.png')
 
+def search_sections(result: Refinement, residuals: Residuals, *, used: bool) -> Iterator[str]:
+    """
+    Yield the sections about a search for effects.
+
+    What the refinement leaves is shown if the calibration of the page leaves something else. They
+    differ for effects that a calibration cannot correct, such as a slow change of the offset, and
+    for poses of known or shared orientation, whose residual is the vector error.
+
+    """
+    if result.steps:
+        note = '' if used else ' '.join((_NOT_USED, *refusal_lines(result)))
+        yield section('Effects that were found', paragraph(note), paragraph(verdict_words(result)),
+                      figures([ladder(result)], 'wide'), _overview(result))
+    for number, step in enumerate(result.steps, 1):
+        yield _step(result, number, step)
+    left = residuals_of_refinement(result)
+    if not np.isclose(left.rms_mg, residuals.rms_mg, rtol=_SAME_RESIDUAL):
+        yield section('What remains after the refinement',
+                      figures(of_remainder(left, 'refined')))
+    rows = [(f'{effect_named(name).words} ({name})', needs)
+            for name, needs in result.not_testable]
+    yield section('What these data cannot show', scroll_table(
+        'Effects that cannot be tested', ('effect', 'to see it, record'), rows, ''))
+
+
+def _step(result: Refinement, number: int, step: Step) -> str:
+    """Return the section of a step, from 1."""
+    shown = values_of(step)
+    table = scroll_table(f'Values of step {number}', [name for name, _ in shown],
+                         [[value for _, value in shown]] if shown else [])
+    curve = figures([of_curve(result, number - 1)], 'wide') if step.effect == EMPIRICAL else ''
+    title = f'{number}. {effect_named(step.name).words.capitalize()}'
+    return section(title, f'<p>{_story(step)}</p>\n', table,
+                   figures(of_step(result, number - 1)), curve)
+
+
+def _overview(result: Refinement) -> str:
+    """Return the table of steps."""
+    head = ('step', 'effect', 'residual [mg]', 'held out [mg]', 'chance', 'rivals')
+    rows = [(str(number), step.effect,
+             f'{short(step.gap_before_mg)} → {short(step.gap_after_mg)}',
+             f'{short(step.held_out_before_mg)} → {short(step.held_out_after_mg)}',
+             chance(step.p_value), ', '.join(step.likely_rivals) or 'none')
+            for number, step in enumerate(result.steps, 1)]
+    return scroll_table('Steps', head, rows, 'whole-but-last')
+
+
+def _story(step: Step) -> str:
+    """Return a text about the location of the disagreement, and the effect on the residual."""
+    rivals = ', '.join(f'{code(name)} ({percent(step.probabilities[name])})'
+                       for name in step.rivals)
+    return (f'{code(step.effect)} ({escape(effect_named(step.name).term)}). Found '
+            f'{escape(step.where)}. With this effect the residual decreases from '
+            f'{short(step.gap_before_mg)} to <strong>{short(step.gap_after_mg)} mg</strong>, '
+            f'and the held-out residual from {short(step.held_out_before_mg)} to '
+            f'{short(step.held_out_after_mg)} mg; '
+            f'<span class="whole">{escape(chance(step.p_value))}</span>.'
+            + (f' These poses cannot distinguish it from {rivals}.' if rivals else ''))
+
+
+def refusal_lines(result: Refinement) -> tuple[str, ...]:
+    """Return the reason why the calibration must not be used, if there is one."""
+    if not result.refusal:
+        return ()
+    found, advice = result.refusal
+    return (f'the refined calibration must not be used: {found}; {advice}',)
+
+
+# ----------------------------------------------------------------------------- figures
 
 def all_drawings(result: Refinement) -> Iterator[Drawing]:
     """Yield all figures of the report."""
@@ -66,13 +138,11 @@ def write_figures(folder: Path, result: Refinement) -> list[Path]:
     folder.mkdir(exist_ok=True)
     paths = []
     for drawing in all_drawings(result):
-        for suffix in _SUFFIXES:
-            paths.append(folder / f'{drawing.name}{suffix}')
-            save(drawing.figure, paths[-1])
+        for suffix in ('svg', 'png'):
+            paths.append(folder / f'{drawing.name}.{suffix}')
+            save(drawing, paths[-1])
     return paths
 
-
-# ----------------------------------------------------------------------------- the steps
 
 def of_step(result: Refinement, step: int) -> Iterator[Drawing]:
     """Yield figures of the residuals before and after a step, with equal scales."""
@@ -172,17 +242,13 @@ def of_curve(result: Refinement, step: int) -> Drawing:
     words = _carrier_words(carrier)
     title = f'{words[0].upper()}{words[1:]} over {variable_words(variable)}, with 95 % band'
     parts = curve_parts(result, name)
-    with styled():
-        figure = new_figure(HEIGHT_INCHES, title)
-        panel: Any = figure.subplots()
-        panel.grid(visible=True)
-        for part, colour in zip(parts, _COLOURS):
+    with drawn(HEIGHT_INCHES, title) as (figure, (panel,)):
+        for part, colour in zip(parts, AXIS_COLOURS):
             both = variable_of(variable, np.concatenate([part.at, part.poses]))
             at, poses = np.split(both.values, [len(part.at)])
             change, band = part.change * MG, BAND * part.deviation * MG
             panel.plot(at, change, color=colour, label=part.name)
-            panel.fill_between(at, change - band, change + band, color=colour, alpha=0.25,
-                               linewidth=0.0)
+            add_band(panel, at, change - band, change + band, colour)
             panel.plot(poses, np.full(len(poses), 0.02), '|', color=INK, markersize=7,
                        transform=panel.get_xaxis_transform())
         panel.set_xlabel(both.label)
@@ -216,9 +282,8 @@ def ladder(result: Refinement) -> Drawing:
     levels: list[_Level] = [(base_words(result), result.gap_mg, held_out), *(
         (f'+ {step.effect}', step.gap_after_mg, step.held_out_after_mg) for step in result.steps)]
     floor_mg = result.noise_floor_mg
-    with styled():
-        figure = new_figure(1.25 + _LEVEL_INCHES * len(levels), width_inches=_LADDER_WIDTH_INCHES)
-        panel: Any = figure.subplots()
+    with drawn(1.25 + _LEVEL_INCHES * len(levels), width_inches=_LADDER_WIDTH_INCHES, grid='x'
+               ) as (figure, (panel,)):
         _draw_levels(panel, levels)
         if floor_mg:
             panel.axvline(floor_mg, color=ACCENT, linewidth=1.6, linestyle=(0, (5, 3)),
@@ -253,17 +318,14 @@ def _draw_levels(panel: Any, levels: Sequence[_Level]) -> None:
 
 def _scale(panel: Any, values: Sequence[float]) -> None:
     """Set a logarithmic axis of residuals with legible ticks, and space for the numbers."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
+    from matplotlib.ticker import LogLocator, NullLocator
 
     least, largest = min(values, default=1.0), max(values, default=1.0)
     room = max(float(np.log10(largest / least)), 0.5)
     low, high = least / 10.0 ** (0.08 * room), largest * 10.0 ** (0.5 * room)
-    panel.set_xscale('log')
-    panel.set_xlim(low, high)
-    panel.xaxis.set_major_locator(LogLocator(subs=(1.0,) if high / low > 300.0
-                                             else (1.0, 2.0, 5.0)))
+    panel.set(xscale='log', xlim=(low, high),
+              xlabel='residual: RMS over the poses [mg], logarithmic')
+    panel.xaxis.set_major_locator(LogLocator(
+        subs=(1.0,) if high / low > 300.0 else (1.0, 2.0, 5.0)))
     panel.xaxis.set_minor_locator(NullLocator())
-    panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
-    panel.xaxis.set_minor_formatter(NullFormatter())
-    panel.set_xlabel('residual: RMS over the poses [mg], logarithmic')
-    panel.grid(visible=True, axis='x')
+    panel.xaxis.set_major_formatter(lambda value, _: f'{value:g}')

@@ -1,0 +1,481 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The recordings of a fleet, and the row of one recording.
+
+Recordings come from files, folders, globs, lists and addresses. Their row has sensor, date and
+content hash, and the figures of the calibration: capture, fit, refine, rate. It needs bounded
+memory: a log is read in blocks, and the row has a bounded size. Errors that belong to the
+recording are part of the row.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from datetime import datetime, timezone
+import hashlib
+import json
+import os
+from pathlib import Path, PurePosixPath
+import re
+import tempfile
+from typing import Any, TYPE_CHECKING
+from urllib.parse import quote
+
+import numpy as np
+
+from .. import __version__
+from ..calibrate import Calibration, determines, directions_of, fit_poses
+from ..compare import NAMES, rotation_free
+from ..effects import known_code, MODELS
+from ..errors import AccelCalibError, crash_words, InputError, RefusedFitError
+from ..findings import residual_figures
+from ..intake import Intake, poses_of
+from ..logs import LogOptions
+from ..pipeline import calibrated, Outcome, Plan
+from ..table import Poses
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+_SUFFIXES = ('.csv', '.tsv', '.txt', '.log', '.mcap', '.db3', '.bag', '.ulg', '.bin')
+"""Endings of recordings in a folder; a file that is named itself can have any ending."""
+
+_MAGIC = '*?['
+_BLOCK = 1 << 20
+
+
+@dataclass(frozen=True)
+class Input:
+    """
+    A recording that was found.
+
+    Parameters
+    ----------
+    path : str
+        Absolute path, or address such as ``s3://bucket/a.mcap``.
+    inside : str
+        Its path below the folder or glob that was passed, with ``/``.
+
+    """
+
+    path: str
+    inside: str
+
+
+def recordings(given: Iterable[str]) -> Iterator[Input]:
+    """
+    Yield the recordings of files, folders, globs, lists (``@list.txt``) and addresses.
+
+    Parameters
+    ----------
+    given : iterable of str
+        What the user passed.
+
+    Raises
+    ------
+    InputError
+        If one of them does not exist, or holds no recording.
+    OSError
+        If a list or a folder cannot be read.
+
+    """
+    for text in given:
+        if text.startswith('@'):
+            yield from recordings(_lines(Path(text[1:])))
+            continue
+        found = None
+        for found in _addresses(text) if '://' in text else _local(text):
+            yield found
+        if found is None:
+            raise InputError(f'{text} holds no recording, expected at least one that ends with '
+                             f'{", ".join(_SUFFIXES)}',
+                             'correct the name, or put a glob in quotes')
+
+
+def _lines(path: Path) -> Iterator[str]:
+    """Yield the lines of a list; relative names are relative to the list."""
+    with path.open(encoding='utf-8') as file:
+        for line in filter(None, map(str.strip, file)):
+            if not line.startswith('#'):
+                yield line if '://' in line else str(path.parent / line)
+
+
+def _local(text: str) -> Iterator[Input]:
+    """Yield the recordings of a file, folder or glob of this machine, in order."""
+    path = Path(os.path.abspath(text))
+    if path.exists():
+        root = path if path.is_dir() and not _is_bag_folder(path) else path.parent
+        found = [path]
+    elif any(letter in text for letter in _MAGIC):
+        # The folder above the first part with a wildcard.
+        root = next(each for each in reversed(path.parents)
+                    if any(letter in path.relative_to(each).parts[0] for letter in _MAGIC))
+        found = sorted(root.glob(str(path.relative_to(root))))
+    else:
+        raise InputError(f'{text} does not exist, expected a recording, a folder, a glob or @LIST',
+                         'correct the name')
+    for each in found:
+        if each.is_dir():
+            yield from _below(each, root)
+        elif each.is_file():
+            yield Input(str(each), each.relative_to(root).as_posix())
+
+
+def _is_bag_folder(path: Path) -> bool:
+    """Return whether a path is the folder of a rosbag2, which is one recording."""
+    return (path / 'metadata.yaml').is_file()
+
+
+def _below(path: Path, root: Path) -> Iterator[Input]:
+    """Yield the recordings in a folder and its subfolders, in order; a bag is one recording."""
+    if _is_bag_folder(path):
+        yield Input(str(path), path.relative_to(root).as_posix())
+        return
+    for each in sorted(path.iterdir()):
+        if each.name.startswith('.'):
+            continue
+        if each.is_dir():
+            yield from _below(each, root)
+        elif each.is_file() and each.suffix.lower() in _SUFFIXES:
+            yield Input(str(each), each.relative_to(root).as_posix())
+
+
+def _addresses(text: str) -> Iterator[Input]:
+    """Yield the recordings of an address, in order."""
+    system, path = _system(text)
+    with _as_input_error(text):
+        root, found = _found_at(system, path)
+    for each in sorted(found):
+        yield Input(system.unstrip_protocol(each),
+                    PurePosixPath(each).relative_to(root).as_posix())
+
+
+def _found_at(system: Any, path: str) -> tuple[PurePosixPath, list[str]]:
+    """Return the folder above the recordings, and their paths in the file system."""
+    magic = '*[' if '://' in path else _MAGIC  # ? begins the query of an address of the web
+    parts = PurePosixPath(path).parts
+    first = next((k for k, part in enumerate(parts) if set(part) & set(magic)), None)
+    if first is None and system.isfile(path):
+        return PurePosixPath(path).parent, [path]
+    if first is None:
+        return PurePosixPath(path), _files_below(system, path)
+    found = system.glob(path, detail=True).items()
+    files = [each for each, about in found if about['type'] == 'file']
+    below = [file for each, about in found if about['type'] == 'directory'
+             for file in _files_below(system, each)]
+    return PurePosixPath(*parts[:first]), files + below
+
+
+def _files_below(system: Any, path: str) -> list[str]:
+    return [each for each in system.find(path) if each.lower().endswith(_SUFFIXES)]
+
+
+@contextmanager
+def _as_input_error(address: str) -> Iterator[None]:
+    """Raise InputError for the errors of a store, which have many types; OSError stays."""
+    try:
+        yield
+    except (AccelCalibError, OSError):
+        raise
+    except Exception as err:
+        raise InputError(f'{address} cannot be read: {err or type(err).__name__}, expected a '
+                         'store that answers', 'check the address, the network and the '
+                         'credentials, and run again') from err
+
+
+def _system(text: str) -> tuple[Any, str]:
+    """Return the file system of an address, and the path in it."""
+    try:
+        from fsspec.core import url_to_fs
+
+        system, path = url_to_fs(text)
+    except (ImportError, ValueError) as err:
+        raise InputError(f'{text} cannot be opened: {err}', 'install fsspec and its package for '
+                         'this kind of address, such as s3fs for s3://') from err
+    return system, path
+
+
+@contextmanager
+def on_disk(path: str) -> Iterator[Path]:
+    """Yield a recording as a local path; an address is copied to a temporary folder."""
+    if '://' not in path:
+        yield Path(path)
+        return
+    system, inside = _system(path)
+    with tempfile.TemporaryDirectory(prefix='accel_calib-') as folder:
+        local = Path(folder) / PurePosixPath(inside.partition('?')[0]).name
+        with _as_input_error(path):
+            system.get_file(inside, str(local))
+        yield local
+
+
+def content_hash(path: Path) -> str:
+    """Return a hash of a file, or of all files of a folder with their names: 128 bits, in hex."""
+    made, parts = hashlib.blake2b(digest_size=16), [path]
+    if path.is_dir():
+        parts = sorted(each for each in path.rglob('*') if each.is_file())
+    for each in parts:
+        if each != path:
+            name = os.fsencode(each.relative_to(path).as_posix())
+            made.update(b'%d:%b%d:' % (len(name), name, each.stat().st_size))
+        with each.open('rb') as file:
+            while block := file.read(_BLOCK):
+                made.update(block)
+    return made.hexdigest()
+
+
+# ----------------------------------------------------------------------------- names and dates
+
+UNKNOWN = 'unknown'
+"""Sensor of a recording in the passed folder itself, whose file has no name of a sensor."""
+
+_LONGEST_FOLDER = 180
+
+_FIRST_STAMP = datetime(2000, 1, 1, tzinfo=timezone.utc).timestamp()
+_LAST_STAMP = datetime(2100, 1, 1, tzinfo=timezone.utc).timestamp()
+"""Time stamps between these dates count from 1970."""
+
+_DATE = re.compile(r'(?<!\d)(20\d\d)([-_./]?)(0[1-9]|1[0-2])\2(0[1-9]|[12]\d|3[01])'
+                   r'(?:[-_T ]?([01]\d|2[0-3])[-_.:]?([0-5]\d)[-_.:]?([0-5]\d))?(?!\d)')
+_DATE_FOLDER = re.compile(r'(19|20)\d\d([-_.]?\d\d){0,2}([-_T]?\d{2,6})?|\d{1,2}|[Ww]\d{1,2}')
+
+
+def sensor_of(found: Input, name: str, pattern: str = '') -> str:
+    """
+    Return the name of the sensor of a recording, whose name in the file can be empty.
+
+    The groups of the regular expression `pattern` in the path are the name. Without a pattern, it
+    is the folder below the one that was passed and the name in the file. InputError is raised if
+    the path does not match.
+
+    """
+    if pattern:
+        return matched(pattern, found.path, '--sensor-from')
+    folders = [part for part in PurePosixPath(found.inside).parts[:-1]
+               if not _DATE_FOLDER.fullmatch(part)]
+    if name and name not in folders:
+        folders.append(name)
+    return '/'.join(folders) or UNKNOWN
+
+
+def matched(pattern: str, text: str, option: str) -> str:
+    """Return the groups of a regular expression in a text, or the whole match without groups."""
+    match = re.search(pattern, text)
+    if match is None:
+        raise InputError(f'{text} does not match {option} {pattern!r}, expected a match',
+                         f'correct {option}, or leave out this recording')
+    return '/'.join(filter(None, match.groups())) or match.group()
+
+
+def as_folder(sensor: str) -> str:
+    """Return the name of a sensor as the name of one folder."""
+    name = quote(sensor, safe=' ()+,@').replace('~', '%7E')
+    if not name.strip('.'):
+        name = name.replace('.', '%2E')
+    if len(name) <= _LONGEST_FOLDER:
+        return name
+    rest = hashlib.blake2b(sensor.encode(), digest_size=8).hexdigest()
+    return f'{name[:_LONGEST_FOLDER]}~{rest}'
+
+
+def date_of(found: Input, poses: Poses | None, modified_s: float | None) -> tuple[str, str]:
+    """
+    Return the date of a recording in ISO 8601, UTC, and where it comes from.
+
+    It comes from the ``stamps`` of the poses, the ``path``, or the last change of the ``file``
+    [s since 1970]. Both texts are empty if it is not known.
+
+    """
+    if poses is not None and 'time' in poses and len(poses):
+        first = float(poses['time'][0])
+        if _FIRST_STAMP <= first < _LAST_STAMP:
+            return _iso(first), 'stamps'
+    matches = list(_DATE.finditer(found.inside))
+    if matches:
+        year, _, month, day, *clock = matches[-1].groups()
+        try:
+            hour, minute, second = (int(part or 0) for part in clock)
+            when = datetime(int(year), int(month), int(day), hour, minute, second,
+                            tzinfo=timezone.utc)
+            return when.isoformat(timespec='seconds'), 'path'
+        except ValueError:  # such as 30 February
+            pass
+    return ('', '') if modified_s is None else (_iso(modified_s), 'file')
+
+
+def _iso(stamp: float) -> str:
+    return datetime.fromtimestamp(stamp, timezone.utc).isoformat(timespec='seconds')
+
+
+# ----------------------------------------------------------------------------- rows
+
+Row = dict[str, Any]
+
+_TEXTS = ('key', 'content', 'recording', 'sensor_model', 'version', 'date', 'date_from', 'status',
+          'error', 'advice', 'rating', 'rating_reason', 'model', 'refined', 'units', 'calibration')
+_COUNTS = ('poses', 'poses_used')
+_NUMBERS = ('rms_before_mg', 'rms_after_mg', 'held_out_rms_mg', 'noise_floor_mg', 'coverage',
+            'temperature', 'seconds',
+            *(column for name in NAMES for column in (name, f'{name}.sd')))
+
+RESULTS = 2
+"""Version of the rows. Another version makes all recordings be calibrated again."""
+
+_WHOLE_MODEL = '10'
+
+
+def schema() -> pa.Schema:
+    """Return the columns of a row; the sensor is the name of its folder."""
+    import pyarrow as pa
+
+    texts, numbers = pa.list_(pa.string()), pa.list_(pa.float64())
+    parameter = pa.struct([('name', pa.string()), ('value', pa.float64()), ('sd', pa.float64())])
+    return pa.schema([
+        *((name, pa.string()) for name in _TEXTS), *((name, pa.int64()) for name in _COUNTS),
+        *((name, pa.float64()) for name in _NUMBERS), ('determined', pa.bool_()),
+        ('effects', texts), ('warnings', texts),
+        ('parameters', pa.list_(parameter)), ('prior_values', numbers),
+        ('prior_covariance', numbers)])
+
+
+@dataclass(frozen=True)
+class Options:
+    """
+    How the recordings of a fleet are calibrated.
+
+    Parameters
+    ----------
+    sensor_from, model_from : str
+        Regular expressions for the name of the sensor in the path, and for its model in its name.
+    log : LogOptions
+        How to read the logs.
+    settings : dict
+        Fields of `accel_calib.capture.CaptureSettings`.
+    refined : bool
+        Look for effects beyond offset, gain and cross-axis.
+    exports : tuple of str
+        Formats of `accel_calib.stored.exports.FORMATS` to write beside each calibration.
+    own : tuple of str
+        Names of own effects of the user, which are tried beside the catalogue.
+
+    """
+
+    sensor_from: str = ''
+    model_from: str = ''
+    log: LogOptions = LogOptions()
+    settings: dict[str, Any] = field(default_factory=dict)
+    refined: bool = True
+    exports: tuple[str, ...] = ()
+    own: tuple[str, ...] = ()
+
+
+def key_of(content: str, found: Input, options: Options) -> str:
+    """Return the key of a result: content, name from the path, version, options, own effects."""
+    try:
+        place = sensor_of(found, '', options.sensor_from)
+    except AccelCalibError as err:
+        place = str(err)
+    stated = asdict(options)
+    own = [code.hex() for code in known_code().values()] if stated.pop('own') else []
+    about = json.dumps([content, place, __version__, RESULTS, stated, *own], default=str,
+                       sort_keys=True)
+    return hashlib.blake2b(about.encode(), digest_size=16).hexdigest()
+
+
+def row_of(found: Input, path: Path, options: Options) -> tuple[Row, Calibration | None]:
+    """Return the row of a recording, and its calibration unless it is BAD or failed."""
+    row = _about(found, options, None, path)
+    try:
+        intake = poses_of(path, options.log, options.settings)
+        row = _about(found, options, intake.poses, path)
+        outcome = calibrated(intake.poses, intake.units, Plan(
+            sensor=row['sensor'], refined=options.refined, also=options.own))
+    except OSError:
+        raise  # it may be possible to read it later
+    except AccelCalibError as err:
+        return row | _failed(err, str(path), found.path), None
+    except Exception as err:  # a defect of this program must not stop the other recordings
+        return row | _failed(InputError(crash_words(err), 'report it, with the recording')), None
+    calibration = replace(outcome.calibration, date=row['date'])
+    stored = outcome.rating.name != 'BAD'
+    return row | _figures(intake, outcome), calibration if stored else None
+
+
+def _failed(error: AccelCalibError, copy: str = '', name: str = '') -> Row:
+    """Return the columns of an error, with the name of a recording for that of its copy."""
+    message = error.message.replace(copy, name) if copy else error.message
+    return {'status': 'error', 'error': message, 'advice': error.advice}
+
+
+def unread_row(found: Input, options: Options, error: AccelCalibError) -> Row:
+    """Return the row of a recording that could not be read."""
+    if (written := as_text(found.path)) != found.path:
+        found = Input(written, '')
+    return _about(found, options, None, None) | _failed(error) | {'status': 'unread'}
+
+
+def as_text(name: str) -> str:
+    """Return the name of a file, with escapes for what is not UTF-8."""
+    return os.fsencode(name).decode(errors='backslashreplace')
+
+
+def _about(found: Input, options: Options, poses: Poses | None, path: Path | None) -> Row:
+    """Return the columns about a recording: sensor, model and date."""
+    row: Row = {'recording': found.path, 'version': __version__, 'sensor': UNKNOWN}
+    row['date'], row['date_from'] = date_of(
+        found, poses, os.stat(path).st_mtime if path and '://' not in found.path else None)
+    row['sensor_model'] = ''
+    try:
+        row['sensor'] = sensor_of(found, poses.sensor if poses else '', options.sensor_from)
+        if options.model_from:
+            row['sensor_model'] = matched(options.model_from, row['sensor'], '--model-from')
+    except AccelCalibError:
+        if poses is not None:
+            raise
+    return row
+
+
+def _figures(intake: Intake, outcome: Outcome) -> Row:
+    """Return the columns of a calibration and its rating."""
+    calibration, quality = outcome.calibration, outcome.calibration.quality
+    poses = calibration.used_poses
+    warm = float(np.median(poses['temperature'])) if 'temperature' in poses else None
+    deviation = np.sqrt(np.diag(calibration.covariance))
+    return {
+        'status': 'ok', 'rating': outcome.rating.name, 'rating_reason': outcome.rating.reason,
+        'model': calibration.name, 'effects': list(calibration.model.effects),
+        'refined': outcome.line, 'units': intake.units.name, 'poses': len(calibration.poses),
+        'poses_used': len(poses), 'coverage': quality.coverage,
+        **{figure.key: figure.value for figure in residual_figures(quality)},
+        'temperature': warm, 'warnings': list(calibration.warnings),
+        'determined': determines(_WHOLE_MODEL, directions_of(poses, intake.units)),
+        'parameters': [{'name': name, 'value': value, 'sd': sd} for name, value, sd in zip(
+            calibration.parameters, calibration.model.vector.tolist(), deviation.tolist(),
+            strict=True)],
+        **_linear(calibration), **_for_prior(intake, calibration)}
+
+
+def _linear(calibration: Calibration) -> Row:
+    """Return V and S with their standard deviations, at the middle of the context."""
+    free = rotation_free(calibration, calibration.typical_context(1), calibration.units.per_g)
+    variance = np.einsum('tp,pq,tq->t', free.slope, calibration.covariance, free.slope)
+    return {column: float(value) for k, name in enumerate(NAMES) for column, value in (
+        (name, free.values[k]), (f'{name}.sd', np.sqrt(max(variance[k], 0.0))))}
+
+
+def _for_prior(intake: Intake, found: Calibration) -> Row:
+    """Return values and covariance of model 10, if the poses determine it."""
+    if intake.units.is_native:
+        return {}
+    if found.model.effects != MODELS[_WHOLE_MODEL].effects:
+        try:
+            found = fit_poses(intake.poses, intake.units, model=_WHOLE_MODEL)
+        except RefusedFitError:
+            return {}
+    return {'prior_values': found.model.vector.tolist(),
+            'prior_covariance': found.covariance.ravel().tolist()}

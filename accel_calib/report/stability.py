@@ -1,0 +1,423 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The pages of the stability of a sensor: of `noise`, `compare` and `history`.
+
+**Noise.** Allan deviation by axis over the averaging time. The bands are 95 % intervals from the
+equivalent degrees of freedom. The thin line is the sum of the components that were found.
+
+**Several calibrations.** Offsets are in mg and gains in %. For native units, 1 g is the mean of
+the sensitivities.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
+
+import numpy as np
+
+from .sheet import (
+    ACCENT, add_band, add_bar, AFTER, AXIS_COLOURS, BAND, BEFORE, Drawing, drawn, EDGE, FAINT,
+    figures, HEIGHT_INCHES, HINT, how_to_read, INK, legend_below, listing, Mark, Marks, numbers,
+    PAPER, paragraph, rated_sheet, scroll_table, section, THERMAL, THIRD)
+from ..compare import Comparison, History, Parameter
+from ..findings import (
+    change_in_words, CROSS, GAINS, in_words, OFFSETS, rate_comparison, rate_noise, scale_of)
+from ..noise import AxisNoise, duration, FIGURES, Kind, NoiseFigures, shown_unit, TYPICAL, WORDS
+from ..table import Floats
+from ..text import power_of_ten, short, with_minus, with_sd
+from ..units import is_native
+
+if TYPE_CHECKING:
+    from ..calibrate import Calibration
+    from ..findings import Rating
+
+_NOISE_INCHES = 4.0
+_LOOKS = dict(zip('xyz', zip(AXIS_COLOURS, 'os^')))
+"""Colour and marker of each axis."""
+
+_NAMES = {'accelerometer': 'Accelerometer', 'gyroscope': 'Gyroscope'}
+_KALIBR: dict[tuple[Kind, str], str] = {
+    ('accelerometer', 'noise_density'): 'm/s²/√Hz', ('accelerometer', 'random_walk'): 'm/s³/√Hz',
+    ('gyroscope', 'noise_density'): 'rad/s/√Hz', ('gyroscope', 'random_walk'): 'rad/s²/√Hz'}
+"""Units of Kalibr's imu.yaml."""
+
+_HOW_TO_READ_NOISE = (
+    'The Allan deviation at τ is the typical change between two successive averages over τ, '
+    'divided by √2.',
+    'White noise falls with slope −1/2; its density N is the value of that line at τ = 1 s. The '
+    'flat part is 0.664 times the bias instability B. A random walk K rises with slope +1/2, '
+    'and is K/√3 on that line at τ = 1 s (IEEE Std 952 and 1293).',
+    'Data sheets state the noise density for positive frequencies alone, which is √2 N. Kalibr '
+    'and VINS use N.',
+    'Bands are 95 % intervals. At long τ few averages remain, and the bands are wide.',
+)
+
+
+def noise_page(found: NoiseFigures, source: str) -> str:
+    """Return the page of the noise of the recording in the file `source`, as HTML."""
+    body = [_rest(found), figures(_allan(found.of(kind)) for kind in found.kinds),
+            *(_table(found, kind) for kind in found.kinds),
+            section('Notes', listing(found.notes)),
+            section('Not seen', listing(need_lines(found))),
+            section('For Kalibr and VINS', listing(kalibr_lines(found))),
+            how_to_read(*_HOW_TO_READ_NOISE)]
+    return rated_sheet(f'Noise of {Path(source).name or source}', [source], rate_noise(found),
+                       body)
+
+
+def _allan(axes: Sequence[AxisNoise]) -> Drawing:
+    """Draw the Allan deviation of the axes of one sensor over τ, with their 95 % bands."""
+    kind, hover = axes[0].kind, {}
+    unit, scale = shown_unit(kind, 'bias_instability', axes[0].unit)
+    with drawn(_NOISE_INCHES, f'{_NAMES[kind]}: Allan deviation') as (figure, (panel,)):
+        panel.set(xscale='log', yscale='log', xlabel='averaging time τ [s]',
+                  ylabel=f'Allan deviation [{unit}]')
+        for axis in axes:
+            hover[f'curve_{axis.axis}'] = _draw_axis(panel, axis, unit, scale)
+        # Wide bands at long τ must not compress the curves.
+        every = np.concatenate([axis.deviation for axis in axes]) * scale
+        panel.set_ylim(0.5 * float(np.min(every)), 2.0 * float(np.max(every)))
+        panel.legend(ncols=len(axes))
+    ends = [f'{axis.axis} from {axis.deviation[0] * scale:.3g} to '
+            f'{np.min(axis.deviation) * scale:.3g} {unit} at '
+            f'{duration(float(axis.tau[np.argmin(axis.deviation)]))}' for axis in axes]
+    return Drawing(f'allan_{kind}', f'Allan deviation of the {kind} over τ: {", ".join(ends)}',
+                   figure, hover)
+
+
+def _draw_axis(panel: Any, axis: AxisNoise, unit: str, scale: float) -> Marks:
+    """Draw one axis, and return the texts of its markers."""
+    colour, marker = _LOOKS[axis.axis]
+    add_band(panel, axis.tau, axis.low * scale, axis.high * scale, colour)
+    used = (axis.tau >= axis.used[0]) & (axis.tau <= axis.used[1])
+    panel.plot(axis.tau[used], axis.model[used] * scale, color=colour, linewidth=1.0)
+    panel.plot(axis.tau, axis.deviation * scale, linestyle='none', marker=marker, color=colour,
+               markersize=4.0, label=axis.axis, gid=f'curve_{axis.axis}')
+    return tuple(Mark(f'{axis.axis}, τ = {duration(float(tau))}: {value * scale:.3g} {unit}')
+                 for tau, value in zip(axis.tau, axis.deviation, strict=True))
+
+
+def _rest(found: NoiseFigures) -> str:
+    pairs = [('rest', duration(found.seconds)), ('samples', f'{found.samples:,}'),
+             ('rate', f'{found.rate:.5g} Hz')]
+    if found.temperature is not None:
+        low, high = found.temperature
+        pairs.append(('temperature', f'{low:.1f} to {high:.1f} °C'))
+    return numbers(pairs)
+
+
+def _table(found: NoiseFigures, kind: Kind) -> str:
+    """Return the table of the figures of one sensor."""
+    axes = found.of(kind)
+    rows = [[f'{label} [{unit}]', *cells] for label, unit, cells in figure_rows(axes)]
+    rows.append(['from τ', *(f'{duration(axis.used[0])} to {duration(axis.used[1])}'
+                             for axis in axes), ''])
+    head = ['', *(axis.axis for axis in axes), 'typical']
+    return section(_NAMES[kind], scroll_table(f'Noise of the {kind}', head, rows),
+                   paragraph('± is one standard deviation; < is the upper limit with 95 % '
+                             'probability of a figure that the curve does not show. Typical: '
+                             'common parts, from the data sheets of ICM-42688-P and MPU-6050, '
+                             'divided by √2; data sheets do not state the other figures.', 'soft'))
+
+
+def figure_rows(axes: Sequence[AxisNoise]) -> Iterator[tuple[str, str, list[str]]]:
+    """Yield words, unit, and a cell for each axis and for typical values of each figure."""
+    for figure in FIGURES:
+        unit, scale = shown_unit(axes[0].kind, figure, axes[0].unit)
+        found = [axis.figures[figure] for axis in axes]
+        yield WORDS[figure], unit, [
+            *(with_sd(each.value * scale, each.sd * scale) if each.seen
+              else f'< {float(f"{each.upper * scale:.2g}"):g}' for each in found),
+            ' to '.join(f'{float(f"{limit * scale:.2g}"):g}' for limit in TYPICAL.get(
+                (axes[0].kind, figure, axes[0].unit), ()))]
+
+
+def need_lines(found: NoiseFigures) -> list[str]:
+    """Return a line for each figure that is not seen."""
+    return [f'{WORDS[figure]} of the {kind}: {_axes_without(found, kind, figure)}{need}'
+            for (kind, figure), need in found.needs.items()]
+
+
+def _axes_without(found: NoiseFigures, kind: Kind, figure: str) -> str:
+    """Return the axes on which a figure is not seen, if it is seen on others."""
+    axes = found.of(kind)
+    without = [axis.axis for axis in axes if not axis.figures[figure].seen]
+    return '' if len(without) == len(axes) else f'not seen on {", ".join(without)}: '
+
+
+def kalibr_lines(found: NoiseFigures) -> list[str]:
+    """Return the figures of all axes together with the names and units of Kalibr."""
+    lines = []
+    for (kind, figure), unit in _KALIBR.items():
+        value, sd = found.common(kind, figure)
+        if np.isfinite(value) and not is_native(found.of(kind)[0].unit):
+            lines.append(f'{kind}_{figure}: {power_of_ten(value, sd)} {unit}')
+    return [*lines, f'update_rate: {found.rate:.6g} Hz'] if lines else []
+
+
+# ----------------------------------------------------------------------------- calibrations
+
+GROUPS = (('offset', 'Zero-g offset', OFFSETS), ('gain', 'Gain minus 1', GAINS),
+          ('cross_axis', 'Cross-axis gain', CROSS))
+"""Key, words and names of the parameters that are drawn together."""
+
+_COLOURS = (AFTER, ACCENT, THIRD, BEFORE)
+
+_DAY_S = 86400.0
+_ONE_COLOUR = 0.5
+"""Range of temperatures that is drawn in one colour [°C]."""
+
+
+def spoken(name: str) -> str:
+    """Return the name of a parameter in words, such as ``offset x``."""
+    return name.replace('.', ' ')
+
+
+def _named_words(name: str, value: float, sd: float) -> str:
+    """Return a parameter with its name, such as ``offset x +20.3 ± 0.1 mg``."""
+    return f'{spoken(name)} {in_words(name, value, sd)}'
+
+
+def of_parameters(comparison: Comparison, labels: Sequence[str]) -> Iterator[Drawing]:
+    """Yield the difference of each parameter of each run, named by `labels`, from the mean."""
+    for key, words, names in (('offsets', 'Zero-g offset', OFFSETS),
+                              ('gains', 'Gain and cross-axis', (*GAINS, *CROSS))):
+        found = [each for each in comparison.parameters if each.name in names]
+        with drawn(HEIGHT_INCHES, f'{words} minus the mean of the runs', grid='y'
+                   ) as (figure, (panel,)):
+            hover = _draw_parameters(panel, found, labels)
+            if len(labels) <= len(_COLOURS):
+                legend_below(figure, 2)
+        yield Drawing(key, f'{words}: difference of each run from the mean, with 95 % band',
+                      figure, hover)
+
+
+def _draw_parameters(panel: Any, found: Sequence[Parameter], labels: Sequence[str]
+                     ) -> dict[str, Marks]:
+    """Draw the differences of all runs, and return the texts of their markers."""
+    hover = {}
+    panel.axhline(0.0, color=FAINT, linewidth=1.2)
+    factor = np.array([scale_of(each.name)[1] for each in found])
+    for run, label in enumerate(labels):
+        at = np.arange(len(found)) + 0.6 * ((run + 0.5) / len(labels) - 0.5)
+        change = np.array([each.values[run] - np.mean(each.values) for each in found])
+        band = BAND * np.array([each.stated_sd[run] for each in found])
+        colour = _COLOURS[run % len(_COLOURS)]
+        panel.vlines(at, (change - band) * factor, (change + band) * factor, color=colour)
+        panel.plot(at, change * factor, 'o', color=colour, gid=f'run{run}', label=label, **EDGE)
+        hover[f'run{run}'] = tuple(Mark(f'{label}, ' + _named_words(
+            each.name, each.values[run], each.stated_sd[run])) for each in found)
+    panel.set_xticks(range(len(found)), [each.name.partition('.')[2] for each in found])
+    panel.set_ylabel(scale_of(found[0].name)[2])
+    return hover
+
+
+def of_history(history: History) -> Iterator[Drawing]:
+    """Yield offset, gain and cross-axis over the dates, with bands."""
+    for key, words, names in GROUPS:
+        found = [each for each in history.parameters if each.name in names and (
+            names is not CROSS or np.any(each.stated_sd))]
+        if found:
+            yield _over_dates(f'history_{key}', f'{words} over the dates, with 95 % band', history,
+                              found)
+
+
+def _over_dates(key: str, title: str, history: History, found: Sequence[Parameter]) -> Drawing:
+    at, dated = places_of([None if moment.when is None else moment.when.timestamp()
+                           for moment in history.moments])
+    warm, hover = _temperatures(history), {}
+    with drawn(0.9 + 1.25 * len(found), title, len(found), sharex=True) as (figure, panels):
+        for k, (panel, each) in enumerate(zip(panels, found, strict=True)):
+            markers = _draw_line(panel, each, at, warm)
+            markers.set_gid(f'panel{k}')
+            hover[f'panel{k}'] = _marks(history, each)
+        if warm is not None:
+            add_bar(figure, markers, panels, 'temperature [°C]', pad=0.02)
+        label_dates(panels[-1], at, 'date of the fit', dated=dated)
+    return Drawing(key, title, figure, hover)
+
+
+def places_of(stamps: Sequence[float | None]) -> tuple[Floats, bool]:
+    """
+    Return the place of each calibration, and whether it is a date.
+
+    The places are days since 1970 if all of the stamps [s since 1970] are known and differ,
+    otherwise numbers from 1.
+
+    """
+    days = np.array([np.nan if stamp is None else stamp / _DAY_S for stamp in stamps])
+    dated = bool(np.all(np.isfinite(days))) and float(np.ptp(days)) > 0.0
+    return (days if dated else np.arange(1.0, len(days) + 1.0)), dated
+
+
+def _temperatures(history: History) -> Floats | None:
+    """Return the temperature of each calibration, NaN if not known; None if it hardly changes."""
+    warm = np.array([np.nan if moment.temperature is None else moment.temperature
+                     for moment in history.moments])
+    known = warm[np.isfinite(warm)]
+    return warm if len(known) > 1 and np.ptp(known) > _ONE_COLOUR else None
+
+
+def _draw_line(panel: Any, each: Parameter, at: Floats, warm: Floats | None) -> Any:
+    zero, factor, unit = scale_of(each.name)
+    values, band = (each.values - zero) * factor, BAND * each.stated_sd * factor
+    add_band(panel, at, values - band, values + band, AFTER)
+    panel.plot(at, values, color=FAINT, linewidth=1.2)
+    panel.vlines(at, values - band, values + band, color=BEFORE, linewidth=1.0)
+    panel.set_ylabel(f'{each.name.partition(".")[2]} [{unit}]')
+    if warm is None:
+        return panel.plot(at, values, 'o', color=AFTER, markeredgecolor=PAPER)[0]
+    colours = np.where(np.isfinite(warm), warm, np.nanmean(warm))
+    return panel.scatter(at, values, c=colours, cmap=THERMAL, edgecolors=INK, linewidths=0.5,
+                         zorder=3, vmin=np.nanmin(warm), vmax=np.nanmax(warm))
+
+
+def _marks(history: History, each: Parameter) -> Marks:
+    """Return date, value and temperature of each calibration."""
+    return tuple(Mark(
+        f'{label}, {_named_words(each.name, value, sd)}'
+        + ('' if moment.temperature is None else f', {moment.temperature:.0f} °C'))
+        for label, moment, value, sd in zip(history.labels, history.moments, each.values,
+                                            each.stated_sd, strict=True))
+
+
+def label_dates(panel: Any, at: Floats, label: str, *, dated: bool) -> None:
+    """Label the axis with dates of `label`, or with numbers of calibrations."""
+    if not dated:
+        panel.set_xticks(at, [f'{number:.0f}' for number in at])
+        panel.set_xlabel('calibration')
+        return
+    from matplotlib import dates
+
+    locator: Any = dates.AutoDateLocator(maxticks=6)  # type: ignore[no-untyped-call]
+    panel.xaxis.set_major_locator(locator)
+    panel.xaxis.set_major_formatter(
+        dates.ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
+    panel.set_xlabel(label)
+
+
+_HOW_TO_READ = (
+    'The parameters do not depend on the axes of the model, and are at the same temperature for '
+    'all calibrations, if their models contain its effect.',
+    'The test uses all parameters at once and each one alone. p is the probability of differences '
+    'at least this large, if the sensor has not changed.',
+    'RMS and largest: difference of |force| from the mean of the other calibrations, over all '
+    'directions.',
+)
+
+
+def comparison_page(comparison: Comparison, rating: Rating, sources: Sequence[Path],
+                    calibrations: Sequence[Calibration]) -> str:
+    """
+    Return the page of a comparison as HTML.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        The comparison.
+    rating : Rating
+        The verdict.
+    sources : sequence of Path
+        Files of the calibrations.
+    calibrations : sequence of Calibration
+        The calibrations that were compared.
+
+    """
+    labels = [f'{k} {source.name}' for k, source in enumerate(sources, 1)]
+    title = f'Comparison of {len(calibrations)} calibrations{_of_sensor(calibrations)}'
+    body = [section('Calibrations', _runs(comparison, calibrations, labels)),
+            section('Parameters', figures(of_parameters(comparison, labels)), HINT,
+                    _parameters(comparison)),
+            section('Notes', listing(_notes(comparison))), how_to_read(*_HOW_TO_READ)]
+    return rated_sheet(title, map(str, sources), rating, body)
+
+
+def _of_sensor(calibrations: Sequence[Calibration]) -> str:
+    name = next((each.sensor for each in calibrations if each.sensor), '')
+    return f' of {name}' if name else ''
+
+
+def _runs(comparison: Comparison, calibrations: Sequence[Calibration], labels: Sequence[str]
+          ) -> str:
+    """Return a table that compares each run with the others."""
+    head = ('run', 'date', 'model', 'RMS [mg]', 'expected [mg]', 'largest [mg]', 'p')
+    rows = [(label, each.date[:10], each.name, short(run.rms_mg), short(run.expected_mg),
+             short(run.largest_mg), f'{run.p_value:.2g}')
+            for label, each, run in zip(labels, calibrations, comparison.runs, strict=True)]
+    return scroll_table('Calibrations', head, rows)
+
+
+def _parameters(comparison: Comparison) -> str:
+    """Return a table of the spread of each parameter."""
+    rows = []
+    for each in comparison.parameters:
+        zero, factor, unit = scale_of(each.name)
+        stated = float(np.sqrt(np.mean(each.stated_sd ** 2)))
+        mean = with_minus(short((each.values.mean() - zero) * factor))
+        rows.append((spoken(each.name), f'{mean} {unit}',
+                     short(each.spread * factor), short(stated * factor),
+                     '' if each.ratio is None else f'{each.ratio:.2f}'))
+    return scroll_table('Parameters', ('', 'mean', 'spread', 'stated', 'ratio'), rows)
+
+
+def _notes(comparison: Comparison) -> Iterator[str]:
+    yield from comparison.notes
+    if comparison.tilt_deg is not None:
+        yield ('the directions of up of levelled calibrations differ by up to '
+               f'{comparison.tilt_deg:.3g}°; the test does not use them')
+
+
+def history_page(history: History, sources: Sequence[Path],
+                 calibrations: Sequence[Calibration]) -> str:
+    """
+    Return the page of a history as HTML.
+
+    Parameters
+    ----------
+    history : History
+        The history.
+    sources : sequence of Path
+        Files of the calibrations.
+    calibrations : sequence of Calibration
+        The calibrations, as given to `accel_calib.compare.history_of`.
+
+    """
+    body = [section('Over the dates', figures(of_history(history)), HINT),
+            section('Changes', _changes(history)),
+            section('Calibrations', _moments(history, sources)),
+            section('Notes', listing(history.notes)), how_to_read(*_HOW_TO_READ)]
+    return rated_sheet(f'History of {len(calibrations)} calibrations{_of_sensor(calibrations)}',
+                       [f'{history.labels[0]} to {history.labels[-1]}'],
+                       rate_comparison(history.whole), body)
+
+
+def _changes(history: History) -> str:
+    """Return a table with the verdict of each step."""
+    head = ('from', 'to', 'verdict', 'p', 'largest change', 'RMS [mg]')
+    rows = [(first, second, f'{"agree" if change.comparison.agree else "differ"}, '
+             f'{rate_comparison(change.comparison).name}', f'{change.comparison.p_value:.2g}',
+             f'{spoken(change.parameter)} ' + change_in_words(
+                 change.parameter, change.change, change.sd),
+             short(change.comparison.runs[1].rms_mg))
+            for first, second, change in zip(history.labels, history.labels[1:], history.changes,
+                                             strict=False)]
+    return scroll_table('Changes', head, rows)
+
+
+def _moments(history: History, sources: Sequence[Path]) -> str:
+    """Return a table of the calibrations with their parameters."""
+    head = ('', 'date', 'file', 'model', '°C', 'residual [mg]',
+            *(spoken(each.name) for each in history.parameters))
+    rows = []
+    for k, (label, moment) in enumerate(zip(history.labels, history.moments, strict=True)):
+        warm = '' if moment.temperature is None else f'{moment.temperature:.1f}'
+        values = (in_words(each.name, each.values[k], each.stated_sd[k])
+                  for each in history.parameters)
+        rows.append((str(k + 1), label, sources[moment.index].name, moment.model, warm,
+                     short(moment.residual_mg), *values))
+    return scroll_table('Calibrations', head, rows)
