@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What PX4 and ArduPilot do to the readings of an accelerometer, by their parameters.
+What PX4 and ArduPilot do to the readings of an accelerometer, and which of their messages is read.
 
 Both correct in the axes of the sensor, and then rotate to those of the vehicle ([1]_, [2]_):
 
@@ -23,6 +23,9 @@ thermal    TC_An_X0_0, … about TC_An_TREF, if TC_A_ENABLE is 1     INS_TCALn_A
 T is limited to the range of the polynomial. Rotations are numbered as in MAVLink [3]_, and
 ArduPilot has three more; a rotation is roll, then pitch, then yaw about fixed axes. `raw_columns`
 undoes all of this, so that readings, and the parameters made from them, are those of the sensor.
+
+A flight log holds several messages with accelerations, each of several sensors. `choose` takes the
+first message in order of preference whose samples are dense enough for the capture of poses.
 
 .. [1] https://github.com/PX4/PX4-Autopilot/blob/main/src/lib/sensor_calibration/Accelerometer.hpp
 .. [2] https://github.com/ArduPilot/ardupilot/blob/master/libraries/AP_InertialSensor/

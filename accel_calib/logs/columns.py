@@ -23,7 +23,7 @@ import numpy as np
 from .dialect import is_clock, is_number, Layout, shown
 from .names import (
     BARE, bare_name, check_sensor, COUNTERS, format_named, is_unit, LINEAR_WORDS, LogFormat,
-    may_cause, meaning, OURS, RATE, READING, recognise, unit_of, WHOLE_WORDS, WORDS)
+    may_cause, Meaning, meaning, OURS, RATE, READING, recognise, unit_of, WHOLE_WORDS, WORDS)
 from .text import Cells
 from ..errors import InputError
 from ..table import COLUMNS, Floats, quantity_key
@@ -335,11 +335,15 @@ def _listed(layout: Layout, triple: Sequence[int]) -> str:
     return ', '.join(map(layout.name, triple))
 
 
+def _meanings(header: Sequence[str]) -> list[tuple[int, Meaning]]:
+    """Return the indices of columns with what their names mean."""
+    return [(k, meaning(name)) for k, name in enumerate(header[:MOST])]
+
+
 def _triples(quantity: str, header: Sequence[str]) -> dict[tuple[str, ...], list[int]]:
     """Return the columns of the three axes of each sensor of a quantity."""
     axes: dict[tuple[str, ...], dict[int, list[int]]] = {}
-    for k, name in enumerate(header[:MOST]):
-        known = meaning(name)
+    for k, known in _meanings(header):
         if known.quantity == quantity and known.axis is not None:
             axes.setdefault(known.group, {}).setdefault(known.axis, []).append(k)
     found: dict[tuple[str, ...], list[int]] = {}
@@ -358,8 +362,7 @@ def _bare(header: Sequence[str]) -> list[list[int]]:
     if 'w' in map(str.casefold, header):
         return []
     axes: dict[int, list[int]] = {}
-    for k, name in enumerate(header[:MOST]):
-        known = meaning(name)
+    for k, known in _meanings(header):
         if not (known.quantity or known.unit or known.axis is None
                 ) and BARE.issuperset(known.group):
             axes.setdefault(known.axis, []).append(k)
@@ -371,8 +374,8 @@ def _contexts(layout: Layout, found: Mapping[str, Source]) -> dict[str, Source]:
     more: dict[str, Source] = {}
     header = layout.header
     by_quantity: dict[str, list[int]] = {}
-    for k, name in enumerate(header[:MOST]):
-        by_quantity.setdefault(meaning(name).quantity, []).append(k)
+    for k, known in _meanings(header):
+        by_quantity.setdefault(known.quantity, []).append(k)
     if 'time' not in found:
         clocks = _clocks(layout, by_quantity.get('time', ()))
         if clocks:
@@ -426,8 +429,7 @@ def rates_beside(layout: Layout, time: Source) -> list[float]:
     if layout.rate_hz is not None:
         every = step_of(_sample(layout, counted.index, len(layout.sample))) if counted else 1.0
         rates.append(layout.rate_hz / every)
-    for k, name in enumerate(layout.header[:MOST]):
-        known = meaning(name)
+    for k, known in _meanings(layout.header):
         unit = unit_of('time', known.unit)
         if known.quantity == 'time' and unit is not None and k != time.index:
             cells = _sample(layout, k, len(layout.sample))
@@ -447,8 +449,7 @@ def _fraction(layout: Layout, best: int) -> dict[str, Source]:
     """Return the column of the nanoseconds beside whole seconds, as ROS stamps have it."""
     known = meaning(layout.header[best])
     if unit_of('time', known.unit) == ('s', 1.0):
-        for k, name in enumerate(layout.header[:MOST]):
-            other = meaning(name)
+        for k, other in _meanings(layout.header):
             if (other.quantity, other.group) == ('time', known.group) and (
                     unit_of('time', other.unit) == ('ns', 1e-9)):
                 return {FRACTION: _source(layout, k)}

@@ -218,6 +218,8 @@ class TextTable:
                                 for k in self._dates for line in lines):
             return None
         lines, delimiter, columns = plain
+        if delimiter != ',' and self.layout.decimal != '.':
+            lines = [line.replace(',', '.') for line in lines]
         try:
             values = np.loadtxt(lines, delimiter=delimiter, usecols=columns, ndmin=2,
                                 comments=None, quotechar=None)
@@ -246,8 +248,6 @@ class TextTable:
                   (len(line.split()) - 1 for line in lines))
         if set(counts) != {width - 1}:
             return None
-        if delimiter != ',' and self.layout.decimal != '.':
-            lines = [line.replace(',', '.') for line in lines]
         return lines, delimiter or None, self._numeric
 
     def _unquoted(self, lines: list[str]) -> tuple[list[str], str, Sequence[int]] | None:
@@ -268,8 +268,6 @@ class TextTable:
                 return None
             kept = ['\t'.join(row) for row in cells]
             columns = list(range(len(self._numeric)))
-        if self.layout.decimal != '.':
-            kept = [line.replace(',', '.') for line in kept]
         return kept, '\t', columns
 
     def _without_cut(self, lines: list[str]) -> list[str]:
