@@ -73,18 +73,18 @@ from accel_calib.noise.components import COMPONENTS as ALLAN_COMPONENTS, fit_com
 from accel_calib.noise.curve import allan_variances, longest_rest, octaves, shares, spread_of
 from accel_calib.pipeline import calibrated as calibrated_by, is_partial, Plan as FitPlan
 from accel_calib.refine import base as refine_base
-from accel_calib.refine.base import (
-    beginning, clipped, fitted_state, grid_step, off_grid, sampled, unclipped)
+from accel_calib.refine.base import clipped, grid_step, off_grid, sampled, unclipped
 from accel_calib.refine.curves import (
-    _grown as grown_curve, best_curve, Curve, is_curve, Process, process_of, SIGNIFICANT, Walk,
-    walk_beside)
+    _grown as grown_curve, best_curve, Curve, is_curve, Near, probabilities, Process, process_of,
+    SIGNIFICANT, Walk, walk_beside)
 from accel_calib.refine.linear import (
-    _RARE as RARE, Block, candidates, LEVEL as REFINE_LEVEL, Linear, linearised, products_of,
-    WORTH)
-from accel_calib.refine.plan import _levels as levels_of, NOTHING as NOTHING_TO_PLAN
+    beginning, Block, candidates, fitted_state, Linear, linearised, products_of, WORTH)
+from accel_calib.refine.plan import _levels as levels_of
+from accel_calib.refine.result import NOTHING as NOTHING_TO_PLAN, verdict_words
 from accel_calib.refine.search import _is_better as is_better_than_walk, search as search_effects
-from accel_calib.refine.sets import accepted, explored, Near, probabilities, simpler
-from accel_calib.refine.words import advice_for, verdict_words
+from accel_calib.refine.sets import (
+    _RARE as RARE, accepted, explored, LEVEL as REFINE_LEVEL, Set, simpler)
+from accel_calib.refine.steps import advice_for
 from accel_calib.report.page import axis_figures, snippets
 from accel_calib.report.refinement import all_drawings, curve_parts
 from accel_calib.report.residuals import residuals_of, residuals_of_refinement

@@ -10,7 +10,7 @@ from accel_calib.effects import EFFECTS
 from inside import (
     accepted, beginning, Block, candidates, Curve, explored, fitted_state, grown_curve,
     is_better_than_walk, Linear, linearised, Model, Near, Process, process_of, products_of, RARE,
-    REFINE_LEVEL, SIGNIFICANT, simpler, simulate_poses, Walk, walk_beside, WORTH)
+    REFINE_LEVEL, Set, SIGNIFICANT, simpler, simulate_poses, Walk, walk_beside, WORTH)
 import numpy as np
 import pytest
 from scipy.optimize import brentq
@@ -59,7 +59,7 @@ def by_hand(residual, columns, names, worth=WORTH, choice=0.0, tried=1.0, size=1
     ('offset_step', [3e-3, -2e-3, 2e-3, 900.0])])
 def test_the_gain_of_an_effect_is_that_of_a_fit_with_it(name, values):
     state, linear = problem_of(poses_of({name: values}), name)
-    gain, _ = linear.gains(linear.set_of())
+    gain, _ = Set.of(linear).gains()
     best = int(np.argmax(gain))
     shape = linear.blocks[best].shape
     if name.endswith('temperature'):  # a fit would change the lag, too
@@ -70,9 +70,9 @@ def test_the_gain_of_an_effect_is_that_of_a_fit_with_it(name, values):
     after = fitted_state(Model({**state.model.values, name: start}), state.poses_g)
     assert gain[best] > 50.0
     assert gain[best] == pytest.approx(state.fit.chi2 - after.fit.chi2, rel=0.01)
-    chosen = linear.set_of((best,))
+    chosen = Set.of(linear, (best,))
     assert linear.base_rss - chosen.rss == pytest.approx(gain[best], rel=1e-9)
-    np.testing.assert_allclose(linear.values_of(chosen)[best],
+    np.testing.assert_allclose(chosen.values[best],
                                after.model.values[name][:len(effect.parameters)],
                                atol=0.02 * np.max(np.abs(values[:3])))
 
@@ -80,10 +80,10 @@ def test_the_gain_of_an_effect_is_that_of_a_fit_with_it(name, values):
 def test_the_gain_beside_a_set_is_the_fall_that_the_larger_set_brings():
     _, linear = problem_of(poses_of({'quadratic': [2e-3, -1e-3, 1e-3]}, knocked=(5,)),
                            'quadratic', 'cubic', 'gain_asymmetry', 'offset_drift')
-    beside = linear.set_of((0,), (5,))
-    gain, rank = linear.gains(beside)
+    beside = Set.of(linear, (0,), (5,))
+    gain, rank = beside.gains()
     for block in range(1, len(linear.blocks)):
-        larger = linear.set_of((0, block), (5,))
+        larger = Set.of(linear, (0, block), (5,))
         assert beside.rss - larger.rss == pytest.approx(gain[block], rel=1e-6)
         assert len(larger.across) - len(beside.across) == rank[block]
     assert (gain[0], rank[0]) == (pytest.approx(0.0, abs=1e-9), 0.0)
@@ -95,13 +95,13 @@ def test_a_set_without_a_pose_is_the_fit_without_it(out, known):
     context = {'reference': True} if known else {}
     poses = poses_of({}, knocked=out, **context)
     state, linear = problem_of(poses, 'quadratic')
-    chosen = linear.set_of((), out)
+    chosen = Set.of(linear, (), out)
     others = np.delete(np.arange(COUNT), out)
     after = fitted_state(state.model, state.poses_g.take(others))
     assert chosen.parameters == len(out) * (3 if known else 1)
     assert chosen.rss == pytest.approx(after.fit.chi2, rel=1e-3)
     kept = ~np.isin(linear.pose, out)
-    onto, residual = linear.spanned(chosen)
+    onto, residual = chosen.spanned
     np.testing.assert_allclose(onto.T @ onto, np.eye(onto.shape[1]), atol=1e-9)
     np.testing.assert_allclose(residual[kept], after.fit.residual, atol=0.02)
     np.testing.assert_allclose(residual[~kept], 0.0, atol=1e-9)
@@ -113,26 +113,26 @@ def test_the_score_counts_values_shapes_choice_and_size():
     residual[:3] = 6.0, 8.0, 2.0
     columns = np.eye(40)[:, :2]
     linear = by_hand(residual, columns, ['supply_ratio', 'supply_ratio'], choice=3.0, tried=5.0)
-    one, both = linear.set_of((0,)), linear.set_of((0, 1))
+    one, both = Set.of(linear, (0,)), Set.of(linear, (0, 1))
 
     def expected(rss, values, charge):
         whole = WORTH + 40.0
         return (whole * math.log((WORTH + 104.0) / (WORTH + rss))
                 - values * math.log(40.0) * whole / (whole - values - 1.0) - charge)
 
-    assert linear.set_of().score == 0.0
+    assert Set.of(linear).score == 0.0
     assert one.score == pytest.approx(expected(68.0, 1.0, 3.0 + 2.0 * math.log(5.0)))
     assert both.score == pytest.approx(expected(4.0, 2.0, 2.0 * (3.0 + 2.0 * math.log(5.0))))
-    assert linear.scores_beside(one)[1] == pytest.approx(both.score)
-    left_out = linear.set_of((), (0, 1))
+    assert one.scores_beside[1] == pytest.approx(both.score)
+    left_out = Set.of(linear, (), (0, 1))
     assert left_out.score == pytest.approx(
         expected(4.0, 2.0, 2.0 * (2.0 * math.log(40.0) + RARE)))
 
 
 def test_only_sets_of_several_effects_have_smaller_ones():
     linear = by_hand(np.ones(9), np.eye(9)[:, :2], ['supply_ratio', 'offset_drift'])
-    assert linear.fewer(linear.set_of((0,))) == []
-    assert [fewer.blocks for fewer in linear.fewer(linear.set_of((0, 1)))] == [(1,), (0,)]
+    assert Set.of(linear, (0,)).fewer == []
+    assert [fewer.blocks for fewer in Set.of(linear, (0, 1)).fewer] == [(1,), (0,)]
 
 
 NAMES = ('supply_ratio', 'quadratic', 'cubic', 'offset_drift', 'warm_up', 'gain_drift')
@@ -164,7 +164,7 @@ def test_noise_alone_is_significant_as_often_as_stated():
     for seed in range(600):
         residual = np.random.default_rng(seed).normal(size=30)
         linear = by_hand(residual, np.eye(30)[:, :4], names)
-        best.append(min(linear.probability(linear.set_of((k,)), k) for k in range(4)))
+        best.append(min(Set.of(linear, (k,)).probability(k) for k in range(4)))
     assert np.mean(np.array(best) < 0.1) == pytest.approx(0.1, abs=0.03)
     assert np.mean(np.array(best) < REFINE_LEVEL) == pytest.approx(REFINE_LEVEL, abs=0.009)
 
@@ -178,19 +178,19 @@ def test_two_effects_are_found_where_neither_alone_is_significant():
     _, linear = problem_of(poses_of(hidden, time=time, temperature=warm), *EFFECTS)
     for block, each in enumerate(linear.blocks):
         if each.effect in hidden:
-            assert linear.probability(linear.set_of((block,)), block) > REFINE_LEVEL
-    best = next(accepted(linear, explored(linear)))
-    assert set(linear.effects_of(best)) == set(hidden)
-    assert linear.is_significant(best)
+            assert Set.of(linear, (block,)).probability(block) > REFINE_LEVEL
+    best = next(accepted(explored(linear)))
+    assert set(best.effects) == set(hidden)
+    assert best.is_significant
 
 
 def test_an_effect_and_knocked_poses_are_found_together():
     hidden, knocked = {'offset_temperature': [3e-4, -2e-4, 2e-4]}, (4, 17, 33, 51)
     _, linear = problem_of(poses_of(hidden, knocked=knocked), *EFFECTS)
-    best = next(accepted(linear, explored(linear)))
-    assert linear.effects_of(best) == ('offset_temperature',)
+    best = next(accepted(explored(linear)))
+    assert best.effects == ('offset_temperature',)
     assert best.out == knocked
-    values = next(iter(linear.values_of(best).values()))
+    values = next(iter(best.values.values()))
     np.testing.assert_allclose(values, hidden['offset_temperature'], atol=3e-5)
 
 
@@ -202,14 +202,14 @@ def test_of_sets_that_are_almost_as_good_the_one_with_fewest_values_is_preferred
                          ('quadratic', 'cubic', 'cubic'))
         blocks = linear.blocks[0], linear.blocks[1]._replace(columns=slice(1, 3))
         linear = replace(linear, blocks=blocks)
-        return linear, [linear.set_of((k,)) for k in (0, 1)]
+        return [Set.of(linear, (k,)) for k in (0, 1)]
 
     def beyond(side):
-        one, two = sets_at(side)[1]
+        one, two = sets_at(side)
         return two.score - one.score - better
 
-    linear, both = sets_at(brentq(beyond, 0.0, 30.0))
-    assert linear.effects_of(next(accepted(linear, both))) == (preferred,)
+    best = next(accepted(sets_at(brentq(beyond, 0.0, 30.0))))
+    assert best.effects == (preferred,)
 
 
 def test_a_simpler_set_has_all_other_effects_and_the_best_shape():
@@ -220,9 +220,9 @@ def test_a_simpler_set_has_all_other_effects_and_the_best_shape():
     poses = poses.with_columns(reading=poses.reading + 10.0 * behind[:, np.newaxis] * size)
     names = ('cross_coupling', 'offset_temperature', 'temperature_rate', 'quadratic')
     _, linear = problem_of(poses, *names)
-    chosen = linear.set_of([int(linear.numbers_of[name][0]) for name in names])
-    found, = (each for each in simpler(linear, chosen)
-              if set(linear.effects_of(each)) == {*names} - {'temperature_rate'})
+    chosen = Set.of(linear, [int(linear.numbers_of[name][0]) for name in names])
+    found, = (each for each in simpler(chosen)
+              if set(each.effects) == {*names} - {'temperature_rate'})
     shape, = (linear.blocks[each].shape for each in found.blocks
               if linear.blocks[each].effect == 'offset_temperature')
     assert shape == pytest.approx([lag, 0.0], rel=0.3)
@@ -231,16 +231,16 @@ def test_a_simpler_set_has_all_other_effects_and_the_best_shape():
 def test_a_pose_that_an_effect_explains_is_not_left_out():
     poses = poses_of({'offset_step': [4e-3, -4e-3, 4e-3, 180.0]})  # before it: 6 poses of 60
     _, linear = problem_of(poses, 'offset_step', 'quadratic', 'offset_drift')
-    best = next(accepted(linear, explored(linear)))
-    assert linear.effects_of(best) == ('offset_step',)
+    best = next(accepted(explored(linear)))
+    assert best.effects == ('offset_step',)
     assert best.out == ()
 
 
 def test_noise_alone_has_no_effects_and_no_outliers():
     _, linear = problem_of(poses_of({}), *EFFECTS)
-    best = next(accepted(linear, explored(linear)))
+    best = next(accepted(explored(linear)))
     assert (best.blocks, best.out, best.score) == ((), (), 0.0)
-    assert [each.out for each in linear.with_outliers(linear.set_of())] == [()]
+    assert [each.out for each in Set.of(linear).with_outliers] == [()]
 
 
 def random_process(count, modes, rng):
@@ -259,14 +259,14 @@ def test_whitened_equations_are_those_of_generalised_least_squares():
     inverse = np.linalg.inv(variance)
     both = np.column_stack([columns, residual])
     np.testing.assert_allclose(white.products, both.T @ inverse @ both)
-    onto, left = white.spanned(white.set_of())
+    onto, left = Set.of(white).spanned
     assert onto.shape == (20, 0)
     assert left @ left == pytest.approx(residual @ inverse @ residual)
     values = np.linalg.solve(columns.T @ inverse @ columns, columns.T @ inverse @ residual)
-    found = white.values_of(white.set_of((0, 1)))
+    found = Set.of(white, (0, 1)).values
     np.testing.assert_allclose([found[0][0], found[1][0]], values)
     flat = Walk(process, 0.0, 0.0, 0.0).whitened(linear)
-    np.testing.assert_array_equal(flat.spanned(flat.set_of())[1], residual)
+    np.testing.assert_array_equal(Set.of(flat).spanned[1], residual)
     assert white.penalty - flat.penalty == pytest.approx(np.linalg.slogdet(variance)[1])
 
 
@@ -283,7 +283,7 @@ def test_a_pose_left_out_beside_a_walk_is_as_if_it_were_not_there():
         moved[7] += knock
         linear = by_hand(moved, np.eye(30)[:, :1], ['supply_ratio'])
         white = Walk(process, 50.0, 0.0, 0.0).whitened(linear)
-        assert white.set_of((), (7,)).rss == pytest.approx(expected)
+        assert Set.of(white, (), (7,)).rss == pytest.approx(expected)
 
 
 @pytest.mark.parametrize('chosen', [(), (0,)])
@@ -295,7 +295,7 @@ def test_a_held_out_residual_beside_a_walk_is_predicted_by_the_other_poses(chose
     both = rng.normal(size=(15, 2))
     residual, column = np.split(both - base @ (base.T @ both), 2, axis=1)
     linear = replace(by_hand(residual[:, 0], column, ['supply_ratio']), onto=base)
-    left, held_out = Walk(process, ratio, 0.0, 0.0).residuals(linear, linear.set_of(chosen))
+    left, held_out = Walk(process, ratio, 0.0, 0.0).residuals(Set.of(linear, chosen))
     design = np.column_stack([base, column[:, :len(chosen)]])
 
     def beside(rows):
@@ -324,7 +324,7 @@ def test_a_walk_is_likely_where_the_offset_walks_and_not_in_noise():
     likely = []
     for size_g in (1e-3, 0.0):
         linear, poses = wandering(size_g)
-        walk = walk_beside(linear, linear.set_of(), process_of(linear, poses))
+        walk = walk_beside(Set.of(linear), process_of(linear, poses))
         likely.append(walk.likelihood_ratio)
     assert likely[0] > 3.0 * SIGNIFICANT
     assert likely[1] < 0.5 * SIGNIFICANT
@@ -337,7 +337,7 @@ def test_the_variance_of_a_walk_is_bounded_where_the_noise_is_not_known(size, le
     along = np.sqrt(process.values) * rng.normal(size=6) * size
     linear = by_hand(process.axes @ along + rng.normal(size=60), np.eye(60)[:, :1],
                      ['supply_ratio'], worth=0.0)
-    ratio = walk_beside(linear, linear.set_of(), process).ratio
+    ratio = walk_beside(Set.of(linear), process).ratio
     assert least * (1.0 - 1e-9) <= ratio <= most * (1.0 + 1e-9)
 
 
@@ -347,7 +347,7 @@ def test_the_variance_of_a_walk_is_bounded_where_the_noise_is_not_known(size, le
 def test_a_curve_over_time_must_be_clearly_better_than_a_walk(variable, score, better):
     rng = np.random.default_rng(3)
     linear = by_hand(rng.normal(size=20), np.eye(20)[:, :1], ['supply_ratio'])
-    nothing = linear.set_of()
+    nothing = Set.of(linear)
     walk = Walk(random_process(20, 4, rng), 1.0, nothing.score + 20.0, 50.0)
     curve = Curve(f'empirical-offset-{variable}-1', np.zeros(5), score, (), 0.0)
-    assert is_better_than_walk(curve, Near(linear, nothing, walk, linear, None)) == better
+    assert is_better_than_walk(curve, Near(nothing, linear, walk, None)) == better

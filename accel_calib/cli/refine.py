@@ -18,8 +18,8 @@ from .inputs import intake, prior, rows_between, stored_calibration
 from ..effects import effect_named
 from ..findings import rate_refinement, refinement_json
 from ..intake import Intake
-from ..refine import refine, refine_with_fleet, Refinement
-from ..refine.words import base_words, chance, residual_words, verdict_words
+from ..refine import (
+    base_words, chance, refine, refine_with_fleet, Refinement, residual_words, verdict_words)
 from ..report import refinement_page, write_figures, write_page
 from ..stored import write_calibration
 from ..stored.exports import write_plan

@@ -4,20 +4,22 @@
 """
 From poses and a calibration to the gap, the named effect and the larger model.
 
-`refinement` is the entry point. `calibrations` contains the base, also a stored calibration, and
-the refined calibration. `base` prepares the poses and fits the base. `linear` contains the effects
-of the catalogue as columns of the equations near a model, and the score of a set of effects and
-outliers. `sets` searches for the best set and computes the probability of each effect. `curves`
-contains causes without a known form: a random walk of the offset, and an empirical curve. `search`
-searches near a model and fits in turn. `result` makes the record, `plan` chooses the poses that
-separate effects from their rivals, and `words` makes the sentences.
+`refinement` is the entry point: it fits the base, and makes the refined calibration. `base`
+prepares the poses. `linear` contains the effects of the catalogue as columns of the equations near
+a model. `sets` scores sets of effects and outliers, searches for the best one, and computes the
+probability of each effect. `curves` contains causes without a known form: a random walk of the
+offset, and an empirical curve. `search` searches near a model and fits in turn. `steps` describes
+what it found, `plan` chooses the poses that separate effects from their rivals, and `result`
+contains the records and their sentences.
 
 """
 
-from .calibrations import refitted
-from .plan import PlannedPose, PosePlan
-from .refinement import refine, refine_with_fleet
-from .result import Refinement, Stage, Step
+from .refinement import refine, refine_with_fleet, refitted
+from .result import (
+    base_words, chance, percent, PlannedPose, PosePlan, Refinement, residual_words, shown_name,
+    Stage, Step, values_of, verdict_words)
+from .steps import times_typical
 
-__all__ = ['PlannedPose', 'PosePlan', 'Refinement', 'Stage', 'Step', 'refine',
-           'refine_with_fleet', 'refitted']
+__all__ = ['PlannedPose', 'PosePlan', 'Refinement', 'Stage', 'Step', 'base_words', 'chance',
+           'percent', 'refine', 'refine_with_fleet', 'refitted', 'residual_words', 'shown_name',
+           'times_typical', 'values_of', 'verdict_words']

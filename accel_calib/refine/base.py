@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What a search starts from: the poses that can be used, and a model fitted to them.
+The poses that a search starts from.
 
 **Long tables.** A sample of a long table bounds the time and the memory of a refinement; such
 tables come from machines, or are samples in place of poses. With `MOST` equations a refinement
@@ -10,6 +10,12 @@ takes 10 s and 300 MB as a rule, and about a minute and 900 MB in the worst case
 noise that no effect explains. A pose has one equation, or three if its orientation is known or
 shared. The sample takes one pose out of each part of the table. The place in the part changes by
 the golden ratio, so that a table that repeats the same turns gives all of them.
+
+**Stored calibration as the base.** The calibration is the simulation, and the new poses are the
+measurement. The poses of the calibration are added to the new poses, without their times, because
+the clocks of two recordings can differ. If the file was edited by hand, or the new poses are
+partly those of the calibration and contradict it, the readings that the calibration predicts
+replace its measured ones.
 
 **Effects of the output** act on the whole reading: readings clipped at a limit, or on a grid. They
 are not columns of the equations, so they are detected in the readings themselves.
@@ -28,20 +34,19 @@ capture includes it in the noise of its poses; in other tables it is missing, an
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .linear import held_out, Linear, linearised, Set
-from ..calibrate import with_history
+from .linear import beginning, State, without
+from ..calibrate import Calibration, in_g, with_history
 from ..capture import rounding_left
 from ..effects import included, Model, MODELS
-from ..estimate import estimate, Fit, judge, NotConvergedError
+from ..estimate import estimate, judge, NotConvergedError
+from ..finding import has
+from ..geometry import unit
 from ..table import Floats, Poses
-from ..units import MG
 
 MOST = 6000
 """Largest number of equations that a refinement uses."""
@@ -50,10 +55,6 @@ _VECTORS = 3
 """Number of equations of a pose of known or shared orientation."""
 
 _GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
-
-_CHI2_LEVEL = 1e-3
-_CHI2_RATIO = 1.3
-"""chi² per degree of freedom that still counts as noise: poses repeat worse than samples."""
 
 _QUIET = 0.7
 """Largest scatter of clipped samples, relative to the smallest scatter away from the limit."""
@@ -104,84 +105,21 @@ _RELEVANT = 0.25
 """Smallest part of the variance of a mean that a relevant grid causes."""
 
 
+_DIGITS = 7
+"""Number of decimals [g] in which two readings of the same pose are equal."""
+
+_SAME = 0.999
+"""Quantile of chi² below which a stored calibration agrees with poses of its fit."""
+
+_EITHER = ('temperature', 'supply_voltage', 'rate', 'previous')
+"""Context that is set to NaN if the stored poses do not have it, as quantities are."""
+
 _EQUAL = 1e-9
 """Relative difference below which numbers of a quantity are equal."""
 
 _OF_READING = 0.1
 """Scatter of the ratio of a quantity to the length of the readings below which it is computed from
 them, relative to the scatter of the length."""
-
-
-@dataclass(frozen=True)
-class State:
-    """A model fitted to the poses kept."""
-
-    fit: Fit
-
-    @property
-    def model(self) -> Model:
-        """Return the fitted model, ΔR = I."""
-        return self.fit.model
-
-    @property
-    def poses_g(self) -> Poses:
-        """Return the poses kept, in g, with the column ``previous``."""
-        return self.fit.poses_g
-
-    @cached_property
-    def linear(self) -> Linear:
-        """Return the equations with all values of the model projected out, without candidates."""
-        return linearised(self.fit, self.model.effects)
-
-    @cached_property
-    def nothing(self) -> Set:
-        """Return the empty set beside the model."""
-        return self.linear.set_of()
-
-    @property
-    def residual(self) -> Floats:
-        """(m,) array, residuals of the equations with all values fitted."""
-        return self.linear.residual
-
-    @property
-    def rss(self) -> float:
-        """Sum of squared residuals."""
-        return self.linear.base_rss
-
-    @property
-    def held_out(self) -> Floats:
-        """(m,) array, each residual if its own equation is left out of the fit (PRESS)."""
-        return held_out(self.residual, 1.0 - np.sum(self.linear.onto ** 2, axis=1))
-
-    @property
-    def dof(self) -> int:
-        """Return the number of independent equations minus that of fitted values."""
-        return self.linear.dof
-
-    @property
-    def is_noise(self) -> bool:
-        """Return whether noise may explain the residual; True if the noise is not known."""
-        return not self.fit.noise_known or is_noise(self.rss, self.dof)
-
-    def gap_mg(self, residual: Floats) -> float:
-        """Return the RMS over the new poses of (m,) residuals of the equations [mg]."""
-        of_poses = self.fit.equations.of_poses(residual)
-        if 'new' in self.poses_g:
-            of_poses = of_poses[self.poses_g['new'] > 0.0]
-        return float(np.sqrt(np.mean(of_poses ** 2))) * MG
-
-    def mg_of_poses(self, residual: Floats) -> Floats:
-        """Return the (n,) residuals of poses from (m,) residuals of the equations [mg]."""
-        return self.fit.equations.of_poses(residual) * MG
-
-    @property
-    def floor_mg(self) -> float | None:
-        """Return the residual expected of a correct model [mg]; None if the noise is unknown."""
-        if not self.fit.noise_known:
-            return None
-        rows = self.fit.by_pose.rows[self.fit.equations.pose]
-        share = np.sqrt(self.dof / len(rows)) * np.ones(len(rows))
-        return self.gap_mg(share)
 
 
 def causes(poses_g: Poses) -> tuple[str, ...]:
@@ -208,32 +146,6 @@ def _in_proportion(values: Floats, length: Floats) -> bool:
     ratio = values / length
     return bool(np.std(ratio) * np.mean(length) < _OF_READING * np.std(length)
                 * np.abs(np.mean(ratio)))
-
-
-def with_effect(model: Mapping[str, Floats], name: str, values: Floats) -> dict[str, Floats]:
-    """Return the values of a model with one more effect, which replaces those it contains."""
-    contained = included((name,))
-    return {**{key: part for key, part in model.items() if key not in contained}, name: values}
-
-
-def is_noise(rss: float, dof: float) -> bool:
-    """Return whether measured noise explains a weighted sum of squares."""
-    from scipy.special import chdtrc
-
-    return bool(dof <= 0 or rss <= _CHI2_RATIO * dof or chdtrc(dof, rss) > _CHI2_LEVEL)
-
-
-def beginning(poses_g: Poses, model: Model) -> State:
-    """Return the state of a base model, fitted to all poses; `NotConvergedError` if that fails."""
-    return State(estimate(model, with_history(poses_g, model)))
-
-
-def fitted_state(model: Model, poses_g: Poses, most: float = np.inf) -> State | None:
-    """Return the state of a model fitted to poses; None without a sound fit below `most`."""
-    try:
-        return State(estimate(model, poses_g, most=most))
-    except NotConvergedError:
-        return None
 
 
 def sampled(poses: Poses) -> Poses:
@@ -299,7 +211,7 @@ def grid_step(poses_g: Poses) -> float | None:
     """Return the step of a grid that causes most of the noise of the pose means [g], or None."""
     clip = clipped(poses_g)
     if clip is not None:  # readings at a limit are constant, too
-        poses_g = poses_g.take(np.delete(np.arange(len(poses_g)), clip.poses))
+        poses_g = without(poses_g, clip.poses)
     if not len(poses_g):
         return None
     step = _constant_step(poses_g) or _alternating_step(poses_g)
@@ -406,7 +318,7 @@ def unclipped(poses_g: Poses, base: Model) -> tuple[State | None, Clipped | None
     # Clipped samples hardly scatter, so their noise is meaningless: all weights are equal here.
     plain = Poses({key: values for key, values in poses_g.columns.items() if key != 'std'},
                   poses_g.row)
-    kept = plain.take(np.delete(np.arange(len(plain)), clip.poses))
+    kept = without(plain, clip.poses)
     if not any(_fits_better(model, plain, kept) for model in (base, _linear(base))):
         return None, None
     return _whole(plain, kept, base), clip
@@ -468,3 +380,81 @@ def _is_included(poses_g: Poses, step: float) -> bool:
 def _is_all_noise(state: State) -> bool:
     """Return whether the residuals match the noise of the grid, neither larger nor smaller."""
     return state.is_noise and state.rss > _LEAST_OF_GRID * state.dof
+
+
+def beside_stored(poses_g: Poses, calibration: Calibration) -> Poses:
+    """
+    Return new poses in g followed by those of a stored calibration, with the column ``new``.
+
+    Return only the new poses, without this column, if the calibration has no effects or no poses,
+    or was fitted to some of the new poses and still agrees with them.
+
+    """
+    stored = with_history(in_g(calibration.poses, calibration.units), calibration.model)
+    stored = stored.take(np.isin(stored.row, calibration.used_poses.row))
+    if not len(stored) or not calibration.model.effects:
+        return poses_g
+    shared, edited = _shares(poses_g, stored), has(calibration.noted, 'edited')
+    if shared and not edited and _agrees(calibration, poses_g):
+        return poses_g
+    if shared or edited:
+        stored = _as_calibrated(stored, calibration)
+    count = (len(poses_g), len(stored))
+    either = {*_EITHER, *poses_g.quantities}
+    columns = {key: _joined(key, poses_g, stored) for key in poses_g.columns
+               if key in stored or key in either}
+    if 'time' in calibration.ranges:  # limited to the range of the calibration
+        held = np.clip(poses_g['time'], *calibration.ranges['time'])
+        columns['time'] = np.concatenate([held, stored['time']])
+    elif 'time' in poses_g:
+        columns['time'] = np.concatenate([poses_g['time'], np.full(count[1], np.nan)])
+    if 'orientation' in poses_g:
+        least = float(np.min(poses_g['orientation']))
+        columns['orientation'] = np.concatenate([
+            poses_g['orientation'], least - 1.0 - np.arange(count[1])])
+    if 'std' not in columns or 'count' not in columns:
+        columns = {key: values for key, values in columns.items() if key not in ('std', 'count')}
+    columns['new'] = np.repeat([1.0, 0.0], count)
+    return Poses(columns, _rows(poses_g, stored))
+
+
+def with_stored(poses: Poses, calibration: Calibration) -> Poses:
+    """Return poses followed by those of a stored calibration, in the unit of the readings."""
+    stored = calibration.used_poses
+    columns = {key: np.concatenate([poses[key], stored[key]]) for key in poses.columns
+               if key in stored}
+    return replace(poses, columns=columns, row=_rows(poses, stored))
+
+
+def _rows(poses: Poses, stored: Poses) -> NDArray[np.int64]:
+    return np.concatenate([poses.row, int(poses.row.max()) + 1 + np.arange(len(stored))])
+
+
+def _shares(poses_g: Poses, stored: Poses) -> bool:
+    """Return whether a pose is in both tables."""
+    new, old = ({tuple(row) for row in poses.reading.round(_DIGITS).tolist()}
+                for poses in (poses_g, stored))
+    return not new.isdisjoint(old)
+
+
+def _agrees(calibration: Calibration, poses_g: Poses) -> bool:
+    """Return whether a fit to the poses is no better than the calibration as stored."""
+    from scipy.special import chdtri
+
+    model = Model(calibration.model.values)
+    fit = estimate(model, poses_g)
+    excess = judge(model, calibration.held(poses_g)).chi2 - fit.chi2
+    worse = max(fit.chi2 / max(fit.dof, 1), 1.0)
+    return bool(excess / worse < chdtri(len(model.vector), 1.0 - _SAME))
+
+
+def _as_calibrated(stored: Poses, calibration: Calibration) -> Poses:
+    """Return the poses with the readings that the calibration predicts in their directions."""
+    here = calibration.model.at(stored.columns)
+    return stored.with_columns(reading=here.reading(unit(here.force(stored.reading))))
+
+
+def _joined(key: str, poses_g: Poses, stored: Poses) -> Floats:
+    ours = poses_g[key]
+    theirs = stored[key] if key in stored else np.full((len(stored), *ours.shape[1:]), np.nan)
+    return np.concatenate([ours, theirs])

@@ -33,12 +33,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .base import causes, State
-from .linear import (
-    Block, candidates, held_out, LEVEL, Linear, linearised, outside_of, products_of, Set)
+from .base import causes
+from .linear import Block, candidates, held_out, Linear, linearised, outside_of, products_of, State
+from .sets import LEVEL, Set
 from ..effects import (
     CARRIERS, curve_pairs, effect_named, EFFECTS, EMPIRICAL, empirical_name, empirical_parts,
-    Model, MODES)
+    LADDER, Model, MODES, WANDER)
 from ..estimate import Fit, judge
 from ..table import Floats, Poses
 
@@ -86,14 +86,10 @@ def best_curve(state: State, poses_g: Poses, out: tuple[int, ...]) -> Curve | No
     best, tried = None, 0
     for carrier, variable in _pairs(poses_g):
         for problem in _problems(plain, fit, carrier, variable):
-            chosen, tried = _grown(_kept(problem, out)), tried + 1
-            if chosen.blocks and (best is None or chosen.score > best[0]):
-                best = chosen.score, problem, chosen
-    if best is None:
-        return None
-    score, problem, chosen = best
-    return _accepted(score - 2.0 * math.log(tried), problem, problem.set_of(chosen.blocks, out),
-                     tried)
+            grown, tried = _grown(_kept(problem, out)), tried + 1
+            if grown.blocks and (best is None or grown.score > best[0]):
+                best = grown.score, Set.of(problem, grown.blocks, out)
+    return None if best is None else _accepted(best[0] - 2.0 * math.log(tried), best[1], tried)
 
 
 def _pairs(poses_g: Poses) -> list[tuple[str, str]]:
@@ -127,18 +123,18 @@ def _problems(plain: Linear, fit: Fit, carrier: str, variable: str) -> Iterator[
 
 def _kept(problem: Linear, out: tuple[int, ...]) -> Linear:
     """Return the problem of the other poses, for its products alone."""
-    nothing = problem.set_of((), out)
+    nothing = Set.of(problem, (), out)
     return replace(problem, products=problem.products - nothing.across.T @ nothing.across,
                    base_rss=nothing.rss, dof=problem.dof - int(nothing.parameters))
 
 
 def _grown(problem: Linear) -> Set:
     """Return the cosines with the best score."""
-    best = now = problem.set_of()
+    best = now = Set.of(problem)
     for _ in range(_MOST_MODES):
-        scores = problem.scores_beside(now)
+        scores = now.scores_beside
         scores[list(now.blocks)] = -np.inf
-        now = problem.extended(now, int(np.argmax(scores)))
+        now = now.extended(int(np.argmax(scores)))
         if now.parameters > _LARGEST_SHARE * problem.dof:
             break
         if now.score > best.score:
@@ -148,31 +144,28 @@ def _grown(problem: Linear) -> Set:
     return best
 
 
-def _accepted(score: float, problem: Linear, chosen: Set, tried: int) -> Curve | None:
+def _accepted(score: float, chosen: Set, tried: int) -> Curve | None:
     """Return a curve, or None if it is not significant or poses held out do not agree."""
     # The outliers are found again: without the curve, good poses may have looked like outliers.
-    chosen = max(problem.with_outliers(chosen), key=lambda either: either.score)
-    nothing = problem.set_of((), chosen.out)
-    choices = tried * math.prod(problem.blocks[block].tried for block in chosen.blocks)
-    p_value = min(1.0, problem.chance(nothing, chosen) * choices)
+    chosen = max(chosen.with_outliers, key=lambda either: either.score)
+    nothing = chosen.instead(())
+    p_value = min(1.0, chosen.chance(nothing) * tried * math.prod(
+        each.tried for each in chosen.entries))
     if p_value > LEVEL or score < _CLEARLY:
         return None
-    before, after = _held_out(problem, nothing), _held_out(problem, chosen)
-    if after > _HELD_OUT * before:
+    if _held_out(chosen) > _HELD_OUT * _held_out(nothing):
         return None
-    carrier, variable, _ = empirical_parts(problem.blocks[0].effect)
-    values = problem.values_of(chosen)
-    blocks = sorted(chosen.blocks)
-    modes = [empirical_parts(problem.blocks[block].effect)[2][0] for block in blocks]
-    return Curve(empirical_name(carrier, variable, modes), np.concatenate(
-        [*(values[block] for block in blocks), problem.blocks[0].shape]), score, chosen.out,
-        p_value)
+    blocks, first = sorted(chosen.blocks), chosen.entries[0]
+    carrier, variable, _ = empirical_parts(first.effect)
+    name = empirical_name(carrier, variable, [block + 1 for block in blocks])
+    values = np.concatenate([*(chosen.values[block] for block in blocks), first.shape])
+    return Curve(name, values, score, chosen.out, p_value)
 
 
-def _held_out(problem: Linear, chosen: Set) -> float:
+def _held_out(chosen: Set) -> float:
     """Return the sum of squares of the residuals, each predicted from the other equations."""
-    onto, residual = problem.spanned(chosen)
-    own = 1.0 - np.sum(problem.onto ** 2, axis=1) - np.sum(onto ** 2, axis=1)
+    onto, residual = chosen.spanned
+    own = 1.0 - np.sum(chosen.linear.onto ** 2, axis=1) - np.sum(onto ** 2, axis=1)
     kept = own > 1e-6  # not the outliers
     return float(np.sum(held_out(residual[kept], own[kept]) ** 2))
 
@@ -190,12 +183,12 @@ def nearest_effects(before: State) -> dict[str, float]:
     """Return the known effects that leave least of the residual, and what they leave [mg]."""
     names = tuple(name for name in EFFECTS if name not in before.model.values)
     linear = linearised(before.fit, before.model.effects, candidates(names, before.poses_g))
-    gain, rank = linear.gains(linear.set_of())
+    gain, rank = Set.of(linear).gains()
     left_mg: dict[str, float] = {}
     for number in np.argsort(-gain):
         effect = linear.blocks[number].effect
         if rank[number] and effect not in left_mg and len(left_mg) < _NEAREST:
-            _, left = linear.spanned(linear.set_of((int(number),)))
+            _, left = Set.of(linear, (int(number),)).spanned
             left_mg[effect] = before.gap_mg(left)
     return left_mg
 
@@ -257,16 +250,16 @@ class Walk:
                        products=linear.products - across.T @ (taken * across),
                        penalty=float(np.sum(np.log(spread))) + _charge(linear))
 
-    def residuals(self, linear: Linear, chosen: Set) -> tuple[Floats, Floats]:
+    def residuals(self, chosen: Set) -> tuple[Floats, Floats]:
         """Return the residual without the walk, and the same with each equation held out."""
         spread = 1.0 + self.ratio * self.process.values
-        onto, residual = linear.spanned(chosen)
+        onto, residual = chosen.spanned
         left = self.process.axes - onto @ (onto.T @ self.process.axes)
         precision = np.diag(1.0 / np.maximum(spread - 1.0, 1e-12)) + left.T @ left
         smooth = np.linalg.solve(precision, left.T)
         residual = residual - left @ (smooth @ residual)
         # Without its own equation each residual is P z over the diagonal of P.
-        own = (1.0 - np.sum(linear.onto ** 2, axis=1) - np.sum(onto ** 2, axis=1)
+        own = (1.0 - np.sum(chosen.linear.onto ** 2, axis=1) - np.sum(onto ** 2, axis=1)
                - np.sum(left * smooth.T, axis=1))
         return residual, held_out(residual, own)
 
@@ -292,11 +285,11 @@ def process_of(linear: Linear, poses: Poses) -> Process | None:
     return Process(modes @ (vectors[:, kept] / np.sqrt(values[kept])), values[kept] / values[-1])
 
 
-def walk_beside(linear: Linear, chosen: Set, process: Process) -> Walk:
+def walk_beside(chosen: Set, process: Process) -> Walk:
     """Return the most likely walk beside a set."""
+    linear, (spanned, residual) = chosen.linear, chosen.spanned
     spread = 1.0 + _RATIOS[:, np.newaxis] * process.values
     taken = 1.0 - 1.0 / spread
-    spanned, residual = linear.spanned(chosen)
     onto, own = process.axes.T @ spanned, chosen.across[:, -1]
     along, count = process.axes.T @ linear.residual, onto.shape[1]
     squares = (onto[:, :, np.newaxis] * onto[:, np.newaxis]).reshape(len(onto), count ** 2)
@@ -336,3 +329,71 @@ def _fall_by_scatter(linear: Linear, residual: Floats, white: float) -> float:
 def _charge(linear: Linear) -> float:
     """Return what a walk costs in the score: its size, and its choice among the candidates."""
     return float(np.log(max(linear.dof, 2)) + linear.choice)
+
+
+LEAST = 0.01
+"""Smallest probability of a rival."""
+
+
+@dataclass(frozen=True)
+class Near:
+    """
+    What was chosen in the equations of all poses near a model.
+
+    `chosen` has the effects and outliers; its equations are whitened if there is a `walk` of the
+    offset, and `plain` are not. `process` has the modes of a walk; None if it is not tried.
+
+    """
+
+    chosen: Set
+    plain: Linear
+    walk: Walk | None
+    process: Process | None
+
+    @property
+    def beside(self) -> Set:
+        """Return what was chosen, in the equations that are not whitened."""
+        return self.chosen.within(self.plain)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return the names of the chosen effects."""
+        return self.chosen.effects
+
+    @property
+    def key(self) -> tuple[frozenset[str], tuple[int, ...], bool]:
+        """Return what was chosen, apart from values and shapes."""
+        return frozenset(self.names), self.chosen.out, self.walk is not None
+
+
+def probabilities(name: str, near: Near) -> dict[str, float]:
+    """Return the probabilities of an effect or `WANDER` and those in its place, largest first."""
+    if name != WANDER and name not in near.names:
+        return {name: 1.0}
+    whole = near.plain.worth + near.plain.dof
+    certainty = max((whole - near.chosen.parameters) / whole, LEAST)
+    scores = _scores(name, near, near.chosen.score + 2.0 * np.log(LEAST) / certainty)
+    most = max(scores.values())
+    weights = {key: float(np.exp(certainty * (score - most) / 2.0))
+               for key, score in scores.items()}
+    total = sum(weights.values())
+    ordered = sorted(weights, key=lambda key: -weights[key])
+    return {key: weights[key] / total for key in ordered}
+
+
+def _scores(name: str, near: Near, least: float) -> dict[str, float]:
+    """Return the scores above `least` of the set with each effect in the place of a named one."""
+    if name == WANDER:
+        others = near.beside
+    else:
+        others = near.chosen.without(near.chosen.blocks[near.names.index(name)])
+    scores = {name: near.chosen.score}
+    for number, likely in enumerate(others.scores_beside):
+        effect = others.linear.blocks[number].effect
+        if (likely > least and effect not in near.names
+                and (effect in LADDER or name not in LADDER)):
+            score = others.extended(number).score
+            scores[effect] = max(score, scores.get(effect, -np.inf))
+    if name != WANDER and near.walk is None and near.process is not None:
+        scores[WANDER] = walk_beside(others, near.process).score
+    return scores

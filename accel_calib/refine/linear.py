@@ -40,8 +40,8 @@ them costs, and the effects of the catalogue cost the same. Each pose that is le
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 import math
 from typing import Any, NamedTuple
@@ -49,36 +49,23 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..effects import Context, Effect, effect_named, factors_of, kind_of, Model
-from ..estimate import by_pose, Equations, Fit, outliers_among
+from ..calibrate import with_history
+from ..effects import Context, Effect, effect_named, factors_of, included, kind_of, Model
+from ..estimate import Equations, estimate, Fit, NotConvergedError
 from ..table import Floats, Poses
+from ..units import MG
 
 WORTH = 4.0
 """ν, degrees of freedom that the measured noise counts as."""
 
-LEVEL = 0.01
-"""Probability that any effect is named if there is no hidden effect."""
-
-_SEEN = 0.02
+SEEN = 0.02
 """Smallest part of a column outside of the model; otherwise it cannot be distinguished."""
-
-_DETERMINED = 1e-12
-"""Smallest square of a relative singular value of the columns of values that are determined."""
 
 _LARGEST_LOG = 100.0
 """Largest logarithm of a ratio, against overflow."""
 
 _LEAST_OWN = 0.02
 """Smallest 1 - leverage; below it, an equation alone determines a value."""
-
-_USUAL = 1.6
-"""Standard deviation of the logarithm of the size of an effect relative to its typical size."""
-
-_MOST_UNUSUAL = 6.0
-"""Largest penalty for an unusual size."""
-
-_RARE = 5.0
-"""Additional cost of each pose that is left out: few poses are knocked."""
 
 _SHAPES_AT_ONCE = 250
 """If there are more shapes, only evenly spread shapes are tried."""
@@ -88,6 +75,10 @@ _MANY_POSES, _FEW_SHAPES = 1000, 60
 
 _SHAPES_ALIKE = 3.0
 """Number of neighbouring shapes that count as one independent trial."""
+
+_CHI2_LEVEL = 1e-3
+_CHI2_RATIO = 1.3
+"""chi² per degree of freedom that still counts as noise: poses repeat worse than samples."""
 
 _OFFSET = Model({'offset': np.zeros(3)})
 
@@ -232,10 +223,11 @@ class Linear:
     @cached_property
     def by_width(self) -> list[tuple[NDArray[np.intp], NDArray[np.intp], Floats]]:
         """Blocks of the same width: (k,) blocks, (k, w) columns, and (k, w, w) products."""
-        return list(self._grouped(np.arange(len(self.blocks))))
+        return list(self.grouped(np.arange(len(self.blocks))))
 
-    def _grouped(self, numbers: NDArray[np.intp]
-                 ) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp], Floats]]:
+    def grouped(self, numbers: NDArray[np.intp]
+                ) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp], Floats]]:
+        """Yield some blocks, those of the same width together, as `by_width`."""
         ends = np.array([(block.columns.start, block.columns.stop) for block in self.blocks],
                         np.intp).reshape(-1, 2)[numbers]
         widths = ends[:, 1] - ends[:, 0]
@@ -243,10 +235,6 @@ class Linear:
             index = ends[widths == width, :1] + np.arange(width)
             yield (numbers[widths == width], index,
                    self.products[index[:, :, np.newaxis], index[:, np.newaxis, :]])
-
-    def effects_of(self, chosen: Set) -> tuple[str, ...]:
-        """Return the names of the effects of a set."""
-        return tuple(self.blocks[block].effect for block in chosen.blocks)
 
     def score(self, rss: Any, parameters: Any, charge: Any) -> Any:
         """Return the score of sets from their RSS, number of values and other charges."""
@@ -256,172 +244,17 @@ class Linear:
         few = whole / np.maximum(whole - parameters - 1.0, 1e-9)
         return fall - few * parameters * math.log(max(self.dof, 2)) - charge - self.penalty
 
-    def rss_of(self, score: float, chosen: Set) -> float:
+    def rss_of(self, score: float, parameters: float, charge: float) -> float:
         """Return the RSS with which a set has a score."""
-        room = float(self.score(self.base_rss, chosen.parameters, chosen.charge)) - score
+        room = float(self.score(self.base_rss, parameters, charge)) - score
         ratio = math.exp(min(room / (self.worth + self.dof), _LARGEST_LOG))
         return (self.worth + self.base_rss) * ratio - self.worth
 
-    def set_of(self, blocks: Sequence[int] = (), out: Iterable[int] = ()) -> Set:
-        """Return the set of these blocks, with these poses left out."""
-        out = tuple(sorted(out))
-        if out not in self._of_poses:
-            self._of_poses[out] = self._span_of(out)
-        return self._grown(self._of_poses[out], blocks)
-
     @cached_property
-    def _of_poses(self) -> dict[tuple[int, ...], _Span]:
-        """Return the bases of the poses that were left out so far."""
-        return {}
-
-    def _span_of(self, out: tuple[int, ...]) -> _Span:
-        rows = np.flatnonzero(np.isin(self.pose, out)) if out else np.zeros(0, np.intp)
-        units: Floats = np.zeros((len(self.pose), len(rows)))
-        units[rows, np.arange(len(rows))] = 1.0
-        if out:
-            units = np.linalg.qr(self.whitened(units - self.onto @ self.onto[rows].T))[0]
-        white = self.whitened(units)
-        across = np.column_stack([white.T @ self.columns, white.T @ self.residual])
-        return _Span((), out, units, across, np.eye(len(rows)))
-
-    def extended(self, before: Set, block: int) -> Set:
-        """Return a set with one more block."""
-        return self._grown(before.span, (block,))
-
-    def instead(self, chosen: Set, blocks: Sequence[int]) -> Set:
-        """Return the set of other blocks, with the same poses left out."""
-        return self.set_of(blocks, chosen.out)
-
-    def without(self, chosen: Set, block: int) -> Set:
-        """Return a set without one of its blocks."""
-        return self.instead(chosen, [other for other in chosen.blocks if other != block])
-
-    def _grown(self, span: _Span, blocks: Sequence[int]) -> Set:
-        """Return the set that spans these blocks, too."""
-        for block in blocks:
-            part = self.blocks[block].columns
-            along = span.across[:, part]
-            left = self.products[part] - along.T @ span.across
-            size, axes = np.linalg.eigh(left[:, part])
-            kept = _is_seen(size)
-            span = span.beside(block, along, left, axes[:, kept] / np.sqrt(size[kept]))
-        searched, cost = self._costs
-        own = list(span.blocks)
-        charge = float(np.sum(cost[own])) + self._unusual(span)
-        charge += len(span.out) * (2.0 * math.log(max(self.poses, 2)) + _RARE)
-        parameters = float(len(span.across) + np.sum(searched[own]))
-        gain = span.across[:, -1] @ span.across[:, -1]
-        rss = max(float(self.products[-1, -1] - gain), 0.0)
-        return Set(span, rss, parameters, charge, float(self.score(rss, parameters, charge)))
-
-    def spanned(self, chosen: Set) -> tuple[Floats, Floats]:
-        """Return (m, q) orthonormal columns that span a set, and the (m,) residual beside it."""
-        columns = self.whitened(self.columns[:, self._index(chosen.blocks)])
-        onto = np.hstack([chosen.span.units, columns]) @ chosen.span.mix
-        return onto, self.whitened(self.residual) - onto @ chosen.across[:, -1]
-
-    def fewer(self, chosen: Set) -> list[Set]:
-        """Return a set of several blocks without each of them."""
-        several = chosen.blocks if len(chosen.blocks) > 1 else ()
-        return [self.without(chosen, block) for block in several]
-
-    def with_outliers(self, chosen: Set) -> list[Set]:
-        """Return a set as it is, and with the outliers that it leaves, if they differ."""
-        key = frozenset(chosen.blocks)
-        if key not in self._outliers:
-            self._outliers[key] = self._outliers_beside(
-                self.set_of(chosen.blocks) if chosen.out else chosen)
-        out = self._outliers[key]
-        return [chosen] if out == chosen.out else [chosen, self.set_of(chosen.blocks, out)]
-
-    @cached_property
-    def _outliers(self) -> dict[frozenset[int], tuple[int, ...]]:
-        """Return the outliers that were found so far, by the blocks beside them."""
-        return {}
-
-    def _outliers_beside(self, plain: Set) -> tuple[int, ...]:
-        onto, residual = self.spanned(plain)
-        return tuple(outliers_among(
-            by_pose(residual, np.hstack([self.onto, onto]), self.pose), plain.rss,
-            self.dof - int(plain.parameters), self.poses, noise_known=self.worth > 0.0
-        ).poses.tolist())
-
-    def _unusual(self, span: _Span) -> float:
-        """Return the penalty for the sizes of the effects."""
-        penalty = 0.0
-        for block, values in self._values(span).items():
-            size = float(np.max(np.abs(values))) / self.blocks[block].entry.typical
-            penalty += min((max(math.log(max(size, 1e-300)), 0.0) / _USUAL) ** 2, _MOST_UNUSUAL)
-        return penalty
-
-    def values_of(self, chosen: Set) -> dict[int, Floats]:
-        """Return the (p,) values of the effect of each block of a set."""
-        return self._values(chosen.span)
-
-    def _values(self, span: _Span) -> dict[int, Floats]:
-        if not span.blocks:
-            return {}
-        index = self._index(span.blocks)
-        left, right = self.products[index][:, index], self.products[-1, index]
-        if span.out:
-            across = span.across[:span.units.shape[1]]
-            left = left - across[:, index].T @ across[:, index]
-            right = right - across[:, index].T @ across[:, -1]
-        values = np.linalg.lstsq(left, right, rcond=_DETERMINED)[0] / self.sizes[index]
-        found: dict[int, Floats] = {}
-        start = 0
-        for block in span.blocks:
-            part = self.blocks[block].columns
-            count = part.stop - part.start
-            found[block] = values[start:start + count]
-            start += count
-        return found
-
-    def _index(self, blocks: Iterable[int]) -> list[int]:
-        """Return the columns of these blocks."""
-        return [column for block in blocks for column in range(
-            self.blocks[block].columns.start, self.blocks[block].columns.stop)]
-
-    def gains(self, beside: Set, effect: str = '') -> tuple[Floats, Floats]:
-        """
-        Return the (b,) gain of each block in addition to a set, and its (b,) rank.
-
-        Both are 0 for the blocks of other effects, if one is given.
-
-        """
-        across = beside.across
-        along = self.products[-1, :-1] - across[:, -1] @ across[:, :-1]
-        gain, rank = np.zeros(len(self.blocks)), np.zeros(len(self.blocks))
-        groups = self._grouped(self.numbers_of[effect]) if effect else self.by_width
-        for numbers, index, products in groups:
-            parts = np.moveaxis(across[:, index], 0, 2)
-            gain[numbers], rank[numbers] = _explained(
-                products - parts @ np.swapaxes(parts, 1, 2), along[index])
-        return gain, rank
-
-    def best_of(self, effect: str, beside: Set) -> int:
-        """Return the block of an effect with the largest gain in addition to a set."""
-        own = self.numbers_of[effect]
-        return int(own[np.argmax(self.gains(beside, effect)[0][own])])
-
-    @cached_property
-    def _costs(self) -> tuple[Floats, Floats]:
+    def costs(self) -> tuple[Floats, Floats]:
         """(b,) arrays, values searched of each block, and what its choice costs."""
         return (np.array([block.searched for block in self.blocks], float),
                 self.choice + 2.0 * np.log(np.array([block.tried for block in self.blocks])))
-
-    def scores_beside(self, before: Set) -> Floats:
-        """
-        Return the (b,) scores with one more block, without the penalty for its size.
-
-        They are -inf for a block that determines nothing.
-
-        """
-        gain, rank = self.gains(before)
-        searched, cost = self._costs
-        scores = self.score(before.rss - gain, before.parameters + rank + searched,
-                            before.charge + cost)
-        return np.where(rank > 0.0, scores, -np.inf)
 
     def whitened(self, columns: Floats) -> Floats:
         """Return (m,) or (m, q) columns outside of the base, whitened as the equations are."""
@@ -431,114 +264,15 @@ class Linear:
         whitened: Floats = columns - axes @ ((axes.T @ columns).T * loss).T
         return whitened
 
-    def probability(self, chosen: Set, block: int) -> float:
-        """Return the probability that noise alone makes a block this good beside the others."""
-        chance = self.chance(self.without(chosen, block), chosen)
-        return min(1.0, chance * self.kinds * self.blocks[block].tried)
+    @cached_property
+    def outliers(self) -> dict[frozenset[int], tuple[int, ...]]:
+        """Return the outliers that were found so far, by the blocks beside them."""
+        return {}
 
-    def is_significant(self, chosen: Set) -> bool:
-        """Return whether each effect of a set is significant beside the others."""
-        return all(self.probability(chosen, block) < LEVEL for block in chosen.blocks)
-
-    def chance(self, fewer: Set, more: Set) -> float:
-        """Return the probability that noise alone makes a set this good beside a smaller one."""
-        from scipy.special import fdtrc
-
-        added = more.parameters - fewer.parameters
-        left = self.worth + self.dof - more.parameters
-        if added < 1 or left < 1:
-            return 1.0
-        variance = (self.worth + more.rss + 1e-300) / left
-        return float(fdtrc(added, left, (fewer.rss - more.rss) / added / variance))
-
-
-@dataclass(frozen=True)
-class _Span:
-    """
-    An orthonormal basis of blocks and of poses that are left out, by its products.
-
-    The columns `units` (m, k) span the poses. With those of the blocks, they are k' columns; times
-    `mix` (k', q) they are the basis. `across` (q, c + 1) are the products of the basis with the
-    columns of the problem and, last, with its residual.
-
-    """
-
-    blocks: tuple[int, ...]
-    out: tuple[int, ...]
-    units: Floats
-    across: Floats
-    mix: Floats
-
-    def beside(self, block: int, along: Floats, left: Floats, new: Floats) -> _Span:
-        """
-        Return the span with a block of w columns.
-
-        `along` (q, w) are the products of the basis with them, `left` (w, c + 1) those of their
-        part outside of the basis with all columns, and `new` (w, r) makes this part orthonormal.
-
-        """
-        rows, count = self.mix.shape
-        mix = np.zeros((rows + len(left), count + new.shape[1]))
-        mix[:rows, :count], mix[:rows, count:] = self.mix, -self.mix @ (along @ new)
-        mix[rows:, count:] = new
-        return _Span((*self.blocks, block), self.out, self.units,
-                     np.concatenate([self.across, new.T @ left]), mix)
-
-
-@dataclass(frozen=True)
-class Set:
-    """
-    Effects that are added to the base, and poses that are left out.
-
-    Beside the `span` of both, the sum of squares `rss` is left. `parameters` is the number of
-    values, with searched shapes and equations left out. `charge` is subtracted from the score
-    apart from these values. `score` is the criterion, 0 for the base.
-
-    """
-
-    span: _Span = field(repr=False)
-    rss: float
-    parameters: float
-    charge: float
-    score: float
-
-    @property
-    def blocks(self) -> tuple[int, ...]:
-        """Return the indices of the blocks of the effects."""
-        return self.span.blocks
-
-    @property
-    def out(self) -> tuple[int, ...]:
-        """Return the indices of the poses that are left out."""
-        return self.span.out
-
-    @property
-    def across(self) -> Floats:
-        """(q, c + 1) array, products of a basis of the set with the columns and the residual."""
-        return self.span.across
-
-
-def _is_seen(squares: Floats) -> NDArray[np.bool_]:
-    """Return which directions of columns are outside of a basis, by their increasing squares."""
-    return (squares > _SEEN ** 2) & (squares > _SEEN ** 2 * squares[..., -1:])
-
-
-def _explained(products: Floats, along: Floats) -> tuple[Floats, Floats]:
-    """Return what k blocks explain, and their ranks, from their products (k, w, w) and (k, w)."""
-    width, size = along.shape[1], np.trace(products, axis1=1, axis2=2)
-    # No eigenvalue is below this, as the others are at most `size` together.
-    least = np.linalg.det(products) * (max(width - 1, 1) / np.maximum(size, _SEEN ** 2)) ** (
-        width - 1)
-    whole = least > _SEEN ** 2 * np.maximum(size, 1.0)
-    gain, rank = np.zeros(len(size)), np.full(len(size), width)
-    solved = np.linalg.solve(products[whole], along[whole][:, :, np.newaxis])[:, :, 0]
-    gain[whole] = np.sum(along[whole] * solved, axis=1)
-    squares, axes = np.linalg.eigh(products[~whole])
-    kept = _is_seen(squares)
-    towards = (along[~whole][:, np.newaxis] @ axes)[:, 0]
-    gain[~whole] = np.sum(towards ** 2 * kept / np.where(kept, squares, 1.0), axis=1)
-    rank[~whole] = np.sum(kept, axis=1)
-    return gain, rank
+    @cached_property
+    def without_poses(self) -> dict[tuple[int, ...], Any]:
+        """Return the sets without effects that were made so far, by the poses left out."""
+        return {}
 
 
 def products_of(columns: Floats, residual: Floats) -> Floats:
@@ -584,11 +318,16 @@ def visible(fit: Fit, tried: Sequence[Candidate]) -> dict[str, float]:
         columns, sizes = outside_of(onto, near.columns_of(each.name, each.factors))
         own = columns.reshape(len(columns), len(each.shapes), -1).swapaxes(0, 1)
         sized = own * sizes.reshape(len(own), 1, -1)
-        seen = _is_seen(np.linalg.eigvalsh(own.swapaxes(1, 2) @ own)).any(axis=1)
+        seen = is_seen(np.linalg.eigvalsh(own.swapaxes(1, 2) @ own)).any(axis=1)
         if np.any(seen):
             squares = np.linalg.eigvalsh(sized.swapaxes(1, 2) @ sized)[seen, -1]
             found[each.name] = math.sqrt(np.max(squares)) * each.entry.typical
     return found
+
+
+def is_seen(squares: Floats) -> NDArray[np.bool_]:
+    """Return which directions of columns are outside of a basis, by their increasing squares."""
+    return (squares > SEEN ** 2) & (squares > SEEN ** 2 * squares[..., -1:])
 
 
 def outside_of(onto: Floats, columns: Floats) -> tuple[Floats, Floats]:
@@ -632,3 +371,101 @@ def _blocks(near: Equations, context: Context, present: Model, tried: Sequence[C
         columns[:, start:start + width] = near.columns_of(each.name, each.factors)
         blocks += each.blocks(start, alike[kind_of(each.name)])
     return tuple(blocks), columns
+
+
+@dataclass(frozen=True)
+class State:
+    """A model fitted to the poses kept."""
+
+    fit: Fit
+
+    @property
+    def model(self) -> Model:
+        """Return the fitted model, ΔR = I."""
+        return self.fit.model
+
+    @property
+    def poses_g(self) -> Poses:
+        """Return the poses kept, in g, with the column ``previous``."""
+        return self.fit.poses_g
+
+    @cached_property
+    def linear(self) -> Linear:
+        """Return the equations with all values of the model projected out, without candidates."""
+        return linearised(self.fit, self.model.effects)
+
+    @property
+    def residual(self) -> Floats:
+        """(m,) array, residuals of the equations with all values fitted."""
+        return self.linear.residual
+
+    @property
+    def rss(self) -> float:
+        """Sum of squared residuals."""
+        return self.linear.base_rss
+
+    @property
+    def held_out(self) -> Floats:
+        """(m,) array, each residual if its own equation is left out of the fit (PRESS)."""
+        return held_out(self.residual, 1.0 - np.sum(self.linear.onto ** 2, axis=1))
+
+    @property
+    def dof(self) -> int:
+        """Return the number of independent equations minus that of fitted values."""
+        return self.linear.dof
+
+    @property
+    def is_noise(self) -> bool:
+        """Return whether noise may explain the residual; True if the noise is not known."""
+        return not self.fit.noise_known or is_noise(self.rss, self.dof)
+
+    def gap_mg(self, residual: Floats) -> float:
+        """Return the RMS over the new poses of (m,) residuals of the equations [mg]."""
+        of_poses = self.fit.equations.of_poses(residual)
+        if 'new' in self.poses_g:
+            of_poses = of_poses[self.poses_g['new'] > 0.0]
+        return float(np.sqrt(np.mean(of_poses ** 2))) * MG
+
+    def mg_of_poses(self, residual: Floats) -> Floats:
+        """Return the (n,) residuals of poses from (m,) residuals of the equations [mg]."""
+        return self.fit.equations.of_poses(residual) * MG
+
+    @property
+    def floor_mg(self) -> float | None:
+        """Return the residual expected of a correct model [mg]; None if the noise is unknown."""
+        if not self.fit.noise_known:
+            return None
+        rows = self.fit.by_pose.rows[self.fit.equations.pose]
+        share = np.sqrt(self.dof / len(rows)) * np.ones(len(rows))
+        return self.gap_mg(share)
+
+
+def is_noise(rss: float, dof: float) -> bool:
+    """Return whether measured noise explains a weighted sum of squares."""
+    from scipy.special import chdtrc
+
+    return bool(dof <= 0 or rss <= _CHI2_RATIO * dof or chdtrc(dof, rss) > _CHI2_LEVEL)
+
+
+def beginning(poses_g: Poses, model: Model) -> State:
+    """Return the state of a base model, fitted to all poses; `NotConvergedError` if that fails."""
+    return State(estimate(model, with_history(poses_g, model)))
+
+
+def fitted_state(model: Model, poses_g: Poses, most: float = np.inf) -> State | None:
+    """Return the state of a model fitted to poses; None without a sound fit below `most`."""
+    try:
+        return State(estimate(model, poses_g, most=most))
+    except NotConvergedError:
+        return None
+
+
+def with_effect(model: Mapping[str, Floats], name: str, values: Floats) -> dict[str, Floats]:
+    """Return the values of a model with one more effect, which replaces those it contains."""
+    contained = included((name,))
+    return {**{key: part for key, part in model.items() if key not in contained}, name: values}
+
+
+def without(poses: Poses, out: Sequence[int] | NDArray[np.intp]) -> Poses:
+    """Return the poses but those at these indices."""
+    return poses.take(np.delete(np.arange(len(poses)), out))

@@ -24,32 +24,24 @@ values of the models are uncertain in them, too, so it is what `refine` will rep
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 import math
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .base import fitted_state, with_effect
-from .sets import LEAST, Near, probabilities
-from .words import condition_words, percent, plan_lines, shown_name, versus
+from .curves import LEAST, Near, probabilities
+from .linear import fitted_state, with_effect
+from .result import ENOUGH, percent, PlannedPose, PosePlan, shown_name, versus
+from .search import Found
+from .sets import Set
 from ..effects import effect_named, Model, WANDER
 from ..estimate import Fit, judge, kinds
 from ..geometry import attitude_words, ATTITUDES, spread_directions
 from ..table import Floats, is_quantity, Poses
-
-if TYPE_CHECKING:
-    from .search import Found
-
-ENOUGH = 0.95
-"""Expected probability of the right effect at which a plan ends."""
-
-NOTHING = (f'there is nothing to separate: no named effect has a rival that leaves it a '
-           f'probability below {100.0 * ENOUGH:.0f} %')
-"""The line of an empty plan."""
 
 VARIED = ('temperature', 'supply_voltage', 'time', 'std')
 """Context that a plan can vary, by column; it can vary quantities, too."""
@@ -82,74 +74,6 @@ _DRAWS, _SEED = 1000, 1
 """Random readings for the expected probability; the same for each plan."""
 
 
-@dataclass(frozen=True)
-class PlannedPose:
-    """
-    One pose of a plan.
-
-    Parameters
-    ----------
-    up : tuple of float
-        Direction to point up, a unit vector in the sensor axes.
-    words : str
-        The same in words.
-    context : mapping of str to float
-        What else to set, by column of `accel_calib.table.COLUMNS`: ``temperature`` [°C],
-        ``supply_voltage`` [V], ``std`` [g], and ``time`` as the wait after the last pose [s].
-    separates : tuple of str
-        The named effect and its rivals.
-    expected : float
-        Expected probability of the right one of them after this pose and those before it.
-
-    """
-
-    up: tuple[float, float, float]
-    words: str
-    context: Mapping[str, float]
-    separates: tuple[str, ...]
-    expected: float
-
-    @property
-    def purpose(self) -> str:
-        """Return what the pose is for."""
-        return f'to separate {versus(self.separates)}'
-
-    @property
-    def conditions(self) -> str:
-        """Return the context in words; empty if the pose can be taken at once."""
-        return condition_words(self.context)
-
-
-@dataclass(frozen=True)
-class PosePlan:
-    """
-    Poses that separate named effects from their rivals soonest.
-
-    Parameters
-    ----------
-    poses : tuple of PlannedPose
-        The poses in the order to take them; empty if there are no rivals, or no pose separates
-        them.
-    lines : tuple of str
-        The plan in words.
-
-    """
-
-    poses: tuple[PlannedPose, ...] = ()
-    lines: tuple[str, ...] = (NOTHING,)
-
-    @property
-    def advice(self) -> tuple[str, ...]:
-        """Return a line about the first pose; empty without poses."""
-        if not self.poses:
-            return ()
-        first, last = self.poses[0], self.poses[-1]
-        where = f', {first.conditions}' if first.conditions else ''
-        return (f'next pose to separate {versus(first.separates)}: {first.words}{where} (1 of '
-                f'{len(self.poses)} poses, with which the expected probability of the right one '
-                f'is {percent(last.expected)})',)
-
-
 def plan_poses(found: Found) -> PosePlan:
     """
     Return at most `MOST_POSES` poses that separate named effects from their rivals soonest.
@@ -157,56 +81,43 @@ def plan_poses(found: Found) -> PosePlan:
     A random walk of the offset cannot be predicted, so it is not planned for.
 
     """
-    near = found.near
-    if near.walk is not None:
+    if found.near.walk is not None:
         return PosePlan()
-    contests = [each for each in (_contest(name, found) for name in near.names) if each]
-    if not contests:
+    rivalries = list(filter(None, (_fits(name, found) for name in found.near.names)))
+    if not rivalries:
         return PosePlan()
-    grid = _Candidates.of(found.final.fit, _varied(contests))
-    return _in_words(contests, grid, _chosen([each.at(grid.poses_g) for each in contests]))
+    grid = _Candidates.of(found.final.fit, _varied({name for each in rivalries for name in each}))
+    contests = [_Contest.of(each, found.near, grid.poses_g) for each in rivalries]
+    return _in_words(contests, grid, _chosen(contests))
 
 
-def variance_of(near: Near) -> float:
-    """Return the variance of a pose in units of its noise, moderated as in the search."""
-    linear, chosen = near.linear, near.chosen
-    left = max(linear.worth + linear.dof - chosen.parameters, 1.0)
-    return max((linear.worth + chosen.rss) / left, 1e-12)
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Contest:
-    """A named effect and its rivals: names, (k,) probabilities, a fit with each, and λ."""
+    """
+    What a named effect and its rivals, k models, predict for c candidates of r equations each.
+
+    `weights` (k,) are the probabilities of the models. The predictions `means` (k, c, r) are in
+    units of √λ. For each model, `rows` (c, r, q) is the derivative by its values, and `spreads`
+    (q, q) their covariance.
+
+    """
 
     names: tuple[str, ...]
     weights: Floats
-    fits: tuple[Fit, ...]
-    variance: float
-
-    def at(self, candidates: Poses) -> _Predictions:
-        """Return what each model predicts for candidates."""
-        each = [judge(fit.model, candidates) for fit in self.fits]
-        count, scale = len(candidates), math.sqrt(self.variance)
-        means = np.array([-fit.residual.reshape(count, -1) for fit in each]) / scale
-        rows = [fit.columns.reshape(count, -1, fit.columns.shape[1]) for fit in each]
-        spreads = tuple(fit.by_pose.spread for fit in self.fits)
-        return _Predictions(means, tuple(rows), spreads, self.weights)
-
-
-@dataclass(frozen=True)
-class _Predictions:
-    """
-    The predictions of k models for c candidates of r equations each, in units of √λ.
-
-    `means` is (k, c, r), and `weights` (k,) the probabilities of the models. For each model,
-    `rows` (c, r, q) is the derivative by its values, and `spreads` (q, q) their covariance.
-
-    """
-
     means: Floats
     rows: tuple[Floats, ...]
     spreads: tuple[Floats, ...]
-    weights: Floats
+
+    @classmethod
+    def of(cls, fits: Mapping[str, tuple[float, Fit]], near: Near, candidates: Poses) -> _Contest:
+        """Return a contest from the probability of each model, and its fit to the poses so far."""
+        weights = np.array([weight for weight, _ in fits.values()])
+        each = [judge(fit.model, candidates) for _, fit in fits.values()]
+        count, scale = len(candidates), math.sqrt(_variance(near.chosen))
+        means = np.array([-fit.residual.reshape(count, -1) for fit in each]) / scale
+        rows = tuple(fit.columns.reshape(count, -1, fit.columns.shape[1]) for fit in each)
+        return cls(tuple(fits), weights, means, rows,
+                   tuple(fit.by_pose.spread for _, fit in fits.values()))
 
     def gains(self, taken: Sequence[int]) -> Floats:
         """Return the (c,) expected change of the log odds by each candidate, after others."""
@@ -255,8 +166,15 @@ def _after(left: Floats, rows: Floats, spread: Floats, taken: list[int]
     return left - np.einsum('crq,jq->jcr', rows, learned), spread - gain @ own @ spread
 
 
-def _contest(name: str, found: Found) -> _Contest | None:
-    """Return a named effect with its rivals, or None if it is certain enough."""
+def _variance(chosen: Set) -> float:
+    """Return the variance of a pose in units of its noise, moderated as in the search."""
+    linear = chosen.linear
+    left = max(linear.worth + linear.dof - chosen.parameters, 1.0)
+    return max((linear.worth + chosen.rss) / left, 1e-12)
+
+
+def _fits(name: str, found: Found) -> dict[str, tuple[float, Fit]]:
+    """Return probability and fit of an effect and its rivals; empty if it is certain enough."""
     fits: dict[str, Fit] = {name: found.final.fit}
     weights = probabilities(name, found.near)
     for rival, weight in weights.items():
@@ -264,32 +182,27 @@ def _contest(name: str, found: Found) -> _Contest | None:
             fit = _fit_of(rival, name, found)
             if fit is not None:
                 fits[rival] = fit
-    parts = np.array([weights[each] for each in fits])
-    parts /= np.sum(parts)
-    if len(fits) < 2 or np.max(parts) >= ENOUGH:
-        return None
-    return _Contest(tuple(fits), parts, tuple(fits.values()), variance_of(found.near))
+    total = sum(weights[each] for each in fits)
+    if len(fits) < 2 or max(weights[each] for each in fits) >= ENOUGH * total:
+        return {}
+    return {each: (weights[each] / total, fit) for each, fit in fits.items()}
 
 
 def _fit_of(rival: str, name: str, found: Found) -> Fit | None:
     """Return the fit with a rival in the place of an effect, or None without a sound fit."""
-    near = found.near
-    own = near.chosen.blocks[near.names.index(name)]
-    others = near.linear.without(near.chosen, own)
-    best = near.linear.best_of(rival, others)
-    chosen = near.linear.extended(others, best)
+    chosen = found.near.chosen
+    others = chosen.without(chosen.blocks[chosen.effects.index(name)])
+    best = others.best_of(rival)
     unchanged = {key: part for key, part in found.final.model.values.items() if key != name}
-    block = near.linear.blocks[best]
     values = with_effect(unchanged, rival, np.concatenate(
-        [near.linear.values_of(chosen)[best], block.shape]))
+        [others.extended(best).values[best], chosen.linear.blocks[best].shape]))
     state = fitted_state(Model(values), found.final.poses_g)
     return None if state is None else state.fit
 
 
-def _varied(contests: Sequence[_Contest]) -> tuple[str, ...]:
-    """Return the columns that the effects in contest are functions of."""
-    needs = {key for contest in contests for name in contest.names
-             for key in effect_named(name).needs}
+def _varied(names: Iterable[str]) -> tuple[str, ...]:
+    """Return the columns that these effects are functions of."""
+    needs = {key for name in names for key in effect_named(name).needs}
     return tuple(key for key in (*VARIED, *sorted(filter(is_quantity, needs))) if key in needs)
 
 
@@ -366,45 +279,40 @@ def _columns(poses_g: Poses, force: Floats, shown: Sequence[Mapping[str, float]]
     return {**found, 'previous': -force}  # turned from the opposite attitude
 
 
-def _chosen(contests: Sequence[_Predictions]) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Return the chosen candidates, and the contest for which each was chosen."""
-    taken: list[int] = []
-    reasons: list[int] = []
-    open_ = set(range(len(contests)))
-    while len(taken) < MOST_POSES:
-        expected = {k: contests[k].expected(taken) for k in open_}
-        open_ = {k for k in open_ if expected[k] < ENOUGH}
-        if not open_:
+def _chosen(contests: Sequence[_Contest]) -> list[tuple[int, _Contest]]:
+    """Return the chosen candidates, each with the contest for which it was chosen."""
+    chosen: list[tuple[int, _Contest]] = []
+    left = list(contests)
+    while len(chosen) < MOST_POSES:
+        taken = [index for index, _ in chosen]
+        expected = [each.expected(taken) for each in left]
+        left = [each for each, right in zip(left, expected, strict=True) if right < ENOUGH]
+        if not left:
             break
-        worst = min(open_, key=lambda k: expected[k])
-        gains = contests[worst].gains(taken)
+        worst = left[int(np.argmin([right for right in expected if right < ENOUGH]))]
+        gains = worst.gains(taken)
         if np.max(gains) < _LEAST_GAIN:
-            open_.remove(worst)
+            left = [each for each in left if each is not worst]
             continue
-        taken.append(int(np.argmax(gains >= _AS_GOOD * np.max(gains))))
-        reasons.append(worst)
-    return tuple(taken), tuple(reasons)
+        chosen.append((int(np.argmax(gains >= _AS_GOOD * np.max(gains))), worst))
+    return chosen
 
 
 def _in_words(contests: Sequence[_Contest], grid: _Candidates,
-              chosen: tuple[tuple[int, ...], tuple[int, ...]]) -> PosePlan:
+              chosen: Sequence[tuple[int, _Contest]]) -> PosePlan:
     """Return the plan of the chosen candidates, in the order to take them."""
-    taken, reasons = chosen
-    order = sorted(range(len(taken)), key=lambda k: _effort(grid.shown[taken[k]]))
-    taken = tuple(taken[k] for k in order)
-    reasons = tuple(reasons[k] for k in order)
-    own = [each.at(grid.poses_g.take(np.array(taken, np.intp))) for each in contests] if (
-        taken) else []
+    ordered = sorted(chosen, key=lambda each: _effort(grid.shown[each[0]]))
+    taken = [index for index, _ in ordered]
     poses = tuple(
         PlannedPose(_triple(grid.up[index]), attitude_words(grid.up[index]), grid.shown[index],
-                    contests[reason].names, own[reason].expected(range(number)))
-        for number, (index, reason) in enumerate(zip(taken, reasons, strict=True), 1))
+                    contest.names, contest.expected(taken[:number]))
+        for number, (index, contest) in enumerate(ordered, 1))
     lines = []
-    for reason, contest in enumerate(contests):
-        expected = own[reason].expected(range(len(taken))) if own else 0.0
+    for contest in contests:
+        expected = contest.expected(taken) if taken else 0.0
         lines += plan_lines(dict(zip(contest.names, contest.weights.tolist(), strict=True)), [
-            (pose.words, pose.conditions) for pose, why in zip(poses, reasons, strict=True)
-            if why == reason], expected, enough=expected >= ENOUGH)
+            (pose.words, pose.conditions) for pose, (_, why) in zip(poses, ordered, strict=True)
+            if why is contest], expected, enough=expected >= ENOUGH)
     return PosePlan(poses, tuple(lines))
 
 
@@ -417,3 +325,41 @@ def _effort(shown: Mapping[str, float]) -> tuple[float, ...]:
 def _triple(vector: Floats) -> tuple[float, float, float]:
     x, y, z = vector.tolist()
     return x, y, z
+
+
+def plan_lines(weights: Mapping[str, float], poses: Sequence[tuple[str, str]], expected: float, *,
+               enough: bool) -> list[str]:
+    """
+    Return the lines about one contest, with the direction and the conditions of each pose.
+
+    `weights` are the probabilities of the named effect and of its rivals. After all poses of the
+    plan, the right one has the probability `expected`; `enough`: more poses are not needed.
+
+    """
+    odds = ', '.join(percent(weight) for weight in weights.values())
+    what = f'to separate {versus(tuple(weights))} ({odds})'
+    end = f'the expected probability of the right one is then {percent(expected)}'
+    if poses:
+        return [f'{what}, take these poses:', *_held(poses), end]
+    if enough:
+        return [f'{what}, the same poses are enough: {end}']
+    return [f'{what}, poses at 1 g do not help; apply other forces (a centrifuge)']
+
+
+def _held(poses: Sequence[tuple[str, str]]) -> Iterator[str]:
+    """Yield one line for each condition; conditions with the same directions share a line."""
+    directions: dict[str, list[str]] = {}
+    for direction, where in poses:
+        directions.setdefault(where, []).append(direction)
+    shared: dict[tuple[str, ...], list[str]] = {}
+    for where, held in directions.items():
+        shared.setdefault(tuple(_counted(held)), []).append(where)
+    for texts, places in shared.items():
+        where = ' and '.join(filter(None, places))
+        yield f'{where + ": " if where else ""}hold {"; ".join(texts)}'
+
+
+def _counted(texts: list[str]) -> list[str]:
+    """Return each text once, with the number of times if there are several."""
+    times = {text: texts.count(text) for text in texts}
+    return [text if count == 1 else f'{text} ({count} poses)' for text, count in times.items()]

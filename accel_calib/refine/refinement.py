@@ -19,31 +19,38 @@ are listed as not testable.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .base import is_noise, sampled, State
-from .calibrations import base_of, beside_stored, Given, refined_calibration, without_orientation
-from .plan import plan_poses, PosePlan
-from .result import (
-    beside_walk, not_testable, Refinement, Stage, steps_of, untestable, Verdict, verdict_of)
+from .base import beside_stored, sampled, with_stored
+from .linear import fitted_state, is_noise, State
+from .plan import plan_poses
+from .result import plain_name, PosePlan, Refinement, Stage, Verdict
 from .search import Found, search
-from .words import advice_for, sample_words
+from .steps import advice_for, beside_walk, not_testable, steps_of, untestable, verdict_of
 from ..calibrate import (
-    Calibration, check_sensor, fit_with_fleet, FLEET, FleetPrior, gated, in_g, only_norm,
-    posterior, quality_of, Rejected, sound_rows, sure_rows, with_history, with_rest_noise)
-from ..effects import Model, MODELS, PROCESSES, with_vector
-from ..errors import RefusedFitError
-from ..estimate import judge, NotConvergedError
-from ..finding import Finding
+    BASES, Calibration, check_sensor, fit_findings, fit_poses, fit_with_fleet, FLEET, FleetPrior,
+    gated, in_g, OF_A_FIT, only_norm, posterior, quality_of, record_of, refuse_if_unfit, Rejected,
+    sound_rows, sure_rows, uncertainty_g, with_history, with_rest_noise)
+from ..effects import CHANGES, included, Model, MODELS, parameter_names, PROCESSES, with_vector
+from ..errors import RefusedFitError, TAKE_ALL_SIDES
+from ..estimate import (
+    fit_sphere, judge, LARGEST_DILUTION, NotConvergedError, outliers, variance_factor)
+from ..finding import Finding, without as without_kinds
 from ..geometry import unit
-from ..table import check_units, Poses
+from ..table import check_units, Floats, Poses
 from ..text import counted
 from ..units import MG, Units
 
 _LEAST_POSES = 4
 """Smallest number of poses in which an effect can be found."""
+
+_ROUNDS = 6
+"""Largest number of fits after which outliers are left out."""
+
+_NAMED = 4
+"""Largest number of undetermined values that are named."""
 
 _BASE = '10'
 
@@ -115,7 +122,10 @@ def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Un
             f'found {counted(len(sound), "pose")} for '
             f'{counted(found.base.linear.onto.shape[1], "parameter")} of the base, expected more '
             'poses to find an effect', 'take 24 poses or more')
-    note = (Finding('note', sample_words(len(poses_g), total)),) if len(poses_g) < total else ()
+    sample = Finding('note', f'the refinement uses {len(poses_g)} of {total} poses, spread evenly '
+                     'over the table, to bound its time and memory; it does not look for '
+                     'disturbed poses among the others; choose rows to use others')
+    note = (sample,) if len(poses_g) < total else ()
     given = Given(poses, poses_g, stored is not None, (*rejected, *unsound), note)
     return _record(calibration, found, given, sensor or poses.sensor, date)
 
@@ -244,3 +254,186 @@ def _of_fit(fitted: Calibration, poses_g: Poses, verdict: Verdict,
         tuple(each.row for each in fitted.rejected), missing, advice, fitted, (), poses_g,
         state.fit.equations.force, (Stage('base', state.mg_of_poses(state.fit.residual)),),
         PosePlan())
+
+
+def base_of(poses: Poses, units: Units, name: str, *, sensor: str = '', date: str = ''
+            ) -> Calibration:
+    """Return the base as a calibration; `sensor`, `date` and errors as in `fit_poses`."""
+    if name not in BASES:
+        raise ValueError(f'base is {name!r}, expected one of {BASES}')
+    if name == 'ideal':
+        return ideal(poses, units)
+    try:
+        return fit_poses(poses, units, model=name, sensor=sensor, date=date)
+    except RefusedFitError:
+        if name == 'auto' and 'orientation' in poses:
+            return ideal(poses, units)
+        raise
+
+
+def ideal(poses: Poses, units: Units) -> Calibration:
+    """Return the ideal sensor; for native readings with a fitted offset and scale."""
+    values: dict[str, Floats] = {}
+    if units.is_native:
+        mat_w, vec_v = fit_sphere(poses.reading)
+        units = Units('native', float(mat_w[0, 0]))
+        values = {'offset': vec_v / units.per_g}
+    poses_g = in_g(poses, units)
+    fit = judge(Model(values), poses_g)
+    return record_of(fit, poses, units, unit(poses_g.reading), 'ideal', 'ml', reason='ideal')
+
+
+def with_changes(model: Model) -> tuple[Model, Floats]:
+    """
+    Return a model with the changes since the stored calibration included in its effects.
+
+    The (q, p) matrix maps the values of `model` to those of the result.
+
+    """
+    effects: list[str] = []
+    for name in sorted(model.effects, key=CHANGES.__contains__):  # the changes last
+        own = plain_name(name)
+        contained = included((own,)).intersection(effects)
+        if contained:
+            effects[effects.index(contained.pop())] = own
+        elif own not in effects and own not in included(effects):
+            effects.append(own)
+    names = parameter_names(tuple(effects))
+    owners = [owner for name in model.effects for owner in _owners(name, effects)]
+    matrix = np.array([[name in owner for owner in owners] for name in names], float)
+    matrix = matrix.reshape(len(names), len(owners))
+    values = with_vector(tuple(effects), matrix @ model.vector).values
+    return Model(values, model.rotation), matrix
+
+
+def _owners(name: str, effects: list[str]) -> list[set[str]]:
+    """Return the names of the values, among those of some effects, that each value adds to."""
+    own = plain_name(name)
+    if own in effects:
+        return [{value} for value in parameter_names((own,))]
+    whole = tuple(effect for effect in effects if own in included((effect,)))
+    return [set(parameter_names(whole))] * len(parameter_names((own,)))
+
+
+def without_orientation(poses: Poses) -> Poses:
+    """Return the poses as poses of unknown orientation."""
+    return Poses({key: values for key, values in poses.columns.items()
+                  if key not in ('reference', 'orientation')}, poses.row)
+
+
+@dataclass(frozen=True)
+class Given:
+    """The input poses, those used [g], whether the base is stored, rejected rows, and notes."""
+
+    poses: Poses
+    poses_g: Poses
+    stored: bool
+    rejected: tuple[Rejected, ...]
+    notes: tuple[Finding, ...]
+
+    @property
+    def joint(self) -> bool:
+        """Whether the poses of the stored calibration are used, too."""
+        return 'new' in self.poses_g
+
+
+def refitted(before: Calibration, poses: Poses, *, sensor: str = '', date: str = ''
+             ) -> Calibration:
+    """
+    Fit the values of a calibration anew to other poses, with the same effects.
+
+    Parameters
+    ----------
+    before : Calibration
+        The calibration; its unit is that of the readings.
+    poses : Poses
+        Poses with the columns that the effects need.
+    sensor, date : str
+        Name of the sensor and date for the result.
+
+    Raises
+    ------
+    RefusedFitError
+        If the poses do not determine the values, or the result is not plausible.
+    InputError
+        If the readings are clearly in another unit.
+
+    """
+    check_units(poses, before.units)
+    sure, doubts = sure_rows(poses)
+    sound, unsound = sound_rows(sure, before.units)
+    poses_g = with_history(in_g(sound, before.units), before.model)
+    lacking = [key for key in before.model.needs if key not in poses_g]
+    if lacking:
+        raise RefusedFitError(f'the poses have no {" or ".join(lacking)}, which the calibration '
+                              'in use corrects for', 'record it, or call ~/reset')
+    given = Given(poses, poses_g, stored=True, rejected=(*doubts, *unsound), notes=())
+    final = _settled(before.model, poses_g)
+    out = [Rejected(int(row), 'outlier', 'outlier') for row in poses_g.row
+           if row not in final.poses_g.row]
+    rejected = tuple(sorted((*given.rejected, *out), key=lambda each: each.row))
+    calibration, refusal = refined_calibration(before, final, (), given, rejected)
+    if refusal:
+        raise RefusedFitError(*refusal)
+    return replace(calibration, reason=before.reason, sensor=sensor or before.sensor, date=date)
+
+
+def _settled(model: Model, poses_g: Poses) -> State:
+    """Return the state of a model fitted to poses without the outliers."""
+    kept, out = poses_g, np.zeros(0, np.intp)
+    for _ in range(_ROUNDS):
+        kept = kept.take(np.setdiff1d(np.arange(len(kept)), out))
+        state = fitted_state(Model(model.values), kept)
+        if state is None:
+            break
+        out = outliers(state.fit, len(poses_g)).poses
+        if not len(out):
+            return state
+    raise RefusedFitError('the effects of the calibration cannot be fitted to these poses, '
+                          'expected a fit that converges', TAKE_ALL_SIDES)
+
+
+def refined_calibration(base: Calibration, final: State, added: tuple[str, ...], given: Given,
+                        rejected: tuple[Rejected, ...]) -> tuple[Calibration, tuple[str, ...]]:
+    """Return the refined calibration, and the refusal if it must not be used."""
+    model, matrix = with_changes(final.model)
+    kept, poses = final.poses_g, given.poses
+    unchanged = final.model.effects == model.effects
+    if given.joint and unchanged and all(key in base.poses for key in model.needs):
+        poses = with_stored(given.poses, base)
+    elif given.joint:
+        kept = kept.take(kept['new'] > 0.0)
+    at_poses = judge(model, kept if base.form.known_orientation
+                     else without_orientation(kept))
+    names = ', '.join(plain_name(name) for name in added)
+    others = without_kinds(base.noted, *OF_A_FIT)
+    findings = [each for each in others if not given.stored or each.kind == 'flat_pose']
+    refined = replace(
+        base, model=Model(model.values, base.model.rotation),
+        covariance=matrix @ final.fit.covariance @ matrix.T,
+        quality=quality_of(at_poses, base.units, unit(at_poses.equations.force)), poses=poses,
+        rejected=rejected, noted=(*given.notes, *findings), method='ml',
+        reason=f'{base.reason}; refined: {names or "nothing added"}')
+    try:
+        return _determined(gated(with_rest_noise(refined, given.poses)), final)
+    except RefusedFitError as refused:
+        return refined, (refused.message, refused.advice)
+
+
+def _determined(refined: Calibration, final: State) -> tuple[Calibration, tuple[str, ...]]:
+    """Return a calibration with findings, or a refusal if the poses do not determine it."""
+    fit = final.fit
+    if refined.name == 'ideal':  # an offset that was not fitted is not zero
+        refuse_if_unfit('4', unit(fit.equations.force))
+    if fit.undetermined:
+        return refined, (f'the poses do not determine {", ".join(fit.undetermined[:_NAMED])}'
+                         f'{", …" if len(fit.undetermined) > _NAMED else ""}',
+                         TAKE_ALL_SIDES)
+    factor = variance_factor(fit.chi2, fit.dof, fit.noise_known)
+    dilution = uncertainty_g(refined) / float(np.median(fit.equations.scale) * np.sqrt(factor))
+    if dilution > LARGEST_DILUTION:
+        return refined, ('the poses do not determine the refined calibration: the error of |a| '
+                         f'is up to {dilution:.3g} times that of a pose, expected less than '
+                         f'{LARGEST_DILUTION:.0f} times',
+                         TAKE_ALL_SIDES)
+    return replace(refined, noted=(*refined.noted, *fit_findings(fit, dilution))), ()

@@ -1,59 +1,41 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The record of a refinement, and its steps from what a search found.
-
-**Where.** Each step states where simulation and measurement disagree without the effect: an
-instant, the ends of the range of a column, or directions of the force.
-
-**Not testable.** Effects that the poses cannot show, and the data to record for them.
-
-"""
+"""The record of a refinement, and its sentences."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
-from itertools import pairwise
-import math
 from typing import Literal
 
 import numpy as np
 
-from .base import fitted_state, is_noise, State, with_effect
-from .curves import is_curve, nearest_effects, steepest
-from .linear import candidates, linearised, visible
-from .plan import PosePlan
-from .search import Found
-from .sets import LEAST, probabilities
-from .words import (
-    change_words, curve_words, direction_words, grid_words, instant_words, limit_words, percent,
-    plain_name, range_words, shown_name)
 from ..calibrate import Calibration
-from ..effects import (
-    CHANGES, effect_named, EFFECTS, included, kind_of, LADDER, Model, parameter_names, PROCESSES,
-    variable_of, WANDER)
-from ..estimate import judge, kinds
-from ..geometry import ATTITUDES
-from ..table import column_of, Floats, Poses, Record
-from ..text import listed, table
-from ..units import MG
-
-MOST_RIVALS = 3
-"""Largest number of rivals of an effect that is called the explanation."""
+from ..effects import CHANGES, COVARIATES, effect_named, kind_of, value_unit, variable_of, WANDER
+from ..table import Floats, is_quantity, Poses, Record
+from ..text import counted, short, table
 
 Verdict = Literal['no_gap', 'explained', 'described', 'unexplained']
 
-_LEAST_VISIBLE = 0.1
-"""Smallest visible change of the residuals by an effect of typical size, relative to the noise."""
 
-_LARGEST = 3
-"""Number of directions that are stated."""
+ENOUGH = 0.95
+"""Expected probability of the right effect at which a plan ends."""
 
-_NEAR = np.cos(np.radians(30.0))
-"""Poses within 30° of a direction count as poses of this direction."""
+NOTHING = (f'there is nothing to separate: no named effect has a rival that leaves it a '
+           f'probability below {100.0 * ENOUGH:.0f} %')
+"""The line of an empty plan."""
+
+_LEAST_P = 1e-16
+
+_VERDICTS = {
+    'no_gap': 'No gap beyond the noise: these poses support no further effect.',
+    'explained': 'The gap is explained: only noise remains beyond the named effects.',
+    'described': 'The gap is described, not explained: only noise remains beyond {}, but its '
+                 'cause is not known.',
+    'unexplained': 'A gap remains that no effect of the catalogue explains.',
+}
 
 
 @dataclass(frozen=True)
@@ -129,6 +111,74 @@ class Stage:
     residual_mg: Floats
 
 
+@dataclass(frozen=True)
+class PlannedPose:
+    """
+    One pose of a plan.
+
+    Parameters
+    ----------
+    up : tuple of float
+        Direction to point up, a unit vector in the sensor axes.
+    words : str
+        The same in words.
+    context : mapping of str to float
+        What else to set, by column of `accel_calib.table.COLUMNS`: ``temperature`` [°C],
+        ``supply_voltage`` [V], ``std`` [g], and ``time`` as the wait after the last pose [s].
+    separates : tuple of str
+        The named effect and its rivals.
+    expected : float
+        Expected probability of the right one of them after this pose and those before it.
+
+    """
+
+    up: tuple[float, float, float]
+    words: str
+    context: Mapping[str, float]
+    separates: tuple[str, ...]
+    expected: float
+
+    @property
+    def purpose(self) -> str:
+        """Return what the pose is for."""
+        return f'to separate {versus(self.separates)}'
+
+    @property
+    def conditions(self) -> str:
+        """Return the context in words; empty if the pose can be taken at once."""
+        return condition_words(self.context)
+
+
+@dataclass(frozen=True)
+class PosePlan:
+    """
+    Poses that separate named effects from their rivals soonest.
+
+    Parameters
+    ----------
+    poses : tuple of PlannedPose
+        The poses in the order to take them; empty if there are no rivals, or no pose separates
+        them.
+    lines : tuple of str
+        The plan in words.
+
+    """
+
+    poses: tuple[PlannedPose, ...] = ()
+    lines: tuple[str, ...] = (NOTHING,)
+
+    @property
+    def advice(self) -> tuple[str, ...]:
+        """Return a line about the first pose; empty without poses."""
+        if not self.poses:
+            return ()
+        first, last = self.poses[0], self.poses[-1]
+        where = f', {first.conditions}' if first.conditions else ''
+        return (f'next pose to separate {versus(first.separates)}: {first.words}{where} (1 of '
+                f'{len(self.poses)} poses, with which the expected probability of the right one '
+                f'is {percent(last.expected)})',)
+
+
 @dataclass(frozen=True, repr=False, eq=False)
 class Refinement(Record):
     """
@@ -202,226 +252,108 @@ class Refinement(Record):
         return (table(head, rows) if rows else '') + lines
 
 
-def verdict_of(found: Found, steps: Sequence[Step], *, refused: bool) -> tuple[Verdict, bool]:
-    """Return the verdict on a search, and whether it is undecided what explains the gap."""
-    residual, _ = beside_walk(found)
-    if found.final.fit.noise_known and not is_noise(float(residual @ residual), found.final.dof):
-        return 'unexplained', False
-    if steps and (refused or any(len(step.rivals) > MOST_RIVALS for step in steps)):
-        return 'unexplained', True
-    if found.curve is not None or found.walk is not None:
-        return 'described', False
-    return 'explained' if steps else 'no_gap', False
+def verdict_words(result: Refinement) -> str:
+    """Return the verdict as a sentence."""
+    walks = any(step.effect == WANDER for step in result.steps)
+    words = _VERDICTS[result.verdict].format(
+        'a slow change of the offset' if walks else 'an empirical curve')
+    if result.undecided:
+        words = _undecided(result)
+    elif result.verdict == 'unexplained' and result.steps:
+        words = ('A gap remains beyond the named effects, and no effect of the catalogue explains '
+                 'it.')
+    if result.noise_floor_mg is None:
+        words += (' The noise of the poses is not known (no std and count), so their scatter is '
+                  'taken as the noise.')
+    return words
 
 
-def steps_of(found: Found, start: State, date: str, *, joint: bool
-             ) -> tuple[tuple[Step, ...], tuple[Stage, ...]]:
-    """
-    Return the steps of a search, and the residuals at each stage.
-
-    The base `start` is as fitted, or as stored at a date; `joint`: its poses are used, too.
-
-    """
-    states = _sequence(found, start)
-    of_output = _output_steps(found)
-    added = [_step(name, pair, found, date, unseen=joint and k == 0)
-             for k, (name, pair) in enumerate(zip(found.added, pairwise(states), strict=False))]
-    steps = (*of_output, *added)
-    names = ('base', *(step.effect for step in steps))
-    at = (*states[:1] * len(of_output), *states)  # limit and grid leave the residuals
-    return steps, tuple(
-        Stage(name, state.mg_of_poses(beside_walk(found)[0] if name == WANDER
-                                      else state.fit.residual))
-        for name, state in zip(names, at, strict=True))
+def _undecided(result: Refinement) -> str:
+    """Return why it is not known what explains a gap."""
+    if result.refusal:
+        why = result.refusal[0]
+    else:
+        most = max(result.steps, key=lambda step: len(step.rivals))
+        why = f'{len(most.rivals)} others explain it about as well as {most.effect}'
+    return f'Not enough poses: they cannot tell what explains the gap, because {why}.'
 
 
-def _sequence(found: Found, start: State) -> list[State]:
-    """Return the initial state and the state after each added effect."""
-    states, values = [start], dict(found.base.model.values)
-    for name in found.added:
-        if name != WANDER:
-            own = found.final.model.values.get(name)
-            values = with_effect(values, name, np.zeros(len(effect_named(name).values))
-                                 if own is None else own)
-            states.append(fitted_state(Model(values), found.base.poses_g) or states[-1])
-    if len(states) > 1:
-        states[-1] = State(judge(found.final.model, states[-1].poses_g))
-    return states if found.added[-1:] != (WANDER,) else [*states, states[-1]]
+def residual_words(result: Refinement) -> str:
+    """Return the residual of the base and of the refined model, and the noise floor."""
+    floor = ('not known' if result.noise_floor_mg is None
+             else f'{short(result.noise_floor_mg)} mg')
+    residual = f'{short(result.gap_mg)} mg'
+    if result.steps:
+        residual = f'{short(result.gap_mg)} -> {short(result.remaining_gap_mg)} mg'
+    poses = result.poses_g
+    count = int(np.sum(poses['new'] > 0.0)) if 'new' in poses else len(poses)
+    return f'residual {residual} over {counted(count, "pose")}, noise floor {floor}'
 
 
-def _step(name: str, states: tuple[State, State], found: Found, date: str, *, unseen: bool
-          ) -> Step:
-    """Return the record of one step; `unseen`: the earlier model was not fitted to the poses."""
-    before, after = states
-    rivals, chances = _rivals(name, found)
-    if name == WANDER:
-        residual, held_out = beside_walk(found)
-        return Step(name, rivals, chances, {}, {}, before.gap_mg(before.residual),
-                    before.gap_mg(residual), before.gap_mg(before.held_out),
-                    before.gap_mg(held_out), _p_value(name, before, found),
-                    _where(name, before, residual), name)
-    effect, first, last = effect_named(name), before.fit.residual, after.fit.residual
-    values = after.model.values.get(name, np.zeros(len(effect.values)))
-    words = _curve(name, before, last) if is_curve(name) else _where(name, before, last)
-    deviations = _deviations(name, after)
-    if name in CHANGES:
-        words = f'{change_words(name, values, [*deviations.values()], date)}; {words}'
-    shown = effect.shown(values)
-    return Step(kind_of(shown_name(name)), rivals, chances, shown,
-                {part: deviations[part] for part in shown if deviations.get(part)},
-                before.gap_mg(first), after.gap_mg(last),
-                before.gap_mg(first if unseen else before.held_out),
-                after.gap_mg(after.held_out), _p_value(name, before, found), words,
-                plain_name(name))
+def base_words(result: Refinement) -> str:
+    """Return the name of the base model."""
+    name = result.calibration.name
+    return 'ideal sensor' if name == 'ideal' else f'model {name}'
 
 
-def _rivals(name: str, found: Found) -> tuple[tuple[str, ...], dict[str, float]]:
-    """Return the rivals of an effect, and the probabilities of it and of those in its place."""
-    own, chances = shown_name(name), dict[str, float]()
-    for other, part in probabilities(name, found.near).items():
-        shown = kind_of(own) if shown_name(other) == own else shown_name(other)
-        chances[shown] = chances.get(shown, 0.0) + part
-    return tuple(other for other, part in chances.items()
-                 if other != kind_of(own) and part > LEAST), chances
+def chance(p_value: float) -> str:
+    """Return the probability that noise alone explains a step."""
+    return f'p < {_LEAST_P:.0e}' if p_value < _LEAST_P else f'p = {p_value:.1g}'
 
 
-def _p_value(name: str, before: State, found: Found) -> float:
-    near = found.near
-    if name == WANDER:
-        return math.exp(-found.walk.likelihood_ratio / 2.0) if found.walk else 1.0
-    if found.curve is not None and name == found.curve.name:
-        return found.curve.p_value
-    if name in near.names:
-        return near.linear.probability(near.chosen, near.chosen.blocks[near.names.index(name)])
-    linear = linearised(before.fit, before.model.effects, candidates(LADDER, before.poses_g))
-    own = [number for number, block in enumerate(linear.blocks) if block.effect == name]
-    return linear.probability(linear.set_of(own), own[0]) if own else 1.0
+def percent(probability: float) -> str:
+    """Return a probability as text; only certainty is 0 or 100 %."""
+    if 0.0 < probability < 0.005:
+        return '< 1 %'
+    return '> 99 %' if 0.995 <= probability < 1.0 else f'{100.0 * probability:.0f} %'
 
 
-def _output_steps(found: Found) -> list[Step]:
-    """Return the steps for readings clipped at a limit or on a grid."""
-    steps = []
-    gap, held_out = found.base.gap_mg(found.base.residual), found.base.gap_mg(found.base.held_out)
-    if found.clipped is not None and found.with_clipped is not None:
-        whole, limit_g = found.with_clipped, found.clipped.limit_g
-        rows = listed('row', whole.poses_g.row[found.clipped.poses].tolist())
-        steps.append(Step('saturation', (), {'saturation': 1.0}, {'limit': limit_g},
-                          {}, whole.gap_mg(whole.residual), gap,
-                          whole.gap_mg(whole.held_out), held_out, 0.0,
-                          limit_words(rows, limit_g), 'saturation'))
-    if found.grid_g is not None:
-        steps.append(Step('quantisation', (), {'quantisation': 1.0}, {'step': found.grid_g}, {},
-                          gap, gap, held_out, held_out, 0.0, grid_words(found.grid_g * MG),
-                          'quantisation'))
-    return steps
+def values_of(step: Step) -> list[tuple[str, str]]:
+    """Return name and text of each value of a step; values in g are given in mg."""
+    effect = effect_named(step.name)
+    values = []
+    for name, value in step.parameters.items():
+        unit_name, scale = value_unit(step.name, name)
+        words = (f'{value * scale:+.3g} {unit_name}'.replace('-', '−')
+                 if name in effect.parameters else f'{value:.5g} {unit_name}'.rstrip())
+        values.append((name, words))
+    return values
 
 
-def beside_walk(found: Found) -> tuple[Floats, Floats]:
-    """Return the final residual without the walk, and the same held out."""
-    final = found.final
-    if found.walk is None:
-        return final.residual, final.held_out
-    return found.walk.residuals(final.linear, final.nothing)
+def plain_name(name: str) -> str:
+    """Return the name of an effect, for a change that of the effect that has changed."""
+    return CHANGES[name].base if name in CHANGES else name
 
 
-def _curve(name: str, before: State, after: Floats) -> str:
-    """Return a description of an empirical curve, given the residuals with it."""
-    share_mg = before.mg_of_poses(before.fit.residual - after)
-    return curve_words(name, float(np.max(np.abs(share_mg))),
-                       steepest(variable_of(name), before.poses_g, share_mg),
-                       nearest_effects(before))
+def shown_name(name: str) -> str:
+    """Return the name of an effect among rivals; a covariate keeps its quantity."""
+    if kind_of(name) in COVARIATES:
+        return f'{kind_of(name)}-{variable_of(name)}'
+    return plain_name(kind_of(name))
 
 
-def _deviations(name: str, state: State) -> dict[str, float]:
-    """Return the standard deviations of the values of an effect of a model; empty without it."""
-    names = parameter_names(state.model.effects)
-    spread = np.sqrt(np.diag(state.fit.covariance)).tolist()
-    return {part: spread[names.index(f'{name}.{part}')] for part in effect_named(name).values
-            if name in state.model.values}
+def versus(names: Sequence[str]) -> str:
+    """Return the words of an effect and its rivals."""
+    first, *others = (shown_name(name) for name in names)
+    return f'{first} from {", ".join(others)}'
 
 
-def _where(name: str, before: State, after: Floats) -> str:
-    """Return where an effect explains the disagreement, given the residuals with it."""
-    share_mg = before.mg_of_poses(before.fit.residual - after)
-    effect = effect_named(name)
-    if name == 'offset_step':
-        return _instant(before.poses_g, share_mg)
-    column = next((key for key in effect.needs if key in before.poses_g and key != 'new'), None)
-    if column is None:
-        return _directions(before.fit.equations.force, share_mg)
-    return _range(column, before.poses_g[column], share_mg)
+def condition_words(context: Mapping[str, float]) -> str:
+    """Return the context of a planned pose in words; empty if the pose can be taken at once."""
+    parts = []
+    if 'temperature' in context:
+        parts.append(f'at {context["temperature"]:.0f} °C')
+    if 'supply_voltage' in context:
+        parts.append(f'at {context["supply_voltage"]:.2f} V')
+    if 'std' in context:
+        parts.append(f'with {1e3 * context["std"]:.2g} mg of vibration')
+    parts += [f'at {key} {value:.4g}' for key, value in context.items() if is_quantity(key)]
+    if context.get('time', 0.0) > 0.0:
+        parts.append(f'{_duration(context["time"])} after the last pose')
+    return ' '.join(parts)
 
 
-def _instant(poses_g: Poses, share_mg: Floats) -> str:
-    """Return a text about the instant of the largest change between successive poses."""
-    order = np.argsort(poses_g['time'], kind='stable')
-    order = order[:int(np.sum(np.isfinite(poses_g['time'])))]
-    time, rows, moved = poses_g['time'][order], poses_g.row[order], share_mg[order]
-    count = np.arange(1, len(moved))
-    sums = np.cumsum(moved ** 2)[:-1]
-    at = int(np.argmax(np.abs(sums / count - (np.sum(moved ** 2) - sums) / (len(moved) - count))))
-    return instant_words((time[at], time[at + 1]), (rows[at], rows[at + 1]))
-
-
-def _range(column: str, values: Floats, share_mg: Floats) -> str:
-    """Return a text about the range of a quantity and the disagreement at both ends."""
-    known = np.isfinite(values.reshape(len(share_mg), -1)).all(axis=1)
-    values, share_mg = values[known], share_mg[known]
-    if values.ndim > 1:
-        values = np.linalg.norm(values, axis=1)
-    order = np.argsort(values, kind='stable')
-    ends = max(1, len(order) // 5)
-    low, high = (float(np.sqrt(np.mean(share_mg[part] ** 2)))
-                 for part in (order[:ends], order[-ends:]))
-    return range_words(column, (values[order[0]], values[order[-1]]), (low, high))
-
-
-def _directions(force: Floats, share_mg: Floats) -> str:
-    """Return a text about the directions with the largest disagreement."""
-    signs, near = np.sign(ATTITUDES), ATTITUDES @ force.T >= _NEAR
-    counts = np.sum(near, axis=1)
-    means = np.where(counts > 0, near @ share_mg / np.maximum(counts, 1), 0.0)
-    return direction_words([(signs[k], means[k], counts[k])
-                            for k in np.argsort(-np.abs(means))[:_LARGEST] if counts[k]],
-                           len(share_mg))
-
-
-def untestable(found: Found, steps: Sequence[Step]) -> tuple[tuple[str, str], ...]:
-    """Return the effects that the poses of a search cannot show, with the data to record."""
-    final = found.final
-    names = tuple(name for name in EFFECTS if name not in final.model.effects)
-    rivals = tuple(rival for step in steps for rival in step.rivals)
-    return not_testable(final.poses_g, visible(final.fit, candidates(names, final.poses_g)),
-                        (*final.model.effects, *rivals))
-
-
-def not_testable(poses_g: Poses, testable: Mapping[str, float], present: tuple[str, ...]
-                 ) -> tuple[tuple[str, str], ...]:
-    """
-    Return the effects that these poses cannot show, with the data to record.
-
-    `testable` are the effects that the poses distinguish from the model, and how visible they
-    are; `present` are the effects of the model and their rivals.
-
-    """
-    missing = []
-    unknown = not len(kinds(poses_g)[0])
-    passed = {*present, *included(present)}
-    for name, effect in {**EFFECTS, **PROCESSES}.items():
-        if name in passed or effect.output is not None or passed & {*effect.includes}:
-            continue
-        if name in testable and (effect.needs or testable[name] > _LEAST_VISIBLE):
-            continue
-        lacking = [', '.join(column_of(key).names) for key in effect.needs if key not in poses_g]
-        if lacking:
-            missing.append((name, ' and '.join(lacking)))
-        elif effect.known_orientation and unknown:
-            missing.append((name, 'ref_x, ref_y, ref_z (known orientation)'))
-        elif name in PROCESSES:
-            continue
-        elif effect.needs:
-            missing.append((name, 'poses with a larger change of this quantity: '
-                            f'{column_of(effect.needs[0]).meaning}'))
-        else:
-            missing.append((name, 'more poses in more directions'))
-    return tuple(missing)
+def _duration(seconds: float) -> str:
+    if seconds < 120.0:
+        return f'{seconds:.0f} s'
+    return f'{seconds / 60.0:.0f} min' if seconds < 7200.0 else f'{seconds / 3600.0:.1f} h'

@@ -27,11 +27,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .base import (
-    beginning, causes, Clipped, fitted_state, is_noise, off_grid, State, unclipped, with_effect)
-from .curves import best_curve, Curve, Process, process_of, SIGNIFICANT, Walk, walk_beside
-from .linear import Candidate, candidates, LEVEL, Linear, linearised, Set
-from .sets import accepted, explored, Near, NOTHING, simpler
+from .base import causes, Clipped, off_grid, unclipped
+from .curves import best_curve, Curve, Near, Process, process_of, SIGNIFICANT, Walk, walk_beside
+from .linear import (
+    beginning, Candidate, candidates, fitted_state, is_noise, Linear, linearised, State,
+    with_effect, without)
+from .sets import accepted, explored, LEVEL, Set, simpler
 from ..calibrate import with_previous
 from ..effects import (
     CHANGES, covariate_names, effect_named, EFFECTS, empirical_parts, included, LADDER, Model,
@@ -61,6 +62,10 @@ _EXACT = 0.05
 
 _LEAST_SHARE = 0.6
 """Part of the residual above the noise that the named effects must explain."""
+
+
+_NOTHING: tuple[frozenset[str], tuple[int, ...], bool] = (frozenset(), (), False)
+"""The key of a choice without effects, outliers and a walk."""
 
 
 @dataclass(frozen=True)
@@ -136,8 +141,7 @@ def _with_own_noise(found: Found, poses_g: Poses, base: Model, also: tuple[str, 
     if 'new' not in poses_g or not found.near.plain.worth or not (found.walk or found.curve):
         return found
     near = found.near
-    beside = near.plain.set_of(near.chosen.blocks, near.chosen.out)
-    onto, residual = near.plain.spanned(beside)
+    onto, residual = near.beside.spanned
     own = 1.0 - np.sum(near.plain.onto ** 2, axis=1) - np.sum(onto ** 2, axis=1)
     new, factor = poses_g['new'] > 0.0, np.ones(len(poses_g))
     for group in (new, ~new):
@@ -147,7 +151,7 @@ def _with_own_noise(found: Found, poses_g: Poses, base: Model, also: tuple[str, 
         return found
     scaled = poses_g.with_columns(std=poses_g['std'] * np.sqrt(factor)[:, np.newaxis])
     again = _search(scaled, base, also)
-    kept = poses_g.take(np.delete(np.arange(len(poses_g)), again.outliers))
+    kept = without(poses_g, again.outliers)
     return replace(again, base=State(judge(again.base.model, kept)),
                    final=State(judge(again.final.model, kept)))
 
@@ -167,7 +171,7 @@ def _search(poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
         force = judge(state.model, poses_g).equations.force
         poses_g = with_previous(poses_g, unit(force))
         state, near = _settled(State(judge(state.model, poses_g)), poses_g, fixed, names)
-    begun = _without(begun, poses_g, np.array(near.chosen.out, np.intp))
+    begun = _fitted_without(begun, poses_g, near.chosen.out)
     state, near, back = _judged(begun, state, near)
     walks = (WANDER,) if near.walk is not None else ()
     named = _end(start, state, (*ladder, *near.names, *walks), near, back, poses_g)
@@ -200,9 +204,8 @@ def _with_one_curve(found: Found, start: State, poses_g: Poses) -> Found:
     curve = None if beside is None else best_curve(beside.final, poses_g, beside.near.chosen.out)
     if beside is None or curve is None:
         return found
-    named, fewer = (found.near.plain.set_of(each.near.chosen.blocks, each.near.chosen.out)
-                    for each in (found, beside))
-    if curve.score < named.score - fewer.score - _SEVERAL * (len(slow) - 1):
+    gained = found.near.beside.score - beside.near.beside.score
+    if curve.score < gained - _SEVERAL * (len(slow) - 1):
         return found
     described = _with_curve(beside, curve, start, poses_g)
     return found if described is None or not described.final.is_noise else described
@@ -210,17 +213,14 @@ def _with_one_curve(found: Found, start: State, poses_g: Poses) -> Found:
 
 def _with_curve(found: Found, curve: Curve, start: State, poses_g: Poses) -> Found | None:
     """Return what was found, with a curve; None if its fit fails or does not explain enough."""
-    kept = np.delete(np.arange(len(poses_g)), curve.out)
     after = fitted_state(Model({**found.final.model.values, curve.name: curve.values}),
-                         poses_g.take(kept))
+                         without(poses_g, curve.out))
     if after is None or after.fit.at_bound or not _explains(found.final, after):
         return None
     out = np.array(curve.out, np.intp)
-    near = found.near
-    near = replace(near, linear=near.plain, walk=None,
-                   chosen=near.plain.set_of(near.chosen.blocks, near.chosen.out))
-    return replace(found, base=_without(start, poses_g, out), final=after, near=near,
-                   walk=None, outliers=out, curve=curve,
+    return replace(found, base=_fitted_without(start, poses_g, curve.out), final=after, walk=None,
+                   near=replace(found.near, walk=None, chosen=found.near.beside), outliers=out,
+                   curve=curve,
                    added=(*(name for name in found.added if name != WANDER), curve.name))
 
 
@@ -230,12 +230,11 @@ def _less(found: Found, names: Collection[str]) -> Found | None:
     state = fitted_state(Model(values), found.final.poses_g) if names else None
     if state is None:
         return None
-    near = found.near
-    blocks = [block for block in near.chosen.blocks
-              if near.linear.blocks[block].effect not in names]
-    return replace(found, final=state, near=replace(
-        near, chosen=near.linear.set_of(blocks, near.chosen.out)),
-        added=tuple(name for name in found.added if name not in names))
+    chosen = found.near.chosen
+    blocks = [block for block, name in zip(chosen.blocks, chosen.effects, strict=True)
+              if name not in names]
+    return replace(found, final=state, near=replace(found.near, chosen=chosen.instead(blocks)),
+                   added=tuple(name for name in found.added if name not in names))
 
 
 def _alone(curve: Curve, found: Found, poses_g: Poses) -> Found | None:
@@ -253,171 +252,161 @@ def _walking(found: Found) -> Found | None:
     near = found.near
     if found.walk is not None or near.process is None:
         return None if found.walk is None else found
-    walk = walk_beside(near.plain, near.plain.set_of(near.chosen.blocks, near.chosen.out),
-                       near.process)
+    walk = walk_beside(near.beside, near.process)
     if walk.likelihood_ratio < SIGNIFICANT:
         return None
-    white = walk.whitened(near.plain)
-    near = replace(near, linear=white, walk=walk,
-                   chosen=white.set_of(near.chosen.blocks, near.chosen.out))
+    near = replace(near, walk=walk, chosen=near.chosen.within(walk.whitened(near.plain)))
     return replace(found, near=near, walk=_walk(found.final, near),
                    added=(*found.added, WANDER))
 
 
 def _is_better(curve: Curve, near: Near) -> bool:
     """Return whether a curve is better than a walk; one over time must be clearly better."""
-    plain = near.plain.set_of(near.chosen.blocks, near.chosen.out)
-    walk = 0.0 if near.walk is None else near.walk.score - plain.score
+    walk = 0.0 if near.walk is None else near.walk.score - near.beside.score
     return curve.score > walk + (_TIMED if empirical_parts(curve.name)[1] == 'time' else 0.0)
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """All poses, the effects of a model that stay, and the effects that are tried beside them."""
+
+    poses_g: Poses
+    fixed: tuple[str, ...]
+    tried: tuple[Candidate, ...]
+
+    def near(self, state: State) -> Linear:
+        """Return the equations near a model."""
+        return linearised(judge(state.model, self.poses_g), self.fixed, self.tried)
+
+    def fitted(self, chosen: Set, state: State, most: float = np.inf) -> State | None:
+        """Return the fit of a set; None without a sound fit below `most`."""
+        model = {name: part for name, part in state.model.values.items() if name in self.fixed}
+        for number, values in chosen.values.items():
+            block = chosen.linear.blocks[number]
+            model = with_effect(model, block.effect, np.concatenate([values, block.shape]))
+        after = fitted_state(Model(model), without(self.poses_g, chosen.out), most)
+        return None if after is None or (chosen.blocks and after.fit.at_bound) else after
 
 
 def _settled(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterable[str], *,
              walks: bool = True) -> tuple[State, Near]:
     """Search and fit in turn until the set remains; return the state, and the set near it."""
-    tried = candidates((name for name in names if name not in fixed), poses_g)
+    trial = _Trial(poses_g, fixed,
+                   candidates((name for name in names if name not in fixed), poses_g))
     settled: Near | None = None
     begun = set(state.model.effects) <= set(fixed) and len(state.poses_g) == len(poses_g)
-    seen = [NOTHING] if begun else []
+    seen = [_NOTHING] if begun else []
     refused: set[frozenset[str]] = set()
+    linear = trial.near(state)
     for _ in range(_ROUNDS):
-        linear = linearised(judge(state.model, poses_g), fixed, tried)
         near = _best_near(linear, poses_g, refused, walks=walks)
         if near.key in seen:
             break
-        near, after = _best_fit(near, state, poses_g, fixed)
+        near, after = _best_fit(near, state, trial)
         if after is None:
             refused.add(frozenset(near.names))
-        else:
-            state, settled = after, near
-            seen.append(near.key)
-            if _is_predicted(near, after):
-                linear = linearised(judge(state.model, poses_g), fixed, tried)
-                break
-    else:
-        linear = linearised(judge(state.model, poses_g), fixed, tried)
-    near = _at(linear, settled or Near(linear, linear.set_of(), None, linear, None), poses_g)
-    return _significant(state, near, poses_g, fixed, tried)
+            continue
+        state, settled, linear = after, near, trial.near(after)
+        seen.append(near.key)
+        if _is_predicted(near, after):
+            break
+    near = _at(linear, settled or Near(Set.of(linear), linear, None, None), poses_g)
+    return _significant(state, near, trial)
 
 
 def _is_predicted(near: Near, fitted: State) -> bool:
     """Return whether the equations were linear enough: near the fit, the same would be found."""
-    plain = near.plain.set_of(near.chosen.blocks, near.chosen.out)
-    error, variance = abs(plain.rss - fitted.rss), fitted.rss / max(fitted.dof, 1)
+    error, variance = abs(near.beside.rss - fitted.rss), fitted.rss / max(fitted.dof, 1)
     return fitted.dof > 0 and error < _EXACT * max(variance, 1.0)
 
 
-def _significant(state: State, near: Near, poses_g: Poses, fixed: tuple[str, ...],
-                 tried: tuple[Candidate, ...]) -> tuple[State, Near]:
+def _significant(state: State, near: Near, trial: _Trial) -> tuple[State, Near]:
     """Remove the effects that are not significant near the fit, one by one."""
     while True:
-        weak = [near.linear.without(near.chosen, block) for block in near.chosen.blocks
-                if near.linear.probability(near.chosen, block) > LEVEL]
+        weak = [near.chosen.without(block) for block in near.chosen.blocks
+                if near.chosen.probability(block) > LEVEL]
         if not weak:
             break
         fewer = replace(near, chosen=max(weak, key=lambda fewer: fewer.score))
-        after = _fitted(fewer, state, poses_g, fixed)
+        after = trial.fitted(fewer.chosen, state)
         if after is None:
             break
-        state = after
-        near = _at(linearised(judge(state.model, poses_g), fixed, tried), fewer, poses_g)
+        state, near = after, _at(trial.near(after), fewer, trial.poses_g)
     return state, near
 
 
-def _best_fit(near: Near, state: State, poses_g: Poses, fixed: tuple[str, ...]
-              ) -> tuple[Near, State | None]:
+def _best_fit(near: Near, state: State, trial: _Trial) -> tuple[Near, State | None]:
     """Return the fit of a set, or of a simpler one whose fit has a better score."""
-    best, after = near, _fitted(near, state, poses_g, fixed)
-    most = -np.inf if after is None else _score_of(near, after)
-    for other in sorted(simpler(near.linear, near.chosen), key=lambda other: -other.score):
-        instead = replace(near, chosen=other)
-        tried = _fitted(instead, state, poses_g, fixed, near.plain.rss_of(most, other))
-        if tried is not None and _score_of(instead, tried) > most:
-            best, after, most = instead, tried, _score_of(instead, tried)
+    def score_of(chosen: Set, fitted: State) -> float:
+        return float(near.plain.score(fitted.rss, chosen.parameters, chosen.charge))
+
+    best, after = near, trial.fitted(near.chosen, state)
+    most = -np.inf if after is None else score_of(near.chosen, after)
+    for other in sorted(simpler(near.chosen), key=lambda other: -other.score):
+        fitted = trial.fitted(other, state,
+                              near.plain.rss_of(most, other.parameters, other.charge))
+        if fitted is not None and score_of(other, fitted) > most:
+            best, after, most = replace(near, chosen=other), fitted, score_of(other, fitted)
     return best, after
-
-
-def _score_of(near: Near, fitted: State) -> float:
-    """Return the score of a set with the residual of its fit."""
-    return near.plain.score(fitted.rss, near.chosen.parameters, near.chosen.charge)
 
 
 def _best_near(linear: Linear, poses_g: Poses, refused: set[frozenset[str]], *, walks: bool
                ) -> Near:
     """Return the best set near a model, with or without a walk."""
     def best_of(problem: Linear) -> Set:
-        return next((chosen for chosen in accepted(problem, explored(problem))
-                     if frozenset(problem.effects_of(chosen)) not in refused), problem.set_of())
+        return next((chosen for chosen in accepted(explored(problem))
+                     if frozenset(chosen.effects) not in refused), Set.of(problem))
 
     process = process_of(linear, poses_g) if walks else None
-    best = Near(linear, best_of(linear), None, linear, process)
-    if linear.worth and not any(_in_time(best)) and _is_all_noise(linear, best.chosen):
+    best = Near(best_of(linear), linear, None, process)
+    if linear.worth and not any(_in_time(best)) and _is_all_noise(best.chosen):
         return best
     return best if process is None else _with_walk(best, process, best_of)
 
 
 def _with_walk(best: Near, process: Process, best_of: Callable[[Linear], Set]) -> Near:
     """Return a set with a walk, if it has a better score than the set without one."""
-    linear, beside = best.plain, best.plain.set_of()
+    linear, beside = best.plain, Set.of(best.plain)
     tried = [beside, best.chosen]
     for _ in range(_WALK_ROUNDS):
-        walk = walk_beside(linear, beside, process)
+        walk = walk_beside(beside, process)
         if walk.likelihood_ratio < SIGNIFICANT:
             break
-        chosen = best_of(walk.whitened(linear))
-        beside = linear.set_of(chosen.blocks, chosen.out)
+        beside = best_of(walk.whitened(linear)).within(linear)
         tried.append(beside)
     most = best.chosen.score
-    if all(_in_time(best)) and not _is_all_noise(linear, best.chosen):
+    if all(_in_time(best)) and not _is_all_noise(best.chosen):
         most -= _TREND  # what changes with time only, and not as known, wanders
     for beside in tried:
-        walk = walk_beside(linear, beside, process)
+        walk = walk_beside(beside, process)
         if walk.likelihood_ratio > SIGNIFICANT and walk.score > most:
-            white, most = walk.whitened(linear), walk.score
-            best = replace(best, linear=white, chosen=white.set_of(beside.blocks, beside.out),
-                           walk=walk)
+            most = walk.score
+            best = replace(best, chosen=beside.within(walk.whitened(linear)), walk=walk)
     return best
 
 
 def _in_time(near: Near) -> list[bool]:
     """Return which of the chosen effects change with time."""
-    return ['time' in near.linear.blocks[block].entry.needs for block in near.chosen.blocks]
+    return ['time' in each.entry.needs for each in near.chosen.entries]
 
 
-def _is_all_noise(linear: Linear, chosen: Set) -> bool:
-    return is_noise(chosen.rss, linear.dof - chosen.parameters)
-
-
-def _fitted(near: Near, state: State, poses_g: Poses, fixed: tuple[str, ...],
-            most: float = np.inf) -> State | None:
-    """Return the fit of a set; None without a sound fit below `most`."""
-    model = {name: part for name, part in state.model.values.items() if name in fixed}
-    for number, values in near.linear.values_of(near.chosen).items():
-        block = near.linear.blocks[number]
-        model = with_effect(model, block.effect, np.concatenate([values, block.shape]))
-    kept = np.delete(np.arange(len(poses_g)), near.chosen.out)
-    after = fitted_state(Model(model), poses_g.take(kept), most)
-    if after is None or (near.chosen.blocks and after.fit.at_bound):
-        return None
-    return after
+def _is_all_noise(chosen: Set) -> bool:
+    return is_noise(chosen.rss, chosen.linear.dof - chosen.parameters)
 
 
 def _at(linear: Linear, near: Near, poses_g: Poses) -> Near:
     """Return a set near its fit; its effects are in the order of their contribution."""
-    blocks = [max(number for number, block in enumerate(linear.blocks) if block.effect == name)
-              for name in near.names]
-    plain = linear.set_of(blocks, near.chosen.out)
-    walk = None if near.walk is None else walk_beside(linear, plain, near.walk.process)
-    problem = linear if walk is None else walk.whitened(linear)
-    whole = problem.set_of(blocks, near.chosen.out)
-    blocks.sort(key=lambda block: -problem.without(whole, block).rss)
-    return Near(problem, problem.set_of(blocks, near.chosen.out), walk, linear,
-                process_of(linear, poses_g))
+    blocks = [int(linear.numbers_of[name][-1]) for name in near.names]
+    plain = Set.of(linear, blocks, near.chosen.out)
+    walk = None if near.walk is None else walk_beside(plain, near.walk.process)
+    whole = plain if walk is None else plain.within(walk.whitened(linear))
+    blocks.sort(key=lambda block: -whole.without(block).rss)
+    return Near(whole.instead(blocks), linear, walk, process_of(linear, poses_g))
 
 
-def _without(state: State, poses_g: Poses, out: NDArray[np.intp]) -> State:
+def _fitted_without(state: State, poses_g: Poses, out: tuple[int, ...]) -> State:
     """Return a model fitted to all poses but these."""
-    kept = np.delete(np.arange(len(poses_g)), out)
-    return fitted_state(state.model, poses_g.take(kept)) or state
+    return fitted_state(state.model, without(poses_g, out)) or state
 
 
 def _visible(state: State, names: Iterable[str]) -> tuple[str, ...]:
@@ -434,7 +423,7 @@ def _judged(begun: State, state: State, near: Near) -> tuple[State, Near, tuple[
         return state, near, ()
     if _explains(begun, state):
         return state, near, ()
-    return begun, replace(near, chosen=near.linear.set_of((), near.chosen.out)), near.names
+    return begun, replace(near, chosen=near.chosen.instead(())), near.names
 
 
 def _explains(before: State, after: State) -> bool:
@@ -446,10 +435,10 @@ def _explains(before: State, after: State) -> bool:
 def _end(start: State, state: State, added: tuple[str, ...], near: Near, back: tuple[str, ...],
          poses_g: Poses) -> Found:
     there = {*state.model.values, *included(state.model.values), WANDER}
-    out = np.array(near.chosen.out, np.intp)
-    base = _without(start, poses_g, out) if out.size else start
-    return Found(base, state, tuple(name for name in added if name in there), out, near,
-                 _walk(state, near), None, back)
+    out = near.chosen.out
+    base = _fitted_without(start, poses_g, out) if out else start
+    return Found(base, state, tuple(name for name in added if name in there),
+                 np.array(out, np.intp), near, _walk(state, near), None, back)
 
 
 def _walk(state: State, near: Near) -> Walk | None:
@@ -457,4 +446,4 @@ def _walk(state: State, near: Near) -> Walk | None:
     if near.walk is None:
         return None
     process = process_of(state.linear, state.poses_g)
-    return None if process is None else walk_beside(state.linear, state.nothing, process)
+    return None if process is None else walk_beside(Set.of(state.linear), process)

@@ -33,7 +33,7 @@ from ..effects import (
     variable_words, with_vector)
 from ..findings import effect_figures, Figure, rate_refinement, residual_figures
 from ..geometry import coverage
-from ..refine.words import verdict_words
+from ..refine import verdict_words
 from ..table import COLUMNS, Floats
 from ..text import counted, milli, percentage, short, signed, with_minus
 from ..units import MG

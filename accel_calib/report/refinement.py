@@ -29,7 +29,7 @@ from .sheet import (
 from ..effects import (
     AXES, CARRIERS, curve_unit, effect_named, EMPIRICAL, empirical_parts, parameter_names,
     variable_words)
-from ..refine.words import base_words, chance, percent, values_of, verdict_words
+from ..refine import base_words, chance, percent, values_of, verdict_words
 from ..table import Floats, Poses
 from ..text import short
 from ..units import MG

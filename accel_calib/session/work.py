@@ -30,8 +30,7 @@ from ..findings import (
     calibration_json, rate, rate_refinement, Rating, rating_json, refinement_json)
 from ..geometry import spread_directions
 from ..pipeline import is_partial, is_refined
-from ..refine import refine, Refinement
-from ..refine.words import residual_words, shown_name, times_typical, verdict_words
+from ..refine import refine, Refinement, residual_words, shown_name, times_typical, verdict_words
 from ..table import Poses
 from ..text import counted, listed, now, plain
 from ..units import MG, Units

@@ -19,7 +19,7 @@ from accel_calib.refine import refine
 from accel_calib.table import Poses
 from accel_calib.units import Units
 from inside import (
-    carried, kinds, Linear, Model, probabilities, rotation_free, scatter_of, search_effects,
+    carried, kinds, Linear, Model, probabilities, rotation_free, scatter_of, search_effects, Set,
     spread_directions, unseen_mistakes)
 import numpy as np
 
@@ -119,8 +119,8 @@ def searched(poses: Poses, units: Units, base: str) -> dict[str, Any]:
     calibration = fit_poses(poses, units, model=base)
     model = Model(calibration.model.values)
     found = search_effects(with_history(in_g(poses, calibration.units), model), model)
-    near, linear, chosen = found.near, found.near.linear, found.near.chosen
-    gain, rank = linear.gains(chosen)
+    near, linear, chosen = found.near, found.near.chosen.linear, found.near.chosen
+    gain, rank = chosen.gains()
     best: dict[str, tuple[float, ...]] = {}
     for k, block in enumerate(linear.blocks):
         each = (float(gain[k]), float(rank[k]), block.tried, float(linear.score(
@@ -133,16 +133,16 @@ def searched(poses: Poses, units: Units, base: str) -> dict[str, Any]:
         'states': [those(each, 'rss dof floor_mg is_noise residual held_out')
                    for each in (found.base, found.final)],
         'chosen': {**those(chosen, 'out rss parameters charge score'), 'names': near.names,
-                   'ranks': _ranks(linear, chosen),
+                   'ranks': _ranks(chosen),
                    'shapes': [linear.blocks[k].shape for k in chosen.blocks]},
         'linear': {**those(linear, 'worth dof base_rss choice penalty poses'),
                    'visible': _visible(linear)},
         'probabilities': {name: probabilities(name, near) for name in near.names}}
 
 
-def _ranks(linear: Linear, chosen: Any) -> tuple[float, ...]:
+def _ranks(chosen: Set) -> tuple[float, ...]:
     """Return the number of values that each block of a set determines beside those before it."""
-    sizes = [len(linear.set_of(chosen.blocks[:count], chosen.out).across)
+    sizes = [len(chosen.instead(chosen.blocks[:count]).across)
              for count in range(len(chosen.blocks) + 1)]
     return tuple(np.diff(sizes).astype(float).tolist())
 

@@ -1,0 +1,388 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The steps of a refinement from what a search found, and advice.
+
+**Where.** Each step states where simulation and measurement disagree without the effect: an
+instant, the ends of the range of a column, or directions of the force.
+
+**Not testable.** Effects that the poses cannot show, and the data to record for them.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+import math
+
+import numpy as np
+
+from .curves import is_curve, LEAST, nearest_effects, probabilities, steepest
+from .linear import candidates, fitted_state, is_noise, linearised, State, visible, with_effect
+from .result import plain_name, shown_name, Stage, Step, Verdict
+from .search import Found
+from .sets import Set
+from ..effects import (
+    CHANGES, effect_named, EFFECTS, EMPIRICAL, empirical_parts, included, is_effect, kind_of,
+    LADDER, Model, parameter_names, PROCESSES, TO_SEPARATE, unit_of, variable_words, WANDER)
+from ..estimate import judge, kinds
+from ..geometry import ATTITUDES, axes_of_signs
+from ..table import column_of, Floats, Poses
+from ..text import counted, listed, with_sd
+from ..units import MG
+
+MOST_RIVALS = 3
+"""Largest number of rivals of an effect that is called the explanation."""
+
+_LEAST_VISIBLE = 0.1
+"""Smallest visible change of the residuals by an effect of typical size, relative to the noise."""
+
+_LARGEST = 3
+"""Number of directions that are stated."""
+
+_NEAR = np.cos(np.radians(30.0))
+"""Poses within 30° of a direction count as poses of this direction."""
+
+_FAR = 10.0
+"""Ratio to the typical size above which there is a remark."""
+
+_FEW = 10
+"""Degrees of freedom below which most effects cannot be detected."""
+
+
+def verdict_of(found: Found, steps: Sequence[Step], *, refused: bool) -> tuple[Verdict, bool]:
+    """Return the verdict on a search, and whether it is undecided what explains the gap."""
+    residual, _ = beside_walk(found)
+    if found.final.fit.noise_known and not is_noise(float(residual @ residual), found.final.dof):
+        return 'unexplained', False
+    if steps and (refused or any(len(step.rivals) > MOST_RIVALS for step in steps)):
+        return 'unexplained', True
+    if found.curve is not None or found.walk is not None:
+        return 'described', False
+    return 'explained' if steps else 'no_gap', False
+
+
+def steps_of(found: Found, start: State, date: str, *, joint: bool
+             ) -> tuple[tuple[Step, ...], tuple[Stage, ...]]:
+    """
+    Return the steps of a search, and the residuals at each stage.
+
+    The base `start` is as fitted, or as stored at a date; `joint`: its poses are used, too.
+
+    """
+    states = _sequence(found, start)
+    of_output = _output_steps(found)
+    added = [_step(name, pair, found, date, unseen=joint and k == 0)
+             for k, (name, pair) in enumerate(zip(found.added, pairwise(states), strict=False))]
+    steps = (*of_output, *added)
+    names = ('base', *(step.effect for step in steps))
+    at = (*states[:1] * len(of_output), *states)  # limit and grid leave the residuals
+    return steps, tuple(
+        Stage(name, state.mg_of_poses(beside_walk(found)[0] if name == WANDER
+                                      else state.fit.residual))
+        for name, state in zip(names, at, strict=True))
+
+
+def _sequence(found: Found, start: State) -> list[State]:
+    """Return the initial state and the state after each added effect."""
+    states, values = [start], dict(found.base.model.values)
+    for name in found.added:
+        if name != WANDER:
+            own = found.final.model.values.get(name)
+            values = with_effect(values, name, np.zeros(len(effect_named(name).values))
+                                 if own is None else own)
+            states.append(fitted_state(Model(values), found.base.poses_g) or states[-1])
+    if len(states) > 1:
+        states[-1] = State(judge(found.final.model, states[-1].poses_g))
+    return states if found.added[-1:] != (WANDER,) else [*states, states[-1]]
+
+
+def _step(name: str, states: tuple[State, State], found: Found, date: str, *, unseen: bool
+          ) -> Step:
+    """Return the record of one step; `unseen`: the earlier model was not fitted to the poses."""
+    before, after = states
+    rivals, chances = _rivals(name, found)
+    first, last, held_out = before.fit.residual, after.fit.residual, after.held_out
+    first_held_out = first if unseen else before.held_out
+    if name == WANDER:
+        first, first_held_out = before.residual, before.held_out
+        last, held_out = beside_walk(found)
+    effect, words = effect_named(name), _where(name, before, last)
+    values = after.model.values.get(name, np.zeros(len(effect.values)))
+    deviations = _deviations(name, after)
+    if name in CHANGES:
+        words = f'{_change(name, values, [*deviations.values()], date)}; {words}'
+    shown = effect.shown(values)
+    return Step(kind_of(shown_name(name)), rivals, chances, shown,
+                {part: deviations[part] for part in shown if deviations.get(part)},
+                before.gap_mg(first), after.gap_mg(last),
+                before.gap_mg(first_held_out), after.gap_mg(held_out),
+                _p_value(name, before, found), words, plain_name(name))
+
+
+def _rivals(name: str, found: Found) -> tuple[tuple[str, ...], dict[str, float]]:
+    """Return the rivals of an effect, and the probabilities of it and of those in its place."""
+    own, chances = shown_name(name), dict[str, float]()
+    for other, part in probabilities(name, found.near).items():
+        shown = kind_of(own) if shown_name(other) == own else shown_name(other)
+        chances[shown] = chances.get(shown, 0.0) + part
+    return tuple(other for other, part in chances.items()
+                 if other != kind_of(own) and part > LEAST), chances
+
+
+def _p_value(name: str, before: State, found: Found) -> float:
+    near = found.near
+    if name == WANDER:
+        return math.exp(-found.walk.likelihood_ratio / 2.0) if found.walk else 1.0
+    if found.curve is not None and name == found.curve.name:
+        return found.curve.p_value
+    if name in near.names:
+        return near.chosen.probability(near.chosen.blocks[near.names.index(name)])
+    linear = linearised(before.fit, before.model.effects, candidates(LADDER, before.poses_g))
+    own = [number for number, block in enumerate(linear.blocks) if block.effect == name]
+    return Set.of(linear, own).probability(own[0]) if own else 1.0
+
+
+def _output_steps(found: Found) -> list[Step]:
+    """Return the steps for readings clipped at a limit or on a grid."""
+    steps = []
+    gap, held_out = found.base.gap_mg(found.base.residual), found.base.gap_mg(found.base.held_out)
+    if found.clipped is not None and found.with_clipped is not None:
+        whole, limit_g = found.with_clipped, found.clipped.limit_g
+        rows = listed('row', whole.poses_g.row[found.clipped.poses].tolist())
+        where = f'in {rows}: an axis reads {limit_g:.4g} g and its samples hardly scatter'
+        steps.append(Step('saturation', (), {'saturation': 1.0}, {'limit': limit_g},
+                          {}, whole.gap_mg(whole.residual), gap,
+                          whole.gap_mg(whole.held_out), held_out, 0.0, where, 'saturation'))
+    if found.grid_g is not None:
+        step_mg = found.grid_g * MG
+        where = (f'pose means are multiples of {step_mg:.3g} mg, which causes '
+                 f'{step_mg / np.sqrt(12.0):.2g} mg RMS per axis')
+        steps.append(Step('quantisation', (), {'quantisation': 1.0}, {'step': found.grid_g}, {},
+                          gap, gap, held_out, held_out, 0.0, where, 'quantisation'))
+    return steps
+
+
+def beside_walk(found: Found) -> tuple[Floats, Floats]:
+    """Return the final residual without the walk, and the same held out."""
+    final = found.final
+    if found.walk is None:
+        return final.residual, final.held_out
+    return found.walk.residuals(Set.of(final.linear))
+
+
+def _curve(name: str, before: State, share_mg: Floats) -> str:
+    """Return what an empirical curve changes, and the known effects that are most similar."""
+    carrier, variable, _ = empirical_parts(name)
+    whole, _, part = carrier.partition('.')
+    what = 'size of the force' if whole == 'force' else whole.replace('_', '-')
+    words = (f'the {what}{f" of {part}" if part else ""} changes with {variable_words(variable)} '
+             f'by up to {np.max(np.abs(share_mg)):.2g} mg')
+    steep = steepest(variable, before.poses_g, share_mg)
+    if steep is not None:
+        words += (f', most between {steep[0]:.4g} and {steep[1]:.4g} '
+                  f'{column_of(variable).unit}').rstrip()
+    nearest = [f'{effect} (leaves {left:.2g} mg)'
+               for effect, left in nearest_effects(before).items()]
+    return words + (f'; no known effect has this form, the nearest are {", ".join(nearest)}'
+                    if nearest else '')
+
+
+def _deviations(name: str, state: State) -> dict[str, float]:
+    """Return the standard deviations of the values of an effect of a model; empty without it."""
+    names = parameter_names(state.model.effects)
+    spread = np.sqrt(np.diag(state.fit.covariance)).tolist()
+    return {part: spread[names.index(f'{name}.{part}')] for part in effect_named(name).values
+            if name in state.model.values}
+
+
+def _where(name: str, before: State, after: Floats) -> str:
+    """Return where an effect explains the disagreement, given the residuals with it."""
+    share_mg = before.mg_of_poses(before.fit.residual - after)
+    if is_curve(name):
+        return _curve(name, before, share_mg)
+    if name == 'offset_step':
+        return _instant(before.poses_g, share_mg)
+    column = next((key for key in effect_named(name).needs
+                   if key in before.poses_g and key != 'new'), None)
+    if column is None:
+        return _directions(before.fit.equations.force, share_mg)
+    return _range(column, before.poses_g[column], share_mg)
+
+
+def _instant(poses_g: Poses, share_mg: Floats) -> str:
+    """Return a text about the instant of the largest change between successive poses."""
+    order = np.argsort(poses_g['time'], kind='stable')
+    order = order[:int(np.sum(np.isfinite(poses_g['time'])))]
+    time, rows, moved = poses_g['time'][order], poses_g.row[order], share_mg[order]
+    count = np.arange(1, len(moved))
+    sums = np.cumsum(moved ** 2)[:-1]
+    at = int(np.argmax(np.abs(sums / count - (np.sum(moved ** 2) - sums) / (len(moved) - count))))
+    return (f'between {time[at]:.6g} and {time[at + 1]:.6g} s (rows {rows[at]} and '
+            f'{rows[at + 1]})')
+
+
+def _range(column: str, values: Floats, share_mg: Floats) -> str:
+    """Return a text about the range of a quantity and the disagreement at both ends."""
+    known = np.isfinite(values.reshape(len(share_mg), -1)).all(axis=1)
+    values, share_mg = values[known], share_mg[known]
+    if values.ndim > 1:
+        values = np.linalg.norm(values, axis=1)
+    order = np.argsort(values, kind='stable')
+    ends = max(1, len(order) // 5)
+    low, high = (float(np.sqrt(np.mean(share_mg[part] ** 2)))
+                 for part in (order[:ends], order[-ends:]))
+    span = f'{values[order[0]]:.4g} to {values[order[-1]]:.4g} {unit_of(column)}'.rstrip()
+    return (f'over {column.replace("_", " ")} {span}: {low:.2g} mg RMS in the lowest fifth of the '
+            f'poses, {high:.2g} mg in the highest')
+
+
+def _directions(force: Floats, share_mg: Floats) -> str:
+    """Return a text about the directions with the largest disagreement."""
+    signs, near = np.sign(ATTITUDES), ATTITUDES @ force.T >= _NEAR
+    counts = np.sum(near, axis=1)
+    means = np.where(counts > 0, near @ share_mg / np.maximum(counts, 1), 0.0)
+    largest = [k for k in np.argsort(-np.abs(means))[:_LARGEST] if counts[k]]
+    return 'with ' + ', '.join(
+        f'{axes_of_signs(signs[k])} up ({means[k]:+.2g} mg over {counts[k]} of {len(share_mg)} '
+        'poses)' for k in largest)
+
+
+def untestable(found: Found, steps: Sequence[Step]) -> tuple[tuple[str, str], ...]:
+    """Return the effects that the poses of a search cannot show, with the data to record."""
+    final = found.final
+    names = tuple(name for name in EFFECTS if name not in final.model.effects)
+    rivals = tuple(rival for step in steps for rival in step.rivals)
+    return not_testable(final.poses_g, visible(final.fit, candidates(names, final.poses_g)),
+                        (*final.model.effects, *rivals))
+
+
+def not_testable(poses_g: Poses, testable: Mapping[str, float], present: tuple[str, ...]
+                 ) -> tuple[tuple[str, str], ...]:
+    """
+    Return the effects that these poses cannot show, with the data to record.
+
+    `testable` are the effects that the poses distinguish from the model, and how visible they
+    are; `present` are the effects of the model and their rivals.
+
+    """
+    missing = []
+    unknown = not len(kinds(poses_g)[0])
+    passed = {*present, *included(present)}
+    for name, effect in {**EFFECTS, **PROCESSES}.items():
+        if name in passed or effect.output is not None or passed & {*effect.includes}:
+            continue
+        if name in testable and (effect.needs or testable[name] > _LEAST_VISIBLE):
+            continue
+        lacking = [', '.join(column_of(key).names) for key in effect.needs if key not in poses_g]
+        if lacking:
+            missing.append((name, ' and '.join(lacking)))
+        elif effect.known_orientation and unknown:
+            missing.append((name, 'ref_x, ref_y, ref_z (known orientation)'))
+        elif name in PROCESSES:
+            continue
+        elif effect.needs:
+            missing.append((name, 'poses with a larger change of this quantity: '
+                            f'{column_of(effect.needs[0]).meaning}'))
+        else:
+            missing.append((name, 'more poses in more directions'))
+    return tuple(missing)
+
+
+def _change(name: str, values: Floats, deviations: Sequence[float], date: str) -> str:
+    """Return the change of values since a stored calibration of a date, with uncertainties."""
+    effect = effect_named(CHANGES[name].base)
+    scale, unit_name = (1e3, 'mg') if effect.is_offset else (100.0, '%')
+    shown = ', '.join(f'{"+" if value > 0.0 else ""}{with_sd(value * scale, sd * scale)}'
+                      for value, sd in zip(values.tolist(), deviations, strict=True))
+    since = f' since {date[:10]}' if date else ''
+    return f'the {effect.words} has changed by ({shown}) {unit_name}{since}'
+
+
+def advice_for(found: Found, steps: tuple[Step, ...], untestable: tuple[tuple[str, str], ...],
+               left_out: int, *, unexplained: bool = False) -> tuple[str, ...]:
+    """
+    Return advice for the user, one line each.
+
+    `untestable` are the effects that the data cannot show, and the data to record for them;
+    `left_out` is the number of poses that were left out; `unexplained`: a gap remains.
+
+    """
+    lines = [*_other_sensor(found), *_unseen_turn(found)]
+    lines += [_separating(step) for step in steps if step.rivals]
+    lines += [line for step in steps for line in _remarks(step)]
+    if left_out:
+        were, them = ('was', 'it') if left_out == 1 else ('were', 'them')
+        lines.append(f'{counted(left_out, "pose")} {were} left out; take {them} again')
+    if found.base.dof < _FEW:
+        lines.append(f'{counted(len(found.base.poses_g), "pose")} leave '
+                     f'{counted(found.base.dof, "degree")} of freedom, which is too few to detect '
+                     'most effects: take 24 poses or more')
+    if unexplained:
+        lines += _unexplained(found, untestable)
+    return tuple(lines)
+
+
+def _unexplained(found: Found, untestable: tuple[tuple[str, str], ...]) -> list[str]:
+    final, nearest = found.final, ''
+    if not found.taken_back and found.curve is None and WANDER not in found.added:
+        return [f'poses repeat {np.sqrt(final.rss / final.dof):.1f} times worse than their '
+                'samples, and the scatter has no structure: clamp the sensor, let it settle '
+                'longer']
+    if found.taken_back:
+        nearest = f'; {", ".join(found.taken_back)} would explain only a part'
+    lines = [f'a gap remains that no effect testable with these data explains{nearest}: check '
+             'what differs between the poses, and repeat some of them']
+    columns = sorted({needs for effect, needs in untestable if effect_named(effect).needs})
+    if columns:
+        lines.append(f'record {"; ".join(columns)}: their effects cannot be tested yet')
+    return lines
+
+
+def _other_sensor(found: Found) -> list[str]:
+    """Return a line if the changes are too large for one sensor."""
+    for name, values in found.final.model.values.items():
+        if name in CHANGES and np.max(np.abs(values)) > CHANGES[name].repeatable_g:
+            return ['this is probably another sensor: its '
+                    f'{CHANGES[name].base} differs from the stored one by '
+                    f'{np.max(np.abs(values)):.2g} {CHANGES[name].unit}, which is too much for '
+                    'one sensor; fit a new calibration from its own poses']
+    return []
+
+
+def _unseen_turn(found: Found) -> list[str]:
+    """Return a line if the sensor may have turned since the stored calibration, unseen."""
+    poses_g = found.base.poses_g
+    if 'new' not in poses_g or 'reference' in poses_g:
+        return []
+    return ['a mount that has turned since the calibration cannot show: only |force| = 1 g is '
+            'known; take poses of known orientation (ref_x, ref_y, ref_z) with both']
+
+
+def _separating(step: Step) -> str:
+    families = {effect_named(name).family for name in (step.name, *step.rivals)
+                if is_effect(name)}
+    family = families.pop() if len(families) == 1 else ''
+    return (f'{step.effect} cannot be distinguished from {", ".join(step.rivals)} here: '
+            f'{TO_SEPARATE[family]}')
+
+
+def times_typical(step: Step) -> float:
+    """Return the largest value of an effect relative to that of typical parts; 0: not known."""
+    if step.effect == EMPIRICAL:
+        return 0.0
+    effect = effect_named(step.name)
+    return max((abs(step.parameters.get(name, 0.0)) for name in effect.parameters),
+               default=0.0) / effect.typical
+
+
+def _remarks(step: Step) -> list[str]:
+    """Return a remark on values that are far larger than in common parts."""
+    times = times_typical(step)
+    if times <= _FAR:
+        return []
+    effect = effect_named(step.name)
+    return [f'{step.effect} is {times * effect.typical:.2g} {effect.unit}, typical parts have '
+            f'about {effect.typical:.2g}: check that the sensor causes it, and not the setup']
