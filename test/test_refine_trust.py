@@ -16,7 +16,8 @@ from accel_calib.table import Poses
 from accel_calib.units import units_of
 import generator
 from inside import (
-    advice_for, main, Model, model_with, search_effects, simulate_poses, verdict_words)
+    advice_for, main, Model, model_with, rotation_from_rpy, search_effects, simulate_poses,
+    verdict_words)
 import numpy as np
 import pandas as pd
 import pytest
@@ -383,6 +384,28 @@ def test_a_mount_that_turned_is_named_where_the_orientation_is_known(seed):
     blind = fit_poses(taken(30, known=False), G)
     assert any('mount that has turned' in line
                for line in refine(taken(30, turn, known=False), G, base=blind).advice)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_mount_that_turned_by_two_degrees_has_no_change_of_gain(seed):
+    rng = np.random.default_rng([89, seed])
+    angles = np.radians(2.0) * random_directions(1, rng)[0]
+    turn, model = rotation_from_rpy(*angles), with_effects(rng)
+
+    def taken(count, model, rotation):
+        up = random_directions(count, rng)
+        return poses_of(model, rng, up @ rotation.T).with_columns(reference=up)
+
+    base = fit_poses(taken(30, model, np.eye(3)), G)
+    turned = taken(30, model, turn)
+    found = refine(turned, G, base=base)
+    assert [step.effect for step in found.steps] == ['misalignment']
+    assert found.verdict == 'explained'
+    mat_w = model.linear_part[0]
+    np.testing.assert_allclose(found.calibration.gain, mat_w @ turn, atol=1e-3)
+    stretched = Model({**model.values, 'axis_gain': model.values['axis_gain'] + [4e-3, -3e-3, 0]})
+    both = refine(taken(30, stretched, turn), G, base=base)
+    assert {'misalignment', 'axis_gain'} <= {step.effect for step in both.steps}
 
 
 @pytest.mark.parametrize('noisier', [2.0, 4.0])

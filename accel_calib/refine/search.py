@@ -35,8 +35,8 @@ from .linear import (
 from .sets import accepted, explored, LEVEL, Set, simpler
 from ..calibrate import with_previous
 from ..effects import (
-    CHANGES, covariate_names, effect_named, EFFECTS, empirical_parts, included, LADDER, Model,
-    WANDER)
+    CHANGES, covariate_names, effect_named, EFFECTS, empirical_parts, included, LADDER,
+    linear_values, Model, parameter_names, WANDER)
 from ..estimate import judge, kinds
 from ..geometry import unit
 from ..table import Poses
@@ -434,11 +434,42 @@ def _explains(before: State, after: State) -> bool:
 
 def _end(start: State, state: State, added: tuple[str, ...], near: Near, back: tuple[str, ...],
          poses_g: Poses) -> Found:
-    there = {*state.model.values, *included(state.model.values), WANDER}
+    there = {*state.model.values, *included(state.model.values), WANDER} - _of_a_turn(state)
     out = near.chosen.out
     base = _fitted_without(start, poses_g, out) if out else start
     return Found(base, state, tuple(name for name in added if name in there),
                  np.array(out, np.intp), near, _walk(state, near), None, back)
+
+
+def _of_a_turn(state: State) -> set[str]:
+    """
+    Return the changes of gains that a mount that has turned explains.
+
+    With W and its change C, the sensor reads (W + C) u, or W R u if it has turned by R. R is
+    linear in its angles only to first order; the rest of W R - W is a symmetric change. R is that
+    of W⁻¹ (W + C) = R P, and the changes are compared with it within their covariance. The fit
+    does not depend on what is named.
+
+    """
+    from scipy.special import chdtri
+
+    values = {CHANGES[name].base: part for name, part in state.model.values.items()
+              if name in CHANGES}
+    gains = [name for name in state.model.values if name in CHANGES
+             and not effect_named(CHANGES[name].base).is_offset
+             and not CHANGES[name].known_orientation]
+    if not gains or not any(effect_named(name).known_orientation for name in values):
+        return set()
+    mat_w, mat_c = state.model.linear_part[0], Model(values).linear_part[0] - np.eye(3)
+    left, _, right = np.linalg.svd(np.eye(3) + np.linalg.solve(mat_w, mat_c))
+    turned = linear_values(np.eye(3) + mat_w @ (left @ right - np.eye(3)), np.zeros(3))
+    names = parameter_names(state.model.effects)
+    index = [names.index(f'{name}.{part}') for name in gains
+             for part in effect_named(name).parameters]
+    away = np.concatenate([state.model.values[name] - turned[CHANGES[name].base]
+                           for name in gains])
+    chi2 = away @ np.linalg.solve(state.fit.covariance[np.ix_(index, index)], away)
+    return set(gains) if chi2 < chdtri(len(away), LEVEL) else set()
 
 
 def _walk(state: State, near: Near) -> Walk | None:
