@@ -4,23 +4,24 @@
 """
 The estimator: from poses and a list of effects to values. `calibrate` and `refine` use it.
 
-`equations` sets up the equations of the poses. `fit` minimises the residuals and computes the
-covariance. `outliers` finds outliers and defines the weight of the measured noise. `robust` fits
-without gross outliers, and finds mistakes that the poses do not locate or show. `closed_form`
-computes start values. `geometry` computes what poses determine before any fit.
+`equations` sets up the equations of the poses, with the weight of the measured noise. `fit`
+minimises the residuals and computes the covariance. `outliers` fits without outliers, and finds
+mistakes that the poses do not locate or show. `closed_form` computes start values. `geometry`
+computes what poses determine before any fit.
 
 """
 
 from .closed_form import (
-    closed_form, faces, fit_12, fit_sphere, lower_triangular, sensing_axes, TIES)
-from .equations import believable, Equations, kinds, originals
-from .fit import estimate, Fit, judge, NotConvergedError, Point, Prior, solve
+    closed_form, faces, fit_12, fit_sphere, lower_triangular, sensing_axes, start_of, TIES)
+from .equations import believable, Equations, kinds, originals, variance_factor
+from .fit import by_pose, estimate, Fit, judge, NotConvergedError, Point, Prior, solve
 from .geometry import (
     Combination, dilution, error_left_in, free_parameters, Identifiability, identifiability,
     information_of, LARGEST_DILUTION, left_out, NORM_MODELS, over_the_sphere, pose_noise,
     poses_needed, relative_weights, rows_of, WEAK_DILUTION)
-from .outliers import by_pose, LARGEST_SHARE, outliers_among, variance_factor
-from .robust import covariance_with, fit_norm, outliers, Rival, rivals, start_of, unseen_mistakes
+from .outliers import (
+    covariance_with, fit_norm, LARGEST_SHARE, outliers, outliers_among, Rival, rivals,
+    unseen_mistakes)
 
 __all__ = ['LARGEST_DILUTION', 'LARGEST_SHARE', 'NORM_MODELS', 'TIES', 'WEAK_DILUTION',
            'Combination', 'Equations', 'Fit', 'Identifiability', 'NotConvergedError', 'Point',

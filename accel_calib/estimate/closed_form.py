@@ -48,13 +48,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
+from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..effects import MODELS, parameter_names, with_linear_part, with_vector
+from .equations import believable
+from ..effects import linear_values, Model, MODELS, parameter_names, with_linear_part, with_vector
 from ..errors import RefusedFitError
-from ..table import Floats
+from ..table import Floats, Poses
 from ..text import counted
 
 _RIDGE = 1e-12
@@ -216,6 +219,15 @@ def _stepped(values: Floats, step: Floats) -> tuple[Floats, Floats]:
     return (axes / np.sqrt(squared)) @ axes.T, centre
 
 
+_MOST_SUBSETS = 400
+"""Largest number of subsets that are fitted."""
+
+_SPARE = 3
+"""Number of poses in a random subset beyond the free parameters."""
+
+_CONCENTRATIONS = 3
+"""Number of closed forms after each of which the nearest poses are selected again."""
+
 _FACE_COSINE = np.cos(np.radians(20.0))
 """A reading within 20° of a sensor axis is one of the six faces."""
 
@@ -249,6 +261,56 @@ def fit_sphere(reading: Floats) -> tuple[Floats, Floats]:
     third = (r @ np.sum(r * r, axis=-2)[..., np.newaxis])[..., 0]
     centre, radius = sphere_of(r @ r.swapaxes(-1, -2), third, r.shape[-1])
     return radius[..., np.newaxis, np.newaxis] * _IDENTITY, mean + centre
+
+
+def start_of(name: str, reading: Floats) -> Model:
+    """Return start values by the closed form; a sphere if the poses are not on an ellipsoid."""
+    mat_w, vec_v = closed_form(name, reading)
+    if not np.all(np.isfinite(mat_w)):
+        mat_w, vec_v = closed_form('4', reading)
+    values = linear_values(mat_w, vec_v)
+    return Model({effect: values[effect] for effect in MODELS[name].effects})
+
+
+def agreeing(name: str, poses_g: Poses, most: int) -> NDArray[np.intp]:
+    """Return the indices of all poses but `most`, selected so that they agree best."""
+    count = len(poses_g)
+    reading = poses_g.reading
+    noise = believable(poses_g.noise)
+    noise = np.ones_like(reading) if noise is None else noise
+    nearest = _subsets(count, most, len(parameter_names(MODELS[name].effects)))
+    for _ in range(_CONCENTRATIONS):
+        squared = _squared_distances(name, reading, nearest, noise)
+        nearest = np.argsort(squared, axis=1)[:, :count - most]
+        trimmed = np.take_along_axis(squared, nearest, axis=1).sum(axis=1)
+        nearest = nearest[np.argsort(trimmed)[:10]]
+    return np.sort(nearest[0])
+
+
+def _subsets(count: int, most: int, free: int) -> NDArray[np.intp]:
+    """Return all subsets of count - most poses, or `_MOST_SUBSETS` random subsets."""
+    if comb(count, most) <= _MOST_SUBSETS:
+        out = np.array(list(combinations(range(count), most)))
+        inside = np.ones((len(out), count), bool)
+        np.put_along_axis(inside, out, False, axis=1)
+        return np.nonzero(inside)[1].reshape(len(out), -1)
+    size = min(free + _SPARE, count - most)
+    rng = np.random.default_rng(count)
+    return np.argsort(rng.random((_MOST_SUBSETS, count)), axis=1)[:, :size]
+
+
+def _squared_distances(name: str, reading: Floats, subsets: NDArray[np.intp], noise: Floats
+                       ) -> Floats:
+    """Return the (s, n) squared distances of all poses from the closed form of each subset."""
+    with np.errstate(all='ignore'):  # some subsets are not on an ellipsoid, or are in a plane
+        mat_w, vec_v = closed_form(name, reading[subsets])
+        sound = np.isfinite(mat_w).all(axis=(1, 2)) & (np.abs(np.linalg.det(mat_w)) > 0.0)
+        inverse = np.linalg.inv(np.where(sound[:, np.newaxis, np.newaxis], mat_w, np.eye(3)))
+        u = (reading - vec_v[:, np.newaxis]) @ np.swapaxes(inverse, 1, 2)
+        length = np.linalg.norm(u, axis=2)
+        along = (u / length[:, :, np.newaxis]) @ inverse
+        squared = (length - 1.0) ** 2 / np.sum((along * noise) ** 2, axis=2)
+    return np.where(sound[:, np.newaxis] & np.isfinite(squared), squared, np.inf)
 
 
 def fit_12(reading: Floats, reference: Floats) -> tuple[Floats, Floats]:

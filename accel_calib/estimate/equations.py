@@ -33,15 +33,27 @@ smaller than it is, and the other poses would look like outliers. Two rests in t
 are no copies: by chance, only one pair in 5000 differs by less than `_ALIKE` of the noise on all
 axes.
 
+**Noise.** The variance of a residual is λ times the variance predicted by the noise of its pose.
+Either the noise is correct and λ = 1, or poses repeat worse or better than their samples predict,
+with log λ uniformly distributed from log 0.01 to log 10⁴. The residuals decide between both
+(Bayes' rule with the likelihood λ^(-dof/2) exp(-chi²/2λ)). The distribution of a parameter is then
+a mixture of normal distributions, and its stated variance is such that ±1.96 standard deviations
+contain 95 % of it. If the noise was not measured, λ is estimated from the residuals alone, and the
+mixture is Student's t. Without degrees of freedom, the noise of a common sensor is assumed.
+
+In tests the measured noise counts as a number of degrees of freedom (moderated variance, Smyth
+2004).
+
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import product
 import math
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,6 +87,28 @@ _OF_READING = ('reading', 'std', 'count', 'label')
 _TURNS = 5
 _STRAIGHT = 1e-9
 """Most turns of a common direction, and the turn at which it is found [rad]."""
+
+_BELIEF = 8.0
+_BELIEF_IN_USUAL = 3.0
+"""Degrees of freedom in a test that measured noise, and assumed noise, count as."""
+
+_RIGHT = 0.7
+"""Prior probability that the measured noise is correct."""
+
+_INTERVAL = 0.95
+_NORMAL = 1.959964
+_SCALES = np.logspace(-2.0, 4.0, 121)
+_ONE = 40
+"""Values of λ; index of λ = 1."""
+
+_BEYOND = 1e3
+"""chi² per degree of freedom above which the measured noise is ignored."""
+
+_DOUBT_BELOW = 0.01
+"""Probability of the chi² of the poses left below which they contradict the measured noise."""
+
+_DOUBTED = 1.0
+"""Degrees of freedom that contradicted noise counts as."""
 
 Indices = NDArray[np.intp]
 
@@ -178,7 +212,7 @@ class Equations:
     Parameters
     ----------
     parts : tuple
-        Equations of each kind of pose.
+        Equations of each kind of pose, in units of the noise.
     force : (n, 3) array
         u of each pose; a unit vector where the orientation is not known [g].
     scale : (n,) array
@@ -194,7 +228,7 @@ class Equations:
 
     """
 
-    parts: tuple[_Part, ...]
+    parts: tuple[_Known | _Shared | _Alone, ...]
     force: Floats
     scale: Floats
     count: int
@@ -227,31 +261,13 @@ class Equations:
         return np.sqrt(np.bincount(self.pose, sizes ** 2, len(self.scale)))
 
 
-class _Part(Protocol):
-    """
-    The equations of poses of one kind, in units of the noise.
-
-    `which` are the indices of the poses, `pose` that of each equation.
-
-    """
-
-    residual: Any
-    which: Indices
-    pose: Indices
-    force: Floats
-    scale: Floats
-
-    def columns(self, model: Model | EachShape) -> Floats:
-        """Return the (m, p) derivative of the prediction by the values of a model."""
-
-
 def equations(model: Model, poses: Measured) -> Equations:
     """Set up the equations near a model with ΔR = I; NaN where a reading's force is not unique."""
-    parts: list[_Part] = []
+    parts: list[_Known | _Shared | _Alone] = []
     force, scale = np.empty((poses.count, 3)), np.empty(poses.count)
     for make, kind in ((_Known, poses.known), (_Shared, poses.shared), (_Alone, poses.alone)):
         if len(kind.which):
-            part: _Part = make(model, kind)
+            part = make(model, kind)
             parts.append(part)
             force[kind.which], scale[kind.which] = part.force, part.scale
     groups = poses.shared.group
@@ -359,3 +375,62 @@ class _Shared:
         basis = model.basis(self.force, self._context).full
         rows = self._projected(basis / self._sigma[:, :, np.newaxis])
         return rows.reshape(len(self.pose), basis.shape[2])
+
+
+def belief_in(noise_known: bool) -> float:
+    """Return the degrees of freedom that the noise counts as in a test."""
+    return _BELIEF if noise_known else _BELIEF_IN_USUAL
+
+
+@cache
+def _grid() -> tuple[Floats, Floats]:
+    """Return (k,) half widths, and the (m, k) part of N(0, λ) within each of them."""
+    from scipy.special import ndtr
+
+    width = np.geomspace(0.15, 250.0, 141)
+    return width, 2.0 * ndtr(width / np.sqrt(_SCALES)[:, np.newaxis]) - 1.0
+
+
+def variance_factor(chi2: float, dof: int, noise_known: bool) -> float:
+    """
+    Return the ratio of the stated variance to the variance predicted by the noise.
+
+    `chi2` is the sum of the squared residuals in units of the noise, or of `USUAL_NOISE_G` if the
+    noise was not measured. `dof` is the number of equations minus that of free values.
+
+    """
+    if dof <= 0:
+        return 1.0 if noise_known else _student(_BELIEF_IN_USUAL)
+    if not noise_known or chi2 > _BEYOND * dof:
+        return chi2 / dof * _student(dof)
+    return _of_mixture(chi2, dof)
+
+
+def _student(dof: float) -> float:
+    """Return the squared ratio of the 95 % intervals of Student's t and a normal variable."""
+    from scipy.special import stdtrit
+
+    return float(stdtrit(dof, 0.5 + _INTERVAL / 2.0) / _NORMAL) ** 2
+
+
+def _of_mixture(chi2: float, dof: int) -> float:
+    """Return the factor for measured noise, which may be correct."""
+    width, held = _grid()
+    likelihood = (chi2 * (1.0 - 1.0 / _SCALES) - dof * np.log(_SCALES)) / 2.0
+    largest = np.max(likelihood)
+    weight = np.exp(likelihood - largest) * (1.0 - _RIGHT)
+    weight[_ONE] += _RIGHT * len(_SCALES) * np.exp(-largest)
+    part = (weight / np.sum(weight)) @ held
+    above = int(np.argmax(part >= _INTERVAL))
+    share = (_INTERVAL - part[above - 1]) / (part[above] - part[above - 1])
+    between = width[above - 1] * (width[above] / width[above - 1]) ** share
+    return float(between / _NORMAL) ** 2
+
+
+def belief_beside(dof: int, chi2: float, noise_known: bool) -> float:
+    """Return the degrees of freedom that the noise counts as, given the chi² of the poses kept."""
+    from scipy.special import chdtrc
+
+    if noise_known and chdtrc(max(dof, 1), chi2) < _DOUBT_BELOW:
+        return _DOUBTED
+    return belief_in(noise_known)

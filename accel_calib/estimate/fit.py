@@ -7,8 +7,7 @@ The maximum likelihood fit of any list of effects to poses of any kind, by least
 `.equations` sets up the equations of the poses. Damped least squares (Levenberg 1944, Marquardt
 1963) within bounds minimises the sum of their squared residuals; for a dozen poses,
 `scipy.optimize.least_squares` takes several times as long, mostly because of overhead
-(`benchmarks/fits.py`). The covariance is (JᵀJ)⁻¹ times the variance factor of `.outliers`, because
-poses often repeat worse than the noise of their samples predicts.
+(`benchmarks/fits.py`). The covariance is (JᵀJ)⁻¹ times the variance factor of `.equations`.
 
 The bounds of each parameter limit its contribution to a reading to `Effect.plausible_g`. A fitted
 shape constant stays near the values that the search tries. The effects of V and W have no bounds
@@ -28,14 +27,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .closed_form import along_quadrics
-from .equations import Equations, equations, measured
-from .outliers import belief_in, by_pose, ByPose, variance_factor
+from .equations import belief_in, Equations, equations, Indices, measured, variance_factor
 from ..effects import CHANGES, fitted_places, LADDER, Model, parameter_names, with_vector
 from ..errors import RefusedFitError
 from ..geometry import unit
@@ -77,6 +75,63 @@ _WHOLE = 1e-6
 
 _SHAPE_ROOM = 5.0
 """Factor by which a fitted shape constant may exceed the range that the search tries."""
+
+
+@dataclass(frozen=True)
+class ByPose:
+    """
+    The equations of a fit by pose: k rows each, padded with 0.
+
+    `residual` (n, k) and the derivative `columns` (n, k, q) are in units of the noise; `rows` (n,)
+    are the numbers of equations; `prior` (r, q) are the columns of a prior.
+
+    """
+
+    residual: Floats
+    columns: Floats
+    rows: NDArray[np.int64]
+    prior: Floats | None = None
+
+    @cached_property
+    def spread(self) -> Floats:
+        """(q, q) array, (JᵀJ)⁻¹."""
+        flat = self.flat
+        normal = flat.T @ flat
+        if self.prior is not None:
+            normal = normal + self.prior.T @ self.prior
+        return np.linalg.pinv(normal, hermitian=True)
+
+    @property
+    def downhill(self) -> Floats:
+        """(q,) array, Jᵀ times the residuals."""
+        return self.flat.T @ self.residual.ravel()
+
+    @property
+    def flat(self) -> Floats:
+        """(n k, q) array, the derivative with one row per equation."""
+        return self.columns.reshape(self.residual.size, self.columns.shape[2])
+
+    def own(self, spread: Floats) -> Floats:
+        """Return the (n, k, k) matrices I - leverage of each pose."""
+        return (np.eye(self.columns.shape[1])
+                - self.columns @ spread @ np.swapaxes(self.columns, 1, 2))
+
+
+def by_pose(residual: Floats, columns: Floats, pose: Indices,
+            prior: Floats | None = None) -> ByPose:
+    """Return (m,) residuals and (m, q) columns by pose, given the (m,) pose of each equation."""
+    rows = np.bincount(pose)
+    count = len(rows)
+    if len(pose) == count:
+        order = np.argsort(pose)
+        return ByPose(residual[order][:, np.newaxis], columns[order][:, np.newaxis], rows, prior)
+    order = np.argsort(pose, kind='stable')
+    slot = np.arange(len(pose)) - np.repeat(np.cumsum(rows) - rows, rows)
+    by_row = np.zeros((count, int(rows.max())))
+    derivative = np.zeros((*by_row.shape, columns.shape[1]))
+    by_row[pose[order], slot] = residual[order]
+    derivative[pose[order], slot] = columns[order]
+    return ByPose(by_row, derivative, rows, prior)
 
 
 @dataclass(frozen=True)
@@ -144,7 +199,8 @@ class Fit:
     @cached_property
     def by_pose(self) -> ByPose:
         """Return the equations by pose."""
-        return by_pose(self.residual, self.columns, self.equations.pose, self.prior)
+        prior = None if self.prior is None else self.prior.columns
+        return by_pose(self.residual, self.columns, self.equations.pose, prior)
 
     @cached_property
     def undetermined(self) -> tuple[str, ...]:
@@ -199,7 +255,8 @@ class NotConvergedError(RefusedFitError):
                          'check the poses for mistakes, or take more poses')
 
 
-class Point(NamedTuple):
+@dataclass(frozen=True)
+class Point:
     """The (m,) residuals and (m, q) derivative at some values, and the object they are from."""
 
     residual: Floats
@@ -207,15 +264,11 @@ class Point(NamedTuple):
     source: Any = None
     singular: float = _SINGULAR_STEP
 
-    @property
+    @cached_property
     def cost(self) -> float:
         """Sum of the squared residuals; infinite if a residual or derivative is not finite."""
         cost = float(self.residual @ self.residual)
         return cost if np.isfinite(cost) and np.all(np.isfinite(self.columns)) else np.inf
-
-
-NOWHERE = Point(np.array([np.inf]), np.zeros((1, 1)))
-"""A point without a prediction; its cost is infinite."""
 
 
 def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upper: Floats,
@@ -332,7 +385,7 @@ def estimate(start: Model, poses_g: Poses, prior: Prior | None = None,
                 return _with_prior(Point(near.residual, near.columns(model)[:, fitted], near),
                                    values, prior, weight)
             except np.linalg.LinAlgError:
-                return NOWHERE
+                return Point(np.array([np.inf]), np.zeros((1, 1)))
 
     lower, upper = _bounds(start, poses_g)
     lower, upper = lower[fitted], upper[fitted]

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Outliers, and the weight of the measured noise in tests and in the covariance.
+Fits without outliers, and mistakes in poses that the other poses do not locate or show.
 
 The pose with the largest residual against a fit of the other poses (externally studentised, with
 the moderated variance of `accel_calib.estimate.fit.Fit`) is removed, and so on, several times. The
@@ -11,50 +11,44 @@ are outliers. In this test several outliers do not mask each other. Between the 
 updated to first order. Above `_MANY` poses, outliers no longer mask each other, and all poses that
 are extreme relative to the median are removed at once.
 
-A gross outlier can distort the first fit. `fit_norm` then starts from poses that agree.
+**Gross outliers.** A single wrong row, such as zeros or a reading in another unit, can distort the
+closed form and the fit of all poses so far that the residuals do not show which row is wrong. If
+that fit is suspicious, subsets are fitted in closed form. The subset with the smallest trimmed
+squares (least trimmed squares, Rousseeuw 1984) starts a fit, which then includes every pose that
+agrees with it.
 
-**Noise.** The variance of a residual is λ times the variance predicted by the noise of its pose.
-Either the noise is correct and λ = 1, or poses repeat worse or better than their samples predict,
-with log λ uniformly distributed from log 0.01 to log 10⁴. The residuals decide between both
-(Bayes' rule with the likelihood λ^(-dof/2) exp(-chi²/2λ)). The distribution of a parameter is then
-a mixture of normal distributions, and its stated variance is such that ±1.96 standard deviations
-contain 95 % of it. If the noise was not measured, λ is estimated from the residuals alone, and the
-mixture is Student's t. Without degrees of freedom, the noise of a common sensor is assumed.
+**Rivals.** The search for outliers leaves out the rows that agree least with the others. If there
+are few poses more than values, the poses may agree nearly as well without another row instead. A
+mean shift of each of the two rows is a hypothesis. Its probability, with a uniform prior on the
+shift and the moderated variance of the tests, is (Abraham and Box 1978)
 
-In tests the measured noise counts as a number of degrees of freedom (moderated variance, Smyth
-2004).
+    |JᵀJ|^(-1/2) (f + χ²)^(-(f + dof)/2) / Π s
+
+over the poses that are kept, with their noise s. The noise counts as f degrees of freedom. A rival
+is a row whose hypothesis is at least `LEVEL` times as probable as that of the row left out. The
+covariance of a fit with rivals includes the difference to the fit of each rival.
+
+**Unchecked rows.** A pose with a leverage near 1 pulls the fit towards itself, so that its mistake
+does not show. The largest mistake that the test for outliers does not find is
+δ s / √(1 - leverage) (internal reliability, Baarda 1968), with δ the limit of the test in standard
+deviations.
 
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cache, cached_property
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..table import Floats
-
-if TYPE_CHECKING:
-    from .fit import Point
-
-_BELIEF = 8.0
-_BELIEF_IN_USUAL = 3.0
-"""Degrees of freedom in a test that measured noise, and assumed noise, count as."""
-
-_RIGHT = 0.7
-"""Prior probability that the measured noise is correct."""
-
-_INTERVAL = 0.95
-_NORMAL = 1.959964
-_SCALES = np.logspace(-2.0, 4.0, 121)
-_ONE = 40
-"""Values of λ; index of λ = 1."""
-
-_BEYOND = 1e3
-"""chi² per degree of freedom above which the measured noise is ignored."""
+from .closed_form import agreeing, start_of
+from .equations import belief_beside, belief_in, Indices
+from .fit import ByPose, estimate, Fit, judge, NotConvergedError
+from ..effects import MODELS, parameter_names
+from ..table import Floats, Poses
 
 LEVEL = 0.007
 """Probability that a pose of a set without outliers is removed."""
@@ -70,126 +64,36 @@ _MANY = 200
 _MEDIAN_OF_CHI2 = {1: 0.454936, 3: 2.365974}
 """Median of chi² by degrees of freedom."""
 
-_DOUBT_BELOW = 0.01
-"""Probability of the chi² of the poses left below which they contradict the measured noise."""
+_ROUNDS = 6
+"""Largest number of fits after which poses are left out or included."""
 
-_DOUBTED = 1.0
-"""Degrees of freedom that contradicted noise counts as."""
+_SUSPICIOUS = 4.0
+"""chi² per degree of freedom above which the fit of all poses is suspicious."""
 
+_CLEARLY = 10.0
+"""Ratio of the variances above which a pose that the robust fit leaves out is an outlier. The
+choice among subsets makes small differences look significant, so a smaller ratio is ignored;
+`.outliers` decides about the other poses."""
 
-def belief_in(noise_known: bool) -> float:
-    """Return the degrees of freedom that the noise counts as in a test."""
-    return _BELIEF if noise_known else _BELIEF_IN_USUAL
+_EXPLAINED = 0.25
+"""Smallest part of the residuals by the mistake of one row that a mistake of another row explains
+to first order; other rows are no rivals."""
 
+_LARGEST_LOG = 100.0
+"""Largest logarithm of odds, against overflow."""
 
-@cache
-def _grid() -> tuple[Floats, Floats]:
-    """Return (k,) half widths, and the (m, k) part of N(0, λ) within each of them."""
-    from scipy.special import ndtr
+_HARDLY = 0.1
+"""1 - leverage below this: the other poses hardly check the pose."""
 
-    width = np.geomspace(0.15, 250.0, 141)
-    return width, 2.0 * ndtr(width / np.sqrt(_SCALES)[:, np.newaxis]) - 1.0
-
-
-def variance_factor(chi2: float, dof: int, noise_known: bool) -> float:
-    """
-    Return the ratio of the stated variance to the variance predicted by the noise.
-
-    `chi2` is the sum of the squared residuals in units of the noise, or of `USUAL_NOISE_G` if the
-    noise was not measured. `dof` is the number of equations minus that of free values.
-
-    """
-    if dof <= 0:
-        return 1.0 if noise_known else _student(_BELIEF_IN_USUAL)
-    if not noise_known or chi2 > _BEYOND * dof:
-        return chi2 / dof * _student(dof)
-    return _of_mixture(chi2, dof)
-
-
-def _student(dof: float) -> float:
-    """Return the squared ratio of the 95 % intervals of Student's t and a normal variable."""
-    from scipy.special import stdtrit
-
-    return float(stdtrit(dof, 0.5 + _INTERVAL / 2.0) / _NORMAL) ** 2
-
-
-def _of_mixture(chi2: float, dof: int) -> float:
-    """Return the factor for measured noise, which may be correct."""
-    width, held = _grid()
-    likelihood = (chi2 * (1.0 - 1.0 / _SCALES) - dof * np.log(_SCALES)) / 2.0
-    largest = np.max(likelihood)
-    weight = np.exp(likelihood - largest) * (1.0 - _RIGHT)
-    weight[_ONE] += _RIGHT * len(_SCALES) * np.exp(-largest)
-    part = (weight / np.sum(weight)) @ held
-    above = int(np.argmax(part >= _INTERVAL))
-    share = (_INTERVAL - part[above - 1]) / (part[above] - part[above - 1])
-    between = width[above - 1] * (width[above] / width[above - 1]) ** share
-    return float(between / _NORMAL) ** 2
-
-
-@dataclass(frozen=True)
-class ByPose:
-    """
-    The equations of a fit by pose: k rows each, padded with 0.
-
-    `residual` (n, k) and the derivative `columns` (n, k, q) are in units of the noise; `rows` (n,)
-    are the numbers of equations; `prior` has the rows of a prior.
-
-    """
-
-    residual: Floats
-    columns: Floats
-    rows: NDArray[np.int64]
-    prior: Point | None = None
-
-    @cached_property
-    def spread(self) -> Floats:
-        """(q, q) array, (JᵀJ)⁻¹."""
-        flat = self.flat
-        normal = flat.T @ flat
-        if self.prior is not None:
-            normal = normal + self.prior.columns.T @ self.prior.columns
-        return np.linalg.pinv(normal, hermitian=True)
-
-    @property
-    def downhill(self) -> Floats:
-        """(q,) array, Jᵀ times the residuals; zero at the solution."""
-        along = self.flat.T @ self.residual.ravel()
-        return along if self.prior is None else along + self.prior.columns.T @ self.prior.residual
-
-    @property
-    def flat(self) -> Floats:
-        """(n k, q) array, the derivative with one row per equation."""
-        return self.columns.reshape(self.residual.size, self.columns.shape[2])
-
-    def own(self, spread: Floats) -> Floats:
-        """Return the (n, k, k) matrices I - leverage of each pose."""
-        return (np.eye(self.columns.shape[1])
-                - self.columns @ spread @ np.swapaxes(self.columns, 1, 2))
-
-
-def by_pose(residual: Floats, columns: Floats, pose: NDArray[np.intp],
-            prior: Point | None = None) -> ByPose:
-    """Return (m,) residuals and (m, q) columns by pose, given the (m,) pose of each equation."""
-    rows = np.bincount(pose)
-    count = len(rows)
-    if len(pose) == count:
-        order = np.argsort(pose)
-        return ByPose(residual[order][:, np.newaxis], columns[order][:, np.newaxis], rows, prior)
-    order = np.argsort(pose, kind='stable')
-    slot = np.arange(len(pose)) - np.repeat(np.cumsum(rows) - rows, rows)
-    by_row = np.zeros((count, int(rows.max())))
-    derivative = np.zeros((*by_row.shape, columns.shape[1]))
-    by_row[pose[order], slot] = residual[order]
-    derivative[pose[order], slot] = columns[order]
-    return ByPose(by_row, derivative, rows, prior)
+_ALONE = 1e-9
+"""1 - leverage below this: the pose alone determines a parameter."""
 
 
 @dataclass(frozen=True)
 class Outliers:
     """Poses to leave out, as (d,) indices among the poses of a fit, and the chi² of the others."""
 
-    poses: NDArray[np.intp]
+    poses: Indices
     chi2: float
 
 
@@ -216,15 +120,6 @@ def outliers_among(data: ByPose, chi2: float, dof: int, total: int, *, noise_kno
     return Outliers(np.sort(order.pose[:count]), float(order.rss[count]))
 
 
-def belief_beside(dof: int, chi2: float, noise_known: bool) -> float:
-    """Return the degrees of freedom that the noise counts as, given the chi² of the poses kept."""
-    from scipy.special import chdtrc
-
-    if noise_known and chdtrc(max(dof, 1), chi2) < _DOUBT_BELOW:
-        return _DOUBTED
-    return belief_in(noise_known)
-
-
 def _limit(spare: int, total: int, rows: int) -> int:
     """Return the largest number of poses to leave out, each with `rows` equations."""
     return max(min(int(LARGEST_SHARE * total), spare // (2 * rows)), 0)
@@ -241,8 +136,8 @@ class _Removed:
 
     """
 
-    pose: NDArray[np.intp]
-    rows: NDArray[np.int64]
+    pose: Indices
+    rows: Indices
     size: Floats
     rss: Floats
     dof: int
@@ -258,7 +153,7 @@ class _Removed:
         return int(found[-1]) + 1 if len(found) else 0
 
 
-def beyond(ratio: Floats, rows: NDArray[np.int64], dof: Floats | float) -> Floats:
+def beyond(ratio: Floats, rows: Indices, dof: Floats | float) -> Floats:
     """Return the probability of a larger ratio of variances by chance (F distribution)."""
     from scipy.special import fdtrc
 
@@ -320,3 +215,235 @@ def _far_out(data: ByPose, chi2: float, dof: int, limit: int, *, noise_known: bo
     largest = np.argsort(-size, kind='stable')[:limit]
     found = np.sort(largest[extreme[largest]])
     return Outliers(found, max(chi2 - float(np.sum(alone[found])), 0.0))
+
+
+def fit_norm(name: str, poses_g: Poses) -> tuple[Fit, Indices]:
+    """
+    Fit model 4, 7 or 10 to poses in g of unknown orientation, without the outliers.
+
+    Return the fit and the (k,) indices of the poses used. Raise `NotConvergedError` if the poses
+    are not on an ellipsoid. The poses are at least as many as free parameters.
+
+    """
+    everyone = np.arange(len(poses_g))
+    direct = _without_outliers(name, poses_g, everyone)
+    if direct is not None and direct[0].chi2 <= _SUSPICIOUS * max(direct[0].dof, 1):
+        return direct
+    robust = _from_those_that_agree(name, poses_g)
+    if robust is None:
+        if direct is None:
+            raise NotConvergedError
+        return direct
+    found, gross = direct, _grossest_first(*robust, poses_g)
+    for count in range(len(gross) + 1):
+        if found is not None and found[0].variance <= _CLEARLY * robust[0].variance:
+            return found
+        found = _without_outliers(name, poses_g, np.setdiff1d(everyone, gross[:count + 1]))
+    return robust
+
+
+def outliers(fit: Fit, total: int) -> Outliers:
+    """
+    Return the outliers among the poses of a fit; `total` includes the poses left out before.
+
+    They are at most `LARGEST_SHARE` of all poses, and at most so many that the other equations
+    identify them.
+
+    """
+    return outliers_among(fit.by_pose, fit.chi2, fit.dof, total, noise_known=fit.noise_known)
+
+
+def _grossest_first(fit: Fit, kept: Indices, poses_g: Poses) -> Indices:
+    """Return the poses that a fit leaves out, in decreasing order of the residual."""
+    out = np.setdiff1d(np.arange(len(poses_g)), kept)
+    away = np.abs(judge(fit.model, poses_g).residual[out])
+    return out[np.argsort(-away, kind='stable')]
+
+
+def _without_outliers(name: str, poses_g: Poses, kept: Indices
+                      ) -> tuple[Fit, Indices] | None:
+    """Fit poses and leave out outliers until there are none; None if a fit does not converge."""
+    fit = _fit(name, poses_g, kept)
+    for _ in range(_ROUNDS):
+        out = () if fit is None else outliers(fit, len(poses_g)).poses
+        if not len(out):
+            break
+        kept = np.delete(kept, out)
+        fit = _fit(name, poses_g, kept)
+    if fit is None:
+        return None
+    if len(kept) < len(poses_g):
+        return _with_those_that_agree(name, poses_g, kept) or (fit, kept)
+    return fit, kept
+
+
+def _from_those_that_agree(name: str, poses_g: Poses) -> tuple[Fit, Indices] | None:
+    """Fit the poses that agree best, and include those that agree with them."""
+    most = _most(name, len(poses_g))
+    if most < 1:
+        return None
+    return _with_those_that_agree(name, poses_g, agreeing(name, poses_g, most))
+
+
+def _with_those_that_agree(name: str, poses_g: Poses, kept: Indices
+                           ) -> tuple[Fit, Indices] | None:
+    """Include the poses that agree with a fit, leave out the others; None if too few agree."""
+    tried: set[bytes] = set()
+    while (fit := _fit(name, poses_g, kept)) is not None:
+        tried.add(kept.tobytes())
+        agreeing = np.flatnonzero(_agrees(fit, kept, poses_g))
+        if len(poses_g) - len(agreeing) > _most(name, len(poses_g)):
+            return None
+        if agreeing.tobytes() in tried or len(tried) == _ROUNDS:
+            return fit, kept
+        kept = agreeing
+    return None
+
+
+def _fit(name: str, poses_g: Poses, kept: Indices) -> Fit | None:
+    now = poses_g.take(kept)
+    try:
+        return estimate(start_of(name, now.reading), now)
+    except NotConvergedError:
+        return None
+
+
+def _most(name: str, count: int) -> int:
+    """Return the largest number of poses that can be left out."""
+    free = len(parameter_names(MODELS[name].effects))
+    return min(int(LARGEST_SHARE * count), (count - free) // 2)
+
+
+def _agrees(fit: Fit, kept: Indices, poses_g: Poses) -> NDArray[np.bool_]:
+    """Return which poses agree with a fit to the poses kept."""
+    data = judge(fit.model, poses_g).by_pose
+    leverage = np.einsum('nkp,pq,nkq->n', data.columns, fit.by_pose.spread, data.columns)
+    inside = np.isin(np.arange(len(poses_g)), kept)
+    spare = np.where(inside, np.maximum(1.0 - leverage, 1e-6), 1.0 + leverage)
+    belief = belief_beside(fit.dof, fit.chi2, fit.noise_known)
+    size = data.residual[:, 0] ** 2 / spare / ((belief + fit.chi2) / (belief + fit.dof))
+    agrees: NDArray[np.bool_] = beyond(size, data.rows, belief + fit.dof) >= LEVEL / len(poses_g)
+    return agrees
+
+
+class Rival(NamedTuple):
+    """
+    A pose that may be wrong instead of a pose that was left out.
+
+    `left_out` and `instead` are the indices of the pose left out and of its rival, `fit` the fit
+    without the rival, and `odds` the probability that the rival is wrong over that of the other
+    pose.
+
+    """
+
+    left_out: int
+    instead: int
+    fit: Fit
+    odds: float
+
+
+def rivals(fit: Fit, kept: Indices, poses_g: Poses,
+           refit: Callable[[Poses], Fit]) -> tuple[Rival, ...]:
+    """
+    Return the poses that may be wrong instead of those that were left out.
+
+    `kept` are the (k,) indices of the poses of the fit among `poses_g`, all poses without copies.
+    `refit` fits the same model to other poses, and may raise `NotConvergedError`.
+
+    """
+    found = []
+    for out, instead in _look_alikes(fit, kept, poses_g):
+        others = np.union1d(np.setdiff1d(kept, [instead]), [out])
+        try:
+            rival = refit(poses_g.take(others))
+        except NotConvergedError:
+            continue
+        odds = _odds(rival, fit)
+        if odds >= LEVEL:
+            found.append(Rival(out, instead, rival, odds))
+    return tuple(found)
+
+
+def covariance_with(fit: Fit, found: tuple[Rival, ...]) -> Floats:
+    """
+    Return the (p, p) covariance of a fit with its rivals.
+
+    It includes the square of the difference to the fit of each rival, times the odds, at most 1.
+
+    """
+    spread = fit.covariance
+    for rival in found:
+        away = rival.fit.model.vector - fit.model.vector
+        spread = spread + min(rival.odds, 1.0) * np.outer(away, away)
+    return spread
+
+
+def _look_alikes(fit: Fit, kept: Indices, poses_g: Poses) -> Iterator[tuple[int, int]]:
+    """Yield the poses left out, each with a pose kept whose mistake would look like its own."""
+    out = np.setdiff1d(np.arange(len(poses_g)), kept)
+    if not len(out):
+        return
+    data = judge(fit.model, poses_g.take(np.concatenate([kept, out])), fit.ties).by_pose
+    spread, columns = fit.by_pose.spread, data.columns
+    pull = np.linalg.eigvalsh(columns @ spread @ np.swapaxes(columns, 1, 2))[:, -1]
+    inside = pull[:len(kept)] / np.maximum(1.0 - pull[:len(kept)], _ALONE)
+    for place in len(kept) + np.flatnonzero(pull[len(kept):] * np.max(inside) >= _EXPLAINED):
+        # By Cauchy's inequality, the mistakes of the other poses have no look-alike.
+        part = _explained(data.residual[place], columns[place], columns[:len(kept)], spread)
+        for index in kept[part >= _EXPLAINED]:
+            yield int(out[place - len(kept)]), int(index)
+
+
+def _explained(shift: Floats, own: Floats, others: Floats, spread: Floats) -> Floats:
+    """
+    Return the (n,) part of the residuals by a mistake of one pose that each other pose explains.
+
+    The mistake is `shift` (k,) per noise, `own` (k, q) and `others` (n, k, q) are the derivatives
+    at the poses, and `spread` is (JᵀJ)⁻¹ of the others.
+
+    """
+    onto = spread @ own.T
+    inverse = np.linalg.inv(np.eye(len(own)) + own @ onto)
+    spread = spread - onto @ inverse @ onto.T
+    left = np.eye(len(own)) - others @ spread @ np.swapaxes(others, 1, 2)
+    moved = others @ (spread @ (own.T @ shift))
+    solved = np.linalg.pinv(left, _ALONE, hermitian=True) @ moved[:, :, np.newaxis]
+    part: Floats = np.sum(moved * solved[:, :, 0], axis=1) / max(shift @ inverse @ shift, 1e-300)
+    return part
+
+
+def _odds(rival: Fit, fit: Fit) -> float:
+    """Return the ratio of the probabilities of two hypotheses."""
+    belief = belief_beside(fit.dof, fit.chi2, fit.noise_known)
+    difference = _log_probability(rival, belief) - _log_probability(fit, belief)
+    return float(np.exp(min(difference, _LARGEST_LOG)))
+
+
+def _log_probability(fit: Fit, belief: float) -> float:
+    """Return the logarithm of the probability of a hypothesis, up to a constant."""
+    volume = np.linalg.slogdet(fit.by_pose.spread)[1] / 2.0
+    noise = float(fit.by_pose.rows @ np.log(fit.equations.scale))
+    return float(volume - noise - (belief + fit.dof) / 2.0 * np.log(belief + fit.chi2))
+
+
+def unseen_mistakes(fit: Fit) -> Floats:
+    """
+    Return the (n,) largest mistakes of poses along the force that the test does not find [g].
+
+    0 for poses that the others check well, infinite for poses that alone determine a parameter.
+
+    """
+    from scipy.special import stdtrit
+
+    data = fit.by_pose
+    own = data.own(data.spread)
+    least = own[:, 0, 0] if own.shape[1] == 1 else np.linalg.eigvalsh(own)[:, 0]
+    size = np.zeros(len(least))
+    weak = np.flatnonzero(least < _HARDLY)
+    if len(weak):
+        dof = max(belief_in(fit.noise_known) + fit.dof - 1.0, 1.0)
+        limit = float(stdtrit(dof, 1.0 - LEVEL / len(least) / 2.0)) * np.sqrt(fit.variance)
+        with np.errstate(divide='ignore'):
+            size[weak] = limit * fit.equations.scale[weak] / np.sqrt(
+                np.where(least[weak] > _ALONE, least[weak], 0.0))
+    return size
