@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.floating[Any]]
+Indices = NDArray[np.intp]
 
 UnitName = Literal['m/s2', 'g', 'native']
 UNIT_NAMES: tuple[str, ...] = get_args(UnitName)

@@ -19,12 +19,10 @@ from typing import Any
 
 from accel_calib.calibrate import (
     Calibration, determines, mounting_figures, posterior, refuse_if_unfit, sound_rows)
-from accel_calib.calibrate.known_orientation import axes_of, fault_of
 from accel_calib.calibrate.mounting import (
-    doubts_about_flat, mounting, with_heading, with_heading_of)
-from accel_calib.calibrate.partial import carried
+    axes_of, doubts_about_flat, fault_of, mounting, with_heading, with_heading_of)
+from accel_calib.calibrate.partial import carried, common_sensors, typical_spread, without_knocked
 from accel_calib.calibrate.pose_planning import missing_poses, shape_words, unseen
-from accel_calib.calibrate.prior import common_sensors, typical_spread, without_knocked
 from accel_calib.capture import rounding_left
 from accel_calib.capture.chunks import Extremes
 from accel_calib.capture.trend import (

@@ -4,12 +4,11 @@
 """
 From poses to a calibration.
 
-`fit` is the entry point and has the gate, which rejects implausible results. It calls
-`unknown_orientation` or `known_orientation`, which also detects wiring faults. `partial` is for
-few poses, with the typical values of `prior`. `pose_planning` explains what poses do not determine
-and plans the next pose. `mounting` computes the mounting. `calibration` is the record, `quality`
-makes it and computes its figures, and `rest_noise` those of the gyro and of the samples. `context`
-compares samples with the range of a calibration.
+`fit` is the entry point, and `partial` that for few poses, with the typical values of sensors.
+`calibration` is the record. `quality` makes it, computes its figures, and has the gate, which
+rejects implausible results. `rest_noise` adds the figures of the gyro and of the samples.
+`mounting` computes the mounting and detects wiring faults. `pose_planning` explains what poses do
+not determine and plans the next pose. `context` compares samples with the range of a calibration.
 
 """
 
@@ -19,20 +18,17 @@ from .calibration import (
 from .context import (
     of_samples, Outside, outside, SampleContext, thermal_stream, USES_LIMIT, with_history,
     with_previous)
-from .fit import (
-    deviations_g, fit_poses, gated, LARGEST_OFFSET_G, sound_rows, sure_rows, uncertainty_g)
+from .fit import directions_of, fit_poses, fit_unknown, only_norm, sound_rows, sure_rows
 from .mounting import (
     angle_words, flat_direction, in_frame, level, level_by_rows, mounting_figures, mounting_of,
     mounting_words, on_topics, set_heading, with_given_mounting)
-from .partial import fit_partial, fit_with_fleet, mounting_only
+from .partial import fit_partial, fit_with_fleet, FleetPrior, mounting_only, posterior
 from .pose_planning import (
     determines, lies_in_cone, next_pose, NextPose, Outlook, outlook, refuse_if_unfit)
-from .prior import FleetPrior, posterior
 from .quality import (
-    errors_after, errors_before, fit_findings, in_g, OF_A_FIT, quality_of, record_of, Verification,
-    verify)
+    deviations_g, errors_after, errors_before, fit_findings, gated, in_g, LARGEST_OFFSET_G,
+    OF_A_FIT, quality_of, record_of, uncertainty_g, Verification, verify)
 from .rest_noise import gyro_bias_of, GyroBias, sample_noise_of, SampleNoise, with_rest_noise
-from .unknown_orientation import directions_of, fit_unknown, only_norm
 
 __all__ = ['BASES', 'FLEET', 'FRAMES', 'LARGEST_OFFSET_G', 'METHODS', 'MODEL_NAMES', 'OF_A_FIT',
            'PRIOR', 'STORED_METHODS', 'USES_LIMIT', 'Calibration', 'FleetPrior', 'FrameName',

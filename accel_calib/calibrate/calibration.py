@@ -42,7 +42,7 @@ PRIOR = 'prior'
 """Method of a calibration whose values are partly those of a common sensor; see `.partial`."""
 
 FLEET = 'fleet'
-"""Method of a calibration whose values are partly those of a fleet; see `.prior`."""
+"""Method of a calibration whose values are partly those of a fleet; see `.partial`."""
 
 STORED_METHODS = (*METHODS, PRIOR, FLEET)
 """Methods of stored calibrations; the user selects one of `METHODS`."""

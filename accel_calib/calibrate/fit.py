@@ -2,63 +2,75 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The entry point, from poses to a calibration, and the gate.
+The fit: from poses to a calibration.
 
-The gate checks every calibration before it is stored, loaded or used. A fit has already converged
-(`accel_calib.estimate.fit`), and its poses determine the model (`.pose_planning`). The gate checks
-the calibration itself: finite values, a proper rotation, a valid covariance, plausible offset,
-gain and effects, and a useful uncertainty. The limits are far beyond the values of working
-sensors; only useless calibrations exceed them.
+The method ``ml``, the default, weights poses by their noise and leaves out outliers. The method
+``algebraic`` minimises the cost functions of AN5286 and the ESGI'95 report, unweighted and with
+every row.
 
-Each limit is written as `not value <= limit`, so that NaN does not pass it. Absurd values may
-overflow on the way; infinity does not pass either.
+**Unknown orientation.** Model 4, 7, 9 or 10 is fitted by |force| = 1 g. ``auto`` goes from the
+smallest model to larger models. It selects each model that explains significantly more than noise,
+by an F test at `_LEVEL_OF_MODELS` with the moderated variance of `accel_calib.estimate.fit.Fit`.
 
-A calibration without effects, such as a mounting alone, has no residual of a fit to check. The
-uncertainty of a partial fit (`.partial`) is limited by that of common sensors, and its warning
-states it. It has no other limit.
+**Known orientation.** Model 12 is fitted, or model 10 if the sensor was placed badly.
+An orientation is known only as accurately as the sensor was placed. A placement error of 2° turns
+the force by 35 mg but does not change its length, so a fit by |force| = 1 g is not affected. If
+the poses determine model 10, its forces are rotated onto the known forces (orthogonal Procrustes
+problem, Schönemann 1966, with Huber's weights so that one misplaced pose has little influence).
+The remaining differences are tangential. If an F test shows that they are larger than the noise
+and the uncertainty of the fit explain, the fit uses only |force| = 1 g. The known orientations
+then determine only the rotation of the axes, ΔR.
 
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
 
-from .calibration import Calibration, Method, METHODS, MODEL_NAMES, ORIENTED, PRIOR, Rejected
-from .known_orientation import fit_known, wiring
-from .rest_noise import with_rest_noise
-from .unknown_orientation import fit_unknown
-from ..effects import LADDER, Model, times
+from .calibration import Calibration, Method, METHODS, MODEL_NAMES, ORIENTED, Rejected
+from .mounting import wiring
+from .pose_planning import determines, refuse_if_unfit, unseen
+from .quality import finished, fit_findings, in_g, LARGEST_OFFSET_G, record_of, rival_findings
+from ..effects import (
+    force_slope, length_rows, Model, MODELS, parameter_basis, sensor_force, with_linear_part,
+    with_vector)
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
-from ..finding import Finding, without
-from ..geometry import OVER_THE_SPHERE, unit
-from ..table import check_units, Floats, Poses
+from ..estimate import (
+    closed_form, covariance_with, dilution, estimate, faces, Fit, fit_12, fit_norm, fit_sphere,
+    free_parameters, judge, LARGEST_DILUTION, lower_triangular, NORM_MODELS, NotConvergedError,
+    originals, outliers, Point, pose_noise, poses_needed, rivals, solve, start_of, TIES,
+    WEAK_DILUTION)
+from ..finding import Finding
+from ..geometry import unit
+from ..table import check_units, Poses
 from ..text import listed
-from ..units import MG, Units
-
-LARGEST_OFFSET_G = 1.0
-"""Largest zero-g offset of a working accelerometer [g]; not checked for native units."""
-
-GAINS = (0.5, 2.0)
-"""Smallest and largest gain of a working accelerometer, relative to the scale of its units."""
-
-LARGEST_RESIDUAL_G = 0.05
-"""Largest residual of poses on one ellipsoid [g]."""
-
-LARGEST_UNCERTAINTY_G = 0.1
-"""Largest uncertainty of |force| of a useful calibration [g]."""
-
-_WARN_UNCERTAINTY_G = 0.005
-_ROTATION_TOLERANCE = 1e-6
-_COVARIANCE_TOLERANCE = 1e-6
+from ..units import Floats, Indices, MG, Units
 
 _LARGEST_REST_G = 3.0
 _NATIVE_SPREADS = 20.0
 """Largest reading of an accelerometer at rest: |reading| [g]; for native units the distance from
 the median, relative to the median of these distances."""
 
-_CHECK_POSES = 'check the poses for mistakes, take new poses, and fit again'
+_LEVEL_OF_MODELS = 0.03
+
+_MOST_NAMED = 3
+"""Largest number of groups of equal rows in a warning."""
+
+_LEVEL_OF_PLACEMENT = 1e-4
+"""Level of the F test for placement errors."""
+
+_LEAST_RATIO = 4.0
+"""Smallest ratio of variances that counts: placement errors about as large as the noise."""
+
+_WARN_DEGREES = 0.2
+_WARN_CHI2 = 4.0
+"""Residuals above both limits cause a finding about the placement."""
+
+_ROUNDS = 20
+_SMALL_ANGLE = 1e-6
 
 
 def fit_poses(poses: Poses, units: Units, *, model: str = 'auto', method: Method = 'ml',
@@ -102,8 +114,8 @@ def fit_poses(poses: Poses, units: Units, *, model: str = 'auto', method: Method
     # The fitted table has references that the input may lack.
     every = calibration.poses if len(calibration.poses) == len(poses) else poses
     return finished(replace(
-        calibration, sensor=sensor or poses.sensor, date=date, poses=every,
-        rejected=tuple(left_out), noted=(*wiring(calibration), *calibration.noted)), poses)
+        calibration, poses=every, rejected=tuple(left_out),
+        noted=(*wiring(calibration), *calibration.noted)), poses, sensor, date)
 
 
 def _without_doubtful(poses: Poses, rejected: tuple[Rejected, ...], units: Units, model: str,
@@ -129,149 +141,6 @@ def _fitted(poses: Poses, units: Units, model: str, method: Method) -> Calibrati
     if model == ORIENTED or (model == 'auto' and 'reference' in poses):
         return fit_known(poses, units, method)
     return fit_unknown(poses, units, model, method)
-
-
-def finished(calibration: Calibration, poses: Poses) -> Calibration:
-    """Return a calibration that has passed the gate, with the figures of its rests."""
-    return with_rest_noise(gated(calibration), poses)
-
-
-@np.errstate(over='ignore', invalid='ignore')
-def gated(calibration: Calibration) -> Calibration:
-    """
-    Check a calibration, and return it with a finding if its uncertainty is large.
-
-    Raises
-    ------
-    RefusedFitError
-        If the calibration is not plausible.
-
-    """
-    _check_numbers(calibration)
-    _check_rotation(calibration.model.rotation)
-    _check_covariance(calibration.covariance)
-    _check_gain(calibration)
-    _check_effects(calibration)
-    residual = calibration.quality.rms_after_mg / MG
-    if calibration.model.effects and not residual <= LARGEST_RESIDUAL_G:
-        raise RefusedFitError(
-            f'the residual is {residual * MG:.3g} mg (RMS) after the fit, expected less than '
-            f'{LARGEST_RESIDUAL_G * MG:.0f} mg: the poses are not on an ellipsoid', _CHECK_POSES)
-    return _with_uncertainty(calibration)
-
-
-def _check_numbers(calibration: Calibration) -> None:
-    model = calibration.model
-    for what, values in (('value', model.vector), ('gain', model.linear_part[0]),
-                         ('rotation', model.rotation), ('covariance', calibration.covariance)):
-        if not np.all(np.isfinite(values)):
-            raise RefusedFitError(f'the calibration has a {what} that is not finite, expected '
-                                  'finite numbers', _CHECK_POSES)
-
-
-def _check_rotation(rotation: Floats) -> None:
-    proper = (rotation.shape == (3, 3) and np.linalg.det(rotation) > 0.0
-              and np.allclose(rotation @ rotation.T, np.eye(3), atol=_ROTATION_TOLERANCE))
-    if not proper:
-        raise RefusedFitError('the mounting ΔR is not orthonormal, or it is a mirror image; '
-                              'expected a rotation', 'level the mounting again')
-
-
-def _check_covariance(covariance: Floats) -> None:
-    """Refuse a covariance that is not symmetric and positive semidefinite."""
-    root = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    with np.errstate(over='ignore', invalid='ignore'):
-        scaled = covariance / root / root[:, np.newaxis]
-    sound = (np.all(np.diag(covariance) >= 0.0) and np.all(np.isfinite(scaled))
-             and np.allclose(scaled, scaled.T, atol=_COVARIANCE_TOLERANCE)
-             and (not len(root)
-                  or np.min(np.linalg.eigvalsh(scaled)) >= -_COVARIANCE_TOLERANCE * len(root)))
-    if not sound:
-        raise RefusedFitError('the covariance is not valid, expected a symmetric and positive '
-                              'semidefinite matrix', 'fit again')
-
-
-def _check_gain(calibration: Calibration) -> None:
-    mat_w, vec_v = calibration.model.linear_part
-    gains = np.linalg.svd(mat_w, compute_uv=False)
-    if not np.linalg.det(mat_w) > 0.0 and not calibration.form.known_orientation:
-        raise RefusedFitError('the gain W is singular or a mirror image, expected det W > 0',
-                              _CHECK_POSES)
-    if not GAINS[0] <= gains[-1] <= gains[0] <= GAINS[1]:
-        raise RefusedFitError('the poses are not on an ellipsoid of an accelerometer: the gains '
-                              f'are {gains[-1]:.3g} to {gains[0]:.3g}, expected {GAINS[0]:g} to '
-                              f'{GAINS[1]:g}', f'check the units, or {_CHECK_POSES}')
-    offset = float(np.linalg.norm(vec_v))
-    if not calibration.units.is_native and not offset <= LARGEST_OFFSET_G:
-        raise RefusedFitError(f'the zero-g offset is {offset:.3g} g, expected less than '
-                              f'{LARGEST_OFFSET_G:g} g', _CHECK_POSES)
-
-
-def _check_effects(calibration: Calibration) -> None:
-    """Refuse effects whose contribution to a pose of the calibration is not plausible."""
-    used = calibration.used_poses
-    for name, values in calibration.model.values.items():
-        model = Model({name: values})
-        effect = model.terms.effects[0]
-        if name in LADDER or effect.output is not None or not len(used):
-            continue
-        if any(key not in used for key in model.needs if key != 'previous'):
-            continue
-        added = _contribution(model, used, calibration.units)
-        if not added <= effect.plausible_g:
-            raise RefusedFitError(f'{name} adds up to {added:.3g} g to a reading, expected less '
-                                  f'than {effect.plausible_g:g} g', _CHECK_POSES)
-
-
-def _contribution(model: Model, used: Poses, units: Units) -> float:
-    """Return the largest contribution of an effect at poses [g]."""
-    context = {**used.columns}
-    if 'std' in used:
-        context['std'] = units.to_g(used['std'])
-    context.setdefault('previous', unit(used.reading))
-    directions = unit(used.reading)
-    added = model.at(context).reading(directions) - directions
-    return float(np.max(np.linalg.norm(added, axis=1)))
-
-
-def uncertainty_g(calibration: Calibration) -> float:
-    """Return the largest standard deviation of |force| over the sphere [g]."""
-    return float(np.max(deviations_g(calibration, OVER_THE_SPHERE)))
-
-
-def deviations_g(calibration: Calibration, up: Floats) -> Floats:
-    """
-    Return the (n,) standard deviations of |force| that the calibration causes [g].
-
-    They are 0 if the effects need context that the calibration does not have. `up` is (n, 3), unit
-    vectors in the sensor axes.
-
-    """
-    model = calibration.model
-    known = calibration.typical_context(len(up))
-    if any(key not in known for key in model.needs):
-        return np.zeros(len(up))
-    across = times(model.at(known).inverse_slope(up).swapaxes(-1, -2), up)
-    rows = model.basis(up, known).along(across)
-    return np.sqrt(np.maximum(np.sum(rows @ calibration.covariance * rows, axis=1), 0.0))
-
-
-def _with_uncertainty(calibration: Calibration) -> Calibration:
-    if calibration.method == PRIOR:
-        return calibration
-    uncertain = uncertainty_g(calibration)
-    if not uncertain <= LARGEST_UNCERTAINTY_G:
-        raise RefusedFitError(
-            f'the poses do not determine the calibration: the uncertainty of |a| is up to '
-            f'{uncertain * MG:.3g} mg, expected less than {LARGEST_UNCERTAINTY_G * MG:.0f} mg',
-            next((noted.words for noted in calibration.noted
-                  if noted.kind == 'outlier_not_certain'), TAKE_ALL_SIDES))
-    others = without(calibration.noted, 'uncertainty')
-    if uncertain < _WARN_UNCERTAINTY_G:
-        return replace(calibration, noted=others)
-    return replace(calibration, noted=(*others, Finding(
-        'uncertainty', f'the uncertainty of |a| is up to {uncertain * MG:.2g} mg',
-        'take more poses, spread over the sphere')))
 
 
 def sound_rows(poses: Poses, units: Units) -> tuple[Poses, tuple[Rejected, ...]]:
@@ -311,3 +180,316 @@ def _why(poses: Poses, index: int, wild: bool) -> str:
         return f'the reading ({reading}) is not plausible for an accelerometer at rest'
     noise = float(np.max(poses.noise[index])) if poses.noise is not None else np.nan
     return f'the uncertainty of the mean is {noise:.3g}, so the sensor was not at rest'
+
+
+def directions_of(poses: Poses, units: Units) -> Floats:
+    """
+    Return approximate directions of up before a fit, (n, 3) unit vectors in the sensor axes.
+
+    They start from the centre of the readings if the poses determine it. Native readings always
+    start from the centre of their sphere.
+
+    """
+    raw = unit(poses.reading)
+    if not units.is_native and dilution('4', raw) > WEAK_DILUTION:
+        return raw
+    return unit(poses.reading - fit_sphere(poses.reading)[1])
+
+
+def fit_unknown(poses: Poses, units: Units, model: str, method: Method) -> Calibration:
+    """Fit poses of unknown orientation; parameters and errors as in `fit_poses`."""
+    return _by_norm(poses, units, model, method)[0]
+
+
+def own_scale(poses: Poses, units: Units) -> Units:
+    """Return native units with the scale estimated from the poses; other units unchanged."""
+    if not units.is_native:
+        return units
+    if len(poses) < free_parameters('4'):
+        refuse_if_unfit('4', np.zeros((len(poses), 3)))
+    return Units('native', float(fit_sphere(poses.reading)[0][0, 0]))
+
+
+def _by_norm(poses: Poses, units: Units, model: str, method: Method) -> tuple[Calibration, Fit]:
+    """Fit model 4, 7, 9, 10 or ``auto`` by |force| = 1 g; errors as in `fit_poses`."""
+    units = own_scale(poses, units)
+    poses_g, directions = only_norm(in_g(poses, units)), directions_of(poses, units)
+    dilutions = _dilutions(model, directions, pose_noise(poses_g.noise, directions))
+    original = originals(poses_g) if method == 'ml' else np.arange(len(poses_g))
+    kept = np.unique(original)
+    fits: dict[str, Fit] = {}
+    if method == 'ml':
+        largest = list(dilutions)[-1]
+        fits[largest], among = _fit_norm(largest, poses_g.take(kept))
+        kept = kept[among]
+    left, used = poses_g.take(kept), directions[kept]
+    noise = pose_noise(left.noise, used)
+    if len(kept) < len(poses_g):
+        dilutions = _dilutions(model, used, noise)
+    fits = {name: fits.get(name) or _fit_rows(left, name, method) for name in dilutions}
+    name, reason = (model, f'model {model} was requested') if model != 'auto' else _choose(fits)
+    fit, out = fits[name], np.setdiff1d(np.unique(original), kept)
+    unlike = rivals(fit, kept, out, poses_g, lambda others: _estimated(name, others))
+    return record_of(
+        fit, poses, units, used, name, method, covariance=covariance_with(fit, unlike),
+        rejected=rejected_by(fit.model, poses_g.take(~np.isin(original, kept))), reason=reason,
+        noted=(*copies(original, poses_g), *rival_findings(unlike, poses_g.row),
+               *fit_findings(fit, dilutions[name]),
+               *(unseen(list(dilutions)[-1], used, noise) if model == 'auto' else ()))), fit
+
+
+def copies(original: Indices, poses: Poses) -> Iterator[Finding]:
+    """Yield a finding about the rows that count as one pose, from the result of `originals`."""
+    first, count = np.unique(original, return_counts=True)
+    groups = [poses.row[original == each].tolist() for each in first[count > 1]]
+    if groups:
+        shown = '; '.join(listed('row', rows) for rows in groups[:_MOST_NAMED])
+        more = len(groups) - _MOST_NAMED
+        yield Finding('copies', f'equal rows count as one pose: {shown}'
+                      f'{f"; and {more} more" if more > 0 else ""}',
+                      rows=tuple(row for rows in groups for row in rows))
+
+
+def only_norm(poses_g: Poses) -> Poses:
+    """Return the poses with the columns that a fit by |force| = 1 g uses."""
+    kept = ('reading', 'std', 'count')
+    return Poses({key: poses_g[key] for key in kept if key in poses_g}, poses_g.row)
+
+
+def _dilutions(model: str, directions: Floats, noise: Floats | None) -> dict[str, float]:
+    """Return the dilution of each candidate model that the poses determine, smallest first."""
+    names = NORM_MODELS if model == 'auto' else (model,)
+    dilutions = {name: dilution(name, directions, noise) for name in names
+                 if len(directions) >= poses_needed(name)}
+    determined = {name: each for name, each in dilutions.items() if each <= LARGEST_DILUTION}
+    if names[0] not in determined:
+        refuse_if_unfit(names[0], directions, noise)
+    return determined
+
+
+def _fit_norm(name: str, poses_g: Poses) -> tuple[Fit, Indices]:
+    """Fit a model without the outliers; model 9 in its own axes."""
+    try:
+        fit, kept = fit_norm(MODELS[name].norm, poses_g)
+    except NotConvergedError:
+        raise RefusedFitError(
+            f'the {len(poses_g)} poses are not on an ellipsoid, but model {name} needs one',
+            f'{TAKE_ALL_SIDES}, and hold it still in each') from None
+    return _in_own_axes(name, fit, poses_g.take(kept)), kept
+
+
+def _estimated(name: str, poses_g: Poses) -> Fit:
+    return _in_own_axes(name, estimate(start_of(MODELS[name].norm, poses_g.reading), poses_g),
+                        poses_g)
+
+
+def _in_own_axes(name: str, fit: Fit, poses_g: Poses) -> Fit:
+    """Return a fit in the axes of its model: those of model 9 are fixed to the sensing axes."""
+    return _in_sensing_axes(fit.model.linear_part, poses_g) if MODELS[name].sensing_axes else fit
+
+
+def _in_sensing_axes(linear_part: tuple[Floats, Floats], poses_g: Poses) -> Fit:
+    """Return model 9 at these poses, from W in any axes, and V."""
+    mat_w, vec_v = linear_part
+    turned = with_linear_part(lower_triangular(mat_w), vec_v).values
+    model = Model({name: turned.get(name, np.zeros(3)) for name in MODELS['9'].effects})
+    return judge(model, poses_g, TIES)
+
+
+def _fit_rows(poses_g: Poses, name: str, method: Method) -> Fit:
+    if method == 'ml':
+        return _estimated(name, poses_g)
+    mat_w, vec_v = closed_form(name, poses_g.reading)
+    if not np.all(np.isfinite(mat_w)):
+        raise RefusedFitError(f'the poses are not on an ellipsoid, but model {name} needs one',
+                              TAKE_ALL_SIDES)
+    if MODELS[name].sensing_axes:
+        return _in_sensing_axes(_of_the_report(mat_w, vec_v, poses_g), poses_g)
+    return judge(start_of(name, poses_g.reading), poses_g)
+
+
+def _of_the_report(mat_w: Floats, vec_v: Floats, poses_g: Poses) -> tuple[Floats, Floats]:
+    """Return the W and V that minimise the sum of (|a| - g)², eq. 17 of the ESGI'95 report."""
+    effects = MODELS['10'].effects
+
+    def point_at(values: Floats) -> Point:
+        model = with_vector(effects, values)
+        u = sensor_force(model, poses_g.reading, {})
+        rows = length_rows(model, u, {})
+        return Point(np.linalg.norm(u, axis=1) - 1.0, model.basis(u, {}).along(rows))
+
+    values = with_linear_part(mat_w, vec_v).values
+    start = np.concatenate([values[name] for name in effects])
+    free = np.full(len(start), np.inf)
+    found, _ = solve(point_at, start, -free, free)
+    return with_vector(effects, found).linear_part
+
+
+def _choose(fits: Mapping[str, Fit]) -> tuple[str, str]:
+    """Return the smallest model that the data support, and the reason."""
+    chosen, *larger = fits
+    reasons: list[str] = []
+    for name in larger:
+        chance = _by_chance(fits[chosen], fits[name])
+        change = f'{_rms_mg(fits[chosen]):.3g} to {_rms_mg(fits[name]):.3g} mg'
+        if chance < _LEVEL_OF_MODELS:
+            reasons.append(f'model {name} reduces the residual of model {chosen} from {change} '
+                           f'(by chance: p = {chance:.1g})')
+            chosen = name
+        else:
+            reasons.append(f'model {name} would change it from {change}, which noise explains '
+                           f'(p = {chance:.2g})')
+    return chosen, '; '.join(reasons) or f'the poses determine only model {chosen}'
+
+
+def _rms_mg(fit: Fit) -> float:
+    return float(np.sqrt(np.mean(fit.equations.of_poses(fit.residual) ** 2))) * MG
+
+
+def _by_chance(small: Fit, large: Fit) -> float:
+    """Return the probability that noise alone explains the improvement by the larger model."""
+    from scipy.special import fdtrc
+
+    if large.variance_dof <= 0:
+        return 1.0
+    added = small.dof - large.dof
+    gained = max(small.chi2 - large.chi2, 0.0) / added
+    return float(fdtrc(added, large.variance_dof, gained / max(large.variance, 1e-300)))
+
+
+def rejected_by(model: Model, poses_g: Poses) -> tuple[Rejected, ...]:
+    """Return outliers with their distance from 1 g under a model."""
+    if not len(poses_g):
+        return ()
+    away = np.linalg.norm(sensor_force(model, poses_g.reading, {}), axis=1) - 1.0
+    return tuple(Rejected(int(row), f'outlier: |force| differs by {error * MG:+.2f} mg from 1 g '
+                          'in the fit of the others', 'outlier')
+                 for row, error in zip(poses_g.row, away, strict=True))
+
+
+def fit_known(poses: Poses, units: Units, method: Method) -> Calibration:
+    """Fit poses of known orientation; parameters and errors as in `fit_poses`."""
+    poses, reason = _with_reference(poses, units)
+    if method == 'ml':
+        by_norm = _unless_placed_well(poses, units)
+        if by_norm is not None:
+            return by_norm
+    if units.is_native:
+        mat_x = fit_12(poses.reading, poses['reference'])[0]
+        units = Units('native', float(np.cbrt(abs(np.linalg.det(mat_x)))))
+    refuse_if_unfit(ORIENTED, unit(poses['reference']))
+    poses_g = in_g(poses, units)
+    fit, rejected = _without_outliers(poses_g, method)
+    out = np.isin(poses.row, [pose.row for pose in rejected])
+    unlike = rivals(fit, np.flatnonzero(~out), np.flatnonzero(out), poses_g,
+                    lambda others: estimate(fit.model, others))
+    return record_of(
+        fit, poses, units, unit(fit.poses_g['reference']), ORIENTED, method,
+        covariance=covariance_with(fit, unlike), rejected=rejected, reason=reason,
+        noted=(*rival_findings(unlike, poses.row), *fit_findings(fit, 0.0), *_placement(fit)))
+
+
+def _without_outliers(poses_g: Poses, method: Method
+                      ) -> tuple[Fit, tuple[Rejected, ...]]:
+    """Fit model 12, without outliers if the other poses determine the model."""
+    kept = ('reading', 'reference') if method == 'algebraic' else tuple(poses_g.columns)
+    poses_g = Poses({key: poses_g[key] for key in kept if key in poses_g}, poses_g.row)
+    effects = MODELS[ORIENTED].effects
+    rejected: tuple[Rejected, ...] = ()
+    fit = estimate(with_vector(effects, np.zeros(12)), poses_g)
+    while method == 'ml':
+        out = outliers(fit, len(poses_g)).poses
+        left = fit.poses_g.take(np.delete(np.arange(len(fit.poses_g)), out))
+        if not len(out) or not determines(ORIENTED, unit(left['reference'])):
+            break
+        off = fit.equations.of_poses(fit.residual)[out] * MG
+        rejected = (*rejected, *(
+            Rejected(int(row), f'outlier: the reading differs by {error:.2f} mg from the fit of '
+                     'the other poses', 'outlier')
+            for row, error in zip(fit.poses_g.row[out], off, strict=True)))
+        fit = estimate(fit.model, left)
+    return fit, rejected
+
+
+def _with_reference(poses: Poses, units: Units) -> tuple[Poses, str]:
+    """Return the poses with their known forces, and a text about the source of the forces."""
+    if 'reference' in poses:
+        return poses, 'the orientations are known'
+    faces_up = faces(poses.reading)
+    if faces_up is None:
+        raise RefusedFitError('the poses have no ref_x,ref_y,ref_z and are not the six faces, '
+                              'but model 12 needs known orientations', 'add these columns, use '
+                              'only the six faces (--rows), or use model 10')
+    force = faces_up * (1.0 if units.is_native else units.per_g)
+    return poses.with_columns(reference=force), 'the poses are the six faces'
+
+
+def _unless_placed_well(poses: Poses, units: Units) -> Calibration | None:
+    """Fit by |force| = 1 g alone if it contradicts the known orientations; otherwise None."""
+    units, directions = own_scale(poses, units), directions_of(poses, units)
+    if not determines('10', directions):
+        return None
+    try:
+        by_norm, fit = _by_norm(poses, units, '10', 'ml')
+    except RefusedFitError:  # without the outliers the poses do not determine the model
+        return None
+    seen = in_g(poses.take(np.isin(poses.row, fit.poses_g.row)), units)
+    u, known = sensor_force(fit.model, seen.reading, {}), unit(seen['reference'])
+    rotation = _rotation_onto(unit(u), known)
+    if np.linalg.det(rotation) < 0.0:  # mirrored axes: only W can show them
+        return None
+    away = unit(u) - known @ rotation.T
+    variance = _tangential_variance(fit, by_norm.covariance, u)
+    if not _is_placement(away, variance, fit.variance_dof):
+        return None
+    angle = np.degrees(np.linalg.norm(away, axis=1))
+    words = (f'the known orientations differ by {np.sqrt(np.mean(angle ** 2)):.2g}° (RMS) from a '
+             f'fit by |force| = 1 g, most in row {seen.row[np.argmax(angle)]} '
+             f'({np.max(angle):.2g}°): the fit uses only |force| = 1 g, and the orientations '
+             'determine only the rotation of the axes')
+    return replace(by_norm, model=replace(by_norm.model, rotation=rotation), reason=words,
+                   noted=(Finding('placement', words), *by_norm.noted))
+
+
+def _placement(fit: Fit) -> Iterator[Finding]:
+    """Yield a finding about placement errors that |force| = 1 g cannot detect in these poses."""
+    if fit.dof == 0:
+        return
+    off = fit.equations.of_poses(fit.residual)
+    angle = np.degrees(np.sqrt(3.0 * np.sum(off ** 2) / fit.dof))
+    if angle >= _WARN_DEGREES and fit.chi2 >= _WARN_CHI2 * fit.dof:
+        yield Finding('placement', f'the readings differ by {angle:.2g}° from the known '
+                      'orientations: if the placement of the sensor is not more accurate, the '
+                      'result has this error', 'take 12 or more poses in other orientations, too, '
+                      'and fit model 10')
+
+
+def _rotation_onto(directions: Floats, known: Floats) -> Floats:
+    """Return the orthogonal (3, 3) matrix R with directions = R known; robust to outliers."""
+    weight = np.ones(len(directions))
+    for _ in range(_ROUNDS):
+        left, _, right = np.linalg.svd((directions * weight[:, np.newaxis]).T @ known)
+        rotation: Floats = left @ right
+        away = np.linalg.norm(directions - known @ rotation.T, axis=1)
+        weight = 1.0 / np.maximum(away, max(float(np.median(away)), _SMALL_ANGLE))
+    return rotation
+
+
+def _tangential_variance(fit: Fit, covariance: Floats, u: Floats) -> Floats:
+    """Return the (n,) variance across the force u from noise and uncertainty of the fit [g²]."""
+    moved = np.linalg.solve(force_slope(fit.model, u, {}), parameter_basis(fit.model, u, {}))
+    spread = moved @ covariance @ np.swapaxes(moved, 1, 2)
+    along = np.einsum('ni,nij,nj->n', unit(u), spread, unit(u))
+    own = 2.0 * fit.equations.scale ** 2 * fit.variance
+    return own + np.trace(spread, axis1=1, axis2=2) - along
+
+
+def _is_placement(away: Floats, variance: Floats, variance_dof: float) -> bool:
+    """Return whether the differences are larger than the noise explains."""
+    from scipy.special import fdtrc
+
+    dof = 2.0 * len(away) - 3.0
+    ratio = float(np.sum(away ** 2) / np.sum(variance)) * 2.0 * len(away) / dof
+    return bool(ratio > _LEAST_RATIO and fdtrc(dof, variance_dof, ratio) < _LEVEL_OF_PLACEMENT)
+
+

@@ -2,33 +2,66 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Figures and findings of a fit, its record, and the residuals of a calibration on other poses.
+Figures and findings of a fit, its record, and the gate.
 
 The error of a pose is |force| - 1 g. For model 12 and poses of known orientation it is the length
 of the vector error. The residual of a calibration is the RMS of the errors over the poses.
+
+The gate checks every calibration before it is stored, loaded or used. A fit has already converged
+(`accel_calib.estimate.fit`), and its poses determine the model (`.pose_planning`). The gate checks
+the calibration itself: finite values, a proper rotation, a valid covariance, plausible offset,
+gain and effects, and a useful uncertainty. The limits are far beyond the values of working
+sensors; only useless calibrations exceed them.
+
+Each limit is written as `not value <= limit`, so that NaN does not pass it. Absurd values may
+overflow on the way; infinity does not pass either.
+
+A calibration without effects, such as a mounting alone, has no residual of a fit to check. The
+uncertainty of a partial fit (`.partial`) is limited by that of common sensors, and its warning
+states it. It has no other limit.
 
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .calibration import Calibration, check_sensor, Quality, Rejected
+from .calibration import Calibration, check_sensor, PRIOR, Quality, Rejected
 from .context import with_history
-from ..effects import correct, Model, sensor_force
+from .rest_noise import with_rest_noise
+from ..effects import correct, LADDER, length_rows, Model, sensor_force
+from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import believable, Fit, judge, Rival, unseen_mistakes, WEAK_DILUTION
-from ..finding import Finding
-from ..geometry import coverage
+from ..finding import Finding, without
+from ..geometry import coverage, OVER_THE_SPHERE, unit
 from ..table import Floats, Poses
 from ..text import listed
 from ..units import MG, Units
 
 _LEAST_OWN = 1e-9
 """1 - leverage below this: the pose alone determines a parameter."""
+
+LARGEST_OFFSET_G = 1.0
+"""Largest zero-g offset of a working accelerometer [g]; not checked for native units."""
+
+GAINS = (0.5, 2.0)
+"""Smallest and largest gain of a working accelerometer, relative to the scale of its units."""
+
+LARGEST_RESIDUAL_G = 0.05
+"""Largest residual of poses on one ellipsoid [g]."""
+
+LARGEST_UNCERTAINTY_G = 0.1
+"""Largest uncertainty of |force| of a useful calibration [g]."""
+
+_WARN_UNCERTAINTY_G = 0.005
+_ROTATION_TOLERANCE = 1e-6
+_COVARIANCE_TOLERANCE = 1e-6
+
+_CHECK_POSES = 'check the poses for mistakes, take new poses, and fit again'
 
 
 @dataclass(frozen=True)
@@ -76,15 +109,21 @@ def verify(calibration: Calibration, poses: Poses) -> Verification:
     check_sensor(calibration, poses.sensor)
     poses_g = calibration.held(with_history(in_g(poses, units), model))
     vectors = calibration.form.known_orientation and 'reference' in poses
-    before = errors_before(poses_g, units, vectors=vectors)
-    after = errors_after(model, poses_g, vectors=vectors)
     floor = None
     if believable(poses_g.noise) is not None:
         known = poses_g if vectors else _without_orientation(poses_g)
         scale = judge(Model(model.values), known).equations.scale
         floor = _rms_mg(scale) * float(np.sqrt(3.0 if vectors else 1.0))
-    return Verification(_rms_mg(before), _rms_mg(after), _largest_percent(before),
-                        _largest_percent(after), floor)
+    return Verification(*_residuals(model, poses_g, units, vectors), floor)
+
+
+def _residuals(model: Model, poses_g: Poses, units: Units, vectors: bool
+               ) -> tuple[float, float, float, float]:
+    """Return the first four figures of `Quality` and of `Verification`."""
+    errors = (errors_before(poses_g, units, vectors=vectors),
+              errors_after(model, poses_g, vectors=vectors))
+    before, after = (float(np.max(np.abs(each))) * 100.0 for each in errors)
+    return _rms_mg(errors[0]), _rms_mg(errors[1]), before, after
 
 
 def _without_orientation(poses_g: Poses) -> Poses:
@@ -95,11 +134,9 @@ def _without_orientation(poses_g: Poses) -> Poses:
 def quality_of(fit: Fit, units: Units, directions: Floats) -> Quality:
     """Return figures of a fit; `directions` are up in each of its poses, (n, 3) unit vectors."""
     vectors = 'reference' in fit.poses_g
-    before = errors_before(fit.poses_g, units, vectors=vectors)
-    errors = errors_after(fit.model, fit.poses_g, vectors=vectors)
     held_out = _held_out(fit)
-    return Quality(_rms_mg(before), _rms_mg(errors), _largest_percent(before),
-                   _largest_percent(errors), None if held_out is None else _rms_mg(held_out),
+    return Quality(*_residuals(fit.model, fit.poses_g, units, vectors),
+                   None if held_out is None else _rms_mg(held_out),
                    noise_floor_mg(fit) if fit.noise_known else None,
                    fit.chi2 / fit.dof if fit.noise_known and fit.dof > 0 else None,
                    coverage(directions))
@@ -107,12 +144,11 @@ def quality_of(fit: Fit, units: Units, directions: Floats) -> Quality:
 
 def record_of(fit: Fit, poses: Poses, units: Units, directions: Floats, name: str, method: str, *,
               covariance: Floats | None = None, rejected: tuple[Rejected, ...] = (),
-              reason: str = '', noted: tuple[Finding, ...] = (), sensor: str = '', date: str = ''
-              ) -> Calibration:
+              reason: str = '', noted: tuple[Finding, ...] = ()) -> Calibration:
     """
     Return a fit as a calibration with ΔR = I, or with the ΔR of its model.
 
-    The gate has not checked it yet: `accel_calib.calibrate.fit.finished` does. A fit is also
+    The gate has not checked it yet: `finished` does. A fit is also
     compared with another fit to fewer poses, or of a larger model, which need not be useful.
 
     Parameters
@@ -125,12 +161,12 @@ def record_of(fit: Fit, poses: Poses, units: Units, directions: Floats, name: st
         Direction of up in each pose of the fit, unit vectors.
     covariance : (p, p) array, optional
         Covariance of the values; by default that of the fit.
-    units, name, method, rejected, reason, noted, sensor, date
+    units, name, method, rejected, reason, noted
         As in `Calibration`; `rejected` in any order.
 
     """
     return Calibration(
-        name, method, fit.model, units, sensor, 'ros', date,
+        name, method, fit.model, units, poses.sensor, 'ros', '',
         fit.covariance if covariance is None else covariance, quality_of(fit, units, directions),
         poses, tuple(sorted(rejected, key=lambda pose: pose.row)), reason, noted)
 
@@ -188,10 +224,6 @@ def _held_out(fit: Fit) -> Floats | None:
 
 def _rms_mg(errors_g: Floats | float) -> float:
     return float(np.sqrt(np.mean(np.square(errors_g)))) * MG
-
-
-def _largest_percent(errors_g: Floats) -> float:
-    return float(np.max(np.abs(errors_g))) * 100.0
 
 
 _UNSEEN_G = 0.01
@@ -267,3 +299,146 @@ def rival_findings(found: tuple[Rival, ...], row: NDArray[np.int64]) -> Iterator
 
 def _and_more(rows: list[int]) -> str:
     return f' and {len(rows) - _MOST_NAMED} more' if len(rows) > _MOST_NAMED else ''
+
+
+def finished(calibration: Calibration, poses: Poses, sensor: str, date: str) -> Calibration:
+    """Return a calibration that has passed the gate, with the figures of its rests."""
+    named = replace(calibration, sensor=sensor or poses.sensor, date=date)
+    return with_rest_noise(gated(named), poses)
+
+
+@np.errstate(over='ignore', invalid='ignore')
+def gated(calibration: Calibration) -> Calibration:
+    """
+    Check a calibration, and return it with a finding if its uncertainty is large.
+
+    Raises
+    ------
+    RefusedFitError
+        If the calibration is not plausible.
+
+    """
+    _check_numbers(calibration)
+    _check_rotation(calibration.model.rotation)
+    _check_covariance(calibration.covariance)
+    _check_gain(calibration)
+    _check_effects(calibration)
+    residual = calibration.quality.rms_after_mg / MG
+    if calibration.model.effects and not residual <= LARGEST_RESIDUAL_G:
+        raise RefusedFitError(
+            f'the residual is {residual * MG:.3g} mg (RMS) after the fit, expected less than '
+            f'{LARGEST_RESIDUAL_G * MG:.0f} mg: the poses are not on an ellipsoid', _CHECK_POSES)
+    return _with_uncertainty(calibration)
+
+
+def _check_numbers(calibration: Calibration) -> None:
+    model = calibration.model
+    for what, values in (('value', model.vector), ('gain', model.linear_part[0]),
+                         ('rotation', model.rotation), ('covariance', calibration.covariance)):
+        if not np.all(np.isfinite(values)):
+            raise RefusedFitError(f'the calibration has a {what} that is not finite, expected '
+                                  'finite numbers', _CHECK_POSES)
+
+
+def _check_rotation(rotation: Floats) -> None:
+    proper = (rotation.shape == (3, 3) and np.linalg.det(rotation) > 0.0
+              and np.allclose(rotation @ rotation.T, np.eye(3), atol=_ROTATION_TOLERANCE))
+    if not proper:
+        raise RefusedFitError('the mounting ΔR is not orthonormal, or it is a mirror image; '
+                              'expected a rotation', 'level the mounting again')
+
+
+def _check_covariance(covariance: Floats) -> None:
+    """Refuse a covariance that is not symmetric and positive semidefinite."""
+    root = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    with np.errstate(over='ignore', invalid='ignore'):
+        scaled = covariance / root / root[:, np.newaxis]
+    sound = (np.all(np.diag(covariance) >= 0.0) and np.all(np.isfinite(scaled))
+             and np.allclose(scaled, scaled.T, atol=_COVARIANCE_TOLERANCE)
+             and (not len(root)
+                  or np.min(np.linalg.eigvalsh(scaled)) >= -_COVARIANCE_TOLERANCE * len(root)))
+    if not sound:
+        raise RefusedFitError('the covariance is not valid, expected a symmetric and positive '
+                              'semidefinite matrix', 'fit again')
+
+
+def _check_gain(calibration: Calibration) -> None:
+    mat_w, vec_v = calibration.model.linear_part
+    gains = np.linalg.svd(mat_w, compute_uv=False)
+    if not np.linalg.det(mat_w) > 0.0 and not calibration.form.known_orientation:
+        raise RefusedFitError('the gain W is singular or a mirror image, expected det W > 0',
+                              _CHECK_POSES)
+    if not GAINS[0] <= gains[-1] <= gains[0] <= GAINS[1]:
+        raise RefusedFitError('the poses are not on an ellipsoid of an accelerometer: the gains '
+                              f'are {gains[-1]:.3g} to {gains[0]:.3g}, expected {GAINS[0]:g} to '
+                              f'{GAINS[1]:g}', f'check the units, or {_CHECK_POSES}')
+    offset = float(np.linalg.norm(vec_v))
+    if not calibration.units.is_native and not offset <= LARGEST_OFFSET_G:
+        raise RefusedFitError(f'the zero-g offset is {offset:.3g} g, expected less than '
+                              f'{LARGEST_OFFSET_G:g} g', _CHECK_POSES)
+
+
+def _check_effects(calibration: Calibration) -> None:
+    """Refuse effects whose contribution to a pose of the calibration is not plausible."""
+    used = calibration.used_poses
+    for name, values in calibration.model.values.items():
+        model = Model({name: values})
+        effect = model.terms.effects[0]
+        if name in LADDER or effect.output is not None or not len(used):
+            continue
+        if any(key not in used for key in model.needs if key != 'previous'):
+            continue
+        added = _contribution(model, used, calibration.units)
+        if not added <= effect.plausible_g:
+            raise RefusedFitError(f'{name} adds up to {added:.3g} g to a reading, expected less '
+                                  f'than {effect.plausible_g:g} g', _CHECK_POSES)
+
+
+def _contribution(model: Model, used: Poses, units: Units) -> float:
+    """Return the largest contribution of an effect at poses [g]."""
+    context = {**used.columns}
+    if 'std' in used:
+        context['std'] = units.to_g(used['std'])
+    context.setdefault('previous', unit(used.reading))
+    directions = unit(used.reading)
+    added = model.at(context).reading(directions) - directions
+    return float(np.max(np.linalg.norm(added, axis=1)))
+
+
+def uncertainty_g(calibration: Calibration) -> float:
+    """Return the largest standard deviation of |force| over the sphere [g]."""
+    return float(np.max(deviations_g(calibration, OVER_THE_SPHERE)))
+
+
+def deviations_g(calibration: Calibration, up: Floats) -> Floats:
+    """
+    Return the (n,) standard deviations of |force| that the calibration causes [g].
+
+    They are 0 if the effects need context that the calibration does not have. `up` is (n, 3), unit
+    vectors in the sensor axes.
+
+    """
+    model = calibration.model
+    known = calibration.typical_context(len(up))
+    if any(key not in known for key in model.needs):
+        return np.zeros(len(up))
+    rows = model.basis(up, known).along(length_rows(model, up, known))
+    return np.sqrt(np.maximum(np.sum(rows @ calibration.covariance * rows, axis=1), 0.0))
+
+
+def _with_uncertainty(calibration: Calibration) -> Calibration:
+    if calibration.method == PRIOR:
+        return calibration
+    uncertain = uncertainty_g(calibration)
+    if not uncertain <= LARGEST_UNCERTAINTY_G:
+        raise RefusedFitError(
+            f'the poses do not determine the calibration: the uncertainty of |a| is up to '
+            f'{uncertain * MG:.3g} mg, expected less than {LARGEST_UNCERTAINTY_G * MG:.0f} mg',
+            next((noted.words for noted in calibration.noted
+                  if noted.kind == 'outlier_not_certain'), TAKE_ALL_SIDES))
+    others = without(calibration.noted, 'uncertainty')
+    if uncertain < _WARN_UNCERTAINTY_G:
+        return replace(calibration, noted=others)
+    return replace(calibration, noted=(*others, Finding(
+        'uncertainty', f'the uncertainty of |a| is up to {uncertain * MG:.2g} mg',
+        'take more poses, spread over the sphere')))

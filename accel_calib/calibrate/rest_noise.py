@@ -210,61 +210,48 @@ def gyro_bias_of(poses: Poses) -> GyroBias | None:
     """
     if 'rate' not in poses or len(poses) < LEAST_RESTS:
         return None
-    rests = _rates_of(poses)
-    if not np.any(rests.rate) or not _in_rad_s(rests.rate):
+    if not np.any(poses['rate']) or not _in_rad_s(poses['rate']):
         return None
-    rests = rests.take(_agreeing(rests))
-    constant, line = _means(rests), _lines(rests)
-    sloping = np.zeros(3, bool) if line is None else line.is_sloping(len(rests.rate))
+    if 'time' in poses:
+        poses = poses.take(np.argsort(poses['time'], kind='stable'))
+    rests = poses.take(_agreeing(poses))
+    constant, line = _fitted(np.ones((len(rests), 1)), rests), _lines(rests)
+    sloping = np.zeros(3, bool) if line is None else line.is_sloping(len(rests))
     chosen = constant if line is None else line.where(sloping, constant)
     bias, sd = chosen.values[0], chosen.deviation[0]
     if np.any(np.abs(bias) >= LARGEST_BIAS) or np.any(sd >= _LARGEST_SD):
         return None
     slope = np.where(sloping, chosen.values[-1], 0.0)
-    if rests.temperature is None:
-        return GyroBias(bias, sd, len(rests.rate), math.nan, slope, ())
-    limits = (float(rests.temperature.min()), float(rests.temperature.max()))
-    mean = float(np.clip(rests.temperature.mean(), *limits))
-    return GyroBias(bias, sd, len(rests.rate), mean, slope, limits)
+    if 'temperature' not in rests:
+        return GyroBias(bias, sd, len(rests), math.nan, slope, ())
+    temperature = rests['temperature']
+    limits = (float(temperature.min()), float(temperature.max()))
+    mean = float(np.clip(temperature.mean(), *limits))
+    return GyroBias(bias, sd, len(rests), mean, slope, limits)
 
 
-@dataclass(frozen=True)
-class _Rates:
-    """Rates (n, 3) [rad/s], variances of their noise, and (n,) temperatures, in order of time."""
-
-    rate: Floats
-    variance: Floats
-    temperature: Floats | None
-
-    def take(self, which: NDArray[np.bool_]) -> _Rates:
-        return _Rates(self.rate[which], self.variance[which],
-                      None if self.temperature is None else self.temperature[which])
+def _noise_of(rests: Poses) -> Floats:
+    """Return the (n, 3) variances of the mean rates that the noise of the samples causes."""
+    if 'rate_std' not in rests or 'count' not in rests:
+        return np.full(rests['rate'].shape, _TINY)
+    return np.asarray(rests['rate_std'] ** 2 / rests['count'][:, np.newaxis] + _TINY)
 
 
-def _rates_of(poses: Poses) -> _Rates:
-    if 'time' in poses:
-        poses = poses.take(np.argsort(poses['time'], kind='stable'))
-    variance = np.zeros_like(poses['rate'], dtype=float)
-    if 'rate_std' in poses and 'count' in poses:
-        variance = poses['rate_std'] ** 2 / poses['count'][:, np.newaxis]
-    return _Rates(poses['rate'], variance + _TINY, poses.columns.get('temperature'))
-
-
-def _agreeing(rests: _Rates) -> NDArray[np.bool_]:
+def _agreeing(rests: Poses) -> NDArray[np.bool_]:
     """Return which rests have the rate that noise and scatter explain."""
     from scipy.special import stdtrit
 
-    count, left = len(rests.rate), rests.rate
-    with_slope = rests.temperature is not None and count >= _ENOUGH
-    if rests.temperature is not None and with_slope:
-        slope = _slope_of_pairs(rests.rate, rests.temperature)
-        left = left - rests.temperature[:, np.newaxis] * slope
+    count, left, noise = len(rests), rests['rate'], _noise_of(rests)
+    with_slope = 'temperature' in rests and count >= _ENOUGH
+    if with_slope:
+        temperature = rests['temperature']
+        left = left - temperature[:, np.newaxis] * _slope_of_pairs(left, temperature)
     left = np.abs(left - np.median(left, axis=0))
     factor = _MAD_FEW[count] if count < len(_MAD_FEW) else count / (count - 0.8)
     spread = _MAD * factor * np.median(left, axis=0)
-    scatter = np.maximum(spread ** 2 - np.median(rests.variance, axis=0), 0.0)
+    scatter = np.maximum(spread ** 2 - np.median(noise, axis=0), 0.0)
     limit = float(stdtrit(count - 1 - with_slope, 1.0 - _TAIL))
-    return np.asarray(np.all(left ** 2 <= limit ** 2 * (rests.variance + scatter), axis=1))
+    return np.asarray(np.all(left ** 2 <= limit ** 2 * (noise + scatter), axis=1))
 
 
 def _slope_of_pairs(values: Floats, temperature: Floats) -> Floats:
@@ -320,26 +307,22 @@ class _RateFit:
         return _RateFit(values, variance, np.where(mine, self.residual, other.residual))
 
 
-def _means(rests: _Rates) -> _RateFit:
-    return _fitted(np.ones((len(rests.rate), 1)), rests)
-
-
-def _lines(rests: _Rates) -> _RateFit | None:
+def _lines(rests: Poses) -> _RateFit | None:
     """Return lines over temperature minus its mean; None if they are not determined."""
-    temperature = rests.temperature
+    temperature = rests.columns.get('temperature')
     if temperature is None or len(temperature) < _ENOUGH or not np.ptp(temperature) > 0.0:
         return None
     design = np.column_stack([np.ones(len(temperature)), temperature - temperature.mean()])
     return _fitted(design, rests)
 
 
-def _fitted(design: Floats, rests: _Rates) -> _RateFit:
+def _fitted(design: Floats, rests: Poses) -> _RateFit:
     """Fit the rates of each axis with noise and scatter; `design` is (n, p)."""
     from scipy.special import stdtrit
 
     surplus = float(stdtrit(len(design) - design.shape[1], _CONFIDENCE)) / _NORMAL
     values, variance, residual = [], [], []
-    for rate, noise in zip(rests.rate.T, rests.variance.T, strict=True):
+    for rate, noise in zip(rests['rate'].T, _noise_of(rests).T, strict=True):
         scatter = _scatter(design, rate, noise)
         found, inverse, left = _weighted(design, rate, noise + scatter)
         share = (noise + surplus ** 2 * scatter) / (noise + scatter) ** 2

@@ -52,13 +52,13 @@ from itertools import combinations
 from math import comb
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .equations import believable
 from ..effects import linear_values, Model, MODELS, parameter_names, with_linear_part, with_vector
 from ..errors import RefusedFitError
-from ..table import Floats, Poses
+from ..table import Poses
 from ..text import counted
+from ..units import Floats, Indices
 
 _RIDGE = 1e-12
 """Keeps the solution finite for poses in a plane; the centre is then in the plane."""
@@ -73,11 +73,11 @@ _IDENTITY, _ONES, _COLUMN = np.eye(3), np.ones(3), np.ones((3, 1))
 class Form:
     """The monomials r_i r_j of a quadric: (k,) arrays of i and j; pairs with i = j are first."""
 
-    first: NDArray[np.intp]
-    second: NDArray[np.intp]
+    first: Indices
+    second: Indices
 
     @cached_property
-    def pairs(self) -> NDArray[np.intp]:
+    def pairs(self) -> Indices:
         """(2 k,) array, all i, then all j."""
         return np.concatenate([self.first, self.second])
 
@@ -272,7 +272,7 @@ def start_of(name: str, reading: Floats) -> Model:
     return Model({effect: values[effect] for effect in MODELS[name].effects})
 
 
-def agreeing(name: str, poses_g: Poses, most: int) -> NDArray[np.intp]:
+def agreeing(name: str, poses_g: Poses, most: int) -> Indices:
     """Return the indices of all poses but `most`, selected so that they agree best."""
     count = len(poses_g)
     reading = poses_g.reading
@@ -287,7 +287,7 @@ def agreeing(name: str, poses_g: Poses, most: int) -> NDArray[np.intp]:
     return np.sort(nearest[0])
 
 
-def _subsets(count: int, most: int, free: int) -> NDArray[np.intp]:
+def _subsets(count: int, most: int, free: int) -> Indices:
     """Return all subsets of count - most poses, or `_MOST_SUBSETS` random subsets."""
     if comb(count, most) <= _MOST_SUBSETS:
         out = np.array(list(combinations(range(count), most)))
@@ -299,7 +299,7 @@ def _subsets(count: int, most: int, free: int) -> NDArray[np.intp]:
     return np.argsort(rng.random((_MOST_SUBSETS, count)), axis=1)[:, :size]
 
 
-def _squared_distances(name: str, reading: Floats, subsets: NDArray[np.intp], noise: Floats
+def _squared_distances(name: str, reading: Floats, subsets: Indices, noise: Floats
                        ) -> Floats:
     """Return the (s, n) squared distances of all poses from the closed form of each subset."""
     with np.errstate(all='ignore'):  # some subsets are not on an ellipsoid, or are in a plane

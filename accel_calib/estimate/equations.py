@@ -56,11 +56,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..effects import AtContext, Context, EachShape, Model, times
 from ..geometry import unit
-from ..table import Floats, Poses
+from ..table import Poses
+from ..units import Floats, Indices
 
 USUAL_NOISE_G = 5e-4
 """Noise of a pose mean of a common MEMS sensor, assumed if it was not measured [g]."""
@@ -109,8 +109,6 @@ _DOUBT_BELOW = 0.01
 
 _DOUBTED = 1.0
 """Degrees of freedom that contradicted noise counts as."""
-
-Indices = NDArray[np.intp]
 
 
 def believable(noise: Floats | None) -> Floats | None:

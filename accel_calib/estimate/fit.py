@@ -33,11 +33,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .closed_form import along_quadrics
-from .equations import belief_in, Equations, equations, Indices, measured, variance_factor
+from .equations import belief_in, Equations, equations, measured, variance_factor
 from ..effects import CHANGES, fitted_places, LADDER, Model, parameter_names, with_vector
 from ..errors import RefusedFitError
 from ..geometry import unit
-from ..table import Floats, Poses
+from ..table import Poses
+from ..units import Floats, Indices
 
 _MOST_STEPS = 60
 _FIRST_DAMPING = 1e3   # relative to the smallest determined square

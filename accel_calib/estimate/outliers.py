@@ -45,10 +45,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .closed_form import agreeing, start_of
-from .equations import belief_beside, belief_in, Indices
+from .equations import belief_beside, belief_in
 from .fit import ByPose, estimate, Fit, judge, NotConvergedError
 from ..effects import MODELS, parameter_names
-from ..table import Floats, Poses
+from ..table import Poses
+from ..units import Floats, Indices
 
 LEVEL = 0.007
 """Probability that a pose of a set without outliers is removed."""
@@ -342,25 +343,25 @@ class Rival(NamedTuple):
     odds: float
 
 
-def rivals(fit: Fit, kept: Indices, poses_g: Poses,
+def rivals(fit: Fit, kept: Indices, out: Indices, poses_g: Poses,
            refit: Callable[[Poses], Fit]) -> tuple[Rival, ...]:
     """
     Return the poses that may be wrong instead of those that were left out.
 
-    `kept` are the (k,) indices of the poses of the fit among `poses_g`, all poses without copies.
-    `refit` fits the same model to other poses, and may raise `NotConvergedError`.
+    `kept` and `out` are indices among `poses_g`, without copies: of the poses of the fit, and of
+    those left out. `refit` fits the same model to other poses, and may raise `NotConvergedError`.
 
     """
     found = []
-    for out, instead in _look_alikes(fit, kept, poses_g):
-        others = np.union1d(np.setdiff1d(kept, [instead]), [out])
+    for wrong, instead in _look_alikes(fit, kept, out, poses_g):
+        others = np.union1d(np.setdiff1d(kept, [instead]), [wrong])
         try:
             rival = refit(poses_g.take(others))
         except NotConvergedError:
             continue
         odds = _odds(rival, fit)
         if odds >= LEVEL:
-            found.append(Rival(out, instead, rival, odds))
+            found.append(Rival(wrong, instead, rival, odds))
     return tuple(found)
 
 
@@ -378,9 +379,9 @@ def covariance_with(fit: Fit, found: tuple[Rival, ...]) -> Floats:
     return spread
 
 
-def _look_alikes(fit: Fit, kept: Indices, poses_g: Poses) -> Iterator[tuple[int, int]]:
+def _look_alikes(fit: Fit, kept: Indices, out: Indices, poses_g: Poses
+                 ) -> Iterator[tuple[int, int]]:
     """Yield the poses left out, each with a pose kept whose mistake would look like its own."""
-    out = np.setdiff1d(np.arange(len(poses_g)), kept)
     if not len(out):
         return
     data = judge(fit.model, poses_g.take(np.concatenate([kept, out])), fit.ties).by_pose

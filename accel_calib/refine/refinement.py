@@ -10,7 +10,7 @@ base.
 **Typical values of a fleet.** The search for effects is that without a fleet, because a fleet says
 nothing about effects beyond offset, gain and cross-axis. It needs more poses than model 10 has
 values. If it names effects, the fitted values are combined with the fleet
-(`accel_calib.calibrate.prior`): offset, gain and cross-axis move towards the fleet, and the
+(`accel_calib.calibrate.partial`): offset, gain and cross-axis move towards the fleet, and the
 effects with them as far as the poses cannot distinguish them. Otherwise the result is the fit with
 the fleet. If the poses do not carry a search, the first advice states the reason, and all effects
 are listed as not testable.
