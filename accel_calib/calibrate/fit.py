@@ -491,5 +491,3 @@ def _is_placement(away: Floats, variance: Floats, variance_dof: float) -> bool:
     dof = 2.0 * len(away) - 3.0
     ratio = float(np.sum(away ** 2) / np.sum(variance)) * 2.0 * len(away) / dof
     return bool(ratio > _LEAST_RATIO and fdtrc(dof, variance_dof, ratio) < _LEVEL_OF_PLACEMENT)
-
-

@@ -15,27 +15,24 @@ refused. Three results are still possible:
 
 **Common sensors.** Before any pose, each value of model 10 is normally distributed about zero with
 the typical size of its effect (`accel_calib.effects`). The poses reduce this uncertainty only in
-the combinations that they carry. Poses near one direction determine the sum of offset and gain
+the combinations that they carry: poses near one direction determine the sum of offset and gain
 along it, and, by their tilt, some combinations across it. The covariance of the result is the
-posterior covariance. It is small for |force| in the directions of the poses. In the other
-directions it is nearly that of a sensor without calibration.
+posterior one. It is small for |force| in the directions of the poses, and elsewhere nearly that of
+a sensor without calibration.
 
 **Fleet** (empirical Bayes). The sensors of one model have the values of model 10 with the mean m
 and the covariance P. A few sensors are unlike the others. The values of a sensor are therefore
 normally distributed about m with one of several covariances: those of the fleet, s² P with a small
 s, or those of common sensors, with the probability `_UNLIKE`. The poses are fitted with each of
 them, and the most probable one is used: the evidence of the readings times the probability of the
-covariance. The readings of a sensor that is unlike the fleet contradict the covariances of the
-fleet. It is then fitted as a common sensor.
+covariance. A sensor whose readings contradict the fleet is fitted as a common sensor. A fit that
+needs no prior, such as a refined one, has its values x with the covariance C. They are combined
+with the fleet to first order (`posterior`): x + K (m - x) with K = C (C + P)⁻¹.
 
-A fit that needs no prior, such as a refined one, has its values x with the covariance C. They are
-combined with the fleet to first order (`posterior`): x + K (m - x) with K = C (C + P)⁻¹.
-
-**Noise.** Poses often repeat worse than the noise of their samples predicts. If this is not taken
-into account, little holds the values, and they follow the errors of the poses far beyond those of
-common sensors. The poses are therefore fitted with several variance factors of the noise, from a
-large one to 1, each fit starting from the previous one. The evidence of a factor is the
-probability of the readings r, given factor and prior,
+**Noise.** Poses often repeat worse than the noise of their samples predicts. The values would then
+follow the errors of the poses far beyond those of common sensors. The poses are therefore fitted
+with several variance factors of the noise, from a large one to 1, each fit starting from the
+previous one. The evidence of a factor is the probability of the readings r, given factor and prior
 
     r ~ N(0, factor · noise² + J P Jᵀ)
 
@@ -346,7 +343,9 @@ def fit_partial(poses: Poses, units: Units, *, sensor: str = '', date: str = '')
 
     Use this function if a fit is refused and `lies_in_cone` is true for the directions. If the
     sensor can be turned, a fit with more poses is better. Only |force| = 1 g is used, even if the
-    orientations are known.
+    orientations are known. The calibration has ΔR = I and the method `PRIOR`. Its covariance
+    includes the prior. The reason states what the poses determine, and a finding what they leave
+    open.
 
     Parameters
     ----------
@@ -356,12 +355,6 @@ def fit_partial(poses: Poses, units: Units, *, sensor: str = '', date: str = '')
         Unit of the readings, not native.
     sensor, date : str
         Stored in the record. By default the name in the poses.
-
-    Returns
-    -------
-    Calibration
-        The calibration with ΔR = I and the method `PRIOR`. Its covariance includes the prior. The
-        reason states what the poses determine, and a finding what they leave open.
 
     Raises
     ------

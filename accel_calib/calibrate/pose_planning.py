@@ -32,8 +32,8 @@ from .calibration import Calibration, ORIENTED
 from ..errors import RefusedFitError
 from ..estimate import (
     Combination, dilution, error_left_in, Identifiability, identifiability, information_of,
-    LARGEST_DILUTION, left_out, NORM_MODELS, over_the_sphere, pose_noise, poses_needed,
-    relative_weights, rows_of, WEAK_DILUTION)
+    LARGEST_DILUTION, largest_error, left_out, NORM_MODELS, pose_noise, poses_needed, rows_of,
+    WEAK_DILUTION)
 from ..finding import Finding
 from ..geometry import ATTITUDES, axes_of_signs, cone_of, distinct, OVER_THE_SPHERE, words_of
 from ..table import Floats
@@ -84,9 +84,7 @@ class NextPose:
 @lru_cache(maxsize=8)
 def _mean_information(name: str) -> Floats:
     """Return the (p, p) information of one pose spread over the sphere."""
-    rows = over_the_sphere(name)
-    mean: Floats = np.einsum('nip,niq->pq', rows, rows) / len(rows)
-    return mean
+    return information_of(name, OVER_THE_SPHERE) / len(OVER_THE_SPHERE)
 
 
 def next_pose(directions: Floats, name: str = '10', noise: Floats | None = None, *,
@@ -107,7 +105,7 @@ def next_pose(directions: Floats, name: str = '10', noise: Floats | None = None,
 
     """
     count = len(directions)
-    information = information_of(name, directions, relative_weights(noise, count))
+    information = information_of(name, directions, noise)
     error, fits = _error(name, information, count), determines(name, directions, noise)
     up = _best(name, directions, information)
     if up is None or not _helps(name, up, information, count):
@@ -120,40 +118,27 @@ def next_pose(directions: Floats, name: str = '10', noise: Floats | None = None,
 def _helps(name: str, up: Floats, information: Floats, count: int) -> bool:
     """Return whether a pose in this direction improves a fit visibly."""
     now, after = (_error(name, information, count),
-                  _error(name, information + _of_pose(name, up), count + 1))
-    return after <= (1.0 - _LEAST_GAIN) * now or _is_poor(name, information)
-
-
-def _of_pose(name: str, up: Floats) -> Floats:
-    """Return the (p, p) information of one pose."""
-    return information_of(name, up[np.newaxis], np.ones(1))
+                  _error(name, information + information_of(name, up[np.newaxis]), count + 1))
+    return after <= (1.0 - _LEAST_GAIN) * now or largest_error(name, information) > _GOOD_DILUTION
 
 
 def _planned(name: str, directions: Floats, information: Floats, spare: int) -> Iterator[Floats]:
     """Yield the attitudes to add until the poses determine a model well."""
-    while len(directions) < poses_needed(name) + spare or _is_poor(name, information):
+    while (len(directions) < poses_needed(name) + spare
+           or largest_error(name, information) > _GOOD_DILUTION):
         up = _best(name, directions, information)
         if up is None:
             return
         yield up
         directions = np.vstack([directions, up])
-        information = information + _of_pose(name, up)
+        information = information + information_of(name, up[np.newaxis])
 
 
 def missing_poses(name: str, directions: Floats, noise: Floats | None = None) -> list[str]:
     """Return the sides, edges and corners to point up next, until a model is determined well."""
-    information = information_of(name, directions, relative_weights(noise, len(directions)))
+    information = information_of(name, directions, noise)
     return [f'{words_of(up)} ({axes_of_signs(up)})'
             for up in _planned(name, directions, information, 0)]
-
-
-def _is_poor(name: str, information: Floats) -> bool:
-    """Return whether a fit with this information has a large error in some direction."""
-    if np.linalg.matrix_rank(information, hermitian=True) < len(information):
-        return True
-    rows = over_the_sphere(name)
-    errors = np.einsum('nip,pq,niq->n', rows, np.linalg.inv(information), rows)
-    return bool(np.max(errors) > _GOOD_DILUTION ** 2)
 
 
 def _best(name: str, directions: Floats, information: Floats) -> Floats | None:

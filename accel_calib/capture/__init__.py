@@ -4,17 +4,15 @@
 """
 From samples to still poses. The node and recordings use the same rule.
 
-`detector` is the entry point; it joins still chunks to dwells. `chunks` sums the samples over
-short intervals of header time, and `rule` decides whether the sensor is still in each chunk, from
-the arithmetic in `trend`. `dwell` accumulates a dwell and accepts or rejects it. `poses` makes the
-pose table.
+`chunks` sums the samples over short intervals of header time. `rule` decides whether the sensor is
+still in each chunk, from the arithmetic in `trend`. `dwell` joins still chunks to dwells, and
+accepts or rejects each. `detector` is the entry point, and makes the pose table.
 
 """
 
 from .chunks import CaptureSettings, CONTEXT, REPEATED, Repeated, settings_from
-from .detector import StillDetector
+from .detector import capture, Captured, poses_from, samples_of, select, StillDetector
 from .dwell import Dwell
-from .poses import capture, Captured, poses_from, samples_of, select
 from .rule import rounding_left
 
 __all__ = ['CONTEXT', 'REPEATED', 'CaptureSettings', 'Captured', 'Dwell', 'Repeated',

@@ -2,27 +2,25 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The stillness detector of one sensor: it joins still chunks to dwells.
+The stillness detector of one sensor, and from recordings to poses.
 
-The window of a chunk is tested at once, and again after `HORIZON` more chunks, when the noise is
-better known. Only then does the chunk join the dwell. A dwell that began before the noise was
-known therefore starts where the sensor came to rest, and a slope or an oscillation excludes all
-its chunks. A window that is not still ends the dwell at once; the waiting chunks are then decided
-with the noise known so far.
+**Repeated poses.** Two poses whose readings have the distance c differ in direction by
+2 asin(c/2r), where r is the reading of 1 g. Offsets cancel in the difference. In native units r is
+half the largest range of the readings over the axes. Until the sensor has been turned over, this r
+is too small and the angle too large. Then too few poses count as repeated, not too many.
 
-Next to a significant slope, the slope may continue below significance. There a weaker slope is
-enough to reject the dwell.
-
-All chunks of a still window belong to the dwell. The first and the last chunk of a dwell are
-trimmed. If the sensor is still again after a knock, in the same orientation, the dwell continues.
-A dwell is therefore returned `KNOCK` chunks after its end.
+**Merging.** The mean of two readings on a sphere lies inside the sphere: for weights w and 1 - w
+by w (1 - w) c²/2r², which is 1.25 mg for 0.1 rad. If 1 g is known, the mean is moved outwards by
+this distance. The weights are the inverse variances of the means, and std/√count of the merged
+pose is the noise of the weighted mean.
 
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-import copy
+from dataclasses import dataclass, replace
+from itertools import chain
 import math
 from typing import Any
 
@@ -30,179 +28,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .chunks import (
-    CaptureSettings, chained, Chunker, CHUNKS_PER_WINDOW, CONTEXT, Interruption, MOTION, Records,
-    sums_type, together)
-from .dwell import Dwell, dwell_type, figures, figures_type, judged, OngoingDwell
-from .rule import HORIZON, Judged, Rule
-from ..table import Floats
+    CaptureSettings, chained, Chunker, CONTEXT, Interruption, MOTION, Records, together)
+from .dwell import Dwell, figures, figures_type, judged, OngoingDwell, Tracker
+from .rule import Rule
+from ..errors import InputError
+from ..table import ABOUT, Floats, numbered, Poses, Recording
 from ..units import Units
 
-_SAMPLES = 16
-"""Smallest number of samples in a dwell."""
-
-KNOCK = CHUNKS_PER_WINDOW + 3
-"""Largest number of disturbed windows within a dwell: a knock of about 4 chunks."""
-
-_LEAD = CHUNKS_PER_WINDOW - 2
-"""Chunks before the first still window that belong to the dwell."""
-
-
-def _judged_type(sums: np.dtype[Any]) -> np.dtype[Any]:
-    """Return the type of a chunk with its verdict; see `rule.Judged`."""
-    return np.dtype([
-        ('sums', dwell_type(sums)), ('begin', float), ('end', float), ('limit', float, 6),
-        ('still', bool), ('trending', np.intp)])
-
-
-_NONE = np.empty(0, _judged_type(sums_type(0)))
-"""No chunks, of any type."""
-
-
-class Tracker:
-    """Join still chunks to dwells, in one segment."""
-
-    def __init__(self, settings: CaptureSettings, rule: Rule, judged: Judged, number: int
-                 ) -> None:
-        chunks = judged.chunks
-        self._rule = rule
-        self._chunks = chunks
-        shortest = max(settings.min_dwell, _SAMPLES * chunks.period)
-        self._shortest = math.ceil(shortest / chunks.length - 1e-9)
-        longest = settings.max_dwell / chunks.length
-        self._longest = max(int(longest), self._shortest) if math.isfinite(longest) else 0
-        self._waiting = self._lead = self._held = _NONE
-        self._dwell: OngoingDwell | None = None
-        self._pause = 0
-        self._beside_slope = False
-        self.number = number
-
-    def feed(self, judged: Judged) -> list[OngoingDwell]:
-        """Return the dwells that end with these chunks."""
-        self._waiting = chained(self._waiting, _records(judged))
-        return self._decide(last=False)
-
-    def close(self) -> list[OngoingDwell]:
-        """End the ongoing dwell because no chunk follows, and return all dwells that end."""
-        done = self._decide(last=True)
-        return done + self._end()
-
-    def current(self) -> OngoingDwell | None:
-        """Return the ongoing dwell as if it ended now, or None if it is too short."""
-        if not len(self._waiting) or not self._waiting['still'][-1]:
-            return None
-        twin = copy.copy(self)
-        twin._dwell = copy.copy(self._dwell)
-        ended = twin._decide(last=True)
-        del ended
-        return twin._finished()
-
-    def _decide(self, last: bool) -> list[OngoingDwell]:
-        waiting = self._waiting
-        verdict = _verdict(waiting, last)
-        done: list[OngoingDwell] = []
-        edges = np.flatnonzero(np.diff(verdict)) + 1
-        for start, stop in zip([0, *edges], [*edges, len(verdict)]):
-            if stop > start:
-                part = waiting[start:stop]
-                done += self._extend(part) if verdict[start] else self._skip(part)
-        self._waiting = waiting[len(verdict):]
-        return done
-
-    def _skip(self, chunks: Records) -> list[OngoingDwell]:
-        self._pause += len(chunks)
-        self._lead = _tail(chained(self._lead, _tail(chunks, _LEAD)), _LEAD)
-        self._held = _NONE
-        sloping = bool((chunks['trending'] > 0).any())
-        self._beside_slope |= sloping
-        done = self._end() if self._pause > KNOCK or sloping else []
-        self._beside_slope = sloping or (self._beside_slope and self._dwell is not None)
-        return done
-
-    def _extend(self, chunks: Records) -> list[OngoingDwell]:
-        done: list[OngoingDwell] = []
-        before = self._held
-        if self._pause or self._dwell is None:
-            before = _without_windows(self._lead)
-            if self._dwell is None or not self._continues(chained(before, chunks[:1])):
-                done = self._end()
-                self._dwell = OngoingDwell(self._chunks, self.number)
-            self._pause = 0
-        chunks = chained(before, chunks)
-        self._lead = _NONE
-        self._held = _tail(chunks, 1)
-        return done + self._add(chunks[:-1])
-
-    def _continues(self, first: Records) -> bool:
-        return (self._dwell is not None and self._dwell.chunks > 0
-                and self._dwell.continued_by(first['sums'], self._rule.scale))
-
-    def _add(self, chunks: Records) -> list[OngoingDwell]:
-        assert self._dwell is not None
-        done: list[OngoingDwell] = []
-        while self._longest and self._dwell.chunks + len(chunks) >= self._longest:
-            room = self._longest - self._dwell.chunks
-            self._append(chunks[:room])
-            done.append(self._dwell)
-            self._dwell = OngoingDwell(self._chunks, self.number)
-            chunks = chunks[room:]
-        self._append(chunks)
-        return done
-
-    def _append(self, chunks: Records) -> None:
-        assert self._dwell is not None
-        self._dwell.add(chunks['sums'].copy(), chunks['begin'], chunks['end'])
-
-    def _end(self) -> list[OngoingDwell]:
-        found = self._finished()
-        if self._dwell is not None:
-            self.number += 1
-        self._dwell = None
-        self._held = _NONE
-        return [] if found is None else [found]
-
-    def _finished(self) -> OngoingDwell | None:
-        if self._dwell is None or self._dwell.chunks < self._shortest:
-            return None
-        self._dwell.beside_slope = self._beside_slope
-        return self._dwell
-
-
-def _records(judged: Judged) -> Records:
-    chunks = judged.chunks
-    found = np.empty(len(judged.still), _judged_type(chunks.sums.dtype))
-    for name in chunks.sums.dtype.names or ():
-        found['sums'][name] = chunks.sums[name]
-    found['sums']['level'], found['sums']['windows'] = judged.level.T, 1.0
-    found['begin'], found['end'] = chunks.begin, chunks.end
-    found['limit'], found['still'] = judged.limit.T, judged.still
-    found['trending'] = judged.trending
-    return found
-
-
-def _tail(chunks: Records, size: int) -> Records:
-    return chunks[max(len(chunks) - size, 0):]
-
-
-def _without_windows(chunks: Records) -> Records:
-    found = chunks.copy()
-    found['sums']['level'] = found['sums']['windows'] = 0.0
-    return found
-
-
-def _verdict(chunks: Records, last: bool) -> NDArray[np.bool_]:
-    """Return the final verdict on the first chunks, as many as can be decided now."""
-    size, still = len(chunks), chunks['still']
-    index = np.arange(size)
-    nearest = np.where(still, 2 * size + HORIZON, index)
-    ended = np.minimum.accumulate(nearest[::-1])[::-1]
-    due = np.minimum(index + HORIZON, ended)
-    if last:
-        due = np.minimum(due, size - 1)
-    count = int(np.searchsorted(due, size))
-    due, ended = due[:count], ended[:count]
-    over = np.any(chunks['sums']['level'][:count] > chunks['limit'][due], axis=1)
-    slope = np.append(chunks['trending'], 0)[np.minimum(ended, size)]
-    return np.asarray(still[:count] & ~over & ~(ended - index[:count] < slope))
+_BLOCK = 1 << 14     # samples summed at a time; they fit in the cache
+_AT_ONCE = 1 << 17   # samples passed to the detector at a time
 
 
 _EARLIER = 100
@@ -360,3 +194,210 @@ def _columns(samples: Floats) -> Floats:
     known: NDArray[np.bool_] = np.any(~np.isnan(samples), axis=0)
     rows = len(known) if known[MOTION:].any() else MOTION if known[4:MOTION].any() else 4
     return np.ascontiguousarray(samples[:, :rows].T)
+
+
+@dataclass(frozen=True)
+class Captured:
+    """
+    The result of a capture.
+
+    Parameters
+    ----------
+    samples, recorded : int
+        Number of samples in the poses, and in the recording.
+    threshold, quietest : float
+        Standard deviation below which a window is still, at the end, and that of the quietest
+        window, each of the axis with the largest one [unit of the readings].
+    seconds : float
+        Duration of the recording without interruptions [s].
+    interruptions : tuple of Interruption
+        Interruptions of the stamps.
+
+    """
+
+    poses: Poses
+    samples: int
+    threshold: float
+    seconds: float
+    interruptions: tuple[Interruption, ...]
+    recorded: int
+    quietest: float
+
+
+def capture(recording: Recording | Iterable[Recording], units: Units,
+            settings: CaptureSettings = CaptureSettings()) -> Captured:
+    """
+    Find the still poses of a recording, in order of time.
+
+    Parameters
+    ----------
+    recording : Recording, or an iterable of them
+        The samples, as a whole or in blocks. ``rate``, ``temperature``, ``supply_voltage`` and the
+        quantities of the first block are used if present.
+    units : Units
+        Unit of the readings.
+    settings : CaptureSettings
+        Settings of the detector and of the poses.
+
+    Raises
+    ------
+    InputError
+        If a time or a reading is not finite.
+
+    """
+    parts = iter([recording] if isinstance(recording, Recording) else recording)
+    first = next(parts, None)
+    context = context_of(first)
+    detector = StillDetector(settings, units, keep=None, context=context)
+    spans: list[tuple[float, float]] = []
+    recorded = 0
+    about: dict[str, Any] = {}
+    for part in parts if first is None else chain((first,), parts):
+        for start in range(0, len(part), _AT_ONCE):
+            stop = min(start + _AT_ONCE, len(part))
+            detector.add(samples_of(part, begin, min(begin + _BLOCK, stop), context)
+                         for begin in range(start, stop, _BLOCK))
+        if len(part):
+            spans = [*spans[:1], (float(part['time'][0]), float(part['time'][-1]))]
+            recorded += len(part)
+            about = {name: getattr(part, name) for name in ABOUT}
+    detector.close()
+    dwells = select(detector.dwells(), settings, units)
+    interruptions = detector.interruptions
+    seconds = spans[-1][1] - spans[0][0] if spans else 0.0
+    poses = replace(poses_from(dwells, settings), **about)
+    return Captured(poses, sum(each.samples for each in dwells),
+                    detector.threshold, seconds - sum(each.seconds for each in interruptions),
+                    interruptions, recorded, detector.quietest)
+
+
+def context_of(recording: Recording | None) -> tuple[str, ...]:
+    """Return the keys of the context of a recording that poses have: `CONTEXT` and quantities."""
+    return CONTEXT if recording is None else (*CONTEXT, *recording.quantities)
+
+
+def samples_of(recording: Recording, start: int, stop: int, context: Sequence[str] = CONTEXT
+               ) -> Floats:
+    """
+    Return samples start to stop for `StillDetector.add`: (k, n), a row for each of its columns.
+
+    A time or a reading that is not finite is an InputError.
+
+    """
+    which = slice(start, stop)
+    time = recording['time'][which]
+    samples = np.empty((_width(recording, context), len(time)))
+    samples[0] = time
+    samples[1:4] = recording.reading[which].T
+    samples[4:] = np.nan
+    if 'rate' in recording:
+        samples[4:7] = recording['rate'][which].T
+    for row, name in enumerate(context, start=MOTION):
+        if name in recording:
+            samples[row] = recording[name][which]
+    if not np.isfinite(samples[:4].sum()):
+        _refuse(samples[:4], recording.row[which])
+    return samples
+
+
+def _refuse(given: Floats, row: NDArray[np.int64]) -> None:
+    bad = np.flatnonzero(~np.isfinite(given).all(axis=0))
+    if len(bad):
+        message = (f'row {row[bad[0]]} holds a time or reading that is not finite, expected '
+                   'finite numbers')
+        raise InputError(message, 'remove that row, or repair the recording')
+
+
+def _width(recording: Recording, context: Sequence[str]) -> int:
+    if any(name in recording for name in context):
+        return MOTION + len(context)
+    return MOTION if 'rate' in recording else 4
+
+
+def poses_from(dwells: Sequence[Dwell], settings: CaptureSettings = CaptureSettings()) -> Poses:
+    """
+    Return the pose table of these dwells.
+
+    The table has the columns of context that all dwells have; ``rate_std`` likewise. It has the
+    column ``orientation`` if ``max_dwell`` is finite, and ``doubtful`` if a dwell is doubtful.
+
+    """
+    columns: dict[str, NDArray[Any]] = {
+        'time': np.array([each.time for each in dwells], dtype=float),
+        'reading': np.array([each.mean for each in dwells], dtype=float).reshape(-1, 3),
+        'std': np.array([each.std for each in dwells], dtype=float).reshape(-1, 3),
+        'count': np.array([each.count for each in dwells], dtype=float)}
+    for name in dwells[0].context if dwells else ():
+        if all(name in each.context for each in dwells):
+            columns[name] = np.array([each.context[name] for each in dwells])
+    rate_std = np.array([each.rate_std for each in dwells], dtype=float)
+    if 'rate' in columns and np.isfinite(rate_std).all():
+        columns['rate_std'] = rate_std
+    if np.isfinite(settings.max_dwell):
+        columns['orientation'] = np.array([each.orientation for each in dwells], dtype=np.int64)
+    if any(each.doubtful for each in dwells):
+        columns['doubtful'] = np.array([each.doubtful for each in dwells], dtype=float)
+    return Poses(columns, numbered(columns))
+
+
+def select(dwells: Sequence[Dwell], settings: CaptureSettings, units: Units) -> list[Dwell]:
+    """Keep, merge or refuse repeated dwells, as set; doubtful dwells are kept."""
+    if settings.repeated == 'keep':
+        return list(dwells)
+    radius = _radius([each.mean for each in dwells], units)
+    kept: list[Dwell] = []
+    for dwell in dwells:
+        near = None if dwell.doubtful else _nearest(dwell, kept, radius, settings)
+        if near is None:
+            kept.append(dwell)
+        elif settings.repeated == 'merge':
+            kept[near] = merged(kept[near], dwell, units)
+    return kept
+
+
+def merged(first: Dwell, second: Dwell, units: Units) -> Dwell:
+    """
+    Return the weighted mean of two dwells in nearly the same direction.
+
+    Time and context are weighted by the number of samples. The first dwell sets the orientation.
+
+    """
+    weight = _weight(first, second)
+    mean = weight * first.mean + (1.0 - weight) * second.mean
+    if not units.is_native:
+        chord = float(np.linalg.norm(first.mean - second.mean)) / units.per_g
+        mean = mean * (1.0 + 0.5 * weight * (1.0 - weight) * chord**2)
+    noise = np.sqrt(weight**2 * first.std**2 / first.count
+                    + (1.0 - weight)**2 * second.std**2 / second.count)
+    count = first.count + second.count
+    samples = first.samples + second.samples
+    share = first.samples / samples
+    rate_std = np.sqrt(share * first.rate_std**2 + (1.0 - share) * second.rate_std**2)
+    context = {name: share * first.context[name] + (1.0 - share) * second.context[name]
+               for name in first.context if name in second.context}
+    return replace(first, end=second.end, mean=mean, std=noise * np.sqrt(count), count=count,
+                   time=share * first.time + (1.0 - share) * second.time,
+                   samples=samples, context=context, rate_std=rate_std)
+
+
+def _weight(first: Dwell, second: Dwell) -> float:
+    one = float(np.sum(first.std**2)) / first.count
+    two = float(np.sum(second.std**2)) / second.count
+    return two / (one + two) if one + two > 0.0 else first.samples / (
+        first.samples + second.samples)
+
+
+def _radius(means: Sequence[Floats], units: Units) -> float:
+    if not units.is_native:
+        return units.per_g
+    return 0.5 * float(np.ptp(np.array(means), axis=0).max()) if means else 0.0
+
+
+def _nearest(dwell: Dwell, others: Sequence[Dwell], radius: float, settings: CaptureSettings
+             ) -> int | None:
+    """Return the index of the nearest other dwell within ``min_pose_angle``, or None."""
+    far = [float(np.linalg.norm(dwell.mean - each.mean))
+           if each.orientation != dwell.orientation and not each.doubtful else np.inf
+           for each in others]
+    reach = 2.0 * radius * np.sin(0.5 * settings.min_pose_angle)
+    return int(np.argmin(far)) if far and min(far) < reach else None

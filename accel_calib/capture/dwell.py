@@ -2,42 +2,51 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Dwells: still stretches, averaged and tested.
+Dwells: still stretches, joined, averaged and tested.
 
-Mean and standard deviation are those of all samples. The number of samples is divided by the
-excess of the noise of the mean (see `trend`), so that std/√count is the noise of the mean along
-the force (see below). A short dwell is not enough to estimate the excess, which is a property
-of the sensor. The median over all dwells is therefore used, unless a dwell has a clearly larger
-excess. Samples that are rounded to steps cause an error of the mean. Averaging does not remove
-this error if the noise of the samples is less than a step. Its variance follows from the mean
-variance of the samples of each axis over all dwells (see `rule`). One dwell without any variance
-is added to this mean, because a few dwells that alternate between two steps look like more noise.
+**Joining.** The window of a chunk is tested at once, and again after `HORIZON` more chunks, when
+the noise is better known. Only then does the chunk join the dwell. A dwell that began before the
+noise was known therefore starts where the sensor came to rest, and a slope or an oscillation
+excludes all its chunks. A window that is not still ends the dwell at once; the waiting chunks are
+then decided with the noise known so far. Next to a significant slope, the slope may continue below
+significance; a weaker slope is enough to reject the dwell there.
 
-The white noise of the angular rate is the mean variance of the windows. The standard deviation
-over the whole dwell would include the slow drift of a gyro, which is not white.
+All chunks of a still window belong to the dwell, but its first and last chunk are trimmed. If the
+sensor is still again after a knock, in the same orientation, the dwell continues. A dwell is
+therefore returned `KNOCK` chunks after its end. The chunks of an ongoing dwell are combined into
+at most `2 · CELLS` cells of 2ᵏ chunks, so that a dwell of days needs no more memory than one of a
+minute.
 
-A dwell is rejected in three cases:
+**Mean.** Mean and standard deviation are those of all samples. The number of samples is divided by
+the excess of the noise of the mean (see `trend`), so that std/√count is the noise of the mean
+along the force. A short dwell is not enough to estimate the excess, which is a property of the
+sensor. The median over all dwells is therefore used, unless a dwell has a clearly larger excess.
+The noise is that along the mean reading if this is known to be the vertical: a sensor that settles
+tilts slightly, which changes its reading across the vertical, but its mean is correct for its mean
+attitude, and the fit uses only the noise along the force.
+
+Samples that are rounded to steps cause an error of the mean, which averaging does not remove if
+their noise is less than a step. Its variance follows from the mean variance of the samples of each
+axis over all dwells (see `rule`). One dwell without any variance is added to this mean, because a
+few dwells that alternate between two steps look like more noise. The white noise of the angular
+rate is the mean variance of the windows, which does not include the slow drift of a gyro.
+
+**Tests.** The noise may become known after a dwell ended, so each query tests all dwells again. A
+dwell is rejected in three cases:
 
 - Its windows vary on average more than `DWELL_RATIO` times the noise of the sensor, significantly.
   This detects a tremor below the threshold of a single window.
 - The reading has a slope through the dwell or through half of it.
 - Its noise does not exclude a slow turn (see `rule.TURN_G`). A noisier sensor needs a longer
-  dwell. Once five dwells determine the bias of the gyro, the gyro decides instead.
-
-The noise may become known after the dwell ended, so each query tests the dwells again.
-
-The noise of a mean is computed along the mean reading if that is known to be the vertical. A
-sensor that settles tilts slightly, which changes its reading across the vertical. Its mean is
-correct for its mean attitude, and the fit uses only the noise along the force.
-
-The chunks of an ongoing dwell are combined into at most `2 · CELLS` cells. The number of chunks
-per cell is a power of two, so a dwell of days needs no more memory than a dwell of a minute.
+  dwell. Once five dwells determine the bias of the gyro, the gyro decides instead. It alone shows
+  a turn at 0.3 °/s, or one that begins late in a dwell.
 
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+import copy
 from dataclasses import dataclass, field
 import math
 from typing import Any
@@ -45,8 +54,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .chunks import chained, Chunks, Records, summed
-from .rule import DWELL_SLOPE_G, Rule, STRENGTH, WEAK_STRENGTH
+from .chunks import CaptureSettings, chained, Chunks, CHUNKS_PER_WINDOW, Records, summed, sums_type
+from .rule import DWELL_SLOPE_G, HORIZON, Judged, Rule, STRENGTH, WEAK_STRENGTH
 from .trend import excess_of_means, Line, lines_through, strength_of, Trend
 from ..table import Floats
 
@@ -360,3 +369,170 @@ class OngoingDwell:
         apart = np.abs(old['first'] / old['count'][:, np.newaxis]
                        - new['first'] / new['count'][:, np.newaxis])[0, :3]
         return bool(np.all(apart <= np.sqrt(level) + _AGREE_G * scale))
+
+
+_SAMPLES = 16
+"""Smallest number of samples in a dwell."""
+
+KNOCK = CHUNKS_PER_WINDOW + 3
+"""Largest number of disturbed windows within a dwell: a knock of about 4 chunks."""
+
+_LEAD = CHUNKS_PER_WINDOW - 2
+"""Chunks before the first still window that belong to the dwell."""
+
+
+def _judged_type(sums: np.dtype[Any]) -> np.dtype[Any]:
+    """Return the type of a chunk with its verdict; see `rule.Judged`."""
+    return np.dtype([
+        ('sums', dwell_type(sums)), ('begin', float), ('end', float), ('limit', float, 6),
+        ('still', bool), ('trending', np.intp)])
+
+
+_NONE = np.empty(0, _judged_type(sums_type(0)))
+"""No chunks, of any type."""
+
+
+class Tracker:
+    """Join still chunks to dwells, in one segment."""
+
+    def __init__(self, settings: CaptureSettings, rule: Rule, judged: Judged, number: int
+                 ) -> None:
+        chunks = judged.chunks
+        self._rule = rule
+        self._chunks = chunks
+        shortest = max(settings.min_dwell, _SAMPLES * chunks.period)
+        self._shortest = math.ceil(shortest / chunks.length - 1e-9)
+        longest = settings.max_dwell / chunks.length
+        self._longest = max(int(longest), self._shortest) if math.isfinite(longest) else 0
+        self._waiting = self._lead = self._held = _NONE
+        self._dwell: OngoingDwell | None = None
+        self._pause = 0
+        self._beside_slope = False
+        self.number = number
+
+    def feed(self, judged: Judged) -> list[OngoingDwell]:
+        """Return the dwells that end with these chunks."""
+        self._waiting = chained(self._waiting, _records(judged))
+        return self._decide(last=False)
+
+    def close(self) -> list[OngoingDwell]:
+        """End the ongoing dwell because no chunk follows, and return all dwells that end."""
+        done = self._decide(last=True)
+        return done + self._end()
+
+    def current(self) -> OngoingDwell | None:
+        """Return the ongoing dwell as if it ended now, or None if it is too short."""
+        if not len(self._waiting) or not self._waiting['still'][-1]:
+            return None
+        twin = copy.copy(self)
+        twin._dwell = copy.copy(self._dwell)
+        twin._decide(last=True)
+        return twin._finished()
+
+    def _decide(self, last: bool) -> list[OngoingDwell]:
+        waiting = self._waiting
+        verdict = _verdict(waiting, last)
+        done: list[OngoingDwell] = []
+        edges = np.flatnonzero(np.diff(verdict)) + 1
+        for start, stop in zip([0, *edges], [*edges, len(verdict)]):
+            if stop > start:
+                part = waiting[start:stop]
+                done += self._extend(part) if verdict[start] else self._skip(part)
+        self._waiting = waiting[len(verdict):]
+        return done
+
+    def _skip(self, chunks: Records) -> list[OngoingDwell]:
+        self._pause += len(chunks)
+        self._lead = _tail(chained(self._lead, _tail(chunks, _LEAD)), _LEAD)
+        self._held = _NONE
+        sloping = bool((chunks['trending'] > 0).any())
+        self._beside_slope |= sloping
+        done = self._end() if self._pause > KNOCK or sloping else []
+        self._beside_slope = sloping or (self._beside_slope and self._dwell is not None)
+        return done
+
+    def _extend(self, chunks: Records) -> list[OngoingDwell]:
+        done: list[OngoingDwell] = []
+        before = self._held
+        if self._pause or self._dwell is None:
+            before = _without_windows(self._lead)
+            if self._dwell is None or not self._continues(chained(before, chunks[:1])):
+                done = self._end()
+                self._dwell = OngoingDwell(self._chunks, self.number)
+            self._pause = 0
+        chunks = chained(before, chunks)
+        self._lead = _NONE
+        self._held = _tail(chunks, 1)
+        return done + self._add(chunks[:-1])
+
+    def _continues(self, first: Records) -> bool:
+        return (self._dwell is not None and self._dwell.chunks > 0
+                and self._dwell.continued_by(first['sums'], self._rule.scale))
+
+    def _add(self, chunks: Records) -> list[OngoingDwell]:
+        assert self._dwell is not None
+        done: list[OngoingDwell] = []
+        while self._longest and self._dwell.chunks + len(chunks) >= self._longest:
+            room = self._longest - self._dwell.chunks
+            self._append(chunks[:room])
+            done.append(self._dwell)
+            self._dwell = OngoingDwell(self._chunks, self.number)
+            chunks = chunks[room:]
+        self._append(chunks)
+        return done
+
+    def _append(self, chunks: Records) -> None:
+        assert self._dwell is not None
+        self._dwell.add(chunks['sums'].copy(), chunks['begin'], chunks['end'])
+
+    def _end(self) -> list[OngoingDwell]:
+        found = self._finished()
+        if self._dwell is not None:
+            self.number += 1
+        self._dwell = None
+        self._held = _NONE
+        return [] if found is None else [found]
+
+    def _finished(self) -> OngoingDwell | None:
+        if self._dwell is None or self._dwell.chunks < self._shortest:
+            return None
+        self._dwell.beside_slope = self._beside_slope
+        return self._dwell
+
+
+def _records(judged: Judged) -> Records:
+    chunks = judged.chunks
+    found = np.empty(len(judged.still), _judged_type(chunks.sums.dtype))
+    for name in chunks.sums.dtype.names or ():
+        found['sums'][name] = chunks.sums[name]
+    found['sums']['level'], found['sums']['windows'] = judged.level.T, 1.0
+    found['begin'], found['end'] = chunks.begin, chunks.end
+    found['limit'], found['still'] = judged.limit.T, judged.still
+    found['trending'] = judged.trending
+    return found
+
+
+def _tail(chunks: Records, size: int) -> Records:
+    return chunks[max(len(chunks) - size, 0):]
+
+
+def _without_windows(chunks: Records) -> Records:
+    found = chunks.copy()
+    found['sums']['level'] = found['sums']['windows'] = 0.0
+    return found
+
+
+def _verdict(chunks: Records, last: bool) -> NDArray[np.bool_]:
+    """Return the final verdict on the first chunks, as many as can be decided now."""
+    size, still = len(chunks), chunks['still']
+    index = np.arange(size)
+    nearest = np.where(still, 2 * size + HORIZON, index)
+    ended = np.minimum.accumulate(nearest[::-1])[::-1]
+    due = np.minimum(index + HORIZON, ended)
+    if last:
+        due = np.minimum(due, size - 1)
+    count = int(np.searchsorted(due, size))
+    due, ended = due[:count], ended[:count]
+    over = np.any(chunks['sums']['level'][:count] > chunks['limit'][due], axis=1)
+    slope = np.append(chunks['trending'], 0)[np.minimum(ended, size)]
+    return np.asarray(still[:count] & ~over & ~(ended - index[:count] < slope))

@@ -13,24 +13,22 @@ A window is the last `CHUNKS_PER_WINDOW` chunks. It is still if
 4. the reading has no slope over the last `SLOPE_CHUNKS` that is both significant and larger than
    the drift of a sensor during warm-up. Turning at 0.5 °/s changes a reading by up to 8.7 mg/s
    and is not visible in any variance;
-5. the chunk means do not oscillate with one frequency. Without this condition, shaking from the
-   first second on passes for noise of the sensor. White noise and vibration average out over a
-   chunk. Noise behind a slow low-pass filter does not, but it has no single frequency. A limit of
-   the user (`still_std_max`) replaces this condition.
+5. the chunk means do not oscillate with one frequency. Otherwise, shaking from the first second on
+   would pass for noise of the sensor. White noise and vibration average out over a chunk. Noise
+   behind a slow low-pass filter does not, but it has no single frequency. A limit of the user
+   (`still_std_max`) replaces this condition.
 
 **The noise of the sensor** is the lower envelope of the variances so far. The mean variance v of
 the windows in `LONG` chunks has a standard error of about v √(2/dof), with dof = 2 n / (1 +
-excess) for n samples. Excess is the variance of their mean over that of independent samples (this
-is exact for white noise and close for AR(1) noise). The upper end of this range, v exp(2
-√(2/dof)), is an upper bound of the noise if the sensor is still, and far above the noise if the
-sensor moves. Its minimum so far is therefore used. It is at least the variance that the resolution
-causes: a quantised reading that alternates between two steps of height q has a variance of up to
-q²/4, and q is the smallest step so far. For data without noise, the noise is at least a millionth
-of the reading. The samples of an axis at the limit of the sensor scatter less than its noise, so
-nothing is learned from such an axis (see `clipped`).
-
-Before the noise is known, the unit of the readings sets a limit: a sensor with a standard
-deviation above `STD_CAP_G` is not still.
+excess) for n samples. Excess is the variance of their mean over that of independent samples (exact
+for white noise and close for AR(1) noise). The upper end of this range, v exp(2 √(2/dof)), is an
+upper bound of the noise if the sensor is still, and far above it if the sensor moves; so its
+minimum so far is used. The noise is at least the variance that the resolution causes: a quantised
+reading that alternates between two steps of height q has a variance of up to q²/4, and q is the
+smallest step so far. For data without noise, it is at least a millionth of the reading. Nothing is
+learned from an axis at the limit of the sensor, whose samples scatter less (see `clipped`). Before
+the noise is known, a sensor with a standard deviation above `STD_CAP_G` is not still, if the unit
+of the readings is known.
 
 **Rounding.** Samples x = μ + n with noise n of the standard deviation σ are rounded to multiples
 of q. The error of the mean of many samples depends on μ. Over all μ its variance is

@@ -87,12 +87,33 @@ class Line(NamedTuple):
 
 def sliding_sum(values: Floats, length: int) -> Floats:
     """Return the sums over windows of this length along the last axis: (..., n - length + 1)."""
-    return _folded(values, length, np.add)
+    return _folded(values, length, lambda one, other, apart: one + other)
 
 
 def sliding_max(values: Floats, length: int) -> Floats:
     """Return the maxima over windows of this length."""
-    return _folded(values, length, np.maximum)
+    return _folded(values, length, lambda one, other, apart: np.maximum(one, other))
+
+
+def _weighted(one: Floats, other: Floats, apart: int) -> Floats:
+    """Return the sums Σ x and Σ k x of two windows in a row, from those of each."""
+    return np.stack([one[0] + other[0], one[1] + other[1] + apart * other[0]])
+
+
+def _folded(values: Floats, length: int, fold: Callable[[Floats, Floats, int], Floats]) -> Floats:
+    """Return what windows of this length hold, from the parts and how far they are apart."""
+    count = values.shape[-1] - length + 1
+    found: Floats | None = None
+    size, start = 1, 0
+    while True:
+        if length & size:
+            part = values[..., start:start + count]
+            found = part if found is None else fold(found, part, start)
+            start += size
+        if start == length:
+            return np.asarray(found)
+        values = fold(values[..., :-size], values[..., size:], size)
+        size *= 2
 
 
 def lines(values: Floats, length: int) -> Line:
@@ -100,7 +121,7 @@ def lines(values: Floats, length: int) -> Line:
     if values.shape[-1] == length:
         centred = values - values.sum(axis=1, keepdims=True) / length
         return lines_through(centred[:, np.newaxis], np.array([length]))
-    total, weighted = _weighted(values, length)
+    total, weighted = _folded(np.stack([values, np.zeros_like(values)]), length, _weighted)
     first, last = values[..., :1 - length], values[..., length - 1:]
     square = sliding_sum(values * values, length)
     product = sliding_sum(values[..., :-1] * values[..., 1:], length - 1)
@@ -135,41 +156,6 @@ def lines_through(centred: Floats, sizes: Floats) -> Line:
     left = centred - slope[:, :, np.newaxis] * time
     return Line(slope, np.einsum('akt,akt->ak', left, left),
                 np.einsum('akt,akt->ak', left[:, :, 1:], left[:, :, :-1]), time_square, sizes)
-
-
-def _folded(values: Floats, length: int, fold: Callable[[Floats, Floats], Floats]) -> Floats:
-    count = values.shape[-1] - length + 1
-    found: Floats | None = None
-    size, start = 1, 0
-    while True:
-        if length & size:
-            part = values[..., start:start + count]
-            found = part if found is None else fold(found, part)
-            start += size
-        if start == length:
-            return np.asarray(found)
-        values = fold(values[..., :-size], values[..., size:])
-        size *= 2
-
-
-def _weighted(values: Floats, length: int) -> tuple[Floats, Floats]:
-    """Return the sums Σ x and Σ k x over the windows."""
-    count = values.shape[-1] - length + 1
-    weighted = np.zeros_like(values)
-    total_found = np.zeros((*values.shape[:-1], count))
-    found = np.zeros_like(total_found)
-    size, start = 1, 0
-    while True:
-        if length & size:
-            part = values[..., start:start + count]
-            found = found + weighted[..., start:start + count] + start * part
-            total_found = total_found + part
-            start += size
-        if start == length:
-            return total_found, found
-        weighted = weighted[..., :-size] + weighted[..., size:] + size * values[..., size:]
-        values = values[..., :-size] + values[..., size:]
-        size *= 2
 
 
 def oscillation(values: Floats, length: int, index: NDArray[np.intp]) -> Floats:

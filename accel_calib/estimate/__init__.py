@@ -17,8 +17,8 @@ from .equations import believable, Equations, kinds, originals, variance_factor
 from .fit import by_pose, estimate, Fit, judge, NotConvergedError, Point, Prior, solve
 from .geometry import (
     Combination, dilution, error_left_in, free_parameters, Identifiability, identifiability,
-    information_of, LARGEST_DILUTION, left_out, NORM_MODELS, over_the_sphere, pose_noise,
-    poses_needed, relative_weights, rows_of, WEAK_DILUTION)
+    information_of, LARGEST_DILUTION, largest_error, left_out, NORM_MODELS, pose_noise,
+    poses_needed, rows_of, WEAK_DILUTION)
 from .outliers import (
     covariance_with, fit_norm, LARGEST_SHARE, outliers, outliers_among, Rival, rivals,
     unseen_mistakes)
@@ -26,9 +26,8 @@ from .outliers import (
 __all__ = ['LARGEST_DILUTION', 'LARGEST_SHARE', 'NORM_MODELS', 'TIES', 'WEAK_DILUTION',
            'Combination', 'Equations', 'Fit', 'Identifiability', 'NotConvergedError', 'Point',
            'Prior', 'Rival', 'believable', 'by_pose', 'closed_form', 'covariance_with',
-           'dilution', 'error_left_in', 'estimate', 'faces', 'fit_12',
-           'fit_norm', 'fit_sphere', 'free_parameters', 'identifiability', 'information_of',
-           'judge', 'kinds', 'left_out', 'lower_triangular', 'originals', 'outliers',
-           'outliers_among', 'over_the_sphere', 'pose_noise', 'poses_needed', 'relative_weights',
-           'rivals', 'rows_of', 'sensing_axes', 'solve', 'start_of',
-           'unseen_mistakes', 'variance_factor']
+           'dilution', 'error_left_in', 'estimate', 'faces', 'fit_12', 'fit_norm',
+           'fit_sphere', 'free_parameters', 'identifiability', 'information_of', 'judge',
+           'kinds', 'largest_error', 'left_out', 'lower_triangular', 'originals', 'outliers',
+           'outliers_among', 'pose_noise', 'poses_needed', 'rivals', 'rows_of', 'sensing_axes',
+           'solve', 'start_of', 'unseen_mistakes', 'variance_factor']

@@ -89,11 +89,7 @@ class Form:
     @cached_property
     def linear(self) -> Floats:
         """(3, 3 k) array, the part linear in r when the origin moves by c."""
-        taken = np.zeros((3, 3, len(self.twice)))
-        for k, (i, j) in enumerate(zip(self.first, self.second)):
-            taken[i, j, k] += self.twice[k]
-            taken[j, i, k] += self.twice[k]
-        return taken.reshape(3, -1)
+        return 2.0 * self.scatter.reshape(-1, 3, 3).transpose(1, 2, 0).reshape(3, -1)
 
     @cached_property
     def scatter(self) -> Floats:

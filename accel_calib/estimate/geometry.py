@@ -103,11 +103,10 @@ def over_the_sphere(name: str) -> Floats:
     return rows_of(name, OVER_THE_SPHERE)
 
 
-def information_of(name: str, directions: Floats, weights: Floats) -> Floats:
-    """Return the (p, p) information M."""
-    rows = rows_of(name, directions)
-    information: Floats = np.einsum('n,nip,niq->pq', weights, rows, rows)
-    return information
+def information_of(name: str, directions: Floats, noise: Floats | None = None) -> Floats:
+    """Return the (p, p) information M; arguments as in `identifiability`."""
+    rows = _weighted_rows(name, directions, noise)
+    return rows.T @ rows
 
 
 def free_parameters(name: str) -> int:
@@ -162,11 +161,13 @@ def dilution(name: str, directions: Floats, noise: Floats | None = None) -> floa
     Infinite if the poses do not determine a parameter. Arguments as in `identifiability`.
 
     """
-    rows = _weighted_rows(name, directions, noise)
-    information = rows.T @ rows
-    size = len(information)
+    return largest_error(name, information_of(name, directions, noise))
+
+
+def largest_error(name: str, information: Floats) -> float:
+    """Return the dilution for the (p, p) information of poses."""
     ridge = _NOTHING * np.trace(information) + 1e-300
-    inverse = np.linalg.inv(information + ridge * np.eye(size))
+    inverse = np.linalg.inv(information + ridge * np.eye(len(information)))
     found = float(np.sqrt(np.max(inverse.ravel() @ _pairs_over_the_sphere(name))))
     return found if found < 1.0 / _SINGULAR else np.inf
 
