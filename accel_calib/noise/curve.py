@@ -40,9 +40,11 @@ agrees with the equivalent degrees of freedom, edf = 2 variance² / cov, of Gree
 The sum over the lags uses points that are dense near the kinks of γ.
 
 The deviation is that of allantools, the covariance is not: allantools has none between two τ,
-which the fit needs. Its intervals agree with ours in width (within 5 %) and in coverage where it
-has them, but it has none for the last three octaves, since it must identify the noise first, and
-that needs 30 averages.
+which the fit needs. In 300 simulated rests with a plain B or K, 95 % intervals from the variances
+alone hold the true N, B and K in 84 to 90 %, and those with the covariance in 95 to 99 %. The
+intervals of allantools for the deviations agree with ours in width (within 5 %) and in coverage
+where it has them, but it has none for the last two or three octaves, since it must identify the
+noise first, and that needs 30 averages.
 
 References
 ----------
