@@ -15,6 +15,7 @@ import accel_calib as ac
 from accel_calib.session import CalibratorSettings
 from inside import COMMANDS, parser
 import pytest
+from test_policy import names_of_the_calibrator
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = ['README.md', 'CONTRIBUTING.md', 'QUALITY_DECLARATION.md', 'SECURITY.md', *(
@@ -101,14 +102,12 @@ def anchors_of(path):
 
 
 def test_services_and_topics_of_the_docs_are_those_of_the_node():
-    source = text_of('accel_calib/ros/calibrator_node.py')
     table = [line for line in text_of('docs/node.md').splitlines() if line.startswith('| `')]
     listed = set(re.findall(r'`(~/\w+|imu/\w+|/diagnostics|temperature)`', '\n'.join(
         line for line in table if '_msgs/' in line or 'std_srvs' in line)))
-    made = set(re.findall(r"'(~/\w+|imu/\w+|/diagnostics|temperature)'", source))
-    triggers = re.search(r'_TRIGGERS = \((.*?)\)', source, re.DOTALL).group(1)
-    made |= {f'~/{name}' for name in re.findall(r"'(\w+)'", triggers)}
-    assert listed == made
+    of_every_node = re.compile(r'/parameter_events|/rosout|~/(.*_parameters.*|get_.*)')
+    assert listed == {name for name in names_of_the_calibrator()
+                      if not of_every_node.fullmatch(name)}
 
 
 def test_parameters_of_the_docs_are_those_of_the_node():

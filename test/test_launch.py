@@ -248,14 +248,6 @@ def test_each_topic_has_an_argument(argument: str, topic: str, started: Any) -> 
     assert outside.topic(topic) == '/camera/x'
 
 
-def test_remapped_topics_are_those_of_the_node(started: Any) -> None:
-    source = (ROOT / 'accel_calib' / 'ros' / 'calibrator_node.py').read_text(encoding='utf-8')
-    in_node = set(re.findall(r"'((?:~/)?[a-z/_]+)'", source))
-    remapped = {inside for inside, _ in started().node.remappings}
-    assert len(remapped) == 4
-    assert remapped <= in_node
-
-
 def test_namespace_moves_all_topics_but_the_temperature(started: Any) -> None:
     node = started(namespace='left').node
     assert node.topic('imu/data_raw') == '/left/imu/data_raw'

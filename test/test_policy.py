@@ -1,37 +1,22 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The policy for SROS 2 is well formed, and has the names of the nodes; see test_ros_policy."""
+"""The layouts show topics of the policy for SROS 2; test_ros_policy compares it with the nodes."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+import json
 from pathlib import Path
 import re
+from typing import Any
 from xml.etree import ElementTree
 
 import pytest
+import yaml
 
-ROOT = Path(__file__).parent.parent
-FILE = ROOT / 'config' / 'sros2_policy.xml'
-ROS = ROOT / 'accel_calib' / 'ros'
-
-
-ENCLAVES = {'calibrator': 'calibrator', 'calibrator_lifecycle': 'calibrator',
-            'simulator': 'simulator'}
-"""Name of the node by executable."""
-
-PARAMETERS = {f'~/{name}' for name in (
-    'describe_parameters', 'get_parameter_types', 'get_parameters', 'get_type_description',
-    'list_parameters', 'set_parameters', 'set_parameters_atomically')}
-OF_EVERY_NODE = {'/parameter_events', '/rosout'}
-OF_MANAGED_NODES = {f'~/{name}' for name in (
-    'change_state', 'get_available_states', 'get_available_transitions', 'get_state',
-    'get_transition_graph')}
-
-
-def policy() -> ElementTree.Element:
-    return ElementTree.parse(FILE).getroot()
+CONFIG = Path(__file__).parent.parent / 'config'
+FILE = CONFIG / 'sros2_policy.xml'
 
 
 def optional_elements() -> Iterator[tuple[str, ElementTree.Element]]:
@@ -41,7 +26,8 @@ def optional_elements() -> Iterator[tuple[str, ElementTree.Element]]:
 
 
 def profile_of(executable: str) -> ElementTree.Element:
-    return policy().find(f"enclaves/enclave[@path='/accel_calib/{executable}']/profiles/profile")
+    return ElementTree.parse(FILE).getroot().find(
+        f"enclaves/enclave[@path='/accel_calib/{executable}']/profiles/profile")
 
 
 def granted(profile: ElementTree.Element, tag: str, right: str) -> set[str]:
@@ -50,52 +36,53 @@ def granted(profile: ElementTree.Element, tag: str, right: str) -> set[str]:
             for each in block}
 
 
-def source_names(module: str, method: str) -> set[str]:
-    """Return the names in the calls of a method in a module of the nodes."""
-    text = (ROS / f'{module}.py').read_text(encoding='utf-8')
-    return set(re.findall(rf"{method}\([^()']*'([~/\w]+)'", text))
+def names_of_the_calibrator() -> set[str]:
+    """Return the names of its topics and services."""
+    profile = profile_of('calibrator')
+    return {name for tag, right in (('topics', 'publish'), ('topics', 'subscribe'),
+                                    ('services', 'reply')) for name in granted(profile, tag, right)}
 
 
-def triggers() -> set[str]:
-    text = (ROS / 'calibrator_node.py').read_text(encoding='utf-8')
-    names = re.search(r'_TRIGGERS = \((.*?)\)', text, re.DOTALL).group(1)
-    return {f'~/{name}' for name in re.findall(r"'(\w+)'", names)}
+def of_rviz() -> set[str]:
+    layout = yaml.safe_load((CONFIG / 'calibrator.rviz').read_text(encoding='utf-8'))
+    return {display['Topic']['Value'] for display in layout['Visualization Manager']['Displays']
+            if 'Topic' in display}
 
 
-def test_each_executable_has_an_enclave() -> None:
-    found = {enclave.get('path'): enclave.find('profiles/profile').get('node')
-             for enclave in policy().iter('enclave')}
-    assert found == {f'/accel_calib/{name}': node for name, node in ENCLAVES.items()}
+def of_foxglove() -> set[str]:
+    """Return the topics and services; a path is a topic and fields."""
+    def of(value: Any) -> set[str]:
+        if isinstance(value, str):
+            found = re.match(r'(/[\w/]+)(\.[\w.@]+)?$', value)
+            return {found.group(1)} if found else set()
+        items = [*value, *value.values()] if isinstance(value, dict) else value
+        return {name for item in items for name in of(item)} if isinstance(
+            items, list) else set()
+
+    return of(json.loads((CONFIG / 'foxglove.json').read_text(encoding='utf-8'))['configById'])
 
 
-@pytest.mark.parametrize('executable', ['calibrator', 'calibrator_lifecycle'])
-def test_topics_of_the_calibrator_are_those_of_the_code(executable: str) -> None:
-    profile, managed = profile_of(executable), executable == 'calibrator_lifecycle'
-    made = source_names('calibrator_node', 'create_publisher') | source_names(
-        'calibrator_node', '_published')
-    assert granted(profile, 'topics', 'publish') == made | OF_EVERY_NODE | (
-        {'~/transition_event'} if managed else set())
-    assert granted(profile, 'topics', 'subscribe') == source_names(
-        'calibrator_node', 'create_subscription')
+def of_plotjuggler() -> set[str]:
+    """Return the topics of the curves, of the equations and of the subscription."""
+    root = ElementTree.parse(CONFIG / 'plotjuggler.xml').getroot()
+    sources = [element.text for tag in ('linked_source', 'v1', 'v2') for element in root.iter(tag)]
+    curves = {element.get('name') for element in root.iter('curve')}
+    made = {element.get('name') for element in root.iter('snippet')}
+    subscribed = {name for element in root.iter('selected_topics')
+                  for name in element.get('value').split(';')}
+    of_series = {next((topic for topic in subscribed if one.startswith(f'{topic}/')), one)
+                 for one in [*sources, *(curves - made)]}
+    return subscribed | of_series
 
 
-@pytest.mark.parametrize('executable', ['calibrator', 'calibrator_lifecycle'])
-def test_services_of_the_calibrator_are_those_of_the_code(executable: str) -> None:
-    profile, managed = profile_of(executable), executable == 'calibrator_lifecycle'
-    made = triggers() | source_names('calibrator_node', 'create_service')
-    assert len(made) > 10
-    assert granted(profile, 'services', 'reply') == made | PARAMETERS | (
-        OF_MANAGED_NODES if managed else set())
+@pytest.mark.parametrize('topics', [of_rviz, of_foxglove, of_plotjuggler])
+def test_topics_of_a_layout_are_those_of_the_calibrator(topics: Any) -> None:
+    names = {'/' + name.replace('~/', 'calibrator/').lstrip('/')
+             for name in names_of_the_calibrator()}
+    assert set() < topics() <= names
 
 
-def test_names_of_the_simulator_are_those_of_the_code() -> None:
-    profile = profile_of('simulator')
-    made = source_names('simulator_node', 'create_publisher')
-    assert granted(profile, 'topics', 'publish') == made | OF_EVERY_NODE
-    assert granted(profile, 'topics', 'subscribe') == set()
-    assert granted(profile, 'services', 'reply') == PARAMETERS | source_names(
-        'simulator_node', 'create_service')
-
-
-def test_no_node_may_call_a_service() -> None:
-    assert not any(granted(profile, 'services', 'request') for profile in policy().iter('profile'))
+def test_the_layouts_show_what_the_calibrator_publishes() -> None:
+    assert of_rviz() | of_foxglove() | of_plotjuggler() >= {
+        '/imu/data_raw', '/imu/data_calibrated', '/calibrator/poses', '/calibrator/still',
+        '/diagnostics'}
