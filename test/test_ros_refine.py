@@ -7,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 import re
 import signal
-import time
 from typing import Any
 
 from accel_calib.calibrate import Calibration
@@ -34,7 +33,7 @@ def warmed(bench: Any, readings: Readings, publisher: Any, name: str = 'temperat
     meet(bench, publisher, 25.0, name)
     for k, direction in enumerate(spread_directions(POSES)):
         value = 25.0 + 12.0 * np.sin(2.1 * k)
-        published(bench, publisher, value, 0.05)
+        published(bench, publisher, value)
         bench.feed(readings([direction], dwell=1.8) + MOVES * change(value - 25.0) * 9.80665)
 
 
@@ -46,15 +45,10 @@ def message(publisher: Any, value: float) -> Any:
     return kind(**{field: value})
 
 
-def published(bench: Any, publisher: Any, value: float, seconds: float) -> None:
-    """Publish a temperature, or other number, repeatedly."""
-    ends = time.monotonic() + seconds
-
-    def late() -> bool:
-        publisher.publish(message(publisher, value))
-        return time.monotonic() > ends
-
-    bench.spin(late)
+def published(bench: Any, publisher: Any, value: float) -> None:
+    """Publish a temperature, or other number, that the node takes before its answer."""
+    publisher.publish(message(publisher, value))
+    bench.call('self_test')
 
 
 def meet(bench: Any, publisher: Any, value: float, name: str = 'temperature [°C]') -> None:
@@ -243,7 +237,7 @@ def test_messages_are_corrected_as_offline(bench: Any, readings: Readings, name:
     found: list[Any] = []
     for k in range(60):
         temperature = 20.0 + 0.25 * k
-        published(bench, publisher, temperature, 0.05)
+        published(bench, publisher, temperature)
         if k == 30:
             calibration = with_effect(path, name, values)
             answer = bench.call('load')
