@@ -239,16 +239,6 @@ def test_names_of_other_quantities_are_no_accelerations(name: str) -> None:
     assert meaning(name).quantity != 'reading'
 
 
-def test_columns_in_the_order_z_y_x_are_read_by_their_names(tmp_path: Path) -> None:
-    made = samples(per_g=G)
-    x, y, z = made['reading'].T
-    text = text_of(rows_of(made['time'] * 1e9 + 1.7e18, made['time'], z, y, x, digits='.19g'),
-                   'time,seconds_elapsed,z,y,x')
-    log = read_log(write(tmp_path, text))
-    np.testing.assert_allclose(log.table.reading, made['reading'], rtol=1e-9)
-    np.testing.assert_allclose(log.table['time'] - log.table['time'][0], made['time'], atol=1e-5)
-
-
 @pytest.mark.parametrize(('header', 'found', 'advice', 'chosen'), [
     ('t,imu0_ax,imu0_ay,imu0_az,imu1_ax,imu1_ay,imu1_az', 'imu0_ax, imu0_ay, imu0_az and imu1_ax',
      '--columns', {'ax': 'imu1_ax', 'ay': 'imu1_ay', 'az': 'imu1_az'}),
@@ -468,13 +458,6 @@ def test_a_name_that_contradicts_the_readings_is_an_error(header: str, per_g: fl
     assert advice in refusal.value.advice
     assert '\n' not in str(refusal.value)
     assert read_log(path, LogOptions(units='native')).units.name == 'native'
-
-
-def test_a_stated_unit_that_the_readings_contradict_is_an_error(tmp_path: Path) -> None:
-    for text, units in ((log_text(), 'g'), ('# units: "m/s2"\n' + log_text(per_g=1.0), '')):
-        with pytest.raises(InputError, match='the length of the readings is about') as refusal:
-            read_log(write(tmp_path, text), LogOptions(units=units))  # type: ignore[arg-type]
-        assert 'set the units of the readings to' in refusal.value.advice
 
 
 def test_the_unit_that_the_user_states_goes_first(tmp_path: Path) -> None:

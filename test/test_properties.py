@@ -310,16 +310,6 @@ def test_two_poses_that_alone_check_each_other_are_both_named(seed, wrong, knock
     assert error_of(found, sensor) <= SURE * uncertainty_g(found)
 
 
-@pytest.mark.parametrize('bad', ['zero', 'huge', 'overflowing', 'doubled', 'in another unit'])
-@tried(10)
-@given(errors=ERRORS, count=COUNTS, seed=SEEDS, angles=ANGLES, place=st.floats(0.0, 0.99))
-def test_a_row_that_is_no_reading_at_rest_is_left_out_and_named(
-        bad, errors, count, seed, angles, place):
-    poses, row = poses_of(errors, count, seed, angles), int(place * count)
-    poses.reading[row] = BAD[bad](poses.reading[row])
-    assert row + 1 in rows_left_out(fit_poses(poses, G, model='10'))
-
-
 @tried(30)
 @given(errors=ERRORS, count=COUNTS, seed=SEEDS, place=st.floats(0.0, 0.99),
        axis=st.integers(0, 2), value=st.sampled_from([np.nan, np.inf, -np.inf]))
@@ -329,15 +319,3 @@ def test_a_number_that_is_not_finite_is_refused_with_its_row(
     readings[int(place * count), axis] = value
     with pytest.raises(InputError, match=f'row {int(place * count) + 1} of ax, ay, az'):
         ac.fit(readings, units='g', model='10')
-
-
-@tried(15)
-@given(errors=ERRORS, count=COUNTS, seed=SEEDS, angles=ANGLES, place=st.floats(0.0, 0.99))
-def test_a_row_that_is_entered_twice_counts_once(errors, count, seed, angles, place):
-    poses = poses_of(errors, count, seed, angles)
-    again = with_pose(poses, poses.reading[int(place * count)], None)
-    expected, found = fit_poses(poses, G, model='10'), fit_poses(again, G, model='10')
-    small = 1e-3 * uncertainty_g(expected)
-    np.testing.assert_allclose(found.correct(OVER_THE_SPHERE), expected.correct(OVER_THE_SPHERE),
-                               atol=small)
-    assert uncertainty_g(found) == pytest.approx(uncertainty_g(expected), rel=1e-3)
