@@ -15,10 +15,10 @@ from accel_calib.errors import InputError
 from accel_calib.logs import open_log, read_recording
 from accel_calib.messages import correct_bag
 from accel_calib.stored import write_calibration
-from bag_files import a_calibration, copied, COUNT, execute, MAKES, messages, ros1, rosbag2, TOPICS
+from bag_files import (
+    a_calibration, copied, COUNT, execute, MAKES, McapFile, messages, ros1, rosbag2, STORE, TOPICS)
 from faults.fuzz import ended, read_bag
 from faults.sample import sample
-from mcap_file import McapFile, STORE
 import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin

@@ -20,9 +20,10 @@ from accel_calib.errors import InputError
 from accel_calib.logs import read_recording
 from accel_calib.messages import correct_bag
 from accel_calib.stored import write_calibration
-from bag_files import a_calibration, copied, COUNT, execute, messages, rosbag2 as folder_of, TOPICS
+from bag_files import (
+    a_calibration, COMPRESS, copied, COUNT, execute, McapFile, messages, rosbag2 as folder_of,
+    STORE, TOPICS)
 from inside import check_regular, DECOMPRESSED, decompressed, largest, main, open_bag
-from mcap_file import COMPRESS, McapFile, STORE
 import pytest
 from rosbags import rosbag2
 from rosbags.rosbag1 import Writer as Writer1

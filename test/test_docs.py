@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The documentation agrees with the code; test_docs_commands.py runs its commands."""
+"""The documentation and its pictures agree with the code; test_docs_commands runs its commands."""
 
 import ast
 from dataclasses import fields
@@ -10,9 +10,11 @@ import inspect
 from pathlib import Path
 import re
 import shlex
+from xml.etree import ElementTree
 
 import accel_calib as ac
 from accel_calib.session import CalibratorSettings
+from faults.sample import FACTOR
 from inside import COMMANDS, parser
 import pytest
 from test_policy import names_of_the_calibrator
@@ -164,3 +166,43 @@ def test_each_quoted_message_is_in_the_code(templates):
     assert len(QUOTED) >= 35
     for quote in QUOTED:
         assert any(is_in(quote, text) for text in templates), quote
+
+
+FOLDER = ROOT / 'docs' / 'pictures'
+LARGEST = 300_000  # bytes
+RUN_AGAIN = 'run: python docs/pictures.py'
+
+
+@pytest.fixture
+def pictures(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / 'docs'))
+    return importlib.import_module('pictures')
+
+
+def without_numbers(text):
+    return re.sub(r'[-−]?[\d.]+(e-?\d+)?', '#', text)
+
+
+def test_the_picture_of_the_poses_is_drawn_from_the_planner(pictures):
+    assert (FOLDER / 'poses.svg').read_text('utf-8') == pictures.poses_svg(), RUN_AGAIN
+
+
+@pytest.mark.skipif(FACTOR == 1, reason='commands run for half a minute: .ci/run')
+def test_terminals_show_what_the_commands_print(pictures, tmp_path):
+    pictures.prepare(tmp_path)
+    for name, commands in pictures.TERMINALS.items():
+        drawn = pictures.terminal_svg(name, pictures.recorded(commands, tmp_path))
+        stored = (FOLDER / f'{name}.svg').read_text('utf-8')
+        assert without_numbers(pictures.shown_text(stored)) == without_numbers(
+            pictures.shown_text(drawn)), RUN_AGAIN
+
+
+@pytest.mark.parametrize('path', sorted(FOLDER.iterdir()), ids=lambda path: path.name)
+def test_pictures_are_small_and_need_no_network(path):
+    assert path.stat().st_size < LARGEST
+    if path.suffix == '.svg':
+        root = ElementTree.parse(path).getroot()
+        assert root.get('role') == 'img'
+        assert root.get('aria-label') or root.get('aria-labelledby')
+        text = path.read_text('utf-8').replace('http://www.w3.org/2000/svg', '')
+        assert 'http' not in text

@@ -3,8 +3,10 @@
 
 """Samples of a serial port (a pseudo-terminal) or a recording, and ``accel-calib live``."""
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, ExitStack
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, ExitStack, suppress
 import os
 from pathlib import Path
 import re
@@ -15,7 +17,9 @@ import stat
 import subprocess
 import sys
 import tempfile
+from threading import Event, Thread
 import time
+import tty
 from urllib.parse import urlsplit
 
 from accel_calib.errors import InputError
@@ -28,7 +32,6 @@ from inside import (
 from live_bench import TurnedSensor
 import numpy as np
 import pytest
-from serial_board import board
 from viewer import link_of, Viewer, wait
 
 RATE_HZ = 200.0
@@ -366,3 +369,34 @@ def test_a_missing_recording_or_port_is_one_line_and_status_2(
     for source in (tmp_path / 'missing.csv', '/dev/ttyUSB97'):
         assert main(['live', str(source)]) == 2
         assert capsys.readouterr().err.count('\n') == 1
+
+
+@contextmanager
+def board(lines: Iterable[str]) -> Iterator[str]:
+    """
+    Yield the port of a board that sends these lines; their iterator sets the pace.
+
+    As on a real port, bytes that nobody reads in time are lost.
+
+    """
+    ours, theirs = os.openpty()
+    tty.setraw(theirs)
+    os.set_blocking(ours, False)
+    over = Event()
+
+    def send() -> None:
+        for line in lines:
+            if over.is_set():
+                return
+            with suppress(BlockingIOError):
+                os.write(ours, line.encode('latin-1'))
+
+    sender = Thread(target=send)
+    sender.start()
+    try:
+        yield os.ttyname(theirs)
+    finally:
+        over.set()
+        sender.join()
+        os.close(ours)
+        os.close(theirs)

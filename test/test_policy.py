@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The layouts show topics of the policy for SROS 2; test_ros_policy compares it with the nodes."""
+"""The layouts show topics of the policy for SROS 2; test_ros_services compares it with nodes."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def granted(profile: ElementTree.Element, tag: str, right: str) -> set[str]:
 def names_of_the_calibrator() -> set[str]:
     """Return the names of its topics and services."""
     profile = profile_of('calibrator')
-    return {name for tag, right in (('topics', 'publish'), ('topics', 'subscribe'),
-                                    ('services', 'reply')) for name in granted(profile, tag, right)}
+    return (granted(profile, 'topics', 'publish') | granted(profile, 'topics', 'subscribe')
+            | granted(profile, 'services', 'reply'))
 
 
 def of_rviz() -> set[str]:

@@ -1,24 +1,33 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The services of the calibrator, and their answers if they fail."""
+"""The services, the parameters, and all names of the nodes, as stated in files of config/."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import fields
 from pathlib import Path
 import re
+from textwrap import wrap
 from typing import Any
 
+from accel_calib.errors import InputError
 from accel_calib.logs import read_poses
+from accel_calib.session import CalibratorSettings
 from accel_calib.units import units_of
 from diagnostic_msgs.msg import DiagnosticArray
-from inside import Model, plan_for, simulate_poses, spread_directions
-from inside_ros import pose_markers
+from inside import (
+    capture_settings, changed, default_of, expected, Model, plan_for, simulate_poses,
+    spread_directions)
+from inside_ros import pose_markers, SimulatorSettings
 import numpy as np
+import pytest
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Bool
+from test_policy import granted, optional_elements, profile_of
 from visualization_msgs.msg import MarkerArray
+import yaml
 
 Readings = Callable[..., Any]
 Stored = Callable[..., Path]
@@ -107,3 +116,157 @@ def test_self_test_names_what_fails(bench: Any, stored: Stored) -> None:
     answer = bench.call('self_test')
     assert answer.passed == b'\x01', [status.message for status in answer.status]
     assert answer.id == 'imu_link'
+
+
+CONFIG = Path(__file__).parent.parent / 'config' / 'calibrator.yaml'
+SETTINGS = [CalibratorSettings, SimulatorSettings]
+WIDTH = 99
+COMMENT = '    # '
+
+
+def yaml_lines(settings: type[Any]) -> Iterator[str]:
+    """Yield the lines of a parameter file with all defaults, for any node name."""
+    yield '# Parameters of the calibrator with their defaults; generated from'
+    yield '# accel_calib/session/settings.py. Parameters with * can be set while the node runs.'
+    yield '/**:'
+    yield '  ros__parameters:'
+    for each in fields(settings):
+        live = ' *' if each.metadata['live'] else ''
+        words = f"{each.metadata['words']} ({expected(each)}){live}"
+        yield from wrap(words, WIDTH, initial_indent=COMMENT, subsequent_indent=COMMENT)
+        yield f'    {each.name}: {yaml_value(default_of(each))}'
+
+
+def yaml_value(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return repr(value)
+
+
+def test_parameter_file_is_the_table() -> None:
+    """Check the file; write it with: python test/test_ros_services.py."""
+    assert CONFIG.read_text(encoding='utf-8').splitlines() == list(yaml_lines(CalibratorSettings))
+
+
+def test_parameter_file_holds_the_defaults() -> None:
+    given = yaml.safe_load(CONFIG.read_text(encoding='utf-8'))['/**']['ros__parameters']
+    assert CalibratorSettings(**given) == CalibratorSettings()
+    assert list(given) == [parameter.name for parameter in fields(CalibratorSettings)]
+
+
+def test_parameters_accept_numbers_of_other_types() -> None:
+    settings = changed(CalibratorSettings(), {'model': 10, 'min_dwell': 2, 'sensor': 7,
+                                              'use_sim_time': True})
+    assert (settings.model, settings.min_dwell, settings.sensor) == ('10', 2.0, '7')
+    assert isinstance(settings.min_dwell, float)
+
+
+@pytest.mark.parametrize(('name', 'value'), [
+    ('model', '12'), ('model', True), ('gravity', 0.5), ('gravity', float('nan')),
+    ('gravity', '9.8'), ('auto_capture', 1), ('auto_fit_poses', 12.5), ('auto_fit_poses', True),
+    ('units', 'counts'), ('sensor', ['a'])])
+def test_values_that_parameters_do_not_accept_are_refused(name: str, value: Any) -> None:
+    with pytest.raises(InputError, match=f'parameter {name} is .*, expected '):
+        changed(CalibratorSettings(), {name: value})
+
+
+def test_lists_are_checked() -> None:
+    settings = changed(SimulatorSettings(), {'mounting': [1, 2.5, 3], 'effects': []})
+    assert settings.mounting == [1.0, 2.5, 3.0]
+    assert settings.effects == []
+    with pytest.raises(InputError, match='a list of 3 numbers'):
+        changed(SimulatorSettings(), {'mounting': [1.0]})
+
+
+def test_settings_that_contradict_each_other_are_refused() -> None:
+    with pytest.raises(InputError, match='max_dwell'):
+        capture_settings(CalibratorSettings(min_dwell=2.0, max_dwell=3.0))
+
+
+def test_node_declares_all_parameters_and_refuses_invalid_values_while_it_runs(bench: Any) -> None:
+    from rcl_interfaces.srv import DescribeParameters, ListParameters, SetParameters
+    from rclpy.parameter import Parameter
+    bench.calibrator()
+
+    def ask(kind: Any, name: str, **request: Any) -> Any:
+        return bench.ask(kind, f'calibrator/{name}', **request)
+
+    table = {parameter.name: parameter.metadata for parameter in fields(CalibratorSettings)}
+    names = ask(ListParameters, 'list_parameters').result.names
+    assert set(table) <= set(names)
+    described = ask(DescribeParameters, 'describe_parameters', names=list(table)).descriptors
+    assert {each.name: (each.description, not each.read_only) for each in described} == {
+        name: (about['words'], about['live']) for name, about in table.items()}
+    tried = [Parameter('model', value=7), Parameter('model', value='11'),
+             Parameter('gravity', value=9.81), Parameter('auto_fit_poses', value=2)]
+    results = ask(SetParameters, 'set_parameters',
+                  parameters=[each.to_parameter_msg() for each in tried]).results
+    assert [each.successful for each in results] == [True, False, False, False]
+    assert 'expected one of auto' in results[1].reason
+
+
+Names = dict[str, set[str]]
+
+RIGHTS = {'publish': 'topics', 'subscribe': 'topics', 'reply': 'services', 'request': 'services'}
+
+
+def resolved(name: str, node: str) -> str:
+    """Return the full name of a topic or service of a node without a namespace."""
+    return name if name.startswith('/') else f'/{name.replace("~", node)}'
+
+
+def allowed(executable: str, *parameters: str) -> Names:
+    """Return the full names by right, with the rights for these parameters."""
+    profile = profile_of(executable)
+    node = profile.get('node')
+    found = {right: {resolved(name, node) for name in granted(profile, tag, right)}
+             for right, tag in RIGHTS.items()}
+    for parameter, block in optional_elements():
+        if parameter in parameters:
+            for right in block.attrib:
+                found[right] |= {each.text for each in block}
+    return found
+
+
+def used(bench: Any, node: str) -> Names:
+    """Return the full names that a node uses, as DDS shows them."""
+    graph = bench.node
+    looks = {'publish': graph.get_publisher_names_and_types_by_node,
+             'subscribe': graph.get_subscriber_names_and_types_by_node,
+             'reply': graph.get_service_names_and_types_by_node,
+             'request': graph.get_client_names_and_types_by_node}
+    return {right: {name for name, _ in look(node, '/')} for right, look in looks.items()}
+
+
+def compare(bench: Any, node: str, expected: Names) -> None:
+    """Wait until all that is allowed is seen, and check that there is nothing else."""
+    bench.spin(lambda: node in bench.node.get_node_names())
+    bench.spin(lambda: all(expected[right] <= names for right, names in used(bench, node).items()))
+    assert used(bench, node) == expected
+
+
+def test_calibrator_uses_all_that_the_policy_grants_and_nothing_else(bench: Any) -> None:
+    bench.calibrator()
+    compare(bench, 'calibrator', allowed('calibrator'))
+
+
+def test_rights_in_comments_are_those_that_the_parameters_need(
+        bench: Any, tf_message: Any) -> None:
+    bench.calibrator(use_sim_time=True, base_frame='base_link', publish_tf=True)
+    compare(bench, 'calibrator', allowed('calibrator', 'use_sim_time', 'base_frame', 'publish_tf'))
+
+
+def test_simulator_uses_all_that_the_policy_grants_and_nothing_else(bench: Any) -> None:
+    bench.start('simulator', poses=2, dwell=1.0)
+    compare(bench, 'simulator', allowed('simulator'))
+
+
+def test_managed_calibrator_uses_all_that_the_policy_grants_and_nothing_else(bench: Any) -> None:
+    from lifecycle_msgs.msg import Transition
+    bench.start('calibrator_lifecycle')
+    bench.go(Transition.TRANSITION_CONFIGURE)
+    compare(bench, 'calibrator', allowed('calibrator_lifecycle'))
+
+
+if __name__ == '__main__':
+    CONFIG.write_text('\n'.join(yaml_lines(CalibratorSettings)) + '\n', encoding='utf-8')

@@ -1,25 +1,36 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""``accel-calib watch`` beside a calibrator node, both as processes."""
+"""``accel-calib watch`` beside a calibrator node, and the live page of a node."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 import fcntl
+import math
 import os
+from pathlib import Path
 import pty
+import select
 import signal
+import socket
 import struct
 import subprocess
 import sys
 import termios
 import threading
+import time
 from typing import Any
 
+from accel_calib.stored import read_calibration
 from faults.sample import sample
-from inside import CALIBRATOR, COMMAND
+from inside import CALIBRATOR, COMMAND, spread_directions
+from lifecycle_msgs.msg import Transition
+import numpy as np
 import pytest
+import rcl_interfaces.msg
+from sensor_msgs.msg import Imu
+from viewer import fetch, link_of, Viewer, wait
 
 Readings = Callable[..., Any]
 WATCH = (*COMMAND, 'watch')
@@ -146,3 +157,140 @@ def test_reader_of_the_pipe_may_end(bench: Any) -> None:
         bench.end(node, signal.SIGINT)  # so that there is another line to write
         assert process.wait(60) == 0
         assert process.stderr.read() == ''
+
+
+DIRECTIONS = spread_directions(12)
+
+
+def free_port() -> int:
+    with socket.create_server(('127.0.0.1', 0)) as probe:
+        return int(probe.getsockname()[1])
+
+
+def printed_until(node: subprocess.Popen[str], words: str, seconds: float = 60.0) -> str:
+    """Return the first line of a node that contains some words."""
+    ends, text = time.monotonic() + seconds, ''
+    while time.monotonic() < ends:
+        if select.select([node.stdout], [], [], 0.1)[0]:
+            assert node.stdout is not None
+            text = node.stdout.readline()
+            if words in text:
+                return text
+    raise AssertionError(f'the node has not printed {words!r} within {seconds} s')
+
+
+@pytest.fixture
+def viewer(bench: Any, tmp_path: Path) -> Iterator[Viewer]:
+    """Yield a viewer of a calibrator with a page."""
+    node = bench.calibrator(calibration_file=tmp_path / 'c.yaml', web_port=free_port(),
+                            passthrough=True)
+    made = Viewer(link_of(printed_until(node, 'live page: ')))
+    made.node = node  # type: ignore[attr-defined]
+    yield made
+    made.close()
+
+
+def test_a_whole_calibration_through_the_commands_of_the_page(
+        bench: Any, viewer: Viewer, readings: Callable[..., Any], tmp_path: Path) -> None:
+    path = tmp_path / 'c.yaml'
+    bench.feed(readings(DIRECTIONS))
+    bench.spin(lambda: len(viewer.of('poses')[-1]['up']) >= len(DIRECTIONS))
+
+    offered = viewer.ask('fit', bench.spin)
+    assert offered['success'], offered['words']
+    assert viewer.state['preview']
+    residuals = {label: value for label, value, unit in viewer.state['result']['residuals']}
+    assert residuals['residual after'] < 1.0 < residuals['residual before']
+    assert not path.exists()
+    bench.spin(lambda: viewer.state['rating'])
+    assert fetch(viewer.base + '/export/c', Authorization=f'Bearer {viewer.token}')[0] == 409
+
+    assert viewer.ask('save', bench.spin)['success']
+    np.testing.assert_allclose(read_calibration(path).offset / 9.80665, [0.03, -0.02, 0.04],
+                               atol=5e-4)
+    assert not viewer.state['preview']
+    bench.feed(readings(DIRECTIONS[:1]))
+    bench.spin(lambda: abs((viewer.of('progress')[-1]['corrected'] or 0.0) - 1.0) < 0.003)
+
+    status, headers, page = fetch(viewer.base + viewer.state['page'])
+    assert (status, b'<svg' in page) == (200, True)
+    assert "frame-ancestors 'self'" in headers['Content-Security-Policy']
+    status, _, export = fetch(viewer.base + '/export/c', Authorization=f'Bearer {viewer.token}')
+    assert (status, b'void' in export) == (200, True)
+
+    assert viewer.ask('undo', bench.spin)['success']
+    assert viewer.state['result'] is None
+
+
+def test_commands_of_services_and_of_the_page_are_shown_in_the_same_log(
+        bench: Any, viewer: Viewer, readings: Callable[..., Any]) -> None:
+    bench.feed(readings(DIRECTIONS[:2]))
+    refusal = bench.call('fit').message
+    bench.spin(lambda: refusal in [line['words'] for line in viewer.of('log')])
+    assert viewer.ask('fit', bench.spin)['words'] == refusal
+    numbers = [line['number'] for line in viewer.of('log')]
+    assert numbers == sorted(set(numbers))
+
+
+def test_the_newest_message_is_shown_and_not_the_batch_of_the_session(
+        bench: Any, viewer: Viewer, readings: Callable[..., Any]) -> None:
+    bench.feed(readings(DIRECTIONS[:1]))
+    count = len(viewer.of('progress'))
+    for k in range(10):
+        bench.send(bench.imu([0.0, 0.0, 9.80665 * (1.0 + 0.01 * k)]))
+    bench.spin(lambda: any(math.isclose(each['raw'] or 0.0, 1.09, abs_tol=1e-6)
+                           for each in viewer.of('progress')[count:]))
+
+
+def test_a_node_with_viewers_ends_cleanly(viewer: Viewer, bench: Any) -> None:
+    code, printed = bench.end(viewer.node, signal.SIGINT)  # type: ignore[attr-defined]
+    assert (code, 'Traceback' in printed) == (0, False)
+    wait(lambda: viewer.code)
+
+
+def test_the_token_is_neither_in_the_log_of_the_node_nor_in_rosout(
+        bench: Any, viewer: Viewer) -> None:
+    node = viewer.node  # type: ignore[attr-defined]
+    heard = bench.listen(rcl_interfaces.msg.Log, '/rosout', latched=True)
+    bench.spin(lambda: any('live page: ' in line.msg for line in heard))
+    code, printed = bench.end(node, signal.SIGINT)
+    assert code == 0
+    folder = Path(os.environ.get('ROS_LOG_DIR') or bench.home / 'log')
+    file, = folder.glob(f'*_{node.pid}_*.log')
+    logged = file.read_text(encoding='utf-8')
+    assert 'live page: ' in logged
+    for text in (printed, logged, *(line.msg for line in heard)):
+        assert viewer.token not in text
+    assert not list((bench.home / 'accel_calib').glob('live_page_*'))
+
+
+def test_a_node_whose_port_is_in_use_says_so_and_works_on(
+        bench: Any, readings: Callable[..., Any], tmp_path: Path) -> None:
+    with socket.create_server(('127.0.0.1', 0)) as taken:
+        port = taken.getsockname()[1]
+        node = bench.calibrator(calibration_file=tmp_path / 'c.yaml', web_port=port,
+                                passthrough=True)
+        line = printed_until(node, 'in use')
+        assert f'the port {port} of 127.0.0.1 is in use' in line
+        bench.feed(readings(DIRECTIONS[:1]))
+        assert 'pose' in bench.call('capture_pose').message
+        assert node.poll() is None
+
+
+def test_the_managed_node_serves_the_page_while_it_is_configured(
+        bench: Any, stored: Callable[..., Path]) -> None:
+    node = bench.start('calibrator_lifecycle', calibration_file=stored(), web_port=free_port())
+    publisher = bench.node.create_publisher(Imu, 'imu/data_raw', 100)
+    for _ in range(2):  # the second page is at the same port
+        bench.go(Transition.TRANSITION_CONFIGURE)
+        viewer = Viewer(link_of(printed_until(node, 'live page: ')))
+        bench.spin(lambda viewer=viewer: viewer.of('state') and viewer.state['calibration'])
+        bench.go(Transition.TRANSITION_ACTIVATE)
+        bench.spin(lambda viewer=viewer: publisher.publish(bench.imu([0.1, 0.2, 9.8])) or any(
+            each['raw'] for each in viewer.of('progress')))
+        assert viewer.ask('disable', bench.spin)['success']
+        bench.go(Transition.TRANSITION_DEACTIVATE)
+        bench.go(Transition.TRANSITION_CLEANUP)
+        wait(lambda viewer=viewer: viewer.code)
+        viewer.close()
+    assert bench.end(node, signal.SIGTERM)[0] == 0

@@ -19,7 +19,6 @@ from accel_calib.errors import AccelCalibError
 from accel_calib.logs import read_log, write_table
 from accel_calib.stored import write_calibration
 import bag_files as bags
-from mcap_file import McapFile, STORE
 import numpy as np
 import yaml
 
@@ -247,7 +246,7 @@ def _change(rng: Rng, content: Any) -> None:
 
 def random_messages() -> Callable[[Rng], Files]:
     """Return the maker of sound bags with damaged messages, times and names of topics."""
-    made = [(topic, stamp, bytes(STORE.serialize_cdr(each, bags.TOPICS[topic][1])))
+    made = [(topic, stamp, bytes(bags.STORE.serialize_cdr(each, bags.TOPICS[topic][1])))
             for topic, stamp, each in bags.messages()]
     words = ('/imu', '', '/imu\x1b[31m', 'imu', '/' + 300 * 'a', '/temperature', '/ä')
 
@@ -262,7 +261,7 @@ def random_messages() -> Callable[[Rng], Files]:
         topics = [(_one(rng, words) if rng.random() < 0.05 else name, kind)
                   for name, kind in bags.TOPICS]
         with TemporaryDirectory() as name:
-            path = McapFile(topics).write(Path(name) / 'bag.mcap', content)
+            path = bags.McapFile(topics).write(Path(name) / 'bag.mcap', content)
             return files_at(path)
     return make
 
