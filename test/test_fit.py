@@ -302,16 +302,12 @@ def test_a_fit_without_any_residual_has_converged():
 
 @pytest.mark.parametrize('is_nan', ['residual', 'columns'])
 def test_a_step_to_where_residual_or_derivative_is_not_finite_is_not_taken(is_nan):
-    def point_at(values):
-        beyond = np.where(values > 2.0, np.nan, 1.0)
-        parts = {'residual': 3.0 - values, 'columns': np.ones((1, 1))}
-        return Point(**{**parts, is_nan: parts[is_nan] * beyond})
+    def point_at(values):  # the first full step goes to 1.67, where the cost is lower
+        parts = {'residual': 1.0 - values, 'columns': np.full((1, 1), 0.6)}
+        return Point(**{**parts, is_nan: parts[is_nan] * np.where(values > 1.5, np.nan, 1.0)})
 
-    free = np.full(1, -np.inf), np.full(1, np.inf)
-    with pytest.raises(NotConvergedError):
-        solve(point_at, np.zeros(1), *free)
-    values, _ = solve(point_at, np.zeros(1), free[0], np.full(1, 2.0))
-    assert values == 2.0
+    values, _ = solve(point_at, np.zeros(1), np.full(1, -np.inf), np.full(1, np.inf))
+    assert values == pytest.approx(1.0, abs=1e-3)
 
 
 SETS = 4000
