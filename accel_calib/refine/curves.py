@@ -22,6 +22,12 @@ the same columns as an offset. Its size is estimated by maximum likelihood: with
 out, the residual along the singular vectors of the modes has the variances s² (1 + λ Λ_i). With a
 fixed number of modes, the cost is linear in the number of poses.
 
+**Rivals** are effects that would explain the data about as well as a named one. The probability of
+an effect against its rivals follows from the score of the set with each of them in its place,
+exp(c score / 2), all else being equal (Kass and Raftery 1995). The noise is estimated from the
+same equations, so differences are less certain: c is the share of the degrees of freedom that the
+set leaves.
+
 """
 
 from __future__ import annotations

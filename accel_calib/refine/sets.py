@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Search over sets of effects and outliers, and the probability of each effect of a set.
+Sets of effects and outliers: their scores, and the search for the best one.
 
 The search is a beam: it keeps the best few sets by the score of `.linear`, and extends each by one
 effect at a time. After each extension the shapes are chosen again, and the outliers are found
@@ -12,12 +12,6 @@ only if each of its effects is significant beside the others.
 
 **Random walk.** A walk of the offset (`.curves`) competes with the sets: the same search is done
 with equations whitened for the walk, and its score includes the walk.
-
-**Rivals** are effects that would explain the data about as well as a named one. The probability of
-an effect against its rivals follows from the score of the set with each of them in its place,
-exp(c score / 2), all else being equal (Kass and Raftery 1995). The noise is estimated from the
-same equations, so differences are less certain: c is the share of the degrees of freedom that the
-set leaves.
 
 """
 
