@@ -17,25 +17,22 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .calibrate import (
-    Calibration as _Calibration, FrameName, Method, mounting_of, Verification,
-    verify as verify_calibration)
+    Calibration as _Calibration, mounting_of, Verification, verify as verify_calibration)
 from .compare import compare as compare_calibrations, Comparison
 from .effects import know, model_with, OwnEffect as Effect, simulate_poses, simulate_recording
 from .errors import InputError
 from .finding import Finding
 from .findings import figures_of, rate, Rating
 from .geometry import spread_directions
-from .intake import poses_of, samples_again, still_poses
 from .logs import (
-    are_untimed_samples, Frame, LogOptions, open_log, read_log,
-    read_recording as read_whole_recording)
-from .pipeline import calibrated, Flat, Plan
+    are_untimed_samples, Frame, LogOptions, read_log, read_recording as read_whole_recording)
+from .pipeline import calibrated, captured_from, Flat, options_for, Plan, poses_of
 from .refine import refine as find_effects, Refinement
 from .stored import read_calibration, write_calibration
 from .table import (
     check_units, check_values, data_frame, Floats, LARGEST, numbered, Poses, Recording, Table)
 from .text import counted, now
-from .units import is_native, STANDARD_GRAVITY, UnitName, Units, units_of
+from .units import FrameName, is_native, Method, STANDARD_GRAVITY, UnitName, units_of
 
 __all__ = ['Calibration', 'Effect', 'Poses', 'Recording', 'Refinement', 'calibrate', 'capture',
            'compare', 'fit', 'load', 'read_poses', 'read_recording', 'refine', 'simulate',
@@ -293,18 +290,12 @@ def capture(recording: Source | Recording | Data, *, units: UnitName | None = No
         out of range.
 
     """
-    log = _log(recording)
-    if isinstance(recording, Recording):
-        return _captured(recording, units, gravity, settings)
-    if log is None:
+    if not isinstance(recording, Recording) and not _is_log(recording):
         raise InputError(f'found {type(recording).__name__}, expected a recording',
                          'pass a path, a Recording, or a DataFrame with times')
-    options, asked = _options(units, gravity, {'topic': topic, 'sensor': sensor, **settings})
-    with open_log(log, options) as opened:
-        known = opened.units
-        found, _ = still_poses(str(log), known, asked, opened.blocks,
-                               lambda: samples_again(log, options))
-    return replace(found.poses, units=known.name)
+    found, _ = captured_from(*_asked(recording, units, gravity, {
+        'topic': topic, 'sensor': sensor, **settings}))
+    return found.poses
 
 
 def calibrate(log: Source | Poses | Recording | Data, *, units: UnitName | None = None,
@@ -350,8 +341,8 @@ def calibrate(log: Source | Poses | Recording | Data, *, units: UnitName | None 
     """
     plan = Plan(refined=refined, flat=flat, nose_down=nose_down, frame=frame, sensor=sensor,
                 also=know(also))
-    poses = _poses(log, units, gravity, {'sensor': sensor, **settings})
-    return _calibrated(poses, units, gravity, plan)
+    found = poses_of(*_asked(log, units, gravity, {'sensor': sensor, **settings}))
+    return _public(calibrated(found.poses, found.units, plan).calibration)
 
 
 def fit(poses: Source | Poses | Data, *, units: UnitName | None = None,
@@ -399,7 +390,8 @@ def fit(poses: Source | Poses | Data, *, units: UnitName | None = None,
     """
     plan = Plan(model=model, method=method, refined=False, flat=flat, nose_down=nose_down,
                 frame=frame, sensor=sensor)
-    return _calibrated(_poses(poses, units, gravity), units, gravity, plan)
+    found = poses_of(*_asked(poses, units, gravity))
+    return _public(calibrated(found.poses, found.units, plan).calibration)
 
 
 def refine(poses: Source | Poses | Data, *, base: str | Calibration = 'auto',
@@ -438,16 +430,14 @@ def refine(poses: Source | Poses | Data, *, base: str | Calibration = 'auto',
 
     """
     names = know(also)
+    start: str | _Calibration = base
     if isinstance(base, _Calibration):
-        table = _poses(poses, _asked(units, base), base.units.per_g)
-        stored = _in_units_of(base, table, units)
-        found = find_effects(table, stored.units, base=stored, sensor=sensor, date=now(),
-                             also=names)
+        start, table = _beside(base, poses, units)
+        known = start.units
     else:
-        table = _poses(poses, units, gravity)
-        known = _units(units, gravity, table.units, 'the pose table')
-        found = find_effects(table, known, base=base, sensor=sensor, date=now(),
-                             also=names)
+        read = poses_of(*_asked(poses, units, gravity))
+        table, known = read.poses, read.units
+    found = find_effects(table, known, base=start, sensor=sensor, date=now(), also=names)
     return replace(found, calibration=_public(found.calibration))
 
 
@@ -478,10 +468,8 @@ def verify(poses: Source | Poses | Data, calibration: Source | _Calibration, *,
         only one of calibration and poses is in native units.
 
     """
-    stored = (calibration if isinstance(calibration, _Calibration)
-              else load(calibration))
-    table = _poses(poses, _asked(units, stored), stored.units.per_g)
-    known = _in_units_of(stored, table, units)
+    stored = calibration if isinstance(calibration, _Calibration) else load(calibration)
+    known, table = _beside(stored, poses, units)
     check_units(table, known.units)
     return verify_calibration(known, table)
 
@@ -625,40 +613,33 @@ def _directions(count: int) -> Floats:
     return np.vstack([[[0.0, 0.0, 1.0]], mixed])
 
 
-def _poses(given: Source | Poses | Recording | Data, units: UnitName | None = None,
-           gravity: float = STANDARD_GRAVITY, settings: Mapping[str, Any] = {}) -> Poses:
-    """Return poses from a log, a table, an array or a DataFrame; a recording is captured."""
-    log = _log(given)
-    if log is not None:
-        return poses_of(log, *_options(units, gravity, settings)).poses
-    if isinstance(given, Recording):
-        return _captured(given, units, gravity, settings)
-    return given if isinstance(given, Poses) else _array(given)
+def _is_log(given: object) -> bool:
+    """Return whether this is a path or a DataFrame, and no table or array."""
+    return isinstance(given, str | PathLike) or (
+        hasattr(given, 'columns') and not isinstance(given, Table))
 
 
-def _log(given: Source | Poses | Recording | Data) -> Path | Frame | None:
-    """Return a path or a DataFrame as a log; None for a table or an array."""
-    if isinstance(given, str | PathLike):
-        return Path(given)
-    return Frame(given) if hasattr(given, 'columns') and not isinstance(given, Table) else None
-
-
-def _options(units: UnitName | None, gravity: float, settings: Mapping[str, Any]
-             ) -> tuple[LogOptions, dict[str, Any]]:
-    """Return how to read a log, and the settings of the capture."""
+def _asked(given: Source | Poses | Recording | Data, units: UnitName | None,
+           gravity: float = STANDARD_GRAVITY, settings: Mapping[str, Any] = {}
+           ) -> tuple[Any, LogOptions, dict[str, Any]]:
+    """Return a source of poses, how to read it, and the settings of the capture."""
     of_log = {each.name for each in fields(LogOptions)} & settings.keys()
     options = LogOptions(units=units or '', gravity=gravity,
                          **{name: settings[name] for name in of_log})
-    return options, {name: settings[name] for name in settings if name not in of_log}
+    source: Any = given
+    if _is_log(given):
+        source = Path(given) if isinstance(given, str | PathLike) else Frame(given)
+    elif not isinstance(given, Table):
+        source = _array(given)
+    return source, options, {name: settings[name] for name in settings if name not in of_log}
 
 
-def _captured(samples: Recording, units: UnitName | None, gravity: float,
-              settings: Mapping[str, Any]) -> Poses:
-    known = _units(units, gravity, samples.units, 'the recording')
-    check_units(samples, known)
-    _, asked = _options(units, gravity, settings)
-    found, _ = still_poses('the recording', known, asked, samples, lambda: samples)
-    return replace(found.poses, units=known.name)
+def _beside(calibration: _Calibration, given: Source | Poses | Data, units: UnitName | None
+            ) -> tuple[_Calibration, Poses]:
+    """Return a calibration in the unit of poses, and these poses."""
+    source, options, settings = _asked(given, units)
+    poses = poses_of(source, options_for(calibration, options), settings).poses
+    return calibration.in_units_of(replace(poses, units=units or poses.units)), poses
 
 
 def _array(given: Data) -> Poses:
@@ -674,33 +655,6 @@ def _array(given: Data) -> Poses:
                          'expected one row for each pose', 'pass a Recording, or a DataFrame with '
                          'a column time')
     return Poses(columns, numbered(columns))
-
-
-def _calibrated(poses: Poses, units: UnitName | None, gravity: float, plan: Plan) -> Calibration:
-    known = _units(units, gravity, poses.units, 'the pose table')
-    return _public(calibrated(poses, known, plan).calibration)
-
-
-def _units(asked: UnitName | None, gravity: float, stated: str, source: str) -> Units:
-    """Return the unit that the caller or the source states."""
-    if asked and stated and asked != stated:
-        raise InputError(f'{source} is in {stated}, expected {asked}', f'set units={stated!r}')
-    name: Any = asked or stated or 'm/s2'
-    return units_of(name, gravity)
-
-
-def _asked(units: UnitName | None, calibration: _Calibration) -> UnitName | None:
-    """Return the unit to read poses in: native for a native calibration, else recognised."""
-    return units or ('native' if calibration.units.is_native else None)
-
-
-def _in_units_of(calibration: _Calibration, table: Table, asked: UnitName | None
-                 ) -> _Calibration:
-    """Return a calibration in the unit that the caller or the table states, or that it shows."""
-    if asked is not None:
-        _units(asked, STANDARD_GRAVITY, table.units, 'the pose table')
-        return calibration.in_units(asked)
-    return calibration.in_units_of(table)
 
 
 def _public(calibration: _Calibration) -> Calibration:

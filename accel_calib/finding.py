@@ -2,11 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Findings: what is worth knowing about a result, and how much it matters.
+Findings: what is worth knowing about a result, and how much it matters; and the rating of it.
 
 A finding is made where it is found, carried by the calibration, and stored with it. Its kind, its
 level and its rows are data. Its text is for people, and no code reads it. What to do next is one
-step of a known kind, which every surface shows with its own command.
+step of a known kind, which every surface shows with its own command. The rating is the worst level
+of the findings.
 
 """
 
@@ -170,3 +171,50 @@ def ranked(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Return findings of the worst level first, and within a level in the order of `KINDS`."""
     return tuple(sorted(findings, key=lambda each: (-LEVELS.index(each.level),
                                                     _RANKS[each.kind])))
+
+
+@dataclass(frozen=True)
+class Rating:
+    """
+    A verdict about a result.
+
+    Parameters
+    ----------
+    name : {'GOOD', 'USABLE', 'BAD'}
+        The verdict, which is the worst level of the findings.
+    reason : str
+        Reason, as one sentence without a full stop.
+    figures : str
+        The figures of the result.
+    next : NextStep
+        What to do next.
+    findings : tuple of Finding
+        What is worth knowing, that which decides the verdict first.
+
+    """
+
+    name: Level
+    reason: str
+    figures: str
+    next: NextStep  # noqa: A003, the name in JSON
+    findings: tuple[Finding, ...] = ()
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """Return the rating as lines of text: the figures, the reason unless GOOD, and next."""
+        width = len('reason') if self.name != 'GOOD' else len('next')
+        lines: list[tuple[str, str]] = [(self.name, self.figures)]
+        if self.name != 'GOOD':
+            lines.append(('reason', self.reason))
+        lines.append(('next', self.next.text))
+        return tuple(f'{label:<{width}}  {text}' for label, text in lines)
+
+
+def rated(findings: Iterable[Finding], good: str, figures: str, after: NextStep) -> Rating:
+    """Return the rating with the most informative of the worst findings; `after` a good one."""
+    ranks = ranked(findings)
+    below = [each for each in ranks if each.level != 'GOOD']
+    if not below:
+        return Rating('GOOD', good, figures, after, ranks)
+    steps = [each.next for each in below if each.advice]
+    return Rating(below[0].level, below[0].text, figures, next(iter(steps), after), ranks)

@@ -1,28 +1,193 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""From poses to a rated calibration: fit, refine, level, rate; the one way of all surfaces."""
+"""
+The one way of all surfaces: any log to poses, poses to a calibration, samples to corrected ones.
+
+`poses_of` returns the poses of a log, and captures those of a recording. `calibrated` fits,
+refines and levels by a `Plan`, and rates the result. `corrected` applies a stored calibration to
+samples; `Correction` does so block by block.
+
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal, TYPE_CHECKING
+import math
+from pathlib import Path
+from typing import Any, Literal, TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from .calibrate import (
-    Calibration, directions_of, fit_partial, fit_poses, fit_with_fleet, flat_direction, FleetPrior,
-    FrameName, level, level_by_rows, lies_in_cone, Method, PRIOR)
-from .effects import LADDER, Model, PROCESSES
-from .errors import RefusedFitError
+    Calibration, check_sensor, directions_of, fit_partial, fit_poses, fit_with_fleet,
+    flat_direction, FleetPrior, level, level_by_rows, lies_in_cone, PRIOR, SampleContext)
+from .capture import capture, Captured, settings_from
+from .effects import Context, LADDER, Model, PROCESSES
+from .errors import InputError, RefusedFitError
 from .findings import rate, Rating
-from .table import Poses
-from .text import now, short
-from .units import Units
+from .logs import Frame, LogOptions, open_log, OpenLog, Piped, Progress
+from .table import check_units, Poses, Recording, Table
+from .text import counted, now, short
+from .units import FrameName, Method, UnitName, Units, units_of
 
 if TYPE_CHECKING:
     from .refine import Refinement
+
+Source = Path | Piped | Frame | Poses | Recording
+
+_FEW = 6
+"""Fewer poses than these are too few for a calibration with all axes."""
+
+_WIDER = (1.5, 4.0, 10.0)
+"""Factors by which the limit of the standard deviation is widened, to advise another one."""
+
+
+@dataclass(frozen=True)
+class Intake:
+    """
+    Poses of a table or captured from a recording, with the unit of their readings.
+
+    `read_as` is how the log was read, in one line, empty if nothing was assumed. `notes` are what
+    was left out of the log, and `captured` how the poses were captured, if they were.
+
+    """
+
+    poses: Poses
+    units: Units
+    read_as: str = ''
+    notes: tuple[str, ...] = ()
+    captured: tuple[str, ...] = ()
+
+    @property
+    def said(self) -> str:
+        """Return how the log was read and captured, in one line, for an error about it."""
+        return ', '.join(filter(None, (self.read_as, *self.captured)))
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """Return `read_as` and the notes, for the terminal and the page."""
+        return tuple(filter(None, (self.read_as and f'read as: {self.read_as}', *self.notes,
+                                   *self.captured)))
+
+
+def options_for(calibration: Calibration | None, options: LogOptions) -> LogOptions:
+    """Return how to read a log for a calibration: in its unit, if the log states none."""
+    if calibration is None:
+        return options
+    units = calibration.units
+    if units.is_native:  # its readings can look like g
+        return replace(options, default_units='native')
+    return replace(options, gravity=units.per_g) if units.is_si else options
+
+
+def poses_of(source: Source, options: LogOptions = LogOptions(),
+             settings: Mapping[str, Any] = {},
+             progress: Progress = lambda done, count: None) -> Intake:
+    """
+    Return the poses of a log or a table; a recording is captured.
+
+    Parameters
+    ----------
+    source : Path, Piped, Frame, Poses or Recording
+        Pose table or recording, in any format that `accel_calib.logs` reads.
+    options : LogOptions
+        How to read the log; by default it is recognised.
+    settings : mapping
+        Fields of `accel_calib.capture.CaptureSettings` for a recording.
+    progress : function of two int
+        Called with the number of samples done and of all samples.
+
+    Raises
+    ------
+    InputError
+        If the log cannot be read, or a recording has no still stretch.
+    OSError
+        If the file cannot be read.
+
+    """
+    with _opened(source, options) as log:
+        if log.poses is not None:
+            return Intake(log.poses, log.units, log.read_as, log.notes)
+        return _captured(source, log, options, settings, progress)[0]
+
+
+def captured_from(source: Source, options: LogOptions, settings: Mapping[str, Any],
+                  progress: Progress = lambda done, count: None) -> tuple[Intake, Captured]:
+    """Return the poses of a recording and their capture; the rows of a table are samples."""
+    with _opened(source, options) as log:
+        return _captured(source, log, options, settings, progress)
+
+
+@contextmanager
+def _opened(source: Source, options: LogOptions) -> Iterator[OpenLog]:
+    """Open a log, or a table as a log."""
+    if not isinstance(source, Table):
+        with open_log(source, options) as log:
+            yield log
+        return
+    recorded = isinstance(source, Recording)
+    asked, stated = options.units, source.units
+    if asked and stated and asked != stated:
+        raise InputError(f'the {"recording" if recorded else "pose table"} is in {stated}, '
+                         f'expected {asked}', f'set units={stated!r}')
+    units = units_of(asked or stated or options.default_units or 'm/s2', options.gravity)
+    if isinstance(source, Poses):
+        yield OpenLog(iter(()), len(source), units, source.sensor, poses=source)
+    else:
+        check_units(source, units)
+        yield OpenLog(iter((source,)), len(source), units, source.sensor)
+
+
+def _captured(source: Source, log: OpenLog, options: LogOptions, settings: Mapping[str, Any],
+              progress: Progress) -> tuple[Intake, Captured]:
+    """Capture the poses of an open log; InputError without a still stretch."""
+    found = capture(log.watched(progress), log.units, settings_from(settings, log.units))
+    count, wider = len(found.poses), (0.0, 0)
+    if count < _FEW:
+        wider = _wider(source, found, log.units, options, settings)
+    finds = f'{wider[1]} with still_std_max {wider[0]:.3g}'
+    if not count:
+        name = 'the recording' if isinstance(source, Recording) else str(source)
+        raise _nothing_still(name, found, log.units, settings, finds if wider[1] else '')
+    lines = [f'captured {counted(count, "pose")} from {counted(found.recorded, "sample")} in '
+             f'{found.seconds:.0f} s']
+    if wider[1] >= 2 * count:
+        lines.append(f'{counted(count, "pose")} only, {finds}')
+    return Intake(replace(found.poses, units=log.units.name), log.units, log.read_as, log.notes,
+                  tuple(lines)), found
+
+
+def _wider(source: Source, found: Captured, units: Units, options: LogOptions,
+           settings: Mapping[str, Any]) -> tuple[float, int]:
+    """Return a wider limit and the number of poses with it; the narrowest that finds enough."""
+    tried = (0.0, 0)
+    for factor in _WIDER:
+        limit = float(f'{factor * max(found.threshold, found.quietest):.2g}')
+        if math.isfinite(limit) and tried[1] < _FEW:
+            asked = settings_from({**settings, 'still_std_max': limit}, units)
+            with _opened(source, options) as again:
+                count = len(capture(again.blocks, units, asked).poses)
+            tried = max(tried, (limit, count), key=lambda each: each[1])
+    return tried
+
+
+def _nothing_still(source: str, found: Captured, units: Units, settings: Mapping[str, Any],
+                   finds: str) -> InputError:
+    """Return the error for a recording without a still stretch."""
+    window = settings_from(settings, units).still_window
+    numbers = (f': in its quietest {window:g} s the standard deviation is {found.quietest:.2g} '
+               f'{units.name}, the limit is {found.threshold:.2g}'
+               if math.isfinite(found.quietest) else '')
+    tried = (f'; {finds} (wide limits make poses inaccurate)' if finds else
+             '; a wider limit (still_std_max) finds none either')
+    return InputError(f'{source} has no still stretch in {counted(found.recorded, "sample")}'
+                      f'{numbers}; expected at least one', 'hold the sensor still in each pose '
+                      f'for some seconds{tried}')
+
 
 Flat = int | Literal['first', 'last'] | None
 """Row of the flat pose, 1-based, or the first or last pose; None: the mounting stays open."""
@@ -204,3 +369,65 @@ def _refinement(poses: Poses, units: Units, plan: Plan, date: str
     if only_named:
         words.append(f'found {", ".join(only_named)}, which no calibration corrects')
     return found, f'{"; ".join(words)}: {change}'
+
+
+_Samples = TypeVar('_Samples', bound=Table)
+
+
+class Correction:
+    """
+    The correction of the samples of one log, block by block, in order.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        The calibration; it is converted to the unit of the samples.
+    units : Units or {'m/s2', 'g', 'native'}
+        Unit of the samples.
+    sensor : str
+        Name of their sensor; empty if it is not known.
+
+    Attributes
+    ----------
+    calibration : Calibration
+        The calibration in this unit.
+
+    Raises
+    ------
+    StoredCalibrationError
+        If the calibration belongs to another sensor.
+    InputError
+        If only one of calibration and samples is in native units.
+
+    """
+
+    def __init__(self, calibration: Calibration, units: Units | UnitName, sensor: str) -> None:
+        check_sensor(calibration, sensor)
+        self.calibration = calibration.in_units(units)
+        self._context = SampleContext(self.calibration)
+
+    def context(self, samples: Table) -> Context:
+        """Return the context of the next block, as the effects need it."""
+        return self._context.of(samples.columns, len(samples))
+
+    def __call__(self, samples: _Samples) -> _Samples:
+        """Return the next block with corrected readings, in m/s² or g, in the levelled frame."""
+        own = self.calibration
+        columns = {'reading': own.correct(samples.reading, self.context(samples))}
+        if 'rate' in samples:
+            columns['rate'] = samples['rate'] @ own.model.rotation
+        if 'std' in samples:
+            columns['std'] = own.units.to_g(samples['std']) * own.force_per_g
+        return replace(samples.with_columns(**columns), autopilot=None,
+                       units='g' if own.units.is_native else own.units.name)
+
+    @property
+    def notes(self) -> list[str]:
+        """Return what the samples lack, and what left the range of the calibration, so far."""
+        return [*filter(None, [self._context.lacking]),
+                *(each.line for each in self._context.left)]
+
+
+def corrected(samples: _Samples, calibration: Calibration, units: Units) -> _Samples:
+    """Return samples as `Correction` does, at once; `units` is their unit."""
+    return Correction(calibration, units, samples.sensor)(samples)

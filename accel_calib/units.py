@@ -1,7 +1,12 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Units of readings, converted to g at the edge of the package."""
+"""
+Units of readings, converted to g at the edge of the package, and the other names users choose.
+
+They stand below all folders, so that ``accel-calib fit --help`` does not load the calibration.
+
+"""
 
 from __future__ import annotations
 
@@ -17,6 +22,20 @@ Indices = NDArray[np.intp]
 
 UnitName = Literal['m/s2', 'g', 'native']
 UNIT_NAMES: tuple[str, ...] = get_args(UnitName)
+
+FrameName = Literal['ros', 'ned', 'android', 'win8']
+FRAMES: tuple[str, ...] = get_args(FrameName)
+"""Levelled frames."""
+
+Method = Literal['ml', 'algebraic']
+METHODS: tuple[str, ...] = get_args(Method)
+"""Methods of a fit: maximum likelihood, and the cost functions of the documents."""
+
+MODEL_NAMES = ('auto', '4', '7', '9', '10', '12')
+"""Models of a fit."""
+
+BASES = ('auto', 'ideal', '4', '7', '10', '12')
+"""Models that a refinement can start from."""
 
 STANDARD_GRAVITY = 9.80665
 """Standard acceleration of free fall [m/s²], ISO 80000-3."""

@@ -28,10 +28,10 @@ from accel_calib.capture.chunks import Extremes
 from accel_calib.capture.trend import (
     _long_run as long_run, excess_of_means, lines_through, oscillation)
 from accel_calib.cli.commands import COMMANDS, HIDDEN as DEMO_CHOICES, parser
-from accel_calib.cli.frame import Output, shown
 from accel_calib.cli.main import main
-from accel_calib.cli.terminal import in_one_line
-from accel_calib.cli.watch import changes, screen, state
+from accel_calib.cli.nodes import changes, screen, state
+from accel_calib.cli.options import in_one_line
+from accel_calib.cli.output import Output, shown
 from accel_calib.compare import NAMES as PARAMETER_NAMES, rotation_free
 from accel_calib.compare.agreement import (
     on_one_scale, outlier, p_values, Runs, Scatter, scatter_of)
@@ -45,7 +45,7 @@ from accel_calib.effects.model import terms_of
 from accel_calib.effects.thermal import Lag, low_passed, rate_of
 from accel_calib.estimate import believable, kinds, originals, unseen_mistakes
 from accel_calib.estimate.equations import equations, measured
-from accel_calib.findings.rules import number
+from accel_calib.findings.expected import number
 from accel_calib.fleet.overview import (
     digest, digest_of, estimated, Months, not_agreeing, odd_sensors, overview, priors_of,
     shared_effects, typical_of)
@@ -57,7 +57,6 @@ from accel_calib.fleet.sensors import alike, drift_of, merge_sensor, write_parqu
 from accel_calib.geometry import (
     attitude_words, distinct, OVER_THE_SPHERE, quaternion_of, rotation_from_rpy, spread_directions,
     unit, words_of)
-from accel_calib.intake import poses_of
 from accel_calib.live import sources
 from accel_calib.live.sources import is_port, open_source
 from accel_calib.logs import are_samples, bag_samples, bounded_bags, layout_with, open_bag, text
@@ -69,7 +68,7 @@ from accel_calib.logs.serialized import frame_ids, stamps_of
 from accel_calib.messages.one_reading import OneReading
 from accel_calib.noise.components import COMPONENTS as ALLAN_COMPONENTS, fit_components
 from accel_calib.noise.curve import allan_variances, longest_rest, octaves, shares, spread_of
-from accel_calib.pipeline import calibrated as calibrated_by, is_partial, Plan as FitPlan
+from accel_calib.pipeline import calibrated as calibrated_by, is_partial, Plan as FitPlan, poses_of
 from accel_calib.refine import base as refine_base
 from accel_calib.refine.base import clipped, grid_step, off_grid, sampled, unclipped
 from accel_calib.refine.curves import (

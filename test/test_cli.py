@@ -83,6 +83,8 @@ def test_several_tables_return_a_list_in_their_order(tmp_path, capsys):
     status, results = run_json(capsys, 'verify', *tables[2:], '-c', folder / '0.yaml')
     assert status == 0
     assert all(result['rms_after_mg'] < 1 for result in results)
+    assert run_json(capsys, 'verify', *tables[2:], '-c', folder / '0.yaml', '--jobs', 2) == (
+        status, results)
     status, results = run_json(capsys, 'refine', *tables, '--jobs', 2, '-o', folder)
     assert status == 2
     assert [result.get('verdict') for result in results] == ['no_gap', None, 'no_gap', 'no_gap']

@@ -3,10 +3,10 @@
 
 """The mounting: levelling, heading, and axes that are wired wrongly."""
 
-from accel_calib.calibrate import fit_poses, flat_direction, FRAMES, level
+from accel_calib.calibrate import fit_poses, flat_direction, level
 from accel_calib.errors import InputError
 from accel_calib.finding import without
-from accel_calib.units import units_of
+from accel_calib.units import FRAMES, units_of
 from inside import (
     axes_of, fault_of, mounting, rotation_from_rpy, simulate_poses, spread_directions,
     with_heading, with_heading_of)

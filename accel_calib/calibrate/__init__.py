@@ -13,8 +13,8 @@ not determine and plans the next pose. `context` compares samples with the range
 """
 
 from .calibration import (
-    BASES, Calibration, check_sensor, converted, FLEET, FrameName, FRAMES, Method, METHODS,
-    MODEL_NAMES, PRIOR, Quality, Rejected, RejectedKind, STORED_METHODS)
+    Calibration, check_sensor, converted, FLEET, PRIOR, Quality, Rejected, RejectedKind,
+    STORED_METHODS)
 from .context import (
     of_samples, Outside, outside, SampleContext, thermal_stream, USES_LIMIT, with_history,
     with_previous)
@@ -30,16 +30,15 @@ from .quality import (
     OF_A_FIT, quality_of, record_of, uncertainty_g, Verification, verify)
 from .rest_noise import gyro_bias_of, GyroBias, sample_noise_of, SampleNoise, with_rest_noise
 
-__all__ = ['BASES', 'FLEET', 'FRAMES', 'LARGEST_OFFSET_G', 'METHODS', 'MODEL_NAMES',
-           'OF_A_FIT', 'PRIOR', 'STORED_METHODS', 'USES_LIMIT', 'Calibration', 'FleetPrior',
-           'FrameName', 'GyroBias', 'Method', 'NextPose', 'Outlook', 'Outside', 'Quality',
+__all__ = ['FLEET', 'LARGEST_OFFSET_G', 'OF_A_FIT', 'PRIOR', 'STORED_METHODS', 'USES_LIMIT',
+           'Calibration', 'FleetPrior', 'GyroBias', 'NextPose', 'Outlook', 'Outside', 'Quality',
            'Rejected', 'RejectedKind', 'SampleContext', 'SampleNoise', 'Verification',
            'angle_words', 'check_sensor', 'converted', 'determines', 'deviations_g',
            'directions_of', 'errors_after', 'errors_before', 'fit_findings', 'fit_partial',
-           'fit_poses', 'fit_unknown', 'fit_with_fleet', 'flat_direction', 'gated',
-           'gyro_bias_of', 'in_frame', 'in_g', 'level', 'level_by_rows', 'lies_in_cone',
-           'mounting_figures', 'mounting_of', 'mounting_only', 'mounting_words', 'next_pose',
-           'of_samples', 'on_topics', 'only_norm', 'outlook', 'outside', 'posterior',
-           'quality_of', 'record_of', 'refuse_if_unfit', 'sample_noise_of', 'set_heading',
-           'sound_rows', 'sure_rows', 'thermal_stream', 'uncertainty_g', 'verify',
-           'with_given_mounting', 'with_history', 'with_previous', 'with_rest_noise']
+           'fit_poses', 'fit_unknown', 'fit_with_fleet', 'flat_direction', 'gated', 'gyro_bias_of',
+           'in_frame', 'in_g', 'level', 'level_by_rows', 'lies_in_cone', 'mounting_figures',
+           'mounting_of', 'mounting_only', 'mounting_words', 'next_pose', 'of_samples',
+           'on_topics', 'only_norm', 'outlook', 'outside', 'posterior', 'quality_of', 'record_of',
+           'refuse_if_unfit', 'sample_noise_of', 'set_heading', 'sound_rows', 'sure_rows',
+           'thermal_stream', 'uncertainty_g', 'verify', 'with_given_mounting', 'with_history',
+           'with_previous', 'with_rest_noise']

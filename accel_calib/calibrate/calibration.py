@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from html import escape
-from typing import get_args, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,21 +22,10 @@ from ..errors import InputError, StoredCalibrationError
 from ..finding import Finding
 from ..table import Floats, Poses, Record, Table
 from ..text import table, with_sd
-from ..units import UnitName, Units, units_of
-
-FrameName = Literal['ros', 'ned', 'android', 'win8']
-FRAMES: tuple[str, ...] = get_args(FrameName)
-
-MODEL_NAMES = ('auto', '4', '7', '9', '10', '12')
-
-BASES = ('auto', 'ideal', '4', '7', '10', '12')
-"""Models that a refinement can start from."""
+from ..units import FrameName, METHODS, UnitName, Units, units_of
 
 ORIENTED = '12'
 """The model of poses of known orientation."""
-
-Method = Literal['ml', 'algebraic']
-METHODS = get_args(Method)
 
 PRIOR = 'prior'
 """Method of a calibration whose values are partly those of a common sensor; see `.partial`."""

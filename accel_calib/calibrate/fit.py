@@ -30,7 +30,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from .calibration import Calibration, Method, METHODS, MODEL_NAMES, ORIENTED, Rejected
+from .calibration import Calibration, ORIENTED, Rejected
 from .mounting import wiring
 from .pose_planning import determines, refuse_if_unfit, unseen
 from .quality import finished, fit_findings, in_g, LARGEST_OFFSET_G, record_of, rival_findings
@@ -47,7 +47,7 @@ from ..finding import Finding
 from ..geometry import unit
 from ..table import check_units, Poses
 from ..text import listed
-from ..units import Floats, Indices, MG, Units
+from ..units import Floats, Indices, Method, METHODS, MG, MODEL_NAMES, Units
 
 _LARGEST_REST_G = 3.0
 _NATIVE_SPREADS = 20.0

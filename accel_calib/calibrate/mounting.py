@@ -50,7 +50,7 @@ from typing import Any
 
 import numpy as np
 
-from .calibration import Calibration, FrameName
+from .calibration import Calibration
 from .context import with_history
 from .quality import in_g
 from ..effects import AXES, Context, Model, sensor_force
@@ -59,6 +59,7 @@ from ..estimate import fit_12
 from ..finding import Finding, Level, without
 from ..geometry import quaternion_of, rotation_from_rpy, rpy_of
 from ..table import Floats, Poses
+from ..units import FrameName
 
 _NOSE_DOWN = {'ros': np.array([-1.0, 0.0, 0.0]), 'ned': np.array([1.0, 0.0, 0.0]),
               'android': np.array([0.0, -1.0, 0.0]), 'win8': np.array([0.0, 1.0, 0.0])}

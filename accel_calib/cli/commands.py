@@ -133,7 +133,7 @@ def _port(text: str) -> int:
 
 
 def _fit(made: options.Parser) -> None:
-    from ..calibrate import METHODS, MODEL_NAMES
+    from ..units import METHODS, MODEL_NAMES
 
     add = made.add_argument
     options.add_poses(made)
@@ -394,7 +394,7 @@ COMMANDS = {
         'show offset and gain over the dates of calibrations of one sensor', 'compare',
         'accel-calib history january.yaml april.yaml july.yaml --report history.html', _compare),
     'refine': Command(
-        'find effects that a calibration lacks, and add them', 'refine',
+        'find effects that a calibration lacks, and add them', 'fit',
         'accel-calib refine poses.csv -o refined.yaml --report report.html', _refine,
         'calibration', 'poses'),
     'fleet': Command(
@@ -406,8 +406,8 @@ COMMANDS = {
         'correct a recording with a calibration', 'recordings',
         'accel-calib apply recording.mcap -c calibration.yaml -o corrected', _apply, 'table'),
     'export': Command(
-        'write a calibration in the format of a firmware, an autopilot or another tool', 'export',
-        'accel-calib export calibration.yaml --to c -o imu.h', _export, 'export'),
+        'write a calibration in the format of a firmware, an autopilot or another tool',
+        'recordings', 'accel-calib export calibration.yaml --to c -o imu.h', _export, 'export'),
     'noise': Command(
         'find noise density, bias instability and random walk from a long rest', 'recordings',
         'accel-calib noise rest.mcap --json noise.json --report noise.html', _noise),
@@ -416,10 +416,10 @@ COMMANDS = {
         'accel-calib simulate -o poses.csv --effect offset=0.02,-0.01,0.03 '
         '--effect axis_gain=0.01', _simulate, 'table'),
     'report': Command(
-        'write a report about effects that a calibration lacks, with figures (HTML)', 'refine',
+        'write a report about effects that a calibration lacks, with figures (HTML)', 'fit',
         'accel-calib report poses.csv -o report.html --figures figures', _report, 'page'),
     'watch': Command(
-        'show the progress of a calibrator node, and which pose is next', 'watch',
+        'show the progress of a calibrator node, and which pose is next', 'nodes',
         f'accel-calib watch --node left/calibrator\n\nCtrl-C ends it; {_FOR_ROS}', _watch),
     'live': Command(
         'calibrate on a page in the browser, from a serial port or a recording', 'nodes',

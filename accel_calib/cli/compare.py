@@ -15,9 +15,8 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
-from .fit import error_line, short_if_known
-from .frame import Done, rated, rating_lines, table, Verdict, working
-from .inputs import intake, rows_between, stored_calibration
+from .frame import Done, FAILED, intake, rated, rating_lines, rows_between, stored_calibration
+from .output import error_line, short_if_known, table, Verdict
 from ..calibrate import verify
 from ..compare import compare, Comparison, History, history_of, LEVEL
 from ..findings import (
@@ -26,9 +25,6 @@ from ..stored import read_calibration
 from ..table import check_units
 from ..text import plain, short
 from ..units import MG
-
-FAILED = 1
-"""Exit status if the residual is above ``--max``, or if calibrations do not agree."""
 
 
 def run_verify(args: argparse.Namespace) -> Done:
@@ -40,19 +36,19 @@ def run_verify(args: argparse.Namespace) -> Done:
         check_units(poses, calibration.units)
         verification = verify(calibration, poses)
     rating = rate_verification(verification, calibration, poses)
-    if args.report is not None:
-        from ..report import calibration_page, write_page
 
-        with working('drawing the page'):
-            write_page(args.report, calibration_page(
-                calibration, rating, str(args.poses), verification=(verification, poses),
-                stored=str(args.calibration), notes=found.lines))
+    def page() -> str:
+        from ..report import calibration_page
+
+        return calibration_page(calibration, rating, str(args.poses), notes=found.lines,
+                                verification=(verification, poses), stored=str(args.calibration))
+
     result = {'file': args.poses, 'poses': len(poses), **asdict(verification),
               **rated(rating, args), 'read_as': found.read_as, 'read_lines': found.lines,
-              'rating_lines': rating_lines(rating, args)}
+              'rating_lines': [str(line) for line in rating_lines(rating, args)]}
     above = args.max is not None and not verification.rms_after_mg <= args.max
     result |= {} if args.max is None else {'max_mg': args.max, 'above_max': above}
-    return Done(result, several_verify([plain(result)]), FAILED if above else 0)
+    return Done(result, several_verify([plain(result)]), status=FAILED if above else 0, page=page)
 
 
 def several_verify(results: Sequence[dict[str, Any]]) -> Iterator[Any]:
@@ -80,16 +76,16 @@ def run_compare(args: argparse.Namespace) -> Done:
     paths, calibrations = args.calibrations, [read_calibration(path) for path in args.calibrations]
     comparison = compare(calibrations)
     rating = rate_comparison(comparison)
-    if args.report is not None:
-        from ..report import write_page
+
+    def page() -> str:
         from ..report.stability import comparison_page
 
-        with working('drawing the page'):
-            write_page(args.report, comparison_page(comparison, rating, paths, calibrations))
+        return comparison_page(comparison, rating, paths, calibrations)
+
     models = [calibration.name for calibration in calibrations]
-    return Done({**_comparison_result(paths, models, comparison), **rated(rating, args)},
-                [*_comparison_lines(paths, models, comparison), *rating_lines(rating, args)],
-                0 if comparison.agree else FAILED)
+    return Done(_comparison_result(paths, models, comparison),
+                _comparison_lines(paths, models, comparison), rating,
+                status=0 if comparison.agree else FAILED, page=page)
 
 
 def _comparison_result(paths: list[Path], models: list[str], comparison: Comparison
@@ -140,13 +136,13 @@ def run_history(args: argparse.Namespace) -> Done:
     """Sort calibrations by date, and compare them."""
     calibrations = [read_calibration(path) for path in args.calibrations]
     history = history_of(calibrations)
-    if args.report is not None:
-        from ..report import write_page
+
+    def page() -> str:
         from ..report.stability import history_page
 
-        with working('drawing the page'):
-            write_page(args.report, history_page(history, args.calibrations, calibrations))
-    return Done(_history_result(args, history), _history_lines(args, history))
+        return history_page(history, args.calibrations, calibrations)
+
+    return Done(_history_result(args, history), _history_lines(history), page=page)
 
 
 def _history_result(args: argparse.Namespace, history: History) -> dict[str, Any]:
@@ -169,15 +165,13 @@ def _history_result(args: argparse.Namespace, history: History) -> dict[str, Any
         'changes': changes, 'notes': history.notes}
 
 
-def _history_lines(args: argparse.Namespace, history: History) -> Iterator[Any]:
+def _history_lines(history: History) -> Iterator[Any]:
     yield _dates_table(history)
     for first, second, change in zip(history.labels, history.labels[1:], history.changes,
                                      strict=False):
         yield _step_line(first, second, change)
     for note in history.notes:
         yield f'note: {note}'
-    if args.report is not None:
-        yield f'stored in {args.report}'
 
 
 def _step_line(first: str, second: str, change: Any) -> str:

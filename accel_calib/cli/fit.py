@@ -1,73 +1,132 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""``accel-calib fit``, ``calibrate`` and ``fleet``: from logs to calibrations."""
+"""``accel-calib fit``, ``calibrate``, ``refine``, ``report``, ``fleet``: logs to calibrations."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from rich.table import Table
 
-from .frame import console, Done, progress, rated, rating_lines, table, Verdict, working
-from .inputs import given, intake, log_options, plan_of, rows_between, settings
-from ..calibrate import Calibration, GyroBias, Outlook, outlook
+from .frame import (
+    console, Done, FAILED, given, intake, log_options, prior, rows_between, settings,
+    stored_calibration)
+from .output import error_line, progress, short_if_known, table, Verdict, working
+from ..calibrate import Calibration, GyroBias, outlook
 from ..disk import STANDARD_OUTPUT
-from ..errors import system_error
-from ..findings import calibration_json, effect_figures, linear_figures, Rating, refinement_json
-from ..intake import Intake
-from ..pipeline import calibrated, Outcome
+from ..effects import effect_named
+from ..errors import InputError, system_error
+from ..estimate import NORM_MODELS
+from ..findings import (
+    calibration_json, effect_figures, linear_figures, rate_refinement, refinement_json)
+from ..pipeline import calibrated, Intake, Outcome, Plan
 from ..stored import write_calibration
-from ..text import counted, short, with_sd
+from ..text import counted, listed, now, short, with_sd
 from ..units import MG
 
 if TYPE_CHECKING:
     from ..fleet import Summary
-
-BAD_RATING = 1
-"""Exit status for a calibration that is BAD."""
+    from ..refine import Refinement
 
 
 def run_fit(args: argparse.Namespace) -> Done:
     """Fit and store a calibration."""
-    with intake(args, args.poses) as found, working('fitting'):
-        outcome = calibrated(found.poses, found.units, plan_of(
-            args, refined=False, rows=rows_between(found.poses, args.rows)))
-    calibration, rating = outcome.calibration, outcome.rating
-    ahead = outlook(calibration, args.model)
-    stored = [] if args.output is None else [_store(args, calibration, rating)]
-    if args.report is not None:
-        from ..report import calibration_page, write_page
+    found, outcome = _outcome(args, args.poses, refined=False)
+    calibration = outcome.calibration
+    ahead, (lines, stored) = outlook(calibration, args.model), _store(args, outcome)
+    return Done(
+        {'file': args.poses, **calibration_json(calibration, ahead), 'read_as': found.read_as,
+         'read_lines': found.lines},
+        [*found.lines, *calibration_lines(calibration),
+         f'model {calibration.name}: {calibration.reason}',
+         f'next pose: {ahead.next_pose.words}', *lines],
+        outcome.rating, _status(outcome), stored,
+        partial(_page, args, args.poses, found, outcome))
 
+
+def run_calibrate(args: argparse.Namespace) -> Done:
+    """Calibrate, store, and write the page."""
+    found, outcome = _outcome(args, args.log)
+    calibration, refinement = outcome.calibration, outcome.refinement
+    lines, stored = _store(args, outcome)
+    return Done(
+        {'file': args.log, **calibration_json(calibration, outlook(calibration, 'auto')),
+         'read_as': found.read_as, 'read_lines': found.lines, 'refined': outcome.line,
+         'refinement': None if refinement is None else refinement_json(refinement)},
+        [*found.lines, *calibration_lines(calibration), outcome.line, *lines,
+         *_page_beside(args, found, outcome)],
+        outcome.rating, _status(outcome), stored)
+
+
+def _status(outcome: Outcome) -> int:
+    return FAILED if outcome.rating.name == 'BAD' else 0
+
+
+def _outcome(args: argparse.Namespace, log: Path, **more: Any) -> tuple[Intake, Outcome]:
+    """Return the poses of a log, and the calibration that the options ask for."""
+    with intake(args, log) as found, working('fitting'):
+        rows = rows_between(found.poses, args.rows) if getattr(args, 'rows', None) else None
+        return found, calibrated(found.poses, found.units, plan_of(args, rows=rows, **more))
+
+
+def plan_of(args: argparse.Namespace, **more: Any) -> Plan:
+    """
+    Return how to calibrate.
+
+    Raises
+    ------
+    InputError
+        If ``--prior`` stands with another model.
+
+    """
+    plan = Plan(**{**given(Plan, args), 'fleet': prior(args), 'also': args.own, **more})
+    usual = plan.model in ('auto', NORM_MODELS[-1]) and plan.method == 'ml'
+    if plan.fleet is not None and not usual:
+        raise InputError(f'--prior with --model {plan.model} --method {plan.method}, expected '
+                         'model 10 by maximum likelihood', 'leave out these options')
+    return plan
+
+
+def _store(args: argparse.Namespace, outcome: Outcome) -> tuple[list[str], list[Path]]:
+    """Write a calibration unless it is BAD; return why not, and the files written."""
+    if args.output is None:
+        return [], []
+    if outcome.rating.name == 'BAD' and not args.keep_bad:
+        return ['not stored, because it is BAD; to store it, use --keep-bad'], []
+    write_calibration(args.output, outcome.calibration)
+    return [], [args.output]
+
+
+def _page(args: argparse.Namespace, log: Path, found: Intake, outcome: Outcome) -> str:
+    from ..report import calibration_page
+
+    return calibration_page(outcome.calibration, outcome.rating, str(log), notes=found.lines,
+                            refinement=outcome.refinement,
+                            stored=str(args.output or 'calibration.yaml'))
+
+
+def _page_beside(args: argparse.Namespace, found: Intake, outcome: Outcome) -> Iterator[str]:
+    """Write the page beside the calibration, if that is possible; yield a line about it."""
+    from ..report import has_matplotlib, write_page
+
+    if str(args.output) == STANDARD_OUTPUT:
+        return
+    page = args.output.with_suffix('.html')
+    if not has_matplotlib():
+        yield f'no page {page}: matplotlib is not installed'
+        return
+    try:
         with working('drawing the page'):
-            write_page(args.report, calibration_page(
-                calibration, rating, str(args.poses), notes=found.lines,
-                stored=str(args.output or 'calibration.yaml')))
-        stored.append(f'stored in {args.report}')
-    return Done({'file': args.poses, **calibration_json(calibration, ahead),
-                 **rated(rating, args), 'read_as': found.read_as, 'read_lines': found.lines},
-                [*_shown(found, calibration, ahead), *stored,
-                 *rating_lines(rating, args)],
-                BAD_RATING if rating.name == 'BAD' else 0)
-
-
-def _store(args: argparse.Namespace, calibration: Calibration, rating: Rating) -> str:
-    """Write a calibration unless it is BAD; return a line about it."""
-    if rating.name == 'BAD' and not args.keep_bad:
-        return 'not stored, because it is BAD; to store it, use --keep-bad'
-    write_calibration(args.output, calibration)
-    return f'stored in {args.output}'
-
-
-def _shown(found: Intake, calibration: Calibration, ahead: Outlook) -> Iterator[Any]:
-    yield from found.lines
-    yield from calibration_lines(calibration)
-    yield f'model {calibration.name}: {calibration.reason}'
-    yield f'next pose: {ahead.next_pose.words}'
+            write_page(page, _page(args, args.log, found, outcome))
+        yield f'page: {page}'
+    except OSError as err:  # the calibration is stored
+        yield f'no page {page}: {system_error(err)}'
 
 
 def several_fit(results: Sequence[dict[str, Any]]) -> Iterator[str]:
@@ -78,90 +137,6 @@ def several_fit(results: Sequence[dict[str, Any]]) -> Iterator[str]:
             f'{result["rms_after_mg"]:.3g} mg, '))
         yield line if 'error' in result else Verdict(
             f'{line}{result["rating"]}', result['rating'], len(line))
-
-
-def error_line(result: dict[str, Any]) -> str:
-    """Return the error of one of several inputs; empty if there is none."""
-    return f'{result["error"]}; {result["advice"]}' if 'error' in result else ''
-
-
-def run_calibrate(args: argparse.Namespace) -> Done:
-    """Calibrate, store, and write the page."""
-    with intake(args, args.log) as found, working('fitting'):
-        outcome = calibrated(found.poses, found.units, plan_of(args))
-    stored = _stored_outcome(args, found, outcome)
-    ahead = outlook(outcome.calibration, 'auto')
-    refinement, rating = outcome.refinement, outcome.rating
-    return Done(
-        {'file': args.log, **calibration_json(outcome.calibration, ahead), **rated(rating, args),
-         'read_as': found.read_as, 'read_lines': found.lines, 'refined': outcome.line,
-         'refinement': None if refinement is None else refinement_json(refinement)},
-        [*found.lines, *calibration_lines(outcome.calibration), outcome.line, *stored,
-         *rating_lines(rating, args)], BAD_RATING if rating.name == 'BAD' else 0)
-
-
-def _stored_outcome(args: argparse.Namespace, found: Intake, outcome: Outcome) -> list[str]:
-    """Write the calibration and the page; return lines about them."""
-    from ..report import calibration_page, has_matplotlib, write_page
-
-    line = _store(args, outcome.calibration, outcome.rating)
-    if str(args.output) == STANDARD_OUTPUT:
-        return [line]
-    page = args.output.with_suffix('.html')
-    if not has_matplotlib():
-        return [line, f'no page {page}: matplotlib is not installed']
-    try:
-        with working('drawing the page'):
-            write_page(page, calibration_page(
-                outcome.calibration, outcome.rating, str(args.log), stored=str(args.output),
-                refinement=outcome.refinement, notes=found.lines))
-    except OSError as err:  # the calibration is stored
-        return [line, f'no page {page}: {system_error(err)}']
-    return [line, f'page: {page}']
-
-
-def run_fleet(args: argparse.Namespace) -> Done:
-    """Calibrate many recordings on Dask."""
-    from ..fleet import cluster, LIMIT_S, Options, recordings, run, STATUS, Store
-
-    with working('looking for recordings'):
-        found = list({each.path: each for each in recordings(args.recordings)}.values())
-    asked = Options(**{**given(Options, args), 'log': log_options(args),
-                       'settings': settings(args), 'exports': tuple(dict.fromkeys(args.export))})
-    with cluster(args.scheduler, args.workers) as client:
-        console(args).print(f'{counted(len(found), "recording")}; dashboard: '
-                            f'{client.dashboard_link}')
-        with progress('recordings') as moved:
-            summary = run(client, found, asked, Store(args.output.absolute()), moved,
-                          args.time_limit or LIMIT_S)
-    return Done({'recordings': len(found), **{name: summary.counts[name] for name in STATUS},
-                 'sensors': summary.sensors, **rated(summary.rating, args)},
-                [*_summary_lines(summary, args.output), *rating_lines(summary.rating, args)])
-
-
-def _summary_lines(summary: Summary, output: Path) -> Iterator[str]:
-    """Yield the summary as lines of text."""
-    counts = summary.counts
-    yield (f'{counts["ok"]} calibrated, {counts["error"]} with an error, {counts["unread"]} '
-           f'could not be read, {counts["skipped"]} skipped because they are done')
-    for path in summary.damaged:
-        yield f'note: a file of the results was damaged and was made again; it is now {path}'
-    for row in summary.sensors:
-        for change in row['changes']:
-            if change['for_good']:
-                yield (f'{row["sensor"]} changed for good at {change["date"]}: '
-                       f'{change["parameter"]} (p = {change["p_value"]:.2g})')
-    yield f'{counted(len(summary.sensors), "sensor")}, stored in {output}'
-
-
-def _gyro_line(gyro: GyroBias) -> str:
-    """Return the gyro bias as a line of text, in °/s."""
-    values = ', '.join(f'{axis} {with_sd(bias, sd)}' for axis, bias, sd in zip(
-        'xyz', np.degrees(gyro.bias), np.degrees(gyro.sd), strict=True))
-    slope = ('' if not np.any(gyro.slope) else
-             f' at {gyro.temperature:.1f} °C, changes by '
-             f'{", ".join(f"{each:+.2g}" for each in np.degrees(gyro.slope))} °/s per °C')
-    return f'gyro bias: {values} °/s{slope} ({counted(gyro.rests, "rest")})'
 
 
 def calibration_lines(calibration: Calibration) -> Iterator[Any]:
@@ -200,6 +175,150 @@ def _parameter_table(calibration: Calibration) -> Table:
     return table
 
 
-def short_if_known(value: float | None) -> str:
-    """Return a number in three digits, or that it is not known."""
-    return 'not known' if value is None else short(value)
+def _gyro_line(gyro: GyroBias) -> str:
+    """Return the gyro bias as a line of text, in °/s."""
+    values = ', '.join(f'{axis} {with_sd(bias, sd)}' for axis, bias, sd in zip(
+        'xyz', np.degrees(gyro.bias), np.degrees(gyro.sd), strict=True))
+    slope = ('' if not np.any(gyro.slope) else
+             f' at {gyro.temperature:.1f} °C, changes by '
+             f'{", ".join(f"{each:+.2g}" for each in np.degrees(gyro.slope))} °/s per °C')
+    return f'gyro bias: {values} °/s{slope} ({counted(gyro.rests, "rest")})'
+
+
+# ----------------------------------------------------------------------------- effects
+
+def run_refine(args: argparse.Namespace) -> Done:
+    """Refine a calibration, and store it unless it is refused."""
+    found, result = _refined(args)
+    stored = []
+    if args.output is not None and not result.refusal:
+        write_calibration(args.output, result.calibration)
+        stored.append(args.output)
+    if args.plan is not None and result.plan.poses:
+        from ..stored.exports import write_plan
+
+        write_plan(args.plan, result.plan)
+        stored.append(args.plan)
+    return Done({'file': args.poses, **refinement_json(result), 'read_as': found.read_as},
+                [*found.lines, *_shown(args, result)], rate_refinement(result), stored=stored,
+                page=partial(_page_of_effects, args, result),
+                refusal=result.refusal if args.output else ())
+
+
+def run_report(args: argparse.Namespace) -> Done:
+    """Refine a calibration, and write the report and the figures."""
+    from ..report import write_figures
+
+    _, result = _refined(args)
+    lines: list[str] = [result.verdict]
+    if args.figures is not None:
+        count = len(write_figures(args.figures, result))
+        lines.append(f'{counted(count, "file")}, stored in {args.figures}')
+    return Done(shown=lines, page=partial(_page_of_effects, args, result))
+
+
+def _page_of_effects(args: argparse.Namespace, result: Refinement) -> str:
+    from ..report import refinement_page
+
+    return refinement_page(result, str(args.poses))
+
+
+def _refined(args: argparse.Namespace) -> tuple[Intake, Refinement]:
+    """Refine with one log."""
+    from ..refine import refine, refine_with_fleet  # a fit alone does not load the search
+
+    stored = args.calibration and stored_calibration(args.calibration)
+    with intake(args, args.poses, stored) as found, working('refining'):
+        poses = found.poses.take(rows_between(found.poses, args.rows))
+        base, fleet = stored.in_units(found.units) if stored else args.base, prior(args)
+        if fleet is not None:
+            return found, refine_with_fleet(poses, found.units, fleet, sensor=args.sensor,
+                                            date=now(), also=args.own)
+        return found, refine(poses, found.units, base=base, sensor=args.sensor, date=now(),
+                             also=args.own)
+
+
+def _shown(args: argparse.Namespace, result: Refinement) -> Iterator[Any]:
+    from ..refine import residual_words, verdict_words
+
+    if result.steps:
+        yield _steps_table(result)
+    yield f'{verdict_words(result)}\n{residual_words(result)}'
+    if result.disturbed_poses:
+        yield f'left out: {listed("row", result.disturbed_poses)}'
+    for line in result.calibration.warnings:
+        yield f'note: {line}'
+    for line in result.advice:
+        yield f'advice: {line}'
+    if args.plan is not None:
+        for line in result.plan.lines:
+            yield f'plan: {line}'
+    if result.not_testable:
+        names = ', '.join(effect for effect, _ in result.not_testable)
+        yield f'these data cannot show: {names}'
+
+
+def several_refine(results: Sequence[dict[str, Any]]) -> Iterator[str]:
+    """Yield a line for each of several results."""
+    for result in results:
+        yield f'{result["file"]}: {error_line(result) or _in_a_line(result)}'
+
+
+def _in_a_line(result: dict[str, Any]) -> str:
+    names = ' + '.join([result['base'], *(step['effect'] for step in result['steps'])])
+    return (f'{result["verdict"]}: {names}, {short(result["gap_mg"])} -> '
+            f'{short(result["remaining_gap_mg"])} mg')
+
+
+def _steps_table(result: Refinement) -> Table:
+    """Return a table of the steps."""
+    from ..refine import base_words, chance
+
+    table = Table(title=f'From {base_words(result)}: residuals in mg, held out in brackets',
+                  show_lines=True)
+    table.add_column('effect, and where it was found', overflow='fold')
+    for name in ('residual', 'chance'):
+        table.add_column(name, no_wrap=True)
+    for number, step in enumerate(result.steps, 1):
+        gap = (f'{short(step.gap_before_mg)} -> {short(step.gap_after_mg)}\n'
+               f'({short(step.held_out_before_mg)} -> {short(step.held_out_after_mg)})')
+        lines = [f'{number}. {step.effect}', effect_named(step.name).words, step.where,
+                 f'rivals: {", ".join(step.likely_rivals) or "none"}']
+        table.add_row('\n'.join(lines), gap, chance(step.p_value))
+    return table
+
+
+# ----------------------------------------------------------------------------- fleets
+
+def run_fleet(args: argparse.Namespace) -> Done:
+    """Calibrate many recordings on Dask."""
+    from ..fleet import cluster, LIMIT_S, Options, recordings, run, STATUS, Store
+
+    with working('looking for recordings'):
+        found = list({each.path: each for each in recordings(args.recordings)}.values())
+    asked = Options(**{**given(Options, args), 'log': log_options(args),
+                       'settings': settings(args), 'exports': tuple(dict.fromkeys(args.export))})
+    with cluster(args.scheduler, args.workers) as client:
+        console(args).print(f'{counted(len(found), "recording")}; dashboard: '
+                            f'{client.dashboard_link}')
+        with progress('recordings') as moved:
+            summary = run(client, found, asked, Store(args.output.absolute()), moved,
+                          args.time_limit or LIMIT_S)
+    return Done({'recordings': len(found), **{name: summary.counts[name] for name in STATUS},
+                 'sensors': summary.sensors}, _summary_lines(summary, args.output),
+                summary.rating)
+
+
+def _summary_lines(summary: Summary, output: Path) -> Iterator[str]:
+    """Yield the summary as lines of text."""
+    counts = summary.counts
+    yield (f'{counts["ok"]} calibrated, {counts["error"]} with an error, {counts["unread"]} '
+           f'could not be read, {counts["skipped"]} skipped because they are done')
+    for path in summary.damaged:
+        yield f'note: a file of the results was damaged and was made again; it is now {path}'
+    for row in summary.sensors:
+        for change in row['changes']:
+            if change['for_good']:
+                yield (f'{row["sensor"]} changed for good at {change["date"]}: '
+                       f'{change["parameter"]} (p = {change["p_value"]:.2g})')
+    yield f'{counted(len(summary.sensors), "sensor")}, stored in {output}'

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The frame that runs every command: for one input or several, with JSON, lines and exit status.
+The frame of every command: its inputs and outputs, JSON, page, rating and exit status.
 
 The command NAME is the function ``run_NAME`` of its module, from the arguments for one input to
 what is `Done`. If it takes several POSES, it runs once for each of them, and ``several_NAME``
@@ -12,10 +12,6 @@ All files that a command is to write are checked before any work. The folder of 
 exist, no file is written onto an input or onto another output, and an existing file is replaced
 only by one of its own kind, unless ``--force`` is set.
 
-Lines of text break at words, at the width of the terminal or of ``COLUMNS``. A word that is
-longer, such as the name of a file, stays whole. Progress is shown on standard error if it is a
-terminal.
-
 """
 
 from __future__ import annotations
@@ -23,30 +19,33 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from importlib import import_module
 import json
 import os
 from pathlib import Path
 import re
-import sys
-from textwrap import wrap
 from typing import Any, NamedTuple, TYPE_CHECKING
-
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from .commands import COMMANDS, next_command
 from .options import BAD_INPUT
-from .terminal import plain_character
+from .output import Output, progress, Verdict, working
+from ..calibrate import Calibration, FleetPrior
+from ..capture import CaptureSettings
 from ..disk import replaceable, STANDARD_OUTPUT, write_atomically
-from ..errors import AccelCalibError, InputError, RefusedFitError, system_error
+from ..effects import know_file
+from ..errors import AccelCalibError, InputError, RefusedFitError, saying, system_error
+from ..logs import LogOptions
+from ..pipeline import Intake, options_for, poses_of
+from ..stored import OF_FILE, read_calibration, read_prior
+from ..table import Poses
 from ..text import counted, plain
 
 if TYPE_CHECKING:
     from ..findings import Rating
-    from ..logs import Progress
+
+FAILED = 1
+"""Exit status for a result that is BAD, or if a check that was asked for fails."""
 
 _INPUTS = ('poses', 'recording', 'log', 'calibration', 'calibrations', 'noise')
 _OUTPUTS = {'json': 'result', 'report': 'page', 'plan': 'table', 'figures': ''}
@@ -59,14 +58,6 @@ _KINDS = {'calibration': rb'format: accel_calib', 'page': rb'<!DOCTYPE html',
 """Beginning of a file of each kind."""
 
 _HEAD = 4096
-_NO_BREAK = '\N{NO-BREAK SPACE}'
-_MARK = '\ue000'
-"""Stands for a letter of the rating while a line is broken."""
-
-_COLOURS = {'GOOD': 'bold green', 'USABLE': 'bold yellow', 'BAD': 'bold red'}
-
-_TIED = r'(?<=±) | (?=±)|(?<==) | (?==)|(?<=\d) (?=(mg|g|s|h|Hz|%|°|°C|m/s²|poses?)\b)'
-"""Spaces at which a line does not break: ``value ± sd``, ``p = 0.1``, ``3 mg``."""
 
 
 @dataclass(frozen=True)
@@ -77,11 +68,17 @@ class Done:
     Parameters
     ----------
     result : mapping
-        The result for JSON.
+        The result for JSON, besides the rating.
     shown : iterable
         Texts and tables for the terminal; they are made when they are printed.
+    rating : Rating, optional
+        The rating, which follows them.
     status : int
         Exit status.
+    stored : sequence of Path
+        The files written.
+    page : function, optional
+        Returns the page, if one is asked for.
     refusal : tuple of str
         Why the file of ``-o`` is not written, and what to do; empty if it is written.
 
@@ -89,16 +86,25 @@ class Done:
 
     result: Mapping[str, Any] = field(default_factory=dict)
     shown: Iterable[Any] = ()
+    rating: Rating | None = None
     status: int = 0
+    stored: Sequence[Path] = ()
+    page: Callable[[], str] | None = None
     refusal: tuple[str, ...] = ()
 
 
 class Target(NamedTuple):
-    """A file to write: the option that names it, and its kind, empty for any."""
+    """A file to write: its argument and option, and its kind, empty for any."""
 
-    option: str
+    name: str
     path: Path
     kind: str
+    option: str
+
+    @property
+    def is_piped(self) -> bool:
+        """Whether it is standard output."""
+        return str(self.path) == STANDARD_OUTPUT
 
 
 def run(args: argparse.Namespace) -> int:
@@ -123,12 +129,12 @@ def run(args: argparse.Namespace) -> int:
         If a file cannot be read or written.
 
     """
-    _check_targets(args)
+    each = _for_each(args)
+    _check_targets(args, each)
     if getattr(args, 'report', None) or COMMANDS[args.command].writes == 'page':
         from ..report import check_matplotlib
 
         check_matplotlib()
-    each = _for_each(args)
     return _run_one(each[0]) if len(each) == 1 else _run_several(args, each)
 
 
@@ -138,8 +144,26 @@ def _function(kind: str, command: str) -> Callable[[Any], Any]:
     return function
 
 
+def _done(args: argparse.Namespace) -> Done:
+    """Run the command for one input, with the own effects of the user, and draw its page."""
+    path = getattr(args, 'also', None)
+    args.own = () if path is None else know_file(path)
+    done: Done = _function('run', args.command)(args)
+    is_page = COMMANDS[args.command].writes == 'page'
+    page = args.output if is_page else getattr(args, 'report', None)
+    if page is not None and done.page is not None:
+        from ..report import write_page
+
+        with working('drawing the page'):
+            write_page(page, done.page())
+        done = replace(done, stored=[*done.stored, page])
+    if done.rating is not None:
+        done = replace(done, result={**done.result, **rated(done.rating, args)})
+    return done
+
+
 def _run_one(args: argparse.Namespace) -> int:
-    target, command = getattr(args, 'json', None), COMMANDS[args.command]
+    command, output, target = COMMANDS[args.command], console(args), getattr(args, 'json', None)
     try:
         done = _done(args)
     except (AccelCalibError, OSError) as err:
@@ -147,11 +171,11 @@ def _run_one(args: argparse.Namespace) -> int:
         error = _of_error(err)
         write_json(target, {**about, **error})
         if 'read_as' in error and target != STANDARD_OUTPUT:
-            console(args).print(f'read as: {error["read_as"]}')
+            output.print(f'read as: {error["read_as"]}')
         raise
     write_json(target, done.result)
-    output = console(args)
-    for each in done.shown:
+    for each in (*done.shown, *(f'stored in {path}' for path in done.stored),
+                 *(rating_lines(done.rating, args) if done.rating else ())):
         output.print(each)
     if done.refusal:
         raise RefusedFitError(f'{args.output} is not written: {done.refusal[0]}', done.refusal[1])
@@ -168,16 +192,6 @@ def _run_several(args: argparse.Namespace, each: Sequence[argparse.Namespace]) -
     return max(status for status, _ in outcomes)
 
 
-def _done(args: argparse.Namespace) -> Done:
-    """Run the command for one input, with the own effects of the user, ``args.own``."""
-    from ..effects import know_file
-
-    path = getattr(args, 'also', None)
-    args.own = () if path is None else know_file(path)
-    done: Done = _function('run', args.command)(args)
-    return done
-
-
 def _attempt(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     """Return exit status and JSON for one of several inputs; an error is a result, too."""
     try:
@@ -186,34 +200,6 @@ def _attempt(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
         return BAD_INPUT, {'file': str(args.poses), **_of_error(err)}
     refused = dict(zip(('error', 'advice'), done.refusal))
     return BAD_INPUT if refused else done.status, {**plain(done.result), **refused}
-
-
-def rated(rating: Rating, args: argparse.Namespace) -> dict[str, Any]:
-    """Return a rating for JSON."""
-    from ..findings import rating_json
-
-    step = rating.next
-    return rating_json(rating, step.kind, step.text, next_command(step, args))
-
-
-class Verdict(str):
-    """A line of text with a rating from a character on, which a terminal shows in colour."""
-
-    rating: str
-    start: int
-
-    def __new__(cls, line: str, rating: str, start: int = 0) -> Verdict:
-        """Return the line with these attributes."""
-        made = super().__new__(cls, line)
-        made.rating, made.start = rating, start
-        return made
-
-
-def rating_lines(rating: Rating, args: argparse.Namespace) -> list[str]:
-    """Return a rating as lines of text, the last one the next command if there is one."""
-    command = next_command(rating.next, args)
-    first, *others = rating.lines
-    return [Verdict(first, rating.name), *others, *([f'      {command}'] if command else [])]
 
 
 def _of_error(error: AccelCalibError | OSError) -> dict[str, str]:
@@ -251,6 +237,21 @@ def _in_parallel(function: Any, items: Sequence[Any], jobs: int) -> list[Any]:
                 worker.close()
 
 
+def rated(rating: Rating, args: argparse.Namespace) -> dict[str, Any]:
+    """Return a rating for JSON."""
+    from ..findings import rating_json
+
+    step = rating.next
+    return rating_json(rating, step.kind, step.text, next_command(step, args))
+
+
+def rating_lines(rating: Rating, args: argparse.Namespace) -> list[str]:
+    """Return a rating as lines of text, the last one the next command if there is one."""
+    command = next_command(rating.next, args)
+    first, *others = rating.lines
+    return [Verdict(first, rating.name), *others, *([f'      {command}'] if command else [])]
+
+
 def write_json(target: str | None, result: object) -> None:
     """Write a result as JSON to a file, or to standard output for ``-``; None: do nothing."""
     if target is not None:
@@ -258,64 +259,67 @@ def write_json(target: str | None, result: object) -> None:
         write_atomically(Path(target), lambda file: file.write(f'{text}\n'))
 
 
+def console(args: argparse.Namespace) -> Output:
+    """Return the console for text output: standard error if a result goes to standard output."""
+    return Output(stderr=any(target.is_piped for target in _outputs(args)))
+
+
+# ----------------------------------------------------------------------------- files to write
+
+def _outputs(args: argparse.Namespace) -> list[Target]:
+    """Return the outputs that are asked for."""
+    kinds = {'output': COMMANDS[args.command].writes, **_OUTPUTS}
+    given = {name: getattr(args, name, None) for name in kinds}
+    return [Target(name, Path(path), kinds[name], '-o' if name == 'output' else f'--{name}')
+            for name, path in given.items() if path is not None]
+
+
 def _for_each(args: argparse.Namespace) -> list[argparse.Namespace]:
     """Return the arguments for each of one or several POSES; of several, outputs are folders."""
     sources = getattr(args, 'poses', None)
     if not isinstance(sources, list):
         return [args]
-    folders = [(name, target) for name, target in _outputs(args)
+    folders = [target for target in _outputs(args)
                if len(sources) > 1 and target.kind in _SUFFIXES]
     return [argparse.Namespace(**{**vars(args), 'poses': source, **{
-        name: _in_folder(target, Path(source)).path for name, target in folders}})
-        for source in sources]
+        target.name: target.path / f'{Path(source).stem}{_SUFFIXES[target.kind]}'
+        for target in folders}}) for source in sources]
 
 
-def _outputs(args: argparse.Namespace) -> Iterator[tuple[str, Target]]:
-    """Yield the argument and the file of each output that is asked for."""
-    for name, kind in {'output': COMMANDS[args.command].writes, **_OUTPUTS}.items():
-        given = getattr(args, name, None)
-        if given is not None and str(given) != STANDARD_OUTPUT:
-            yield name, Target('-o' if name == 'output' else f'--{name}', Path(given), kind)
-
-
-def _in_folder(folder: Target, source: Path) -> Target:
-    """Return the file in a folder for one of several inputs."""
-    return Target(f'{folder.option} for {source}',
-                  folder.path / f'{source.stem}{_SUFFIXES[folder.kind]}', folder.kind)
-
-
-def _targets(args: argparse.Namespace) -> Iterator[Target]:
+def _targets(args: argparse.Namespace, each: Sequence[argparse.Namespace]) -> Iterator[Target]:
     """Yield the files that a command is to write."""
-    sources = _paths(getattr(args, 'poses', None))
-    for name, target in _outputs(args):
-        if len(sources) < 2 or target.kind not in _SUFFIXES:
+    for target in _outputs(args):
+        if target.is_piped:
+            continue
+        if len(each) == 1 or target.kind not in _SUFFIXES:
             yield target._replace(kind='' if target.path.is_dir() else target.kind)
         elif target.path.is_dir():
-            yield from (_in_folder(target, source) for source in sources)
+            for one in each:
+                yield target._replace(path=getattr(one, target.name),
+                                      option=f'{target.option} for {one.poses}')
         else:
             raise InputError(f'{target.option} {target.path} is not a folder, expected a folder '
-                             f'for {counted(len(sources), "table")}', 'use an existing folder')
-        if args.command == 'calibrate' and name == 'output':
-            yield Target('the page of -o', target.path.with_suffix('.html'), 'page')
+                             f'for {counted(len(each), "table")}', 'use an existing folder')
+        if args.command == 'calibrate' and target.name == 'output':
+            yield Target('page', target.path.with_suffix('.html'), 'page', 'the page of -o')
 
 
-def _check_piped(args: argparse.Namespace) -> None:
+def _check_piped(args: argparse.Namespace, each: Sequence[argparse.Namespace]) -> None:
     """Check that at most one result goes to standard output."""
-    piped = _piped(args)
+    piped = [target.option for target in _outputs(args) if target.is_piped]
     if len(piped) > 1:
         raise InputError(f'{" and ".join(piped)} are both -, expected one of them on standard '
                          'output', 'give one of them the name of a file')
-    several = isinstance(getattr(args, 'poses', None), list) and len(args.poses) > 1
-    if piped and piped != ['--json'] and (several or not COMMANDS[args.command].writes):
+    if piped and piped != ['--json'] and (len(each) > 1 or not COMMANDS[args.command].writes):
         raise InputError(f'{piped[0]} is -, expected a folder here',
                          'use a folder; results of several files do not fit into one')
 
 
-def _check_targets(args: argparse.Namespace) -> None:
-    _check_piped(args)
+def _check_targets(args: argparse.Namespace, each: Sequence[argparse.Namespace]) -> None:
+    _check_piped(args, each)
     inputs = [path for name in _INPUTS for path in _paths(getattr(args, name, None))]
     seen: dict[Path, str] = {}
-    for target in _targets(args):
+    for target in _targets(args, each):
         if not target.kind and not target.path.exists():
             continue
         check_target(target, inputs, force=args.force)
@@ -369,100 +373,65 @@ def _paths(value: object) -> list[Path]:
     return [each for each in values if isinstance(each, Path)]
 
 
-class Output(Console):
-    """A console that breaks lines at words, and takes text as it is, without markup."""
+# ----------------------------------------------------------------------------- inputs
 
-    def __init__(self, stderr: bool = False) -> None:
-        super().__init__(stderr=stderr, highlight=False, markup=False, emoji=False)
-
-    def render_str(self, text: str, **options: Any) -> Text:
-        """Return text with the replacements, so that tables have the right width."""
-        return super().render_str(shown(text, self.encoding), **options)
-
-    def print(self, *objects: Any, **options: Any) -> None:  # noqa: A003
-        """Print; lines of text break at words, and the rest of a line is indented."""
-        if len(objects) == 1 and isinstance(objects[0], str):
-            super().print(self._line(objects[0]), soft_wrap=True, **options)
-        else:
-            super().print(*objects, **options)
-
-    def _line(self, line: str) -> Text:
-        if not isinstance(line, Verdict):
-            return self.render_str('\n'.join(map(self._broken, line.split('\n'))))
-        end, mark = line.start + len(line.rating), _MARK * len(line.rating)
-        before, _, after = self._broken(f'{line[:line.start]}{mark}{line[end:]}').partition(mark)
-        return Text.assemble(self.render_str(before), (line.rating, _COLOURS[line.rating]),
-                             self.render_str(after))
-
-    def _broken(self, line: str) -> str:
-        tied = re.sub(_TIED, _NO_BREAK, line)
-        parts = wrap(tied, self.width, subsequent_indent='  ', break_long_words=False,
-                     break_on_hyphens=False)
-        return '\n'.join(parts).replace(_NO_BREAK, ' ') or line
+def given(record: Any, args: argparse.Namespace) -> dict[str, Any]:
+    """Return the fields of a record that have an option; None stands for the default."""
+    found = {each.name: getattr(args, each.name, None) for each in fields(record)}
+    return {name: value for name, value in found.items() if value is not None}
 
 
-def shown(text: str, encoding: str) -> str:
-    """Return text in the characters of an encoding, without control characters."""
-    safe = ''.join(each if each.isprintable() or each == '\n' else plain_character(each)
-                   for each in text)
-    try:
-        safe.encode(encoding)
-    except UnicodeEncodeError:
-        return ''.join(each if _has(encoding, each) else plain_character(each) for each in safe)
-    return safe
+def log_options(args: argparse.Namespace, calibration: Calibration | None = None) -> LogOptions:
+    """Return how to read a log; in the unit of a calibration if the log states none."""
+    columns = {ours: theirs for each in args.columns for ours, theirs in each.items()}
+    return options_for(calibration, LogOptions(**{**given(LogOptions, args), 'columns': columns}))
 
 
-def _has(encoding: str, character: str) -> bool:
-    try:
-        character.encode(encoding)
-    except UnicodeEncodeError:
-        return False
-    return True
-
-
-def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
-    """Return a table whose first column holds names, and the others numbers."""
-    made = Table(title=title)
-    made.add_column(columns[0], overflow='fold')
-    for name in columns[1:]:
-        made.add_column(name, justify='right')
-    for row in rows:
-        made.add_row(*row)
-    return made
+def settings(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the settings of the capture that are asked for."""
+    return given(CaptureSettings, args)
 
 
 @contextmanager
-def progress(what: str) -> Iterator[Progress]:
-    """Show a progress bar, and yield the function that updates it."""
-    if not sys.stderr.isatty():
-        yield lambda done, count: None
-        return
-    from rich.progress import BarColumn, Progress as Bar, TextColumn, TimeRemainingColumn
-
-    columns = (BarColumn(), TextColumn('{task.description}'), TimeRemainingColumn())
-    with Bar(*columns, console=Output(stderr=True), transient=True) as bar:
-        task = bar.add_task(what, total=None)  # the bar moves to and fro until a number is known
-        yield lambda done, count: bar.update(task, completed=done, total=count,
-                                             description=f'{done:,} of {count:,} {what}')
+def intake(args: argparse.Namespace, path: Path, calibration: Calibration | None = None
+           ) -> Iterator[Intake]:
+    """Yield the poses of a log, captured from a recording; later errors say how it was read."""
+    with progress('samples') as moved:
+        found = poses_of(path, log_options(args, calibration), settings(args), moved)
+    with saying(found.said):
+        yield found
 
 
-@contextmanager
-def working(what: str) -> Iterator[None]:
-    """Show that work of unknown length goes on."""
-    if not sys.stderr.isatty():
-        yield
-        return
-    with Output(stderr=True).status(what):
-        yield
+def stored_calibration(path: Path) -> Calibration:
+    """Read a stored calibration; report on standard error if it was edited by hand."""
+    calibration = read_calibration(path)
+    for found in calibration.noted:
+        if found.kind in OF_FILE:
+            Output(stderr=True).print(f'note: {path}: {found.words}')
+    return calibration
 
 
-def console(args: argparse.Namespace) -> Output:
-    """Return the console for text output: standard error if a result goes to standard output."""
-    return Output(stderr=bool(_piped(args)))
+def prior(args: argparse.Namespace) -> FleetPrior | None:
+    """Return the typical values of ``--prior``."""
+    return None if args.prior is None else read_prior(args.prior, args.sensor_model)
 
 
-def _piped(args: argparse.Namespace) -> list[str]:
-    """Return the options whose result goes to standard output."""
-    named = {'-o': 'output', **{f'--{name}': name for name in _OUTPUTS}}
-    return [option for option, name in named.items()
-            if str(getattr(args, name, None)) == STANDARD_OUTPUT]
+def rows_between(poses: Poses, text: str | None) -> slice:
+    """
+    Return the rows ``A:B`` of a table, 1-based, inclusive; A and B are optional.
+
+    Raises
+    ------
+    InputError
+        If the text is not of this form, or the rows are not in the table.
+
+    """
+    first, colon, last = (text or ':').partition(':')
+    try:
+        start, stop = int(first or 1), int((last if colon else first) or len(poses))
+    except ValueError:
+        start, stop = 0, 0
+    if not 1 <= start <= stop <= len(poses):
+        raise InputError(f'--rows is {text}, expected A:B within 1:{len(poses)}',
+                         'set A and B to the first and the last row, 1-based')
+    return slice(start - 1, stop)

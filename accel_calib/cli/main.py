@@ -20,6 +20,7 @@ import sys
 from threading import current_thread, main_thread
 
 INTERRUPTED = 130
+_STANDARD_ERROR = 2
 NOT_READ = 141
 """Exit status of a program that SIGPIPE ends."""
 
@@ -37,11 +38,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     with _leaving():
         from .commands import parser
-        from .terminal import open_streams, use_plain_characters
         from ..errors import AccelCalibError, crash_words, system_error
 
-        open_streams()
-        use_plain_characters()
+        _open_streams()
         if '_ARGCOMPLETE' in os.environ:
             _complete()
         own, for_ros = _split(sys.argv[1:] if arguments is None else arguments)
@@ -83,6 +82,26 @@ def _leaving() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
+def _open_streams() -> None:
+    """
+    Open what is closed of the standard streams, so that no other file gets its number.
+
+    Standard output and error replace the characters that their encoding lacks.
+
+    """
+    while (number := os.open(os.devnull, os.O_RDWR)) <= _STANDARD_ERROR:
+        pass
+    os.close(number)
+    for name, mode in (('stdin', 'r'), ('stdout', 'w'), ('stderr', 'w')):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode, encoding='utf-8'))  # noqa: SIM115
+    from .options import plain_handler
+
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, 'reconfigure'):
+            stream.reconfigure(errors=plain_handler())
+
+
 def _complete() -> None:
     """Print the completions that the shell asks for, and exit."""
     try:
@@ -101,8 +120,7 @@ def _split(arguments: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
 
 
 def _refuse(command: str, line: str) -> int:
-    from .options import BAD_INPUT
-    from .terminal import in_one_line
+    from .options import BAD_INPUT, in_one_line
 
     print(f'accel-calib {command}: {in_one_line(line)}', file=sys.stderr)
     return BAD_INPUT

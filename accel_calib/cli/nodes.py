@@ -1,30 +1,63 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""``accel-calib demo``, ``live``, ``node`` and ``simulator``: what runs while messages arrive."""
+"""
+``accel-calib demo``, ``live``, ``node``, ``simulator`` and ``watch``: while messages arrive.
+
+A terminal shows the screen of ``watch``, which is drawn again, with a bell for each captured pose.
+Another output, such as a pipe or ``ssh HOST COMMAND`` without ``-t``, gets a line for each change.
+
+**Large words.** The sides of the sensor to point up are drawn in letters of 5 rows of pixels, so
+that they can be read from a distance. Two columns of the terminal, or half a row, are one pixel.
+
+"""
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
-from typing import Any, TYPE_CHECKING
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+import math
+import os
+import signal
+import sys
+from typing import Any, NamedTuple, TYPE_CHECKING
 
+import numpy as np
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
+from rich.live import Live
+from rich.panel import Panel
 from rich.table import Table
+from rich.text import Text
 
 from .commands import HIDDEN
-from .frame import console, Done, Output, table
-from .inputs import log_options, settings
-from .terminal import ended
+from .frame import console, Done, FAILED, log_options, settings
+from .output import Output, table
 from ..errors import InputError, NEEDS_ROS
+from ..geometry import words_of
+from ..units import MG
 
 if TYPE_CHECKING:
     from ..ros.demo import Outcome
+    from ..ros.watch import Show
+    from ..session import Progress
 
 _ERRORS = {'vector_mg': 'error of a, RMS [mg]', 'rms_mg': 'error of |a|, RMS [mg]',
            'max_mg': 'error of |a|, largest [mg]', 'tilt_deg': 'error of up, RMS [deg]'}
 
-CHECK_FAILED = 1
-"""Exit status if the error does not shrink, or the hidden effect is not found."""
+
+@contextmanager
+def ended() -> Iterator[Callable[[], bool]]:
+    """Yield a function that returns whether Ctrl-C or SIGTERM came."""
+    came: list[int] = []
+    before = {number: signal.signal(number, lambda number, frame: came.append(number))
+              for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(came)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def run_node(args: argparse.Namespace) -> Done:
@@ -84,8 +117,8 @@ def run_demo(args: argparse.Namespace) -> Done:
         return Done()
     outcome = demonstrate(output.print, HIDDEN.get(args.hidden, ''))
     verdict = [] if args.hidden is None else [_verdict(outcome)]
-    return Done(_to_json(outcome), [_table(outcome), *verdict],
-                0 if outcome.succeeded else CHECK_FAILED)
+    return Done(_to_json(outcome), [_errors_table(outcome), *verdict],
+                status=0 if outcome.succeeded else FAILED)
 
 
 def _to_json(outcome: Outcome) -> dict[str, Any]:
@@ -106,7 +139,7 @@ def _verdict(outcome: Outcome) -> str:
     return f'{passed}: hidden was {outcome.hidden}, ~/refine added {named}{lag}'
 
 
-def _table(outcome: Outcome) -> Table:
+def _errors_table(outcome: Outcome) -> Table:
     columns = (('imu/data_calibrated', 'after ~/refine') if outcome.hidden else
                ('imu/data_raw', 'imu/data_calibrated'))
     before, after = asdict(outcome.before), asdict(outcome.after)
@@ -114,3 +147,333 @@ def _table(outcome: Outcome) -> Table:
         f'Errors at {outcome.rests} rests in other poses, after {outcome.seconds:.0f} s',
         ('', *columns), ((words, f'{before[name]:.3g}', f'{after[name]:.3g}')
                          for name, words in _ERRORS.items()))
+
+
+# ----------------------------------------------------------------------------- watch
+
+GOOD, BAD, NEXT = 'green', 'red', 'bold yellow'
+
+_SCALE = 2.0
+"""Stillness at the end of its bar; the limit is at its middle."""
+
+_WORDS = 30
+"""Width of the words beside the bars, so that the bars keep their length."""
+
+_OTHER_ROWS = 16
+"""Rows of the screen besides the large words."""
+
+_LETTERS = {
+    'A': '.#. #.# ### #.# #.#', 'B': '##. #.# ##. #.# ##.', 'C': '### #.. #.. #.. ###',
+    'D': '##. #.# #.# #.# ##.',
+    'E': '### #.. ##. #.. ###', 'F': '### #.. ##. #.. #..', 'G': '### #.. #.# #.# ###',
+    'H': '#.# #.# ### #.# #.#', 'I': '# # # # #', 'K': '#.# #.# ##. #.# #.#',
+    'L': '#.. #.. #.. #.. ###', 'M': '#...# ##.## #.#.# #...# #...#',
+    'N': '#..# ##.# #.## #..# #..#', 'O': '### #.# #.# #.# ###', 'P': '### #.# ### #.. #..',
+    'R': '##. #.# ##. #.# #.#', 'S': '### #.. ### ..# ###', 'T': '### .#. .#. .#. .#.',
+    'V': '#.# #.# #.# #.# .#.', ' ': '. . . . .',
+}
+"""Rows of pixels of each letter, from the top."""
+
+
+_CALLS = {'fit': 'CALL FIT', 'refine': 'CALL REFINE', 'level': 'SET LEVEL', 'accept': 'ACCEPT',
+          'save': 'SAVE', 'done': 'DONE'}
+"""Large words for each kind of step that is not a pose."""
+
+_SAME = math.cos(math.radians(10.0))
+"""A direction within 10° of a side, an edge or a corner is named after it."""
+
+
+class _Row(NamedTuple):
+    """A row of the screen: what it shows, in words, and as the share of a bar (NaN: no bar)."""
+
+    label: str
+    words: str
+    share: float = math.nan
+    style: str = GOOD
+    limit: float = math.nan
+
+
+def run_watch(args: argparse.Namespace) -> Done:
+    """Show the progress until the user ends it."""
+    with ended() as is_over:
+        try:
+            from ..ros import watch
+        except ImportError as err:
+            raise InputError(f'ROS 2 is not installed ({err}), but the command needs it',
+                             NEEDS_ROS) from err
+        for_ros = [args.command, *args.for_ros]
+        try:
+            if args.once:
+                _print(*watch.current(args.node, is_over, for_ros))
+            else:
+                with _output(args.bell) as show:
+                    watch.watch(args.node, show, is_over, for_ros)
+        except BrokenPipeError:
+            # The reader of the pipe has ended. Python must not write the rest at its exit.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return Done()
+
+
+def _print(node: str, progress: Progress | None) -> None:
+    """Print a progress once."""
+    if progress is None:
+        return
+    if sys.stdout.isatty():
+        Output().print(screen(node, progress))
+    else:
+        print(*state(node, progress), sep='\n', flush=True)
+
+
+@contextmanager
+def _output(bell: bool) -> Iterator[Show]:
+    """Yield the function that shows the progress."""
+    console = Output()
+    if not sys.stdout.isatty() or console.is_dumb_terminal:
+        yield _Lines().show
+        return
+    with Live(console=console, auto_refresh=False, screen=True) as live:
+        shown = _Screen(live, bell)
+        yield shown.show
+    if shown.view is not None:
+        console.print(shown.view)  # the terminal returns to what it showed before
+
+
+class _Lines:
+    """Output of a line for each change."""
+
+    def __init__(self) -> None:
+        self._last: Progress | None = None
+        self._problem = ''
+
+    def show(self, node: str, progress: Progress | None, problem: str) -> None:
+        """Print what has changed."""
+        if problem != self._problem:
+            print(problem or f'messages from {node} arrive again', flush=True)
+        if progress is not None:
+            for line in changes(node, self._last, progress):
+                print(line, flush=True)
+        self._last, self._problem = progress, problem
+
+
+class _Screen:
+    """
+    A screen that is drawn again, with a bell for each captured pose.
+
+    Attributes
+    ----------
+    view : rich renderable or None
+        What it shows.
+
+    """
+
+    def __init__(self, live: Live, bell: bool) -> None:
+        self._live, self._bell = live, bell
+        self._last: Progress | None = None
+        self.view: RenderableType | None = None
+
+    def show(self, node: str, progress: Progress | None, problem: str) -> None:
+        """Draw the screen."""
+        if progress is not None and captured(self._last, progress) and self._bell:
+            self._live.console.bell()
+        self._last = progress
+        self.view = screen(node, progress, problem)
+        self._live.update(self.view, refresh=True)
+
+
+def screen(node: str, progress: Progress | None, problem: str = '') -> RenderableType:
+    """
+    Return the screen.
+
+    Parameters
+    ----------
+    node : str
+        Full name of the calibrator.
+    progress : Progress or None
+        Its progress; None before the first message.
+    problem : str, optional
+        Why no messages arrive, and what to do.
+
+    """
+    parts: list[RenderableType] = [Text(problem, style=f'bold {BAD}')] if problem else []
+    if progress is not None:
+        parts += [_table(_rows(progress)), '', *_next(node, progress)]
+    elif not problem:
+        parts.append(Text('waiting for the first message'))
+    return Panel(Group(*parts), title=Text(node), border_style=BAD if problem else 'dim')
+
+
+def state(node: str, progress: Progress) -> Iterator[str]:
+    """Yield the lines of a progress: its rows, the next step, and the call of its service."""
+    for row in _rows(progress):
+        yield f'{row.label}: {row.words}'
+    yield f'next: {progress.advice or "wait"}'
+    if _sides(progress):
+        yield _direction(progress)
+    if progress.command:
+        yield service_call(node, progress.command)
+
+
+def captured(before: Progress | None, now: Progress) -> bool:
+    """Return whether a pose was captured in between."""
+    return before is not None and now.poses > before.poses
+
+
+def changes(node: str, before: Progress | None, now: Progress) -> Iterator[str]:
+    """Yield a line for each change that the user must know; all is new if `before` is None."""
+    if before is None or (before.poses, before.advice) != (now.poses, now.advice):
+        what = 'captured pose' if captured(before, now) else 'poses:'
+        yield (f'{what} {_count(now)}; coverage {now.coverage:.0%}; accuracy {_accuracy(now)}; '
+               f'next: {now.advice or "wait"}{_end(node, now)}')
+    if before is None or before.still != now.still:
+        yield f'still: hold it for {now.min_dwell:g} s' if now.still else 'moving'
+
+
+def _end(node: str, progress: Progress) -> str:
+    """Return the end of a line with the call of a service, unless a pose comes first."""
+    if progress.step == 'poses' or not progress.command:
+        return ''
+    return f': {service_call(node, progress.command)}'
+
+
+def service_call(node: str, name: str) -> str:
+    """Return the command that calls a service of a node."""
+    return f'ros2 service call {node}/{name} std_srvs/srv/Trigger'
+
+
+def _rows(progress: Progress) -> list[_Row]:
+    now, style = progress, GOOD if progress.still else BAD
+    share = now.poses / max(now.poses, now.total, 1)
+    return [
+        _Row('stillness', _stillness(now), now.stillness / _SCALE, style, 1.0 / _SCALE),
+        _Row('dwell', _dwell(now), now.dwell / now.min_dwell, style),
+        _Row('poses', _count(now), share),
+        _Row('coverage', f'{now.coverage:.0%} of the sphere', now.coverage),
+        _Row('accuracy', _accuracy(now)), _Row('|a|', _length(now)),
+        *([] if math.isnan(now.temperature) else [
+            _Row('temperature', f'{now.temperature:.1f} °C')])]
+
+
+def _stillness(progress: Progress) -> str:
+    if math.isnan(progress.stillness):
+        return 'no Imu messages yet'
+    digits = 2 if progress.stillness < 10.0 else 0
+    times = f'{progress.stillness:.{digits}f} times the limit'
+    return f'{"still" if progress.still else "moving"}, {times}'
+
+
+def _dwell(progress: Progress) -> str:
+    enough = progress.dwell >= progress.min_dwell
+    return f'{progress.dwell:.1f} s of {progress.min_dwell:g} s{", long enough" if enough else ""}'
+
+
+def _count(progress: Progress) -> str:
+    if progress.poses >= progress.total:
+        return str(progress.poses)
+    return f'{progress.poses} of about {progress.total}'
+
+
+def _accuracy(progress: Progress) -> str:
+    if math.isnan(progress.accuracy):
+        return 'not known'
+    if math.isinf(progress.accuracy):
+        return 'not determined by these poses'
+    return f'{progress.accuracy * MG:.2g} mg expected'
+
+
+def _length(progress: Progress) -> str:
+    if math.isnan(progress.corrected):
+        return 'not known' if math.isnan(progress.length) else f'{progress.length:.4f} g'
+    raw = '' if math.isnan(progress.length) else f'{progress.length:.4f} g, '
+    return f'{raw}corrected {progress.corrected:.4f} g'
+
+
+def _direction(progress: Progress) -> str:
+    return f'direction in sensor axes: {" ".join(f"{part:+.2f}" for part in progress.direction)}'
+
+
+def _next(node: str, progress: Progress) -> Iterator[RenderableType]:
+    """Yield the next action, in large words if it is a pose or the fit."""
+    sides = _sides(progress)
+    if progress.step in _CALLS:
+        yield from (_Large(_CALLS[progress.step], f'bold {GOOD}'), '')
+    elif sides:
+        yield from (_Large(sides, NEXT), '')
+    yield Text(progress.advice or 'wait', style='bold')
+    if sides:
+        yield Text(_direction(progress), style='dim')
+    if progress.command:
+        yield Text(service_call(node, progress.command), style='dim')
+
+
+def _sides(progress: Progress) -> str:
+    """Return the sides to point up, such as ``FRONT LEFT``; empty for another direction."""
+    if not progress.direction:
+        return ''
+    signs = np.sign(np.round(np.array(progress.direction), 1))
+    if signs @ progress.direction < _SAME * np.linalg.norm(signs):
+        return ''
+    return words_of(signs).removeprefix('the ').rsplit(' ', 1)[0].upper()
+
+
+def _table(rows: Iterable[_Row]) -> Table:
+    table = Table.grid(padding=(0, 2, 0, 0), expand=True)
+    table.add_column(no_wrap=True)
+    table.add_column(ratio=1)
+    table.add_column(no_wrap=True, min_width=_WORDS)
+    for row in rows:
+        bar = '' if math.isnan(row.share) else _Bar(row)
+        table.add_row(Text(row.label), bar, Text(row.words))
+    return table
+
+
+@dataclass(frozen=True)
+class _Bar:
+    """A bar that fills the available width, with a line at the limit."""
+
+    row: _Row
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        full, empty, line = '#-|' if options.ascii_only else '█░┃'
+        width = options.max_width
+        done = round(min(self.row.share, 1.0) * width)
+        text = Text(full * done, style=self.row.style, no_wrap=True)
+        text.append(empty * (width - done), style='dim')
+        if not math.isnan(self.row.limit):
+            at = min(round(self.row.limit * width), width - 1)
+            text = Text.assemble(text[:at], (line, 'bold white'), text[at + 1:], no_wrap=True)
+        yield text
+
+
+@dataclass(frozen=True)
+class _Large:
+    """Words in the largest letters that fit the terminal."""
+
+    words: str
+    style: str
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        rows = _pixels(self.words)
+        wide, half = _two_columns(rows), _half_rows(rows)
+        fitting = [lines for lines in (wide, half) if len(lines[0]) <= options.max_width
+                   and len(lines) <= console.height - _OTHER_ROWS]
+        lines = fitting[0] if fitting and not options.ascii_only else [self.words]
+        yield Text('\n'.join(lines), style=self.style)
+
+
+def _pixels(words: str) -> list[str]:
+    """Return the rows of pixels of words."""
+    letters = [_LETTERS[letter].split() for letter in words]
+    return ['.'.join(parts) for parts in zip(*letters)]
+
+
+def _two_columns(rows: list[str]) -> list[str]:
+    """Return lines with two columns for a pixel."""
+    return [''.join('██' if pixel == '#' else '  ' for pixel in row) for row in rows]
+
+
+def _half_rows(rows: list[str]) -> list[str]:
+    """Return lines with half a row for a pixel."""
+    blocks = {'..': ' ', '#.': '▀', '.#': '▄', '##': '█'}
+    padded = [*rows, '.' * len(rows[0])]
+    return [''.join(blocks[upper + lower] for upper, lower in zip(above, below))
+            for above, below in zip(padded[::2], padded[1::2])]

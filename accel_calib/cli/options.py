@@ -2,16 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Options that several commands have.
+Options that several commands have, and the parser, whose errors are one line of plain characters.
 
 Each option is stated once. Options that fill a record have the names, types and defaults of its
-fields; `accel_calib.cli.inputs` makes the record.
+fields; `accel_calib.cli.frame.given` has their values.
 
 """
 
 from __future__ import annotations
 
 import argparse
+import codecs
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -19,12 +20,42 @@ import re
 import sys
 from typing import Any, NoReturn
 
-from .terminal import in_one_line
-
 BAD_INPUT = 2
 """Exit status for invalid input."""
 
 STANDARD_INPUT = '-'
+
+_PLAIN = {'±': '+-', '°': ' deg', '²': '2', '³': '3', '⁻': '-', '¹': '1', '−': '-',
+          '–': '-', '·': '*', '×': 'x', '…': '...', '→': '->', '≤': '<=', '≥': '>=', '√': 'sqrt ',
+          'Δ': 'D', 'σ': 'sigma', 'τ': 'tau', 'ω': 'omega', 'µ': 'u', 'μ': 'u', '█': '#', '│': '|',
+          '─': '-', '✓': 'ok'}
+"""Replacements for an output that has not these characters."""
+
+_HANDLER = 'accel_calib.plain'
+
+
+def plain_handler() -> str:
+    """Return the name of the error handler that replaces characters an encoding lacks."""
+    codecs.register_error(_HANDLER, _replace)
+    return _HANDLER
+
+
+def _replace(error: UnicodeError) -> tuple[str, int]:
+    """Return the replacement for characters that the encoding lacks, and where to go on."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    return ''.join(map(plain_character, error.object[error.start:error.end])), error.end
+
+
+def plain_character(character: str) -> str:
+    """Return the replacement of a character: ASCII without control characters."""
+    return _PLAIN.get(character) or character.encode('unicode_escape').decode('ascii')
+
+
+def in_one_line(text: str) -> str:
+    """Return text as one line without control characters."""
+    return ''.join(each if each.isprintable() else plain_character(each)
+                   for each in ' '.join(text.split()))
 
 
 class Parser(argparse.ArgumentParser):
@@ -227,7 +258,7 @@ def add_stored(made: Any, about: str = 'stored calibration', **needed: bool) -> 
 
 def add_mounting(made: Parser) -> None:
     """Add the options of the frame and of the mounting, without ``--flat``."""
-    from ..calibrate import FRAMES
+    from ..units import FRAMES
 
     share(made, '--nose-down')
     made.add_argument('--frame', choices=FRAMES, default='ros',
@@ -236,7 +267,7 @@ def add_mounting(made: Parser) -> None:
 
 def add_base(made: Parser) -> None:
     """Add the options for what a refinement starts from."""
-    from ..calibrate import BASES
+    from ..units import BASES
 
     base = made.add_mutually_exclusive_group()
     add_stored(base, 'stored calibration to compare with and to start from')

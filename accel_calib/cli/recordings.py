@@ -1,13 +1,13 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""``accel-calib capture``, ``apply``, ``simulate`` and ``noise``: commands on recordings."""
+"""``accel-calib capture``, ``apply``, ``simulate``, ``noise``, ``export``: files to files."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import asdict, replace
 from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,43 +15,40 @@ from typing import TYPE_CHECKING
 from rich import box
 from rich.table import Table
 
-from .frame import Done, progress, rated, rating_lines, working
-from .inputs import log_options, settings, stored_calibration
-from ..calibrate import Calibration, check_sensor, of_samples, Outside, SampleContext
+from .frame import check_target, Done, given, log_options, settings, stored_calibration, Target
+from .output import Output, progress
+from ..calibrate import Calibration
 from ..capture import Captured
-from ..disk import STANDARD_OUTPUT
-from ..effects import Context, parse_effect
+from ..disk import STANDARD_OUTPUT, write_atomically
+from ..effects import parse_effect
 from ..errors import InputError
 from ..findings import rate_noise
-from ..intake import Intake, samples_again, still_poses
 from ..logs import is_bag, open_log, OpenLog, Progress, write_blocks, write_table
-from ..table import Poses, Recording
+from ..pipeline import captured_from, corrected, Correction
+from ..table import Recording
 from ..text import counted
-from ..units import UnitName, Units, units_of
+from ..units import units_of
 
 if TYPE_CHECKING:
     from ..noise import AxisNoise, NoiseFigures
+    from ..stored.exports import Exported
 
 
 def run_capture(args: argparse.Namespace) -> Done:
     """Find the still stretches of a recording, and write the poses."""
-    with open_log(args.recording, log_options(args)) as log, progress('samples') as moved:
-        captured, wider = still_poses(
-            str(args.recording), log.units, settings(args), log.watched(moved),
-            lambda: samples_again(args.recording, log_options(args)))
-        lines = Intake(captured.poses, log.units, log.read_as, log.notes, wider).lines
-    write_table(args.output, replace(captured.poses, units=log.units.name))
+    with progress('samples') as moved:
+        found, captured = captured_from(args.recording, log_options(args), settings(args), moved)
+    write_table(args.output, found.poses)
     return Done({
         'poses': len(captured.poses), 'samples': captured.recorded,
         'samples_in_poses': captured.samples,
         'threshold': captured.threshold, 'seconds': captured.seconds,
         'interruptions': [item._asdict() for item in captured.interruptions],
-        'read_lines': lines}, [*lines, *_captured_lines(args, captured)])
+        'read_lines': replace(found, captured=found.captured[1:]).lines},
+        [*found.lines, *_interruptions(captured)], stored=[args.output])
 
 
-def _captured_lines(args: argparse.Namespace, captured: Captured) -> Iterator[str]:
-    yield (f'{counted(len(captured.poses), "pose")} in {captured.seconds:.0f} s of '
-           f'{args.recording}, stored in {args.output}')
+def _interruptions(captured: Captured) -> Iterator[str]:
     for item in captured.interruptions:
         what = {'gap': f'samples are missing for {item.seconds:.3g} s',
                 'jump_back': f'the stamps jump back by {-item.seconds:.3g} s',
@@ -64,57 +61,44 @@ def run_apply(args: argparse.Namespace) -> Done:
     calibration = stored_calibration(args.calibration)
     if args.no_rotate:
         calibration = calibration.in_sensor_frame
-    left: list[Outside] = []
     lines: list[str] = []
     if isinstance(args.recording, Path) and is_bag(args.recording):
-        from ..messages import correct_bag
-
-        if str(args.output) == STANDARD_OUTPUT:
-            raise InputError('a bag cannot be written to standard output, expected a file',
-                             'name a file with -o')
-        with progress('messages') as moved:
-            count = correct_bag(args.recording, calibration, args.output, args.topic, moved,
-                                left.append, note=lambda line: lines.append(f'note: {line}'),
-                                temperature_topic=args.temperature_topic,
-                                supply_topic=args.supply_topic, units=args.units or 'm/s2',
-                                gravity=args.gravity)
+        count = _correct_bag(args, calibration, lines)
     else:
-        count = _correct_table(args, calibration, left.append, lines)
-    return Done(shown=[*lines, *(f'note: {each.line}' for each in left),
-                       f'corrected {counted(count, "sample")}, stored in {args.output}'])
+        count = _correct_table(args, calibration, lines)
+    return Done(shown=[*lines, f'corrected {counted(count, "sample")}'], stored=[args.output])
 
 
-def _correct_table(args: argparse.Namespace, calibration: Calibration,
-                   report: Callable[[Outside], object], lines: list[str]) -> int:
+def _correct_bag(args: argparse.Namespace, calibration: Calibration, lines: list[str]) -> int:
+    from ..messages import correct_bag
+
+    if str(args.output) == STANDARD_OUTPUT:
+        raise InputError('a bag cannot be written to standard output, expected a file',
+                         'name a file with -o')
+    with progress('messages') as moved:
+        return correct_bag(args.recording, calibration, args.output, args.topic, moved,
+                           note=lambda line: lines.append(f'note: {line}'),
+                           temperature_topic=args.temperature_topic,
+                           supply_topic=args.supply_topic, units=args.units or 'm/s2',
+                           gravity=args.gravity)
+
+
+def _correct_table(args: argparse.Namespace, calibration: Calibration, lines: list[str]) -> int:
     """Correct a log that is not a bag; how it was read is added to the lines."""
-    path, out = args.recording, args.output
-    with (open_log(path, log_options(args, calibration)) as log,
+    with (open_log(args.recording, log_options(args, calibration)) as log,
           progress('samples') as moved):
-        calibration = calibration.in_units(log.units)
-        check_sensor(calibration, log.sensor)
-        context = SampleContext(calibration)
+        correction = Correction(calibration, log.units, log.sensor)
         blocks = log.watched(moved) if log.poses is None else (log.poses,)
-        count = write_blocks(out, (corrected(block, calibration,
-                                             context.of(block.columns, len(block)))
-                                   for block in blocks))
-        lines += [f'read as: {log.read_as}'] if log.read_as else []
-        lines += [f'note: {line}' for line in log.notes]
-        lines += [f'note: {context.lacking}'] if context.lacking else []
-    for each in context.left:
-        report(each)
+        count = write_blocks(args.output, map(correction, blocks))
+        lines += _read_lines(log)
+    lines += [f'note: {line}' for line in correction.notes]
     return count
 
 
-def corrected(table: Poses | Recording, calibration: Calibration, known: Context
-              ) -> Poses | Recording:
-    """Return a table with the corrected readings, in m/s² or g; `known` is its context."""
-    columns = {'reading': calibration.correct(table.reading, known)}
-    units: UnitName = 'g' if calibration.units.is_native else calibration.units.name
-    if 'rate' in table:
-        columns['rate'] = table['rate'] @ calibration.model.rotation
-    if 'std' in table:
-        columns['std'] = calibration.units.to_g(table['std']) * calibration.force_per_g
-    return replace(table.with_columns(**columns), units=units, autopilot=None)
+def _read_lines(log: OpenLog) -> list[str]:
+    """Return how a log was read."""
+    said = [f'read as: {log.read_as}'] if log.read_as else []
+    return said + [f'note: {line}' for line in log.notes]
 
 
 def run_simulate(args: argparse.Namespace) -> Done:
@@ -125,44 +109,33 @@ def run_simulate(args: argparse.Namespace) -> Done:
               if hasattr(args, name) and name != 'also'}
     table = simulate(dict(parse_effect(text) for text in args.effect), **chosen)
     write_table(args.output, table)
-    return Done(shown=[f'{counted(len(table), "row")}, stored in {args.output}'])
+    return Done(shown=[counted(len(table), 'row')], stored=[args.output])
 
 
 def run_noise(args: argparse.Namespace) -> Done:
     """Find a long rest, and compute the figures of its noise."""
     from ..noise import check_allantools, to_json
-    from ..report import write_page
     from ..report.stability import noise_page
 
     check_allantools()
     found, lines = _noise(args)
-    if args.report is not None:
-        with working('drawing the page'):
-            write_page(args.report, noise_page(found, str(args.recording)))
-        stored = [f'stored in {args.report}']
-    else:
-        stored = []
-    rating = rate_noise(found)
-    return Done({'recording': args.recording, **to_json(found), **rated(rating, args)},
-                [*lines, *_noise_lines(found), *stored, *rating_lines(rating, args)])
+    return Done({'recording': args.recording, **to_json(found)}, [*lines, *_noise_lines(found)],
+                rate_noise(found),
+                page=lambda: noise_page(found, str(args.recording)))
 
 
 def _noise(args: argparse.Namespace) -> tuple[NoiseFigures, list[str]]:
     """Return the figures, and how the recording was read."""
     from ..noise import noise_of
 
-    asked = log_options(args)
     calibration = args.calibration and stored_calibration(args.calibration)
-    if calibration and calibration.units.is_native:
-        asked = replace(asked, units=asked.units or 'native')
-    with open_log(args.recording, asked) as log:
+    with open_log(args.recording, log_options(args, calibration)) as log:
         with progress('samples') as moved:
             recording = _samples(log, args.recording, moved)
-        lines = [f'read as: {log.read_as}'] if log.read_as else []
-        lines += [f'note: {note}' for note in log.notes]
-        units = log.units
+        lines, units = _read_lines(log), log.units
     if calibration:
-        recording, units = _corrected_rest(recording, units, calibration)
+        recording = corrected(recording, calibration, units)
+        units = units_of('g') if units.is_native else units
     with progress('axes') as moved:
         return noise_of(recording, units, args.gravity, moved), lines
 
@@ -182,16 +155,6 @@ def _samples(log: OpenLog, path: Path, moved: Progress) -> Recording:
         return Recording(log.poses.columns, log.poses.row, log.poses.units, log.poses.sensor)
     raise InputError(f'{path} is a pose table, expected a recording',
                      'use the samples of a long rest, with their time')
-
-
-def _corrected_rest(recording: Recording, units: Units, calibration: Calibration
-                    ) -> tuple[Recording, Units]:
-    """Return the corrected recording, in g if it was in native units."""
-    own = calibration.in_units(units)
-    check_sensor(own, recording.sensor)
-    known = of_samples(recording.columns, len(recording), own.model)
-    made = recording.with_columns(reading=own.correct(recording.reading, known))
-    return made, units_of('g') if units.is_native else units
 
 
 def _noise_lines(found: NoiseFigures) -> Iterator[str | Table]:
@@ -221,3 +184,40 @@ def _noise_table(kind: str, axes: tuple[AxisNoise, ...]) -> Table:
     for label, unit, cells in figure_rows(axes):
         table.add_row(f'{label}, {unit}', *cells[:-1])
     return table
+
+
+def run_export(args: argparse.Namespace) -> Done:
+    """Write the file, and print what it does not hold on standard error."""
+    from ..stored.exports import export, Options, read_noise
+
+    calibration = stored_calibration(args.calibration)
+    chosen = Options(**{**given(Options, args), 'name': args.name or _name(args)})
+    noise = None if args.noise is None else read_noise(args.noise)
+    made = export(calibration, args.to, noise, chosen)
+    target = _target(args, made)
+    write_atomically(target, made.write)
+    console, is_file = Output(stderr=True), args.output != STANDARD_OUTPUT
+    for line in (*made.losses, *(f'note: {note}' for note in made.notes),
+                 *([f'stored in {target}'] if is_file else [])):
+        console.print(line)
+    return Done({'format': args.to, 'file': target if is_file else None,
+                 'calibration': args.calibration, 'leaves_mg': made.leaves_mg,
+                 'losses': [asdict(loss) for loss in made.details], 'notes': made.notes})
+
+
+def _name(args: argparse.Namespace) -> str:
+    """Return the name of the functions, from the name of the file to write."""
+    from ..stored.exports import identifier
+
+    named = args.output if args.output not in (None, STANDARD_OUTPUT) else args.calibration
+    return identifier(Path(named).stem)
+
+
+def _target(args: argparse.Namespace, made: Exported) -> Path:
+    """Return the file to write."""
+    if args.output == STANDARD_OUTPUT:
+        return Path(args.output)
+    target = (args.calibration.with_name(f'{args.calibration.stem}{made.suffix}')
+              if args.output is None else Path(args.output))
+    check_target(Target('output', target, 'export', '-o'), [args.calibration], force=args.force)
+    return target

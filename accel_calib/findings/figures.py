@@ -26,12 +26,12 @@ import numpy as np
 from ..calibrate import Calibration, Outlook, Quality, Verification
 from ..effects import AXES, effect_named, LADDER, value_unit
 from ..estimate import sensing_axes
+from ..finding import Rating
 from ..table import Floats
 from ..text import signed
 from ..units import MG
 
 if TYPE_CHECKING:
-    from .verdicts import Rating
     from ..refine import Refinement
 
 OFFSETS = ('offset.x', 'offset.y', 'offset.z')

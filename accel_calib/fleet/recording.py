@@ -34,9 +34,8 @@ from ..compare import NAMES, rotation_free
 from ..effects import known_code, MODELS
 from ..errors import AccelCalibError, crash_words, InputError, RefusedFitError
 from ..findings import residual_figures
-from ..intake import Intake, poses_of
 from ..logs import LogOptions
-from ..pipeline import calibrated, Outcome, Plan
+from ..pipeline import calibrated, Intake, Outcome, Plan, poses_of
 from ..table import Poses
 
 if TYPE_CHECKING:

@@ -198,7 +198,7 @@ def _bag(bag: Bag, options: LogOptions) -> OpenLog:
     blocks = imu_samples(bag, topic, sensor, chosen=bool(options.sensor), context=context,
                          notes=notes)
     # Drivers exist that publish g, although Imu messages are in m/s².
-    units = units_of(options.units or 'm/s2', options.gravity)
+    units = units_of(options.units or options.default_units or 'm/s2', options.gravity)
     return OpenLog(_checked(bag.path, blocks, units), bag.count(topic), units, sensor,
                    f'Imu messages of {topic} in {units.name}', noted=lambda: notes)
 

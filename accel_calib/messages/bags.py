@@ -11,8 +11,9 @@ Correction of a bag: a copy with a corrected Imu topic; all other messages are u
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 import errno
 import glob
 import os
@@ -26,11 +27,12 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from .correction import corrected, output_frame, output_scale
-from ..calibrate import Calibration, check_sensor, on_topics, Outside, SampleContext
+from ..calibrate import Calibration, on_topics
 from ..errors import InputError
 from ..logs import (
-    Bag, context_of, ContextTopics, damage_as_input_error, doubles_at, IMU_DOUBLES, Messages,
-    open_bag, Progress, put_doubles, renamed)
+    Bag, context_of, damage_as_input_error, doubles_at, IMU_DOUBLES, Messages, open_bag, Progress,
+    put_doubles, renamed)
+from ..pipeline import Correction
 from ..table import check_units, Recording
 from ..units import STANDARD_GRAVITY, UnitName, Units, units_of
 
@@ -46,8 +48,7 @@ _NO_HASH = 'RIHS01_' + 64 * '0'
 
 
 def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = '',
-                progress: Progress = lambda done, count: None,
-                report: Callable[[Outside], object] = lambda found: None, *,
+                progress: Progress = lambda done, count: None, *,
                 note: Callable[[str], object] = lambda line: None,
                 temperature_topic: str = '', supply_topic: str = '', units: UnitName = 'm/s2',
                 gravity: float = STANDARD_GRAVITY) -> int:
@@ -65,10 +66,9 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
         suffix of the storage. A copy of a ROS 1 bag is a ROS 1 bag.
     topic : str
         Imu topic, for a bag with several Imu topics.
-    progress, report, note : callable
-        Functions that are called after each block of messages; at the end for each quantity of the
-        context that left the range of the calibration; and with each note about topics and lost
-        messages.
+    progress, note : callable
+        Functions that are called after each block of messages, and with each note about topics,
+        lost messages, and what the messages lack or left the range of the calibration.
     temperature_topic, supply_topic : str
         As in `accel_calib.logs.context_of`.
     units : {'m/s2', 'g', 'native'}
@@ -96,18 +96,14 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
         _check_kind(bag, out)
         name = bag.imu_topic(topic)
         sensor = bag.first_frame_id(name)
-        check_sensor(calibration, sensor)
-        calibration = on_topics(calibration.in_units(units), calibration.frame)
+        correction = Correction(on_topics(calibration, calibration.frame), units, sensor)
         context = context_of(bag, name, sensor, temperature_topic, supply_topic)
         context = context.needed(bag, calibration.model.needs)
         with _new(out) as folder:
-            correction = _Correction(calibration, bag, name, sensor, context,
-                                     units_of(units, gravity), gravity)
-            count = _copy(bag, folder, out, correction, progress)
-        for each in correction.context.left:
-            report(each)
-        for line in filter(None, (*bag.notes, *context.notes, *bag.lost(name, count),
-                                  correction.context.lacking)):
+            imus = _Topic(bag, name, sensor, context.tracks(), correction,
+                          units_of(units, gravity), output_scale(correction.calibration, gravity))
+            count = _copy(bag, folder, out, imus, progress)
+        for line in (*bag.notes, *context.notes, *bag.lost(name, count), *correction.notes):
             note(line)
         return count
 
@@ -135,40 +131,40 @@ def _new(out: Path) -> Iterator[Path]:
         shutil.rmtree(folder)
 
 
-class _Correction:
-    """The correction of the messages of one topic."""
+@dataclass
+class _Topic:
+    """The messages of one Imu topic, with the context over time; `units` are those recorded."""
 
-    def __init__(self, calibration: Calibration, bag: Bag, topic: str, sensor: str,
-                 context: ContextTopics, units: Units, gravity: float) -> None:
-        self._calibration, self._bag, self._sensor = calibration, bag, sensor
-        self._frame_id = output_frame(calibration, sensor)
-        self._units, self._tracks = units, context.tracks()
-        self._scale = output_scale(calibration, gravity)
-        self.context = SampleContext(calibration)
-        self.topic, self.done = topic, 0
+    bag: Bag
+    name: str
+    sensor: str
+    tracks: Mapping[str, Any]
+    correction: Correction
+    units: Units
+    scale: float
+    done: int = 0
 
-    def __call__(self, raws: list[bytes]) -> Messages:
+    def corrected(self, raws: list[bytes]) -> Messages:
         """Return corrected messages in a new buffer."""
-        messages, context, _ = self._bag.imus(raws, self.topic, self.done, self._sensor)
+        own = self.correction.calibration
+        messages, columns, _ = self.bag.imus(raws, self.name, self.done, self.sensor)
+        samples = Recording(columns, np.arange(len(messages)))
         if not self.done:
-            check_units(Recording(context, np.arange(len(messages))), self._units,
-                        str(self._bag.path))
-        for key, track in self._tracks.items():
-            context[key] = track.at(context['time'])
+            check_units(samples, self.units, str(self.bag.path))
+        known = self.correction.context(samples.with_columns(
+            **{key: track.at(columns['time']) for key, track in self.tracks.items()}))
         doubles = doubles_at(messages, slice(0, IMU_DOUBLES))
-        known = self.context.of(context, len(doubles))
         with np.errstate(over='ignore', invalid='ignore'):  # damaged numbers become infinite
-            put_doubles(messages, corrected(self._calibration, doubles, known,
-                                            scale=self._scale))
+            put_doubles(messages, corrected(own, doubles, known, scale=self.scale))
         self.done += len(messages)
-        return renamed(messages, self._frame_id) if self._calibration.is_levelled else messages
+        return renamed(messages, output_frame(own, self.sensor)) if own.is_levelled else messages
 
 
-def _copy(bag: Bag, folder: Path, out: Path, correction: _Correction, progress: Progress) -> int:
+def _copy(bag: Bag, folder: Path, out: Path, imus: _Topic, progress: Progress) -> int:
     """Copy all messages, and correct those of the Imu topic."""
     target = folder / (out.stem if out.suffix in ('.mcap', '.db3') else out.name)
-    count = bag.count(correction.topic)
-    imu = {id(connection) for connection in bag.connections(correction.topic)}
+    count = bag.count(imus.name)
+    imu = {id(connection) for connection in bag.connections(imus.name)}
     written = 0
     writer = _writer(bag, target, out.suffix)
     with _full_disk(out), writer:
@@ -176,16 +172,16 @@ def _copy(bag: Bag, folder: Path, out: Path, correction: _Correction, progress: 
             outputs = _added(bag, writer)
         for block in bag.blocks():
             which = [k for k, (connection, _, _) in enumerate(block) if id(connection) in imu]
-            new = correction([block[k][2] for k in which]).each() if which else ()
+            new = imus.corrected([block[k][2] for k in which]).each() if which else ()
             changed = dict(zip(which, new, strict=True))
             with damage_as_input_error(bag.path), _full_disk(out):  # a stamp can be out of range
                 for k, (connection, stamp, raw) in enumerate(block):
                     writer.write(outputs[id(connection)], stamp, changed.get(k, raw))
             written += len(block)
-            progress(correction.done, count)
+            progress(imus.done, count)
     _check_copy(bag, target, written)
     (target if target.name == out.name else next(target.glob(f'*{out.suffix}'))).rename(out)
-    return correction.done
+    return imus.done
 
 
 @contextmanager

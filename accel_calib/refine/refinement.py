@@ -30,8 +30,8 @@ from .result import plain_name, PosePlan, Refinement, Stage, Verdict
 from .search import Found, search
 from .steps import advice_for, beside_walk, not_testable, steps_of, untestable, verdict_of
 from ..calibrate import (
-    BASES, Calibration, check_sensor, fit_findings, fit_poses, fit_with_fleet, FLEET, FleetPrior,
-    gated, in_g, OF_A_FIT, only_norm, posterior, quality_of, record_of, refuse_if_unfit, Rejected,
+    Calibration, check_sensor, fit_findings, fit_poses, fit_with_fleet, FLEET, FleetPrior, gated,
+    in_g, OF_A_FIT, only_norm, posterior, quality_of, record_of, refuse_if_unfit, Rejected,
     sound_rows, sure_rows, uncertainty_g, with_history, with_rest_noise)
 from ..effects import CHANGES, included, Model, MODELS, parameter_names, PROCESSES, with_vector
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
@@ -41,7 +41,7 @@ from ..finding import Finding, without as without_kinds
 from ..geometry import unit
 from ..table import check_units, Floats, Poses
 from ..text import counted
-from ..units import MG, Units
+from ..units import BASES, MG, Units
 
 _LEAST_POSES = 4
 """Smallest number of poses in which an effect can be found."""

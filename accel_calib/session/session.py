@@ -29,12 +29,12 @@ from .stream import Around, Reports, SILENT, StreamStatistics
 from .work import draw_poses, load_files, report_rating
 from .worker import answered, Event, Log, Mounting, Severity, ShowPoses, Still
 from ..calibrate import (
-    Calibration, FrameName, in_frame, mounting_of, mounting_words, on_topics, with_given_mounting)
+    Calibration, in_frame, mounting_of, mounting_words, on_topics, with_given_mounting)
 from ..compare import status
 from ..errors import InputError
 from ..table import Floats
 from ..text import counted
-from ..units import units_of
+from ..units import FrameName, units_of
 
 if TYPE_CHECKING:
     from ..findings import Rating

@@ -20,12 +20,13 @@ import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING, TypeVar
 
-from ..calibrate import FrameName, FRAMES, Method, METHODS, MODEL_NAMES
 from ..capture import CaptureSettings, CONTEXT, REPEATED, Repeated
 from ..effects import know_file, MODELS
 from ..errors import InputError
 from ..table import quantity_key
-from ..units import is_native, STANDARD_GRAVITY, UNIT_NAMES, UnitName
+from ..units import (
+    FrameName, FRAMES, is_native, Method, METHODS, MODEL_NAMES, STANDARD_GRAVITY, UNIT_NAMES,
+    UnitName)
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance

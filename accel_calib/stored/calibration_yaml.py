@@ -29,8 +29,8 @@ from .plain_yaml import (
     values_at)
 from .. import __version__
 from ..calibrate import (
-    Calibration, FleetPrior, FRAMES, gated, GyroBias, in_g, LARGEST_OFFSET_G, MODEL_NAMES,
-    mounting_figures, Quality, Rejected, RejectedKind, SampleNoise, STORED_METHODS)
+    Calibration, FleetPrior, gated, GyroBias, in_g, LARGEST_OFFSET_G, mounting_figures, Quality,
+    Rejected, RejectedKind, SampleNoise, STORED_METHODS)
 from ..disk import check_regular, write_atomically
 from ..effects import (
     CHANGES, Effect, effect_named, is_effect, Model, MODELS, parameter_names, PROCESSES)
@@ -40,7 +40,7 @@ from ..estimate import Prior
 from ..finding import Finding, KINDS, LEVELS, without
 from ..table import (
     Autopilot, check_values, column_of, COLUMNS, Floats, is_quantity, LARGEST, Poses)
-from ..units import UNIT_NAMES, Units
+from ..units import FRAMES, MODEL_NAMES, UNIT_NAMES, Units
 
 try:  # eight times as fast, but not in every build of PyYAML
     from yaml import CSafeDumper as SafeDumper

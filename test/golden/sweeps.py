@@ -12,8 +12,8 @@ from typing import Any
 
 import accel_calib as ac
 from accel_calib.calibrate import (
-    Calibration, fit_poses, FleetPrior, FRAMES, gated, gyro_bias_of, level, lies_in_cone,
-    next_pose, Rejected, set_heading, with_given_mounting)
+    Calibration, fit_poses, FleetPrior, gated, gyro_bias_of, level, lies_in_cone, next_pose,
+    Rejected, set_heading, with_given_mounting)
 from accel_calib.compare import compare
 from accel_calib.effects import CHANGES, effect_named, EFFECTS, MONOMIALS, PROCESSES
 from accel_calib.estimate import (
@@ -22,7 +22,7 @@ from accel_calib.finding import Finding, LEVELS
 from accel_calib.findings import Expected, LIMITS, rate
 from accel_calib.geometry import coverage
 from accel_calib.table import check_units, numbered, Poses
-from accel_calib.units import units_of
+from accel_calib.units import FRAMES, units_of
 from golden.driven import messages
 from golden.figures import attempt, of_expected, of_fit, those
 from inside import (

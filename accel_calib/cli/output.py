@@ -1,0 +1,138 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Text on the terminal: lines, tables, ratings in colour, progress.
+
+Lines break at words, at the width of the terminal or of ``COLUMNS``. A word that is longer, such
+as the name of a file, stays whole. An output whose encoding lacks a character gets a plain
+replacement, such as ``+-`` for ±, and control characters from files never reach the terminal.
+Progress is shown on standard error if it is a terminal.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+import re
+import sys
+from textwrap import wrap
+from typing import Any, TYPE_CHECKING
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from .options import plain_character, plain_handler
+from ..text import short
+
+if TYPE_CHECKING:
+    from ..logs import Progress
+
+_NO_BREAK = '\N{NO-BREAK SPACE}'
+_MARK = '\ue000'
+"""Stands for a letter of the rating while a line is broken."""
+
+_COLOURS = {'GOOD': 'bold green', 'USABLE': 'bold yellow', 'BAD': 'bold red'}
+
+_TIED = r'(?<=±) | (?=±)|(?<==) | (?==)|(?<=\d) (?=(mg|g|s|h|Hz|%|°|°C|m/s²|poses?)\b)'
+"""Spaces at which a line does not break: ``value ± sd``, ``p = 0.1``, ``3 mg``."""
+
+
+class Verdict(str):
+    """A line of text with a rating from a character on, which a terminal shows in colour."""
+
+    rating: str
+    start: int
+
+    def __new__(cls, line: str, rating: str, start: int = 0) -> Verdict:
+        """Return the line with these attributes."""
+        made = super().__new__(cls, line)
+        made.rating, made.start = rating, start
+        return made
+
+
+class Output(Console):
+    """A console that breaks lines at words, and takes text as it is, without markup."""
+
+    def __init__(self, stderr: bool = False) -> None:
+        super().__init__(stderr=stderr, highlight=False, markup=False, emoji=False)
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Return text with the replacements, so that tables have the right width."""
+        return super().render_str(shown(text, self.encoding), **options)
+
+    def print(self, *objects: Any, **options: Any) -> None:  # noqa: A003
+        """Print; lines of text break at words, and the rest of a line is indented."""
+        if len(objects) == 1 and isinstance(objects[0], str):
+            super().print(self._line(objects[0]), soft_wrap=True, **options)
+        else:
+            super().print(*objects, **options)
+
+    def _line(self, line: str) -> Text:
+        if not isinstance(line, Verdict):
+            return self.render_str('\n'.join(map(self._broken, line.split('\n'))))
+        end, mark = line.start + len(line.rating), _MARK * len(line.rating)
+        before, _, after = self._broken(f'{line[:line.start]}{mark}{line[end:]}').partition(mark)
+        return Text.assemble(self.render_str(before), (line.rating, _COLOURS[line.rating]),
+                             self.render_str(after))
+
+    def _broken(self, line: str) -> str:
+        tied = re.sub(_TIED, _NO_BREAK, line)
+        parts = wrap(tied, self.width, subsequent_indent='  ', break_long_words=False,
+                     break_on_hyphens=False)
+        return '\n'.join(parts).replace(_NO_BREAK, ' ') or line
+
+
+def shown(text: str, encoding: str) -> str:
+    """Return text in the characters of an encoding, without control characters."""
+    safe = ''.join(each if each.isprintable() or each == '\n' else plain_character(each)
+                   for each in text)
+    return safe.encode(encoding, plain_handler()).decode(encoding)
+
+
+def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
+    """Return a table whose first column holds names, and the others numbers."""
+    made = Table(title=title)
+    made.add_column(columns[0], overflow='fold')
+    for name in columns[1:]:
+        made.add_column(name, justify='right')
+    for row in rows:
+        made.add_row(*row)
+    return made
+
+
+def error_line(result: dict[str, Any]) -> str:
+    """Return the error of one of several inputs; empty if there is none."""
+    return f'{result["error"]}; {result["advice"]}' if 'error' in result else ''
+
+
+def short_if_known(value: float | None) -> str:
+    """Return a number in three digits, or that it is not known."""
+    return 'not known' if value is None else short(value)
+
+
+@contextmanager
+def progress(what: str) -> Iterator[Progress]:
+    """Show a progress bar, and yield the function that updates it."""
+    if not sys.stderr.isatty():
+        yield lambda done, count: None
+        return
+    from rich.progress import BarColumn, Progress as Bar, TextColumn, TimeRemainingColumn
+
+    columns = (BarColumn(), TextColumn('{task.description}'), TimeRemainingColumn())
+    with Bar(*columns, console=Output(stderr=True), transient=True) as bar:
+        task = bar.add_task(what, total=None)  # the bar moves to and fro until a number is known
+        yield lambda done, count: bar.update(task, completed=done, total=count,
+                                             description=f'{done:,} of {count:,} {what}')
+
+
+@contextmanager
+def working(what: str) -> Iterator[None]:
+    """Show that work of unknown length goes on."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    with Output(stderr=True).status(what):
+        yield
