@@ -415,4 +415,4 @@ def test_without_a_still_stretch_the_quietest_window_the_limit_and_a_wider_one_a
     advice = re.search(r'(\d+) with still_std_max (\S+)', result['advice'])
     assert advice is not None, result
     run('capture', log, '-o', tmp_path / 'p.csv', '--still-std-max', advice[2])
-    assert f'{advice[1]} poses in' in capsys.readouterr().out
+    assert f'captured {advice[1]} poses from' in capsys.readouterr().out
