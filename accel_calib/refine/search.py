@@ -310,6 +310,8 @@ def _settled(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterab
         seen.append(near.key)
         if _is_predicted(near, after):
             break
+    if settled is None and len(state.poses_g) < len(poses_g):  # the set has all poses
+        state = _fitted_without(state, poses_g, ())
     near = _at(linear, settled or Near(Set.of(linear), linear, None, None), poses_g)
     return _significant(state, near, trial)
 
@@ -405,8 +407,9 @@ def _at(linear: Linear, near: Near, poses_g: Poses) -> Near:
 
 
 def _fitted_without(state: State, poses_g: Poses, out: tuple[int, ...]) -> State:
-    """Return a model fitted to all poses but these."""
-    return fitted_state(state.model, without(poses_g, out)) or state
+    """Return a model fitted to all poses but these; with its values if the fit fails."""
+    kept = without(poses_g, out)
+    return fitted_state(state.model, kept) or State(judge(state.model, kept))
 
 
 def _visible(state: State, names: Iterable[str]) -> tuple[str, ...]:

@@ -35,6 +35,9 @@ FEW = 1
 """Trials per task in `make test`."""
 
 _NEVER = -1
+_REFUSAL = ['advice', 'error']
+"""Keys of the JSON of a command that has failed."""
+
 _DATE = re.compile(rb'\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d')
 
 
@@ -115,6 +118,8 @@ def contents(folder: Path) -> dict[str, object]:
 
 def _content(path: Path) -> object:
     """Return all but the date of a file; of a calibration its values and warnings of damage."""
+    if path.suffix == '.json' and b'"error"' in path.read_bytes():
+        return sorted({*json.loads(path.read_bytes())} & {*_REFUSAL})
     if '.yaml' not in path.name:
         return _DATE.sub(b'', path.read_bytes())
     try:
@@ -137,8 +142,9 @@ def main() -> None:
         for kind, at in sample(cases, FEW, seed):
             found = trial(task, start, work, kind, at)
             after = contents(work)
+            refusal = [_REFUSAL] if found['status'] == 2 else []
             found['torn'] = [name for name in {*before, *after} if after.get(name) not in (
-                before.get(name), complete.get(name))]
+                before.get(name), complete.get(name), *refusal)]
             found['left'] = [path.name for path in work.iterdir() if path.name[0] == '.']
             found['again'] = trial_again(task, work)
             after = contents(work)
