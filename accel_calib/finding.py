@@ -33,6 +33,7 @@ KINDS: Mapping[str, str] = MappingProxyType({
     'mounting': 'the mountings of calibrations differ',
     'edited': 'the file was edited by hand',
     'mounting_alone': 'offset and gain are not calibrated',
+    'thermal_alone': 'the offset over temperature is known, but not the offset and the gain',
     'partial': 'the poses lie near one direction',
     'outlier_not_certain': 'other poses may be wrong instead of those left out',
     'no_check': 'there are only as many poses as values',
@@ -42,6 +43,7 @@ KINDS: Mapping[str, str] = MappingProxyType({
     'doubtful': 'the sensor may have moved during poses that are used',
     'beyond_noise': 'the residuals are larger than the noise explains',
     'settling': 'the readings changed with time, and may change again',
+    'thermal_hysteresis': 'the readings differ between warming and cooling',
     'not_corrected': 'an effect cannot be corrected in single samples',
     'omitted': 'a smaller model omits what the poses do not determine',
     'new_orientations': 'the error in new orientations is larger than a limit',
@@ -81,7 +83,8 @@ STEPS: Mapping[str, str] = MappingProxyType({
 """Kinds of next steps and their meaning, in the order of a calibration."""
 
 _STEP_OF = {'flat_pose': 'level', 'mounting': 'level', 'changed': 'fit', 'edited': 'verify',
-            **dict.fromkeys(('not_calibrated', 'unnamed', 'noisy', 'not_seen'), 'record')}
+            **dict.fromkeys(('not_calibrated', 'unnamed', 'noisy', 'not_seen',
+                             'thermal_hysteresis'), 'record')}
 """Step by kind of finding; for other kinds, poses are to be taken."""
 
 _RANKS = {kind: rank for rank, kind in enumerate(KINDS)}

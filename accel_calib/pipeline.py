@@ -12,7 +12,7 @@ samples; `Correction` does so block by block.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -23,12 +23,15 @@ from typing import Any, Literal, TYPE_CHECKING, TypeVar
 import numpy as np
 
 from .calibrate import (
-    Calibration, check_sensor, directions_of, fit_partial, fit_poses, fit_with_fleet,
-    flat_direction, FleetPrior, level, level_by_rows, lies_in_cone, PRIOR, SampleContext)
-from .capture import capture, Captured, settings_from
+    Calibration, check_sensor, Curve, curve_of, directions_of, fit_partial, fit_poses,
+    fit_with_fleet, flat_direction, FleetPrior, level, level_by_rows, lies_in_cone, PRIOR,
+    SampleContext, thermal_alone, with_curve, without_curve)
+from .capture import (
+    capture, Captured, cells_of, is_turned_over, LEAST_RANGE, Ramp, ramp_of, settings_from)
 from .effects import Context, LADDER, Model, PROCESSES
-from .errors import InputError, RefusedFitError
+from .errors import InputError, RefusedFitError, saying
 from .findings import rate, Rating
+from .geometry import unit
 from .logs import Frame, LogOptions, open_log, OpenLog, Piped, Progress
 from .table import check_units, Poses, Recording, Table
 from .text import counted, now, short
@@ -38,6 +41,9 @@ if TYPE_CHECKING:
     from .refine import Refinement
 
 Source = Path | Piped | Frame | Poses | Recording
+
+_ONE_DIRECTION = math.cos(math.radians(6.0))
+"""Cosine of the largest angle between readings of a board that was not turned."""
 
 _FEW = 6
 """Fewer poses than these are too few for a calibration with all axes."""
@@ -189,6 +195,77 @@ def _nothing_still(source: str, found: Captured, units: Units, settings: Mapping
                       f'for some seconds{tried}')
 
 
+@dataclass(frozen=True)
+class RampIntake:
+    """The ramp of a still board; other fields as those of `Intake`."""
+
+    ramp: Ramp
+    units: Units
+    read_as: str = ''
+    notes: tuple[str, ...] = ()
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """Return `read_as`, the range of the temperature and the notes."""
+        low, high = self.ramp.range_c
+        words = (f'a still board for {self.ramp.seconds / 60.0:.0f} min, from {low:.1f} to '
+                 f'{high:.1f} °C')
+        return tuple(filter(None, (self.read_as and f'read as: {self.read_as}', words,
+                                   *self.notes, *self.ramp.notes)))
+
+
+def ramp_or_poses(source: Path | Piped | Frame, options: LogOptions = LogOptions(),
+                  settings: Mapping[str, Any] = {},
+                  progress: Progress = lambda done, count: None) -> Intake | RampIntake:
+    """
+    Return the ramp of a still board, or the poses of a log in many directions.
+
+    Parameters and errors as in `poses_of`. Further InputErrors are those of a ramp
+    (`accel_calib.capture.ramp`).
+
+    """
+    with open_log(source, options) as log, saying(log.read_as):
+        table = log.poses
+        if table is not None and not _is_slow_recording(table):
+            return Intake(table, log.units, log.read_as, log.notes)
+        samples = log.watched(progress) if table is None else (Recording(
+            table.columns, table.row, table.units, table.sensor, table.autopilot),)
+        cells = cells_of(samples, log.units)
+        if not is_turned_over(cells):
+            return RampIntake(ramp_of(cells), log.units, log.read_as, log.notes)
+    return poses_of(source, options, settings, progress)
+
+
+def still_ramp(source: Path | Piped | Frame, options: LogOptions, found: Intake
+               ) -> RampIntake | None:
+    """
+    Return the ramp of a log whose poses all lie in one direction; None if it has no ramp.
+
+    A log of one direction does not determine a calibration. If its temperature spans
+    `LEAST_RANGE`, it is that of a still board that warms up.
+
+    """
+    if not found.captured or not _is_one_direction(found.poses):
+        return None
+    with open_log(source, options) as log:
+        if log.units.is_native:
+            return None
+        cells = cells_of(log.blocks, log.units)
+        low, high = cells.range_c
+        return (RampIntake(ramp_of(cells), log.units, log.read_as, log.notes)
+                if high - low >= LEAST_RANGE else None)
+
+
+def _is_slow_recording(poses: Poses) -> bool:
+    """Return whether a table has the form of poses, but is of one board that was not turned."""
+    return 'time' in poses and 'count' not in poses and _is_one_direction(poses)
+
+
+def _is_one_direction(poses: Poses) -> bool:
+    up = unit(poses.reading)
+    return bool(np.all(up @ up[0] > _ONE_DIRECTION))
+
+
 Flat = int | Literal['first', 'last'] | None
 """Row of the flat pose, 1-based, or the first or last pose; None: the mounting stays open."""
 
@@ -337,6 +414,66 @@ def _mounted_as(before: Calibration, calibration: Calibration) -> Calibration:
     headed = replace(calibration, model=Model(calibration.model.values, before.rotation),
                      frame=before.frame)
     return level(headed, reading, before.frame, context)
+
+
+@dataclass(frozen=True)
+class ThermalOutcome:
+    """A calibration with the offset over temperature, and the curve of this offset."""
+
+    calibration: Calibration
+    curve: Curve
+
+    @cached_property
+    def rating(self) -> Rating:
+        """Return whether the calibration is good, and the next step."""
+        return rate(self.calibration)
+
+
+def thermally_calibrated(ramps: Sequence[Ramp], units: Units, poses: Poses | None = None,
+                         plan: Plan = Plan()) -> ThermalOutcome:
+    """
+    Fit the offset over temperature to ramps of a still board, and a calibration to poses, if any.
+
+    Parameters
+    ----------
+    ramps : sequence of Ramp
+        One or more; each has its own orientation.
+    units : Units
+        Unit of the readings of the calibration, and of the poses.
+    poses : Poses, optional
+        Poses of the same sensor in many directions, with their temperature.
+    plan : Plan
+        How to fit and level the poses; nothing is refined.
+
+    Raises
+    ------
+    RefusedFitError, InputError
+        As in `calibrated`, or if the logs are of several sensors.
+
+    """
+    _check_one_sensor([*(each.stretches for each in ramps), *([] if poses is None else [poses])])
+    curve = curve_of(ramps)
+    if poses is None:
+        made = thermal_alone(curve, units, sensor=plan.sensor, date=now())
+        rows = made.poses
+    else:
+        steady = without_curve(curve, poses, units)
+        fitted = calibrated(steady, units, replace(
+            plan, refined=False, flat=None, nose_down=None)).calibration
+        made, rows = with_curve(fitted, curve, poses), poses
+    return ThermalOutcome(level_by_rows(
+        made, rows, plan.frame, _row(rows, plan.flat), plan.nose_down), curve)
+
+
+def _check_one_sensor(tables: Sequence[Poses]) -> None:
+    """Refuse tables of several sensors, by device id in an autopilot, or else by name."""
+    devices = {each.autopilot.device_id for each in tables if each.autopilot} - {None}
+    names = {each.sensor for each in tables if not each.autopilot} - {''}
+    for known in (devices, names):
+        if len(known) > 1:
+            raise InputError(f'the logs are of the sensors {", ".join(sorted(map(str, known)))}, '
+                             'expected one sensor', 'choose one with --sensor, or give the logs '
+                             'of one sensor')
 
 
 def _row(poses: Poses, flat: Flat) -> int | None:

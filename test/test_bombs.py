@@ -325,7 +325,8 @@ def test_only_regular_files_are_read(tmp_path: Path) -> None:
 COMMANDS = [('fit', '{}'), ('fit', '{}', '--rows', '1:9'), ('verify', '{}', '-c', '{yaml}'),
             ('verify', '{yaml}', '-c', '{}'),
             ('refine', '{}'), ('calibrate', '{}', '-o', '{out}'), ('capture', '{}', '-o', '{out}'),
-            ('noise', '{}'), ('apply', '{}', '-c', '{yaml}', '-o', '{out}'),
+            ('noise', '{}'), ('thermal', '{}', '-o', '{out}'),
+            ('apply', '{}', '-c', '{yaml}', '-o', '{out}'),
             ('report', '{}', '-o', '{out}'), ('compare', '{}', '{}'), ('history', '{}'),
             ('export', '{}', '--to', 'c'),
             ('export', '{yaml}', '--to', 'kalibr', '--noise', '{}')]

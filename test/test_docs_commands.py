@@ -36,6 +36,7 @@ from faults.sample import sample
 from inside import COMMANDS, main, model_with, simulate_recording, spread_directions
 import numpy as np
 import pytest
+import ramps
 from shared import run_snippets
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -109,6 +110,9 @@ FILES = {
     'recording': bag,
     'recording.mcap': bag_file,
     'recordings/': fleet,
+    'warm_up.csv': lambda path: write_table(path, ramps.ramp(3)),
+    'warm_up.ulg': lambda path: ramps.write_ulog(path, ramps.ramp(3)),
+    'twelve_poses.csv': lambda path: write_table(path, ramps.twelve_poses(4)),
     'recording.csv': lambda path: write_table(path, recording(poses=14, seed=9)),
     'poses.csv': lambda path: write_table(path, poses(8)),
     'other_poses.csv': lambda path: write_table(path, poses(18)),

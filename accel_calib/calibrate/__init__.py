@@ -9,6 +9,7 @@ From poses to a calibration.
 rejects implausible results. `rest_noise` adds the figures of the gyro and of the samples.
 `mounting` computes the mounting and detects wiring faults. `pose_planning` explains what poses do
 not determine and plans the next pose. `context` compares samples with the range of a calibration.
+`thermal` is for a still board whose temperature changes.
 
 """
 
@@ -29,16 +30,18 @@ from .quality import (
     deviations_g, errors_after, errors_before, fit_findings, gated, in_g, LARGEST_OFFSET_G,
     OF_A_FIT, quality_of, record_of, uncertainty_g, Verification, verify)
 from .rest_noise import gyro_bias_of, GyroBias, sample_noise_of, SampleNoise, with_rest_noise
+from .thermal import Curve, curve_of, thermal_alone, with_curve, without_curve
 
 __all__ = ['FLEET', 'LARGEST_OFFSET_G', 'OF_A_FIT', 'PRIOR', 'STORED_METHODS', 'USES_LIMIT',
-           'Calibration', 'FleetPrior', 'GyroBias', 'NextPose', 'Outlook', 'Outside', 'Quality',
-           'Rejected', 'RejectedKind', 'SampleContext', 'SampleNoise', 'Verification',
-           'angle_words', 'check_sensor', 'converted', 'determines', 'deviations_g',
+           'Calibration', 'Curve', 'FleetPrior', 'GyroBias', 'NextPose', 'Outlook', 'Outside',
+           'Quality', 'Rejected', 'RejectedKind', 'SampleContext', 'SampleNoise', 'Verification',
+           'angle_words', 'check_sensor', 'converted', 'curve_of', 'determines', 'deviations_g',
            'directions_of', 'errors_after', 'errors_before', 'fit_findings', 'fit_partial',
            'fit_poses', 'fit_unknown', 'fit_with_fleet', 'flat_direction', 'gated', 'gyro_bias_of',
            'in_frame', 'in_g', 'level', 'level_by_rows', 'lies_in_cone', 'mounting_figures',
            'mounting_of', 'mounting_only', 'mounting_words', 'next_pose', 'of_samples',
            'on_topics', 'only_norm', 'outlook', 'outside', 'posterior', 'quality_of', 'record_of',
            'refuse_if_unfit', 'sample_noise_of', 'set_heading', 'sound_rows', 'sure_rows',
-           'thermal_stream', 'uncertainty_g', 'verify', 'with_given_mounting', 'with_history',
-           'with_previous', 'with_rest_noise']
+           'thermal_alone', 'thermal_stream', 'uncertainty_g', 'verify', 'with_curve',
+           'with_given_mounting', 'with_history', 'with_previous', 'with_rest_noise',
+           'without_curve']

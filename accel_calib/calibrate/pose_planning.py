@@ -28,7 +28,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from .calibration import Calibration, ORIENTED
+from .calibration import Calibration, ORIENTED, PRIOR
 from ..errors import RefusedFitError
 from ..estimate import (
     Combination, dilution, error_left_in, Identifiability, identifiability, information_of,
@@ -200,7 +200,8 @@ def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
     """
     Return what the poses of a calibration determine, and the next pose for the model asked for.
 
-    Effects are taken in the middle of their range.
+    Effects are taken in the middle of their range. The uncertainty of a mounting alone, and of an
+    offset over temperature alone, is not known.
 
     """
     poses = calibration.used_poses
@@ -208,7 +209,8 @@ def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
     force = np.linalg.solve(mat_w, (calibration.units.to_g(poses.reading) - vec_v).T).T
     directions = force / np.linalg.norm(force, axis=1, keepdims=True)
     noise = pose_noise(poses.noise, directions)
-    uncertainty = _uncertainty(calibration) if calibration.model.effects else np.nan
+    alone = calibration.method == PRIOR and not calibration.form.effects
+    uncertainty = np.nan if alone or not calibration.model.effects else _uncertainty(calibration)
     planned = asked
     if asked in ('auto', ORIENTED):  # with wrong orientations model 12 became 10
         planned = ORIENTED if calibration.form.known_orientation else NORM_MODELS[-1]

@@ -6,15 +6,18 @@ From samples to still poses. The node and recordings use the same rule.
 
 `chunks` sums the samples over short intervals of header time. `rule` decides whether the sensor is
 still in each chunk, from the arithmetic in `trend`. `dwell` joins still chunks to dwells, and
-accepts or rejects each. `detector` is the entry point, and makes the pose table.
+accepts or rejects each. `detector` is the entry point, and makes the pose table. `ramp` makes the
+stretches of a still board whose temperature changes.
 
 """
 
 from .chunks import CaptureSettings, CONTEXT, REPEATED, Repeated, settings_from
 from .detector import capture, Captured, poses_from, samples_of, select, StillDetector
 from .dwell import Dwell
+from .ramp import Cells, cells_of, FASTEST, is_turned_over, LEAST_RANGE, Ramp, ramp_of
 from .rule import rounding_left
 
-__all__ = ['CONTEXT', 'REPEATED', 'CaptureSettings', 'Captured', 'Dwell', 'Repeated',
-           'StillDetector', 'capture', 'poses_from', 'rounding_left', 'samples_of', 'select',
+__all__ = ['CONTEXT', 'FASTEST', 'LEAST_RANGE', 'REPEATED', 'Captured', 'CaptureSettings',
+           'Cells', 'Dwell', 'Ramp', 'Repeated', 'StillDetector', 'capture', 'cells_of',
+           'is_turned_over', 'poses_from', 'ramp_of', 'rounding_left', 'samples_of', 'select',
            'settings_from']

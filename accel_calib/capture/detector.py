@@ -296,11 +296,12 @@ def samples_of(recording: Recording, start: int, stop: int, context: Sequence[st
         if name in recording:
             samples[row] = recording[name][which]
     if not np.isfinite(samples[:4].sum()):
-        _refuse(samples[:4], recording.row[which])
+        check_finite(samples[:4], recording.row[which])
     return samples
 
 
-def _refuse(given: Floats, row: NDArray[np.int64]) -> None:
+def check_finite(given: Floats, row: NDArray[np.int64]) -> None:
+    """Raise InputError if a time or a reading, (k, n), is not finite."""
     bad = np.flatnonzero(~np.isfinite(given).all(axis=0))
     if len(bad):
         message = (f'row {row[bad[0]]} holds a time or reading that is not finite, expected '

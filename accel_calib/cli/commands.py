@@ -165,6 +165,21 @@ def _calibrate(made: options.Parser) -> None:
     options.add_capture(made)
 
 
+def _thermal(made: options.Parser) -> None:
+    add = made.add_argument
+    add('logs', nargs='+', type=options.log_path, metavar='LOG', help='log of a still board whose '
+        'temperature changes; several are fitted together, and one of them may be of poses in '
+        'many directions; - for standard input')
+    add('-o', '--output', type=Path, default=Path('calibration.yaml'), metavar='FILE',
+        help='calibration to write (default: %(default)s); the page has the same name with .html')
+    add('--flat', type=_flat, metavar='ROW', help='pose with the robot level: its row, 1-based, '
+        'or first or last; it determines the mounting')
+    options.add_mounting(made)
+    options.share(made, '--keep-bad', '--json')
+    options.add_log(made)
+    options.add_capture(made)
+
+
 def _verify(made: options.Parser) -> None:
     options.add_poses(made)
     options.add_stored(made, required=True)
@@ -375,6 +390,10 @@ COMMANDS = {
     'calibrate': Command(
         'make a calibration, a page and a verdict from any log', 'fit',
         'accel-calib calibrate log.csv --flat last', _calibrate, 'calibration', 'log'),
+    'thermal': Command(
+        'fit the offset over temperature to logs of a still board that warms up', 'thermal',
+        'accel-calib thermal warm_up.ulg poses.ulg -o calibration.yaml', _thermal, 'calibration',
+        'logs'),
     'capture': Command(
         'find the still stretches of a recording and write the pose table', 'recordings',
         'accel-calib capture recording.mcap -o poses.csv', _capture, 'table'),

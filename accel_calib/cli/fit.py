@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
@@ -25,7 +25,7 @@ from ..errors import InputError, system_error
 from ..estimate import NORM_MODELS
 from ..findings import (
     calibration_json, effect_figures, linear_figures, rate_refinement, refinement_json)
-from ..pipeline import calibrated, Intake, Outcome, Plan
+from ..pipeline import calibrated, Intake, Outcome, Plan, still_ramp, ThermalOutcome
 from ..stored import write_calibration
 from ..text import counted, listed, now, short, with_sd
 from ..units import MG
@@ -37,42 +37,45 @@ if TYPE_CHECKING:
 
 def run_fit(args: argparse.Namespace) -> Done:
     """Fit and store a calibration."""
-    found, outcome = _outcome(args, args.poses, refined=False)
+    with intake(args, args.poses) as found, working('fitting'):
+        rows = rows_between(found.poses, args.rows) if args.rows else None
+        outcome = calibrated(found.poses, found.units, plan_of(args, rows=rows, refined=False))
     calibration = outcome.calibration
-    ahead, (lines, stored) = outlook(calibration, args.model), _store(args, outcome)
+    ahead, (lines, stored) = outlook(calibration, args.model), store(args, outcome)
     return Done(
         {'file': args.poses, **calibration_json(calibration, ahead), 'read_as': found.read_as,
          'read_lines': found.lines},
         [*found.lines, *calibration_lines(calibration),
          f'model {calibration.name}: {calibration.reason}',
          f'next pose: {ahead.next_pose.words}', *lines],
-        outcome.rating, _status(outcome), stored,
+        outcome.rating, status_of(outcome), stored,
         partial(_page, args, args.poses, found, outcome))
 
 
 def run_calibrate(args: argparse.Namespace) -> Done:
     """Calibrate, store, and write the page."""
-    found, outcome = _outcome(args, args.log)
+    with intake(args, args.log) as found, working('fitting'):
+        ramp = still_ramp(args.log, log_options(args), found)
+        if ramp is not None:
+            from .thermal import thermal_done
+
+            return thermal_done(args, [args.log], [ramp],
+                                'its temperature changes: fitted as by accel-calib thermal')
+        outcome = calibrated(found.poses, found.units, plan_of(args))
     calibration, refinement = outcome.calibration, outcome.refinement
-    lines, stored = _store(args, outcome)
+    lines, stored = store(args, outcome)
     return Done(
         {'file': args.log, **calibration_json(calibration, outlook(calibration, 'auto')),
          'read_as': found.read_as, 'read_lines': found.lines, 'refined': outcome.line,
          'refinement': None if refinement is None else refinement_json(refinement)},
         [*found.lines, *calibration_lines(calibration), outcome.line, *lines,
-         *_page_beside(args, found, outcome)],
-        outcome.rating, _status(outcome), stored)
+         *page_beside(args, partial(_page, args, args.log, found, outcome))],
+        outcome.rating, status_of(outcome), stored)
 
 
-def _status(outcome: Outcome) -> int:
+def status_of(outcome: Outcome | ThermalOutcome) -> int:
+    """Return the exit status for a calibration."""
     return FAILED if outcome.rating.name == 'BAD' else 0
-
-
-def _outcome(args: argparse.Namespace, log: Path, **more: Any) -> tuple[Intake, Outcome]:
-    """Return the poses of a log, and the calibration that the options ask for."""
-    with intake(args, log) as found, working('fitting'):
-        rows = rows_between(found.poses, args.rows) if getattr(args, 'rows', None) else None
-        return found, calibrated(found.poses, found.units, plan_of(args, rows=rows, **more))
 
 
 def plan_of(args: argparse.Namespace, **more: Any) -> Plan:
@@ -93,7 +96,8 @@ def plan_of(args: argparse.Namespace, **more: Any) -> Plan:
     return plan
 
 
-def _store(args: argparse.Namespace, outcome: Outcome) -> tuple[list[str], list[Path]]:
+def store(args: argparse.Namespace, outcome: Outcome | ThermalOutcome
+          ) -> tuple[list[str], list[Path]]:
     """Write a calibration unless it is BAD; return why not, and the files written."""
     if args.output is None:
         return [], []
@@ -111,7 +115,7 @@ def _page(args: argparse.Namespace, log: Path, found: Intake, outcome: Outcome) 
                             stored=str(args.output or 'calibration.yaml'))
 
 
-def _page_beside(args: argparse.Namespace, found: Intake, outcome: Outcome) -> Iterator[str]:
+def page_beside(args: argparse.Namespace, page_of: Callable[[], str]) -> Iterator[str]:
     """Write the page beside the calibration, if that is possible; yield a line about it."""
     from ..report import has_matplotlib, write_page
 
@@ -123,7 +127,7 @@ def _page_beside(args: argparse.Namespace, found: Intake, outcome: Outcome) -> I
         return
     try:
         with working('drawing the page'):
-            write_page(page, _page(args, args.log, found, outcome))
+            write_page(page, page_of())
         yield f'page: {page}'
     except OSError as err:  # the calibration is stored
         yield f'no page {page}: {system_error(err)}'

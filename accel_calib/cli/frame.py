@@ -47,9 +47,12 @@ if TYPE_CHECKING:
 FAILED = 1
 """Exit status for a result that is BAD, or if a check that was asked for fails."""
 
-_INPUTS = ('poses', 'recording', 'log', 'calibration', 'calibrations', 'noise')
+_INPUTS = ('poses', 'recording', 'log', 'logs', 'calibration', 'calibrations', 'noise')
 _OUTPUTS = {'json': 'result', 'report': 'page', 'plan': 'table', 'figures': ''}
 """Kind of the file that each option writes, besides ``-o``."""
+
+_WITH_PAGE = ('calibrate', 'thermal')
+"""Commands that write a page beside the calibration."""
 
 _SUFFIXES = {'calibration': '.yaml', 'page': '.html', 'table': '.csv'}
 _KINDS = {'calibration': rb'format: accel_calib', 'page': rb'<!DOCTYPE html',
@@ -300,7 +303,7 @@ def _targets(args: argparse.Namespace, each: Sequence[argparse.Namespace]) -> It
         else:
             raise InputError(f'{target.option} {target.path} is not a folder, expected a folder '
                              f'for {counted(len(each), "table")}', 'use an existing folder')
-        if args.command == 'calibrate' and target.name == 'output':
+        if args.command in _WITH_PAGE and target.name == 'output':
             yield Target('page', target.path.with_suffix('.html'), 'page', 'the page of -o')
 
 

@@ -114,6 +114,10 @@ def _warming_squared(context: Mapping[str, Any], shape: Floats) -> Any:
     return _warming(context, shape) ** 2
 
 
+def _warming_cubed(context: Mapping[str, Any], shape: Floats) -> Any:
+    return _warming(context, shape) ** 3
+
+
 def _lagged_warming(key: str) -> Factor:
     """Return the factor of an effect whose acting temperature is the column `key`."""
     def factor(context: Mapping[str, Any], shape: Floats) -> Any:
@@ -255,6 +259,17 @@ EFFECTS: dict[str, Effect] = {
                            output=_on_grid),
 }
 """All effects that are functions of the force and the context."""
+
+OF_RAMPS: dict[str, Effect] = {
+    'offset_temperature_cubic': _in_time(
+        'offset that changes with the cube of temperature', 'third-order TCO', AXES, 'g/°C³',
+        1e-7, terms=by_axis(ONE), factor=_warming_cubed, needs=('temperature',))}
+"""Effects that only the ramp of a still board shows (`accel_calib.calibrate.thermal`). Still poses
+are too few to distinguish them, so that `accel_calib.refine` does not try them."""
+
+OFFSET_POWERS = ('offset', 'offset_temperature', 'offset_temperature_quadratic',
+                 'offset_temperature_cubic')
+"""The effects that make the offset a polynomial in the temperature, by the power."""
 
 WANDER = 'offset_wander'
 PROCESSES: dict[str, Effect] = {
@@ -458,7 +473,8 @@ def is_effect(name: str) -> bool:
 @cache
 def effect_named(name: str) -> Effect:
     """Return the effect with this name: of the catalogue, own, a covariate, or a curve."""
-    found = EFFECTS.get(name) or PROCESSES.get(name) or CHANGES.get(name) or OWN.get(name)
+    found = (EFFECTS.get(name) or OF_RAMPS.get(name) or PROCESSES.get(name) or CHANGES.get(name)
+             or OWN.get(name))
     return found or (_covariate(name) if kind_of(name) in COVARIATES else _empirical(name))
 
 

@@ -23,7 +23,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from ..calibrate import Calibration, Outlook, Quality, Verification
+from ..calibrate import Calibration, Curve, Outlook, Quality, Verification
 from ..effects import AXES, effect_named, LADDER, value_unit
 from ..estimate import sensing_axes
 from ..finding import Rating
@@ -206,6 +206,17 @@ def refinement_json(result: Refinement) -> dict[str, Any]:
         'advice': result.advice, 'plan': result.plan.lines,
         'warnings': result.calibration.warnings,
         'refusal': result.refusal[0] if result.refusal else None}
+
+
+def curve_json(curve: Curve) -> dict[str, Any]:
+    """Return the offset over temperature for JSON; values of order k are in mg/°C^k."""
+    return {
+        'reference_c': curve.reference_c, 'range_c': curve.range_c, 'degree': curve.degree,
+        'coefficients': dict(zip(AXES, (curve.values * MG).T, strict=True)),
+        'coefficients_sd': dict(zip(AXES, (curve.deviations * MG).T, strict=True)),
+        'band_mg': curve.band_mg, 'change_mg': curve.change_mg, 'residual_mg': curve.residual_mg,
+        'held_out_mg': curve.held_out_mg, 'hysteresis_mg': curve.hysteresis_mg,
+        'lag_s': curve.lag_s}
 
 
 def rating_json(rating: Rating, kind: str, text: str, command: str) -> dict[str, Any]:

@@ -116,10 +116,14 @@ def _too_large(expected: Expected, refinement: Refinement | None) -> Iterator[Fi
 
 
 def _limited(expected: Expected) -> Iterator[Finding]:
-    """Yield a finding if the calibration is partial, or only a mounting."""
+    """Yield a finding if the calibration is partial, a mounting, or a curve over temperature."""
     if not expected.calibration.model.effects:
         yield Finding('mounting_alone', 'it is a mounting alone: offset and gain are not '
                       'calibrated', _more_poses(expected), 'USABLE')
+    elif expected.is_partial and not expected.calibration.form.effects:
+        yield Finding('thermal_alone', 'it is the offset over temperature alone: offset and gain '
+                      'are not calibrated', 'run thermal with a log of twelve poses, too, or '
+                      'calibrate in the autopilot after this', 'USABLE')
     elif expected.is_partial:
         yield Finding('partial', 'the poses lie near one direction: in other orientations the '
                       f'error is up to {mg(expected.worst_mg)}', _more_poses(expected), 'USABLE')

@@ -118,7 +118,7 @@ def calibration_page(calibration: Calibration, rating: Rating, source: str, *,
     title = f'{what} of {name}' if name else what
     about = [source, f'sensor {calibration.sensor}' if calibration.sensor else '',
              f'fitted {calibration.date}' if calibration.date else '']
-    body = [_key_numbers(calibration, residuals, checked), _values(calibration),
+    body = [_key_numbers(calibration, residuals, checked), values_section(calibration),
             _covered(calibration, residuals, plan=refinement is None and checked is None),
             section('Before and after', figures([of_before_after(
                 residuals, (checked or calibration.quality).noise_floor_mg)], 'wide')),
@@ -180,7 +180,7 @@ def _remarks(calibration: Calibration, residuals: Residuals, used: Refinement | 
         f'row {row}: {reason}' for row, reason in sorted(residuals.reasons.items())))
 
 
-def _values(calibration: Calibration) -> str:
+def values_section(calibration: Calibration) -> str:
     """Return the section with the values of the calibration."""
     rows = [*_linear_rows(calibration), *_effect_rows(calibration)]
     if calibration.is_levelled:

@@ -182,7 +182,8 @@ def _run(path: Path, rng: Rng) -> object:
                ['export', file, '--to', 'json', '-o', made], ['export', file, '--to', 'px4']]
     of_log = [['capture', file, '-o', made], ['fit', file, '-o', made, '--json', '-'],
               ['verify', file, '-c', good], ['apply', file, '-c', good, '-o', made],
-              ['calibrate', file, '-o', made, '--no-refine', '--json', '-'], ['noise', file]]
+              ['calibrate', file, '-o', made, '--no-refine', '--json', '-'], ['noise', file],
+              ['thermal', file, '-o', made, '--json', '-']]
     commands = of_yaml if path.suffix == '.yaml' else of_log
     return checked([*commands[int(rng.integers(len(commands)))]], out)
 

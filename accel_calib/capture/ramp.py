@@ -1,0 +1,320 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+From the samples of a still board whose temperature changes to stretches of equal duration.
+
+The samples are summed over cells of 1 s, so that the memory does not grow with the sample rate.
+Cells in which the board shakes are left out. The other cells are averaged over at most
+`_STRETCHES` stretches. The noise of a stretch is that of its mean: it comes from the second
+differences of successive means, which neither a slope nor a slow change contributes to, and which
+contain the noise that is correlated within a stretch.
+
+A ramp is refused, in one line, if it cannot show what temperature does:
+
+- there is no temperature, or it spans less than `LEAST_RANGE`;
+- the board was turned: its direction leaves the first one by more than `_TURNED`;
+- the board was shifted: the readings jump between two neighbours by more than `_JUMP_G`, and by
+  more than their noise, while a polynomial in the temperature does not. A slow tilt during a
+  single ramp looks like the temperature, and is not seen;
+- the ramp is too fast for the thermometer. Stretches with a rate above `FASTEST` are left out, and
+  the others must span `LEAST_RANGE`. A thermometer in the package of the sensor lags by about
+  10 s. At 5 °C/min it is then 0.8 °C behind, which is 0.8 mg in a common part of 1 mg/°C.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .detector import check_finite
+from ..errors import InputError
+from ..geometry import unit
+from ..table import Autopilot, Floats, numbered, Poses, Recording
+from ..text import counted
+from ..units import MG, Units
+
+LEAST_RANGE = 5.0
+"""Smallest range of the temperature of a ramp [°C]; the autopilots ask for 10 °C or more."""
+
+FASTEST = 5.0
+"""Largest rate of the temperature [°C/min]."""
+
+_STRETCHES, _LEAST_STRETCHES = 240, 30
+_RATE_OVER_S = 60.0
+_SHAKEN, _SHAKEN_G = 6.0, 0.005
+"""A cell is shaken if its deviation is above both: relative to the median, and absolute [g]."""
+
+_TURNED, _FIRST = np.radians(6.0), 10
+"""Angle at which a board counts as turned [rad]; cells that state its first direction."""
+
+_LEAST_DIRECTIONS = 4
+_APART = np.radians(20.0)
+"""Number of rests in directions this far apart that make a log one of poses."""
+
+_REST_S = 2
+"""Successive still cells of a rest in `is_turned_over`."""
+
+_JUMP_G, _JUMP_NOISES, _NEIGHBOURS = 0.003, 8.0, 4
+_DEGREE = 3
+
+
+@dataclass(frozen=True)
+class Cells:
+    """
+    Averages of a log over cells of 1 s, in order of time.
+
+    Parameters
+    ----------
+    time, temperature, count : (m,) array
+        Means [s], [°C], and number of samples; the temperature is NaN where it is not known.
+    reading, std : (m, 3) array
+        Mean and standard deviation of the readings [g].
+    sensor, autopilot : str, Autopilot or None
+        As in `accel_calib.table.Table`.
+
+    """
+
+    time: Floats
+    temperature: Floats
+    count: Floats
+    reading: Floats
+    std: Floats
+    sensor: str = ''
+    autopilot: Autopilot | None = None
+
+    def take(self, which: NDArray[np.bool_]) -> Cells:
+        """Return the cells where the mask is true."""
+        return Cells(self.time[which], self.temperature[which], self.count[which],
+                     self.reading[which], self.std[which], self.sensor, self.autopilot)
+
+    @property
+    def range_c(self) -> tuple[float, float]:
+        """Return the lowest and the highest temperature [°C]; NaN if none is known."""
+        known = self.temperature[np.isfinite(self.temperature)]
+        return (float(known.min()), float(known.max())) if len(known) else (np.nan, np.nan)
+
+    @property
+    def is_still(self) -> NDArray[np.bool_]:
+        """Return in which cells the board does not shake."""
+        size = np.max(self.std, axis=1)
+        return np.asarray(size <= max(_SHAKEN * float(np.median(size)), _SHAKEN_G))
+
+
+def cells_of(blocks: Iterable[Recording], units: Units) -> Cells:
+    """
+    Return the averages of samples over cells of 1 s.
+
+    Raises
+    ------
+    InputError
+        If there are no samples, a time or a reading is not finite, or the readings are in native
+        units, whose scale one orientation does not show.
+
+    """
+    if units.is_native:
+        raise InputError('the readings are in native units, and a board in one orientation does '
+                         'not show their scale; expected readings in m/s2 or g',
+                         'convert the readings')
+    parts, sensor, autopilot = list[Floats](), '', None
+    start = 0.0
+    zero: Floats = np.zeros(3)
+    for block in blocks:
+        if not len(block):
+            continue
+        if not parts:
+            start, zero = float(block['time'][0]), units.to_g(block.reading[0])
+            sensor, autopilot = block.sensor, block.autopilot
+        check_finite(np.vstack([block['time'], block.reading.T]), block.row)
+        parts.append(_sums(block, units, start, zero))
+    if not parts:
+        raise InputError('the log has no samples, expected those of a still board',
+                         'record the board while its temperature changes')
+    cell, place = np.unique(np.concatenate([part[0] for part in parts]), return_inverse=True)
+    n, n_warm, time, warm, *rest = (np.bincount(place, column, len(cell)) for column in
+                                    np.concatenate([part[1:] for part in parts], axis=1))
+    first, second = np.array(rest[:3]).T, np.array(rest[3:]).T
+    mean = first / n[:, np.newaxis]
+    variance = (second - mean * first) / np.maximum(n - 1.0, 1.0)[:, np.newaxis]
+    with np.errstate(invalid='ignore'):
+        return Cells(time / n + start, warm / n_warm, n.astype(float), mean + zero,
+                     np.sqrt(np.maximum(variance, 0.0)), sensor, autopilot)
+
+
+def _sums(block: Recording, units: Units, start: float, zero: Floats) -> Floats:
+    """Return (11, m): the number of each cell, and the sums of its samples."""
+    reading, time = units.to_g(block.reading) - zero, block['time'] - start
+    warm = block['temperature'] if 'temperature' in block else np.full(len(time), np.nan)
+    known = np.isfinite(warm)
+    cell, place = np.unique(np.floor(time), return_inverse=True)
+    columns = (np.ones(len(time)), known, time, np.where(known, warm, 0.0), *reading.T,
+               *(reading ** 2).T)
+    return np.array([cell, *(np.bincount(place, column) for column in columns)])
+
+
+def is_turned_over(cells: Cells) -> bool:
+    """Return whether a log has rests in many directions, as one of poses has."""
+    up, still = unit(cells.reading), cells.is_still
+    rest = still[1:] & still[:-1] & (np.sum(up[1:] * up[:-1], axis=1) > np.cos(_TURNED / 6.0))
+    found = list[Floats]()
+    for each in up[1:][rest]:
+        if all(each @ other < np.cos(_APART) for other in found):
+            found.append(each)
+    return len(found) >= _LEAST_DIRECTIONS
+
+
+@dataclass(frozen=True)
+class Ramp:
+    """
+    Stretches of a still board whose temperature changes, in order of time.
+
+    Parameters
+    ----------
+    stretches : Poses
+        Means [g] with time, temperature, std and count; std/√count is the noise of a mean.
+    rate : (n,) array
+        Rate of the temperature [°C/s].
+    seconds : float
+        Duration of the log [s].
+    notes : tuple of str
+        What was left out.
+
+    """
+
+    stretches: Poses
+    rate: Floats
+    seconds: float
+    notes: tuple[str, ...] = ()
+
+    @property
+    def range_c(self) -> tuple[float, float]:
+        """Return the lowest and the highest temperature [°C]."""
+        warm = self.stretches['temperature']
+        return float(warm.min()), float(warm.max())
+
+
+def ramp_of(cells: Cells) -> Ramp:
+    """
+    Return the stretches of a still board.
+
+    Raises
+    ------
+    InputError
+        If the cells cannot show what the temperature does; see the module.
+
+    """
+    known = np.isfinite(cells.temperature)
+    _check_range(cells)
+    _check_direction(cells)
+    still = cells.is_still
+    kept, seconds = cells.take(known & still), float(cells.time[-1] - cells.time[0])
+    stretches, warm_rate = _averaged(kept)
+    _check_jumps(stretches)
+    slow = np.abs(warm_rate) * 60.0 <= FASTEST
+    _check_rate(stretches, warm_rate, slow)
+    notes = []
+    if not np.all(still):
+        notes.append(f'{counted(int(np.sum(~still)), "second")} left out, in which the board '
+                     'shook')
+    if not np.all(slow):
+        notes.append(f'{int(np.sum(~slow))} of {counted(len(slow), "stretch")[:-1]}es left out, '
+                     f'in which the temperature changes by more than {FASTEST:g} °C/min')
+    return Ramp(stretches.take(slow), warm_rate[slow], seconds, tuple(notes))
+
+
+def _check_range(cells: Cells) -> None:
+    low, high = cells.range_c
+    if np.isnan(low):
+        raise InputError('the log has no temperature, expected that of the sensor', 'record it, '
+                         'or name its column with --columns temperature=NAME, or its topic with '
+                         '--temperature-topic')
+    if high - low < LEAST_RANGE:
+        raise InputError(f'the temperature is {low:.1f} to {high:.1f} °C, expected a range of at '
+                         f'least {LEAST_RANGE:g} °C', 'cool the board in a freezer, and record '
+                         'while it warms up to room temperature')
+
+
+def _check_direction(cells: Cells) -> None:
+    """Refuse a board that was turned."""
+    up, still = unit(cells.reading), cells.is_still
+    first = unit(np.median(up[still][:_FIRST], axis=0)[np.newaxis])[0]
+    away = np.arccos(np.clip(up @ first, -1.0, 1.0))
+    turned = np.flatnonzero((away > _TURNED) & still)
+    if len(turned):
+        raise _moved(cells.time[turned[0]] - cells.time[0],
+                     f'it was turned by {np.degrees(away[turned[0]]):.0f}°')
+
+
+def _moved(seconds: float, what: str) -> InputError:
+    return InputError(f'the board moved {seconds:.0f} s after the start ({what}), expected a '
+                      'board that lies still', 'fix the board, keep cables and fans away, and '
+                      'record again, or cut the log there')
+
+
+def _averaged(cells: Cells) -> tuple[Poses, Floats]:
+    """Return the stretches with their noise, and the rate of the temperature in each [°C/s]."""
+    time = cells.time - cells.time[0]
+    length = max(float(time[-1]) / _STRETCHES, 1.0)
+    _, place, cell_count = np.unique(np.floor(time / length), return_inverse=True,
+                                     return_counts=True)
+    if len(cell_count) < _LEAST_STRETCHES:
+        raise InputError(f'the board lies still for {float(time[-1]):.0f} s, expected at least '
+                         f'{_LEAST_STRETCHES} s', 'record while the board warms up, for half an '
+                         'hour')
+    count = np.bincount(place, cells.count)
+
+    def mean(values: Floats) -> Floats:
+        return np.bincount(place, values * cells.count) / count
+
+    reading = np.array([mean(column) for column in cells.reading.T]).T
+    moment, warm = mean(cells.time), mean(cells.temperature)
+    bend = reading[2:] - 2.0 * reading[1:-1] + reading[:-2]
+    noise = np.sqrt(np.median(bend ** 2, axis=0) / _MEDIAN_CHI2 / 6.0)
+    columns = {'time': moment, 'reading': reading, 'temperature': warm, 'count': count,
+               'std': noise * np.sqrt(count)[:, np.newaxis]}
+    return Poses(columns, numbered(columns), 'g', cells.sensor, cells.autopilot), _rate(
+        moment, warm)
+
+
+_MEDIAN_CHI2 = 0.4549
+"""Median of the square of a normal variable."""
+
+
+def _rate(time: Floats, temperature: Floats) -> Floats:
+    """Return the rate of the temperature over about a minute, or two neighbours [°C/s]."""
+    step = max(round(_RATE_OVER_S / 2.0 / float(np.median(np.diff(time)))), 1)
+    low = np.maximum(np.arange(len(time)) - step, 0)
+    high = np.minimum(np.arange(len(time)) + step, len(time) - 1)
+    return np.asarray((temperature[high] - temperature[low]) / (time[high] - time[low]))
+
+
+def _check_jumps(stretches: Poses) -> None:
+    """Refuse a board that was shifted between two stretches."""
+    warm, reading = stretches['temperature'], stretches.reading
+    scaled = (warm - warm.mean()) / max(float(np.ptp(warm)), 1e-9)
+    powers = scaled[:, np.newaxis] ** np.arange(_DEGREE + 1)
+    left = reading - powers @ np.linalg.lstsq(powers, reading, rcond=None)[0]
+    sums = np.cumsum(np.vstack([np.zeros(3), left]), axis=0)
+    k = _NEIGHBOURS
+    means = (sums[k:] - sums[:-k]) / k
+    jump = np.linalg.norm(means[k:] - means[:-k], axis=1)
+    noise = float(np.linalg.norm(np.median(stretches.noise, axis=0)))  # type: ignore[arg-type]
+    at = int(np.argmax(jump))
+    if jump[at] > max(_JUMP_G, _JUMP_NOISES * noise * np.sqrt(2.0 / k)):
+        raise _moved(float(stretches['time'][at + k] - stretches['time'][0]),
+                     f'the readings jump by {jump[at] * MG:.1f} mg, which the temperature does '
+                     'not explain')
+
+
+def _check_rate(stretches: Poses, rate: Floats, slow: NDArray[np.bool_]) -> None:
+    warm = stretches['temperature'][slow]
+    if np.sum(slow) >= _LEAST_STRETCHES and np.ptp(warm) >= LEAST_RANGE:
+        return
+    raise InputError(
+        f'the ramp is too fast for the thermometer: the temperature changes by up to '
+        f'{np.max(np.abs(rate)) * 60.0:.0f} °C/min, expected at most {FASTEST:g} °C/min over a '
+        f'range of {LEAST_RANGE:g} °C', 'put the board into a closed box while it warms up')

@@ -1,0 +1,348 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The offset over temperature from a still board: against the truth, and against the autopilots.
+
+The fits of the autopilots stand here as their documents describe them, with `numpy.polyfit` of
+degree 3 over all samples:
+
+- PX4: a median filter of 31 samples, means over 2000 intervals of the temperature, and the middle
+  of the range as reference;
+- ArduPilot: means over 2 s, 35 °C as reference, coefficients in 10⁻⁶ m/s².
+
+"""
+
+from pathlib import Path
+
+from accel_calib.calibrate import Curve, curve_of
+from accel_calib.capture import cells_of, ramp_of
+from accel_calib.errors import InputError
+from accel_calib.logs import write_table
+from accel_calib.stored import read_calibration, write_calibration
+from accel_calib.table import Recording
+from accel_calib.units import MG, units_of
+from faults.sample import sample
+from inside import export, thermally_calibrated
+import numpy as np
+import pytest
+from ramps import BENT, G, LINE, offset_at, ramp, twelve_poses, TWISTED, UP, warming, write_ulog
+from scipy.signal import medfilt
+from shared import data, run, run_json
+from test_exports import ardupilot, qgroundcontrol
+from test_log_formats import make
+
+UNITS = units_of('m/s2')
+
+
+def curve(*logs: Recording) -> Curve:
+    return curve_of([ramp_of(cells_of([log], UNITS)) for log in logs])
+
+
+def px4_fit(log: Recording):
+    """Return reference [°C] and coefficients (4, 3) of powers 0 to 3 [m/s²/°C^k]."""
+    warm = log['temperature']
+    reference, edges = (warm.min() + warm.max()) / 2.0, np.linspace(warm.min(), warm.max(), 2001)
+    place = np.clip(np.digitize(warm, edges) - 1, 0, 1999)
+    size = np.bincount(place, minlength=2000)
+    full = size > 0
+    found = []
+    for axis in medfilt(log.reading, (31, 1)).T:
+        x, y = (np.bincount(place, each, 2000)[full] / size[full] for each in (
+            warm - reference, axis - np.median(axis)))
+        found.append(np.polyfit(x, y, 3)[::-1])
+    return reference, np.array(found).T
+
+
+def ardupilot_fit(log: Recording, rate_hz: float = 5.0):
+    """Return reference [°C] and coefficients (4, 3) of powers 0 to 3 [m/s²/°C^k]."""
+    width = int(2 * rate_hz)
+    smooth = [np.convolve(each, np.full(width, 1.0 / width), 'valid') for each in (
+        log['temperature'], *log.reading.T)]
+    return 35.0, np.array([np.polyfit(smooth[0] - 35.0, axis - axis.mean(), 3)[::-1]
+                           for axis in smooth[1:]]).T
+
+
+def vendor_at(fit, temperature, reference_c):
+    """Return the (n, 3) curve of a vendor, relative to that at a temperature [g]."""
+    zero, values = fit
+    powers = (np.append(temperature, reference_c) - zero)[:, np.newaxis] ** np.arange(4)
+    offset = powers @ values / G
+    return offset[:-1] - offset[-1]
+
+
+VENDORS = {'px4': px4_fit, 'ardupilot': ardupilot_fit}
+
+
+@pytest.mark.parametrize(('truth', 'degree'), [((), 0), (LINE, 1), (BENT, 2), (TWISTED, 3)])
+@pytest.mark.parametrize('seed', sample(range(20), 2))
+def test_the_degree_and_the_coefficients_are_those_of_the_sensor(truth, degree, seed):
+    found = curve(ramp(seed, truth))
+    assert found.degree == degree
+    assert found.reference_c == 25.0
+    assert found.hysteresis_mg is None
+    np.testing.assert_allclose(found.values, np.reshape(truth, (degree, 3)), rtol=0.0,
+                               atol=5.0 * np.max(found.deviations, initial=0.0))
+    assert found.band_mg < 1.0
+
+
+@pytest.mark.parametrize('seed', sample(range(20, 60), 4))
+def test_correlated_noise_does_not_raise_the_degree(seed):
+    found = curve(ramp(seed, LINE, wander_g=3e-4))
+    assert found.degree == 1
+    assert np.all(np.abs(found.values - LINE) < 6.0 * found.deviations)
+
+
+@pytest.mark.parametrize('wander_g', [0.0, 1e-4])
+def test_deviations_include_the_correlated_noise(wander_g):
+    runs = [curve(ramp(seed, LINE, wander_g=wander_g, rate_hz=2.0)) for seed in range(200, 225)]
+    away = np.array([(each.values - LINE) / each.deviations for each in runs])
+    assert 0.6 < np.sqrt(np.mean(away ** 2)) < 1.6
+
+
+@pytest.mark.parametrize('vendor', VENDORS)
+@pytest.mark.parametrize('seed', sample(range(80, 90), 2))
+def test_coefficients_are_those_of_the_autopilots(vendor, seed, tmp_path):
+    log = ramp(seed, TWISTED, noise_g=0.001)
+    outcome = thermally_calibrated([ramp_of(cells_of([log], UNITS))], UNITS)
+    zero, theirs = VENDORS[vendor](log)
+    text = export(outcome.calibration, vendor).text_or_bytes
+    assert isinstance(text, str)
+    written = qgroundcontrol(text) if vendor == 'px4' else ardupilot(text, tmp_path)
+    ours = np.array([[written[f'TC_A0_X{k}_{axis}'] if vendor == 'px4' else
+                      written[f'INS_TCAL1_ACC{k}_{"XYZ"[axis]}'] / 1e6 for axis in range(3)]
+                     for k in (1, 2, 3)])
+    if vendor == 'px4':
+        assert written['TC_A0_TREF'] == pytest.approx(zero, abs=0.3)
+    half = (outcome.curve.range_c[1] - outcome.curve.range_c[0]) / 2.0
+    apart = (ours - theirs[1:]) / G * MG * half ** np.array([[1.0], [2.0], [3.0]])
+    assert np.max(np.abs(apart)) < 1.0  # mg at the end of the range
+    grid = np.linspace(*outcome.curve.range_c, 40)
+    np.testing.assert_allclose(outcome.curve.at(grid), vendor_at((zero, theirs), grid, 25.0),
+                               atol=5e-4)
+
+
+@pytest.mark.parametrize('vendor', VENDORS)
+@pytest.mark.parametrize('truth', [LINE, BENT, TWISTED])
+def test_the_error_on_a_second_ramp_is_not_larger_than_that_of_the_autopilots(vendor, truth):
+    """The second ramp has other temperatures, and its noise is left out."""
+    ours, theirs = [], []
+    for seed in range(100, 110):
+        log, warm = ramp(seed, truth, wander_g=1e-4), warming(2000, -9.0, 33.0, cool=True)
+        for errors, offset in ((ours, curve(log).at(warm)),
+                               (theirs, vendor_at(VENDORS[vendor](log), warm, 25.0))):
+            errors.append(np.sum(np.var(offset - offset_at(warm, truth), axis=0)))
+    assert np.mean(ours) <= 1.02 * np.mean(theirs)
+
+
+def test_the_curve_of_a_lagging_thermometer_lies_between_warming_and_cooling():
+    found = curve(ramp(3, BENT, minutes=80.0, cool=True, lag_s=30.0))
+    assert found.hysteresis_mg == pytest.approx(1.5, abs=1.0)
+    assert found.lag_s == pytest.approx(30.0, rel=0.4)
+    grid = np.linspace(*found.range_c, 30)
+    np.testing.assert_allclose(found.at(grid), offset_at(grid, BENT), atol=6e-4)
+    without = curve(ramp(3, BENT, minutes=80.0, cool=True))
+    assert without.hysteresis_mg is not None
+    assert without.hysteresis_mg < 0.3
+
+
+def test_ramps_of_several_orientations_share_one_curve():
+    found = curve(ramp(5), ramp(6, up=np.array([1.0, 0.0, 0.0])))
+    assert found.degree == 2
+    assert np.all(np.abs(found.values - BENT) < 5.0 * found.deviations)
+
+
+@pytest.mark.parametrize(('low', 'high', 'reference'), [
+    (-15.0, 15.0, 15.0), (30.0, 60.0, 30.0), (0.0, 50.0, 25.0)])
+def test_the_calibration_is_zero_at_25_degrees_or_the_nearest_end(low, high, reference, tmp_path):
+    log = ramp(7, TWISTED, low=low, high=high)
+    made = thermally_calibrated([ramp_of(cells_of([log], UNITS))], UNITS)
+    assert made.curve.reference_c == pytest.approx(reference, abs=1.5)
+    write_calibration(tmp_path / 'c.yaml', made.calibration)
+    stored = read_calibration(tmp_path / 'c.yaml')
+    assert stored == made.calibration
+    low, high = stored.ranges['temperature']
+    assert made.curve.range_c == (low, high)
+    context = {'temperature': np.linspace(low, high, 50)}
+    reading = np.tile(UP * G, (50, 1))
+    moved = (reading - stored.correct(reading, context)) / G
+    np.testing.assert_allclose(moved, made.curve.at(context['temperature']), atol=1e-12)
+    at_25 = offset_at(np.array([made.curve.reference_c]), TWISTED)
+    truth = offset_at(context['temperature'], TWISTED) - at_25
+    np.testing.assert_allclose(moved, truth, atol=1.5e-3)
+    assert made.rating.name == 'USABLE'
+    assert made.rating.findings[0].kind == 'thermal_alone'
+
+
+def written(tmp_path: Path, **logs: Recording) -> list[Path]:
+    paths = [tmp_path / f'{name}.csv' for name in logs]
+    for path, log in zip(paths, logs.values(), strict=True):
+        write_table(path, log)
+    return paths
+
+
+def test_a_ramp_and_a_log_of_poses_become_one_calibration(tmp_path, capsys):
+    paths = written(tmp_path, poses=twelve_poses(11), ramp=ramp(8))
+    out = tmp_path / 'c.yaml'
+    status, result = run_json(capsys, 'thermal', *paths, '-o', out, '--flat', 'first')
+    assert (status, result['rating'], result['model']) == (0, 'GOOD', '10')
+    stored = read_calibration(out)
+    assert stored.is_levelled
+    sd = np.array(result['offset_sd'])
+    np.testing.assert_array_less(np.abs(np.array(result['offset']) / G - make.OFFSET_G) * G,
+                                 4.0 * sd + 1e-9)
+    np.testing.assert_allclose(stored.gain, make.GAIN, atol=2e-3)
+    other = twelve_poses(12)
+    cold = ramp(9)
+    for each in (other, cold):
+        left = stored.correct(each.reading, dict(each.columns))
+        size = np.median(np.linalg.norm(left, axis=1)) / G
+        assert abs(size - 1.0) < 1e-3
+    assert out.with_suffix('.html').read_text(encoding='utf-8').count('<svg') == 3
+    assert {each['kind'] for each in result['findings']} >= {'open'}
+    assert result['thermal']['degree'] == 2
+
+
+def test_a_boards_log_of_another_sensor_does_not_fit_to_the_poses(tmp_path, capsys):
+    log = ramp(8)
+    shifted = Recording({**log.columns, 'reading': log.reading * 1.05}, log.row, 'm/s2')
+    paths = written(tmp_path, poses=twelve_poses(11), ramp=shifted)
+    status, result = run_json(capsys, 'thermal', *paths, '-o', tmp_path / 'c.yaml')
+    assert (status, result['rating']) == (1, 'BAD')
+    assert not (tmp_path / 'c.yaml').exists()
+
+
+def test_the_result_is_described_in_json_and_in_the_terminal(tmp_path, capsys):
+    path, = written(tmp_path, ramp=ramp(8))
+    status, result = run_json(capsys, 'thermal', path, '-o', tmp_path / 'c.yaml')
+    assert (status, result['rating']) == (0, 'USABLE')
+    thermal = result['thermal']
+    assert set(thermal) == {
+        'reference_c', 'range_c', 'degree', 'coefficients', 'coefficients_sd', 'band_mg',
+        'change_mg', 'residual_mg', 'held_out_mg', 'hysteresis_mg', 'lag_s'}
+    assert thermal['hysteresis_mg'] is None
+    assert thermal['lag_s'] is None
+    assert {axis: len(values) for axis, values in thermal['coefficients'].items()} == {
+        'x': 2, 'y': 2, 'z': 2}
+    assert thermal['coefficients']['x'][0] == pytest.approx(0.5, abs=0.05)
+    assert {'offset', 'gain', 'rating_reason', 'findings', 'next', 'read_as'} <= set(result)
+    assert result['file'] == [str(path)]
+    run('thermal', path, '-o', tmp_path / 'c.yaml')
+    printed = capsys.readouterr().out
+    assert 'hysteresis: not known' in printed
+    assert 'degree 2 from -9' in printed
+
+
+def test_calibrate_recognises_a_still_board_that_warms_up(tmp_path, capsys):
+    path, = written(tmp_path, ramp=ramp(8))
+    status, result = run_json(capsys, 'calibrate', path, '-o', tmp_path / 'c.yaml')
+    assert status == 0
+    assert result['thermal']['degree'] == 2
+    assert any('fitted as by accel-calib thermal' in line for line in result['read_lines'])
+    assert 'offset_temperature_quadratic' in read_calibration(tmp_path / 'c.yaml').model.effects
+
+
+def test_a_log_of_px4_is_read_and_its_sensor_kept(tmp_path, capsys):
+    pytest.importorskip('pyulog')
+    write_ulog(tmp_path / 'ramp.ulg', ramp(8))
+    assert run('thermal', tmp_path / 'ramp.ulg', '-o', tmp_path / 'c.yaml') == 0
+    assert run('export', tmp_path / 'c.yaml', '--to', 'px4', '-o', tmp_path / 'p.params') == 0
+    found = qgroundcontrol((tmp_path / 'p.params').read_text())
+    assert found['TC_A0_ID'] == found['CAL_ACC0_ID'] == 2490378
+    assert (found['TC_A0_TMIN'], found['TC_A0_TMAX']) == pytest.approx((-10.0, 33.6), abs=1.0)
+
+
+def changed(log: Recording, **columns) -> Recording:
+    return Recording({**log.columns, **columns}, log.row, 'm/s2')
+
+
+def bumped(seconds: float, change_g) -> Recording:
+    log = ramp(8)
+    later = (log['time'] > seconds)[:, np.newaxis]
+    return changed(log, reading=log.reading + later * np.array(change_g) * G)
+
+
+def without_temperature() -> Recording:
+    log = ramp(8)
+    return Recording({key: log[key] for key in ('time', 'reading')}, log.row, 'm/s2')
+
+
+REFUSED = {
+    'no temperature': (without_temperature, 'has no temperature'),
+    'narrow': (lambda: ramp(8, low=20.0, high=24.0), 'expected a range of at least 5 °C'),
+    'shifted': (lambda: bumped(900.0, [0.006, 0.0, 0.0]), 'the readings jump by [5-7].* mg'),
+    'turned': (lambda: bumped(600.0, [0.0, 0.7, -0.3]), 'moved 60[01] s after .* turned by'),
+    'fast': (lambda: ramp(8, minutes=4.0), 'too fast for the thermometer'),
+    'short': (lambda: ramp(8, minutes=0.4), 'expected at least 30 s'),
+}
+
+
+@pytest.mark.parametrize('case', REFUSED)
+def test_a_log_that_cannot_show_the_temperature_is_refused_in_one_line(case, tmp_path, capsys):
+    make_log, words = REFUSED[case]
+    path, = written(tmp_path, ramp=make_log())
+    with pytest.raises(InputError, match=words):
+        curve(make_log())
+    assert run('thermal', path, '-o', tmp_path / 'c.yaml') == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len([line for line in lines if line.startswith('accel-calib thermal: ')]) == 1
+    assert not (tmp_path / 'c.yaml').exists()
+
+
+def test_a_shaken_part_and_a_fast_begin_are_left_out_with_a_note():
+    log = ramp(8)
+    shaken = (log['time'] > 600.0) & (log['time'] < 620.0)
+    rough = np.random.default_rng(1).normal(size=(len(log), 3)) * 0.2 * G
+    found = ramp_of(cells_of([changed(log, reading=log.reading + rough * shaken[:, np.newaxis])],
+                             UNITS))
+    assert 'the board shook' in found.notes[0]
+    assert np.all(np.abs(curve_of([found]).values - BENT) < 5.0 * curve_of([found]).deviations)
+    assert 'more than 5 °C/min' in ramp_of(cells_of([ramp(8, minutes=20.0)], UNITS)).notes[0]
+
+
+@pytest.mark.parametrize(('logs', 'words'), [
+    (('poses',), 'expected one of a still board'), (('poses', 'poses', 'ramp'), 'at most one')])
+def test_the_logs_are_of_one_board_and_at_most_one_is_of_poses(logs, words, tmp_path, capsys):
+    written(tmp_path, poses=twelve_poses(11), ramp=ramp(8))
+    assert run('thermal', *(tmp_path / f'{name}.csv' for name in logs),
+               '-o', tmp_path / 'c.yaml') == 2
+    assert words in ' '.join(capsys.readouterr().err.split())
+
+
+def test_logs_of_several_sensors_are_refused():
+    ramps = [ramp_of(cells_of([Recording(ramp(8).columns, ramp(8).row, 'm/s2', name)], UNITS))
+             for name in ('left', 'right')]
+    with pytest.raises(InputError, match='sensors left, right, expected one'):
+        thermally_calibrated(ramps, UNITS)
+
+
+def test_readings_in_counts_are_refused():
+    with pytest.raises(InputError, match='native units'):
+        cells_of([ramp(8)], units_of('native'))
+
+
+def test_poses_without_temperature_are_refused():
+    poses = make.recording(1)
+    still = Recording({key: poses[key] for key in ('time', 'reading')}, poses.row, 'g')
+    from accel_calib.capture import capture
+
+    found = capture(still, units_of('g')).poses
+    with pytest.raises(InputError, match='the poses have no temperature'):
+        thermally_calibrated([ramp_of(cells_of([ramp(8)], UNITS))], units_of('g'), found)
+
+
+def test_the_sense_hat_has_the_curve_that_others_found(tmp_path, capsys):
+    path = data('sensehat_lsm9ds1_temperature.csv')
+    lines = path.read_text().splitlines()
+    still = [line for line in lines[3:] if float(line.partition(',')[0]) > 82180.0]
+    cut = tmp_path / 'still.csv'
+    cut.write_text('\n'.join([*lines[:3], *still]))
+    status, result = run_json(capsys, 'thermal', cut, '-o', tmp_path / 'c.yaml')
+    assert status == 0
+    thermal = result['thermal']
+    assert thermal['degree'] == 1
+    slopes = [thermal['coefficients'][axis][0] for axis in 'xyz']
+    np.testing.assert_allclose(slopes, [0.57, 0.41, -0.41], atol=0.02)
+    assert thermal['hysteresis_mg'] > 0.3
+    assert run('thermal', path, '-o', tmp_path / 'd.yaml') == 2
+    assert 'the board moved' in ' '.join(capsys.readouterr().err.split())
