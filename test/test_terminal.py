@@ -94,6 +94,13 @@ def test_control_characters_are_escaped():
     assert shown('a ± \udc80', 'ascii') == 'a +- \\udc80'
 
 
+def test_a_wrong_value_of_a_known_option_gets_no_suggestion(capsys):
+    with pytest.raises(SystemExit, match='2'):
+        main(['fit', 'x.csv', '--gravity', '-3'])
+    error = capsys.readouterr().err
+    assert 'expected a positive number; see accel-calib fit --help' in error
+
+
 @pytest.mark.parametrize(('arguments', 'meant'), [
     (['calibrte', 'x'], 'calibrate'), (['fit', 'x.csv', '--modle', '4'], '--model'),
     (['refine', 'x.csv', '--bsae', '4'], '--base'), (['fit', 'x', '--units', 'm/s'], 'm/s2')])

@@ -65,7 +65,8 @@ class Parser(argparse.ArgumentParser):
         """Print one line, and exit with status 2."""
         known = self._known()
         given = message.partition(' (choose')[0]
-        wrong = re.findall(r"'([^']+)'", given) or given.split()
+        wrong = re.findall(r"'([^']+)'", given) or [
+            word.rstrip(':') for word in given.split() if word.startswith('-')]
         near = [name for word in wrong if word not in known
                 for name in get_close_matches(word, known, 1)]
         meant = f' (did you mean {near[0]}?)' if near else ''
