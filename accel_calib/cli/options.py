@@ -15,6 +15,7 @@ import argparse
 import codecs
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
+from functools import cache
 from pathlib import Path
 import re
 import sys
@@ -34,6 +35,7 @@ _PLAIN = {'±': '+-', '°': ' deg', '²': '2', '³': '3', '⁻': '-', '¹': '1',
 _HANDLER = 'accel_calib.plain'
 
 
+@cache
 def plain_handler() -> str:
     """Return the name of the error handler that replaces characters an encoding lacks."""
     codecs.register_error(_HANDLER, _replace)
