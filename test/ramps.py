@@ -69,7 +69,7 @@ def twelve_poses(seed: int, curve: Curve = BENT) -> Recording:
                      found.row, 'm/s2')
 
 
-def write_ulog(path: Path, samples: Recording, device: int = 2490378) -> None:
+def write_ulog(path: Path, samples: Recording, device: int = 1310988) -> None:
     """Write the samples as sensor_accel of PX4."""
     stamps = make.stamps_us(samples)
     fields = {'timestamp': ('uint64_t', stamps), 'timestamp_sample': ('uint64_t', stamps),

@@ -248,7 +248,7 @@ def test_a_log_of_px4_is_read_and_its_sensor_kept(tmp_path, capsys):
     assert run('thermal', tmp_path / 'ramp.ulg', '-o', tmp_path / 'c.yaml') == 0
     assert run('export', tmp_path / 'c.yaml', '--to', 'px4', '-o', tmp_path / 'p.params') == 0
     found = qgroundcontrol((tmp_path / 'p.params').read_text())
-    assert found['TC_A0_ID'] == found['CAL_ACC0_ID'] == 2490378
+    assert found['TC_A0_ID'] == found['CAL_ACC0_ID'] == 1310988
     assert (found['TC_A0_TMIN'], found['TC_A0_TMAX']) == pytest.approx((-10.0, 33.6), abs=1.0)
 
 
