@@ -270,20 +270,20 @@ class Calibration(Record):
         border = float(np.sqrt(own.per_g * other.units.per_g))
         return other if (length > border) is (other.units.per_g > border) else self
 
-    @property
+    @cached_property
     def offset_sd(self) -> Floats:
         """Return the standard deviation of V, (3,), in the unit of the readings."""
         rows = _linear_rows(self.model, np.zeros((1, 3)))[0]
         return self.units.from_g(_deviation(rows, self.covariance))
 
-    @property
+    @cached_property
     def gain_sd(self) -> Floats:
         """Return the standard deviation of W, (3, 3)."""
         rows = _linear_rows(self.model, np.vstack([np.zeros(3), np.eye(3)]))
         columns = [_deviation(row - rows[0], self.covariance) for row in rows[1:]]
         return np.column_stack(columns) * (self.units.per_g / self.force_per_g)
 
-    @property
+    @cached_property
     def used_poses(self) -> Poses:
         """Return the poses that the calibration was fitted to, in the unit of the readings."""
         rejected = [pose.row for pose in self.rejected]

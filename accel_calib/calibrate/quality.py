@@ -89,10 +89,9 @@ class Verification:
 
 def in_g(poses: Poses, units: Units) -> Poses:
     """Return the poses with readings, std and reference in g; native references are in g."""
-    scaled = {key: units.to_g(poses[key]) for key in ('reading', 'std') if key in poses}
-    if 'reference' in poses and not units.is_native:
-        scaled['reference'] = units.to_g(poses['reference'])
-    return poses.with_columns(**scaled)
+    keys = ('reading', 'std') if units.is_native else ('reading', 'std', 'reference')
+    columns = poses.columns
+    return poses.with_columns(**{key: units.to_g(columns[key]) for key in keys if key in columns})
 
 
 def verify(calibration: Calibration, poses: Poses) -> Verification:

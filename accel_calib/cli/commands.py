@@ -391,7 +391,7 @@ COMMANDS = {
         'make a calibration, a page and a verdict from any log', 'fit',
         'accel-calib calibrate log.csv --flat last', _calibrate, 'calibration', 'log'),
     'thermal': Command(
-        'fit the offset over temperature to logs of a still board that warms up', 'thermal',
+        'fit the offset over temperature to logs of a still board that warms up', 'fit',
         'accel-calib thermal warm_up.ulg poses.ulg -o calibration.yaml', _thermal, 'calibration',
         'logs'),
     'capture': Command(

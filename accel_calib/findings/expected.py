@@ -132,7 +132,7 @@ class Expected:
                 else int(np.count_nonzero(np.diag(calibration.covariance))))
         return max(count - free, 0)
 
-    @property
+    @cached_property
     def is_vector(self) -> bool:
         """Whether the errors are those of the force as a vector, not of its length."""
         return self.calibration.form.known_orientation and 'reference' in self.poses

@@ -5,12 +5,12 @@
 From poses and a calibration to the gap, the named effect and the larger model.
 
 `refinement` is the entry point: it fits the base, and makes the refined calibration. `base`
-prepares the poses. `linear` contains the effects of the catalogue as columns of the equations near
-a model. `sets` scores sets of effects and outliers and searches for the best one. `curves`
-contains causes without a known form: a random walk of the offset, and an empirical curve; beside
-them it computes the probability of each effect and of its rivals. `search` searches near a model
-and fits in turn. `steps` describes what it found, `plan` chooses the poses that separate effects
-from their rivals, and `result` contains the records and their sentences.
+prepares the poses. `state` is a model fitted to them, with the effects of the catalogue as columns
+of its equations. `linear` scores sets of these columns and of outliers, and `beam` searches for
+the best set. `curves` contains causes without a known form: a random walk of the offset, and an
+empirical curve; beside them it computes the probability of each effect and of its rivals. `search`
+searches near a model and fits in turn. `steps` describes what it found, `plan` chooses the poses
+that separate effects from their rivals, and `result` contains the records and their sentences.
 
 """
 

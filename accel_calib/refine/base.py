@@ -39,7 +39,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .linear import beginning, State, without
+from .state import beginning, State, without
 from ..calibrate import Calibration, in_g, with_history
 from ..capture import rounding_left
 from ..effects import included, Model, MODELS

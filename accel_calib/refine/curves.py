@@ -40,8 +40,8 @@ from typing import NamedTuple
 import numpy as np
 
 from .base import causes
-from .linear import Block, candidates, held_out, Linear, linearised, outside_of, products_of, State
-from .sets import LEVEL, Set
+from .linear import Block, held_out, LEVEL, Linear, outside_of, products_of, Set
+from .state import candidates, linearised, State
 from ..effects import (
     CARRIERS, curve_pairs, effect_named, EFFECTS, EMPIRICAL, empirical_name, empirical_parts,
     LADDER, Model, MODES, WANDER)

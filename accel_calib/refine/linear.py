@@ -39,9 +39,8 @@ them costs, and the effects of the catalogue cost the same. Each pose that is le
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 import math
 from typing import Any, NamedTuple
@@ -49,38 +48,33 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibrate import with_history
-from ..effects import Context, Effect, effect_named, factors_of, included, kind_of, Model
-from ..estimate import Equations, estimate, Fit, NotConvergedError
-from ..table import Floats, Poses
-from ..units import MG
-
-WORTH = 4.0
-"""ν, degrees of freedom that the measured noise counts as."""
+from ..effects import Effect, kind_of
+from ..estimate import by_pose, outliers_among
+from ..table import Floats
 
 SEEN = 0.02
 """Smallest part of a column outside of the model; otherwise it cannot be distinguished."""
+
+LEVEL = 0.01
+"""Probability that any effect is named if there is no hidden effect."""
+
+_DETERMINED = 1e-12
+"""Smallest square of a relative singular value of the columns of values that are determined."""
+
+_USUAL = 1.6
+"""Standard deviation of the logarithm of the size of an effect relative to its typical size."""
+
+_MOST_UNUSUAL = 6.0
+"""Largest penalty for an unusual size."""
+
+_RARE = 5.0
+"""Additional cost of each pose that is left out: few poses are knocked."""
 
 _LARGEST_LOG = 100.0
 """Largest logarithm of a ratio, against overflow."""
 
 _LEAST_OWN = 0.02
 """Smallest 1 - leverage; below it, an equation alone determines a value."""
-
-_SHAPES_AT_ONCE = 250
-"""If there are more shapes, only evenly spread shapes are tried."""
-
-_MANY_POSES, _FEW_SHAPES = 1000, 60
-"""The same for more poses than this."""
-
-_SHAPES_ALIKE = 3.0
-"""Number of neighbouring shapes that count as one independent trial."""
-
-_CHI2_LEVEL = 1e-3
-_CHI2_RATIO = 1.3
-"""chi² per degree of freedom that still counts as noise: poses repeat worse than samples."""
-
-_OFFSET = Model({'offset': np.zeros(3)})
 
 
 class Block(NamedTuple):
@@ -92,66 +86,6 @@ class Block(NamedTuple):
     entry: Effect
     searched: int = 0
     tried: float = 1.0
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """
-    An effect to try with each of its (s,) `shapes`, which count as `tried` independent ones.
-
-    `factors` (shapes, t or 1, n) are those of its terms at the poses. They do not depend on a
-    model.
-
-    """
-
-    name: str
-    shapes: tuple[Floats, ...]
-    tried: float
-    factors: Floats
-
-    @property
-    def entry(self) -> Effect:
-        """Return the effect."""
-        return effect_named(self.name)
-
-    def beside(self, present: Floats | None, context: Context) -> Candidate:
-        """Return the candidate with the shape of its values in a model, too."""
-        if present is None or len(self.shapes) < 2:
-            return self
-        shape = self.entry.split(present)[1]
-        return replace(self, shapes=(*self.shapes, shape), factors=np.concatenate(
-            [self.factors, factors_of(self.name, [shape], context)]))
-
-    def blocks(self, start: int, alike: int) -> Iterator[Block]:
-        """Yield a block for each shape, from a column on; `alike` candidates are of one kind."""
-        count, entry, searched = len(self.entry.parameters), self.entry, len(self.shapes) > 1
-        for shape in self.shapes:
-            new = searched and not np.array_equal(shape, entry.usual)
-            yield Block(self.name, shape, slice(start, start + count), entry, int(new),
-                        (self.tried if new else 1.0) * alike)
-            start += count
-
-
-def candidates(names: Iterable[str], poses_g: Poses) -> tuple[Candidate, ...]:
-    """Return the effects of these names that the context of the poses allows."""
-    found, context = [], poses_g.columns
-    for name in names:
-        effect = effect_named(name)
-        if effect.output is None and all(key in context for key in effect.needs):
-            shapes, tried = _shapes(effect, context, len(poses_g))
-            if shapes:
-                found.append(Candidate(name, shapes, tried, factors_of(name, shapes, context)))
-    return tuple(found)
-
-
-def _shapes(effect: Effect, context: Context, poses: int) -> tuple[tuple[Floats, ...], float]:
-    """Return the shapes of an effect to try, and the number that they count as."""
-    if effect.shapes is None:
-        return (np.zeros(0),), 1.0
-    shapes = tuple(effect.shapes(context))
-    most = _SHAPES_AT_ONCE if poses <= _MANY_POSES else _FEW_SHAPES
-    shapes = shapes[::-(-len(shapes) // most)] if len(shapes) > most else shapes
-    return shapes, max(len(shapes) / _SHAPES_ALIKE, 1.0)
 
 
 @dataclass(frozen=True)
@@ -275,6 +209,249 @@ class Linear:
         return {}
 
 
+@dataclass(frozen=True, eq=False)
+class Set:
+    """
+    Effects that are added to the base, and poses that are left out.
+
+    `blocks` are the indices of the blocks of the effects in the problem `linear`, and `out` those
+    of the poses. The columns `units` (m, k) span the poses. With those of the blocks, they are k'
+    columns; times `mix` (k', q) they are an orthonormal basis. `across` (q, c + 1) are the
+    products of the basis with the columns of the problem and, last, with its residual.
+
+    """
+
+    linear: Linear = field(repr=False)
+    blocks: tuple[int, ...]
+    out: tuple[int, ...]
+    units: Floats = field(repr=False)
+    across: Floats = field(repr=False)
+    mix: Floats = field(repr=False)
+
+    @classmethod
+    def of(cls, linear: Linear, blocks: Iterable[int] = (), out: Iterable[int] = ()) -> Set:
+        """Return the set of these blocks, with these poses left out."""
+        out = tuple(sorted(out))
+        if out not in linear.without_poses:
+            linear.without_poses[out] = cls._of_poses(linear, out)
+        found: Set = linear.without_poses[out]
+        for block in blocks:
+            found = found.extended(block)
+        return found
+
+    @classmethod
+    def _of_poses(cls, linear: Linear, out: tuple[int, ...]) -> Set:
+        rows = np.flatnonzero(np.isin(linear.pose, out)) if out else np.zeros(0, np.intp)
+        units: Floats = np.zeros((len(linear.pose), len(rows)))
+        units[rows, np.arange(len(rows))] = 1.0
+        if out:
+            outside = units - linear.onto @ linear.onto[rows].T
+            units = np.linalg.qr(linear.whitened(outside))[0]
+        white = linear.whitened(units)
+        across = np.column_stack([white.T @ linear.columns, white.T @ linear.residual])
+        return cls(linear, (), out, units, across, np.eye(len(rows)))
+
+    def extended(self, block: int) -> Set:
+        """Return the set with one more block."""
+        part = self.linear.blocks[block].columns
+        along = self.across[:, part]
+        left = self.linear.products[part] - along.T @ self.across
+        size, axes = np.linalg.eigh(left[:, part])
+        kept = is_seen(size)
+        new = axes[:, kept] / np.sqrt(size[kept])
+        rows, count = self.mix.shape
+        mix = np.zeros((rows + len(left), count + new.shape[1]))
+        mix[:rows, :count], mix[:rows, count:] = self.mix, -self.mix @ (along @ new)
+        mix[rows:, count:] = new
+        return replace(self, blocks=(*self.blocks, block), mix=mix,
+                       across=np.concatenate([self.across, new.T @ left]))
+
+    def instead(self, blocks: Iterable[int]) -> Set:
+        """Return the set of other blocks, with the same poses left out."""
+        return Set.of(self.linear, blocks, self.out)
+
+    def within(self, linear: Linear) -> Set:
+        """Return the same set in other equations with the same candidates."""
+        return Set.of(linear, self.blocks, self.out)
+
+    def without(self, block: int) -> Set:
+        """Return the set without one of its blocks."""
+        return self.instead(other for other in self.blocks if other != block)
+
+    @property
+    def fewer(self) -> list[Set]:
+        """Return a set of several blocks without each of them."""
+        return [self.without(block) for block in self.blocks if len(self.blocks) > 1]
+
+    @property
+    def with_outliers(self) -> list[Set]:
+        """Return the set as it is, and with the outliers that it leaves, if they differ."""
+        found, key = self.linear.outliers, frozenset(self.blocks)
+        if key not in found:
+            found[key] = (Set.of(self.linear, self.blocks) if self.out else self)._outliers
+        out = found[key]
+        return [self] if out == self.out else [self, Set.of(self.linear, self.blocks, out)]
+
+    @property
+    def _outliers(self) -> tuple[int, ...]:
+        linear, (onto, residual) = self.linear, self.spanned
+        return tuple(outliers_among(
+            by_pose(residual, np.hstack([linear.onto, onto]), linear.pose), self.rss,
+            linear.dof - int(self.parameters), linear.poses, noise_known=linear.worth > 0.0
+        ).poses.tolist())
+
+    @cached_property
+    def rss(self) -> float:
+        """Return the sum of squares that is left."""
+        gain = self.across[:, -1] @ self.across[:, -1]
+        return max(float(self.linear.products[-1, -1] - gain), 0.0)
+
+    @cached_property
+    def parameters(self) -> float:
+        """Return the number of values, with searched shapes and equations left out."""
+        return float(len(self.across) + np.sum(self.linear.costs[0][list(self.blocks)]))
+
+    @cached_property
+    def charge(self) -> float:
+        """Return what is subtracted from the score apart from the number of values."""
+        charge = float(np.sum(self.linear.costs[1][list(self.blocks)]))
+        for block, values in self.values.items():
+            size = float(np.max(np.abs(values))) / self.linear.blocks[block].entry.typical
+            charge += min((max(math.log(max(size, 1e-300)), 0.0) / _USUAL) ** 2, _MOST_UNUSUAL)
+        return charge + len(self.out) * (2.0 * math.log(max(self.linear.poses, 2)) + _RARE)
+
+    @cached_property
+    def score(self) -> float:
+        """Return the criterion, 0 for the base."""
+        return float(self.linear.score(self.rss, self.parameters, self.charge))
+
+    @cached_property
+    def effects(self) -> tuple[str, ...]:
+        """Return the names of the effects."""
+        return tuple(self.linear.blocks[block].effect for block in self.blocks)
+
+    @cached_property
+    def entries(self) -> list[Block]:
+        """Return the blocks."""
+        return [self.linear.blocks[block] for block in self.blocks]
+
+    @cached_property
+    def values(self) -> dict[int, Floats]:
+        """Return the (p,) values of the effect of each block."""
+        if not self.blocks:
+            return {}
+        index, linear = self._index, self.linear
+        left, right = linear.products[index][:, index], linear.products[-1, index]
+        if self.out:
+            across = self.across[:self.units.shape[1]]
+            left = left - across[:, index].T @ across[:, index]
+            right = right - across[:, index].T @ across[:, -1]
+        values = np.linalg.lstsq(left, right, rcond=_DETERMINED)[0] / linear.sizes[index]
+        ends = np.cumsum([each.columns.stop - each.columns.start for each in self.entries])
+        return dict(zip(self.blocks, np.split(values, ends[:-1]), strict=True))
+
+    @property
+    def _index(self) -> list[int]:
+        """Return the columns of the blocks."""
+        return [column for each in self.entries
+                for column in range(each.columns.start, each.columns.stop)]
+
+    @property
+    def spanned(self) -> tuple[Floats, Floats]:
+        """Return (m, q) orthonormal columns that span the set, and the (m,) residual beside it."""
+        columns = self.linear.whitened(self.linear.columns[:, self._index])
+        onto = np.hstack([self.units, columns]) @ self.mix
+        return onto, self.linear.whitened(self.linear.residual) - onto @ self.across[:, -1]
+
+    def gains(self, effect: str = '') -> tuple[Floats, Floats]:
+        """
+        Return the (b,) gain of each block in addition to the set, and its (b,) rank.
+
+        Both are 0 for the blocks of other effects, if one is given.
+
+        """
+        linear, across = self.linear, self.across
+        along = linear.products[-1, :-1] - across[:, -1] @ across[:, :-1]
+        gain, rank = np.zeros(len(linear.blocks)), np.zeros(len(linear.blocks))
+        groups = linear.grouped(linear.numbers_of[effect]) if effect else linear.by_width
+        for numbers, index, products in groups:
+            parts = np.moveaxis(across[:, index], 0, 2)
+            gain[numbers], rank[numbers] = _explained(
+                products - parts @ np.swapaxes(parts, 1, 2), along[index])
+        return gain, rank
+
+    def best_of(self, effect: str) -> int:
+        """Return the block of an effect with the largest gain in addition to the set."""
+        own = self.linear.numbers_of[effect]
+        return int(own[np.argmax(self.gains(effect)[0][own])])
+
+    @property
+    def scores_beside(self) -> Floats:
+        """
+        Return the (b,) scores with one more block, without the penalty for its size.
+
+        They are -inf for a block that determines nothing.
+
+        """
+        gain, rank = self.gains()
+        searched, cost = self.linear.costs
+        scores = self.linear.score(self.rss - gain, self.parameters + rank + searched,
+                                   self.charge + cost)
+        return np.where(rank > 0.0, scores, -np.inf)
+
+    def probability(self, block: int) -> float:
+        """Return the probability that noise alone makes a block this good beside the others."""
+        chance = self.chance(self.without(block))
+        return min(1.0, chance * self.linear.kinds * self.linear.blocks[block].tried)
+
+    @property
+    def is_significant(self) -> bool:
+        """Return whether each effect of the set is significant beside the others."""
+        return all(self.probability(block) < LEVEL for block in self.blocks)
+
+    def chance(self, fewer: Set) -> float:
+        """Return the probability that noise alone makes the set this good beside a smaller one."""
+        from scipy.special import fdtrc
+
+        worth, added = self.linear.worth, self.parameters - fewer.parameters
+        left = worth + self.linear.dof - self.parameters
+        if added < 1 or left < 1:
+            return 1.0
+        variance = (worth + self.rss + 1e-300) / left
+        return float(fdtrc(added, left, (fewer.rss - self.rss) / added / variance))
+
+
+def _explained(products: Floats, along: Floats) -> tuple[Floats, Floats]:
+    """Return what k blocks explain, and their ranks, from their products (k, w, w) and (k, w)."""
+    width, size = along.shape[1], np.trace(products, axis1=1, axis2=2)
+    # No eigenvalue is below this, as the others are at most `size` together.
+    least = np.linalg.det(products) * (max(width - 1, 1) / np.maximum(size, SEEN ** 2)) ** (
+        width - 1)
+    whole = least > SEEN ** 2 * np.maximum(size, 1.0)
+    gain, rank = np.zeros(len(size)), np.full(len(size), width)
+    solved = np.linalg.solve(products[whole], along[whole][:, :, np.newaxis])[:, :, 0]
+    gain[whole] = np.sum(along[whole] * solved, axis=1)
+    squares, axes = np.linalg.eigh(products[~whole])
+    kept = is_seen(squares)
+    towards = (along[~whole][:, np.newaxis] @ axes)[:, 0]
+    gain[~whole] = np.sum(towards ** 2 * kept / np.where(kept, squares, 1.0), axis=1)
+    rank[~whole] = np.sum(kept, axis=1)
+    return gain, rank
+
+
+def is_seen(squares: Floats) -> NDArray[np.bool_]:
+    """Return which directions of columns are outside of a basis, by their increasing squares."""
+    return (squares > SEEN ** 2) & (squares > SEEN ** 2 * squares[..., -1:])
+
+
+def outside_of(onto: Floats, columns: Floats) -> tuple[Floats, Floats]:
+    """Return (m, c) columns of norm 1 with a base projected out, and their (c,) norms before."""
+    sizes = _norms(columns)
+    columns = columns / sizes
+    columns -= onto @ (onto.T @ columns)
+    return columns, sizes
+
+
 def products_of(columns: Floats, residual: Floats) -> Floats:
     """Return the products of (m, c) columns and, last, an (m,) residual, (c + 1, c + 1)."""
     count = columns.shape[1]
@@ -291,51 +468,12 @@ def held_out(residual: Floats, own: Floats) -> Floats:
     return predicted
 
 
-def linearised(fit: Fit, base: tuple[str, ...], tried: Sequence[Candidate] = ()) -> Linear:
-    """Return the linear problem at a fit, given the names of the base, and the candidates."""
-    near, model = fit.equations, fit.model
-    held = Model({name: values for name, values in model.values.items() if name in base})
-    further = Model({name: values for name, values in model.values.items() if name not in base})
-    residual = near.residual
-    if further.values:
-        residual = residual + near.columns(further) @ _amplitudes(further)
-    onto = _orthonormal(near.columns(held)[:, held.fitted])
-    residual = residual - onto @ (onto.T @ residual)
-    blocks, raw = _blocks(near, fit.poses_g.columns, further, tried)
-    columns, sizes = outside_of(onto, raw)
-    kinds = len({kind_of(block.effect) for block in blocks})
-    return Linear(onto, residual, near.pose, blocks, columns, sizes,
-                  products_of(columns, residual), WORTH if near.noise_known else 0.0,
-                  near.count - onto.shape[1], float(residual @ residual), near.columns(_OFFSET),
-                  2.0 * math.log(1.0 + kinds))
-
-
-def visible(fit: Fit, tried: Sequence[Candidate]) -> dict[str, float]:
-    """Return the effect on the residuals of candidates of typical size beside a fit, per noise."""
-    near, found = fit.equations, {}
-    onto = _orthonormal(fit.columns)
-    for each in tried:
-        columns, sizes = outside_of(onto, near.columns_of(each.name, each.factors))
-        own = columns.reshape(len(columns), len(each.shapes), -1).swapaxes(0, 1)
-        sized = own * sizes.reshape(len(own), 1, -1)
-        seen = is_seen(np.linalg.eigvalsh(own.swapaxes(1, 2) @ own)).any(axis=1)
-        if np.any(seen):
-            squares = np.linalg.eigvalsh(sized.swapaxes(1, 2) @ sized)[seen, -1]
-            found[each.name] = math.sqrt(np.max(squares)) * each.entry.typical
-    return found
-
-
-def is_seen(squares: Floats) -> NDArray[np.bool_]:
-    """Return which directions of columns are outside of a basis, by their increasing squares."""
-    return (squares > SEEN ** 2) & (squares > SEEN ** 2 * squares[..., -1:])
-
-
-def outside_of(onto: Floats, columns: Floats) -> tuple[Floats, Floats]:
-    """Return (m, c) columns of norm 1 with a base projected out, and their (c,) norms before."""
-    sizes = _norms(columns)
-    columns = columns / sizes
-    columns -= onto @ (onto.T @ columns)
-    return columns, sizes
+def orthonormal(columns: Floats) -> Floats:
+    """Return orthonormal columns with the span of others."""
+    if not columns.shape[1]:
+        return columns
+    vectors, scales, _ = np.linalg.svd(columns / _norms(columns), full_matrices=False)
+    return np.asarray(vectors[:, scales > 1e-6 * scales[0]])
 
 
 def _norms(columns: Floats) -> Floats:
@@ -343,129 +481,3 @@ def _norms(columns: Floats) -> Floats:
     sizes: Floats = np.sqrt(np.einsum('mc,mc->c', columns, columns))
     sizes[sizes == 0.0] = 1.0
     return sizes
-
-
-def _amplitudes(model: Model) -> Floats:
-    """Return the (p,) values of a model with those of its shapes set to zero."""
-    parts = [np.concatenate([values[:len(effect.parameters)], np.zeros(len(effect.shape))])
-             for effect, values in zip(model.terms.effects, model.values.values(), strict=True)]
-    return np.concatenate(parts)
-
-
-def _orthonormal(columns: Floats) -> Floats:
-    if not columns.shape[1]:
-        return columns
-    vectors, scales, _ = np.linalg.svd(columns / _norms(columns), full_matrices=False)
-    return np.asarray(vectors[:, scales > 1e-6 * scales[0]])
-
-
-def _blocks(near: Equations, context: Context, present: Model, tried: Sequence[Candidate]
-            ) -> tuple[tuple[Block, ...], Floats]:
-    """Return the blocks of the candidates, and their columns."""
-    alike = Counter(kind_of(each.name) for each in tried)
-    tried = [each.beside(present.values.get(each.name), context) for each in tried]
-    widths = [len(each.shapes) * len(each.entry.parameters) for each in tried]
-    columns = np.empty((len(near.pose), sum(widths)), order='F')
-    blocks: list[Block] = []
-    for each, start, width in zip(tried, np.cumsum([0, *widths]).tolist(), widths):
-        columns[:, start:start + width] = near.columns_of(each.name, each.factors)
-        blocks += each.blocks(start, alike[kind_of(each.name)])
-    return tuple(blocks), columns
-
-
-@dataclass(frozen=True)
-class State:
-    """A model fitted to the poses kept."""
-
-    fit: Fit
-
-    @property
-    def model(self) -> Model:
-        """Return the fitted model, ΔR = I."""
-        return self.fit.model
-
-    @property
-    def poses_g(self) -> Poses:
-        """Return the poses kept, in g, with the column ``previous``."""
-        return self.fit.poses_g
-
-    @cached_property
-    def linear(self) -> Linear:
-        """Return the equations with all values of the model projected out, without candidates."""
-        return linearised(self.fit, self.model.effects)
-
-    @property
-    def residual(self) -> Floats:
-        """(m,) array, residuals of the equations with all values fitted."""
-        return self.linear.residual
-
-    @property
-    def rss(self) -> float:
-        """Sum of squared residuals."""
-        return self.linear.base_rss
-
-    @property
-    def held_out(self) -> Floats:
-        """(m,) array, each residual if its own equation is left out of the fit (PRESS)."""
-        return held_out(self.residual, 1.0 - np.sum(self.linear.onto ** 2, axis=1))
-
-    @property
-    def dof(self) -> int:
-        """Return the number of independent equations minus that of fitted values."""
-        return self.linear.dof
-
-    @property
-    def is_noise(self) -> bool:
-        """Return whether noise may explain the residual; True if the noise is not known."""
-        return not self.fit.noise_known or is_noise(self.rss, self.dof)
-
-    def gap_mg(self, residual: Floats) -> float:
-        """Return the RMS over the new poses of (m,) residuals of the equations [mg]."""
-        of_poses = self.fit.equations.of_poses(residual)
-        if 'new' in self.poses_g:
-            of_poses = of_poses[self.poses_g['new'] > 0.0]
-        return float(np.sqrt(np.mean(of_poses ** 2))) * MG
-
-    def mg_of_poses(self, residual: Floats) -> Floats:
-        """Return the (n,) residuals of poses from (m,) residuals of the equations [mg]."""
-        return self.fit.equations.of_poses(residual) * MG
-
-    @property
-    def floor_mg(self) -> float | None:
-        """Return the residual expected of a correct model [mg]; None if the noise is unknown."""
-        if not self.fit.noise_known:
-            return None
-        rows = self.fit.by_pose.rows[self.fit.equations.pose]
-        share = np.sqrt(self.dof / len(rows)) * np.ones(len(rows))
-        return self.gap_mg(share)
-
-
-def is_noise(rss: float, dof: float) -> bool:
-    """Return whether measured noise explains a weighted sum of squares."""
-    from scipy.special import chdtrc
-
-    return bool(dof <= 0 or rss <= _CHI2_RATIO * dof or chdtrc(dof, rss) > _CHI2_LEVEL)
-
-
-def beginning(poses_g: Poses, model: Model) -> State:
-    """Return the state of a base model, fitted to all poses; `NotConvergedError` if that fails."""
-    return State(estimate(model, with_history(poses_g, model)))
-
-
-def fitted_state(model: Model, poses_g: Poses, most: float = np.inf) -> State | None:
-    """Return the state of a model fitted to poses; None without a sound fit below `most`."""
-    try:
-        return State(estimate(model, poses_g, most=most))
-    except NotConvergedError:
-        return None
-
-
-def with_effect(model: Mapping[str, Floats], name: str, values: Floats) -> dict[str, Floats]:
-    """Return the values of a model with one more effect, which replaces those it contains."""
-    contained = included((name,))
-    return {**{key: part for key, part in model.items() if key not in contained}, name: values}
-
-
-def without(poses: Poses, out: Sequence[int] | NDArray[np.intp]) -> Poses:
-    """Return the poses but those at these indices."""
-    return poses.take(np.delete(np.arange(len(poses)), out))

@@ -34,10 +34,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .curves import LEAST, Near, probabilities
-from .linear import fitted_state, with_effect
+from .linear import Set
 from .result import ENOUGH, percent, PlannedPose, PosePlan, shown_name, versus
 from .search import Found
-from .sets import Set
+from .state import fitted_state, with_effect
 from ..effects import effect_named, Model, WANDER
 from ..estimate import Fit, judge, kinds
 from ..geometry import attitude_words, ATTITUDES, spread_directions

@@ -24,10 +24,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .base import beside_stored, sampled, with_stored
-from .linear import fitted_state, is_noise, State
 from .plan import plan_poses
 from .result import plain_name, PosePlan, Refinement, Stage, Verdict
 from .search import Found, search
+from .state import fitted_state, is_noise, State
 from .steps import advice_for, beside_walk, not_testable, steps_of, untestable, verdict_of
 from ..calibrate import (
     Calibration, check_sensor, fit_findings, fit_poses, fit_with_fleet, FLEET, FleetPrior, gated,

@@ -28,11 +28,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .base import causes, Clipped, off_grid, unclipped
+from .beam import accepted, explored, simpler
 from .curves import best_curve, Curve, Near, Process, process_of, SIGNIFICANT, Walk, walk_beside
-from .linear import (
-    beginning, Candidate, candidates, fitted_state, is_noise, Linear, linearised, State,
-    with_effect, without)
-from .sets import accepted, explored, LEVEL, Set, simpler
+from .linear import LEVEL, Linear, Set
+from .state import (
+    beginning, Candidate, candidates, fitted_state, is_noise, linearised, State, with_effect,
+    without)
 from ..calibrate import with_previous
 from ..effects import (
     CHANGES, covariate_names, effect_named, EFFECTS, empirical_parts, included, LADDER,

@@ -20,10 +20,10 @@ import math
 import numpy as np
 
 from .curves import is_curve, LEAST, nearest_effects, probabilities, steepest
-from .linear import candidates, fitted_state, is_noise, linearised, State, visible, with_effect
+from .linear import Set
 from .result import plain_name, shown_name, Stage, Step, Verdict
 from .search import Found
-from .sets import Set
+from .state import candidates, fitted_state, is_noise, linearised, State, visible, with_effect
 from ..effects import (
     CHANGES, effect_named, EFFECTS, EMPIRICAL, empirical_parts, included, is_effect, kind_of,
     LADDER, Model, parameter_names, PROCESSES, TO_SEPARATE, unit_of, variable_words, WANDER)

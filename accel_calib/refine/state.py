@@ -1,0 +1,259 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+A model fitted to the poses kept, and its equations with the candidates as columns.
+
+A candidate is an effect with each shape that is tried. `linearised` projects the base of a model
+out of the equations, for the candidates that the context of the poses allows.
+
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .linear import Block, held_out, is_seen, Linear, orthonormal, outside_of, products_of
+from ..calibrate import with_history
+from ..effects import Context, Effect, effect_named, factors_of, included, kind_of, Model
+from ..estimate import Equations, estimate, Fit, NotConvergedError
+from ..table import Floats, Poses
+from ..units import MG
+
+WORTH = 4.0
+"""ν, degrees of freedom that the measured noise counts as."""
+
+_SHAPES_AT_ONCE = 250
+"""If there are more shapes, only evenly spread shapes are tried."""
+
+_MANY_POSES, _FEW_SHAPES = 1000, 60
+"""The same for more poses than this."""
+
+_SHAPES_ALIKE = 3.0
+"""Number of neighbouring shapes that count as one independent trial."""
+
+_CHI2_LEVEL = 1e-3
+_CHI2_RATIO = 1.3
+"""chi² per degree of freedom that still counts as noise: poses repeat worse than samples."""
+
+_OFFSET = Model({'offset': np.zeros(3)})
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """
+    An effect to try with each of its (s,) `shapes`, which count as `tried` independent ones.
+
+    `factors` (shapes, t or 1, n) are those of its terms at the poses. They do not depend on a
+    model.
+
+    """
+
+    name: str
+    shapes: tuple[Floats, ...]
+    tried: float
+    factors: Floats
+
+    @property
+    def entry(self) -> Effect:
+        """Return the effect."""
+        return effect_named(self.name)
+
+    def beside(self, present: Floats | None, context: Context) -> Candidate:
+        """Return the candidate with the shape of its values in a model, too."""
+        if present is None or len(self.shapes) < 2:
+            return self
+        shape = self.entry.split(present)[1]
+        return replace(self, shapes=(*self.shapes, shape), factors=np.concatenate(
+            [self.factors, factors_of(self.name, [shape], context)]))
+
+    def blocks(self, start: int, alike: int) -> Iterator[Block]:
+        """Yield a block for each shape, from a column on; `alike` candidates are of one kind."""
+        count, entry, searched = len(self.entry.parameters), self.entry, len(self.shapes) > 1
+        for shape in self.shapes:
+            new = searched and not np.array_equal(shape, entry.usual)
+            yield Block(self.name, shape, slice(start, start + count), entry, int(new),
+                        (self.tried if new else 1.0) * alike)
+            start += count
+
+
+def candidates(names: Iterable[str], poses_g: Poses) -> tuple[Candidate, ...]:
+    """Return the effects of these names that the context of the poses allows."""
+    found, context = [], poses_g.columns
+    for name in names:
+        effect = effect_named(name)
+        if effect.output is None and all(key in context for key in effect.needs):
+            shapes, tried = _shapes(effect, context, len(poses_g))
+            if shapes:
+                found.append(Candidate(name, shapes, tried, factors_of(name, shapes, context)))
+    return tuple(found)
+
+
+def _shapes(effect: Effect, context: Context, poses: int) -> tuple[tuple[Floats, ...], float]:
+    """Return the shapes of an effect to try, and the number that they count as."""
+    if effect.shapes is None:
+        return (np.zeros(0),), 1.0
+    shapes = tuple(effect.shapes(context))
+    most = _SHAPES_AT_ONCE if poses <= _MANY_POSES else _FEW_SHAPES
+    shapes = shapes[::-(-len(shapes) // most)] if len(shapes) > most else shapes
+    return shapes, max(len(shapes) / _SHAPES_ALIKE, 1.0)
+
+
+def linearised(fit: Fit, base: tuple[str, ...], tried: Sequence[Candidate] = ()) -> Linear:
+    """Return the linear problem at a fit, given the names of the base, and the candidates."""
+    near, model = fit.equations, fit.model
+    held = Model({name: values for name, values in model.values.items() if name in base})
+    further = Model({name: values for name, values in model.values.items() if name not in base})
+    residual = near.residual
+    if further.values:
+        residual = residual + near.columns(further) @ _amplitudes(further)
+    onto = orthonormal(near.columns(held)[:, held.fitted])
+    residual = residual - onto @ (onto.T @ residual)
+    blocks, raw = _blocks(near, fit.poses_g.columns, further, tried)
+    columns, sizes = outside_of(onto, raw)
+    kinds = len({kind_of(block.effect) for block in blocks})
+    return Linear(onto, residual, near.pose, blocks, columns, sizes,
+                  products_of(columns, residual), WORTH if near.noise_known else 0.0,
+                  near.count - onto.shape[1], float(residual @ residual), near.columns(_OFFSET),
+                  2.0 * math.log(1.0 + kinds))
+
+
+def visible(fit: Fit, tried: Sequence[Candidate]) -> dict[str, float]:
+    """Return the effect on the residuals of candidates of typical size beside a fit, per noise."""
+    near, found = fit.equations, {}
+    onto = orthonormal(fit.columns)
+    for each in tried:
+        columns, sizes = outside_of(onto, near.columns_of(each.name, each.factors))
+        own = columns.reshape(len(columns), len(each.shapes), -1).swapaxes(0, 1)
+        sized = own * sizes.reshape(len(own), 1, -1)
+        seen = is_seen(np.linalg.eigvalsh(own.swapaxes(1, 2) @ own)).any(axis=1)
+        if np.any(seen):
+            squares = np.linalg.eigvalsh(sized.swapaxes(1, 2) @ sized)[seen, -1]
+            found[each.name] = math.sqrt(np.max(squares)) * each.entry.typical
+    return found
+
+
+def _amplitudes(model: Model) -> Floats:
+    """Return the (p,) values of a model with those of its shapes set to zero."""
+    parts = [np.concatenate([values[:len(effect.parameters)], np.zeros(len(effect.shape))])
+             for effect, values in zip(model.terms.effects, model.values.values(), strict=True)]
+    return np.concatenate(parts)
+
+
+def _blocks(near: Equations, context: Context, present: Model, tried: Sequence[Candidate]
+            ) -> tuple[tuple[Block, ...], Floats]:
+    """Return the blocks of the candidates, and their columns."""
+    alike = Counter(kind_of(each.name) for each in tried)
+    tried = [each.beside(present.values.get(each.name), context) for each in tried]
+    widths = [len(each.shapes) * len(each.entry.parameters) for each in tried]
+    columns = np.empty((len(near.pose), sum(widths)), order='F')
+    blocks: list[Block] = []
+    for each, start, width in zip(tried, np.cumsum([0, *widths]).tolist(), widths):
+        columns[:, start:start + width] = near.columns_of(each.name, each.factors)
+        blocks += each.blocks(start, alike[kind_of(each.name)])
+    return tuple(blocks), columns
+
+
+@dataclass(frozen=True)
+class State:
+    """A model fitted to the poses kept."""
+
+    fit: Fit
+
+    @property
+    def model(self) -> Model:
+        """Return the fitted model, ΔR = I."""
+        return self.fit.model
+
+    @property
+    def poses_g(self) -> Poses:
+        """Return the poses kept, in g, with the column ``previous``."""
+        return self.fit.poses_g
+
+    @cached_property
+    def linear(self) -> Linear:
+        """Return the equations with all values of the model projected out, without candidates."""
+        return linearised(self.fit, self.model.effects)
+
+    @property
+    def residual(self) -> Floats:
+        """(m,) array, residuals of the equations with all values fitted."""
+        return self.linear.residual
+
+    @property
+    def rss(self) -> float:
+        """Sum of squared residuals."""
+        return self.linear.base_rss
+
+    @property
+    def held_out(self) -> Floats:
+        """(m,) array, each residual if its own equation is left out of the fit (PRESS)."""
+        return held_out(self.residual, 1.0 - np.sum(self.linear.onto ** 2, axis=1))
+
+    @property
+    def dof(self) -> int:
+        """Return the number of independent equations minus that of fitted values."""
+        return self.linear.dof
+
+    @property
+    def is_noise(self) -> bool:
+        """Return whether noise may explain the residual; True if the noise is not known."""
+        return not self.fit.noise_known or is_noise(self.rss, self.dof)
+
+    def gap_mg(self, residual: Floats) -> float:
+        """Return the RMS over the new poses of (m,) residuals of the equations [mg]."""
+        of_poses = self.fit.equations.of_poses(residual)
+        if 'new' in self.poses_g:
+            of_poses = of_poses[self.poses_g['new'] > 0.0]
+        return float(np.sqrt(np.mean(of_poses ** 2))) * MG
+
+    def mg_of_poses(self, residual: Floats) -> Floats:
+        """Return the (n,) residuals of poses from (m,) residuals of the equations [mg]."""
+        return self.fit.equations.of_poses(residual) * MG
+
+    @property
+    def floor_mg(self) -> float | None:
+        """Return the residual expected of a correct model [mg]; None if the noise is unknown."""
+        if not self.fit.noise_known:
+            return None
+        rows = self.fit.by_pose.rows[self.fit.equations.pose]
+        share = np.sqrt(self.dof / len(rows)) * np.ones(len(rows))
+        return self.gap_mg(share)
+
+
+def is_noise(rss: float, dof: float) -> bool:
+    """Return whether measured noise explains a weighted sum of squares."""
+    from scipy.special import chdtrc
+
+    return bool(dof <= 0 or rss <= _CHI2_RATIO * dof or chdtrc(dof, rss) > _CHI2_LEVEL)
+
+
+def beginning(poses_g: Poses, model: Model) -> State:
+    """Return the state of a base model, fitted to all poses; `NotConvergedError` if that fails."""
+    return State(estimate(model, with_history(poses_g, model)))
+
+
+def fitted_state(model: Model, poses_g: Poses, most: float = np.inf) -> State | None:
+    """Return the state of a model fitted to poses; None without a sound fit below `most`."""
+    try:
+        return State(estimate(model, poses_g, most=most))
+    except NotConvergedError:
+        return None
+
+
+def with_effect(model: Mapping[str, Floats], name: str, values: Floats) -> dict[str, Floats]:
+    """Return the values of a model with one more effect, which replaces those it contains."""
+    contained = included((name,))
+    return {**{key: part for key, part in model.items() if key not in contained}, name: values}
+
+
+def without(poses: Poses, out: Sequence[int] | NDArray[np.intp]) -> Poses:
+    """Return the poses but those at these indices."""
+    return poses.take(np.delete(np.arange(len(poses)), out))
