@@ -26,7 +26,8 @@ from .findings import figures_of, rate, Rating
 from .geometry import spread_directions
 from .logs import (
     are_untimed_samples, Frame, LogOptions, read_log, read_recording as read_whole_recording)
-from .pipeline import calibrated, captured_from, Flat, options_for, Plan, poses_of
+from .pipeline import (
+    calibrated, captured_from, Flat, options_for, Plan, poses_of, still_ramp, thermally_calibrated)
 from .refine import refine as find_effects, Refinement
 from .stored import read_calibration, write_calibration
 from .table import (
@@ -305,6 +306,8 @@ def calibrate(log: Source | Poses | Recording | Data, *, units: UnitName | None 
     """
     Calibrate from any log: read or capture the poses, fit, find further effects, and level.
 
+    A recording of a still board whose temperature changes gives the offset over temperature alone.
+
     Parameters
     ----------
     log : str, Path, Poses, Recording, DataFrame or (n, 3) array
@@ -341,8 +344,11 @@ def calibrate(log: Source | Poses | Recording | Data, *, units: UnitName | None 
     """
     plan = Plan(refined=refined, flat=flat, nose_down=nose_down, frame=frame, sensor=sensor,
                 also=know(also))
-    found = poses_of(*_asked(log, units, gravity, {'sensor': sensor, **settings}))
-    return _public(calibrated(found.poses, found.units, plan).calibration)
+    source, options, asked = _asked(log, units, gravity, {'sensor': sensor, **settings})
+    found = poses_of(source, options, asked)
+    ramp = still_ramp(source, options, found)
+    return _public((calibrated(found.poses, found.units, plan) if ramp is None
+                    else thermally_calibrated([ramp], plan)).calibration)
 
 
 def fit(poses: Source | Poses | Data, *, units: UnitName | None = None,

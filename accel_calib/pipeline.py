@@ -236,8 +236,7 @@ def ramp_or_poses(source: Path | Piped | Frame, options: LogOptions = LogOptions
     return poses_of(source, options, settings, progress)
 
 
-def still_ramp(source: Path | Piped | Frame, options: LogOptions, found: Intake
-               ) -> RampIntake | None:
+def still_ramp(source: Source, options: LogOptions, found: Intake) -> RampIntake | None:
     """
     Return the ramp of a log whose poses all lie in one direction; None if it has no ramp.
 
@@ -247,7 +246,7 @@ def still_ramp(source: Path | Piped | Frame, options: LogOptions, found: Intake
     """
     if not found.captured or not _is_one_direction(found.poses):
         return None
-    with open_log(source, options) as log:
+    with _opened(source, options) as log:
         if log.units.is_native:
             return None
         cells = cells_of(log.blocks, log.units)
@@ -429,40 +428,53 @@ class ThermalOutcome:
         return rate(self.calibration)
 
 
-def thermally_calibrated(ramps: Sequence[Ramp], units: Units, poses: Poses | None = None,
-                         plan: Plan = Plan()) -> ThermalOutcome:
+def thermally_calibrated(logs: Sequence[Intake | RampIntake], plan: Plan = Plan()
+                         ) -> ThermalOutcome:
     """
     Fit the offset over temperature to ramps of a still board, and a calibration to poses, if any.
 
     Parameters
     ----------
-    ramps : sequence of Ramp
-        One or more; each has its own orientation.
-    units : Units
-        Unit of the readings of the calibration, and of the poses.
-    poses : Poses, optional
-        Poses of the same sensor in many directions, with their temperature.
+    logs : sequence of Intake or RampIntake
+        One or more ramps, each in its own orientation, and at most one log of poses of the same
+        sensor in many directions, with their temperature. Its unit is that of the calibration.
     plan : Plan
         How to fit and level the poses; nothing is refined.
 
     Raises
     ------
     RefusedFitError, InputError
-        As in `calibrated`, or if the logs are of several sensors.
+        As in `calibrated`, or if there is no ramp, or the logs are of several sensors.
 
     """
-    _check_one_sensor([*(each.stretches for each in ramps), *([] if poses is None else [poses])])
-    curve = curve_of(ramps)
-    if poses is None:
-        made = thermal_alone(curve, units, sensor=plan.sensor, date=now())
+    ramps = [each for each in logs if isinstance(each, RampIntake)]
+    turned = _turned_over(logs)
+    _check_one_sensor([*(each.ramp.stretches for each in ramps),
+                       *([] if turned is None else [turned.poses])])
+    curve = curve_of([each.ramp for each in ramps])
+    if turned is None:
+        made = thermal_alone(curve, ramps[0].units, sensor=plan.sensor, date=now())
         rows = made.poses
     else:
-        steady = without_curve(curve, poses, units)
-        fitted = calibrated(steady, units, replace(
+        rows, units = turned.poses, turned.units
+        fitted = calibrated(without_curve(curve, rows, units), units, replace(
             plan, refined=False, flat=None, nose_down=None)).calibration
-        made, rows = with_curve(fitted, curve, poses), poses
+        made = with_curve(fitted, curve, rows)
     return ThermalOutcome(level_by_rows(
         made, rows, plan.frame, _row(rows, plan.flat), plan.nose_down), curve)
+
+
+def _turned_over(logs: Sequence[Intake | RampIntake]) -> Intake | None:
+    """Return the one log of poses, if there is one; raise InputError without a ramp."""
+    turned = [each for each in logs if isinstance(each, Intake)]
+    if len(turned) == len(logs):
+        raise InputError(f'{counted(len(turned), "log")} of poses in many directions, expected '
+                         'one of a still board whose temperature changes', 'record the board '
+                         'while it warms up from the freezer, and give this log, too')
+    if len(turned) > 1:
+        raise InputError(f'{len(turned)} logs are of poses in many directions, expected at most '
+                         'one', 'leave out the others')
+    return turned[0] if turned else None
 
 
 def _check_one_sensor(tables: Sequence[Poses]) -> None:

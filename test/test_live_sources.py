@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, ExitStack, suppress
+import fcntl
 import os
 from pathlib import Path
 import re
@@ -14,9 +15,11 @@ import resource
 import signal
 import socket
 import stat
+import struct
 import subprocess
 import sys
 import tempfile
+import termios
 from threading import Event, Thread
 import time
 import tty
@@ -376,7 +379,9 @@ def board(lines: Iterable[str]) -> Iterator[str]:
     """
     Yield the port of a board that sends these lines; their iterator sets the pace.
 
-    As on a real port, bytes that nobody reads in time are lost.
+    As on a real port, bytes that nobody reads in time are lost. The board starts when the port is
+    opened, as many do. Opening it discards what has arrived, so that only the second of two lines
+    that are gone is known to be read.
 
     """
     ours, theirs = os.openpty()
@@ -385,6 +390,11 @@ def board(lines: Iterable[str]) -> Iterator[str]:
     over = Event()
 
     def send() -> None:
+        for _ in range(2):
+            os.write(ours, b'\n')
+            while struct.unpack('i', fcntl.ioctl(theirs, termios.FIONREAD, bytes(4)))[0]:
+                if over.wait(0.001):
+                    return
         for line in lines:
             if over.is_set():
                 return

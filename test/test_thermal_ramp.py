@@ -15,6 +15,7 @@ degree 3 over all samples:
 
 from pathlib import Path
 
+import accel_calib as ac
 from accel_calib.calibrate import Curve, curve_of
 from accel_calib.capture import cells_of, ramp_of
 from accel_calib.errors import InputError
@@ -23,7 +24,7 @@ from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import Recording
 from accel_calib.units import MG, units_of
 from faults.sample import sample
-from inside import export, thermally_calibrated
+from inside import export, Intake, RampIntake, thermally_calibrated
 import numpy as np
 import pytest
 from ramps import BENT, G, LINE, offset_at, ramp, twelve_poses, TWISTED, UP, warming, write_ulog
@@ -37,6 +38,12 @@ UNITS = units_of('m/s2')
 
 def curve(*logs: Recording) -> Curve:
     return curve_of([ramp_of(cells_of([log], UNITS)) for log in logs])
+
+
+def thermal(*logs: Recording | Intake):
+    return thermally_calibrated([
+        log if isinstance(log, Intake) else RampIntake(ramp_of(cells_of([log], UNITS)), UNITS)
+        for log in logs])
 
 
 def px4_fit(log: Recording):
@@ -104,7 +111,7 @@ def test_deviations_include_the_correlated_noise(wander_g):
 @pytest.mark.parametrize('seed', sample(range(80, 90), 2))
 def test_coefficients_are_those_of_the_autopilots(vendor, seed, tmp_path):
     log = ramp(seed, TWISTED, noise_g=0.001)
-    outcome = thermally_calibrated([ramp_of(cells_of([log], UNITS))], UNITS)
+    outcome = thermal(log)
     zero, theirs = VENDORS[vendor](log)
     text = export(outcome.calibration, vendor).text_or_bytes
     assert isinstance(text, str)
@@ -156,7 +163,7 @@ def test_ramps_of_several_orientations_share_one_curve():
     (-15.0, 15.0, 15.0), (30.0, 60.0, 30.0), (0.0, 50.0, 25.0)])
 def test_the_calibration_is_zero_at_25_degrees_or_the_nearest_end(low, high, reference, tmp_path):
     log = ramp(7, TWISTED, low=low, high=high)
-    made = thermally_calibrated([ramp_of(cells_of([log], UNITS))], UNITS)
+    made = thermal(log)
     assert made.curve.reference_c == pytest.approx(reference, abs=1.5)
     write_calibration(tmp_path / 'c.yaml', made.calibration)
     stored = read_calibration(tmp_path / 'c.yaml')
@@ -239,7 +246,10 @@ def test_calibrate_recognises_a_still_board_that_warms_up(tmp_path, capsys):
     assert status == 0
     assert result['thermal']['degree'] == 2
     assert any('fitted as by accel-calib thermal' in line for line in result['read_lines'])
-    assert 'offset_temperature_quadratic' in read_calibration(tmp_path / 'c.yaml').model.effects
+    stored = read_calibration(tmp_path / 'c.yaml')
+    assert 'offset_temperature_quadratic' in stored.model.effects
+    assert ac.calibrate(path) == stored
+    assert ac.calibrate(ramp(8)).model.effects == stored.model.effects
 
 
 def test_a_log_of_px4_is_read_and_its_sensor_kept(tmp_path, capsys):
@@ -310,10 +320,9 @@ def test_the_logs_are_of_one_board_and_at_most_one_is_of_poses(logs, words, tmp_
 
 
 def test_logs_of_several_sensors_are_refused():
-    ramps = [ramp_of(cells_of([Recording(ramp(8).columns, ramp(8).row, 'm/s2', name)], UNITS))
-             for name in ('left', 'right')]
+    logs = [Recording(ramp(8).columns, ramp(8).row, 'm/s2', name) for name in ('left', 'right')]
     with pytest.raises(InputError, match='sensors left, right, expected one'):
-        thermally_calibrated(ramps, UNITS)
+        thermal(*logs)
 
 
 def test_readings_in_counts_are_refused():
@@ -326,9 +335,9 @@ def test_poses_without_temperature_are_refused():
     still = Recording({key: poses[key] for key in ('time', 'reading')}, poses.row, 'g')
     from accel_calib.capture import capture
 
-    found = capture(still, units_of('g')).poses
+    units = units_of('g')
     with pytest.raises(InputError, match='the poses have no temperature'):
-        thermally_calibrated([ramp_of(cells_of([ramp(8)], UNITS))], units_of('g'), found)
+        thermal(ramp(8), Intake(capture(still, units).poses, units))
 
 
 def test_the_sense_hat_has_the_curve_that_others_found(tmp_path, capsys):

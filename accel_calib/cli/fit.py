@@ -85,16 +85,12 @@ def run_thermal(args: argparse.Namespace) -> Done:
 def _thermal_done(args: argparse.Namespace, logs: Sequence[Path],
                   found: Sequence[Intake | RampIntake], *notes: str) -> Done:
     """Fit, store, write the page, and return what is done, with further notes on the logs."""
-    ramps = [each for each in found if isinstance(each, RampIntake)]
-    poses = _of_poses(found, ramps)
-    units = poses.units if poses else ramps[0].units
     lines = [*(line for each in found for line in each.lines), *notes]
     read_as = ', '.join(dict.fromkeys(each.read_as for each in found if each.read_as))
     plan = Plan(**{**given(Plan, args), 'rows': None, 'fleet': None, 'refined': False})
     with saying(read_as), working('fitting'):
-        outcome = thermally_calibrated([each.ramp for each in ramps], units,
-                                       None if poses is None else poses.poses, plan)
-    calibration = outcome.calibration
+        outcome = thermally_calibrated(found, plan)
+    calibration, is_whole = outcome.calibration, any(isinstance(each, Intake) for each in found)
     (left_out, stored), names = store(args, outcome), ', '.join(map(str, logs))
 
     def page() -> str:
@@ -106,22 +102,9 @@ def _thermal_done(args: argparse.Namespace, logs: Sequence[Path],
         {'file': list(logs), **calibration_json(calibration, outlook(calibration, 'auto')),
          'read_as': read_as, 'read_lines': lines, 'thermal': curve_json(outcome.curve)},
         [*lines, *_curve_lines(outcome.curve),
-         *(calibration_lines(calibration) if poses else _notes(calibration)), *left_out,
+         *(calibration_lines(calibration) if is_whole else _notes(calibration)), *left_out,
          *page_beside(args, page)],
         outcome.rating, status_of(outcome), stored)
-
-
-def _of_poses(found: Sequence[Intake | RampIntake], ramps: Sequence[RampIntake]) -> Intake | None:
-    """Return the one log of poses, if there is one; raise InputError without a ramp."""
-    poses = [each for each in found if isinstance(each, Intake)]
-    if not ramps:
-        raise InputError(f'{counted(len(poses), "log")} of poses in many directions, expected one '
-                         'of a still board whose temperature changes', 'record the board while it '
-                         'warms up from the freezer, and give this log, too')
-    if len(poses) > 1:
-        raise InputError(f'{len(poses)} logs are of poses in many directions, expected at most '
-                         'one', 'leave out the others')
-    return poses[0] if poses else None
 
 
 def _curve_lines(curve: Curve) -> Iterator[Any]:
