@@ -29,6 +29,10 @@ from .errors import InputError
 
 STANDARD_OUTPUT = '-'
 
+FORMAT = 'accel_calib calibration'
+FIRST_LINE = f'format: {FORMAT}'
+"""Format of a stored calibration, and its first line, by which readers of logs know it."""
+
 _SUFFIX = '.tmp'
 _STALE_S = 3600.0
 """Age of a temporary file that no process writes any more [s]."""

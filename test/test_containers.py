@@ -223,6 +223,16 @@ def test_a_log_of_the_blackbox_says_how_to_decode_it(name: str, tmp_path: Path) 
         read_log(path)
 
 
+@pytest.mark.parametrize('method', [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
+@pytest.mark.parametrize('head', [
+    'ULog\x01\x12\x35', 'FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns\n'])
+def test_a_flight_log_in_an_archive_says_to_unpack_it(head: str, method: int, tmp_path: Path
+                                                      ) -> None:
+    path = zipped(tmp_path / 'log.zip', {'flight': head}, method)
+    with pytest.raises(InputError, match='holds the flight log flight.*unpack it'):
+        read_log(path)
+
+
 @pytest.mark.parametrize('blank', [',,,', ';;;', '""', '  ', ',,,\n,,,\n,,,'])
 def test_blank_rows_at_the_end_are_left_out(blank: str, tmp_path: Path) -> None:
     made = samples(per_g=G, rest=60, turn=20)

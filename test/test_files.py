@@ -127,6 +127,16 @@ def test_shape_at_its_usual_value_is_not_stored(values, text, calibration):
     assert format_calibration(parse_calibration(again, 'calibration.yaml')) == again
 
 
+@pytest.mark.parametrize('command', ['calibrate', 'fit', 'refine', 'verify', 'capture', 'apply'])
+def test_a_calibration_in_place_of_a_log_is_named(command, calibration, tmp_path, capsys):
+    path = tmp_path / 'calibration.yaml'
+    write_calibration(path, calibration)
+    used = ['-c', path] if command in ('verify', 'apply') else []
+    stored = [] if command == 'verify' else ['-o', tmp_path / 'other']
+    assert run(command, path, *used, *stored) == 2
+    assert 'is a calibration, expected a log or a table of poses' in capsys.readouterr().err
+
+
 def test_the_previous_calibration_is_kept(calibration, tmp_path):
     path = tmp_path / 'calibration.yaml'
     path.write_text('the one before')

@@ -35,7 +35,7 @@ import numpy as np
 
 from .columns import Chosen, chosen, is_log_header, LogOptions
 from .dialect import shown
-from .flight import sound_log
+from .flight import is_flight_log, sound_log
 from .names import meaning, READING, record_instead
 from .text import open_text, TextTable
 from ..errors import InputError, needing
@@ -60,6 +60,9 @@ _SMALL, _LARGEST_RATIO = 2_000_000, 100
 
 _ROWS = 500
 """Number of rows of a sheet that are read at once."""
+
+_HEAD = 8192
+"""Bytes of a file by which it is recognised."""
 
 _CELL_BYTES = 18
 """Bytes of a number as text, about."""
@@ -225,7 +228,17 @@ def _files(path: Path, archive: zipfile.ZipFile) -> list[Member]:
     if any(info.flag_bits & _ENCRYPTED for info in infos):
         raise InputError(f'{path} needs a password, expected a ZIP archive without one',
                          _UNPACK)
-    return [Member(info.filename, info.file_size, partial(archive.open, info)) for info in infos]
+    return [Member(info.filename, info.file_size, partial(_unpacked, path, archive, info))
+            for info in infos]
+
+
+def _unpacked(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Any:
+    """Open a file of an archive; InputError if it is a flight log."""
+    file: Any = archive.open(info)
+    if is_flight_log(file.peek(_HEAD)[:_HEAD]):
+        raise InputError(f'{path} holds the flight log {info.filename}, expected a table',
+                         _UNPACK)
+    return file
 
 
 # ------------------------------------------------------------------------------------ Excel

@@ -69,6 +69,11 @@ FMT = re.compile(rb'^FMT, *\d+, *\d+, *\w+, *\w+', re.MULTILINE)
 _STANDARD_ERROR = 2
 
 
+def is_flight_log(head: bytes) -> bool:
+    """Return whether a file with these first bytes is a log of PX4 or ArduPilot."""
+    return head.startswith((ULOG, DATAFLASH)) or FMT.search(head) is not None
+
+
 @contextmanager
 def sound_log(path: Path, expected: str, advice: str = 'copy it from the vehicle again'
               ) -> Iterator[None]:

@@ -31,11 +31,11 @@ from .bag_samples import context_of, imu_samples, together
 from .columns import check_once, chosen, is_log_header, LogOptions, Source, with_indices
 from .containers import FIRST_BYTES, Frame, open_table, Piped
 from .dialect import layout_of
-from .flight import DATAFLASH, FMT, read_dataflash, read_ulg, ULOG
+from .flight import is_flight_log, read_dataflash, read_ulg, ULOG
 from .names import OURS, READING
 from .quantities import are_samples, are_untimed_samples, decided, Quantities
 from .text import Cells, open_text, TextTable
-from ..disk import check_regular, write_atomically
+from ..disk import check_regular, FIRST_LINE, write_atomically
 from ..errors import InputError, saying
 from ..table import (
     check_units, check_values, column_of, COLUMNS, is_quantity, numbered, Poses, present,
@@ -172,14 +172,18 @@ def _opened(path: Path | Piped | Frame, options: LogOptions) -> Iterator[OpenLog
         return
     with path.open('rb') as file:
         head = file.read(_HEAD)
-    if head.startswith(ULOG):
-        yield _flight(path, read_ulg(path, options.topic, options.sensor), options)
-    elif head.startswith(DATAFLASH) or FMT.search(head):
-        yield _flight(path, read_dataflash(path, options.topic, options.sensor), options)
-    elif head.startswith(FIRST_BYTES) or (path.suffix == '.mat' and b'\0' in head):
+    if head.startswith(FIRST_LINE.encode()):
+        raise InputError(f'{path} is a calibration, expected a log or a table of poses',
+                         'use the log or the table that it was made from; most commands take a '
+                         'calibration with -c')
+    if head.startswith(FIRST_BYTES) or (path.suffix == '.mat' and b'\0' in head):
         with open_table(path, head, options) as (member, text):
             log = _text(path / member, text, options)
             yield replace(log, read_as=', '.join(filter(None, (member, log.read_as))))
+    elif head.startswith(ULOG):
+        yield _flight(path, read_ulg(path, options.topic, options.sensor), options)
+    elif is_flight_log(head):
+        yield _flight(path, read_dataflash(path, options.topic, options.sensor), options)
     else:
         with open_text(path, lambda cells: is_log_header(cells, options)) as text:
             yield _text(path, text, options)

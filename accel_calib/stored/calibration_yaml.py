@@ -31,7 +31,7 @@ from .. import __version__
 from ..calibrate import (
     Calibration, FleetPrior, gated, GyroBias, in_g, LARGEST_OFFSET_G, mounting_figures, Quality,
     Rejected, RejectedKind, SampleNoise, STORED_METHODS)
-from ..disk import check_regular, write_atomically
+from ..disk import check_regular, FIRST_LINE, FORMAT, write_atomically
 from ..effects import (
     CHANGES, Effect, effect_named, is_effect, Model, MODELS, parameter_names, PROCESSES)
 from ..errors import (
@@ -47,8 +47,6 @@ try:  # eight times as fast, but not in every build of PyYAML
 except ImportError:
     from yaml import SafeDumper  # type: ignore[assignment]
 
-_FORMAT = 'accel_calib calibration'
-_FIRST_LINE = f'format: {_FORMAT}'
 _VERSION = 3
 """The only version that is read; earlier ones were never released."""
 
@@ -131,7 +129,7 @@ def _values_in(calibration: Calibration) -> int:
 def _content(calibration: Calibration) -> dict[str, Any]:
     model, units, poses = calibration.model, calibration.units, calibration.poses
     return {
-        'format': _FORMAT, 'version': _VERSION, 'package_version': __version__,
+        'format': FORMAT, 'version': _VERSION, 'package_version': __version__,
         'equation': _EQUATION, 'sensor': calibration.sensor, 'stream': calibration.stream,
         'date': calibration.date,
         **({} if poses.autopilot is None else {'autopilot': asdict(poses.autopilot)}),
@@ -215,9 +213,9 @@ def _text_of(data: bytes, name: str) -> str:
     """Return the text of a file of this format."""
     if not data.strip(b'\0 \t\r\n'):
         raise _damaged(name, 'it is empty')
-    if not data.startswith(_FIRST_LINE.encode()):
+    if not data.startswith(FIRST_LINE.encode()):
         raise StoredCalibrationError(f'{name} is not a calibration of accel_calib, expected the '
-                                     f'first line "{_FIRST_LINE}"', 'use a file that fit wrote')
+                                     f'first line "{FIRST_LINE}"', 'use a file that fit wrote')
     if len(data) > MOST_BYTES:
         raise _damaged(name, f'it has more than {MOST_BYTES} bytes')
     try:
