@@ -215,7 +215,7 @@ def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
     if asked in ('auto', ORIENTED):  # with wrong orientations model 12 became 10
         planned = ORIENTED if calibration.form.known_orientation else NORM_MODELS[-1]
     known, noise_g = np.isfinite(uncertainty), None
-    if known and determines(calibration.name, directions, noise):
+    if known and calibration.form.effects and determines(calibration.name, directions, noise):
         noise_g = uncertainty / identifiability(calibration.name, directions, noise).mean_dilution
     return Outlook(identifiability(planned, directions, noise),
                    next_pose(directions, planned, noise, noise_g=noise_g),
