@@ -29,6 +29,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
+import scipy
 
 from .calibration import Calibration, ORIENTED, Rejected
 from .mounting import wiring
@@ -348,13 +349,12 @@ def _rms_mg(fit: Fit) -> float:
 
 def _by_chance(small: Fit, large: Fit) -> float:
     """Return the probability that noise alone explains the improvement by the larger model."""
-    from scipy.special import fdtrc
-
     if large.variance_dof <= 0:
         return 1.0
     added = small.dof - large.dof
     gained = max(small.chi2 - large.chi2, 0.0) / added
-    return float(fdtrc(added, large.variance_dof, gained / max(large.variance, 1e-300)))
+    ratio = gained / max(large.variance, 1e-300)
+    return float(scipy.special.fdtrc(added, large.variance_dof, ratio))
 
 
 def rejected_by(model: Model, poses_g: Poses) -> tuple[Rejected, ...]:
@@ -486,8 +486,7 @@ def _tangential_variance(fit: Fit, covariance: Floats, u: Floats) -> Floats:
 
 def _is_placement(away: Floats, variance: Floats, variance_dof: float) -> bool:
     """Return whether the differences are larger than the noise explains."""
-    from scipy.special import fdtrc
-
     dof = 2.0 * len(away) - 3.0
     ratio = float(np.sum(away ** 2) / np.sum(variance)) * 2.0 * len(away) / dof
-    return bool(ratio > _LEAST_RATIO and fdtrc(dof, variance_dof, ratio) < _LEVEL_OF_PLACEMENT)
+    chance = float(scipy.special.fdtrc(dof, variance_dof, ratio))
+    return ratio > _LEAST_RATIO and chance < _LEVEL_OF_PLACEMENT

@@ -49,6 +49,7 @@ import math
 from typing import Any
 
 import numpy as np
+import scipy
 
 from .calibration import Calibration
 from .context import with_history
@@ -478,9 +479,7 @@ def _mapping(permutation: Floats) -> str:
 
 def _turn(rotation: Floats) -> str:
     """Return a rotation of the sensor as an angle about an axis."""
-    from scipy.spatial.transform import Rotation
-
-    vector = Rotation.from_matrix(rotation).as_rotvec(degrees=True)
+    vector = scipy.spatial.transform.Rotation.from_matrix(rotation).as_rotvec(degrees=True)
     angle = float(np.linalg.norm(vector))
     axis = vector / angle
     axis = axis if axis[np.argmax(np.abs(axis))] > 0.0 or angle < 179.0 else -axis

@@ -49,6 +49,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+import scipy
 
 from ..table import Floats, Poses, Record
 
@@ -239,8 +240,6 @@ def _noise_of(rests: Poses) -> Floats:
 
 def _agreeing(rests: Poses) -> NDArray[np.bool_]:
     """Return which rests have the rate that noise and scatter explain."""
-    from scipy.special import stdtrit
-
     count, left, noise = len(rests), rests['rate'], _noise_of(rests)
     with_slope = 'temperature' in rests and count >= _ENOUGH
     if with_slope:
@@ -250,7 +249,7 @@ def _agreeing(rests: Poses) -> NDArray[np.bool_]:
     factor = _MAD_FEW[count] if count < len(_MAD_FEW) else count / (count - 0.8)
     spread = _MAD * factor * np.median(left, axis=0)
     scatter = np.maximum(spread ** 2 - np.median(noise, axis=0), 0.0)
-    limit = float(stdtrit(count - 1 - with_slope, 1.0 - _TAIL))
+    limit = float(scipy.special.stdtrit(count - 1 - with_slope, 1.0 - _TAIL))
     return np.asarray(np.all(left ** 2 <= limit ** 2 * (noise + scatter), axis=1))
 
 
@@ -295,9 +294,7 @@ class _RateFit:
 
     def is_sloping(self, count: int) -> NDArray[np.bool_]:
         """Return which axes have a significant slope."""
-        from scipy.special import stdtrit
-
-        limit = float(stdtrit(count - 2, 1.0 - _TAIL))
+        limit = float(scipy.special.stdtrit(count - 2, 1.0 - _TAIL))
         return np.asarray(np.abs(self.values[1]) > limit * self.deviation[1])
 
     def where(self, mine: NDArray[np.bool_], other: _RateFit) -> _RateFit:
@@ -318,9 +315,7 @@ def _lines(rests: Poses) -> _RateFit | None:
 
 def _fitted(design: Floats, rests: Poses) -> _RateFit:
     """Fit the rates of each axis with noise and scatter; `design` is (n, p)."""
-    from scipy.special import stdtrit
-
-    surplus = float(stdtrit(len(design) - design.shape[1], _CONFIDENCE)) / _NORMAL
+    surplus = float(scipy.special.stdtrit(len(design) - design.shape[1], _CONFIDENCE)) / _NORMAL
     values, variance, residual = [], [], []
     for rate, noise in zip(rests['rate'].T, _noise_of(rests).T, strict=True):
         scatter = _scatter(design, rate, noise)
@@ -342,8 +337,6 @@ def _weighted(design: Floats, rate: Floats, variance: Floats) -> tuple[Floats, F
 
 def _scatter(design: Floats, rate: Floats, noise: Floats) -> float:
     """Return τ², at which the weighted squares have their expected sum; see the module."""
-    from scipy.optimize import brentq
-
     dof = design.shape[0] - design.shape[1]
     flat = _weighted(design, rate, np.ones(len(rate)))[2]
     high = float(flat @ flat) / dof * (1.0 + _ROUNDING)
@@ -354,4 +347,4 @@ def _scatter(design: Floats, rate: Floats, noise: Floats) -> float:
 
     if excess(0.0) <= 0.0:
         return 0.0
-    return float(brentq(excess, 0.0, high, xtol=_ROUNDING * high))
+    return float(scipy.optimize.brentq(excess, 0.0, high, xtol=_ROUNDING * high))

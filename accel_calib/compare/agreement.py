@@ -49,6 +49,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 
 from ..calibrate import Calibration, fit_unknown, in_g, with_history
 from ..effects import Context, effect_named, force_slope, Model, parameter_basis, reading_of
@@ -201,14 +202,12 @@ def on_one_scale(runs: Sequence[Scatter]) -> CommonScale:
 
 def _pooled(runs: Sequence[Scatter]) -> tuple[float, float, list[int]]:
     """Pool runs; return the scale, its degrees of freedom, and the noisier runs."""
-    from scipy.special import fdtrc
-
     pool, worse = [run for run in runs if run.dof == 0], []
     for k in sorted((k for k, run in enumerate(runs) if run.dof > 0),
                     key=lambda k: runs[k].chi2 / runs[k].dof):
         scale, dof = _scale(pool)
         ratio = runs[k].chi2 / runs[k].dof / max(scale, 1e-300)
-        if dof > 0.0 and fdtrc(runs[k].dof, dof, ratio) < _WORSE:
+        if dof > 0.0 and scipy.special.fdtrc(runs[k].dof, dof, ratio) < _WORSE:
             worse.append(k)
         else:
             pool = [*pool, runs[k]]
@@ -217,11 +216,9 @@ def _pooled(runs: Sequence[Scatter]) -> tuple[float, float, list[int]]:
 
 def _scale(pool: Sequence[Scatter]) -> tuple[float, float]:
     """Return the scale of these runs and its degrees of freedom; 1 and 0 if there are none."""
-    from scipy.special import chdtrc
-
     chi2, dof = sum(run.chi2 for run in pool), sum(run.dof for run in pool)
     belief = sum(run.belief for run in pool)
-    if dof > 0 and chdtrc(dof, chi2) < _CONTRADICTED:
+    if dof > 0 and scipy.special.chdtrc(dof, chi2) < _CONTRADICTED:
         belief = 0.0
     return ((belief + chi2) / (belief + dof) if belief + dof > 0 else 1.0), belief + dof
 
@@ -353,16 +350,14 @@ class Runs:
     @property
     def least(self) -> Floats:
         """(n,) array, the probability of the most deviating parameter of each run."""
-        from scipy.special import stdtr
-
         variance = np.maximum(np.diagonal(self.covariances, axis1=1, axis2=2), 0.0) + SAME_G ** 2
         weight = 1.0 / variance
         others = np.sum(weight, axis=0) - weight
         mean = (np.sum(weight * self.values, axis=0) - weight * self.values) / others
         sizes = np.abs(self.values - mean) / np.sqrt(variance + 1.0 / others)
         number = np.sum(np.any(variance > 4.0 * SAME_G ** 2, axis=0))
-        least: Floats = 2.0 * stdtr(self.dof, -np.max(sizes, axis=1)) * max(number, 1)
-        return least
+        tail: Floats = scipy.special.stdtr(self.dof, -np.max(sizes, axis=1))
+        return 2.0 * tail * max(number, 1)
 
     @property
     def p_value(self) -> float:
@@ -374,11 +369,10 @@ class Runs:
 
 def _beyond(chi2: float, rank: int, dof: float) -> float:
     """Return the probability of a T² of this rank that is at least this large."""
-    from scipy.special import chdtrc, fdtrc
-
     if rank == 0:  # T² is in units of SAME_G²
         return float(chi2 <= 1.0)
-    return float(chdtrc(rank, chi2) if np.isinf(dof) else fdtrc(rank, dof, chi2 / rank))
+    return float(scipy.special.chdtrc(rank, chi2) if np.isinf(dof)
+                 else scipy.special.fdtrc(rank, dof, chi2 / rank))
 
 
 def _either(first: float, second: float) -> float:

@@ -29,6 +29,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 
 from ..table import Floats
 
@@ -108,8 +109,6 @@ def _merged(time: Floats) -> Floats:
 
 def _smoothed_rate(time: Floats, temperature: Floats) -> Floats:
     """Return the (n,) rate at n increasing times: a least-squares problem with 3 n unknowns."""
-    from scipy.linalg import solveh_banded
-
     count, step = len(time), np.diff(time)
     middle = float(np.mean(temperature))
     unit = np.array([1.0, 1.0 / float(np.median(step)), float(np.median(step)) ** -2])
@@ -130,7 +129,7 @@ def _smoothed_rate(time: Floats, temperature: Floats) -> Floats:
             banded[3 + row - column, :-1, column] = beside[1:, row, column]
     right = np.zeros((count, 3))
     right[:, 0] = (temperature - middle) / _ERROR ** 2
-    found = solveh_banded(banded.reshape(6, -1), right.ravel(), lower=True)
+    found = scipy.linalg.solveh_banded(banded.reshape(6, -1), right.ravel(), lower=True)
     rate: Floats = found[1::3] * unit[1]
     return rate
 

@@ -56,6 +56,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 
 from ..effects import AtContext, Context, EachShape, Model, times
 from ..geometry import unit
@@ -383,10 +384,8 @@ def belief_in(noise_known: bool) -> float:
 @cache
 def _grid() -> tuple[Floats, Floats]:
     """Return (k,) half widths, and the (m, k) part of N(0, λ) within each of them."""
-    from scipy.special import ndtr
-
     width = np.geomspace(0.15, 250.0, 141)
-    return width, 2.0 * ndtr(width / np.sqrt(_SCALES)[:, np.newaxis]) - 1.0
+    return width, 2.0 * scipy.special.ndtr(width / np.sqrt(_SCALES)[:, np.newaxis]) - 1.0
 
 
 def variance_factor(chi2: float, dof: int, noise_known: bool) -> float:
@@ -406,9 +405,7 @@ def variance_factor(chi2: float, dof: int, noise_known: bool) -> float:
 
 def _student(dof: float) -> float:
     """Return the squared ratio of the 95 % intervals of Student's t and a normal variable."""
-    from scipy.special import stdtrit
-
-    return float(stdtrit(dof, 0.5 + _INTERVAL / 2.0) / _NORMAL) ** 2
+    return float(scipy.special.stdtrit(dof, 0.5 + _INTERVAL / 2.0) / _NORMAL) ** 2
 
 
 def _of_mixture(chi2: float, dof: int) -> float:
@@ -427,8 +424,6 @@ def _of_mixture(chi2: float, dof: int) -> float:
 
 def belief_beside(dof: int, chi2: float, noise_known: bool) -> float:
     """Return the degrees of freedom that the noise counts as, given the chi² of the poses kept."""
-    from scipy.special import chdtrc
-
-    if noise_known and chdtrc(max(dof, 1), chi2) < _DOUBT_BELOW:
+    if noise_known and scipy.special.chdtrc(max(dof, 1), chi2) < _DOUBT_BELOW:
         return _DOUBTED
     return belief_in(noise_known)

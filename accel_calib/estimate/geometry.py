@@ -30,6 +30,7 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 
 import numpy as np
+import scipy
 
 from .equations import believable, LEAST_NOISE
 from ..effects import EFFECTS, Model, MODELS, parameter_names, with_vector
@@ -267,11 +268,9 @@ def identifiability(name: str, directions: Floats, noise: Floats | None = None
 def _combinations(names: tuple[str, ...], axes: Floats, deviations: Floats
                   ) -> tuple[Combination, ...]:
     """Return sparse combinations that span these (k, p) combinations."""
-    from scipy.linalg import qr
-
     if not len(axes):
         return ()
-    pivots = qr(axes, mode='r', pivoting=True)[1][:len(axes)]
+    pivots = scipy.linalg.qr(axes, mode='r', pivoting=True)[1][:len(axes)]
     mixed = np.linalg.inv(axes[:, pivots])  # each combination has its own pivot
     mixed = mixed / np.linalg.norm(mixed, axis=1, keepdims=True)
     uncertain = np.sqrt(np.sum(times(mixed ** 2, deviations ** 2), axis=1))

@@ -43,6 +43,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+import scipy
 
 from .closed_form import agreeing, start_of
 from .equations import belief_beside, belief_in
@@ -156,9 +157,7 @@ class _Removed:
 
 def beyond(ratio: Floats, rows: Indices, dof: Floats | float) -> Floats:
     """Return the probability of a larger ratio of variances by chance (F distribution)."""
-    from scipy.special import fdtrc
-
-    chance: Floats = fdtrc(rows, np.maximum(dof, 1.0), ratio)
+    chance: Floats = scipy.special.fdtrc(rows, np.maximum(dof, 1.0), ratio)
     return chance
 
 
@@ -434,8 +433,6 @@ def unseen_mistakes(fit: Fit) -> Floats:
     0 for poses that the others check well, infinite for poses that alone determine a parameter.
 
     """
-    from scipy.special import stdtrit
-
     data = fit.by_pose
     own = data.own(data.spread)
     least = own[:, 0, 0] if own.shape[1] == 1 else np.linalg.eigvalsh(own)[:, 0]
@@ -443,7 +440,8 @@ def unseen_mistakes(fit: Fit) -> Floats:
     weak = np.flatnonzero(least < _HARDLY)
     if len(weak):
         dof = max(belief_in(fit.noise_known) + fit.dof - 1.0, 1.0)
-        limit = float(stdtrit(dof, 1.0 - LEVEL / len(least) / 2.0)) * np.sqrt(fit.variance)
+        limit = np.sqrt(fit.variance) * float(
+            scipy.special.stdtrit(dof, 1.0 - LEVEL / len(least) / 2.0))
         with np.errstate(divide='ignore'):
             size[weak] = limit * fit.equations.scale[weak] / np.sqrt(
                 np.where(least[weak] > _ALONE, least[weak], 0.0))

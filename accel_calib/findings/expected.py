@@ -10,6 +10,7 @@ from functools import cached_property
 import math
 
 import numpy as np
+import scipy
 
 from ..calibrate import Calibration, deviations_g, in_g, next_pose, NextPose, PRIOR
 from ..effects import effect_named, EMPIRICAL, empirical_parts, LADDER, Model, MODELS, predict
@@ -267,16 +268,12 @@ class Expected:
 
 def _few(dof: int) -> float:
     """Return the ratio of the largest scatter that `dof` squares allow to their RMS."""
-    from scipy.special import chdtri
-
-    return math.sqrt(dof / float(chdtri(dof, 1.0 - _UNLUCKY)))
+    return math.sqrt(dof / float(scipy.special.chdtri(dof, 1.0 - _UNLUCKY)))
 
 
 def _by_chance(chi2_per_dof: float, dof: int) -> float:
     """Return the probability that noise alone causes residuals at least this large."""
-    from scipy.special import chdtrc
-
-    return float(chdtrc(dof, chi2_per_dof * dof))
+    return float(scipy.special.chdtrc(dof, chi2_per_dof * dof))
 
 
 def directions_in(poses: Poses, calibration: Calibration) -> Floats:

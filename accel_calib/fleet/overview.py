@@ -40,6 +40,7 @@ from typing import TypeVar
 from urllib.parse import unquote
 
 import numpy as np
+import scipy
 
 from .recording import Row, UNKNOWN
 from .sensors import alike, Store
@@ -248,8 +249,6 @@ def odd_sensors(values: Mapping[str, Floats], deviations: Mapping[str, Floats] |
         Values by sensor, and their standard deviations; by default 0.
 
     """
-    from scipy.special import stdtrit
-
     if len(values) < FEWEST:
         return []
     names, table = list(values), np.array(list(values.values()))
@@ -258,7 +257,7 @@ def odd_sensors(values: Mapping[str, Floats], deviations: Mapping[str, Floats] |
     away = table - np.median(table, axis=0)
     spread = np.hypot(_MAD * np.median(np.abs(away), axis=0), own)
     far = np.abs(away) / np.maximum(spread, 1e-9)
-    limit = -stdtrit(_EFFICIENCY * len(names), _CHANCE / (2.0 * table.size))
+    limit = -scipy.special.stdtrit(_EFFICIENCY * len(names), _CHANCE / (2.0 * table.size))
     found = [(names[i], NAMES[k], float(table[i, k]), float(far[i, k]))
              for i, k in zip(*np.nonzero(far > limit), strict=True)]
     return sorted(found, key=lambda each: -each[3])
@@ -266,13 +265,11 @@ def odd_sensors(values: Mapping[str, Floats], deviations: Mapping[str, Floats] |
 
 def not_agreeing(sensors: Iterable[Row]) -> list[Row]:
     """Return the sensors whose calibrations differ, with a false discovery rate of `_FALSE`."""
-    from scipy.stats import false_discovery_control
-
     tested = sorted((row for row in sensors if row['p_value'] is not None),
                     key=lambda row: float(row['p_value']))
     if not tested:
         return []
-    adjusted = false_discovery_control([row['p_value'] for row in tested])
+    adjusted = scipy.stats.false_discovery_control([row['p_value'] for row in tested])
     return [row for row, p_value in zip(tested, adjusted, strict=True) if p_value <= _FALSE]
 
 
@@ -343,8 +340,6 @@ def estimated(values: Floats, covariances: Floats) -> Prior:
         Their covariances.
 
     """
-    from scipy.special import chdtri
-
     count, size = values.shape
     mean = np.median(values, axis=0)
     spread = np.median(np.abs(values - mean), axis=0) / 0.6745 + _LEAST_SPREAD_G
@@ -358,7 +353,7 @@ def estimated(values: Floats, covariances: Floats) -> Prior:
     shrunk = share * covariance + (1.0 - share) * np.diag(np.diag(covariance))
     shrunk = (shrunk + _LEAST_SPREAD_G ** 2 * np.eye(size)) * (1.0 + 1.0 / count)
     median = float(np.median(_squared(values - mean, shrunk + covariances)))
-    return Prior(mean, shrunk * max(median / chdtri(size, 0.5), 1.0))
+    return Prior(mean, shrunk * max(median / scipy.special.chdtri(size, 0.5), 1.0))
 
 
 def _squared(away: Floats, covariances: Floats) -> Floats:

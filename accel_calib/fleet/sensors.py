@@ -42,6 +42,7 @@ from typing import Any, TYPE_CHECKING
 from urllib.parse import unquote
 
 import numpy as np
+import scipy
 
 from .recording import as_folder, Row, schema
 from ..calibrate import Calibration
@@ -368,14 +369,13 @@ class _Steady:
 
     def changed(self, one: int, other: int, limit: float) -> str | None:
         """Return the value that changed most between two calibrations; None if none did."""
-        from scipy.special import ndtri
-
         away = self.values[:, other] - self.values[:, one]
         away -= self.rates * (self.at[other] - self.at[one])
         sd = np.hypot(self.deviations[:, one], self.deviations[:, other])
         far = np.where(sd > 0.0, np.abs(away) / np.where(sd > 0.0, sd, 1.0), 0.0)
         most = int(np.argmax(far))
-        return self.names[most] if far[most] > -ndtri(limit / (2.0 * len(far))) else None
+        least = -scipy.special.ndtri(limit / (2.0 * len(far)))
+        return self.names[most] if far[most] > least else None
 
     def change(self, name: str, step: int) -> Row:
         """Return the change of a value at a step, with its standard deviation."""
@@ -410,8 +410,6 @@ def drift_of(history: History, changes: Mapping[int, bool | None] = {}) -> Row |
     calibration whose change is not for good is left out.
 
     """
-    from scipy.special import stdtr
-
     years = years_of(history)
     if years is None:
         return None
@@ -431,7 +429,8 @@ def drift_of(history: History, changes: Mapping[int, bool | None] = {}) -> Row |
         fitted = solved @ (each.values[kept] / sd)
         chi2 = float(np.sum(((each.values[kept] - columns @ fitted) / sd) ** 2))
         spread = float(np.sqrt(np.sum(solved[0] ** 2) * max(chi2 / dof, 1.0)))
-        p_value = 2.0 * float(stdtr(dof, -abs(fitted[0]) / spread)) * len(history.parameters)
+        tail = float(scipy.special.stdtr(dof, -abs(fitted[0]) / spread))
+        p_value = 2.0 * tail * len(history.parameters)
         found.append({'parameter': each.name, 'per_year': float(fitted[0]), 'sd': spread,
                       'p_value': min(p_value, 1.0)})
     return min(found, key=lambda each: float(each['p_value']), default=None)

@@ -32,6 +32,7 @@ import zipfile
 import zlib
 
 import numpy as np
+import scipy
 
 from .columns import Chosen, chosen, is_log_header, LogOptions
 from .dialect import shown
@@ -313,8 +314,6 @@ def _cell(value: object) -> str:
 
 def _arrays(path: Path) -> list[Member]:
     """Return the arrays of a ``.mat`` file as tables; those of one length are columns of one."""
-    import scipy.io  # here, because few runs need it
-
     with sound_log(path, 'a MATLAB file (.mat)', _AGAIN):
         try:
             held = scipy.io.whosmat(path)

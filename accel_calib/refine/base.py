@@ -38,6 +38,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+import scipy
 
 from .state import beginning, State, without
 from ..calibrate import Calibration, in_g, with_history
@@ -439,13 +440,11 @@ def _shares(poses_g: Poses, stored: Poses) -> bool:
 
 def _agrees(calibration: Calibration, poses_g: Poses) -> bool:
     """Return whether a fit to the poses is no better than the calibration as stored."""
-    from scipy.special import chdtri
-
     model = Model(calibration.model.values)
     fit = estimate(model, poses_g)
     excess = judge(model, calibration.held(poses_g)).chi2 - fit.chi2
     worse = max(fit.chi2 / max(fit.dof, 1), 1.0)
-    return bool(excess / worse < chdtri(len(model.vector), 1.0 - _SAME))
+    return bool(excess / worse < scipy.special.chdtri(len(model.vector), 1.0 - _SAME))
 
 
 def _as_calibrated(stored: Poses, calibration: Calibration) -> Poses:

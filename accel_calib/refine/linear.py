@@ -47,6 +47,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+import scipy
 
 from ..effects import Effect, kind_of
 from ..estimate import by_pose, outliers_among
@@ -411,14 +412,12 @@ class Set:
 
     def chance(self, fewer: Set) -> float:
         """Return the probability that noise alone makes the set this good beside a smaller one."""
-        from scipy.special import fdtrc
-
         worth, added = self.linear.worth, self.parameters - fewer.parameters
         left = worth + self.linear.dof - self.parameters
         if added < 1 or left < 1:
             return 1.0
         variance = (worth + self.rss + 1e-300) / left
-        return float(fdtrc(added, left, (fewer.rss - self.rss) / added / variance))
+        return float(scipy.special.fdtrc(added, left, (fewer.rss - self.rss) / added / variance))
 
 
 def _explained(products: Floats, along: Floats) -> tuple[Floats, Floats]:

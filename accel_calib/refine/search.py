@@ -26,6 +26,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+import scipy
 
 from .base import causes, Clipped, off_grid, unclipped
 from .beam import accepted, explored, simpler
@@ -455,8 +456,6 @@ def _of_a_turn(state: State) -> set[str]:
     does not depend on what is named.
 
     """
-    from scipy.special import chdtri
-
     values = {CHANGES[name].base: part for name, part in state.model.values.items()
               if name in CHANGES}
     gains = [name for name in state.model.values if name in CHANGES
@@ -473,7 +472,7 @@ def _of_a_turn(state: State) -> set[str]:
     away = np.concatenate([state.model.values[name] - turned[CHANGES[name].base]
                            for name in gains])
     chi2 = away @ np.linalg.solve(state.fit.covariance[np.ix_(index, index)], away)
-    return set(gains) if chi2 < chdtri(len(away), LEVEL) else set()
+    return set(gains) if chi2 < scipy.special.chdtri(len(away), LEVEL) else set()
 
 
 def _walk(state: State, near: Near) -> Walk | None:

@@ -19,6 +19,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+import scipy
 
 from .linear import Block, held_out, is_seen, Linear, orthonormal, outside_of, products_of
 from ..calibrate import with_history
@@ -230,9 +231,8 @@ class State:
 
 def is_noise(rss: float, dof: float) -> bool:
     """Return whether measured noise explains a weighted sum of squares."""
-    from scipy.special import chdtrc
-
-    return bool(dof <= 0 or rss <= _CHI2_RATIO * dof or chdtrc(dof, rss) > _CHI2_LEVEL)
+    return bool(dof <= 0 or rss <= _CHI2_RATIO * dof
+                or scipy.special.chdtrc(dof, rss) > _CHI2_LEVEL)
 
 
 def beginning(poses_g: Poses, model: Model) -> State:
