@@ -588,6 +588,10 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
                                           turn=turn, temperatures=warm.tolist())
     else:
         columns = {key: np.asarray(values, float) for key, values in context.items()}
+        for key, values in columns.items():
+            if values.shape[:1] != (len(up),):
+                raise InputError(f'{key} has shape {values.shape}, expected {len(up)} rows',
+                                 f'give {key} for each pose')
         if len(warm):
             columns['temperature'] = warm if len(warm) == len(up) else np.linspace(
                 warm[0], warm[-1], len(up))

@@ -149,7 +149,7 @@ def until_certain(made: Simulated, twins: Sequence[str], rng: np.random.Generato
     for count in range(MOST + 1):
         found = refined(made, columns)
         step = step_of(found, twins)
-        if step is not None and step.probabilities[step.effect] >= CERTAIN:
+        if step is not None and step.data_probabilities[step.effect] >= CERTAIN:
             return count, step.effect in made.truth
         wanted = at_random(columns, known, rng)
         if by_plan and found.plan.poses:
@@ -169,7 +169,7 @@ def after_plan(made: Simulated, found: Refinement, twins: Sequence[str],
         columns = with_pose(made, columns, Wanted(
             wanted.up, wanted.temperature, float(columns['time'][-1]) + more), rng)
     step = step_of(refined(made, columns), twins)
-    return 0.0 if step is None else step.probabilities.get(next(iter(made.truth)), 0.0)
+    return 0.0 if step is None else step.data_probabilities.get(next(iter(made.truth)), 0.0)
 
 
 def run(case: tuple[tuple[str, str, float, str], tuple[int, ...]]) -> Outcome | None:
@@ -181,11 +181,11 @@ def run(case: tuple[tuple[str, str, float, str], tuple[int, ...]]) -> Outcome | 
     found = refined(made, made.columns)
     step = step_of(found, (first, second))
     if step is None or not {first, second} <= {step.effect, *step.rivals} or (
-            max(step.probabilities.values()) >= CERTAIN or not found.plan.poses):
+            max(step.data_probabilities.values()) >= CERTAIN or not found.plan.poses):
         return None
     planned = until_certain(made, (first, second), np.random.default_rng((*seed, 1)), by_plan=True)
     random = until_certain(made, (first, second), np.random.default_rng((*seed, 2)), by_plan=False)
-    return Outcome(planned[0], random[0], planned[1], random[1], step.probabilities[hidden],
+    return Outcome(planned[0], random[0], planned[1], random[1], step.data_probabilities[hidden],
                    found.plan.poses[-1].expected,
                    after_plan(made, found, (first, second), np.random.default_rng((*seed, 3))),
                    len(found.plan.poses))

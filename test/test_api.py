@@ -59,7 +59,7 @@ def test_functions_stay_when_a_folder_of_their_name_is_imported():
 
 
 @pytest.mark.parametrize(('imported', 'without'), [
-    ('accel_calib', 'numpy'), ('accel_calib.session', 'scipy')])
+    ('accel_calib', 'numpy'), ('accel_calib.session', 'scipy.special')])
 def test_what_is_slow_to_import_is_imported_when_it_is_used(imported, without):
     code = f'import {imported}, sys; print("{without}" in sys.modules)'
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True,
@@ -267,6 +267,7 @@ def test_records_pass_through_other_processes(calibration, poses):
     (lambda poses: ac.fit(poses, nose_down=2), 'nose down but no flat row'),
     (lambda poses: ac.fit(poses, flat=1, nose_down=1), 'within 10° of the flat pose'),
     (lambda poses: ac.simulate({'offest': 1.0}), "'offest' is not in the catalogue"),
+    (lambda poses: ac.simulate({}, time=[0.0, 1.0]), r'time has shape \(2,\), expected 24 rows'),
     (lambda poses: ac.compare([ac.fit(poses)]), 'found 1 calibration, expected at least 2'),
     (lambda poses: ac.capture(ac.simulate({}, recording=True, poses=2), min_dwel=3), 'min_dwel'),
 ])

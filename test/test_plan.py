@@ -64,7 +64,8 @@ def test_a_plan_that_separates_rivals_is_written_and_shown(tmp_path, capsys):
     assert 1 <= len(poses) <= 6
     for step in result['steps']:
         assert sum(step['probabilities'].values()) == pytest.approx(1.0)
-        assert set(step['rivals']) < set(step['probabilities'])
+        assert sum(step['data_probabilities'].values()) == pytest.approx(1.0)
+        assert set(step['rivals']) < {*step['probabilities'], *step['data_probabilities']}
     step = next(step for step in result['steps'] if step['effect'] in ('cubic', 'odd_quadratic'))
     for pose in poses:
         up = np.array(numbers(pose, 'up_x', 'up_y', 'up_z'))
@@ -73,7 +74,7 @@ def test_a_plan_that_separates_rivals_is_written_and_shown(tmp_path, capsys):
         assert pose['attitude'] == attitude_words(up)
     expected = [float(pose['expected_probability']) for pose in poses]
     assert expected == sorted(expected)
-    assert expected[-1] > step['probabilities'][step['effect']]
+    assert expected[-1] > step['data_probabilities'][step['effect']]
     comments = [line[2:] for line in path.read_text().splitlines() if line.startswith('# ')]
     assert comments == result['plan']
 
@@ -141,6 +142,26 @@ def test_the_poses_of_the_plan_name_the_hidden_effect():
                      row=np.arange(1, len(poses) + len(more) + 1))
     after = refine(joined, G, base='10')
     assert after.steps[-1].probabilities['cubic'] > 0.95
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_what_is_usual_does_not_replace_a_pose_that_would_show_it(seed):
+    rng, count = np.random.default_rng(seed), 24
+    at = np.arange(count, dtype=float)
+    known = {'time': 30.0 * at, 'temperature': 20.0 + at / 2.0}  # a ramp: both are one line
+    model = model_with({'offset': np.array([0.02, -0.01, 0.03]),
+                        'offset_drift': np.array([0.05, -0.04, 0.06, 0.0])})
+    poses = simulate_poses(model, random_directions(count, rng), rng, noise_g=0.003, samples=100,
+                           context=known)
+    found = refine(poses, G, base='7')
+    step = found.steps[-1]
+    assert {step.effect, *step.rivals} >= {'offset_temperature', 'offset_drift'}
+    usual, by_data = ([chances[name] for name in ('offset_temperature', 'offset_drift')]
+                      for chances in (step.probabilities, step.data_probabilities))
+    assert usual[0] > 5.0 * usual[1]  # the drift is a hundred usual ones
+    assert by_data[0] == pytest.approx(by_data[1], abs=0.1)
+    assert any('by the data alone' in words for words in step.likely_rivals)
+    assert found.plan.poses
 
 
 def planned(up, **context):

@@ -16,10 +16,10 @@ that separate effects from their rivals, and `result` contains the records and t
 
 from .refinement import refine, refine_with_fleet, refitted
 from .result import (
-    base_words, chance, percent, PlannedPose, PosePlan, Refinement, residual_words, shown_name,
-    Stage, Step, values_of, verdict_words)
+    base_words, chance, PlannedPose, PosePlan, Refinement, residual_words, shown_name, Stage, Step,
+    values_of, verdict_words)
 from .steps import times_typical
 
 __all__ = ['PlannedPose', 'PosePlan', 'Refinement', 'Stage', 'Step', 'base_words', 'chance',
-           'percent', 'refine', 'refine_with_fleet', 'refitted', 'residual_words', 'shown_name',
+           'refine', 'refine_with_fleet', 'refitted', 'residual_words', 'shown_name',
            'times_typical', 'values_of', 'verdict_words']

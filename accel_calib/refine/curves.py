@@ -372,13 +372,19 @@ class Near:
         return frozenset(self.names), self.chosen.out, self.walk is not None
 
 
-def probabilities(name: str, near: Near) -> dict[str, float]:
-    """Return the probabilities of an effect or `WANDER` and those in its place, largest first."""
+def probabilities(name: str, near: Near, *, usual: bool = True) -> dict[str, float]:
+    """
+    Return the probabilities of an effect or `WANDER` and those in its place, largest first.
+
+    `usual`: effects that are far larger than in common sensors are less probable; otherwise, the
+    data alone decide.
+
+    """
     if name != WANDER and name not in near.names:
         return {name: 1.0}
     whole = near.plain.worth + near.plain.dof
     certainty = max((whole - near.chosen.parameters) / whole, LEAST)
-    scores = _scores(name, near, near.chosen.score + 2.0 * np.log(LEAST) / certainty)
+    scores = _scores(name, near, 2.0 * np.log(LEAST) / certainty, usual=usual)
     most = max(scores.values())
     weights = {key: float(np.exp(certainty * (score - most) / 2.0))
                for key, score in scores.items()}
@@ -387,19 +393,23 @@ def probabilities(name: str, near: Near) -> dict[str, float]:
     return {key: weights[key] / total for key in ordered}
 
 
-def _scores(name: str, near: Near, least: float) -> dict[str, float]:
-    """Return the scores above `least` of the set with each effect in the place of a named one."""
+def _scores(name: str, near: Near, least: float, *, usual: bool) -> dict[str, float]:
+    """Return the scores of the set with each effect in the place of a named one, above `least`."""
+    def back(chosen: Set) -> float:
+        return 0.0 if usual else chosen.unusual
+
     if name == WANDER:
         others = near.beside
     else:
         others = near.chosen.without(near.chosen.blocks[near.names.index(name)])
-    scores = {name: near.chosen.score}
+    scores = {name: near.chosen.score + back(near.chosen)}
+    least += scores[name] - back(others)
     for number, likely in enumerate(others.scores_beside):
         effect = others.linear.blocks[number].effect
         if (likely > least and effect not in near.names
                 and (effect in LADDER or name not in LADDER)):
-            score = others.extended(number).score
-            scores[effect] = max(score, scores.get(effect, -np.inf))
+            larger = others.extended(number)
+            scores[effect] = max(larger.score + back(larger), scores.get(effect, -np.inf))
     if name != WANDER and near.walk is None and near.process is not None:
-        scores[WANDER] = walk_beside(others, near.process).score
+        scores[WANDER] = walk_beside(others, near.process).score + back(others)
     return scores

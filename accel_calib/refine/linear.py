@@ -315,11 +315,17 @@ class Set:
     @cached_property
     def charge(self) -> float:
         """Return what is subtracted from the score apart from the number of values."""
-        charge = float(np.sum(self.linear.costs[1][list(self.blocks)]))
+        charge = float(np.sum(self.linear.costs[1][list(self.blocks)])) + self.unusual
+        return charge + len(self.out) * (2.0 * math.log(max(self.linear.poses, 2)) + _RARE)
+
+    @cached_property
+    def unusual(self) -> float:
+        """Return the penalty for effects that are far larger than in common sensors."""
+        penalty = 0.0
         for block, values in self.values.items():
             size = float(np.max(np.abs(values))) / self.linear.blocks[block].entry.typical
-            charge += min((max(math.log(max(size, 1e-300)), 0.0) / _USUAL) ** 2, _MOST_UNUSUAL)
-        return charge + len(self.out) * (2.0 * math.log(max(self.linear.poses, 2)) + _RARE)
+            penalty += min((max(math.log(max(size, 1e-300)), 0.0) / _USUAL) ** 2, _MOST_UNUSUAL)
+        return penalty
 
     @cached_property
     def score(self) -> float:

@@ -174,9 +174,14 @@ def _variance(chosen: Set) -> float:
 
 
 def _fits(name: str, found: Found) -> dict[str, tuple[float, Fit]]:
-    """Return probability and fit of an effect and its rivals; empty if it is certain enough."""
+    """
+    Return probability and fit of an effect and its rivals; empty if the data are certain enough.
+
+    What is usual does not replace a pose that would show it.
+
+    """
     fits: dict[str, Fit] = {name: found.final.fit}
-    weights = probabilities(name, found.near)
+    weights = probabilities(name, found.near, usual=False)
     for rival, weight in weights.items():
         if rival != WANDER and shown_name(rival) != shown_name(name) and weight > LEAST:
             fit = _fit_of(rival, name, found)

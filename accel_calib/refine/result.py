@@ -38,6 +38,10 @@ _VERDICTS = {
 }
 
 
+_APART = 0.05
+"""Difference of two probabilities above which both are stated."""
+
+
 @dataclass(frozen=True)
 class Step:
     """
@@ -50,7 +54,10 @@ class Step:
     rivals : tuple of str
         Effects that these data cannot distinguish from it.
     probabilities : dict
-        Probability of the effect and of each effect in its place, by name.
+        Probability of the effect and of each effect in its place, by name. An effect that is far
+        larger than in common sensors is less probable.
+    data_probabilities : dict
+        The same by the data alone, whatever is usual.
     parameters : dict
         Values by name. For a change of a stored calibration: the changes of the values.
     parameters_sd : dict
@@ -73,6 +80,7 @@ class Step:
     effect: str
     rivals: tuple[str, ...]
     probabilities: dict[str, float]
+    data_probabilities: dict[str, float]
     parameters: dict[str, float]
     parameters_sd: dict[str, float]
     gap_before_mg: float
@@ -90,7 +98,14 @@ class Step:
     @property
     def likely_rivals(self) -> tuple[str, ...]:
         """Return the rivals with their probabilities, such as ``quadratic (11 %)``."""
-        return tuple(f'{name} ({percent(self.probabilities[name])})' for name in self.rivals)
+        return tuple(f'{name} ({self.odds(name)})' for name in self.rivals)
+
+    def odds(self, rival: str) -> str:
+        """Return the probability of a rival, and that by the data alone if it differs much."""
+        whole, alone = (each.get(rival, 0.0) for each in (
+            self.probabilities, self.data_probabilities))
+        by_data = f', by the data alone {percent(alone)}' if abs(alone - whole) > _APART else ''
+        return f'{percent(whole)}{by_data}'
 
 
 @dataclass(frozen=True)

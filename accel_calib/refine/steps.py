@@ -103,7 +103,10 @@ def _step(name: str, states: tuple[State, State], found: Found, date: str, *, un
           ) -> Step:
     """Return the record of one step; `unseen`: the earlier model was not fitted to the poses."""
     before, after = states
-    rivals, chances = _rivals(name, found)
+    chances, by_data = (_chances(name, found, usual=usual) for usual in (True, False))
+    rivals = tuple(other for other, part in {**by_data, **chances}.items()
+                   if other != kind_of(shown_name(name))
+                   and max(part, by_data.get(other, 0.0)) > LEAST)
     first, last, held_out = before.fit.residual, after.fit.residual, after.held_out
     first_held_out = first if unseen else before.held_out
     if name == WANDER:
@@ -115,21 +118,20 @@ def _step(name: str, states: tuple[State, State], found: Found, date: str, *, un
     if name in CHANGES:
         words = f'{_change(name, values, [*deviations.values()], date)}; {words}'
     shown = effect.shown(values)
-    return Step(kind_of(shown_name(name)), rivals, chances, shown,
+    return Step(kind_of(shown_name(name)), rivals, chances, by_data, shown,
                 {part: deviations[part] for part in shown if deviations.get(part)},
                 before.gap_mg(first), after.gap_mg(last),
                 before.gap_mg(first_held_out), after.gap_mg(held_out),
                 _p_value(name, before, found), words, plain_name(name))
 
 
-def _rivals(name: str, found: Found) -> tuple[tuple[str, ...], dict[str, float]]:
-    """Return the rivals of an effect, and the probabilities of it and of those in its place."""
+def _chances(name: str, found: Found, *, usual: bool) -> dict[str, float]:
+    """Return the probabilities of an effect and of those in its place, by the names shown."""
     own, chances = shown_name(name), dict[str, float]()
-    for other, part in probabilities(name, found.near).items():
+    for other, part in probabilities(name, found.near, usual=usual).items():
         shown = kind_of(own) if shown_name(other) == own else shown_name(other)
         chances[shown] = chances.get(shown, 0.0) + part
-    return tuple(other for other, part in chances.items()
-                 if other != kind_of(own) and part > LEAST), chances
+    return chances
 
 
 def _p_value(name: str, before: State, found: Found) -> float:
@@ -153,15 +155,17 @@ def _output_steps(found: Found) -> list[Step]:
         whole, limit_g = found.with_clipped, found.clipped.limit_g
         rows = listed('row', whole.poses_g.row[found.clipped.poses].tolist())
         where = f'in {rows}: an axis reads {limit_g:.4g} g and its samples hardly scatter'
-        steps.append(Step('saturation', (), {'saturation': 1.0}, {'limit': limit_g},
-                          {}, whole.gap_mg(whole.residual), gap,
-                          whole.gap_mg(whole.held_out), held_out, 0.0, where, 'saturation'))
+        sure = {'saturation': 1.0}
+        steps.append(Step(
+            'saturation', (), sure, sure, {'limit': limit_g}, {}, whole.gap_mg(whole.residual),
+            gap, whole.gap_mg(whole.held_out), held_out, 0.0, where, 'saturation'))
     if found.grid_g is not None:
         step_mg = found.grid_g * MG
         where = (f'pose means are multiples of {step_mg:.3g} mg, which causes '
                  f'{step_mg / np.sqrt(12.0):.2g} mg RMS per axis')
-        steps.append(Step('quantisation', (), {'quantisation': 1.0}, {'step': found.grid_g}, {},
-                          gap, gap, held_out, held_out, 0.0, where, 'quantisation'))
+        sure = {'quantisation': 1.0}
+        steps.append(Step('quantisation', (), sure, sure, {'step': found.grid_g}, {}, gap,
+                          gap, held_out, held_out, 0.0, where, 'quantisation'))
     return steps
 
 

@@ -29,7 +29,7 @@ from .sheet import (
 from ..effects import (
     AXES, CARRIERS, curve_unit, effect_named, EMPIRICAL, empirical_parts, parameter_names,
     variable_words)
-from ..refine import base_words, chance, percent, values_of, verdict_words
+from ..refine import base_words, chance, values_of, verdict_words
 from ..table import Floats, Poses
 from ..text import short
 from ..units import MG
@@ -94,8 +94,7 @@ def _overview(result: Refinement) -> str:
 
 def _story(step: Step) -> str:
     """Return a text about the location of the disagreement, and the effect on the residual."""
-    rivals = ', '.join(f'{code(name)} ({percent(step.probabilities[name])})'
-                       for name in step.rivals)
+    rivals = ', '.join(f'{code(name)} ({step.odds(name)})' for name in step.rivals)
     return (f'{code(step.effect)} ({escape(effect_named(step.name).term)}). Found '
             f'{escape(step.where)}. With this effect the residual decreases from '
             f'{short(step.gap_before_mg)} to <strong>{short(step.gap_after_mg)} mg</strong>, '
