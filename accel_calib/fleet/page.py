@@ -35,7 +35,7 @@ from ..report.sheet import (
     write_page)
 from ..report.stability import GROUPS, label_dates, places_of, spoken
 from ..table import Floats
-from ..text import counted, short
+from ..text import counted, short, with_minus
 
 PAGE = 'fleet.html'
 
@@ -118,7 +118,7 @@ def _distribution(values: Mapping[str, object]) -> str:
     for name, column in zip(NAMES, table.T, strict=True):
         zero, factor, unit = scale_of(name)
         parts = (np.quantile(column, [0.0, 0.1, 0.5, 0.9, 1.0]) - zero) * factor
-        rows.append((f'{spoken(name)} [{unit}]', *map(short, parts)))
+        rows.append((f'{spoken(name)} [{unit}]', *(with_minus(short(part)) for part in parts)))
     return scroll_table('Distribution', (counted(len(values), 'sensor'), 'smallest', '10 %',
                                          'median', '90 %', 'largest'), rows)
 
@@ -130,7 +130,7 @@ def _typical(fleet: FleetPrior) -> str:
     for name, mean, sd in zip(parameter_names(MODELS['10'].effects), fleet.prior.mean, spread,
                               strict=True):
         _, factor, unit = scale_of(name)
-        rows.append((name.replace('.', ' ').replace('_', ' '), short(mean * factor),
+        rows.append((name.replace('.', ' ').replace('_', ' '), with_minus(short(mean * factor)),
                      short(sd * factor), unit))
     words = (f'Model 10, from {counted(fleet.sensors, "sensor")}, in fleet.yaml for --prior of '
              'fit and refine.')
