@@ -245,8 +245,9 @@ def interrupted_at(name, handler, poses):
                           check=False, env={**os.environ, 'PYTHONPATH': str(ROOT)})
 
 
-@pytest.mark.parametrize('name', ['argparse', 'accel_calib.errors', 'numpy',
-                                  'numpy.linalg._umath_linalg', 'rich.console', 'scipy.special'])
+@pytest.mark.parametrize('name', [
+    'argparse', 'accel_calib.errors', 'numpy', 'numpy.linalg._umath_linalg', 'rich.console',
+    'scipy.special._ufuncs'])
 def test_ctrl_c_while_modules_load_ends_without_words(name, poses):
     done = interrupted_at(name, 'signal.default_int_handler', poses)
     assert (done.returncode, done.stdout, done.stderr) == (130, '', '')
