@@ -160,8 +160,8 @@ def test_a_calibration_is_offered_to_all_viewers_and_stored_when_it_is_accepted(
     np.testing.assert_allclose(np.array(result['offset']) / GRAVITY, OFFSET, atol=3e-4)
     residuals = {label: value for label, value, unit in result['residuals']}
     assert residuals['residual after'] < 1.0 < residuals['residual before']
-    wait(lambda: viewer.of('progress')[-1]['corrected'] is None
-         or abs(viewer.of('progress')[-1]['corrected'] - 1.0) < 0.01)
+    wait(lambda: any(news['corrected'] is None or abs(news['corrected'] - 1.0) < 0.01
+                     for news in viewer.of('progress')[-1:]))
     wait(lambda: other.state == viewer.state)
     assert other.of('answer') == []
     first = viewer.state['page']
