@@ -100,7 +100,7 @@ def test_correlated_noise_does_not_raise_the_degree(seed):
     assert np.all(np.abs(found.values - LINE) < 6.0 * found.deviations)
 
 
-@pytest.mark.parametrize('wander_g', [0.0, 1e-4])
+@pytest.mark.parametrize('wander_g', [0.0, 1e-4, 1e-3])
 def test_deviations_include_the_correlated_noise(wander_g):
     runs = [curve(ramp(seed, LINE, wander_g=wander_g, rate_hz=2.0)) for seed in range(200, 225)]
     away = np.array([(each.values - LINE) / each.deviations for each in runs])

@@ -18,17 +18,24 @@ when it warms than when it cools, and this must not bend the polynomial. `hyster
 mean difference between the two directions at equal temperatures. The rate that explains it best is
 a lag of the thermometer, `lag_s`.
 
-**Degree.** The noise of a long log is correlated: with all samples, or with the usual tests, the
-degree grows with the wander of the offset. Here each of `_BLOCKS` contiguous parts of the log is
-predicted from a fit of the others. The lowest degree is taken at which no higher one predicts
-better by `_BETTER`, in all and in `_MOST_BLOCKS` of the parts.
+**Deviations.** The noise of a long log is correlated: a slow wander of the offset looks like a
+change with the temperature. The noise of a stretch is taken as white noise of variance σ², for a
+stretch of mean size, plus a random walk, which grows by ρ σ² a second. The part of the readings
+outside of the fit has the covariance
 
-**Deviations.** They come from the same fits (jackknife over contiguous parts [1]_), and so include
-noise that is correlated over a part. A wander as slow as the whole log looks like the temperature;
-only further ramps show it.
+    σ² (A + ρ B),   A of the white noise, B of the walk
 
-.. [1] H. R. Künsch, The jackknife and the bootstrap for general stationary observations, Annals of
-   Statistics 17 (1989) 1217.
+The generalised eigenvectors of B and A make it diagonal for each ρ. The restricted likelihood [1]_
+of all three axes weights a grid of ρ, each with its σ². The covariance of the values is that of
+least squares with this noise, averaged over the grid.
+
+**Degree.** With all samples, or with the usual tests, the degree would grow with the wander. Here
+each of `_BLOCKS` contiguous parts of the log is predicted from a fit of the others. The lowest
+degree is taken at which no higher one predicts better by `_BETTER`, in all and in `_MOST_BLOCKS`
+of the parts, with last coefficients that differ from 0 at `_LEVEL` (χ² over the axes).
+
+.. [1] D. A. Harville, Maximum likelihood approaches to variance component estimation, Journal of
+   the American Statistical Association 72 (1977) 320.
 
 """
 
@@ -40,6 +47,7 @@ from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
+import scipy
 
 from .calibration import Calibration, PRIOR, Quality
 from .fit import only_norm
@@ -55,6 +63,15 @@ from ..units import MG, Units
 
 DEGREE = 3
 """Largest degree; the autopilots store no more."""
+
+_WALKS = np.array([0.0, *np.geomspace(1e-4, 1e5, 64)])
+"""ρ, relative to the one with which the walk between two stretches equals the white noise."""
+
+_WHITE = 0.2
+"""Prior probability that there is no walk: most sensors wander. All other ρ are equal."""
+
+_LEVEL = 0.001
+"""Probability that a coefficient that is zero is taken for one that is not."""
 
 _BLOCKS = 10
 _BETTER, _MOST_BLOCKS = 0.05, 0.6
@@ -172,23 +189,26 @@ def curve_of(ramps: Sequence[Ramp]) -> Curve:
     reference = float(np.clip(REFERENCE_TEMPERATURE, low, high))
     rising, falling = _directions(warm, rate)
     both = bool(np.any(rising & _shared(warm, falling)) and np.any(falling))
-    beside = np.eye(len(ramps))[group]
+    powers = _powers(warm - reference, DEGREE)[:, 1:]
+    levels = np.eye(len(ramps))[group]
     if both:
-        beside = np.column_stack([beside, rate])
-    fits = [_Held(stretches.reading, warm - reference, beside, parts, degree)
-            for parts in [_parts(stretches['time'], warm)] for degree in range(DEGREE + 1)]
-    chosen = fits[_lowest([each.errors for each in fits])]
-    values, degree = chosen.values[beside.shape[1]:], chosen.degree
-    curve_g = _powers(warm - reference, degree)[:, 1:] @ values
+        levels = np.column_stack([levels, rate])
+    designs = [np.column_stack([levels, powers[:, :k]]) for k in range(DEGREE + 1)]
+    errors = [_held_out(stretches, each) for each in designs]
+    fits = [(_solved(each, stretches.reading), _covariance(stretches, group, each))
+            for each in designs]
+    degree, first = _lowest(errors, fits), levels.shape[1]
+    values, covariance = fits[degree][0][first:], fits[degree][1][:, first:, first:]
+    curve_g = powers[:, :degree] @ values
     rest = np.array([np.mean((stretches.reading - curve_g)[group == k], axis=0)
                      for k in range(len(ramps))])
     change = stretches.reading - rest[group]
     left = change - curve_g
     hysteresis, lag = (_hysteresis(warm, rate, left, values, rising, falling) if both
                        else (None, None))
-    return Curve(reference, (low, high), values, chosen.covariance(beside.shape[1]),
-                 tuple(float(np.sqrt(np.mean(each.errors))) * MG for each in fits), hysteresis,
-                 lag, stretches, change, left, rate >= 0.0)
+    return Curve(reference, (low, high), values, covariance,
+                 tuple(float(np.sqrt(np.mean(each))) * MG for each in errors), hysteresis, lag,
+                 stretches, change, left, rate >= 0.0)
 
 
 def _joined(ramps: Sequence[Ramp]) -> tuple[Poses, NDArray[np.intp]]:
@@ -212,45 +232,58 @@ def _parts(time: Floats, warm: Floats) -> NDArray[np.intp]:
     return np.minimum((share * _BLOCKS).astype(np.intp), _BLOCKS - 1)
 
 
-class _Held:
-    """A fit of one degree, and the fits without each of the parts."""
-
-    def __init__(self, reading: Floats, warm: Floats, beside: Floats, parts: NDArray[np.intp],
-                 degree: int) -> None:
-        scale = max(float(np.max(np.abs(warm))), 1e-9)
-        design = np.column_stack([beside, _powers(warm / scale, degree)[:, 1:]])
-        back = np.concatenate([np.ones(beside.shape[1]), scale ** -np.arange(1.0, degree + 1)])
-        self.degree = degree
-        self.values = _solved(design, reading) * back[:, np.newaxis]
-        without, errors = [], []
-        for part in np.unique(parts):
-            out = parts == part
-            found = _solved(design[~out], reading[~out])
-            without.append(found * back[:, np.newaxis])
-            errors.append(np.mean(np.sum((reading - design @ found)[out] ** 2, axis=1)))
-        self._without = np.array(without)
-        self.errors = np.array(errors)
-
-    def covariance(self, first: int) -> Floats:
-        """Return (3, p, p), the jackknife covariance of the values from the first on, by axis."""
-        away = self._without[:, first:] - self.values[first:]
-        count = len(away)
-        return np.asarray(np.einsum('bpa,bqa->apq', away, away) * (count - 1.0) / count)
+def _held_out(stretches: Poses, design: Floats) -> Floats:
+    """Return the mean squared error of each part, predicted from a fit of the others [g²]."""
+    parts, reading = _parts(stretches['time'], stretches['temperature']), stretches.reading
+    errors = []
+    for part in np.unique(parts):
+        out = parts == part
+        left = (reading - design @ _solved(design[~out], reading[~out]))[out]
+        errors.append(np.mean(np.sum(left ** 2, axis=1)))
+    return np.array(errors)
 
 
-def _solved(design: Floats, reading: Floats) -> Floats:
-    return np.asarray(np.linalg.lstsq(design, reading, rcond=None)[0])
+def _covariance(stretches: Poses, group: NDArray[np.intp], design: Floats) -> Floats:
+    """Return the covariance of the values of least squares by axis, (3, p, p)."""
+    count, time = stretches['count'], stretches['time']
+    white, walk = np.diag(np.mean(count) / count), np.zeros((len(time), len(time)))
+    for own in (group == k for k in np.unique(group)):
+        since = time[own] - time[own][0]
+        walk[np.ix_(own, own)] = np.minimum.outer(since, since)
+    outside = np.linalg.qr(design, mode='complete')[0][:, design.shape[1]:]
+    ratio, axes = scipy.linalg.eigh(*(outside.T @ each @ outside for each in (walk, white)))
+    squares = (axes.T @ (outside.T @ stretches.reading)) ** 2
+    walks = _WALKS / np.median(np.diff(time))
+    spread = 1.0 + np.outer(walks, ratio)
+    variance = (1.0 / spread) @ squares / len(ratio)
+    likelihood = -1.5 * np.sum(np.log(spread), axis=1) - len(ratio) / 2.0 * np.sum(
+        np.log(variance + 1e-300), axis=1)
+    share = np.exp(likelihood - np.max(likelihood))
+    share *= np.where(walks == 0.0, _WHITE, (1.0 - _WHITE) / (len(walks) - 1))
+    sizes = (share / np.sum(share))[:, np.newaxis] * variance
+    onto = np.linalg.pinv(design)
+    white, walk = (onto @ each @ onto.T for each in (white, walk))
+    covariance: Floats = (np.multiply.outer(np.sum(sizes, axis=0), white)
+                          + np.multiply.outer(walks @ sizes, walk))
+    return covariance
 
 
-def _lowest(errors: Sequence[Floats]) -> int:
-    """Return the lowest degree at which no higher one predicts the held-out parts better."""
+def _lowest(errors: Sequence[Floats], fits: Sequence[tuple[Floats, Floats]]) -> int:
+    """Return the lowest degree at which no higher one is seen and predicts better."""
     degree = 0
     for higher in range(1, len(errors)):
         one, other = errors[degree], errors[higher]
         falls = np.sqrt(np.mean(other)) < (1.0 - _BETTER) * np.sqrt(np.mean(one))
-        if falls and np.mean(other < one) >= _MOST_BLOCKS:
+        values, covariance = fits[higher]
+        chi2 = np.sum(values[-1] ** 2 / covariance[:, -1, -1])
+        if (falls and np.mean(other < one) >= _MOST_BLOCKS
+                and scipy.special.chdtrc(len(covariance), chi2) < _LEVEL):
             degree = higher
     return degree
+
+
+def _solved(design: Floats, reading: Floats) -> Floats:
+    return np.asarray(np.linalg.lstsq(design, reading, rcond=None)[0])
 
 
 def _directions(warm: Floats, rate: Floats) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

@@ -69,8 +69,8 @@ _HOW_TO_READ_THERMAL = (
     'reference temperature. One orientation shows only this change, not the offset itself.',
     'The degree is the lowest one at which no higher one predicts parts of the log better that '
     'were held out.',
-    'Deviations come from fits without one part of the log after the other, so that they include '
-    'noise that is correlated. Bands are 95 % intervals.',
+    'Deviations include a slow wander of the offset, whose size is estimated from what the curve '
+    'leaves. Bands are 95 % intervals.',
     'Hysteresis is the difference between warming and cooling at the same temperature. A lag of '
     'the thermometer causes it; a slower ramp reduces it.')
 _HOW_TO_READ_STEPS = (
