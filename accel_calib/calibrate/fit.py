@@ -148,18 +148,18 @@ def sound_rows(poses: Poses, units: Units) -> tuple[Poses, tuple[Rejected, ...]]
     """Separate plausible poses from rows that are no readings of an accelerometer at rest."""
     if not len(poses):
         return poses, ()
+    reading, noise = poses.reading, poses.noise
     with np.errstate(over='ignore'):
-        length = np.linalg.norm(poses.reading, axis=1)
-        centre = np.median(poses.reading, axis=0)
-        away = np.linalg.norm(poses.reading - centre, axis=1)
+        length = np.linalg.norm(reading, axis=1)
+        away = np.linalg.norm(reading - np.median(reading, axis=0), axis=1)
     scale = units.per_g
     if units.is_native:
         scale = float(np.median(away)) * _NATIVE_SPREADS / _LARGEST_REST_G
         length = away
     wild = ~(length <= _LARGEST_REST_G * scale)
     noisy = np.zeros(len(poses), bool)
-    if poses.noise is not None and scale > 0.0:
-        noisy = ~(np.max(poses.noise, axis=1) <= LARGEST_OFFSET_G * scale)
+    if noise is not None and scale > 0.0:
+        noisy = ~(np.max(noise, axis=1) <= LARGEST_OFFSET_G * scale)
     rejected = [Rejected(int(poses.row[k]), _why(poses, int(k), bool(wild[k])))
                 for k in np.flatnonzero(wild | noisy)]
     return (poses.take(~(wild | noisy)), tuple(rejected)) if rejected else (poses, ())
