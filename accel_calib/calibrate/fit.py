@@ -139,7 +139,7 @@ def _without_doubtful(poses: Poses, rejected: tuple[Rejected, ...], units: Units
 
 
 def _fitted(poses: Poses, units: Units, model: str, method: Method) -> Calibration:
-    if model == ORIENTED or (model == 'auto' and 'reference' in poses):
+    if model == ORIENTED or (model == 'auto' and 'reference' in poses.columns):
         return fit_known(poses, units, method)
     return fit_unknown(poses, units, model, method)
 
