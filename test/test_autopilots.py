@@ -186,6 +186,16 @@ def test_a_custom_rotation_is_undone_or_said_to_be_unknown(number, names, tmp_pa
     assert names[2] in said[0]
 
 
+def test_a_parameter_of_px4_that_is_no_number_is_left_out(tmp_path: Path) -> None:
+    pytest.importorskip('pyulog')
+    samples = make.recording(1)
+    path = px4_log(tmp_path / 'log.ulg', samples, {'SENS_DAMAGED': 1})
+    sound, data = read_log(path).table, path.read_bytes()
+    path.write_bytes(data.replace(b'int32_t SENS_DAMAGED\1\0\0\0', b'char[4] SENS_DAMAGEDabcd'))
+    assert path.read_bytes() != data
+    assert read_log(path).table == sound
+
+
 @pytest.mark.parametrize(('parameters', 'why'), [
     ({}, 'parameters are not in the log'), ({'AHRS_ORIENTATION': 77.0}, 'is 77'),
     ({'AHRS_ORIENTATION': 0.0, 'INS_ACCSCAL_X': 0.0}, 'scale is 0'),

@@ -204,10 +204,10 @@ def _px4_messages(path: Path
         lost = sum(dropout.duration for dropout in log.dropouts)
         notes.append(f'PX4 reports {counted(len(log.dropouts), "dropout")} of the log, {lost} ms')
     release = log.msg_info_dict.get('ver_sw_release')
+    stated = [*((-np.inf, *each) for each in log.initial_parameters.items()),
+              *((stamp * MICRO, *each) for stamp, *each in log.changed_parameters)]
     return found, Parameters([
-        *(Stated(-np.inf, name, float(value)) for name, value in log.initial_parameters.items()),
-        *(Stated(stamp * MICRO, name, float(value))
-          for stamp, name, value in log.changed_parameters)]), (
+        Stated(time, name, float(value)) for time, name, value in stated if _is_number(value)]), (
         (release >> 24, release >> 16 & 0xff) if isinstance(release, int) else None), notes
 
 
@@ -364,10 +364,10 @@ def _parameters(table: _Table) -> Parameters:
         for time, name, value in rows if _is_number(time) and _is_number(value)])
 
 
-def _is_number(value: float | str) -> bool:
+def _is_number(value: float | str | bytes) -> bool:
     try:
         return math.isfinite(float(value))
-    except ValueError:  # a damaged line of text
+    except ValueError:  # a damaged line of text, or a damaged parameter
         return False
 
 
