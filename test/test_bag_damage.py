@@ -150,6 +150,18 @@ def test_a_file_that_the_metadata_do_not_list_is_noted(whole: dict[str, Path],
     assert 'does not list file later.mcap' in opened.notes[0]
 
 
+def test_damaged_metadata_print_nothing(whole: dict[str, Path], tmp_path: Path,
+                                        recwarn: pytest.WarningsRecorder) -> None:
+    path = copied(whole['mcap folder'], tmp_path)
+    metadata = path / 'metadata.yaml'
+    text = metadata.read_text()
+    assert text.count('message_count: ') > 1
+    metadata.write_text(text.replace('message_count: ', 'message_count: &a '))
+    with open_log(path) as opened:
+        assert sum(map(len, opened.blocks)) == COUNT
+    assert not [str(each.message) for each in recwarn]
+
+
 def test_lost_messages_are_noted(whole: dict[str, Path], calibration: Calibration,
                                  tmp_path: Path) -> None:
     path = copied(whole['sqlite3'], tmp_path)

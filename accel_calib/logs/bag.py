@@ -19,6 +19,7 @@ from functools import cache
 from itertools import islice
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
+import warnings
 
 import numpy as np
 from numpy.typing import NDArray
@@ -239,8 +240,10 @@ def open_bag(path: Path) -> Iterator[Bag]:
     with ExitStack() as stack:
         with damage_as_input_error(path):
             source, notes = readable(path, stack)
-            reader = (Reader2 if ros2 else Reader1)(source)
-            reader.open()
+            with warnings.catch_warnings():
+                warnings.simplefilter('ignore')  # of the YAML of damaged metadata
+                reader = (Reader2 if ros2 else Reader1)(source)
+                reader.open()
             stack.callback(_close, path, reader)
             _check(reader)
         yield Bag(path, reader, ros2, tuple(notes))
