@@ -190,14 +190,15 @@ def curve_of(ramps: Sequence[Ramp]) -> Curve:
     rising, falling = _directions(warm, rate)
     both = bool(np.any(rising & _shared(warm, falling)) and np.any(falling))
     powers = _powers(warm - reference, DEGREE)[:, 1:]
-    levels = np.eye(len(ramps))[group]
+    beside = np.eye(len(ramps))[group]
     if both:
-        levels = np.column_stack([levels, rate])
-    designs = [np.column_stack([levels, powers[:, :k]]) for k in range(DEGREE + 1)]
-    errors = [_held_out(stretches, each) for each in designs]
+        beside = np.column_stack([beside, rate])
+    designs = [np.column_stack([beside, powers[:, :k]]) for k in range(DEGREE + 1)]
+    parts = _parts(stretches['time'], warm)
+    errors = [_held_out(stretches.reading, each, parts) for each in designs]
     fits = [(_solved(each, stretches.reading), _covariance(stretches, group, each))
             for each in designs]
-    degree, first = _lowest(errors, fits), levels.shape[1]
+    degree, first = _lowest(errors, fits), beside.shape[1]
     values, covariance = fits[degree][0][first:], fits[degree][1][:, first:, first:]
     curve_g = powers[:, :degree] @ values
     rest = np.array([np.mean((stretches.reading - curve_g)[group == k], axis=0)
@@ -232,9 +233,8 @@ def _parts(time: Floats, warm: Floats) -> NDArray[np.intp]:
     return np.minimum((share * _BLOCKS).astype(np.intp), _BLOCKS - 1)
 
 
-def _held_out(stretches: Poses, design: Floats) -> Floats:
+def _held_out(reading: Floats, design: Floats, parts: NDArray[np.intp]) -> Floats:
     """Return the mean squared error of each part, predicted from a fit of the others [g²]."""
-    parts, reading = _parts(stretches['time'], stretches['temperature']), stretches.reading
     errors = []
     for part in np.unique(parts):
         out = parts == part

@@ -36,7 +36,7 @@ import scipy
 
 from .columns import Chosen, chosen, is_log_header, LogOptions
 from .dialect import shown
-from .flight import is_flight_log, sound_log
+from .flight import HEAD, is_flight_log, sound_log
 from .names import meaning, READING, record_instead
 from .text import open_text, TextTable
 from ..errors import InputError, needing
@@ -61,9 +61,6 @@ _SMALL, _LARGEST_RATIO = 2_000_000, 100
 
 _ROWS = 500
 """Number of rows of a sheet that are read at once."""
-
-_HEAD = 8192
-"""Bytes of a file by which it is recognised."""
 
 _CELL_BYTES = 18
 """Bytes of a number as text, about."""
@@ -236,7 +233,7 @@ def _files(path: Path, archive: zipfile.ZipFile) -> list[Member]:
 def _unpacked(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Any:
     """Open a file of an archive; InputError if it is a flight log."""
     file: Any = archive.open(info)
-    if is_flight_log(file.peek(_HEAD)[:_HEAD]):
+    if is_flight_log(file.peek(HEAD)[:HEAD]):
         raise InputError(f'{path} holds the flight log {info.filename}, expected a table',
                          _UNPACK)
     return file

@@ -60,6 +60,9 @@ from ..text import counted
 PX4_MESSAGES, ARDUPILOT_MESSAGES = tuple(PX4_FIELDS), ('IMU', 'ACC')
 """Messages with accelerations, in order of preference."""
 
+HEAD = 8192
+"""First bytes of a file by which it is recognised."""
+
 ULOG, DATAFLASH = b'ULog\x01\x12\x35', b'\xa3\x95\x80'
 """First bytes of logs of PX4, and of binary logs of ArduPilot (the head of a message FMT)."""
 

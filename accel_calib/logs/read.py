@@ -31,7 +31,7 @@ from .bag_samples import context_of, imu_samples, together
 from .columns import check_once, chosen, is_log_header, LogOptions, Source, with_indices
 from .containers import FIRST_BYTES, Frame, open_table, Piped
 from .dialect import layout_of
-from .flight import is_flight_log, read_dataflash, read_ulg, ULOG
+from .flight import HEAD, is_flight_log, read_dataflash, read_ulg, ULOG
 from .names import OURS, READING
 from .quantities import are_samples, are_untimed_samples, decided, Quantities
 from .text import Cells, open_text, TextTable
@@ -44,8 +44,6 @@ from ..text import some
 from ..units import Units, units_of
 
 _BAG_SUFFIXES = ('.bag', '.mcap', '.db3')
-_HEAD = 8192
-"""Number of bytes at the beginning of a file that show its kind."""
 
 _DIGITS = '.12g'
 _SHOWN = 12
@@ -171,7 +169,7 @@ def _opened(path: Path | Piped | Frame, options: LogOptions) -> Iterator[OpenLog
             yield _bag(bag, options)
         return
     with path.open('rb') as file:
-        head = file.read(_HEAD)
+        head = file.read(HEAD)
     if head.startswith(FIRST_LINE.encode()):
         raise InputError(f'{path} is a calibration, expected a log or a table of poses',
                          'use the log or the table that it was made from; most commands take a '
