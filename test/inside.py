@@ -62,7 +62,8 @@ from accel_calib.live.sources import is_port, open_source
 from accel_calib.logs import are_samples, bag_samples, bounded_bags, layout_with, open_bag, text
 from accel_calib.logs.bag_samples import together
 from accel_calib.logs.bounded_bags import decompressed, largest
-from accel_calib.logs.flight import read_dataflash, read_ulg, ULOG as ULG_MAGIC
+from accel_calib.logs.flight import read_dataflash, read_ulg
+from accel_calib.logs.formats import ULOG as ULG_MAGIC
 from accel_calib.logs.names import format_named, meaning, record_instead, unit_of
 from accel_calib.logs.serialized import frame_ids, stamps_of
 from accel_calib.messages.one_reading import OneReading

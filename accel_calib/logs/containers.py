@@ -36,17 +36,11 @@ import scipy
 
 from .columns import Chosen, chosen, is_log_header, LogOptions
 from .dialect import shown
-from .flight import HEAD, is_flight_log, sound_log
+from .formats import BLACKBOX, FLIGHT_LOG, HEAD, MATLAB, MATLAB_HDF5, OLE, sound_log
 from .names import meaning, READING, record_instead
 from .text import open_text, TextTable
 from ..errors import InputError, needing
 from ..table import ABOUT
-
-_ZIP, _OLE = b'PK\x03\x04', b'\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1'
-_MATLAB, _MATLAB_HDF5 = b'MATLAB 5.0 MAT-file', b'MATLAB 7.3 MAT-file'
-_BLACKBOX = b'H Product:Blackbox flight data recorder'
-FIRST_BYTES = (_ZIP, _OLE, _MATLAB, _MATLAB_HDF5, _BLACKBOX)
-"""First bytes of containers, and of a log that has to be decoded."""
 
 _WORKBOOK = 'xl/workbook.xml'
 
@@ -131,15 +125,15 @@ def open_table(path: Path, head: bytes, options: LogOptions) -> Iterator[tuple[s
 
 @contextmanager
 def _members_of(path: Path, head: bytes) -> Iterator[Sequence[Member]]:
-    if head.startswith(_BLACKBOX):
+    if head.startswith(BLACKBOX):
         raise InputError(f'{path} is a log of the blackbox as the flight controller wrote it, '
                          'expected its CSV file', f'decode it with blackbox_decode {path.name}')
-    if head.startswith(_MATLAB_HDF5):
+    if head.startswith(MATLAB_HDF5):
         raise InputError(f'{path} is a MATLAB file of version 7.3, expected version 7 or older',
                          f'save it with save(file, "-v7"), or {_EXPORT_MATLAB}')
-    if head.startswith(_OLE):
+    if head.startswith(OLE):
         yield _old_sheets(path)
-    elif head.startswith(_MATLAB) or path.suffix == '.mat':
+    elif head.startswith(MATLAB) or path.suffix == '.mat':
         yield _arrays(path)
     else:
         with _sound_archive(path), zipfile.ZipFile(path) as archive:
@@ -233,7 +227,7 @@ def _files(path: Path, archive: zipfile.ZipFile) -> list[Member]:
 def _unpacked(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Any:
     """Open a file of an archive; InputError if it is a flight log."""
     file: Any = archive.open(info)
-    if is_flight_log(file.peek(HEAD)[:HEAD]):
+    if FLIGHT_LOG.search(file.peek(HEAD)[:HEAD]):
         raise InputError(f'{path} holds the flight log {info.filename}, expected a table',
                          _UNPACK)
     return file

@@ -36,12 +36,9 @@ text form (``.log``) has the same messages, one per line.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
-import errno
+from collections.abc import Mapping, Sequence
 import io
 import math
-import os
 from pathlib import Path
 import re
 from typing import Any
@@ -52,6 +49,7 @@ from numpy.typing import NDArray
 from .autopilot import (
     ardupilot_correction, as_sensed, AsSensed, at, AXES, choose, Correction, finite, FlightLog,
     Message, Parameters, px4_correction, px4_slot, RATES, sound, Stated, taken)
+from .formats import DATAFLASH, sound_log
 from .names import MICRO, PX4_FIELDS, PX4_SPANS
 from ..errors import InputError, needing
 from ..table import Autopilot, Floats
@@ -59,60 +57,6 @@ from ..text import counted
 
 PX4_MESSAGES, ARDUPILOT_MESSAGES = tuple(PX4_FIELDS), ('IMU', 'ACC')
 """Messages with accelerations, in order of preference."""
-
-HEAD = 8192
-"""First bytes of a file by which it is recognised."""
-
-ULOG, DATAFLASH = b'ULog\x01\x12\x35', b'\xa3\x95\x80'
-"""First bytes of logs of PX4, and of binary logs of ArduPilot (the head of a message FMT)."""
-
-FMT = re.compile(rb'^FMT, *\d+, *\d+, *\w+, *\w+', re.MULTILINE)
-"""Message FMT in a text log of ArduPilot."""
-
-_STANDARD_ERROR = 2
-
-
-def is_flight_log(head: bytes) -> bool:
-    """Return whether a file with these first bytes is a log of PX4 or ArduPilot."""
-    return head.startswith((ULOG, DATAFLASH)) or FMT.search(head) is not None
-
-
-@contextmanager
-def sound_log(path: Path, expected: str, advice: str = 'copy it from the vehicle again'
-              ) -> Iterator[None]:
-    """
-    Turn what a library raises for a damaged log into one InputError, and drop what it prints.
-
-    Libraries of logs raise errors of any class, and print. Errors of the system pass.
-
-    """
-    try:
-        with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()), _silent_c():
-            yield
-    except Exception as err:
-        # Of a library, or a seek to before the start of a file, by a damaged length.
-        if isinstance(err, OSError) and err.errno not in (None, errno.EINVAL):
-            raise
-        why = ' '.join(str(err).split()) or type(err).__name__
-        raise InputError(f'{path} is damaged ({why}), expected {expected}',
-                         advice) from err
-
-
-@contextmanager
-def _silent_c() -> Iterator[None]:
-    """Drop what C code prints to standard error, which Python cannot redirect."""
-    try:
-        kept = os.dup(_STANDARD_ERROR)
-    except OSError:  # standard error is closed, so nothing is printed
-        yield
-        return
-    try:
-        with open(os.devnull, 'wb') as nowhere:
-            os.dup2(nowhere.fileno(), _STANDARD_ERROR)
-            yield
-    finally:
-        os.dup2(kept, _STANDARD_ERROR)
-        os.close(kept)
 
 
 # --------------------------------------------------------------------------------------- PX4

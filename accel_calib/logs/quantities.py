@@ -5,12 +5,13 @@
 Quantities of a text log: the conversion of its columns to our units.
 
 `decided` looks at the first block of numbers and decides the unit of each column: what the user,
-the file, the maker's layout or the name states, or else what the readings at rest and the rate of
-the samples show. Each assumption is in `Quantities.read_as`.
+a comment of the file, the maker's layout or the name states, in this order, or else what the
+readings at rest and the rate of the samples show. Each assumption is in `Quantities.read_as`.
 
-**Time.** A unit that no name states is found from the rate: 1 to 10,000 samples per second are
-plausible. Where two units are, that with a rate nearer to 100 Hz is taken; stamps since 1970
-decide before. A counter of the clock can start again.
+A sensor at rest reads 1 g plus its offset, in any direction. So the readings at rest lie on a
+sphere whose radius is 1 g in the unit of the sensor. Without gravity they lie around 0, and no
+sphere fits them. A log without gravity is refused, and so are readings at rest that contradict
+their name.
 
 """
 
@@ -19,144 +20,49 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 import math
-from typing import Any
+from typing import Any, cast, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .accelerometer import compact, rests_of, unit_of_reading
-from .columns import Chosen, FRACTION, LogOptions, rates_beside, unused
-from .dialect import EPOCH_S, has_date, RATES_HZ, seconds_of
-from .names import (
-    bare_name, COUNTERS, DEGREE, meaning, RATE, READING, TICKS, unit_of, UNITS, ZEROS)
+from .columns import Chosen, LogOptions, unused
+from .names import DEGREE, meaning, RATE, READING, record_instead, unit_of, ZEROS
 from .text import Cells
+from .times import Clock, clock_of
 from ..errors import InputError
 from ..table import COLUMNS, Floats
-from ..units import Units, units_of
+from ..units import STANDARD_GRAVITY, UnitName, Units, units_of
 
-TIME_UNITS = dict(UNITS['time'].values())
-"""Factors to seconds, by the name of the unit."""
+_WINDOWS = 400
+"""Largest number of windows of a recording."""
 
-TICK = 'ticks of 100 µs'
+_SHORTEST, _LONGEST = 8, 256
+"""Shortest and longest window [samples]."""
 
-_AGREES = 1.25
-"""Factor within which the rate of stamps is the one that the file states."""
+_QUIET_SHARE = 0.3
+"""Share of the windows that are taken for rests: those with the least scatter."""
 
-_MOST_BACK = 0.1
-"""Share of steps back in time above which a column is no time."""
+_SPHERE_POINTS = 6
+_SPREAD = 0.3
+"""Smallest ratio of the standard deviations along the axes of the readings to fit a sphere."""
 
-_LIKELY_RATE = 20.0
-"""Angular rates [rad/s] of a sensor that is turned by hand stay below this; in °/s they do not."""
+_OFF_SPHERE = 0.1
+"""Largest RMS distance from the sphere, relative to its radius."""
 
-_LIKELY_RATE_DEG = 3000.0
-_LARGEST_RATE = 40.0
-"""Angular rates [rad/s] above those of common gyros, 2000 °/s."""
+_SMALL_G = 0.3
+"""Readings at rest below this [g] have no gravity in them."""
 
-_LIKELY_TEMPERATURE_C = (-60.0, 150.0)
+_SMALL = 0.5
+"""The same, in a unit that is not known: below half of the smallest common unit, g."""
 
-_USUAL_HZ = 100.0
-_DAY_S = 86_400.0
-_COUNTER = 2.0**32
-_NEAR_END = 0.01
-"""Share of the range of a counter, before and after it starts again, in which the stamps are."""
+_FACTOR = 1.4
+"""Largest factor between the readings at rest and 1 g in their unit."""
 
-_MANY_ROWS = 500
-_WINDOW = 8
-_AT_REST = 0.3
-_MOVES = 5.0
-_MOVING = 0.05
-"""Share of windows whose scatter is above `_MOVES` times that at rest, the quantile `_AT_REST`."""
+_MG = (1000.0 / 1.3, 1012.0)
+"""Range of whole numbers at rest that are mg; 1024 counts per g begin above it."""
 
-
-def unit_by_rate(stamps: Floats, beside: Sequence[float] = (),
-                 units: Mapping[str, float] = TIME_UNITS) -> tuple[str, float] | None:
-    """
-    Return the unit in which stamps have a plausible rate, and that rate [Hz], or None.
-
-    `beside` are the rates that the file states; a unit with one of them goes first.
-
-    """
-    step = step_of(stamps)
-    if not step > 0.0:
-        return None
-    rates = {name: 1.0 / (step * unit) for name, unit in units.items()}
-    plausible = [name for name, rate in rates.items() if RATES_HZ[0] * 0.9 <= rate
-                 <= RATES_HZ[1] * 1.1]
-    stated = [name for name in rates if any(_agree(rates[name], rate) for rate in beside)]
-    since_1970 = [name for name in plausible
-                  if EPOCH_S[0] <= float(np.median(stamps)) * units[name] <= EPOCH_S[1]]
-    if not np.all(stamps == np.round(stamps)) and 's' in plausible:
-        plausible = ['s']
-    best = min(stated or since_1970 or plausible, default=None,
-               key=lambda name: abs(math.log(rates[name] / _USUAL_HZ)))
-    return None if best is None else (best, rates[best])
-
-
-def _agree(one: float, two: float) -> bool:
-    return 1.0 / _AGREES < one / two < _AGREES
-
-
-def step_of(stamps: Floats) -> float:
-    """Return the usual step between stamps; some sensors repeat a stamp of whole ms."""
-    steps = np.diff(stamps)
-    if not len(steps):
-        return 0.0
-    middle = float(np.median(steps))
-    forward = steps[steps > 0.0]
-    if middle > 0.0 or not len(forward):
-        return middle
-    return float(forward.sum()) / len(steps)
-
-
-def is_dense(stamps: Floats, reading: Floats) -> bool:
-    """
-    Return whether rows that are far apart in seconds are the samples of a moving sensor.
-
-    A sensor that is logged each ten seconds is nearly always still. In a recording of turns and
-    rests the scatter within many short windows is much larger than that at rest. Of real
-    recordings by hand that is 10 % of the windows or more, of 58 h at rest 1 %.
-
-    """
-    if len(stamps) < _MANY_ROWS or step_of(stamps) < 1.0:
-        return False
-    windows = reading[:len(reading) // _WINDOW * _WINDOW].reshape(-1, _WINDOW, 3)
-    scatter = np.linalg.norm(windows.std(axis=1), axis=1)
-    at_rest = float(np.quantile(scatter, _AT_REST))
-    return bool(np.mean(scatter > _MOVES * at_rest) > _MOVING)
-
-
-@dataclass
-class Counter:
-    """Continues the times of a counter that starts again at one of these periods [s]."""
-
-    periods: tuple[float, ...]
-    added: float = 0.0
-    last: float = math.nan
-    starts: int = 0
-
-    def continued(self, seconds: Floats) -> Floats:
-        """Return times that go on where the counter starts again."""
-        before = np.concatenate([[self.last], seconds[:-1]])
-        steps = np.zeros(len(seconds))
-        for period in self.periods:
-            again = ((before >= (1.0 - _NEAR_END) * period) & (before < 1.000001 * period)
-                     & (seconds <= _NEAR_END * period))
-            steps[again] = period
-            self.starts += int(np.count_nonzero(again))
-        total = self.added + np.cumsum(steps)
-        if len(seconds):
-            self.last, self.added = float(seconds[-1]), float(total[-1])
-        return seconds + total
-
-
-def counter_of(unit: str, *, of_day: bool = False) -> Counter:
-    """Return the counter for stamps in a unit: 2^32 µs or ms, or a day."""
-    if of_day:
-        return Counter((_DAY_S,))
-    ranges = {'µs': (_COUNTER * 1e-6,), 'ms': (_COUNTER * 1e-3,), TICK: (_COUNTER * 1e-4,),
-              's': (_COUNTER * 1e-6, _COUNTER * 1e-3)}
-    return Counter(ranges.get(unit, ()))
-
+_STATED_FACTOR = 2.0
+"""Largest factor between the readings at rest and 1 g in a stated unit."""
 
 _SAMPLES_APART_S = 0.9
 """Rows that are nearer in time are samples."""
@@ -175,6 +81,347 @@ _ONE_SIDE = 0.3
 
 _OF_POSES = {'count', 'orientation', 'std'}
 """Columns that only poses have."""
+
+_LIKELY_RATE = 20.0
+"""Angular rates [rad/s] of a sensor that is turned by hand stay below this; in °/s they do not."""
+
+_LIKELY_RATE_DEG = 3000.0
+_LARGEST_RATE = 40.0
+"""Angular rates [rad/s] above those of common gyros, 2000 °/s."""
+
+_LIKELY_TEMPERATURE_C = (-60.0, 150.0)
+
+
+@dataclass
+class Quantities:
+    """
+    The conversion of the columns of a log; `decided` makes it.
+
+    `clock` converts the times; `rate_hz` is the rate of samples without times. `scales` are the
+    factor to our unit and our value at 0, by column. `instance` is the number of the sensor whose
+    rows are read, where rows of several alternate. `said` is what is assumed, and `notes` what is
+    not used.
+
+    """
+
+    chosen: Chosen
+    units: Units
+    clock: Clock
+    scales: dict[str, tuple[float, float]] = field(default_factory=dict)
+    instance: float | None = None
+    rate_hz: float | None = None
+    said: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def read_as(self) -> str:
+        """Return what is assumed, in one line."""
+        return ', '.join(self.said)
+
+    @property
+    def all_notes(self) -> tuple[str, ...]:
+        """Return what is not used, and whether the counter of the clock started again."""
+        starts = self.clock.starts
+        if not starts:
+            return tuple(self.notes)
+        times = 'once' if starts == 1 else f'{starts} times'
+        return (*self.notes, f'the clock starts again {times} at the end of its range; its times '
+                'are continued')
+
+    def columns(self, cells: Cells) -> tuple[dict[str, NDArray[Any]], NDArray[np.int64]]:
+        """Return the columns of a block in our units, and its row numbers."""
+        if self.instance is not None:
+            cells = _of_instance(self.chosen, cells, self.instance)
+        columns: dict[str, NDArray[Any]] = {}
+        sources = self.chosen.sources
+        for key, column in COLUMNS.items():
+            if column.made or not sources.keys() >= set(column.names):
+                continue
+            if key == 'label':
+                columns[key] = np.array(self.chosen.texts(cells, 'label'), dtype=str)
+            elif key == 'time':
+                columns[key] = self.clock.continued(cells)
+            elif len(column.names) == 1:
+                columns[key] = self._scaled(cells, key)
+            else:
+                columns[key] = np.column_stack([self._scaled(cells, name)
+                                                for name in column.names])
+        columns |= {key: cells.numbers[:, self.chosen.numeric.index(k)]
+                    for key, k in self.chosen.quantities.items()}
+        if self.rate_hz is not None:
+            columns['time'] = (cells.row - 1) / self.rate_hz
+        return columns, cells.row
+
+    def scale(self, keys: Sequence[str], factor: float, zero: float = 0.0) -> None:
+        """Set the factor of columns to our unit, and our value at 0."""
+        self.scales.update(dict.fromkeys(keys, (factor, zero)))
+
+    def _scaled(self, cells: Cells, ours: str) -> Floats:
+        values = self.chosen.numbers(cells, ours)
+        factor, zero = self.scales.get(ours, (1.0, 0.0))
+        return values if (factor, zero) == (1.0, 0.0) else values * factor + zero
+
+
+def _of_instance(columns: Chosen, cells: Cells, instance: float) -> Cells:
+    which = columns.numbers(cells, 'instance') == instance
+    texts = [[text for text, own in zip(part, which) if own] for part in cells.texts]
+    return Cells(cells.numbers[which], texts, cells.row[which])
+
+
+def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
+    """Return the conversion of the columns, from the first block of a log; see above."""
+    made = Quantities(columns, units_of('m/s2', options.gravity), Clock(columns))
+    if columns.maker is not None:
+        made.said.append(f'{columns.maker.name} format')
+        made.notes += [columns.maker.note] if columns.maker.note else []
+    made.said += columns.layout.words
+    if 'instance' in columns.sources:
+        made.instance = _instance(columns, first, options, made.notes)
+        first = _of_instance(columns, first, made.instance)
+    if 'time' in columns.sources:
+        made.clock = clock_of(columns, first, options)
+        made.said += filter(None, [made.clock.words])
+        made.notes += made.clock.doubts
+    _decide_reading(made, first, options)
+    _decide_rate(made, first)
+    _decide_temperature(made, first)
+    _decide_supply(made)
+    made.notes += unused(columns.layout, columns.sources)
+    return made
+
+
+def _instance(columns: Chosen, first: Cells, options: LogOptions, notes: list[str]) -> float:
+    there = np.unique(columns.numbers(first, 'instance')).tolist()
+    words = ', '.join(f'{each:g}' for each in there)
+    if options.sensor:
+        try:
+            asked = float(options.sensor)
+        except ValueError:
+            asked = np.nan
+        if asked not in there:
+            raise InputError(f'{columns.layout.path} has the sensors {words}, expected '
+                             f'{options.sensor}', 'choose one of them with --sensor')
+        return asked
+    if len(there) > 1:
+        notes.append(f'the log has the sensors {words}; sensor {there[0]:g} is read: choose '
+                     'another with --sensor')
+    return float(there[0])
+
+
+# ---------------------------------------------------------------------------------- reading
+
+def _decide_reading(made: Quantities, first: Cells, options: LogOptions) -> None:
+    """Decide the unit of the readings; raise InputError if what states it is contradicted."""
+    columns = made.chosen
+    raw = columns.three(first, READING)
+    samples = _decide_samples(made, first, raw, options)
+    named, factor = _named(columns)
+    stated = _stated(columns, options) or (not named and options.default_units) or ''
+    if stated and stated != named:
+        factor = 1.0
+    rests = rests_of(raw * factor, samples=samples)
+    name = stated or named
+    _check_gravity(columns, rests, units_of(name, options.gravity) if name else None)
+    if not name:
+        name, factor = _at_rest(columns, rests)
+    elif not stated:
+        _check_named(columns, rests, units_of(name))
+    made.units = units_of(name, options.gravity)
+    made.scale(READING, factor)
+    is_ours = columns.names(READING) == list(READING) and (stated or made.units.is_si)
+    if made.said or not is_ours:
+        made.said.append(_words(columns, rests, made.units, factor, stated=bool(stated)))
+    if made.units.is_native and _says_nothing(columns, options):
+        made.notes.append('nothing in the file says what the numbers are: they are taken for '
+                          'those of an accelerometer in counts or volts; a magnetometer looks '
+                          'alike')
+
+
+def _decide_samples(made: Quantities, first: Cells, raw: Floats, options: LogOptions) -> bool:
+    """Return whether rows are samples, rather than poses; set their rate if they lack times."""
+    there = {key: raw for key, column in COLUMNS.items() if column.names[0] in made.chosen.sources}
+    if 'time' in made.chosen.sources:
+        return are_samples({**there, 'time': made.clock.seconds(first)})
+    samples = are_untimed_samples({**there, 'reading': raw})
+    made.rate_hz = options.rate or (made.chosen.layout.rate_hz if samples else None)
+    return samples or made.rate_hz is not None
+
+
+def _named(columns: Chosen) -> tuple[UnitName | Literal[''], float]:
+    """Return the unit that the maker or the names state, and the factor to it."""
+    if columns.maker is not None and columns.maker.units:
+        return columns.maker.units, columns.maker.scales.get('ax', 1.0)
+    found = {unit_of('reading', columns.sources[name].unit) for name in READING}
+    if len(found) > 1:
+        raise InputError(f'{columns.layout.path} has the columns '
+                         f'{", ".join(columns.names(READING))} in several units, expected one '
+                         'unit', 'correct the names, or convert the columns')
+    name, factor = found.pop() or ('', 1.0)
+    return cast(UnitName, name), factor
+
+
+def _stated(columns: Chosen, options: LogOptions) -> UnitName | Literal['']:
+    path, of_file = columns.layout.path, columns.layout.about.get('units', '')
+    if options.units and of_file and options.units != of_file:
+        raise InputError(f'{path} is in {of_file}, but --units is {options.units}',
+                         'remove --units, or correct the file')
+    return options.units or cast(UnitName, of_file)
+
+
+def _check_gravity(columns: Chosen, rests: Rests, units: Units | None) -> None:
+    """Check that gravity is in the readings; `units` is the stated unit, if any."""
+    per_g = None if units is None else units.per_g
+    if (units is not None and units.is_native) or not rests.lack_gravity(per_g):
+        return
+    layout = columns.layout
+    instead = record_instead(layout.header, layout.path)
+    raise InputError(f'{layout.path} holds linear acceleration, gravity removed: the readings at '
+                     f'rest have a length of {rests.length:.3g}, expected 1 g',
+                     instead or 'record the acceleration with gravity, often called raw or total '
+                     'acceleration')
+
+
+def _at_rest(columns: Chosen, rests: Rests) -> tuple[UnitName, float]:
+    own = columns.sources['ax'].name == 'ax'
+    if own and rests.unit is None and rests.near(STANDARD_GRAVITY, _STATED_FACTOR):
+        return 'm/s2', 1.0
+    return rests.unit or ('native', 1.0)
+
+
+def _check_named(columns: Chosen, rests: Rests, units: Units) -> None:
+    """Check that the readings at rest fit the unit in the names."""
+    if units.is_native or (1.0 / _STATED_FACTOR <= rests.length / units.per_g
+                           <= _STATED_FACTOR):
+        return
+    likely = rests.unit
+    advice = (f'add --units {likely[0]}' if likely and likely[1] == 1.0 else
+              'correct the name, or add --units native')
+    maker = columns.maker
+    what = (f'the format {maker.name}' if maker is not None and maker.units else
+            f'the name {columns.sources["ax"].name!r}')
+    raise InputError(f'{columns.layout.path}: {what} states readings in {units.name}, but at rest '
+                     f'they have a length of {rests.length:.4g} {units.name}, expected about '
+                     f'{units.per_g:.4g}', advice)
+
+
+def _words(columns: Chosen, rests: Rests, units: Units, factor: float, *, stated: bool) -> str:
+    """Return how the readings are read."""
+    words, name = compact(columns.names(READING)), units.name
+    if units.is_native and not stated:
+        size = rests.per_g
+        value = f'{size:,.0f}'.replace(',', ' ') if size >= 1000.0 else f'{size:.3g}'
+        counts = ' counts' if rests.whole else ''
+        about = 'at rest' if math.isnan(rests.radius) else '= 1 g'
+        return f'{words}, {value}{counts} {about} (native)'
+    if factor == 1.0:
+        return f'{words} in {name}'
+    unit = columns.sources['ax'].unit or {1e-3: 'mg'}.get(factor, f'{factor:g} {name}')
+    return f'{words} in {unit} -> {name}' if columns.maker is None else f'{words} -> {name}'
+
+
+def compact(parts: Sequence[str]) -> str:
+    """Return names that differ in one place in a short form: ``accX/Y/Z``."""
+    if all(part.isdecimal() for part in parts):
+        return f'columns {", ".join(parts)}'
+    start = next((k for k, letters in enumerate(zip(*parts)) if len(set(letters)) > 1), 0)
+    ends = {part[start + 1:] for part in parts}
+    if len(ends) > 1:
+        return ', '.join(parts)
+    return f'{parts[0][:start]}{"/".join(part[start] for part in parts)}{ends.pop()}'
+
+
+def _says_nothing(columns: Chosen, options: LogOptions) -> bool:
+    """Return whether neither names nor the user say that the readings are accelerations."""
+    named = meaning(columns.sources[READING[0]].name)
+    return not (options.units or columns.maker or named.quantity
+                or {*READING} & {*options.columns})
+
+
+# --------------------------------------------------------------------- rests, samples or poses
+
+@dataclass(frozen=True)
+class Rests:
+    """
+    Readings at rest: median length, and radius of the sphere through them.
+
+    The radius is NaN if they do not determine one. `whole`: all readings are whole numbers.
+
+    """
+
+    length: float
+    radius: float
+    whole: bool
+
+    @property
+    def per_g(self) -> float:
+        """Value of 1 g, as far as the readings tell."""
+        return self.length if math.isnan(self.radius) else self.radius
+
+    def near(self, per_g: float, factor: float = _FACTOR) -> bool:
+        """Return whether 1 g of the readings is within a factor of a value."""
+        lengths = (self.length, self.per_g)
+        return all(1.0 / factor <= length / per_g <= factor for length in lengths)
+
+    @property
+    def unit(self) -> tuple[UnitName, float] | None:
+        """Return the common unit of the readings and the factor to it, or None."""
+        if self.near(STANDARD_GRAVITY):
+            return 'm/s2', 1.0
+        if self.near(1.0):
+            return 'g', 1.0
+        if self.near(1000.0, 1.3) and (not self.whole or _MG[0] < self.per_g < _MG[1]):
+            return 'g', 1e-3
+        return None
+
+    def lack_gravity(self, per_g: float | None) -> bool:
+        """Return whether the readings are small and on no sphere; `per_g` is 1 g if stated."""
+        small = _SMALL if per_g is None else _SMALL_G * per_g
+        return self.length < small and self.unit is None and math.isnan(self.radius)
+
+
+def rests_of(reading: Floats, *, samples: bool) -> Rests:
+    """Return the rests in (n, 3) readings in the unit of the file; rows are samples or poses."""
+    still = _quiet(reading) if samples else reading
+    with np.errstate(over='ignore', invalid='ignore'):
+        length = float(np.median(np.linalg.norm(still, axis=1)))
+        radius = _radius(still)
+    whole = bool(np.all(reading[:1000] == np.round(reading[:1000])))
+    return Rests(length, radius, whole)
+
+
+def _quiet(reading: Floats) -> Floats:
+    size = int(np.clip(len(reading) // _WINDOWS, _SHORTEST, _LONGEST))
+    count = len(reading) // size
+    if count < 2:
+        return reading
+    windows = reading[:count * size].reshape(count, size, 3)
+    with np.errstate(over='ignore', invalid='ignore'):
+        scatter = np.linalg.norm(windows.std(axis=1), axis=1)
+    quiet = np.argsort(scatter, kind='stable')[:max(2, int(_QUIET_SHARE * count))]
+    means: Floats = windows[quiet].mean(axis=1)
+    return means
+
+
+def _radius(still: Floats) -> float:
+    """Return the radius of the sphere through readings at rest; NaN if they determine none."""
+    size = float(np.abs(still).max()) if len(still) else 0.0
+    if len(still) < _SPHERE_POINTS or not 0.0 < size < 1e150:
+        return math.nan
+    scaled = still / size
+    centred = scaled - scaled.mean(axis=0)
+    scales = np.linalg.svd(centred, compute_uv=False)
+    if scales[2] < _SPREAD * scales[0]:
+        return math.nan
+    # |m|² = 2 c·m + (r² - |c|²) is linear in the centre c.
+    rows = np.column_stack([2.0 * centred, np.ones(len(centred))])
+    found = np.linalg.lstsq(rows, np.sum(centred**2, axis=1), rcond=None)[0]
+    square = float(found[3] + found[:3] @ found[:3])
+    if square <= 0.0:
+        return math.nan
+    radius = math.sqrt(square)
+    off = np.linalg.norm(centred - found[:3], axis=1) - radius
+    on_sphere = float(np.sqrt(np.mean(off**2))) < _OFF_SPHERE * radius
+    return radius * size if on_sphere else math.nan
 
 
 def are_samples(columns: Mapping[str, NDArray[Any]]) -> bool:
@@ -203,221 +450,6 @@ def are_untimed_samples(columns: Mapping[str, NDArray[Any]]) -> bool:
                 or np.median(step) < _SAME * spread
                 or spread < _ONE_SIDE * np.linalg.norm(middle)
                 or math.isnan(rests_of(readings, samples=False).radius))
-
-
-@dataclass
-class Quantities:
-    """
-    The conversion of the columns of a log; `decided` makes it.
-
-    `scales` are the factor to our unit and our value at 0, by column. `instance` is the number of
-    the sensor whose rows are read, where rows of several alternate. `rate_hz` is the rate of
-    samples without times. `said` is what is assumed, and `notes` what is not used.
-
-    """
-
-    chosen: Chosen
-    units: Units
-    scales: dict[str, tuple[float, float]] = field(default_factory=dict)
-    counter: Counter = field(default_factory=lambda: Counter(()))
-    instance: float | None = None
-    rate_hz: float | None = None
-    said: list[str] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-
-    @property
-    def read_as(self) -> str:
-        """Return what is assumed, in one line."""
-        return ', '.join(self.said)
-
-    @property
-    def all_notes(self) -> tuple[str, ...]:
-        """Return what is not used, and whether the counter of the clock started again."""
-        if not self.counter.starts:
-            return tuple(self.notes)
-        times = 'once' if self.counter.starts == 1 else f'{self.counter.starts} times'
-        return (*self.notes, f'the clock starts again {times} at the end of its range; its times '
-                'are continued')
-
-    def columns(self, cells: Cells) -> tuple[dict[str, NDArray[Any]], NDArray[np.int64]]:
-        """Return the columns of a block in our units, and its row numbers."""
-        if self.instance is not None:
-            cells = _of_instance(self.chosen, cells, self.instance)
-        columns: dict[str, NDArray[Any]] = {}
-        sources = self.chosen.sources
-        for key, column in COLUMNS.items():
-            if column.made or not sources.keys() >= set(column.names):
-                continue
-            if key == 'label':
-                columns[key] = np.array(self.chosen.texts(cells, 'label'), dtype=str)
-            elif key == 'time':
-                columns[key] = self.counter.continued(self._seconds(cells))
-            elif len(column.names) == 1:
-                columns[key] = self._scaled(cells, key)
-            else:
-                columns[key] = np.column_stack([self._scaled(cells, name)
-                                                for name in column.names])
-        columns |= {key: cells.numbers[:, self.chosen.numeric.index(k)]
-                    for key, k in self.chosen.quantities.items()}
-        if self.rate_hz is not None:
-            columns['time'] = (cells.row - 1) / self.rate_hz
-        return columns, cells.row
-
-    def scale(self, keys: Sequence[str], factor: float, zero: float = 0.0) -> None:
-        """Set the factor of columns to our unit, and our value at 0."""
-        self.scales.update(dict.fromkeys(keys, (factor, zero)))
-
-    def _scaled(self, cells: Cells, ours: str) -> Floats:
-        values = self.chosen.numbers(cells, ours)
-        factor, zero = self.scales.get(ours, (1.0, 0.0))
-        return values if (factor, zero) == (1.0, 0.0) else values * factor + zero
-
-    def _seconds(self, cells: Cells) -> Floats:
-        if self.chosen.dates:
-            return seconds_of(self.chosen.texts(cells, 'time'), self.chosen.layout.path,
-                              cells.row.tolist())
-        seconds = self._scaled(cells, 'time')
-        if FRACTION in self.chosen.sources:
-            return seconds + 1e-9 * self.chosen.numbers(cells, FRACTION)
-        return seconds
-
-
-def _of_instance(columns: Chosen, cells: Cells, instance: float) -> Cells:
-    which = columns.numbers(cells, 'instance') == instance
-    texts = [[text for text, own in zip(part, which) if own] for part in cells.texts]
-    return Cells(cells.numbers[which], texts, cells.row[which])
-
-
-def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
-    """Return the conversion of the columns, from the first block of a log; see above."""
-    made = Quantities(columns, units_of('m/s2', options.gravity))
-    if columns.maker is not None:
-        made.said.append(f'{columns.maker.name} format')
-        made.notes += [columns.maker.note] if columns.maker.note else []
-    made.said += columns.layout.words
-    if 'instance' in columns.sources:
-        made.instance = _instance(columns, first, options, made.notes)
-        first = _of_instance(columns, first, made.instance)
-    if 'time' in columns.sources:
-        _decide_time(made, first, options)
-    _decide_reading(made, first, options)
-    _decide_rate(made, first)
-    _decide_temperature(made, first)
-    _decide_supply(made)
-    made.notes += unused(columns.layout, columns.sources)
-    return made
-
-
-def _instance(columns: Chosen, first: Cells, options: LogOptions, notes: list[str]) -> float:
-    there = np.unique(columns.numbers(first, 'instance')).tolist()
-    words = ', '.join(f'{each:g}' for each in there)
-    if options.sensor:
-        try:
-            asked = float(options.sensor)
-        except ValueError:
-            asked = np.nan
-        if asked not in there:
-            raise InputError(f'{columns.layout.path} has the sensors {words}, expected '
-                             f'{options.sensor}', 'choose one of them with --sensor')
-        return asked
-    if len(there) > 1:
-        notes.append(f'the log has the sensors {words}; sensor {there[0]:g} is read: choose '
-                     'another with --sensor')
-    return float(there[0])
-
-
-# ------------------------------------------------------------------------------------- time
-
-def _decide_time(made: Quantities, first: Cells, options: LogOptions) -> None:
-    source, path = made.chosen.sources['time'], made.chosen.layout.path
-    rate_hz = options.rate or made.chosen.layout.rate_hz
-    if rate_hz is not None and bare_name(source.name) in COUNTERS:
-        made.scale(['time'], 1.0 / rate_hz)
-        made.counter = Counter(tuple(2.0**bits / rate_hz for bits in (8, 16, 32)))
-        made.said.append(f'{source.name} at {rate_hz:g} Hz (stated) -> s')
-        return
-    if options.rate is not None:
-        raise InputError(f'{path} has times, but --rate is {options.rate:g}', 'remove --rate, or '
-                         'leave the times out with --columns time=')
-    if made.chosen.dates:
-        of_day = not has_date(made.chosen.texts(first, 'time')[0])
-        made.counter = counter_of('', of_day=of_day)
-        made.said.append(f'{source.name}: {"times of the day" if of_day else "dates"} -> s')
-        return
-    stamps = made.chosen.numbers(first, 'time')
-    back = np.count_nonzero(np.diff(stamps) < 0.0)
-    if not made.chosen.layout.header and back > _MOST_BACK * (len(stamps) - 1):
-        raise InputError(f'{path} has no header line, and column '
-                         f'{source.name} does not increase, expected times',
-                         'add a header line, or name the columns with --columns ax=1,ay=2,az=3')
-    unit, words = _unit_of_time(made, first, stamps)
-    made.counter = counter_of(unit)
-    scale = {**TIME_UNITS, TICK: 1e-4}[unit]
-    made.scale(['time'], scale)
-    made.said += [words] if words else []
-    stated = made.chosen.layout.rate_hz
-    step = scale * step_of(stamps)
-    if stated and step > 0.0 and not any(_agree(1.0 / step, rate) for rate
-                                         in rates_beside(made.chosen.layout, source)):
-        made.notes.append(f'{source.name} has {1.0 / step:.4g} samples per second, but the file '
-                          f'states {stated:g} Hz')
-
-
-def _unit_of_time(made: Quantities, first: Cells, stamps: Floats) -> tuple[str, str]:
-    source, layout = made.chosen.sources['time'], made.chosen.layout
-    scale = made.chosen.maker and made.chosen.maker.scales.get('time')
-    if scale:
-        unit = min(TIME_UNITS, key=lambda name: abs(np.log(TIME_UNITS[name] / scale)))
-        return unit, f'{source.name} in {unit}' if unit != 's' else ''
-    stated = unit_of('time', source.unit)
-    if stated:
-        return stated[0], f'{source.name} -> s' if stated[0] != 's' else source.name
-    if layout.header and source.name == 'time' and (layout.about or 'count' in made.chosen.sources
-                                                    or not _by_rate(made, first, stamps)):
-        return 's', ''
-    own = TICKS.get(bare_name(source.name), TIME_UNITS)
-    found = unit_by_rate(stamps, rates_beside(layout, source), own)
-    named = f'column {source.name}' if source.name.isdecimal() else source.name
-    if found is None:
-        return 's', f'{named} in s'
-    return found[0], f'{named} in {found[0]} ({found[1]:.3g} Hz)' + (
-        ' -> s' if found[0] != 's' else '')
-
-
-def _by_rate(made: Quantities, first: Cells, stamps: Floats) -> bool:
-    """Return whether the unit of a column ``time`` is found from the rate; by default it is s."""
-    return (made.chosen.names(READING) != list(READING)
-            or is_dense(stamps, made.chosen.three(first, READING)))
-
-
-# ---------------------------------------------------------------------------------- reading
-
-def _decide_reading(made: Quantities, first: Cells, options: LogOptions) -> None:
-    raw = made.chosen.three(first, READING)
-    columns = {'reading': raw, **{key: raw for key, column in COLUMNS.items()
-                                  if column.names[0] in made.chosen.sources}}
-    if 'time' in made.chosen.sources:
-        samples = are_samples({**columns, 'time': made._seconds(first)})
-    else:
-        samples = are_untimed_samples(columns)
-        made.rate_hz = options.rate or (made.chosen.layout.rate_hz if samples else None)
-    samples = samples or made.rate_hz is not None
-    found = unit_of_reading(made.chosen, raw, options, samples=samples)
-    made.units = found.units
-    made.scale(READING, found.factor)
-    if found.assumed or made.said:
-        made.said += found.words
-    if found.units.is_native and _says_nothing(made.chosen, options):
-        made.notes.append('nothing in the file says what the numbers are: they are taken for '
-                          'those of an accelerometer in counts or volts; a magnetometer looks '
-                          'alike')
-
-
-def _says_nothing(columns: Chosen, options: LogOptions) -> bool:
-    """Return whether neither names nor the user say that the readings are accelerations."""
-    named = meaning(columns.sources[READING[0]].name)
-    return not (options.units or columns.maker or named.quantity
-                or {*READING} & {*options.columns})
 
 
 # ---------------------------------------------------------------------------------- context

@@ -29,12 +29,14 @@ from .autopilot import FlightLog
 from .bag import Bag, open_bag
 from .bag_samples import context_of, imu_samples, together
 from .columns import check_once, chosen, is_log_header, LogOptions, Source, with_indices
-from .containers import FIRST_BYTES, Frame, open_table, Piped
+from .containers import Frame, open_table, Piped
 from .dialect import layout_of
-from .flight import HEAD, is_flight_log, read_dataflash, read_ulg, ULOG
+from .flight import read_dataflash, read_ulg
+from .formats import CONTAINERS, FLIGHT_LOG, HEAD, ULOG
 from .names import OURS, READING
 from .quantities import are_samples, are_untimed_samples, decided, Quantities
 from .text import Cells, open_text, TextTable
+from .times import Clock
 from ..disk import check_regular, FIRST_LINE, write_atomically
 from ..errors import InputError, saying
 from ..table import (
@@ -174,14 +176,13 @@ def _opened(path: Path | Piped | Frame, options: LogOptions) -> Iterator[OpenLog
         raise InputError(f'{path} is a calibration, expected a log or a table of poses',
                          'use the log or the table that it was made from; most commands take a '
                          'calibration with -c')
-    if head.startswith(FIRST_BYTES) or (path.suffix == '.mat' and b'\0' in head):
+    if head.startswith(CONTAINERS) or (path.suffix == '.mat' and b'\0' in head):
         with open_table(path, head, options) as (member, text):
             log = _text(path / member, text, options)
             yield replace(log, read_as=', '.join(filter(None, (member, log.read_as))))
-    elif head.startswith(ULOG):
-        yield _flight(path, read_ulg(path, options.topic, options.sensor), options)
-    elif is_flight_log(head):
-        yield _flight(path, read_dataflash(path, options.topic, options.sensor), options)
+    elif FLIGHT_LOG.search(head):
+        read_flight = read_ulg if head.startswith(ULOG) else read_dataflash
+        yield _flight(path, read_flight(path, options.topic, options.sensor), options)
     else:
         with open_text(path, lambda cells: is_log_header(cells, options)) as text:
             yield _text(path, text, options)
@@ -320,8 +321,8 @@ def read_poses(path: Path) -> Poses:
         columns = with_indices(layout, {name: Source(layout.header.index(name), name)
                                         for key in keys for name in COLUMNS[key].names})
         text.choose(columns)
-        blocks = list(_converted(path, text.blocks(), Quantities(columns, units_of('g'))))
-        table, _ = _whole(blocks, [])
+        quantities = Quantities(columns, units_of('g'), Clock(columns))
+        table, _ = _whole(list(_converted(path, text.blocks(), quantities)), [])
         return Poses(table, numbered(table), **layout.about)
 
 

@@ -1,0 +1,215 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Clock of a text log: the conversion of its column of times to seconds.
+
+A unit that no name states is found from the rate: 1 to 10,000 samples per second are plausible.
+Where two units are, that with a rate nearer to 100 Hz is taken; stamps since 1970 decide before.
+A counter of the clock can start again.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from .columns import Chosen, FRACTION, LogOptions, rates_beside
+from .dialect import EPOCH_S, has_date, RATES_HZ, seconds_of
+from .names import bare_name, COUNTERS, READING, TICKS, unit_of, UNITS
+from .text import Cells
+from ..errors import InputError
+from ..table import Floats
+
+_UNITS = dict(UNITS['time'].values())
+"""Factors to seconds, by the name of the unit."""
+
+_TICK = 'ticks of 100 µs'
+_DAY_S = 86_400.0
+_COUNTS = 2.0**32
+_PERIODS_S = {'µs': (_COUNTS * 1e-6,), 'ms': (_COUNTS * 1e-3,), _TICK: (_COUNTS * 1e-4,),
+              's': (_COUNTS * 1e-6, _COUNTS * 1e-3)}
+"""Times after which counters of 32 bits start again [s], by the unit of the stamps."""
+
+_NEAR_END = 0.01
+"""Share of the range of a counter, before and after it starts again, in which the stamps are."""
+
+_AGREES = 1.25
+"""Factor within which the rate of stamps is the one that the file states."""
+
+_MOST_BACK = 0.1
+"""Share of steps back in time above which a column is no time."""
+
+_USUAL_HZ = 100.0
+
+_MANY_ROWS = 500
+_WINDOW = 8
+_AT_REST = 0.3
+_MOVES = 5.0
+_MOVING = 0.05
+"""Share of windows whose scatter is above `_MOVES` times that at rest, the quantile `_AT_REST`."""
+
+
+@dataclass
+class Clock:
+    """
+    The conversion of the times of a log to seconds, block by block; `clock_of` makes it.
+
+    `scale` is the factor to s. A counter starts again at one of the `periods` [s]. `words` is what
+    is assumed, and `doubts` what contradicts it.
+
+    """
+
+    columns: Chosen
+    scale: float = 1.0
+    periods: tuple[float, ...] = ()
+    words: str = ''
+    doubts: tuple[str, ...] = ()
+    added: float = 0.0
+    last: float = math.nan
+    starts: int = 0
+
+    def seconds(self, cells: Cells) -> Floats:
+        """Return the times of a block as they are stated [s]."""
+        columns = self.columns
+        if columns.dates:
+            return seconds_of(columns.texts(cells, 'time'), columns.layout.path,
+                              cells.row.tolist())
+        seconds = columns.numbers(cells, 'time') * self.scale
+        if FRACTION in columns.sources:
+            return seconds + 1e-9 * columns.numbers(cells, FRACTION)
+        return seconds
+
+    def continued(self, cells: Cells) -> Floats:
+        """Return the times of the next block, which go on where the counter starts again [s]."""
+        seconds = self.seconds(cells)
+        before = np.concatenate([[self.last], seconds[:-1]])
+        steps = np.zeros(len(seconds))
+        for period in self.periods:
+            again = ((before >= (1.0 - _NEAR_END) * period) & (before < 1.000001 * period)
+                     & (seconds <= _NEAR_END * period))
+            steps[again] = period
+            self.starts += int(np.count_nonzero(again))
+        total = self.added + np.cumsum(steps)
+        if len(seconds):
+            self.last, self.added = float(seconds[-1]), float(total[-1])
+        return seconds + total
+
+
+def clock_of(columns: Chosen, first: Cells, options: LogOptions) -> Clock:
+    """Return the clock of a log with times, from its first block."""
+    source, layout = columns.sources['time'], columns.layout
+    rate_hz = options.rate or layout.rate_hz
+    if rate_hz is not None and bare_name(source.name) in COUNTERS:
+        return Clock(columns, 1.0 / rate_hz, tuple(2.0**bits / rate_hz for bits in (8, 16, 32)),
+                     f'{source.name} at {rate_hz:g} Hz (stated) -> s')
+    if options.rate is not None:
+        raise InputError(f'{layout.path} has times, but --rate is {options.rate:g}',
+                         'remove --rate, or leave the times out with --columns time=')
+    if columns.dates:
+        if has_date(columns.texts(first, 'time')[0]):
+            return Clock(columns, words=f'{source.name}: dates -> s')
+        return Clock(columns, periods=(_DAY_S,), words=f'{source.name}: times of the day -> s')
+    stamps = columns.numbers(first, 'time')
+    back = np.count_nonzero(np.diff(stamps) < 0.0)
+    if not layout.header and back > _MOST_BACK * (len(stamps) - 1):
+        raise InputError(f'{layout.path} has no header line, and column '
+                         f'{source.name} does not increase, expected times',
+                         'add a header line, or name the columns with --columns ax=1,ay=2,az=3')
+    unit, words = _unit_of_time(columns, first, stamps)
+    scale = {**_UNITS, _TICK: 1e-4}[unit]
+    step = scale * _step_of(stamps)
+    agrees = not layout.rate_hz or not step > 0.0 or any(
+        _agree(1.0 / step, rate) for rate in rates_beside(layout, source))
+    doubts = () if agrees else (f'{source.name} has {1.0 / step:.4g} samples per second, but the '
+                                f'file states {layout.rate_hz:g} Hz',)
+    return Clock(columns, scale, _PERIODS_S.get(unit, ()), words, doubts)
+
+
+def _unit_of_time(columns: Chosen, first: Cells, stamps: Floats) -> tuple[str, str]:
+    """Return the unit of stamps, and what is assumed about it."""
+    source, layout = columns.sources['time'], columns.layout
+    of_maker = columns.maker and columns.maker.scales.get('time')
+    if of_maker:
+        unit = next(name for name, factor in _UNITS.items() if factor == of_maker)
+        return unit, f'{source.name} in {unit}' if unit != 's' else ''
+    stated = unit_of('time', source.unit)
+    if stated:
+        return stated[0], f'{source.name} -> s' if stated[0] != 's' else source.name
+    if layout.header and source.name == 'time' and (layout.about or 'count' in columns.sources
+                                                    or not _by_rate(columns, first, stamps)):
+        return 's', ''
+    units = TICKS.get(bare_name(source.name), _UNITS)
+    found = _unit_by_rate(stamps, rates_beside(layout, source), units)
+    named = f'column {source.name}' if source.name.isdecimal() else source.name
+    if found is None:
+        return 's', f'{named} in s'
+    return found[0], f'{named} in {found[0]} ({found[1]:.3g} Hz)' + (
+        ' -> s' if found[0] != 's' else '')
+
+
+def _by_rate(columns: Chosen, first: Cells, stamps: Floats) -> bool:
+    """Return whether the unit of a column ``time`` is found from the rate; by default it is s."""
+    return (columns.names(READING) != list(READING)
+            or _is_dense(stamps, columns.three(first, READING)))
+
+
+def _unit_by_rate(stamps: Floats, beside: Sequence[float], units: Mapping[str, float]
+                  ) -> tuple[str, float] | None:
+    """
+    Return the unit in which stamps have a plausible rate, and that rate [Hz], or None.
+
+    `beside` are the rates that the file states; a unit with one of them goes first.
+
+    """
+    step = _step_of(stamps)
+    if not step > 0.0:
+        return None
+    rates = {name: 1.0 / (step * unit) for name, unit in units.items()}
+    plausible = [name for name, rate in rates.items() if RATES_HZ[0] * 0.9 <= rate
+                 <= RATES_HZ[1] * 1.1]
+    stated = [name for name in rates if any(_agree(rates[name], rate) for rate in beside)]
+    since_1970 = [name for name in plausible
+                  if EPOCH_S[0] <= float(np.median(stamps)) * units[name] <= EPOCH_S[1]]
+    if not np.all(stamps == np.round(stamps)) and 's' in plausible:
+        plausible = ['s']
+    best = min(stated or since_1970 or plausible, default=None,
+               key=lambda name: abs(math.log(rates[name] / _USUAL_HZ)))
+    return None if best is None else (best, rates[best])
+
+
+def _agree(one: float, two: float) -> bool:
+    return 1.0 / _AGREES < one / two < _AGREES
+
+
+def _step_of(stamps: Floats) -> float:
+    """Return the usual step between stamps; some sensors repeat a stamp of whole ms."""
+    steps = np.diff(stamps)
+    if not len(steps):
+        return 0.0
+    middle = float(np.median(steps))
+    forward = steps[steps > 0.0]
+    if middle > 0.0 or not len(forward):
+        return middle
+    return float(forward.sum()) / len(steps)
+
+
+def _is_dense(stamps: Floats, reading: Floats) -> bool:
+    """
+    Return whether rows that are far apart in seconds are the samples of a moving sensor.
+
+    A sensor that is logged each ten seconds is nearly always still. In a recording of turns and
+    rests the scatter within many short windows is much larger than that at rest. Of real
+    recordings by hand that is 10 % of the windows or more, of 58 h at rest 1 %.
+
+    """
+    if len(stamps) < _MANY_ROWS or _step_of(stamps) < 1.0:
+        return False
+    windows = reading[:len(reading) // _WINDOW * _WINDOW].reshape(-1, _WINDOW, 3)
+    scatter = np.linalg.norm(windows.std(axis=1), axis=1)
+    at_rest = float(np.quantile(scatter, _AT_REST))
+    return bool(np.mean(scatter > _MOVES * at_rest) > _MOVING)
