@@ -63,17 +63,18 @@ PER_MILLION = 1e6
 DEGREE = 3
 """Degree of the polynomials of the offset in the temperature."""
 
-_ROTATIONS = (
+_ROTATIONS: Mapping[int, Sequence[float]] = dict(enumerate((
     *((0, 0, yaw) for yaw in range(0, 360, 45)), (180, 0, 0), (180, 0, 45), (180, 0, 90),
     (180, 0, 135), (0, 180, 0), (180, 0, 225), (180, 0, 270), (180, 0, 315), (90, 0, 0),
     (90, 0, 45), (90, 0, 90), (90, 0, 135), (270, 0, 0), (270, 0, 45), (270, 0, 90),
     (270, 0, 135), (0, 90, 0), (0, 270, 0), (0, 180, 90), (0, 180, 270), (90, 90, 0),
     (180, 90, 0), (270, 90, 0), (90, 180, 0), (270, 180, 0), (90, 270, 0), (180, 270, 0),
-    (270, 270, 0), (90, 180, 90), (90, 0, 270), (90, 68, 293), (0, 315, 0), (90, 315, 0))
+    (270, 270, 0), (90, 180, 90), (90, 0, 270), (90, 68, 293), (0, 315, 0), (90, 315, 0))))
 """Roll, pitch and yaw [deg] of the rotations by number, as PX4 has them."""
 
-_OF_ARDUPILOT = {38: (90, 68.8, 293.3), 41: (0, 7, 0), 42: (45, 0, 0), 43: (315, 0, 0)}
-"""Roll, pitch and yaw [deg] where ArduPilot has others."""
+_OF_ARDUPILOT = {**_ROTATIONS, 38: (90, 68.8, 293.3), 41: (0, 7, 0), 42: (45, 0, 0),
+                 43: (315, 0, 0)}
+"""The same, as ArduPilot has them."""
 
 _CUSTOM = {100: ('AHRS_CUSTOM_ROLL', 'AHRS_CUSTOM_PIT', 'AHRS_CUSTOM_YAW'),
            101: ('CUST_ROT1_ROLL', 'CUST_ROT1_PITCH', 'CUST_ROT1_YAW'),
@@ -254,7 +255,7 @@ def px4_correction(parameters: Parameters, device: int, release: tuple[int, int]
             raise _unknown(f'PX4 {release[0]}.{release[1]} numbers rotation {number:.0f} in '
                            'another way')
         level = parameters.three(values, 'SENS_BOARD_{}_OFF', 0.0)
-        rotation = _rotation(level) @ _numbered('SENS_BOARD_ROT', number)
+        rotation = _rotation(level) @ _numbered('SENS_BOARD_ROT', number, _ROTATIONS)
         constant, thermal, reference, limits = _px4_thermal(parameters, values, device)
         return ByAxis(offset + constant, scale, thermal, reference, limits, rotation)
 
@@ -309,14 +310,11 @@ def _ardupilot_rotation(parameters: Parameters, values: Values) -> Floats:
     return _rotation([parameters.lookup(values, name, 0.0) for name in names])
 
 
-def _numbered(name: str, number: float, others: Mapping[int, Sequence[float]] = {}) -> Floats:
+def _numbered(name: str, number: float, known: Mapping[int, Sequence[float]]) -> Floats:
     """Return the rotation with a number; raise InputError if there is none."""
-    found = others.get(int(number))
-    if found is None and 0.0 <= number < len(_ROTATIONS):
-        found = _ROTATIONS[int(number)]
-    if found is None:
+    if int(number) not in known:
         raise _unknown(f'{name} is {number:.0f}, a rotation that is not known')
-    return _rotation(found)
+    return _rotation(known[int(number)])
 
 
 def _rotation(degrees: Sequence[float] | Floats) -> Floats:

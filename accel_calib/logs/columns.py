@@ -5,9 +5,8 @@
 Columns of a text log: which column of a header holds which of our columns.
 
 What the user names goes first, then our own names, then the maker's layout, then the words of
-other names (`accel_calib.logs.names`). A table without header is read by the number of its
-columns. Two accelerometers that the names cannot tell apart are an error, because a wrong choice
-would give a wrong calibration. Other columns are used only where they are plain.
+other names. A table without header is read by the number of its columns. Two accelerometers that
+the names cannot tell apart are an error, because a wrong choice would give a wrong calibration.
 
 """
 
@@ -190,7 +189,7 @@ def with_indices(layout: Layout, sources: Mapping[str, Source],
     """Return the columns with the indices of those of numbers and of text."""
     text = [sources['label'].index] if 'label' in sources else []
     if 'time' in sources:
-        cells = _sample(layout, sources['time'].index)
+        cells = _sample(layout, sources['time'].index)[:_FIRST_ROWS]
         if cells and all(map(is_clock, cells)):
             text.append(sources['time'].index)
     used = {source.index for source in sources.values()}
@@ -211,8 +210,8 @@ def _quantities(layout: Layout, used: Container[int], sources: Mapping[str, Sour
     return found
 
 
-def _sample(layout: Layout, index: int, rows: int = _FIRST_ROWS) -> list[str]:
-    return [row[index] for row in layout.sample[:rows] if index < len(row)]
+def _sample(layout: Layout, index: int) -> list[str]:
+    return [row[index] for row in layout.sample if index < len(row)]
 
 
 def sources(layout: Layout, given: Mapping[str, str]) -> dict[str, Source]:
@@ -230,7 +229,8 @@ def sources(layout: Layout, given: Mapping[str, str]) -> dict[str, Source]:
     # What is not asked for, and holds other text than numbers, does not stand in the way.
     plain = {ours: source for ours, source in found.items()
              if ours not in CONTEXT or ours in given or source.name == ours
-             or all(is_number(cell.replace(',', '.')) for cell in _sample(layout, source.index))}
+             or all(is_number(cell.replace(',', '.'))
+                    for cell in _sample(layout, source.index)[:_FIRST_ROWS])}
     return {ours: source for ours, source in plain.items() if given.get(ours, ours)}
 
 
@@ -397,7 +397,7 @@ def _clocks(layout: Layout, which: Sequence[int]) -> dict[int, bool]:
     A date that stays the same, or a time of the day in whole seconds, is no clock of the samples.
 
     """
-    cells = {k: _sample(layout, k, len(layout.sample)) for k in which}
+    cells = {k: _sample(layout, k) for k in which}
     different = {k: len(set(texts)) for k, texts in cells.items()
                  if all(is_number(text.replace(',', '.')) or is_clock(text)
                         for text in texts[:_FIRST_ROWS])}
@@ -410,16 +410,18 @@ def _clocks(layout: Layout, which: Sequence[int]) -> dict[int, bool]:
 def counter(layout: Layout) -> Source | None:
     """Return the column that counts the samples, or None."""
     for k, name in enumerate(layout.header[:MOST]):
-        cells = _sample(layout, k, len(layout.sample))
-        if (bare_name(name) in COUNTERS and len(cells) >= _FIRST_ROWS
-                and all(map(is_number, cells)) and step_of(cells) > 0.0):
+        if (bare_name(name) in COUNTERS and len(_sample(layout, k)) >= _FIRST_ROWS
+                and _step_of(layout, k) > 0.0):
             return _source(layout, k)
     return None
 
 
-def step_of(cells: Sequence[str]) -> float:
-    """Return the median step between the numbers of cells."""
-    return float(np.median(np.diff([float(cell) for cell in cells]))) if len(cells) > 1 else 0.0
+def _step_of(layout: Layout, index: int) -> float:
+    """Return the median step between the first numbers of a column; 0 if they are no numbers."""
+    cells = _sample(layout, index)
+    if len(cells) < 2 or not all(map(is_number, cells)):
+        return 0.0
+    return float(np.median(np.diff([float(cell) for cell in cells])))
 
 
 def rates_beside(layout: Layout, time: Source) -> list[float]:
@@ -427,14 +429,13 @@ def rates_beside(layout: Layout, time: Source) -> list[float]:
     rates = []
     counted = counter(layout)
     if layout.rate_hz is not None:
-        every = step_of(_sample(layout, counted.index, len(layout.sample))) if counted else 1.0
-        rates.append(layout.rate_hz / every)
+        rates.append(layout.rate_hz / (_step_of(layout, counted.index) if counted else 1.0))
     for k, known in _meanings(layout.header):
         unit = unit_of('time', known.unit)
         if known.quantity == 'time' and unit is not None and k != time.index:
-            cells = _sample(layout, k, len(layout.sample))
-            if cells and all(map(is_number, cells)) and step_of(cells) > 0.0:
-                rates.append(1.0 / (unit[1] * step_of(cells)))
+            step = _step_of(layout, k)
+            if step > 0.0:
+                rates.append(1.0 / (unit[1] * step))
     return rates
 
 

@@ -5,13 +5,9 @@
 Files that hold several tables: ZIP archives, sheets of Excel, and arrays of MATLAB; DataFrames.
 
 phyphox and Sensor Logger export a ZIP archive with one CSV file for each sensor, and phyphox an
-Excel file with one sheet for each. `open_table` returns the table of the accelerometer. It is
-handed over as the bytes of a CSV file, piece by piece, so that it is read as any other text log
-is. So is a DataFrame.
-
-ZIP is read with the standard library, ``.xlsx`` with `openpyxl`, ``.xls`` with `xlrd`, and
-``.mat`` up to version 7 with `scipy`. Structs and timetables of MATLAB are refused: only MATLAB
-can convert all of them.
+Excel file with one sheet for each. The table of the accelerometer, or a DataFrame, is handed over
+as the bytes of a CSV file, piece by piece, so that it is read as any other text log is. Structs
+and timetables of MATLAB are refused: only MATLAB can convert all of them.
 
 """
 

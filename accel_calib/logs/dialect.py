@@ -4,12 +4,10 @@
 """
 Dialect of a text table: where the table begins, how its cells are parted, what its dates are.
 
-`layout_of` decides from the first lines of a file, its head. It finds the header line, the
-delimiter, the decimal mark and the first line of numbers.
-
-`csv.Sniffer` is not used: it needs many equal rows, and takes a letter, a decimal mark or a blank
-for the delimiter. The delimiter here is that of a header line with known names, or else the one
-whose cells are numbers in most lines. `csv` splits lines with quotes.
+`layout_of` decides from the first lines of a file, its head. `csv.Sniffer` is not used: it needs
+many equal rows, and takes a letter, a decimal mark or a blank for the delimiter. The delimiter
+here is that of a header line with known names, or else the one whose cells are numbers in most
+lines.
 
 Dates are those of ISO 8601, ``2026-01-31T12:00:00.250Z``, with a blank for the T or slashes, and
 ``31-Jan-2026`` and ``31.01.2026``. A date without a zone is taken as UTC.
@@ -110,12 +108,11 @@ class Layout:
     """
     Where the table of a text file begins, and how its cells are parted.
 
-    `decimal` is the decimal mark, empty if the first rows have whole numbers only. `header` are
-    the names of the columns, and `units_row` the cells of a row of units below them; both are
-    empty if there are none. `width` is the number of cells in a row, and `start` that of lines
-    before the first row. `about` has units and sensor from the comments, `notes` what was skipped
-    before the table, and `sample` the cells of the first rows. `rate_hz` is the rate of the
-    samples that the lines before the table state, if it is one.
+    `decimal` is the decimal mark, empty if the first rows have whole numbers only. `units_row` are
+    the cells of a row of units below the `header`; both are empty if there are none. `width` is
+    the number of cells in a row, and `start` that of lines before the first row. `about` has units
+    and sensor from the comments, `notes` what was skipped before the table, and `sample` the cells
+    of the first rows. `rate_hz` is the rate of the samples that the lines before the table state.
 
     """
 
@@ -241,8 +238,8 @@ def layout_of(path: Path, head: Sequence[str], is_header: IsHeader, encoding: st
     Return where a table begins, and how its cells are parted; raise InputError without a table.
 
     `head` are the first lines, and `is_header` returns whether cells are the names of columns of a
-    log. If `strict`, the first line must be the header; otherwise other lines may come before it.
-    `expected` is an example of a header line for error messages.
+    log. If `strict`, no other lines may come before the header. `expected` is an example of it
+    for error messages.
 
     """
     _check_text(path, head, expected)

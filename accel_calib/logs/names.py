@@ -4,16 +4,14 @@
 """
 Names in the header of a text log: what those of any author mean, and the layouts of makers.
 
-**Words.** A name is parted into words at blanks, punctuation, digits and capital letters. `WORDS`
-lists the words for each quantity, and `UNITS` the units. A unit is in brackets or at the end of
-the name. The remaining words distinguish the sensors of a log. Our own names (`ax`, `time`, …) go
-before all others.
+**Words.** A name is parted into words at blanks, punctuation, digits and capital letters. A unit
+is in brackets or at the end of the name. The words that name neither a quantity (`WORDS`) nor a
+unit (`UNITS`) distinguish the sensors of a log. Our own names (`ax`, `time`, …) go before all
+others.
 
 **Layouts.** Phones, autopilots and small boards have a `LogFormat` for each layout of a text log,
-as their makers document it. `recognise` returns the layout whose columns a header has, and
-`format_named` the one that the user names. A layout only states what the names in the file mean. A
-unit that the maker leaves to the user's settings is empty, and the reader finds it from the
-readings at rest.
+as their makers document it. It only states what the names in the file mean. A unit that the maker
+leaves to the user's settings is found from the readings at rest.
 
 **Frames.** A specific force is +1 g along the axis that points up. Phones (phyphox, Sensor Logger
 on Android, MATLAB Mobile) and Betaflight log this sign with z up. PX4 and ArduPilot log this sign
@@ -290,37 +288,19 @@ def _unit_in(quantity: str, words: list[str]) -> tuple[str, list[str]]:
 @dataclass(frozen=True)
 class LogFormat:
     """
-    One layout of a text log.
+    One layout of a text log, named as ``--format`` has it.
 
-    Parameters
-    ----------
-    name : str
-        Name of the maker or tool, as ``--format`` has it.
-    columns : mapping of str to str
-        Name in the file of each of our columns: ``time``, ``ax`` to ``gz``, ``temperature``.
-    scales : mapping of str to float
-        Factor from the unit of the file to ours, for the columns other than the reading that need
-        one. A time without a factor is in a unit that the reader recognises.
-    units : {'m/s2', 'g', 'native', ''}
-        Unit of the reading; empty if the file does not determine it.
-    marks : tuple of str
-        Names that together make the layout plain. The columns are looked for as well.
-    without_gravity : tuple of str
-        Names of the maker's columns of acceleration without gravity, and names of its files of
-        it (ending in ``.csv``).
-    other_sensors : tuple of str
-        Names of the maker's files of other sensors with the same columns.
-    record : str
-        What to record or to use instead of such files.
-    divisors : mapping of str to str
-        Name in the file of the column by which one of our columns is divided, if any.
-    instance : str
-        Name of the column with the number of the sensor, if rows of several sensors alternate.
-    note : str
-        What else a user should know.
-    plain : bool
-        Whether the names alone determine the layout; otherwise it is used only where the user
-        names it.
+    `columns` and `divisors` are names in the file: of our columns, and of the columns by which
+    ours are divided. `scales` are factors from the unit of the file to ours; a time without one is
+    in a unit that the reader recognises. `units` is the unit of the reading, empty if the file
+    does not determine it. `instance` is the column with the number of the sensor, if rows of
+    several alternate.
+
+    Names of `columns` and `marks` together determine the layout if it is `plain`; otherwise it is
+    used only where the user names it. `without_gravity` are the maker's columns of acceleration
+    without gravity, and its files of it (``.csv``); `other_sensors` are its files of other sensors
+    with the same columns. `record` is what to use instead of these files, and `note` what else a
+    user should know.
 
     """
 

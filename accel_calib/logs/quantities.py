@@ -185,26 +185,23 @@ def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
     _decide_reading(made, first, options)
     _decide_rate(made, first)
     _decide_temperature(made, first)
-    _decide_supply(made)
+    if 'supply_voltage' in columns.sources:
+        _convert_if_stated(made, 'supply_voltage', 'V')
     made.notes += unused(columns.layout, columns.sources)
     return made
 
 
 def _instance(columns: Chosen, first: Cells, options: LogOptions, notes: list[str]) -> float:
     there = np.unique(columns.numbers(first, 'instance')).tolist()
-    words = ', '.join(f'{each:g}' for each in there)
+    names = [f'{each:g}' for each in there]
     if options.sensor:
-        try:
-            asked = float(options.sensor)
-        except ValueError:
-            asked = np.nan
-        if asked not in there:
-            raise InputError(f'{columns.layout.path} has the sensors {words}, expected '
+        if options.sensor not in names:
+            raise InputError(f'{columns.layout.path} has the sensors {", ".join(names)}, expected '
                              f'{options.sensor}', 'choose one of them with --sensor')
-        return asked
+        return float(options.sensor)
     if len(there) > 1:
-        notes.append(f'the log has the sensors {words}; sensor {there[0]:g} is read: choose '
-                     'another with --sensor')
+        notes.append(f'the log has the sensors {", ".join(names)}; sensor {names[0]} is read: '
+                     'choose another with --sensor')
     return float(there[0])
 
 
@@ -485,16 +482,10 @@ def _decide_rate(made: Quantities, first: Cells) -> None:
 
 def _decide_temperature(made: Quantities, first: Cells) -> None:
     columns = made.chosen
-    if 'temperature' not in columns.sources:
+    if ('temperature' not in columns.sources
+            or _convert_if_stated(made, 'temperature', '°C')):
         return
     source = columns.sources['temperature']
-    stated = unit_of('temperature', source.unit)
-    if stated is not None:
-        unit, factor = stated
-        if unit != '°C':
-            made.scale(['temperature'], factor, ZEROS[unit])
-            made.said.append(f'{source.name} in {unit} -> °C')
-        return
     if columns.maker is not None or (source.name == 'temperature' and columns.layout.header):
         return
     middle = float(np.median(columns.numbers(first, 'temperature')))
@@ -506,11 +497,11 @@ def _decide_temperature(made: Quantities, first: Cells) -> None:
           'name, such as temperature_K')
 
 
-def _decide_supply(made: Quantities) -> None:
-    if 'supply_voltage' not in made.chosen.sources:
-        return
-    source = made.chosen.sources['supply_voltage']
-    unit, factor = unit_of('supply_voltage', source.unit) or ('V', 1.0)
-    if factor != 1.0:
-        made.scale(['supply_voltage'], factor)
-        made.said.append(f'{source.name} in {unit} -> V')
+def _convert_if_stated(made: Quantities, key: str, ours: str) -> bool:
+    """Convert a column whose name states another unit; return whether it states one."""
+    source = made.chosen.sources[key]
+    unit, factor = unit_of(key, source.unit) or ('', 1.0)
+    if unit not in ('', ours):
+        made.scale([key], factor, ZEROS.get(unit, 0.0))
+        made.said.append(f'{source.name} in {unit} -> {ours}')
+    return bool(unit)

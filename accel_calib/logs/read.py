@@ -61,10 +61,9 @@ Block = tuple[dict[str, NDArray[Any]], NDArray[np.int64]]
 @dataclass(frozen=True)
 class Log:
     """
-    A log: rows with time in s and angular rate in rad/s, the unit of the readings, and notes.
+    A log that was read; `read_as` and `notes` as in `OpenLog`.
 
-    `read_as` is how it was read, in one line, empty if nothing was assumed; `notes` state what was
-    left out.
+    Times are in s, and angular rates in rad/s.
 
     """
 
@@ -86,14 +85,14 @@ class OpenLog:
         raised when a table without times is read as samples.
     samples : int
         Number of samples; of a long text log, an estimate from the size of the file.
-    units : Units
-        Unit of the readings.
-    sensor, read_as : str
-        Name of the sensor, empty if not stated; how the log is read, empty if nothing is assumed.
+    units, sensor
+        Unit of the readings; name of the sensor, empty if not stated.
+    read_as : str
+        How the log is read, in one line; empty if nothing is assumed.
     poses : Poses or None
         The poses, if the log is a pose table.
     noted : function
-        Returns the notes so far.
+        Returns the notes so far: what was left out.
 
     """
 
@@ -231,11 +230,11 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
     first = next(cells)
     quantities = decided(columns, first, options)
     with saying(quantities.read_as):
-        return _decided(path, text, chain((first,), cells), quantities, options)
+        return _decided(path, text, chain((first,), cells), quantities)
 
 
-def _decided(path: Path, text: TextTable, cells: Iterator[Cells], quantities: Quantities,
-             options: LogOptions) -> OpenLog:
+def _decided(path: Path, text: TextTable, cells: Iterator[Cells], quantities: Quantities
+             ) -> OpenLog:
     blocks = _converted(path, cells, quantities)
     head = next(blocks)
     units, about = quantities.units, text.layout.about
@@ -255,10 +254,9 @@ def _decided(path: Path, text: TextTable, cells: Iterator[Cells], quantities: Qu
                              'second with --rate HZ, or name the column with --columns '
                              'time=NAME; if each row is a pose, add a column orientation')
         samples, count = _as_samples(path, poses), len(poses)
-    said = [quantities.read_as] if quantities.read_as else []
-    if quantities.rate_hz is not None:
-        said.append(f'{quantities.rate_hz:g} Hz (stated)')
-    return OpenLog(samples, count, units, sensor, ', '.join(said), poses,
+    rate = '' if quantities.rate_hz is None else f'{quantities.rate_hz:g} Hz (stated)'
+    return OpenLog(samples, count, units, sensor,
+                   ', '.join(filter(None, (quantities.read_as, rate))), poses,
                    noted=lambda: (*text.notes, *quantities.all_notes))
 
 
@@ -349,7 +347,8 @@ def write_blocks(path: Path, blocks: Iterable[Table]) -> int:
             if not keys:
                 keys = [key for key, column in COLUMNS.items() if key in block and not column.made]
                 keys += block.quantities
-                _write_head(file, block)
+                file.writelines(f'# {name}: {json.dumps(value, ensure_ascii=False)}\n'
+                                for name, value in block.about.items())
                 writer.writerow([name for key in keys for name in column_of(key).names])
             parts = [_as_text(block[key]) for key in keys]
             writer.writerows(zip(*(column for part in parts for column in part), strict=True))
@@ -357,11 +356,6 @@ def write_blocks(path: Path, blocks: Iterable[Table]) -> int:
 
     write_atomically(path, write)
     return rows
-
-
-def _write_head(file: TextIO, table: Table) -> None:
-    for name, value in table.about.items():
-        file.write(f'# {name}: {json.dumps(value, ensure_ascii=False)}\n')
 
 
 def _as_text(values: NDArray[Any]) -> list[list[str]]:

@@ -4,10 +4,8 @@
 """
 Numbers and texts of a text table of any dialect, block by block.
 
-`open_text` finds the encoding, and `accel_calib.logs.dialect` the rest of the dialect, from
-the first lines. The rows are then read once, in blocks, so the memory needed does not depend on
-the length of the file. `numpy.loadtxt` parses all numbers. A row is looked at on its own only if
-its block has a fault.
+The rows are read once, in blocks, so the memory needed does not depend on the length of the file.
+`numpy.loadtxt` parses all numbers. A row is looked at on its own only if its block has a fault.
 
 """
 
@@ -95,14 +93,9 @@ def _encoding(head: bytes) -> str:
         head.decode('utf-8')
     except UnicodeDecodeError as err:
         if b'\x00' not in head and err.start < len(head) - 3:
-            return _single_byte(head)
+            bad = head.decode('utf-8', errors='replace').count('\ufffd')
+            return 'cp1252' if bad < 0.05 * len(head) else 'utf-8'  # of Windows, or garbage
     return 'utf-8'
-
-
-def _single_byte(head: bytes) -> str:
-    """Return the encoding of bytes that are not UTF-8: text of Windows, or else garbage."""
-    bad = head.decode('utf-8', errors='replace').count('\ufffd')
-    return 'cp1252' if bad < 0.05 * len(head) else 'utf-8'
 
 
 def _head(path: Path, file: io.TextIOWrapper) -> tuple[list[str], bool]:
