@@ -118,7 +118,7 @@ def with_pose(made: Simulated, columns: Mapping[str, Floats], wanted: Wanted,
 def refined(made: Simulated, columns: Mapping[str, Floats]) -> Refinement:
     """Return the refinement of the poses of a table."""
     count = len(columns['time'])
-    table_ = Simulated(columns, made.truth, made.sizes, {}, made.noise, made.around, made.traits,
+    table_ = Simulated(columns, made.truth, {}, made.noise, made.around, made.traits,
                        made.values, Setup(poses=count))
     return refine(poses_of(table_), units_of('m/s2'), base='10')
 

@@ -77,8 +77,6 @@ class Setup:
     hysteresis : {'unit', 'sign', 'previous'}
         Quantity to which hysteresis is proportional, by axis: the unit vector from the present
         force to the previous one, the sign of this difference, or the previous force.
-    start : float
-        Time of the first pose [s].
     knocked : int
         Number of poses with an error of 10 to 50 mg.
     dropped : tuple of str
@@ -104,7 +102,6 @@ class Setup:
     temperature: str = 'wandering'
     rates: str = 'any'
     hysteresis: str = 'unit'
-    start: float = 0.0
     knocked: int = 0
     dropped: tuple[str, ...] = ()
     lag: float = 0.0
@@ -130,8 +127,6 @@ class Simulated:
     truth : mapping of str to mapping of str to float
         Values of each hidden effect: g, g/g, g/g², g/g³, g/°C, g/°C², 1/°C, g s/°C, g/h, 1/h, m,
         s.
-    sizes : mapping of str to float
-        Size of each hidden effect.
     knocked : mapping of int to float
         Rows of knocked poses, 1-based, and the error of |a| by the knock [g].
     noise : (n,) array
@@ -150,7 +145,6 @@ class Simulated:
 
     columns: Mapping[str, Floats]
     truth: Mapping[str, Mapping[str, float]]
-    sizes: Mapping[str, float]
     knocked: Mapping[int, float]
     noise: Floats
     around: Around
@@ -161,24 +155,7 @@ class Simulated:
 
 def simulate(rng: np.random.Generator, hidden: Mapping[str, float] | None = None,
              setup: Setup = Setup()) -> Simulated:
-    """
-    Return simulated poses of a random sensor.
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-        Source of all random numbers.
-    hidden : mapping of str to float
-        Sizes of the hidden effects, by name in `EFFECTS`.
-    setup : Setup
-        Settings of the simulation.
-
-    Returns
-    -------
-    Simulated
-        The pose table and the truth.
-
-    """
+    """Return simulated poses of a random sensor; `hidden` are sizes of effects in `EFFECTS`."""
     hidden = hidden or {}
     turning = 'lever_arm' in hidden or setup.rates == 'sizeable'
     around = _around(rng, setup, turning)
@@ -202,17 +179,10 @@ def simulate(rng: np.random.Generator, hidden: Mapping[str, float] | None = None
 
 def again(rng: np.random.Generator, before: Simulated) -> Simulated:
     """
-    Return other poses of the same sensor, at the same times and temperatures.
+    Return other poses of the same sensor, at the same times and temperatures, without knocks.
 
     The random walk and the 1/f noise of the offset are also the same. The scatter of each pose is
     not.
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-        Source of all random numbers.
-    before : Simulated
-        The set to repeat in other orientations, without knocks.
 
     """
     setup = replace(before.setup, knocked=0)
@@ -273,21 +243,10 @@ def _shaking(rng: np.random.Generator, setup: Setup, sigma: Floats) -> Floats:
 def _temperature(rng: np.random.Generator, share: Floats, rising: bool
                  ) -> Callable[[Floats], Floats]:
     """
-    Return a random course of the temperature, between 10 and 40 °C at the poses.
+    Return a random course of the temperature [°C], between 10 and 40 °C at the poses.
 
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-        Source of all random numbers.
-    share : (n,) array
-        Times of the poses as shares of the time span.
-    rising : bool
-        Whether the temperature only rises.
-
-    Returns
-    -------
-    callable
-        Sorted shares of the time span -> temperatures [°C].
+    It is a function of sorted shares of the time span; `share` are those of the poses. `rising`:
+    the temperature only rises.
 
     """
     waves = rng.uniform(1.5, 5.0, 3)
@@ -369,17 +328,7 @@ def noise_in_norm(around: Around, traits: Traits) -> Floats:
 
 
 def size_of(added: Floats, around: Around, traits: Traits) -> float:
-    """
-    Return the size of an effect.
-
-    Parameters
-    ----------
-    added : (n, 3) array
-        Contribution of the effect to the mean readings [g].
-    around, traits : Around, Traits
-        The poses and the sensor.
-
-    """
+    """Return the size of an effect that adds these (n, 3) parts to the mean readings [g]."""
     u = around.force
     shift = np.linalg.norm(u + added @ np.linalg.inv(traits.gain).T, axis=1) - 1.0
     design = np.hstack([u, u ** 2, u[:, [0, 0, 1]] * u[:, [1, 2, 2]]])
@@ -439,19 +388,8 @@ def _measured(rng: np.random.Generator, setup: Setup, around: Around, traits: Tr
     return Simulated(
         _columns(output, around, setup), {name: _named(name, values[name], traits)
                                           for name in values},
-        {name: _size(name, values, around, traits) for name in values},
         dict(zip((rows + 1).tolist(), (added - 1.0).tolist(), strict=True)),
         noise_in_norm(around, traits), around, traits, values, setup)
-
-
-def _size(name: str, values: Mapping[str, Floats], around: Around, traits: Traits) -> float:
-    """Return the size of a hidden effect."""
-    if name not in ON_OUTPUT:
-        return size_of(basis_of(name, around, traits) @ values[name], around, traits)
-    samples, limit = _samples(values, around, traits), float(values[name][0])
-    output = (np.clip(samples, -limit, limit) if name == 'saturation'
-              else np.round(samples / limit) * limit)
-    return size_of(np.mean(output - samples, axis=2), around, traits)
 
 
 def _named(name: str, values: Floats, traits: Traits) -> dict[str, float]:
@@ -473,7 +411,7 @@ def _columns(output: Floats, around: Around, setup: Setup) -> dict[str, Floats]:
     """Return the columns of the pose table."""
     mean = np.mean(output, axis=2) * STANDARD_GRAVITY
     std = np.std(output, axis=2, ddof=1) * STANDARD_GRAVITY
-    columns = {'time': np.round(setup.start + around.elapsed, 3)}
+    columns = {'time': np.round(around.elapsed, 3)}
     columns.update(zip(('ax', 'ay', 'az'), mean.T))
     columns.update(zip(('std_x', 'std_y', 'std_z'), std.T))
     columns['count'] = np.full(setup.poses, float(setup.samples))

@@ -41,43 +41,30 @@ OUTSIDE = ('ripple', 'periodic_offset', 'repeatability', 'quartic', 'quintic', '
            'gain_periodic', 'offset_temperature_knee', 'offset_supply_quadratic', 'wander_1f')
 """Effects that can be hidden but are not in the catalogue."""
 
-_OF_FORCE = (('offset', 'force'), ('gain', 'force'), ('force', 'force'))
+Carried = tuple[tuple[str, str], ...]
 
-CARRIER: dict[str, tuple[tuple[str, str], ...]] = {
-    'quadratic': _OF_FORCE,
-    'cubic': _OF_FORCE,
-    'odd_quadratic': _OF_FORCE,
-    'gain_asymmetry': _OF_FORCE,
-    'cross_coupling': (('cross_axis', 'force'),),
-    'offset_temperature': (('offset', 'temperature'),),
-    'gain_temperature': (('gain', 'temperature'),),
-    'supply_ratio': (('offset', 'supply'), ('gain', 'supply')),
-    'offset_drift': (('offset', 'time'),),
-    'warm_up': (('offset', 'time'),),
-    'offset_wander': (('offset', 'time'),),
-    'offset_step': (('offset', 'time'),),
-    'vibration_rectification': (('offset', 'vibration'),),
-    'hysteresis': (),
-    'lever_arm': (),
-    'saturation': (),
-    'quantisation': (),
-    'temperature_rate': (('offset', 'temperature_rate'),),
-    'offset_temperature_quadratic': (('offset', 'temperature'),),
-    'gain_drift': (('gain', 'time'),),
-    'gain_step': (('gain', 'time'),),
-    'ripple': _OF_FORCE,
-    'periodic_offset': (('offset', 'time'),),
-    'repeatability': (),
-    'quartic': _OF_FORCE,
-    'quintic': _OF_FORCE,
-    'dead_zone': _OF_FORCE,
-    'gain_temperature_quadratic': (('gain', 'temperature'),),
-    'gain_temperature_steep': (('gain', 'temperature'),),
-    'cross_axis_temperature': (('cross_axis', 'temperature'),),
-    'gain_periodic': (('gain', 'time'),),
-    'offset_temperature_knee': (('offset', 'temperature'),),
-    'offset_supply_quadratic': (('offset', 'supply'),),
-    'wander_1f': (('offset', 'time'),),
+
+def _all(effects: tuple[str, ...], *carried: tuple[str, str]) -> dict[str, Carried]:
+    return dict.fromkeys(effects, carried)
+
+
+CARRIER: dict[str, Carried] = {
+    **_all(('quadratic', 'cubic', 'odd_quadratic', 'gain_asymmetry', 'ripple', 'quartic',
+            'quintic', 'dead_zone'), ('offset', 'force'), ('gain', 'force'), ('force', 'force')),
+    **_all(('cross_coupling',), ('cross_axis', 'force')),
+    **_all(('offset_temperature', 'offset_temperature_quadratic', 'offset_temperature_knee'),
+           ('offset', 'temperature')),
+    **_all(('temperature_rate',), ('offset', 'temperature_rate')),
+    **_all(('gain_temperature', 'gain_temperature_quadratic', 'gain_temperature_steep'),
+           ('gain', 'temperature')),
+    **_all(('cross_axis_temperature',), ('cross_axis', 'temperature')),
+    **_all(('supply_ratio',), ('offset', 'supply'), ('gain', 'supply')),
+    **_all(('offset_supply_quadratic',), ('offset', 'supply')),
+    **_all(('offset_drift', 'warm_up', 'offset_wander', 'offset_step', 'periodic_offset',
+            'wander_1f'), ('offset', 'time')),
+    **_all(('gain_drift', 'gain_step', 'gain_periodic'), ('gain', 'time')),
+    **_all(('vibration_rectification',), ('offset', 'vibration')),
+    **_all(('hysteresis', 'lever_arm', 'saturation', 'quantisation', 'repeatability')),
 }
 """
 What each effect changes, and with what: pairs of carrier and variable.
