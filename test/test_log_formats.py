@@ -32,12 +32,22 @@ _spec.loader.exec_module(make)
 WITHIN_SD = 5.0
 
 
-def needed(name: str) -> None:
-    """Skip the test if the library for this file is not installed."""
-    if name.endswith('.ulg'):
-        pytest.importorskip('pyulog')
-    if name.endswith('.bin'):
-        pytest.importorskip('pymavlink')
+def px4(name: str | Path, *given: str, **more: str) -> Any:
+    """Read a sample of PX4, or another path."""
+    pytest.importorskip('pyulog')
+    return read_ulg(LOGS / 'px4' / name, *given, **more)
+
+
+def ardupilot(name: str | Path, **given: str) -> Any:
+    """Read a sample of ArduPilot, or another path."""
+    pytest.importorskip('pymavlink')
+    return read_dataflash(LOGS / 'ardupilot' / name, **given)
+
+
+def in_file(folder: Path, data: bytes) -> Path:
+    path = folder / 'log'
+    path.write_bytes(data)
+    return path
 
 
 def header_of(name: str) -> list[str]:
@@ -60,8 +70,10 @@ def check(recording: Recording, units: Any, name: str) -> Calibration:
 
 
 @pytest.mark.parametrize('name', make.TRUTHS)
-def test_a_sample_is_read_without_any_option_and_its_truth_is_found(name: str) -> None:
-    needed(name)
+def test_the_truth_of_a_sample_is_found_without_options_and_with_its_format(name: str) -> None:
+    for end, library in (('.ulg', 'pyulog'), ('.bin', 'pymavlink')):
+        if name.endswith(end):
+            pytest.importorskip(library)
     log = read_log(LOGS / name)
     assert isinstance(log.table, Recording)
     check(log.table, log.units, name)
@@ -72,16 +84,10 @@ def test_a_sample_is_read_without_any_option_and_its_truth_is_found(name: str) -
     if make.TRUTHS[name].temperature:
         assert np.ptp(log.table['temperature']) == pytest.approx(np.ptp(make.WARM), rel=0.05)
     assert log.table['time'][-1] - log.table['time'][0] == pytest.approx(44.75, abs=0.01)
-
-
-@pytest.mark.parametrize('name', make.TRUTHS)
-def test_a_sample_is_read_the_same_when_the_user_names_its_format(name: str) -> None:
-    needed(name)
-    log = read_log(LOGS / name, LogOptions(format=name.split('/')[0]))
-    plain = read_log(LOGS / name)
-    assert log.units == plain.units
-    np.testing.assert_allclose(log.table.reading, plain.table.reading, rtol=1e-12)
-    np.testing.assert_allclose(log.table['time'], plain.table['time'], rtol=1e-12)
+    named = read_log(LOGS / name, LogOptions(format=name.split('/')[0]))
+    assert named.units == log.units
+    np.testing.assert_allclose(named.table.reading, log.table.reading, rtol=1e-12)
+    np.testing.assert_allclose(named.table['time'], log.table['time'], rtol=1e-12)
 
 
 @pytest.mark.parametrize('name', make.WITHOUT_GRAVITY)
@@ -98,26 +104,18 @@ def test_a_log_of_another_sensor_with_the_same_columns_is_refused(name: str) -> 
         read_log(LOGS / name)
 
 
-def test_another_format_than_that_of_the_file_is_refused_with_what_is_lacking() -> None:
+def test_another_and_an_unknown_format_are_refused_with_what_is_lacking_or_meant() -> None:
     with pytest.raises(InputError, match='lacks .*accSmooth'):
         read_log(LOGS / 'phyphox/comma_point.csv', LogOptions(format='betaflight'))
-
-
-def test_an_unknown_format_is_refused_with_the_one_that_is_meant() -> None:
     with pytest.raises(InputError, match='use phyphox'):
         format_named('phypox', ['Time (s)'], 'log.csv')
-
-
-# ------------------------------------------------------------------------------ the formats
 
 
 def test_the_csv_of_an_older_ardupilot_log_has_no_number_of_the_sensor(tmp_path: Path) -> None:
     lines = (LOGS / 'ardupilot/two_imus.csv').read_text(encoding='utf-8').splitlines()
     rows = [line.split(',') for line in lines]
-    kept = [row[:2] + row[3:] for row in rows if row[2] in ('I', '0')]
-    path = tmp_path / 'log.csv'
-    path.write_text('\n'.join(map(','.join, kept)) + '\n', encoding='utf-8')
-    log = read_log(path)
+    kept = [','.join(row[:2] + row[3:]) for row in rows if row[2] in ('I', '0')]
+    log = read_log(in_file(tmp_path, '\n'.join([*kept, '']).encode()))
     assert isinstance(log.table, Recording)
     check(log.table, log.units, 'ardupilot/two_imus.csv')
 
@@ -135,90 +133,63 @@ def test_a_flat_pose_makes_a_level_vehicle_read_up() -> None:
 # ---------------------------------------------------------------------------------- PX4 logs
 
 def test_a_log_of_the_default_profile_gives_the_selected_sensor_with_its_temperature() -> None:
-    pytest.importorskip('pyulog')
-    log = read_ulg(LOGS / 'px4/default.ulg')
+    log, samples = px4('default.ulg'), make.recording(40, down=True)
     assert log.sensor == 'sensor_combined 0'
-    samples = make.recording(40, down=True)
     np.testing.assert_allclose(log.columns['temperature'], samples['temperature'], atol=0.08)
     np.testing.assert_allclose(np.diff(log.columns['time']), 1.0 / make.RATE_HZ, atol=1e-6)
     assert any('CAL_ACC' in note for note in log.notes)
 
 
 def test_the_named_message_and_sensor_of_a_px4_log_are_read() -> None:
-    pytest.importorskip('pyulog')
-    log = read_ulg(LOGS / 'px4/default.ulg', 'sensor_accel', '1')
+    log, samples = px4('default.ulg', 'sensor_accel', '1'), make.recording(40, down=True)
     assert log.sensor == 'sensor_accel 1'
-    samples = make.recording(40, down=True)
     np.testing.assert_allclose(log.columns['ax'], samples.reading[::20, 0] * make.G, rtol=1e-6)
-
-
-def test_a_message_that_a_px4_log_lacks_is_refused_with_those_that_it_has() -> None:
-    pytest.importorskip('pyulog')
     with pytest.raises(InputError, match='has sensor_accel 0, expected vehicle_imu'):
-        read_ulg(LOGS / 'px4/thermal.ulg', 'vehicle_imu')
+        px4('thermal.ulg', 'vehicle_imu')
 
 
 def test_a_name_of_the_sensor_names_it_and_does_not_choose() -> None:
-    pytest.importorskip('pyulog')
-    log = read_ulg(LOGS / 'px4/thermal.ulg', sensor='left imu')
+    log = px4('thermal.ulg', sensor='left imu')
     assert log.sensor == 'left imu'
     assert 'sensor_accel 0' in log.read_as
     with pytest.raises(InputError, match='expected a message 3'):
-        read_ulg(LOGS / 'px4/thermal.ulg', sensor='3')
+        px4('thermal.ulg', sensor='3')
 
 
-def test_a_message_of_another_version_of_px4_is_not_read(tmp_path: Path) -> None:
-    pytest.importorskip('pyulog')
-    samples = make.recording(1)
-    older = {name: field for name, field in make.imu_fields(samples, 1).items()
-             if name != 'delta_velocity_dt'}
-    path = tmp_path / 'log.ulg'
-    path.write_bytes(make.ulog_bytes([('vehicle_imu', 0, older)]))
-    with pytest.raises(InputError, match='none of the messages'):
-        read_ulg(path)
-
-
-def test_vehicle_imu_is_divided_by_its_interval() -> None:
-    pytest.importorskip('pyulog')
-    log = read_ulg(LOGS / 'px4/default.ulg', 'vehicle_imu')
-    samples = make.recording(40, down=True)
+def test_vehicle_imu_is_divided_by_its_interval_and_not_read_without_it(tmp_path: Path) -> None:
+    log, samples = px4('default.ulg', 'vehicle_imu'), make.recording(40, down=True)
     np.testing.assert_allclose(log.columns['az'], samples.reading[::10, 2] * make.G, rtol=1e-6)
     np.testing.assert_allclose(log.columns['gy'], samples['rate'][::10, 1], atol=1e-6)
+    fields = make.imu_fields(make.recording(1), 1)  # of another version of PX4
+    del fields['delta_velocity_dt']
+    with pytest.raises(InputError, match='none of the messages'):
+        px4(in_file(tmp_path, make.ulog_bytes([('vehicle_imu', 0, fields)])))
 
 
 def test_samples_that_px4_marks_as_invalid_are_left_out_and_counted(tmp_path: Path) -> None:
-    pytest.importorskip('pyulog')
     fields = make.combined_fields(make.recording(1))
     kind, relative = fields['accelerometer_timestamp_relative']
     fields['accelerometer_timestamp_relative'] = (kind, [0x7fffffff] * 3 + list(relative[3:]))
-    path = tmp_path / 'log.ulg'
-    path.write_bytes(make.ulog_bytes([('sensor_combined', 0, fields)]))
-    log = read_ulg(path)
+    log = px4(in_file(tmp_path, make.ulog_bytes([('sensor_combined', 0, fields)])))
     assert len(log.columns['time']) == len(relative) - 3
     assert '3 rows of sensor_combined 0 left out' in log.notes[0]
 
 
-def test_a_px4_log_that_is_cut_off_is_read_up_to_there(tmp_path: Path) -> None:
-    pytest.importorskip('pyulog')
-    path = tmp_path / 'log.ulg'
-    path.write_bytes((LOGS / 'px4/thermal.ulg').read_bytes()[:40_001])
-    assert 300 < len(read_ulg(path).columns['time']) < 600
-
-
-def test_without_pyulog_a_px4_log_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, 'pyulog', None)
-    with pytest.raises(InputError, match='pip install pyulog'):
-        read_ulg(LOGS / 'px4/default.ulg')
+def test_flight_logs_that_are_cut_off_are_read_up_to_there(tmp_path: Path) -> None:
+    data = (LOGS / 'px4/thermal.ulg').read_bytes()[:40_001]
+    assert 300 < len(px4(in_file(tmp_path, data)).columns['time']) < 600
+    data = (LOGS / 'ardupilot/two_imus.bin').read_bytes()[:50_003]
+    log = ardupilot(in_file(tmp_path, data))
+    assert 400 < len(log.columns['time']) < 600
+    assert '1 message cut off at the end' in log.notes
 
 
 # ----------------------------------------------------------------------------- ArduPilot logs
 
 def test_the_lowest_sensor_of_an_ardupilot_log_is_read_and_the_others_are_named() -> None:
-    pytest.importorskip('pymavlink')
-    log = read_dataflash(LOGS / 'ardupilot/two_imus.bin')
+    log, other = ardupilot('two_imus.bin'), ardupilot('two_imus.bin', sensor='1')
     assert log.sensor == 'IMU 0'
     assert any('IMU 1' in note for note in log.notes)
-    other = read_dataflash(LOGS / 'ardupilot/two_imus.bin', sensor='1')
     samples = make.recording(51, down=True, poses=6)
     np.testing.assert_allclose(other.columns['ay'], samples.reading[:, 1] * make.G, rtol=1e-6)
 
@@ -229,46 +200,34 @@ def test_the_csv_of_two_sensors_gives_the_lowest_or_the_one_that_is_named() -> N
     other = read_log(path, LogOptions(sensor='1')).table
     samples = make.recording(51, down=True, poses=6)
     np.testing.assert_allclose(other.reading, samples.reading * make.G, rtol=1e-5, atol=1e-6)
+    with pytest.raises(InputError, match='has the sensors 0, 1, expected 2'):
+        read_log(path, LogOptions(sensor='2'))
 
 
 def test_the_text_log_has_the_numbers_of_the_binary_log() -> None:
-    pytest.importorskip('pymavlink')
-    binary = read_dataflash(LOGS / 'ardupilot/two_imus.bin')
-    text = read_dataflash(LOGS / 'ardupilot/one_imu.log')
+    binary, text = ardupilot('two_imus.bin'), ardupilot('one_imu.log')
     assert set(binary.columns) == set(text.columns)
     for key, values in binary.columns.items():
         np.testing.assert_allclose(text.columns[key], values, rtol=1e-6, atol=1e-9)
 
 
-def test_an_ardupilot_log_that_is_cut_off_is_read_up_to_there(tmp_path: Path) -> None:
-    pytest.importorskip('pymavlink')
-    path = tmp_path / 'log.bin'
-    path.write_bytes((LOGS / 'ardupilot/two_imus.bin').read_bytes()[:50_003])
-    log = read_dataflash(path)
-    assert 400 < len(log.columns['time']) < 600
-    assert '1 message cut off at the end' in log.notes
-
-
 def test_garbage_within_an_ardupilot_log_is_passed_over(tmp_path: Path) -> None:
-    pytest.importorskip('pymavlink')
     whole = (LOGS / 'ardupilot/raw_acc.bin').read_bytes()
     start = whole.index(b'\xa3\x95\x65', 20_000)
-    path = tmp_path / 'log.bin'
-    path.write_bytes(whole[:start] + b'\x00\x17\xff' * 9 + whole[start:])
-    stored, read = read_dataflash(LOGS / 'ardupilot/raw_acc.bin'), read_dataflash(path)
-    np.testing.assert_array_equal(read.columns['az'], stored.columns['az'])
+    path = in_file(tmp_path, whole[:start] + b'\x00\x17\xff' * 9 + whole[start:])
+    np.testing.assert_array_equal(ardupilot(path).columns['az'],
+                                  ardupilot('raw_acc.bin').columns['az'])
 
 
 def test_the_messages_of_older_ardupilot_logs_are_read(tmp_path: Path) -> None:
-    path = tmp_path / 'old.log'
-    path.write_text('FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns\n'
-                    'FMT, 131, 43, IMU, Iffffff, TimeMS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ\n'
-                    'FMT, 135, 43, IMU2, Iffffff, TimeMS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ\n'
-                    'IMU, 1000, 0.1, 0.2, 0.3, 1.0, 2.0, -9.8\n'
-                    'IMU2, 1000, 0.1, 0.2, 0.3, 1.5, 2.5, -9.5\n'
-                    'IMU, 1020, 0.1, 0.2, 0.3, 1.1, 2.1, -9.9\n'
-                    'IMU2, 1020, 0.1, 0.2, 0.3, 1.6, 2.6, -9.6\n'
-                    'IMU, 1040, 0.1\n')
+    path = in_file(tmp_path, b'FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns\n'
+                   b'FMT, 131, 43, IMU, Iffffff, TimeMS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ\n'
+                   b'FMT, 135, 43, IMU2, Iffffff, TimeMS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ\n'
+                   b'IMU, 1000, 0.1, 0.2, 0.3, 1.0, 2.0, -9.8\n'
+                   b'IMU2, 1000, 0.1, 0.2, 0.3, 1.5, 2.5, -9.5\n'
+                   b'IMU, 1020, 0.1, 0.2, 0.3, 1.1, 2.1, -9.9\n'
+                   b'IMU2, 1020, 0.1, 0.2, 0.3, 1.6, 2.6, -9.6\n'
+                   b'IMU, 1040, 0.1\n')
     log = read_dataflash(path)
     np.testing.assert_allclose(log.columns['time'], [1.0, 1.02])
     np.testing.assert_allclose(log.columns['az'], [-9.8, -9.9])
@@ -279,30 +238,29 @@ def test_the_messages_of_older_ardupilot_logs_are_read(tmp_path: Path) -> None:
 def test_the_calibration_that_an_ardupilot_log_holds_already_is_named(tmp_path: Path) -> None:
     rows = [*make.dataflash_forms(), ('PARM', (1, 'INS_ACCOFFS_X', 0.25, 0.0)),
             *make.imu_rows(make.recording(1), 0)]
-    pytest.importorskip('pymavlink')
-    path = tmp_path / 'log.bin'
-    path.write_bytes(make.dataflash_bytes(rows))
-    assert any('INS_ACCOFFS_X 0.25' in note for note in read_dataflash(path).notes)
+    log = ardupilot(in_file(tmp_path, make.dataflash_bytes(rows)))
+    assert any('INS_ACCOFFS_X 0.25' in note for note in log.notes)
 
 
-@pytest.mark.parametrize(('read', 'library', 'content'), [
-    *((read_ulg, 'pyulog', each) for each in (
+@pytest.mark.parametrize(('read', 'content'), [
+    *((px4, each) for each in (
         b'', b'ULog\x01\x12\x35\x01', b'time,ax,ay,az\n0,1,2,3\n',
         b'ULog\x01\x12\x35\x01' + b'\xff' * 500)),
-    *((read_dataflash, 'pymavlink', each) for each in (
+    *((ardupilot, each) for each in (
         b'', b'\xa3\x95\x80', b'time,ax\n1,2\n', b'\xa3\x95\x80' + b'\xff' * 400))])
-def test_what_is_no_flight_log_is_refused_in_one_line(
-        read: Any, library: str, content: bytes, tmp_path: Path) -> None:
-    pytest.importorskip(library)
-    path = tmp_path / 'log'
-    path.write_bytes(content)
+def test_what_is_no_flight_log_is_refused_in_one_line(read: Any, content: bytes, tmp_path: Path
+                                                      ) -> None:
+    path = in_file(tmp_path, content)
     with pytest.raises(InputError, match=re.escape(str(path))) as caught:
         read(path)
     assert '\n' not in str(caught.value)
 
 
-def test_without_pymavlink_a_binary_log_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch
-                                                               ) -> None:
-    monkeypatch.setitem(sys.modules, 'pymavlink.DFReader', None)
-    with pytest.raises(InputError, match='pip install pymavlink'):
-        read_dataflash(LOGS / 'ardupilot/two_imus.bin')
+@pytest.mark.parametrize(('module', 'read', 'name'), [
+    ('pyulog', read_ulg, 'px4/default.ulg'),
+    ('pymavlink.DFReader', read_dataflash, 'ardupilot/two_imus.bin')])
+def test_without_its_library_a_binary_log_says_how_to_install_it(
+        module: str, read: Any, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(InputError, match=f'pip install {module.split(".")[0]}'):
+        read(LOGS / name)
