@@ -21,8 +21,6 @@ import numpy as np
 import pytest
 from shared import run, sensor
 
-GOOD = '# a comment\nax,ay,az\n1,2,3\n4,5,6\n'
-
 
 def write(folder, text):
     path = folder / 'table.csv'
@@ -44,16 +42,14 @@ def test_every_column_is_read_as_it_was_written(tmp_path):
     write_table(tmp_path / 'poses.csv', table)
     found = read_poses(tmp_path / 'poses.csv')
     assert set(found.columns) == set(table.columns)
-    for key, values in table.columns.items():
-        if key == 'label':
-            assert found[key].tolist() == values.tolist()
-        else:
-            np.testing.assert_allclose(found[key], values, rtol=1e-11)
+    assert found['label'].tolist() == table['label'].tolist()
+    for key in table.columns.keys() - {'label'}:
+        np.testing.assert_allclose(found[key], table[key], rtol=1e-11)
     np.testing.assert_allclose(np.diff(found['time']), 0.0025, atol=5e-7)
 
 
 def test_columns_may_come_in_any_order_among_others(tmp_path):
-    poses = read_poses(write(tmp_path, 'az,what,ay,ax\n3,x,2,1\n6,y,5,4\n'))
+    poses = read_poses(write(tmp_path, '# a comment\naz,what,ay,ax\n3,x,2,1\n6,y,5,4\n'))
     np.testing.assert_array_equal(poses.reading, [[1, 2, 3], [4, 5, 6]])
     assert list(poses.row) == [1, 2]
 
@@ -80,12 +76,9 @@ def test_a_bad_pose_table_is_refused_in_one_line(text, message, tmp_path):
     assert '\n' not in str(refusal.value)
 
 
-def test_a_recording_needs_times(tmp_path):
+def test_a_recording_needs_times_and_a_missing_file_is_an_error_of_the_system(tmp_path):
     with pytest.raises(InputError, match='no column time'):
-        read_recording(write(tmp_path, GOOD))
-
-
-def test_a_missing_file_raises_the_error_of_the_system(tmp_path):
+        read_recording(write(tmp_path, 'ax,ay,az\n1,2,3\n4,5,6\n'))
     with pytest.raises(FileNotFoundError):
         read_poses(tmp_path / 'none.csv')
 
@@ -99,9 +92,13 @@ def calibration(request):
                      date='2026-11-21T00:00:00+00:00')
 
 
-def test_a_stored_calibration_is_read_with_all_digits(calibration, tmp_path):
+def test_a_stored_calibration_is_read_with_all_digits_and_the_previous_one_is_kept(
+        calibration, tmp_path):
     path = tmp_path / 'calibration.yaml'
+    path.write_text('the one before')
     write_calibration(path, calibration)
+    assert previous(path).read_text() == 'the one before'
+    assert {*tmp_path.iterdir()} == {path, previous(path)}
     found = read_calibration(path)
     assert format_calibration(found) == format_calibration(calibration)
     reading = np.random.default_rng(3).normal(size=(5, 3))
@@ -135,14 +132,6 @@ def test_a_calibration_in_place_of_a_log_is_named(command, calibration, tmp_path
     stored = [] if command == 'verify' else ['-o', tmp_path / 'other']
     assert run(command, path, *used, *stored) == 2
     assert 'is a calibration, expected a log or a table of poses' in capsys.readouterr().err
-
-
-def test_the_previous_calibration_is_kept(calibration, tmp_path):
-    path = tmp_path / 'calibration.yaml'
-    path.write_text('the one before')
-    write_calibration(path, calibration)
-    assert previous(path).read_text() == 'the one before'
-    assert sorted(item.name for item in tmp_path.iterdir()) == [path.name, previous(path).name]
 
 
 @pytest.fixture(scope='module')
@@ -209,23 +198,19 @@ def put(path, text='new\n'):
 
 
 @pytest.mark.parametrize('mode', [0o600, 0o640, 0o644])
-def test_the_permissions_are_kept(mode, tmp_path):
-    path = tmp_path / 'file'
+def test_the_permissions_are_kept_and_those_of_a_new_file_are_of_the_process(mode, tmp_path):
+    path, new = tmp_path / 'file', tmp_path / 'new'
     path.write_text('old\n')
     path.chmod(mode)
-    write_atomically(path, lambda file: file.write('new\n'), keep_before=True)
-    assert stat.S_IMODE(path.stat().st_mode) == mode
-    assert previous(path).read_text() == 'old\n'
-    assert stat.S_IMODE(previous(path).stat().st_mode) == mode
-
-
-def test_a_new_file_has_the_permissions_of_the_process(tmp_path):
     before = os.umask(0o027)
     try:
-        put(tmp_path / 'file')
+        write_atomically(path, lambda file: file.write('new\n'), keep_before=True)
+        put(new)
     finally:
         os.umask(before)
-    assert stat.S_IMODE((tmp_path / 'file').stat().st_mode) == 0o640
+    assert previous(path).read_text() == 'old\n'
+    modes = [stat.S_IMODE(each.stat().st_mode) for each in (path, previous(path), new)]
+    assert modes == [mode, mode, 0o640]
 
 
 def test_a_link_stays_and_its_target_is_replaced(tmp_path):
@@ -236,7 +221,7 @@ def test_a_link_stays_and_its_target_is_replaced(tmp_path):
     put(link)
     assert link.is_symlink()
     assert target.read_text() == 'new\n'
-    assert sorted(each.name for each in tmp_path.iterdir()) == ['folder', 'link']
+    assert {*tmp_path.iterdir()} == {target.parent, link}
 
 
 def test_only_a_regular_writable_file_is_replaced(tmp_path):
@@ -262,25 +247,15 @@ def test_a_link_at_a_temporary_name_is_not_followed(tmp_path, monkeypatch):
     assert victim.read_text() == 'mine\n'
 
 
-def test_leftovers_of_killed_processes_are_removed_and_new_ones_are_kept(tmp_path):
-    old, young = tmp_path / '.file.1.tmp', tmp_path / '.file.2.tmp'
+def test_leftovers_of_killed_processes_are_removed_if_they_are_old_and_can_be(tmp_path):
+    folder, old, young = (tmp_path / f'.file.{k}.tmp' for k in range(3))
+    folder.mkdir()
     for path in (old, young):
         path.write_text('half')
-    os.utime(old, (0.0, 0.0))
-    put(tmp_path / 'file')
-    assert not old.exists()
-    assert young.exists()
-
-
-def test_a_leftover_that_cannot_be_removed_does_not_fail_the_write(tmp_path):
-    folder, old = tmp_path / '.file.1.tmp', tmp_path / '.file.2.tmp'
-    folder.mkdir()
-    old.write_text('half')
     for path in (folder, old):
         os.utime(path, (0.0, 0.0))
     put(tmp_path / 'file')
-    assert folder.exists()
-    assert not old.exists()
+    assert [each.exists() for each in (folder, old, young)] == [True, False, True]
 
 
 def test_a_failed_write_leaves_the_file_unchanged(tmp_path):
@@ -297,10 +272,10 @@ def test_a_failed_write_leaves_the_file_unchanged(tmp_path):
     assert [each.name for each in tmp_path.iterdir()] == ['file']
 
 
-def test_a_full_disk_has_its_own_advice(here, capsys, monkeypatch):
+def test_a_full_disk_has_its_own_advice(tmp_path, capsys, monkeypatch):
     def full(handle):
         raise OSError(28, 'No space left on device')
 
     monkeypatch.setattr(os, 'fsync', full)
-    assert run('simulate', '-o', 'x.csv') == 2
+    assert run('simulate', '-o', tmp_path / 'x.csv') == 2
     assert 'free space on the disk' in capsys.readouterr().err

@@ -4,9 +4,7 @@
 """`apply`, block by block, and samples outside of the range of a calibration."""
 
 from dataclasses import replace
-from pathlib import Path
 import tracemalloc
-from typing import Any
 
 from accel_calib.calibrate import fit_poses, of_samples, outside, SampleContext
 from accel_calib.effects import empirical_name
@@ -17,10 +15,10 @@ from accel_calib.table import numbered, Recording
 from accel_calib.units import units_of
 from bag_files import write_bag
 from inside import (
-    main, model_with, ROWS_OF_A_TEXT, simulate_poses, simulate_recording, spread_directions)
+    model_with, ROWS_OF_A_TEXT, simulate_poses, simulate_recording, spread_directions)
 import numpy as np
 import pytest
-from shared import sensor, with_effects
+from shared import run, sensor, with_effects
 
 UNITS = units_of('m/s2')
 LOW, HIGH = 20.0, 30.0
@@ -47,12 +45,13 @@ def recording():
         np.random.default_rng(7), rate_hz=50.0, dwell=2.0, temperatures=(25.0, 41.0))
 
 
-def in_si(recording):
-    return replace(recording.with_columns(**{key: UNITS.from_g(recording[key])
-                                             for key in ('reading', 'reference')}), units='m/s2')
+def write_si(path, recording):
+    """Write samples in g as a table in m/s²."""
+    columns = {key: UNITS.from_g(recording[key]) for key in ('reading', 'reference')}
+    write_table(path, replace(recording.with_columns(**columns), units='m/s2'))
 
 
-def test_quantities_are_counted_over_blocks():
+def test_quantities_outside_are_counted_over_blocks_and_those_inside_are_not():
     calibration = calibrated(TCO)
     warm = np.array([25.0, 29.0, 35.0, np.nan, 41.0])
     whole = outside(calibration, {'temperature': warm})
@@ -63,10 +62,6 @@ def test_quantities_are_counted_over_blocks():
     found = whole['temperature']
     assert (found.count, found.samples) == (2, 4)
     assert (found.least, found.most) == (25.0, 41.0)
-
-
-def test_quantities_inside_are_not_counted():
-    calibration = calibrated(TCO)
     assert outside(calibration, {'temperature': np.array([LOW, HIGH])})['temperature'].count == 0
     assert not outside(calibration, {'temperature': np.array([np.nan])})
     assert not outside(calibrated({}), {'temperature': np.array([80.0])})
@@ -87,34 +82,24 @@ def test_each_quantity_is_described_in_its_unit(name, values, known, words):
     assert words in found[0]
 
 
-@pytest.mark.parametrize('kind', ['table', 'mcap'])
-def test_apply_says_once_how_many_samples_leave_the_range(kind, recording, tmp_path, capsys):
-    calibration, out = tmp_path / 'calibration.yaml', tmp_path / 'out'
+@pytest.mark.parametrize(('kind', 'within'), [('table', 0), ('mcap', 60)])
+def test_apply_says_once_how_many_samples_leave_the_range(kind, within, recording, tmp_path,
+                                                          capsys):
+    calibration, path = tmp_path / 'calibration.yaml', tmp_path / 'recording.csv'
     write_calibration(calibration, calibrated(TCO))
-    if kind == 'table':
-        path, out = tmp_path / 'recording.csv', tmp_path / 'out.csv'
-        write_table(path, in_si(recording))
-    else:
-        path = write_bag(tmp_path / kind, kind, recording)
-    assert main(['apply', str(path), '-c', str(calibration), '-o', str(out)]) == 0
-    printed = ' '.join(capsys.readouterr().out.split())
-    count = int(np.sum(recording['temperature'] > HIGH))
-    notes = printed.split('note: ')[1:]
-    assert len(notes) == 1
-    stated, of, total, rest = notes[0].split(' ', 3)
+    write_si(path, recording)
+    if kind == 'mcap':
+        path = write_bag(tmp_path / 'recording', kind, recording)
+    applied(path, calibration, tmp_path / f'out{path.suffix}')
+    note, = ' '.join(capsys.readouterr().out.split()).split('note: ')[1:]
+    stated, of, total, rest = note.split(' ', 3)
     assert (of, int(total)) == ('of', len(recording))
-    assert int(stated) == pytest.approx(count, abs=0 if kind == 'table' else 60)
+    assert int(stated) == pytest.approx(np.sum(recording['temperature'] > HIGH), abs=within)
     assert rest.startswith('samples are outside of the range of the calibration: temperature is '
                            '25 to ')
     assert 'but the range of the calibration is 20 to 30 °C; the correction uses the limit' in rest
-
-
-def test_apply_says_nothing_inside_of_the_range(recording, tmp_path, capsys):
-    calibration, path = tmp_path / 'calibration.yaml', tmp_path / 'recording.csv'
-    write_calibration(calibration, calibrated(TCO))
-    inside = recording.take(recording['temperature'] < HIGH)
-    write_table(path, in_si(inside))
-    assert main(['apply', str(path), '-c', str(calibration), '-o', str(tmp_path / 'o.csv')]) == 0
+    write_si(tmp_path / 'inside.csv', recording.take(recording['temperature'] < HIGH))
+    applied(tmp_path / 'inside.csv', calibration, tmp_path / 'o.csv')
     assert 'note:' not in capsys.readouterr().out
 
 
@@ -146,7 +131,7 @@ EFFECTS = {'offset_temperature': np.array([2e-3, -1e-3, 1e-3, 60.0, 0.0]),
            'temperature_rate': np.array([0.02, -0.03, 0.01])}
 
 
-def samples_of(count: int) -> Recording:
+def samples_of(count):
     """Return samples in m/s² whose temperature rises and falls."""
     rng, time = np.random.default_rng(5), 100.0 + np.arange(count) / RATE_HZ
     columns = {'time': time, 'reading': rng.normal([0.2, -0.3, 9.8], 0.01, (count, 3)),
@@ -156,25 +141,24 @@ def samples_of(count: int) -> Recording:
 
 
 @pytest.fixture(scope='module')
-def calibration() -> Any:
+def calibration():
     return calibrated(EFFECTS)
 
 
 @pytest.fixture(scope='module')
-def stored(calibration: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def stored(calibration, tmp_path_factory):
     path = tmp_path_factory.mktemp('stored') / 'calibration.yaml'
     write_calibration(path, calibration)
     return path
 
 
-def applied(path: Path, stored: Path, out: Path) -> Path:
-    assert main(['apply', str(path), '-c', str(stored), '-o', str(out)]) == 0
+def applied(path, stored, out):
+    """Return the copy that the command writes."""
+    assert run('apply', path, '-c', stored, '-o', out) == 0
     return out
 
 
-def test_blocks_give_the_same_as_the_whole(calibration: Any, stored: Path,
-                                           tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-                                           capsys: pytest.CaptureFixture[str]) -> None:
+def test_blocks_give_the_same_as_the_whole(calibration, stored, tmp_path, monkeypatch, capsys):
     samples, path, rows = samples_of(6000), tmp_path / 'recording.csv', 700
     write_table(path, samples)
     whole = read_recording(applied(path, stored, tmp_path / 'whole.csv'))
@@ -194,8 +178,7 @@ def test_blocks_give_the_same_as_the_whole(calibration: Any, stored: Path,
     assert np.max(np.abs(alone - expected)) > 1e-3  # the state at the start of a block matters
 
 
-def test_the_memory_does_not_grow_with_the_length(stored: Path, tmp_path: Path,
-                                                  monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_memory_does_not_grow_with_the_length(stored, tmp_path, monkeypatch):
     monkeypatch.setattr(*ROWS_OF_A_TEXT, 2000)
     path, peaks = tmp_path / 'recording.csv', []
     for count in (8000, 24_000):
@@ -208,9 +191,7 @@ def test_the_memory_does_not_grow_with_the_length(stored: Path, tmp_path: Path,
     assert len(read_recording(tmp_path / 'out.csv')) == 24_000
 
 
-def test_an_error_in_a_late_block_leaves_the_earlier_file(
-        stored: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-        capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_error_in_a_late_block_leaves_the_earlier_file(stored, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(*ROWS_OF_A_TEXT, 1000)
     path, out = tmp_path / 'recording.csv', tmp_path / 'out.csv'
     write_table(path, samples_of(5000))
@@ -219,13 +200,13 @@ def test_an_error_in_a_late_block_leaves_the_earlier_file(
     path.write_text(''.join(lines))
     write_table(out, samples_of(10))
     before = out.read_bytes()
-    assert main(['apply', str(path), '-c', str(stored), '-o', str(out)]) == 2
+    assert run('apply', path, '-c', stored, '-o', out) == 2
     assert 'line 4501' in ' '.join(capsys.readouterr().err.split())
     assert out.read_bytes() == before
     assert sorted(each.name for each in tmp_path.iterdir()) == ['out.csv', 'recording.csv']
 
 
-def test_blocks_are_written_as_one_table(tmp_path: Path) -> None:
+def test_blocks_are_written_as_one_table(tmp_path):
     samples = replace(samples_of(100), sensor='imu "1"')
     write_table(tmp_path / 'whole.csv', samples)
     parts = (samples.take(slice(k, k + 30)) for k in range(0, 100, 30))
