@@ -109,11 +109,6 @@ class Setup:
     heavy: bool = False
     repeats: int = 1
 
-    def __post_init__(self) -> None:
-        if self.understated < 1.0 or self.repeats < 1:
-            raise ValueError(f'understated is {self.understated:g} and repeats is {self.repeats}, '
-                             'expected 1 or more')
-
 
 @dataclass(frozen=True)
 class Simulated:

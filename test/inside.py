@@ -64,7 +64,7 @@ from accel_calib.logs.bag_samples import together
 from accel_calib.logs.bounded_bags import decompressed, largest
 from accel_calib.logs.flight import read_dataflash, read_ulg
 from accel_calib.logs.formats import ULOG as ULG_MAGIC
-from accel_calib.logs.names import format_named, meaning, record_instead, unit_of
+from accel_calib.logs.names import format_named, meaning, unit_of
 from accel_calib.logs.serialized import frame_ids, stamps_of
 from accel_calib.messages.one_reading import OneReading
 from accel_calib.noise.components import COMPONENTS as ALLAN_COMPONENTS, fit_components

@@ -5,8 +5,6 @@
 
 from __future__ import annotations
 
-import csv
-import importlib.util
 from pathlib import Path
 import re
 import sys
@@ -17,18 +15,12 @@ from accel_calib.capture import capture
 from accel_calib.errors import InputError
 from accel_calib.logs import LogOptions, read_log
 from accel_calib.table import Recording
-from inside import format_named, read_dataflash, read_ulg, record_instead
+from data.logs import make
+from inside import format_named, read_dataflash, read_ulg
 import numpy as np
 import pytest
 
 LOGS = Path(__file__).parent / 'data' / 'logs'
-_spec = importlib.util.spec_from_file_location('make_logs', LOGS / 'make.py')
-assert _spec is not None
-assert _spec.loader is not None
-make = importlib.util.module_from_spec(_spec)
-sys.modules['make_logs'] = make
-_spec.loader.exec_module(make)
-
 WITHIN_SD = 5.0
 
 
@@ -48,13 +40,6 @@ def in_file(folder: Path, data: bytes) -> Path:
     path = folder / 'log'
     path.write_bytes(data)
     return path
-
-
-def header_of(name: str) -> list[str]:
-    with (LOGS / name).open(encoding='utf-8', newline='') as file:
-        first = file.readline()
-    delimiter = next(each for each in ';\t,' if each in first)
-    return next(csv.reader([first], delimiter=delimiter, skipinitialspace=True))
 
 
 def check(recording: Recording, units: Any, name: str) -> Calibration:
@@ -90,11 +75,13 @@ def test_the_truth_of_a_sample_is_found_without_options_and_with_its_format(name
     np.testing.assert_allclose(named.table['time'], log.table['time'], rtol=1e-12)
 
 
-@pytest.mark.parametrize('name', make.WITHOUT_GRAVITY)
-def test_a_log_without_gravity_is_refused_and_the_maker_s_other_log_is_named(name: str) -> None:
+@pytest.mark.parametrize(('name', 'advice'), zip(make.WITHOUT_GRAVITY, (
+    "record 'Acceleration with g'", 'use TotalAcceleration.csv')))
+def test_a_log_without_gravity_is_refused_and_the_maker_s_other_log_is_named(
+        name: str, advice: str) -> None:
     with pytest.raises(InputError, match='gravity') as caught:
         read_log(LOGS / name)
-    assert record_instead(header_of(name), LOGS / name) in caught.value.advice
+    assert advice in caught.value.advice
     assert 'native' not in str(caught.value)
 
 

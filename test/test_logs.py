@@ -393,27 +393,19 @@ def test_a_counter_that_starts_again_is_continued_and_noted(unit: float, name: s
     assert any('starts again once' in note for note in log.notes)
 
 
-def test_a_time_that_jumps_back_is_left_as_it_is(reads: Reads) -> None:
+def test_stamps_that_jump_back_or_are_far_apart_stay_times_of_samples(reads: Reads) -> None:
     made = samples()
     made['time'][1000:] -= 5.0
-    log = reads('time,ax,ay,az', made['time'], made['reading'])
-    np.testing.assert_allclose(log.table['time'], made['time'])
-
-
-def test_a_log_each_ten_seconds_stays_in_seconds(reads: Reads) -> None:
-    rng = np.random.default_rng(5)
-    still = np.array([0.1, 0.2, G]) + 0.01 * rng.normal(size=(6000, 3))
-    log = reads('time,ax,ay,az', np.arange(6000) * 10.0, still)
-    assert log.table['time'][-1] == 59_990.0
-    assert isinstance(log.table, Recording)
-
-
-def test_a_recording_with_two_rows_per_second_holds_samples(reads: Reads) -> None:
-    made = samples(rest=10, turn=4)
-    names = [f'ACCELEROMETER {axis} (m/s²)' for axis in 'XYZ']
-    log = reads(','.join([*names, 'Time since start in ms ']), made['reading'],
-                np.arange(len(made['time'])) * 500.0)
-    assert isinstance(log.table, Recording)
+    still = np.array([0.1, 0.2, G]) + 0.01 * np.random.default_rng(5).normal(size=(6000, 3))
+    few = samples(rest=10, turn=4)['reading']
+    for name, stamps, reading, seconds in (
+            ('time', made['time'], made['reading'], made['time']),
+            ('time', np.arange(6000) * 10.0, still, np.arange(6000) * 10.0),
+            ('Time since start in ms', np.arange(len(few)) * 500.0, few,
+             np.arange(len(few)) * 0.5)):
+        log = reads(f'{name},ax,ay,az', stamps, reading)
+        assert isinstance(log.table, Recording)
+        np.testing.assert_allclose(log.table['time'], seconds)
 
 
 @pytest.mark.parametrize(('tick', 'rate_hz'), [(1e-4, 400.0), (1e-4, 60.0), (1e-6, 60.0),
@@ -716,32 +708,25 @@ def test_temperatures_become_degrees_celsius(name: str, factor: float, zero: flo
 
 # ------------------------------------------------------------------------------- large logs
 
-def test_a_long_log_is_read_in_blocks_of_flat_memory(tmp_path: Path) -> None:
-    block = log_text(poses=10, rest=400, turn=100).splitlines(keepends=True)
+def test_a_long_log_is_read_in_blocks_of_flat_memory_as_at_once(tmp_path: Path) -> None:
+    block = rows_of(samples(per_g=1000.0, poses=10, rest=400, turn=100)['reading'], digits='.6g')
     peaks = []
     for times in (40, 100):
-        path = write(tmp_path, ''.join([block[0], *(block[1:] * times)]))
+        lines = [f'{10 * k},{",".join(row)}\n' for k, row in enumerate(block * times)]
+        path = write(tmp_path, ''.join(['millis,accX,accY,accZ\n', *lines]))
         tracemalloc.start()
         with open_log(path) as log:
             rows = [len(each) for each in log.watched(lambda done, count: None)]
             assert log.samples == pytest.approx(sum(rows), rel=0.05)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-        assert sum(rows) == (len(block) - 1) * times
+        assert sum(rows) == len(lines)
         assert max(rows) <= 65536
     assert peaks[1] < 1.3 * peaks[0]
-
-
-def test_a_log_is_read_the_same_in_blocks_and_at_once(tmp_path: Path) -> None:
-    block = rows_of(samples(per_g=1000.0)['reading'], digits='.6g')
-    count = 150_000 // len(block) + 1
-    rows = [[str(k * 10), *row] for k, row in enumerate(block * count)]
-    path = write(tmp_path, text_of(rows, 'millis,accX,accY,accZ'))
-    log = read_log(path)
-    with open_log(path) as opened:
-        parts: list[Any] = list(opened.blocks)
+    whole = read_log(path).table
+    with open_log(path) as log:
+        parts = list(log.blocks)
     assert len(parts) > 1
-    np.testing.assert_array_equal(np.concatenate([part.reading for part in parts]),
-                                  log.table.reading)
-    assert log.table['time'][-1] == pytest.approx((len(rows) - 1) * 0.01)
-    assert log.table.row[-1] == len(rows)
+    np.testing.assert_array_equal(np.concatenate([part.reading for part in parts]), whole.reading)
+    assert whole['time'][-1] == pytest.approx((len(lines) - 1) * 0.01)
+    assert whole.row[-1] == len(lines)
