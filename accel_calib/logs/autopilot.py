@@ -197,13 +197,7 @@ Correction = Callable[[Values], ByAxis]
 
 def raw_columns(columns: Mapping[str, Floats], parameters: Parameters, correction: Correction
                 ) -> dict[str, Floats]:
-    """
-    Return columns (names of a recording) with the readings of the sensor, in its own axes.
-
-    Angular rates are turned back, and not corrected. Raise InputError if the correction is not
-    known.
-
-    """
+    """Return columns with the readings of the sensor in its own axes; rates are only turned."""
     if not parameters:
         raise _unknown('its parameters are not in the log')
     time, found = columns['time'], dict(columns)

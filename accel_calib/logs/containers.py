@@ -108,9 +108,8 @@ def open_table(path: Path, head: bytes, options: LogOptions) -> Iterator[tuple[s
     """
     Open a container, and yield the name of its table with the accelerometer, and the table.
 
-    `head` are the first bytes. Raise InputError if there is no such table, or several.
-    `options.topic` names a table. Tables of linear acceleration come last, and tables whose names
-    say that they are of an accelerometer first.
+    `options.topic` can name it; raise InputError if there is none, or several. Tables of linear
+    acceleration come last, and tables whose names say that they are of an accelerometer first.
 
     """
     with _members_of(path, head) as members:
@@ -140,7 +139,6 @@ def _members_of(path: Path, head: bytes) -> Iterator[Sequence[Member]]:
 
 
 def _member_of(path: Path, members: Sequence[Member], options: LogOptions) -> Member:
-    """Return the table with the accelerometer; see `open_table`."""
     names = [member.name for member in members]
     wanted = [member for member in members if options.topic in ('', member.name)]
     if not wanted:
@@ -188,7 +186,6 @@ def _has_gravity(_: Member, columns: Chosen) -> bool:
 
 
 def _is_named(member: Member, columns: Chosen) -> bool:
-    """Return whether a table or its columns have the name of an acceleration."""
     names = [Path(member.name).stem, *columns.names(READING[:1])]
     return any(meaning(name).quantity == 'reading' or 'accel' in name.casefold()
                for name in names)
@@ -198,7 +195,6 @@ def _is_named(member: Member, columns: Chosen) -> bool:
 
 @contextmanager
 def _sound_archive(path: Path) -> Iterator[None]:
-    """Turn the errors of a damaged or encrypted archive into InputError."""
     try:
         yield
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError) as err:

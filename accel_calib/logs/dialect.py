@@ -267,13 +267,7 @@ def layout_of(path: Path, head: Sequence[str], is_header: IsHeader, encoding: st
 
 
 def _rate_below_start(rows: Sequence[Sequence[str]]) -> float | None:
-    """
-    Return the rate [Hz] of a table without names, or None if its first rows are samples.
-
-    Wristbands of Empatica write the start in seconds since 1970 into each column, and below it the
-    rate.
-
-    """
+    """Return the rate [Hz] that Empatica writes into each column below the start since 1970."""
     values = [{float(cell) for cell in row} if all(map(is_number, row)) else set()
               for row in rows]
     if len(values) < 2 or any(len(each) != 1 for each in values) or len(rows[0]) < len('xyz'):

@@ -534,8 +534,8 @@ def record_instead(header: Sequence[str], path: Path) -> str:
     """
     Return what to record instead, if the maker marks a file as acceleration without gravity.
 
-    The names are no proof: other tools use them for readings with gravity. A reader asks here for
-    its advice once the readings at rest show no gravity.
+    The names are no proof: other tools use them for readings with gravity. So they only add
+    advice once the readings at rest show no gravity.
 
     """
     given = {folded(name) for name in header}

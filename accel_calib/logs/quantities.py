@@ -286,7 +286,6 @@ def _at_rest(columns: Chosen, rests: Rests) -> tuple[UnitName, float]:
 
 
 def _check_named(columns: Chosen, rests: Rests, units: Units) -> None:
-    """Check that the readings at rest fit the unit in the names."""
     if units.is_native or (1.0 / _STATED_FACTOR <= rests.length / units.per_g
                            <= _STATED_FACTOR):
         return
@@ -302,7 +301,6 @@ def _check_named(columns: Chosen, rests: Rests, units: Units) -> None:
 
 
 def _words(columns: Chosen, rests: Rests, units: Units, factor: float, *, stated: bool) -> str:
-    """Return how the readings are read."""
     words, name = compact(columns.names(READING)), units.name
     if units.is_native and not stated:
         size = rests.per_g

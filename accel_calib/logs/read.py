@@ -78,21 +78,11 @@ class OpenLog:
     """
     An open log that is read block by block; `open_log` makes it.
 
-    Parameters
-    ----------
-    blocks : iterator of Recording
-        The samples, in order. The size of a block does not depend on that of the log. An error is
-        raised when a table without times is read as samples.
-    samples : int
-        Number of samples; of a long text log, an estimate from the size of the file.
-    units, sensor
-        Unit of the readings; name of the sensor, empty if not stated.
-    read_as : str
-        How the log is read, in one line; empty if nothing is assumed.
-    poses : Poses or None
-        The poses, if the log is a pose table.
-    noted : function
-        Returns the notes so far: what was left out.
+    `blocks` are the samples, in order; their size does not depend on that of the log. An error is
+    raised when a table without times is read as samples. `samples` is the number of samples; of a
+    long text log, an estimate from the size of the file. `sensor` is empty if it is not stated.
+    `read_as` is how the log is read, in one line, empty if nothing is assumed. `poses` are those
+    of a pose table. `noted` returns the notes so far: what was left out.
 
     """
 
@@ -373,22 +363,10 @@ class LineReader:
     """
     Samples of lines that are read as the lines of a text log are.
 
-    Dialect, columns and units are recognised from the first lines, the head. A line that cannot be
-    read is skipped, because a serial port can lose characters.
-
-    Parameters
-    ----------
-    name : str
-        Name of the port, for messages.
-    head : sequence of str
-        The first complete lines; `first` are their samples.
-    seconds : float
-        Time in which they arrived, for lines without times [s].
-
-    Raises
-    ------
-    InputError
-        If the lines have no accelerometer, or contradict the options, or hold no gravity.
+    Dialect, columns and units are recognised from the `head`, the first complete lines, which
+    arrived within some `seconds`; `first` are their samples. `name` is that of the port. A line
+    that cannot be read is skipped, because a serial port can lose characters. Raise InputError if
+    the lines have no accelerometer, contradict the options, or hold no gravity.
 
     """
 

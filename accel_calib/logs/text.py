@@ -63,12 +63,7 @@ def open_text(path: Path, is_header: IsHeader, *, strict: bool = False,
               expected: str = 'time,ax,ay,az',
               stream: tuple[io.RawIOBase, int] | None = None
               ) -> Iterator[TextTable]:
-    """
-    Open a text table, and find its dialect; parameters and errors as in `layout_of`.
-
-    The bytes are those of the `stream`, with their number, or else of the file.
-
-    """
+    """Open the text table of a file, or of a stream with its size; see `layout_of`."""
     file, size = stream or (io.FileIO(path), path.stat().st_size)
     with io.BufferedReader(file, _PEEKED) as raw:
         encoding = _encoding(raw.peek())
@@ -136,12 +131,7 @@ class TextTable:
         self.more = False
 
     def choose(self, columns: Chosen, *, skip_bad: bool = False) -> None:
-        """
-        Set the columns to read; bad rows raise unless `skip_bad`.
-
-        In the last columns of numbers, the quantities, other cells are NaN.
-
-        """
+        """Set the columns to read. Bad rows raise unless `skip_bad`; bad quantities are NaN."""
         self._numeric, self._text, self._dates = columns.numeric, columns.text, columns.dates
         self._needed = self._numeric[:len(self._numeric) - len(columns.quantities)]
         self._spare = self._numeric[len(self._needed):]

@@ -160,12 +160,7 @@ def _by_rate(columns: Chosen, first: Cells, stamps: Floats) -> bool:
 
 def _unit_by_rate(stamps: Floats, beside: Sequence[float], units: Mapping[str, float]
                   ) -> tuple[str, float] | None:
-    """
-    Return the unit in which stamps have a plausible rate, and that rate [Hz], or None.
-
-    `beside` are the rates that the file states; a unit with one of them goes first.
-
-    """
+    """Return the unit with a plausible rate, best one that the file states, and the rate [Hz]."""
     step = _step_of(stamps)
     if not step > 0.0:
         return None
