@@ -418,9 +418,9 @@ class Choice:
         if 'temperature' in found.columns:
             read_as += f', {temperature}'
         return FlightLog(found.columns, self.name or str(chosen), read_as, found.autopilot,
-                         (*notes, *found.notes))
+                         (*notes, *self._others(), *found.notes))
 
-    def others(self) -> list[str]:
+    def _others(self) -> list[str]:
         """Return notes on the other sensors of the same message, and on other messages."""
         chosen, notes = self.message, []
         usable = [message for message in self.found if len(message.time)]

@@ -156,9 +156,9 @@ def chosen(layout: Layout, options: LogOptions) -> Chosen:
     Raise InputError if there is not exactly one accelerometer, or a given column is not there.
 
     """
-    header, maker = layout.header, None
+    header = layout.header
     if options.format:
-        maker = format_named(options.format, header, str(layout.path))
+        maker: LogFormat | None = format_named(options.format, header, str(layout.path))
     else:
         maker = recognise(header[:MOST])
         # Our own names go first, unless the maker's layout says that they are other columns.
@@ -167,7 +167,7 @@ def chosen(layout: Layout, options: LogOptions) -> Chosen:
     given = dict(options.columns)
     if maker is None or set(READING) & given.keys():
         return with_indices(layout, _counted(layout, options, sources(layout, given)))
-    check_sensor(header, layout.path)
+    check_sensor(maker, layout.path)
     found = sources(layout, {**maker.present(header), **given})
     for ours, theirs in maker.divisors.items():
         found[f'{ours}/'] = column(layout, theirs)

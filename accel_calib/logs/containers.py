@@ -175,14 +175,9 @@ def _tables(path: Path, members: Sequence[Member], options: LogOptions
 
 def _preferred(tables: Mapping[Member, Chosen]) -> list[Member]:
     """Return the tables of accelerometers by their names, as far as the names tell."""
-    left = list(tables)
-    for is_better in (_has_gravity, _is_named):
-        left = [member for member in left if is_better(member, tables[member])] or left
-    return left
-
-
-def _has_gravity(_: Member, columns: Chosen) -> bool:
-    return not record_instead(columns.layout.header, columns.layout.path)
+    ranks = {member: (not record_instead(columns.layout.header, columns.layout.path),
+                      _is_named(member, columns)) for member, columns in tables.items()}
+    return [member for member in tables if ranks[member] == max(ranks.values())]
 
 
 def _is_named(member: Member, columns: Chosen) -> bool:

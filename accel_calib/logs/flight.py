@@ -122,8 +122,7 @@ def read_ulg(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
     else:
         sensed = as_sensed(columns, parameters, autopilot, lambda: _correction(
             chosen, parameters, device, release), _PX4_ADVICE)
-    return choice.log('PX4 log', sensed, 'temperature of the sensor',
-                      (*notes, *invalid, *choice.others()))
+    return choice.log('PX4 log', sensed, 'temperature of the sensor', (*notes, *invalid))
 
 
 def _correction(chosen: Message, parameters: Parameters, device: int,
@@ -251,8 +250,7 @@ def read_dataflash(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
     sensed = as_sensed(columns, parameters, _autopilot(parameters, chosen.instance + 1),
                        lambda: ardupilot_correction(parameters, chosen.instance + 1),
                        _ARDUPILOT_ADVICE)
-    return choice.log('ArduPilot log', sensed, 'temperature T',
-                      (*notes, *dropped, *choice.others()))
+    return choice.log('ArduPilot log', sensed, 'temperature T', (*notes, *dropped))
 
 
 def _ardupilot_messages(tables: Mapping[str, _Table]) -> list[Message]:

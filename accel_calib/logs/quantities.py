@@ -141,11 +141,9 @@ class Quantities:
                 columns[key] = np.array(self.chosen.texts(cells, 'label'), dtype=str)
             elif key == 'time':
                 columns[key] = self.clock.continued(cells)
-            elif len(column.names) == 1:
-                columns[key] = self._scaled(cells, key)
             else:
-                columns[key] = np.column_stack([self._scaled(cells, name)
-                                                for name in column.names])
+                parts = [self._scaled(cells, name) for name in column.names]
+                columns[key] = np.column_stack(parts) if len(parts) > 1 else parts[0]
         columns |= {key: cells.numbers[:, self.chosen.numeric.index(k)]
                     for key, k in self.chosen.quantities.items()}
         if self.rate_hz is not None:
