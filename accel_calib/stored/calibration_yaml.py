@@ -354,6 +354,8 @@ def _values(effect: Effect, stated: Mapping[str, Any]) -> Floats:
         if key not in (*effect.values, 'what', 'unit', *(('own_rms',) if effect.own else ())):
             raise ValueError(f'the key {shown(key)} of an effect is not known, expected one of '
                              f'{", ".join(effect.values)}')
+    if effect.own:
+        number_at(stated, 'own_rms')  # `_check_own` compares it
     known = {**dict(zip(effect.shape, effect.usual)), **stated}
     return np.array([number_at(known, part, LARGEST) for part in effect.values])
 
