@@ -4,21 +4,19 @@
 """
 Stored calibrations, and typical values of a fleet: readable, versioned YAML.
 
-`calibration_bytes` and `calibration_from` convert between records and the content of files. Only
-`write_calibration` and `read_calibration` access the disk. The reader bounds size and nesting
-(`.plain_yaml`) and checks every value, and the calibration then passes the same gate as a fit
-(`accel_calib.calibrate.gate`). The last line of a file is a checksum of the text before it; it
-reveals a file that was edited by hand.
+The reader bounds size and nesting (`.plain_yaml`) and checks every value, and the calibration then
+passes the same gate as a fit (`accel_calib.calibrate.gate`). The last line of a file is a checksum
+of the text before it; it reveals a file that was edited by hand.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields, replace
 import hashlib
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, get_args, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +44,8 @@ try:  # eight times as fast, but not in every build of PyYAML
     from yaml import CSafeDumper as SafeDumper
 except ImportError:
     from yaml import SafeDumper  # type: ignore[assignment]
+
+T = TypeVar('T')
 
 _VERSION = 3
 """The only version that is read; earlier ones were never released."""
@@ -309,7 +309,6 @@ def _damaged(name: str, what: str) -> DamagedCalibrationError:
 
 
 def _calibration(content: Mapping[str, Any]) -> Calibration:
-    """Return the record with the content of a file; raise ValueError for an unexpected value."""
     model = Model(_effects(value_at(content, 'effects', dict)),
                   array_at(content, 'rotation', (3, 3)))
     units, size = _units(value_at(content, 'units', dict)), int(np.sum(model.stated))
@@ -324,14 +323,21 @@ def _calibration(content: Mapping[str, Any]) -> Calibration:
         frame=choice_at(content, 'frame', FRAMES), date=name_at(content, 'date', _LONGEST_NAME),
         covariance=array_at(content, 'covariance', (size, size), finite=False, most=LARGEST),
         quality=_quality(value_at(content, 'quality', dict)),
-        poses=_poses(value_at(content, 'poses', dict), _autopilot(content)), rejected=rejected,
-        reason=value_at(content, 'reason', str),
+        poses=_poses(value_at(content, 'poses', dict), _optional(
+            content, 'autopilot', lambda stated: Autopilot(**stated))),
+        rejected=rejected, reason=value_at(content, 'reason', str),
         noted=tuple(map(_finding, values_at(content, 'findings', dict))),
-        gyro=_gyro_bias(content), noise=_sample_noise(content))
+        gyro=_optional(content, 'gyro_bias', _gyro_bias),
+        noise=_optional(content, 'noise', _sample_noise))
+
+
+def _optional(content: Mapping[str, Any], key: str, make: Callable[[dict[str, Any]], T]
+              ) -> T | None:
+    """Return the record made from a mapping that not every file has, or None."""
+    return None if content.get(key) is None else make(value_at(content, key, dict))
 
 
 def _units(stated: Mapping[str, Any]) -> Units:
-    """Return the unit of the readings; raise ValueError if 1 g in it is implausible."""
     name, per_g = choice_at(stated, 'readings', UNIT_NAMES), number_at(stated, 'per_g')
     low, high = _PER_G[name]
     if not low <= per_g <= high:
@@ -374,11 +380,7 @@ def _finding(stated: Mapping[str, Any]) -> Finding:
                    value_at(stated, 'advice', str), choice_at(stated, 'level', LEVELS), rows)
 
 
-def _gyro_bias(content: Mapping[str, Any]) -> GyroBias | None:
-    """Return the gyro bias; None for files without it."""
-    if content.get('gyro_bias') is None:
-        return None
-    stated = value_at(content, 'gyro_bias', dict)
+def _gyro_bias(stated: Mapping[str, Any]) -> GyroBias:
     bias, sd, slope = (array_at(stated, key, (3,)) for key in ('bias', 'sd', 'slope'))
     temperature = np.nan if stated['temperature'] is None else number_at(stated, 'temperature')
     limits = array_at(stated, 'temperatures', (len(value_at(stated, 'temperatures', list)),))
@@ -386,11 +388,7 @@ def _gyro_bias(content: Mapping[str, Any]) -> GyroBias | None:
                     tuple(limits.tolist()))
 
 
-def _sample_noise(content: Mapping[str, Any]) -> SampleNoise | None:
-    """Return the noise of a sample; None for files without it."""
-    if content.get('noise') is None:
-        return None
-    stated = value_at(content, 'noise', dict)
+def _sample_noise(stated: Mapping[str, Any]) -> SampleNoise:
     return SampleNoise(*(array_at(stated, key, (3,), finite=False) for key in ('force', 'rate')))
 
 
@@ -408,13 +406,6 @@ def _poses(stated: Mapping[str, Any], autopilot: Autopilot | None) -> Poses:
         columns[key] = array_at(stated['quantities'], key, (len(rows),))
     check_values(columns, 'poses')
     return Poses(columns, rows, autopilot=autopilot)
-
-
-def _autopilot(content: Mapping[str, Any]) -> Autopilot | None:
-    """Return the place in an autopilot; None for readings that are not from a flight log."""
-    if content.get('autopilot') is None:
-        return None
-    return Autopilot(**value_at(content, 'autopilot', dict))
 
 
 def _labels(stated: Mapping[str, Any]) -> NDArray[Any]:
@@ -522,7 +513,6 @@ def read_prior(path: Path, model: str = '') -> FleetPrior:
 
 
 def _fleet_of(content: Mapping[str, Any]) -> FleetPrior:
-    """Return typical values from their mapping; raise ValueError if they are not sound."""
     size = len(_PRIOR_NAMES)
     if tuple(content['names']) != _PRIOR_NAMES:
         raise ValueError(f'names are {content["names"]}, expected {list(_PRIOR_NAMES)}')

@@ -78,9 +78,10 @@ Parameters = dict[str, float]
 """Parameters of a firmware by name; whole numbers are of type int."""
 
 
-def _fit_by_axis(calibration: Calibration, reference: float | None = None) -> ByAxis:
+def _fit_by_axis(calibration: Calibration, options: Options, reference: float | None = None
+                 ) -> ByAxis:
     """
-    Return the correction by axis that is nearest to a calibration in m/s².
+    Return the correction by axis that is nearest to a calibration in m/s², in the firmware's axes.
 
     Without a reference, the temperature of the polynomial is the middle of the range [°C].
 
@@ -101,6 +102,7 @@ def _fit_by_axis(calibration: Calibration, reference: float | None = None) -> By
     for axis in range(3):  # from a polynomial in s to one in T - reference
         parts = Polynomial(offset[:, axis])(inner).coef
         shifted[:len(parts), axis] = parts
+    shifted *= _signs(options)
     return ByAxis(shifted[0], scale, shifted[1:], reference, (low, high))
 
 
@@ -118,7 +120,7 @@ def _make_px4(calibration: Calibration, options: Options) -> Made:
     place, options = _place(calibration, options, 'px4')
     instance = _instance(options, _PX4_INSTANCES, 'PX4')
     metric = _in_metric(calibration, 'PX4')
-    found = _turned(_fit_by_axis(metric), options)
+    found = _fit_by_axis(metric, options)
     prefix = f'CAL_ACC{instance}_'
     thermal = f'TC_A{instance if place.thermal is None else place.thermal}_'
     rows = {**_device(options, prefix), **_three(prefix, 'OFF', found.offset),
@@ -147,7 +149,7 @@ def _make_ardupilot(calibration: Calibration, options: Options) -> Made:
     place, options = _place(calibration, options, 'ardupilot')
     instance = _instance(options, _ARDUPILOT_INSTANCES, 'ArduPilot')
     metric = _in_metric(calibration, 'ArduPilot')
-    found = _turned(_fit_by_axis(metric, ARDUPILOT_REFERENCE), options)
+    found = _fit_by_axis(metric, options, ARDUPILOT_REFERENCE)
     prefix = f'INS_ACC{"" if instance == 1 else instance}'
     # The firmware adds the polynomial at CALTEMP, so that it is zero there.
     offset = found.offset + found.moved(ARDUPILOT_REFERENCE)
@@ -241,12 +243,6 @@ def _instance(options: Options, known: tuple[int, ...], label: str) -> int:
         raise InputError(f'--instance is {options.instance}, but {label} has accelerometers '
                          f'{known[0]} to {known[-1]}', 'use one of these numbers')
     return options.instance
-
-
-def _turned(found: ByAxis, options: Options) -> ByAxis:
-    """Return the correction of the same sensor in the axes of the firmware."""
-    signs = _signs(options)
-    return replace(found, offset=found.offset * signs, thermal=found.thermal * signs)
 
 
 def _signs(options: Options) -> Floats:

@@ -39,6 +39,7 @@ _DIRECTIONS = 100
 LEAST_LOSS_MG = 0.005
 """Smaller losses are not mentioned: rounding to single precision causes about 0.0001 mg."""
 
+TITLE = 'Calibration of an accelerometer, written by accel-calib export.'
 _LARGEST_TEXT = 200
 _TEMPERATURE_KEYS = ('temperature', 'temperature_of_offset', 'temperature_of_gain')
 _AXES = {'ros': 'x forward, y left, z up', 'ned': 'x north, y east, z down, read along gravity',
@@ -340,15 +341,9 @@ def about(calibration: Calibration) -> list[str]:
     return lines
 
 
-def head(calibration: Calibration) -> list[str]:
-    """Return the first lines of the comment on top of a file."""
-    return ['Calibration of an accelerometer, written by accel-calib export.',
-            *about(calibration)]
-
-
 def commented(calibration: Calibration, comment: Sequence[str], lines: Sequence[str]) -> str:
     """Return the text of a file with these lines, and a comment on top."""
-    above = [*head(calibration), *comment]
+    above = [TITLE, *about(calibration), *comment]
     return '\n'.join([*(f'# {line}' for line in above), *lines, ''])
 
 
