@@ -435,9 +435,14 @@ def read_calibration(path: Path) -> Calibration:
         If the file cannot be read.
 
     """
+    return calibration_from(_beginning_of(path), str(path))
+
+
+def _beginning_of(path: Path) -> bytes:
+    """Return the content of a regular file; of a file that is too large, one byte too many."""
     check_regular(path)
     with path.open('rb') as file:
-        return calibration_from(file.read(MOST_BYTES + 1), str(path))
+        return file.read(MOST_BYTES + 1)
 
 
 def write_calibration(path: Path, calibration: Calibration, *, keep_before: bool = True) -> None:
@@ -496,9 +501,12 @@ def read_prior(path: Path, model: str = '') -> FleetPrior:
 
     """
     try:
-        content = read_plain(path.read_text(encoding='utf-8'))
+        data = _beginning_of(path)
+        if len(data) > MOST_BYTES:
+            raise ValueError(f'it has more than {MOST_BYTES} bytes')
+        content = read_plain(data.decode())
         if content['format'] != _PRIORS:
-            raise InputError(f'{path} has format {content["format"]}, expected {_PRIORS}',
+            raise InputError(f'{path} has format {shown(content["format"])}, expected {_PRIORS}',
                              'update accel_calib, or make the file again')
         found = [_fleet_of(each) for each in values_at(content, 'models', dict)]
     except (KeyError, TypeError, ValueError, np.linalg.LinAlgError) as err:

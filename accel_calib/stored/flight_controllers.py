@@ -19,16 +19,12 @@ those of the vehicle; the log also states the place of the sensor in the paramet
 turn readings to x forward, y left, z up;
 ``axes='flu'`` turns them back by 180° about x, which changes the sign of the offsets of y and z.
 
-Sources: [1]_ PX4, [2]_ its temperature compensation, [3]_ ArduPilot, [4]_ its temperature
-calibration, [5]_ Betaflight, [6]_ the parameter file of QGroundControl.
+Sources beside the code of the firmware (the URLs below): temperature of PX4 [1]_ and of
+ArduPilot [2]_, and the parameter file of QGroundControl [3]_.
 
-.. [1] https://github.com/PX4/PX4-Autopilot/blob/main/src/lib/sensor_calibration/Accelerometer.hpp
-.. [2] https://docs.px4.io/main/en/advanced_config/sensor_thermal_calibration
-.. [3] https://github.com/ArduPilot/ardupilot/blob/master/libraries/AP_InertialSensor/
-   AP_InertialSensor_Backend.cpp
-.. [4] https://ardupilot.org/copter/docs/common-imutempcal.html
-.. [5] https://github.com/betaflight/betaflight/blob/master/src/main/sensors/acceleration.c
-.. [6] https://docs.qgroundcontrol.com/master/en/qgc-dev-guide/file_formats/parameters.html
+.. [1] https://docs.px4.io/main/en/advanced_config/sensor_thermal_calibration
+.. [2] https://ardupilot.org/copter/docs/common-imutempcal.html
+.. [3] https://docs.qgroundcontrol.com/master/en/qgc-dev-guide/file_formats/parameters.html
 
 """
 
