@@ -16,7 +16,7 @@ from accel_calib.logs import open_log, read_recording
 from accel_calib.messages import correct_bag
 from accel_calib.stored import write_calibration
 from bag_files import (
-    a_calibration, copied, COUNT, execute, MAKES, McapFile, messages, ros1, rosbag2, STORE, TOPICS)
+    a_calibration, copied, COUNT, execute, MAKES, McapFile, raw_messages, ros1, rosbag2, TOPICS)
 from faults.fuzz import ended, read_bag
 from faults.sample import sample
 import numpy as np
@@ -179,12 +179,13 @@ def test_lost_messages_are_noted(whole: dict[str, Path], calibration: Calibratio
 
 @pytest.mark.parametrize(('value', 'words'), [
     (1e300, r'Imu message 8 has the acceleration 1e\+300'),
-    (np.inf, 'Imu message 8 contains NaN or infinity')])
+    (np.inf, 'Imu message 8 contains NaN or infinity'),
+    (np.nan, 'Imu message 8 contains NaN or infinity')])
 def test_an_acceleration_beyond_any_sensor_is_refused(
         value: float, words: str, calibration: Calibration, tmp_path: Path) -> None:
-    made = [(topic, stamp, bytearray(STORE.serialize_cdr(each, TOPICS[topic][1])))
-            for topic, stamp, each in messages() if topic == 0]
-    made[7][2][-96:-88] = np.float64(value).tobytes()
+    made = [each for each in raw_messages() if each[0] == 0]
+    topic, stamp, raw = made[7]
+    made[7] = (topic, stamp, raw[:-96] + np.float64(value).tobytes() + raw[-88:])
     path = McapFile(TOPICS).write(tmp_path / 'bag.mcap', made)
     for work in (lambda: read_recording(path),
                  lambda: correct_bag(path, calibration, tmp_path / 'out')):
