@@ -12,11 +12,10 @@ import subprocess
 
 from accel_calib.calibrate import Calibration, GyroBias, Quality
 from accel_calib.errors import InputError
-from accel_calib.finding import has
 from accel_calib.units import Units, units_of
 from inside import (
     export, EXPORT_FORMATS, ExportOptions, format_calibration, identifier, Model, model_with,
-    parse_calibration, rotation_from_rpy, simulate_poses, spread_directions, terms_of)
+    rotation_from_rpy, simulate_poses, spread_directions, terms_of)
 import numpy as np
 import pytest
 from shared import run
@@ -448,21 +447,6 @@ def test_the_mounting_is_a_loss_where_a_format_does_not_hold_it():
         assert made.leaves_mg == pytest.approx(export(sensor_with(BY_AXIS), to).leaves_mg)
     for to in ('c', 'imu_calib', 'imucal', 'json'):
         assert export(levelled, to).losses == ()
-
-
-def test_a_stored_correction_that_was_edited_is_reported_and_not_used():
-    made = HEADERS['affine']
-    text = format_calibration(made)
-    first = repr(made.matrix.tolist()[0][0])
-    edited = text.replace(f'[{first},', '[1.5,', 1)
-    assert edited != text
-    found = parse_calibration(edited, 'c.yaml')
-    assert has(found.noted, 'correction_in_file')
-    np.testing.assert_array_equal(found.matrix, made.matrix)
-    again = parse_calibration(format_calibration(found), 'c.yaml')
-    assert not has(again.noted, 'correction_in_file')
-    changed = text.replace('residual', 'residual ', 1).replace('sensor: imu_link', 'sensor: other')
-    assert not has(parse_calibration(changed, 'c.yaml').noted, 'correction_in_file')
 
 
 @pytest.fixture
