@@ -14,7 +14,8 @@ import re
 
 from accel_calib.calibrate import Calibration, fit_poses, Rejected
 from accel_calib.effects import know, OwnEffect
-from accel_calib.errors import DamagedCalibrationError, InputError, StoredCalibrationError
+from accel_calib.errors import (
+    AccelCalibError, DamagedCalibrationError, InputError, StoredCalibrationError)
 from accel_calib.finding import has
 from accel_calib.stored import read_calibration, read_prior, write_calibration
 from accel_calib.units import units_of
@@ -97,7 +98,7 @@ def test_the_size_of_a_file_is_bounded_before_it_is_parsed(
     path = tmp_path / 'large.yaml'
     path.write_text(FIRST)
     os.truncate(path, 2**40)  # without blocks on the disk, and more than a memory holds
-    with pytest.raises(InputError, match=f'more than {MOST_BYTES} bytes'):
+    with pytest.raises(AccelCalibError, match=f'more than {MOST_BYTES} bytes'):
         read(path)
     os.mkfifo(tmp_path / 'pipe')
     with pytest.raises(InputError, match='is a pipe'):
