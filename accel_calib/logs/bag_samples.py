@@ -10,9 +10,9 @@ a voltage, such as std_msgs/Float32, sensor_msgs/BatteryState or a type of the u
 contains the definition of such a type, except for old db3 files. Topics that look like one of both
 quantities and are not used are reported.
 
-**Time.** Readings have the stamps of their headers. A message without a header, or with an unset
-stamp, has only the time at which the bag received it. The median difference of both times, over
-the first messages of the Imu, converts this time to that of the stamps.
+**Time.** Readings have the stamps of their headers. Other messages without a stamp of this clock
+have only the time at which the bag received them. The median difference of both times, over the
+first messages of the Imu, converts this time to that of the stamps.
 
 """
 
@@ -68,8 +68,7 @@ class Quantity:
 
     `fields` are names of fields that hold it, the best first, and `parts` are parts of the name of
     a topic or field that is likely to hold it. `units` are the name of a unit, its lowest and
-    highest plausible value, and factor and summand that convert it to the unit of the column; the
-    unit of the column comes first.
+    highest plausible value, and factor and summand that convert it to the first of them.
 
     """
 

@@ -25,9 +25,9 @@ The conventions for covariances are kept: a first element of -1 means no data, a
 unknown. A covariance that is not finite becomes unknown. The covariance of the calibration is
 added to a known covariance of the acceleration.
 
-**Single messages.** The result is the same as that of `corrected`, but computed with Python floats
-(`one_reading`); a test compares both. Covariances rarely change from message to message, so each
-covariance is transformed only once.
+**Single messages.** `Rewriter` has the result of `corrected`, but computes with Python floats
+(`one_reading`). Covariances rarely change from message to message, so that each is transformed
+only once.
 
 """
 
@@ -64,7 +64,7 @@ def output_scale(calibration: Calibration, gravity: float) -> float:
 def corrected(calibration: Calibration, doubles: Floats, context: Context | None = None,
               stream: ThermalStream | None = None, scale: float = 1.0) -> Floats:
     """
-    Return the corrected doubles of Imu messages, (n, 37).
+    Return the corrected doubles of Imu messages.
 
     Parameters
     ----------
@@ -104,12 +104,7 @@ def corrected(calibration: Calibration, doubles: Floats, context: Context | None
 
 
 def output_frame(calibration: Calibration, frame_id: str, chosen: str = '') -> str:
-    """
-    Return the frame_id of corrected messages, from that of the raw messages.
-
-    `chosen` is the name of the levelled frame; empty: ``<frame_id>_levelled``.
-
-    """
+    """Return the frame_id of corrected messages; `chosen` is that of the levelled frame."""
     return (chosen or f'{frame_id}_levelled') if calibration.is_levelled else frame_id
 
 
@@ -166,16 +161,12 @@ class Rewriter:
 
     Parameters
     ----------
-    layout : Layout
-        Layout of the messages.
-    calibration : Calibration
-        The calibration, in the unit of the readings.
-    scale : float
-        m/s² per unit of the corrected force.
-    gravity : float
-        Local gravity [m/s²].
+    layout, calibration
+        Layout of the messages, and the calibration in the unit of the readings.
+    scale, gravity : float
+        m/s² per unit of the corrected force, and local gravity [m/s²].
     frame_id : str
-        frame_id of the corrected messages.
+        frame_id of the corrected messages, whose layout is the attribute `layout`.
     noise : SampleNoise, optional
         Noise of the samples, stated in messages whose covariance is unknown.
     thermal : ThermalStream, optional
@@ -183,8 +174,6 @@ class Rewriter:
 
     Attributes
     ----------
-    layout : Layout
-        Layout of the corrected messages.
     bias : (float, float, float)
         Bias that is subtracted from the angular velocity [rad/s].
 
@@ -219,11 +208,10 @@ class Rewriter:
 
     def __call__(self, data: bytes, context: Mapping[str, float]) -> bytes | None:
         """
-        Return the corrected message with the layout ``self.layout``.
+        Return the corrected message; None for a reading that is not finite.
 
-        `context` has the known columns; it is another mapping if it has changed. A reading that is
-        not finite gives None. Missing context and a corrected force that is not plausible are an
-        InputError.
+        `context` is another mapping if it has changed. Missing context and a corrected force that
+        is not plausible are an InputError.
 
         """
         given = _WHOLE.unpack_from(data, self._given.begin)

@@ -439,7 +439,7 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def _beginning_of(path: Path) -> bytes:
-    """Return the content of a regular file; of a file that is too large, one byte too many."""
+    """Return the content of a regular file, with one byte too many if it is too large."""
     check_regular(path)
     with path.open('rb') as file:
         return file.read(MOST_BYTES + 1)

@@ -4,9 +4,7 @@
 """
 Exports of a calibration to the places where it is used, and the plan of poses as CSV.
 
-`FORMATS` is the list of formats and `export` makes the file of one of them. What a format does not
-hold is measured (`.made`) and returned with the file. `.c_header` and `.flight_controllers` make
-headers and parameters; the other files are made here:
+`.c_header` and `.flight_controllers` make headers and parameters; the other files are made here:
 
 ========= ================================================ ==================================
 format    equation                                         source
@@ -208,7 +206,6 @@ def _of_noise(calibration: Calibration, text: str, notes: tuple[str, ...]) -> Ma
 
 
 def _noise_number(value: float) -> str:
-    """Return a figure of the noise with more digits than it has meaning."""
     return _yaml_number(float(f'{value:.9g}'))
 
 
@@ -318,12 +315,10 @@ class Exported:
 
     @property
     def data(self) -> bytes:
-        """Return the content as bytes."""
         content = self.text_or_bytes
         return content.encode() if isinstance(content, str) else content
 
     def write(self, file: TextIO) -> None:
-        """Write the content to an open file."""
         file.buffer.write(self.data)
 
 

@@ -112,7 +112,6 @@ def _degree(calibration: Calibration) -> int:
 
 
 def _make_px4(calibration: Calibration, options: Options) -> Made:
-    """Return a parameter file of QGroundControl for PX4."""
     place, options = _place(calibration, options, 'px4')
     instance = _instance(options, _PX4_INSTANCES, 'PX4')
     metric = _in_metric(calibration, 'PX4')
@@ -141,7 +140,6 @@ def _make_px4(calibration: Calibration, options: Options) -> Made:
 
 
 def _make_ardupilot(calibration: Calibration, options: Options) -> Made:
-    """Return a parameter file of Mission Planner and MAVProxy for ArduPilot."""
     place, options = _place(calibration, options, 'ardupilot')
     instance = _instance(options, _ARDUPILOT_INSTANCES, 'ArduPilot')
     metric = _in_metric(calibration, 'ArduPilot')
@@ -197,7 +195,6 @@ def _made(text: str, found: ByAxis, metric: Calibration, calibration: Calibratio
 
 
 def _make_betaflight(calibration: Calibration, options: Options) -> Made:
-    """Return commands for Betaflight; raise InputError if a setting cannot hold an offset."""
     signs, per_g, units = _signs(options), _counts_per_g(calibration, options), calibration.units
     factor = 1.0 if units.is_native else per_g / (STANDARD_GRAVITY if units.is_si else 1.0)
     grid = steady_grid(calibration)
@@ -232,7 +229,6 @@ def _in_metric(calibration: Calibration, label: str) -> Calibration:
 
 
 def _instance(options: Options, known: tuple[int, ...], label: str) -> int:
-    """Return the number of the accelerometer; raise InputError if there is none with it."""
     if options.instance is None:
         return known[0]
     if options.instance not in known:

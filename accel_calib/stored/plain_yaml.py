@@ -74,7 +74,6 @@ def read_plain(text: str) -> Any:
 
 
 class _Reader:
-    """The events that are left, and the place in the content."""
 
     def __init__(self, events: Iterator[yaml.Event]) -> None:
         self._events = events
@@ -176,7 +175,6 @@ def value_at(content: Mapping[str, Any], key: str, kind: type[Kind]) -> Kind:
 
 
 def values_at(content: Mapping[str, Any], key: str, kind: type[Kind]) -> list[Kind]:
-    """Return the list of values of this type under a key."""
     return [_checked(each, f'{key} contains', kind) for each in value_at(content, key, list)]
 
 
@@ -240,7 +238,7 @@ def _number(value: Any) -> float | None:
 
 
 def shown(value: Any) -> str:
-    """Return a value as one short line for an error message."""
+    """Return a value as one short line."""
     if isinstance(value, dict):
         return 'a mapping'
     if isinstance(value, list):
