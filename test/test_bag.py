@@ -13,8 +13,8 @@ from accel_calib.logs import LogOptions, open_log, read_recording
 from accel_calib.messages import correct_bag
 from accel_calib.units import units_of
 from bag_files import (
-    a_calibration, header, IMU, imu, MAKES, McapFile, RATE_NS, rosbag2, START, STORE, STRING,
-    TEMPERATURE, write_bag)
+    a_calibration, check_refused, header, IMU, imu, MAKES, McapFile, RATE_NS, rosbag2, START,
+    STORE, STRING, TEMPERATURE, write_bag)
 from inside import (
     BLOCK_OF_A_BAG, rotation_from_rpy, ROWS_OF_A_BAG, simulate_recording, spread_directions)
 import numpy as np
@@ -222,15 +222,10 @@ def test_samples_are_those_that_rosbags_deserializes(make, topic, tmp_path):
 
 @pytest.mark.parametrize('names', [('imu', 'imb'), ('imu', 'a_much_longer_name'), ('', 'imu')])
 @pytest.mark.parametrize('make', ['mcap', 'sqlite3'])
-def test_messages_of_another_sensor_are_refused_until_one_is_chosen(make, names, calibration,
-                                                                    tmp_path):
+def test_messages_of_another_sensor_are_refused_until_one_is_chosen(make, names, tmp_path):
     path = write(tmp_path, make, messages(20, frame_ids=names * 50 + names[1:] * 100))
-    message = f"/imu/a: message 2 is from the sensor '{names[1]}', expected '{names[0]}' as before"
-    with pytest.raises(InputError, match=message):
-        read_recording(path, '/imu/a')
-    with pytest.raises(InputError, match=message):
-        correct_bag(path, calibration, tmp_path / 'out', '/imu/a')
-    assert [item.name for item in tmp_path.iterdir()] == [path.name]
+    check_refused(path, f"/imu/a: message 2 is from the sensor '{names[1]}', "
+                  f"expected '{names[0]}' as before", '/imu/a')
     found = read_recording(path, '/imu/a', names[1])
     assert (len(found), found.sensor) == (150, names[1])
     whole = deserialized(path)
@@ -293,29 +288,20 @@ def test_a_file_becomes_a_file_or_a_folder_with_the_metadata_of_its_messages(
     lambda raw: b'', lambda raw: raw[:100], lambda raw: raw[:-8], lambda raw: raw + bytes(8),
     lambda raw: raw[:12] + b'\xff' * 4 + raw[16:], lambda raw: b'\x00\x03' + raw[2:]],
     ids=['empty', 'short', 'a double less', 'a double more', 'long frame_id', 'parameter list'])
-def test_a_damaged_message_is_reported_in_one_line(make, spoil, calibration, tmp_path):
+def test_a_damaged_message_is_reported_in_one_line(make, spoil, tmp_path):
     made = list(messages(9))
     which = [k for k, (channel, _, _) in enumerate(made) if channel == 0][100]
     broken = spoil(made[which][2])
     made[which] = (0, made[which][1], broken)
     path = write(tmp_path, make, made)
-    message = f'/imu/a: message 101 of {len(broken)} bytes is damaged'
-    with pytest.raises(InputError, match=message) as refusal:
-        read_recording(path, '/imu/a')
-    assert '\n' not in str(refusal.value)
-    with pytest.raises(InputError, match=message):
-        correct_bag(path, calibration, tmp_path / 'out', '/imu/a')
-    assert [item.name for item in tmp_path.iterdir()] == [path.name]
+    check_refused(path, f'/imu/a: message 101 of {len(broken)} bytes is damaged', '/imu/a')
     assert len(read_recording(path, '/imu/b')) == COUNT
 
 
 @pytest.mark.parametrize('make', ['mcap', 'sqlite3'])
-def test_a_topic_without_messages_is_reported_in_one_line(make, tmp_path, calibration):
+def test_a_topic_without_messages_is_reported_in_one_line(make, tmp_path):
     path = write(tmp_path, make, [each for each in messages(11) if each[0]])
-    with pytest.raises(InputError, match='has no message on /imu/a'):
-        read_recording(path, '/imu/a')
-    with pytest.raises(InputError, match='has no message on /imu/a'):
-        correct_bag(path, calibration, tmp_path / 'out', '/imu/a')
+    check_refused(path, 'has no message on /imu/a', '/imu/a')
 
 
 def test_poses_do_not_depend_on_the_size_of_blocks(recording, tmp_path, monkeypatch):

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -59,15 +59,8 @@ def message(store: Any, msgtype: str, stamp: int, value: Any) -> Any:
 
 
 def write(folder: Path, topics: Mapping[str, tuple[str, Values]], kind: str = 'mcap', *,
-          stamped: int = RECEIVED, own_stamp: int | None = None,
-          force: Sequence[float] = (0.1, -0.2, 9.8)) -> Path:
-    """
-    Write a bag of 4 s with an Imu and other topics.
-
-    `stamped` is the first stamp of the Imu, `own_stamp` that of the others [ns], and `force` the
-    acceleration.
-
-    """
+          stamped: int = RECEIVED, own_stamp: int | None = None) -> Path:
+    """Write a bag of 4 s with an Imu and other topics, and their first stamps [ns]."""
     path = folder / ('in.bag' if kind == 'bag' else 'in')
     writer, store = writer_of(path, kind)
     store.register(get_types_from_msg(OWN_DEFINITION, OWN))
@@ -75,7 +68,7 @@ def write(folder: Path, topics: Mapping[str, tuple[str, Values]], kind: str = 'm
     def made() -> Iterator[tuple[int, int, Any]]:
         for k in range(COUNT):
             at = k * STEP
-            yield 0, RECEIVED + at, imu(store, header(store, stamped + at), force)
+            yield 0, RECEIVED + at, imu(store, header(store, stamped + at), (0.1, -0.2, 9.8))
             for topic, (msgtype, value) in enumerate(topics.values(), 1) if k % 10 == 0 else ():
                 stamp = (stamped if own_stamp is None else own_stamp) + at
                 yield topic, RECEIVED + at, message(store, msgtype, stamp, value(at * 1e-9))
@@ -251,18 +244,9 @@ def test_a_bag_is_corrected_with_a_named_temperature(
     assert 'corrected 400 samples' in capsys.readouterr().out
 
 
-def test_a_calibration_in_g_without_temperature_corrects_a_bag_in_m_s2_and_refuses_one_in_g(
-        calibration_in_g: Calibration, tmp_path: Path) -> None:
+def test_a_calibration_without_temperature_needs_no_topic(calibration_in_g: Calibration,
+                                                          tmp_path: Path) -> None:
     path = write(tmp_path, {'/imu/temp': ('std_msgs/msg/Float64', warming)})
     notes: list[str] = []
     assert correct_bag(path, calibration_in_g, tmp_path / 'out', note=notes.append) == COUNT
     assert notes == []
-    raw, found = read(path)[0], read(tmp_path / 'out')[0]
-    np.testing.assert_allclose(
-        found.reading, calibration_in_g.correct(raw.reading / 9.80665) * 9.80665, rtol=1e-12)
-    (tmp_path / 'g').mkdir()
-    wrong = write(tmp_path / 'g', {}, force=(0.01, -0.02, 1.0))
-    with pytest.raises(InputError, match='the length of the readings is about 1, expected about '
-                                         '9.807 at rest in m/s2'):
-        correct_bag(wrong, calibration_in_g, tmp_path / 'out2')
-    assert not (tmp_path / 'out2').exists()

@@ -16,7 +16,8 @@ from accel_calib.logs import open_log, read_recording
 from accel_calib.messages import correct_bag
 from accel_calib.stored import write_calibration
 from bag_files import (
-    a_calibration, copied, COUNT, execute, MAKES, McapFile, raw_messages, ros1, rosbag2, TOPICS)
+    a_calibration, by_hand, check_refused, copied, COUNT, execute, MAKES, raw_messages, ros1,
+    rosbag2)
 from faults.fuzz import ended, read_bag
 from faults.sample import sample
 import numpy as np
@@ -79,40 +80,42 @@ def test_a_cell_of_another_type_is_named(column: str, cell: Any, words: str,
         read_recording(path)
 
 
+def read(path: Path) -> tuple[int, tuple[str, ...]]:
+    """Return the number of samples in a bag, and the notes."""
+    with open_log(path) as opened:
+        return sum(map(len, opened.blocks)), opened.notes
+
+
+def killed(path: Path, folder: Path, *statements: str) -> Path:
+    """Return a copy of a bag as a recorder leaves it that is killed after these statements."""
+    database = sqlite3.connect(copied(path, folder / 'recorded') / 'bag.db3', isolation_level=None)
+    for each in statements:
+        database.execute(each)
+    copy = Path(shutil.copytree(folder / 'recorded' / path.name, folder / 'bag'))
+    database.close()
+    return copy
+
+
 def test_the_messages_in_the_journal_of_a_killed_recorder_are_read(
         whole: dict[str, Path], calibration: Calibration, tmp_path: Path) -> None:
-    (tmp_path / 'recorded').mkdir()
-    path = copied(whole['sqlite3'], tmp_path / 'recorded')
-    database = sqlite3.connect(path / 'bag.db3')
-    database.execute('PRAGMA journal_mode = WAL')
-    database.execute('PRAGMA wal_autocheckpoint = 0')
-    database.execute('INSERT INTO messages SELECT id + 1000, topic_id, timestamp + ?, data '
-                     'FROM messages WHERE topic_id = 1', (10 ** 9,))
-    database.commit()
-    killed = Path(shutil.copytree(path, tmp_path / 'bag'))
-    database.close()
-    (killed / 'bag.db3-shm').unlink()
-    before = {each.name: each.read_bytes() for each in killed.iterdir()}
-    for each in (killed, killed / 'bag.db3'):
-        with open_log(each) as opened:
-            assert sum(map(len, opened.blocks)) == 2 * COUNT
-            assert 'its last messages are read from bag.db3-wal' in opened.notes[0]
-    assert correct_bag(killed, calibration, tmp_path / 'out') == 2 * COUNT
-    assert {each.name: each.read_bytes() for each in killed.iterdir()} == before
+    path = killed(whole['sqlite3'], tmp_path, 'PRAGMA journal_mode = WAL',
+                  'PRAGMA wal_autocheckpoint = 0', 'INSERT INTO messages SELECT id + 1000, '
+                  'topic_id, timestamp + 1000000000, data FROM messages WHERE topic_id = 1')
+    (path / 'bag.db3-shm').unlink()
+    before = {each.name: each.read_bytes() for each in path.iterdir()}
+    for each in (path, path / 'bag.db3'):
+        count, notes = read(each)
+        assert count == 2 * COUNT
+        assert 'its last messages are read from bag.db3-wal' in notes[0]
+    assert correct_bag(path, calibration, tmp_path / 'out') == 2 * COUNT
+    assert {each.name: each.read_bytes() for each in path.iterdir()} == before
 
 
 def test_an_interrupted_transaction_is_undone(whole: dict[str, Path], tmp_path: Path) -> None:
-    (tmp_path / 'recorded').mkdir()
-    path = copied(whole['sqlite3'], tmp_path / 'recorded')
-    database = sqlite3.connect(path / 'bag.db3', isolation_level=None)
-    database.execute('PRAGMA cache_size = 1')
-    database.execute('BEGIN')
-    database.execute("UPDATE messages SET data = x'00'")
-    killed = Path(shutil.copytree(path, tmp_path / 'bag'))
-    database.execute('ROLLBACK')
-    database.close()
-    assert (killed / 'bag.db3-journal').stat().st_size
-    assert len(read_recording(killed)) == COUNT
+    path = killed(whole['sqlite3'], tmp_path, 'PRAGMA cache_size = 1', 'BEGIN',
+                  "UPDATE messages SET data = x'00'")
+    assert (path / 'bag.db3-journal').stat().st_size
+    assert len(read_recording(path)) == COUNT
 
 
 @pytest.mark.parametrize('name', ['run #1', 'what?', '100%20'])
@@ -135,19 +138,17 @@ def test_a_damaged_journal_ends_in_one_line_or_in_a_result(
 def test_a_folder_without_metadata_is_read(whole: dict[str, Path], tmp_path: Path) -> None:
     path = copied(whole['mcap folder'], tmp_path)
     (path / 'metadata.yaml').unlink()
-    with open_log(path) as opened:
-        assert sum(map(len, opened.blocks)) == COUNT
-    assert opened.notes == (f'{path} has no metadata.yaml, as after a recorder was killed; '
-                            'bag.mcap is read without it',)
+    assert read(path) == (COUNT, (f'{path} has no metadata.yaml, as after a recorder was killed; '
+                                  'bag.mcap is read without it',))
 
 
 def test_a_file_that_the_metadata_do_not_list_is_noted(whole: dict[str, Path],
                                                        tmp_path: Path) -> None:
     path = copied(whole['mcap folder'], tmp_path)
     shutil.copy(path / 'bag.mcap', path / 'later.mcap')
-    with open_log(path) as opened:
-        assert sum(map(len, opened.blocks)) == COUNT
-    assert 'does not list file later.mcap' in opened.notes[0]
+    count, notes = read(path)
+    assert count == COUNT
+    assert 'does not list file later.mcap' in notes[0]
 
 
 def test_damaged_metadata_print_nothing(whole: dict[str, Path], tmp_path: Path,
@@ -157,8 +158,7 @@ def test_damaged_metadata_print_nothing(whole: dict[str, Path], tmp_path: Path,
     text = metadata.read_text()
     assert text.count('message_count: ') > 1
     metadata.write_text(text.replace('message_count: ', 'message_count: &a '))
-    with open_log(path) as opened:
-        assert sum(map(len, opened.blocks)) == COUNT
+    assert read(path)[0] == COUNT
     assert not [str(each.message) for each in recwarn]
 
 
@@ -166,15 +166,13 @@ def test_lost_messages_are_noted(whole: dict[str, Path], calibration: Calibratio
                                  tmp_path: Path) -> None:
     path = copied(whole['sqlite3'], tmp_path)
     execute(path / 'bag.db3', 'DELETE FROM messages WHERE rowid % 2')
-    with open_log(path) as opened:
-        found = sum(map(len, opened.blocks))
+    found, said = read(path)
     assert 0 < found < COUNT
-    expected = (f'{COUNT - found} of {COUNT} messages on /imu are lost: the index of {path} '
-                'states them, but they are not in the bag')
-    assert opened.notes == (expected,)
+    assert said == (f'{COUNT - found} of {COUNT} messages on /imu are lost: the index of {path} '
+                    'states them, but they are not in the bag',)
     notes: list[str] = []
     assert correct_bag(path, calibration, tmp_path / 'out', note=notes.append) == found
-    assert notes == [expected]
+    assert notes == [*said]
 
 
 @pytest.mark.parametrize(('value', 'words'), [
@@ -182,15 +180,11 @@ def test_lost_messages_are_noted(whole: dict[str, Path], calibration: Calibratio
     (np.inf, 'Imu message 8 contains NaN or infinity'),
     (np.nan, 'Imu message 8 contains NaN or infinity')])
 def test_an_acceleration_beyond_any_sensor_is_refused(
-        value: float, words: str, calibration: Calibration, tmp_path: Path) -> None:
+        value: float, words: str, tmp_path: Path) -> None:
     made = [each for each in raw_messages() if each[0] == 0]
     topic, stamp, raw = made[7]
     made[7] = (topic, stamp, raw[:-96] + np.float64(value).tobytes() + raw[-88:])
-    path = McapFile(TOPICS).write(tmp_path / 'bag.mcap', made)
-    for work in (lambda: read_recording(path),
-                 lambda: correct_bag(path, calibration, tmp_path / 'out')):
-        with pytest.raises(InputError, match=words):
-            work()
+    check_refused(by_hand()(tmp_path, made=made), words)
 
 
 @pytest.mark.parametrize('size_kb', [8, 24])
