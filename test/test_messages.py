@@ -54,9 +54,9 @@ CASES = {
     'lag': LAGS}
 
 
-def calibration_of(effects, *, unit='m/s2', turned=False, seed=1):
+def calibration_of(effects, *, unit='m/s2', turned=False):
     """Return a linear fit with these effects, and a covariance of all values."""
-    rng, units = np.random.default_rng(seed), units_of(unit)
+    rng, units = np.random.default_rng(1), units_of(unit)
     poses = simulate_poses(sensor(rng), spread_directions(20), rng)
     poses = poses.with_columns(reading=units.from_g(poses.reading), std=units.from_g(poses['std']))
     fitted = fit_poses(poses, units, model='10')
@@ -350,15 +350,24 @@ SHAPES = {'start': 1000.0, 'tau': 1800.0, 'instant': 3000.0, 'lag': 0.0, 'of_sen
 SIZES = {'g/h': 1.0, 'm': 0.1, 'g': 0.01, '1/°C': 1e-3, 'g/°C': 1e-3}
 
 
-def values_of(*names, seed=1):
+def values_of(*names):
     """Return random values of effects."""
-    rng, effects = np.random.default_rng(seed), {name: EFFECTS[name] for name in names}
+    rng, effects = np.random.default_rng(1), {name: EFFECTS[name] for name in names}
     return {name: [*rng.normal(size=len(effect.parameters)) * SIZES.get(effect.unit, 0.003),
                    *(SHAPES[part] for part in effect.shape)] for name, effect in effects.items()}
 
 
-def check(calibration, scale):
-    """Compare forces and covariances of one reading with those of arrays, at 0.1 to 3 g."""
+def several(seed):
+    return tuple(np.random.default_rng(seed).choice(OTHERS, size=4, replace=False))
+
+
+@pytest.mark.parametrize(('names', 'unit', 'scale', 'turned'), [
+    *(((), *each, turned) for each in (('m/s2', 1.0), ('g', 9.80665), ('native', 9.81))
+      for turned in (False, True)),
+    *(((name,), 'm/s2', 1.0, True) for name in OTHERS),
+    *((several(seed), 'g', 9.80665, True) for seed in range(5))])
+def test_one_reading_and_its_covariance_are_corrected_as_arrays_are(names, unit, scale, turned):
+    calibration = calibration_of(values_of(*names), unit=unit, turned=turned)
     here = OneReading(calibration, scale).at(KNOWN)
     known, rng = {key: np.array([value]) for key, value in KNOWN.items()}, np.random.default_rng(5)
     for reading in random_directions(20, rng) * rng.uniform(0.1, 3.0, (20, 1)):
@@ -371,23 +380,6 @@ def check(calibration, scale):
         np.testing.assert_allclose(np.reshape(spreads[0], (3, 3)), expected, rtol=1e-9,
                                    atol=1e-18)
         np.testing.assert_allclose(np.subtract(*spreads), -np.array(OWN), atol=1e-18)
-
-
-@pytest.mark.parametrize('turned', [False, True])
-@pytest.mark.parametrize(('unit', 'scale'), [('m/s2', 1.0), ('g', 9.80665), ('native', 9.81)])
-def test_one_reading_of_a_linear_calibration_is_corrected_as_arrays_are(unit, scale, turned):
-    check(calibration_of({}, unit=unit, turned=turned), scale)
-
-
-@pytest.mark.parametrize('name', OTHERS)
-def test_one_reading_is_corrected_as_arrays_are_for_each_effect(name):
-    check(calibration_of(values_of(name), turned=True), 1.0)
-
-
-@pytest.mark.parametrize('seed', range(5))
-def test_one_reading_is_corrected_as_arrays_are_for_several_effects(seed):
-    names = np.random.default_rng(seed).choice(OTHERS, size=4, replace=False)
-    check(calibration_of(values_of(*names, seed=seed), unit='g', turned=True, seed=seed), 9.80665)
 
 
 def test_acting_temperature_is_limited_to_its_range_at_the_poses():

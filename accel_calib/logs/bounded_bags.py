@@ -174,11 +174,12 @@ class _Mcap(storage_mcap.McapReader):
 
     def open(self) -> None:  # noqa: A003
         super().open()
-        with ExitStack() as stack:
-            stack.callback(self.close)
+        try:
             _check_places(self.chunks)
             _check_together(self.chunks)
-            stack.pop_all()
+        except ValueError:
+            self.close()
+            raise
 
 
 def _check_places(chunks: Sequence[storage_mcap.ChunkInfo]) -> None:
