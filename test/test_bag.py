@@ -233,25 +233,21 @@ def test_messages_of_another_sensor_are_refused_until_one_is_chosen(make, names,
 
 
 @pytest.mark.parametrize('make', ['mcap', 'sqlite3'])
-def test_big_endian_messages_are_read_and_corrected(make, tmp_path, calibration):
+def test_big_endian_messages_are_read_and_corrected(make, tmp_path):
     path = write(tmp_path, make, messages(2, little_endian=False))
     found = read_recording(path, '/imu/a')
     expected = deserialized(path)
     np.testing.assert_array_equal(np.column_stack([found['time'], found['rate'], found.reading]),
                                   expected)
-    correct_bag(path, calibration, tmp_path / 'out', '/imu/a')
+    correct_bag(path, a_calibration(), tmp_path / 'out', '/imu/a')
     np.testing.assert_allclose(deserialized(tmp_path / 'out')[:, 4:],
-                               calibration.correct(expected[:, 4:]), atol=1e-12)
-
-
-@pytest.fixture(scope='module')
-def calibration():
-    return a_calibration()
+                               a_calibration().correct(expected[:, 4:]), atol=1e-12)
 
 
 @pytest.mark.parametrize(('make', 'turned'), [
     *((make, True) for make in KINDS), ('mcap zstd', False), ('sqlite3', False)])
-def test_a_corrected_bag_keeps_all_other_content(make, turned, calibration, tmp_path):
+def test_a_corrected_bag_keeps_all_other_content(make, turned, tmp_path):
+    calibration = a_calibration()
     if turned:
         model = replace(calibration.model, rotation=rotation_from_rpy(0.2, -0.4, 1.0))
         calibration = replace(calibration, model=model)
@@ -267,12 +263,12 @@ def test_a_corrected_bag_keeps_all_other_content(make, turned, calibration, tmp_
 
 @pytest.mark.parametrize('plugin', StoragePlugin)
 def test_a_file_becomes_a_file_or_a_folder_with_the_metadata_of_its_messages(
-        plugin, calibration, tmp_path):
+        plugin, tmp_path):
     path = rosbag2(plugin)(tmp_path, TOPICS, messages(7))
     file = next(item for item in path.iterdir() if item.suffix != '.yaml')
-    correct_bag(file, calibration, tmp_path / f'out{file.suffix}', '/imu/a')
+    correct_bag(file, a_calibration(), tmp_path / f'out{file.suffix}', '/imu/a')
     assert (tmp_path / f'out{file.suffix}').is_file()
-    correct_bag(file, calibration, tmp_path / 'out', '/imu/a')
+    correct_bag(file, a_calibration(), tmp_path / 'out', '/imu/a')
     expected, found = (yaml.safe_load((folder / 'metadata.yaml').read_text())[
         'rosbag2_bagfile_information'] for folder in (path, tmp_path / 'out'))
     for about in (expected, found):

@@ -148,11 +148,17 @@ _PER_MESSAGE = {'time', 'rate'}
 
 
 class _Seen(NamedTuple):
-    """A covariance as given, whether its quantity is in the message, and the corrected one."""
+    """
+    A covariance as given, whether its quantity is in the message, and the corrected one.
+
+    `turned` has the numbers of the corrected one; None if it is not known.
+
+    """
 
     given: bytes
     present: bool
     new: bytes
+    turned: list[float] | None
 
 
 class Rewriter:
@@ -202,9 +208,7 @@ class Rewriter:
         self._name = self.layout.name + bytes(self.layout.begin - self.layout.name_end)
         self._fill_force = _UNKNOWN if noise is None else _diagonal(noise.force)
         self._fill_rate = _UNKNOWN if noise is None else _diagonal(noise.rate)
-        self._seen_force = self._new_force = b''
-        self._own: list[float] | None = None
-        self._seen_rate = self._seen_orientation = _Seen(b'', True, b'')
+        self._seen_force = self._seen_rate = self._seen_orientation = _Seen(b'', True, b'', None)
 
     def __call__(self, data: bytes, context: Mapping[str, float]) -> bytes | None:
         """
@@ -227,22 +231,22 @@ class Rewriter:
         if not (-largest < a < largest and -largest < b < largest and -largest < c < largest):
             raise _implausible(force)
         covariance = data[self._force_spread:]
-        if covariance != self._seen_force:
-            self._see_force(covariance)
-        before = self._before(data, given)
-        if self._own is None:
-            return before + THREE.pack(a, b, c) + self._new_force
-        return before + _FORCE.pack(a, b, c, *at.with_spread(force, self._own))
+        if covariance != self._seen_force.given:
+            self._seen_force = _seen(self._inverse, covariance, self._fill_force)
+        before, own = self._before(data, given), self._seen_force.turned
+        if own is None:
+            return before + THREE.pack(a, b, c) + self._seen_force.new
+        return before + _FORCE.pack(a, b, c, *at.with_spread(force, own))
 
     def _before(self, data: bytes, given: tuple[Any, ...]) -> bytes:
         """Return the message before the acceleration."""
         x, y, z, w, orientation_spread, p, q, r, rate_spread = given[:9]
         if rate_spread != self._seen_rate.given:
-            self._seen_rate = self._seen(rate_spread, self._fill_rate)
+            self._seen_rate = _seen(self._turn, rate_spread, self._fill_rate)
         if orientation_spread != self._seen_orientation.given:
-            self._seen_orientation = self._seen(orientation_spread, _UNKNOWN)
-        _, has_rate, new_rate = self._seen_rate
-        _, has_orientation, new_orientation = self._seen_orientation
+            self._seen_orientation = _seen(self._turn, orientation_spread, _UNKNOWN)
+        _, has_rate, new_rate, _ = self._seen_rate
+        _, has_orientation, new_orientation, _ = self._seen_orientation
         u, v, t = self.bias
         if not (self._turns or u or v or t or new_rate != rate_spread
                 or new_orientation != orientation_spread):
@@ -282,20 +286,6 @@ class Rewriter:
         self._at = self._calibration.at(known)
         return self._at
 
-    def _see_force(self, covariance: bytes) -> None:
-        """Cache the transformed covariance of the acceleration."""
-        self._seen_force = covariance
-        self._own = _transformed(self._inverse, covariance, self._fill_force)
-        self._new_force = covariance if covariance[:8] == _ABSENT else _UNKNOWN
-
-    def _seen(self, covariance: bytes, fill: bytes) -> _Seen:
-        """Return a covariance of rate or orientation with that in the new axes."""
-        present = covariance[:8] != _ABSENT
-        turned = _transformed(np.reshape(self._turn, (3, 3)), covariance, fill)
-        if turned is not None:
-            return _Seen(covariance, present, NINE.pack(*turned))
-        return _Seen(covariance, present, _UNKNOWN if present else covariance)
-
 
 def _implausible(force: Triple) -> InputError:
     words = ', '.join(f'{part:.3g}' for part in force)
@@ -310,14 +300,16 @@ def _diagonal(deviation: Floats) -> bytes:
     return np.diag(np.square(deviation)).astype('<f8').tobytes()
 
 
-def _transformed(matrix: Floats, covariance: bytes, fill: bytes) -> list[float] | None:
-    """Return A C Aᵀ, with `fill` for an unknown covariance; None if it is not known then."""
-    for candidate in (covariance, fill) if covariance[:8] != _ABSENT else ():
+def _seen(matrix: Any, covariance: bytes, fill: bytes) -> _Seen:
+    """Return a covariance C with A C Aᵀ, and `fill` in place of an unknown C."""
+    if covariance[:8] == _ABSENT:
+        return _Seen(covariance, False, covariance, None)
+    for candidate in (covariance, fill):
         numbers = np.frombuffer(candidate, '<f8')[np.newaxis]
         if is_known(numbers)[0]:
-            found: list[float] = transformed(matrix, numbers)[0].tolist()
-            return found
-    return None
+            turned = transformed(np.reshape(matrix, (3, 3)), numbers)[0].tolist()
+            return _Seen(covariance, True, NINE.pack(*turned), turned)
+    return _Seen(covariance, True, _UNKNOWN, None)
 
 
 def motion_of(data: bytes, layout: Layout, gravity: Floats) -> bytes:
