@@ -230,13 +230,13 @@ class Rewriter:
         a, b, c = force
         if not (-largest < a < largest and -largest < b < largest and -largest < c < largest):
             raise _implausible(force)
-        covariance = data[self._force_spread:]
-        if covariance != self._seen_force.given:
-            self._seen_force = _seen(self._inverse, covariance, self._fill_force)
-        before, own = self._before(data, given), self._seen_force.turned
-        if own is None:
-            return before + THREE.pack(a, b, c) + self._seen_force.new
-        return before + _FORCE.pack(a, b, c, *at.with_spread(force, own))
+        covariance, seen = data[self._force_spread:], self._seen_force
+        if covariance != seen.given:
+            seen = self._seen_force = _seen(self._inverse, covariance, self._fill_force)
+        before = self._before(data, given)
+        if seen.turned is None:
+            return before + THREE.pack(a, b, c) + seen.new
+        return before + _FORCE.pack(a, b, c, *at.with_spread(force, seen.turned))
 
     def _before(self, data: bytes, given: tuple[Any, ...]) -> bytes:
         """Return the message before the acceleration."""
