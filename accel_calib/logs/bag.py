@@ -160,12 +160,10 @@ class Bag:
             others = sorted(f'{c.topic} ({c.msgtype})' for c in self.reader.connections)
             raise InputError(f'{self.path} has {some(others) or "no topics"}, expected a topic of '
                              f'type {IMU}', 'record the Imu topic')
-        if topic and topic not in topics:
-            raise InputError(f'{self.path} has the Imu topics {some(topics)}, expected '
-                             f'{topic}', 'choose one of them with --topic')
-        if not topic and len(topics) > 1:
-            raise InputError(f'{self.path} has {len(topics)} Imu topics, expected one: '
-                             f'{some(topics)}', 'choose one of them with --topic')
+        if topic not in topics and (topic or len(topics) > 1):
+            found = (f'the Imu topics {some(topics)}, expected {topic}' if topic else
+                     f'{len(topics)} Imu topics, expected one: {some(topics)}')
+            raise InputError(f'{self.path} has {found}', 'choose one of them with --topic')
         return topic or topics[0]
 
     def first_frame_id(self, topic: str) -> str:

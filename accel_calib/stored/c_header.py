@@ -249,14 +249,18 @@ def _general(header: Header, name: str) -> list[str]:
             '    float d[3], e[3], u[3];', '    int i, step;', '',
             *(f'    d[{axis}] = (raw[{axis}] - {_horner(header.vec_v[:, axis])}) * per_unit;'
               for axis in range(3)),
-            '    for (i = 0; i < 3; ++i) {',
-            '        u[i] = N[i][0] * d[0] + N[i][1] * d[1] + N[i][2] * d[2];', '    }',
+            *_product('u', 'N', 'd', '    '),
             f'    for (step = 0; step < {header.steps}; ++step) {{',
             *(f'        e[{axis}] = d[{axis}]{_added(header, axis)};' for axis in range(3)),
-            '        for (i = 0; i < 3; ++i) {',
-            '            u[i] = N[i][0] * e[0] + N[i][1] * e[1] + N[i][2] * e[2];', '        }',
-            '    }', '    for (i = 0; i < 3; ++i) {',
-            '        force[i] = R[i][0] * u[0] + R[i][1] * u[1] + R[i][2] * u[2];', '    }', '}']
+            *_product('u', 'N', 'e', '        '), '    }', *_product('force', 'R', 'u', '    '),
+            '}']
+
+
+def _product(left: str, matrix: str, right: str, indent: str) -> list[str]:
+    """Return the lines of C that set a vector to a matrix times another vector."""
+    row = ' + '.join(f'{matrix}[i][{column}] * {right}[{column}]' for column in range(3))
+    return [f'{indent}for (i = 0; i < 3; ++i) {{', f'{indent}    {left}[i] = {row};',
+            f'{indent}}}']
 
 
 def _scaled_temperature(header: Header) -> list[str]:

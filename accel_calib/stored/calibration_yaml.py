@@ -190,39 +190,55 @@ def _or_null(value: float) -> float | None:
 
 def calibration_from(data: bytes, name: str) -> Calibration:
     """Return the calibration in a file; with ``edited`` if its checksum does not match."""
-    text = _text_of(data, name)
     try:
-        content = read_plain(text)
-    except ValueError as err:
-        raise _damaged(name, str(err)) from err
+        return _checked(data, name)
+    except StoredCalibrationError:
+        raise
+    except RefusedFitError as err:
+        raise DamagedCalibrationError(f'{name} contains an implausible calibration: {err.message}',
+                                      err.advice) from err
+    except (AccelCalibError, KeyError, TypeError, ValueError, OverflowError,
+            AttributeError) as err:
+        what = (err.message if isinstance(err, AccelCalibError) else
+                f'{err.args[0]} is missing' if isinstance(err, KeyError) else str(err))
+        raise DamagedCalibrationError(f'{name} is damaged ({" ".join(what.split())}), expected a '
+                                      'whole calibration',
+                                      'fit again, or use the previous file (.before)') from err
+
+
+def _checked(data: bytes, name: str) -> Calibration:
+    """Return the calibration in a file after all checks; other errors are those of damage."""
+    text = _text_of(data, name)
+    content = read_plain(text)
     _check_version(content, name)
-    body, found, digest = text.rpartition(_CHECKSUM)
     _check_known(content, name)
-    calibration = _checked(content, name)
+    with np.errstate(all='ignore'):  # the checks refuse what is not finite
+        calibration = gated(_calibration(content))
     _check_own(calibration, content, name)
+    body, found, digest = text.rpartition(_CHECKSUM)
     if not found:
-        raise _damaged(name, 'its last line, the checksum, is missing')
+        raise ValueError('its last line, the checksum, is missing')
     if digest.strip() == _digest(body.rstrip()):
         return calibration
-    other = _other_correction(content, calibration, name)
-    _check_keys(content, calibration, name)
+    other = _other_correction(content, calibration)
+    _check_keys(content, calibration)
     return replace(calibration, noted=(*calibration.noted, OF_FILE['edited'], *other))
 
 
 def _text_of(data: bytes, name: str) -> str:
     """Return the text of a file of this format."""
     if not data.strip(b'\0 \t\r\n'):
-        raise _damaged(name, 'it is empty')
+        raise ValueError('it is empty')
     if not data.startswith(FIRST_LINE.encode()):
         raise StoredCalibrationError(f'{name} is not a calibration of accel_calib, expected the '
                                      f'first line "{FIRST_LINE}"', 'use a file that fit wrote')
     if len(data) > MOST_BYTES:
-        raise _damaged(name, f'it has more than {MOST_BYTES} bytes')
+        raise ValueError(f'it has more than {MOST_BYTES} bytes')
     try:
         return data.decode().replace('\r\n', '\n').replace('\r', '\n')
     except UnicodeDecodeError as err:
         line = 1 + data.count(b'\n', 0, err.start)
-        raise _damaged(name, f'line {line} is not text in UTF-8') from err
+        raise ValueError(f'line {line} is not text in UTF-8') from err
 
 
 def _check_known(content: Mapping[str, Any], name: str) -> None:
@@ -250,43 +266,28 @@ def _check_own(calibration: Calibration, content: Mapping[str, Any], name: str) 
 
 def _check_version(content: Any, name: str) -> None:
     if not isinstance(content, Mapping):
-        raise _damaged(name, 'it is not a YAML mapping')
+        raise ValueError('it is not a YAML mapping')
     version = content.get('version')
     if not isinstance(version, int) or isinstance(version, bool) or version < 1:
-        raise _damaged(name, f'its version is {shown(version)}')
+        raise ValueError(f'its version is {shown(version)}')
     if version != _VERSION:
         raise StoredCalibrationError(f'{name} has version {version}, expected {_VERSION}',
                                      'fit the poses again' if version < _VERSION else
                                      'update accel_calib, or fit the poses again')
 
 
-def _checked(content: Mapping[str, Any], name: str) -> Calibration:
-    """Return the calibration with the content of a file, after all checks."""
-    try:
-        with np.errstate(all='ignore'):  # the checks refuse what is not finite
-            return gated(_calibration(content))
-    except RefusedFitError as err:
-        raise DamagedCalibrationError(f'{name} contains an implausible calibration: {err.message}',
-                                      err.advice) from err
-    except AccelCalibError as err:
-        raise _damaged(name, err.message) from err
-    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as err:
-        what = f'{err.args[0]} is missing' if isinstance(err, KeyError) else str(err)
-        raise _damaged(name, what) from err
-
-
-def _check_keys(content: Mapping[str, Any], calibration: Calibration, name: str) -> None:
+def _check_keys(content: Mapping[str, Any], calibration: Calibration) -> None:
     """Refuse unknown keys in a file that was changed: a damaged key would be ignored."""
     written = {**dict.fromkeys(_NOT_ALWAYS), **_content(calibration)}
     for place, found, known in (('', content, written), *(
             (f'of {key} ', content.get(key), written[key]) for key in _MAPPINGS)):
         for key in found or ():
             if key not in (known or ()):
-                raise _damaged(name, f'the key {shown(key)} {place}is not known, expected one of '
-                                     f'{", ".join(known or ())}')
+                raise ValueError(f'the key {shown(key)} {place}is not known, expected one of '
+                                 f'{", ".join(known or ())}')
 
 
-def _other_correction(content: Mapping[str, Any], calibration: Calibration, name: str
+def _other_correction(content: Mapping[str, Any], calibration: Calibration
                       ) -> tuple[Finding, ...]:
     """Return a finding if a file states a correction that is not that of its effects."""
     if content.get('correction') is None:
@@ -295,17 +296,11 @@ def _other_correction(content: Mapping[str, Any], calibration: Calibration, name
         stated = value_at(content, 'correction', dict)
         offset, matrix = array_at(stated, 'offset', (3,)), array_at(stated, 'matrix', (3, 3))
     except (KeyError, ValueError) as err:
-        raise _damaged(name, f'correction: {err}') from err
+        raise ValueError(f'correction: {err}') from err
     scale = np.max(np.abs(calibration.matrix))
     same = (np.allclose(offset, calibration.offset, 0.0, _SAME * calibration.units.per_g)
             and np.allclose(matrix, calibration.matrix, 0.0, _SAME * float(scale)))
     return () if same else (OF_FILE['correction_in_file'],)
-
-
-def _damaged(name: str, what: str) -> DamagedCalibrationError:
-    return DamagedCalibrationError(f'{name} is damaged ({" ".join(what.split())}), expected a '
-                                   'whole calibration',
-                                   'fit again, or use the previous file (.before)')
 
 
 def _calibration(content: Mapping[str, Any]) -> Calibration:
@@ -360,8 +355,6 @@ def _values(effect: Effect, stated: Mapping[str, Any]) -> Floats:
         if key not in (*effect.values, 'what', 'unit', *(('own_rms',) if effect.own else ())):
             raise ValueError(f'the key {shown(key)} of an effect is not known, expected one of '
                              f'{", ".join(effect.values)}')
-    if effect.own:
-        number_at(stated, 'own_rms')  # `_check_own` compares it
     known = {**dict(zip(effect.shape, effect.usual)), **stated}
     return np.array([number_at(known, part, LARGEST) for part in effect.values])
 
