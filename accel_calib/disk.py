@@ -5,9 +5,8 @@
 Writing of files that are either complete or unchanged.
 
 Only regular files are replaced, through links to their target. A file keeps its permissions and,
-as far as the user may set them, its owner. Temporary files have names that cannot be predicted,
-and are created exclusively. Only regular files are read, too, because others can block without
-end.
+as far as the user may set it, its owner. Temporary files have names that cannot be predicted, and
+are created exclusively. Only regular files are read, too: others can block without end.
 
 """
 
@@ -51,9 +50,8 @@ def write_atomically(path: Path, write: Callable[[TextIO], object], *,
     """
     Write a file through a temporary file, which is flushed to the disk and renamed.
 
-    The function `write` writes the content to an open file. The target of a link is replaced, not
-    the link. With `keep_before` the previous file is kept as ``<name>.before``. The path ``-`` is
-    standard output.
+    `write` writes the content to an open file. With `keep_before` the previous file is kept as
+    ``<name>.before``. The path ``-`` is standard output.
 
     Raises
     ------
@@ -82,7 +80,7 @@ def write_atomically(path: Path, write: Callable[[TextIO], object], *,
 
 
 def copy_atomically(path: Path, target: Path) -> None:
-    """Copy a file within its folder, completely or not at all; raise OSError if it fails."""
+    """Copy a file, its mode and its time within a folder, completely or not at all."""
     with path.open('rb') as source, _replacing(target) as file:
         shutil.copyfileobj(source, file)
         file.flush()
@@ -129,12 +127,7 @@ def replaceable(path: Path) -> os.stat_result | None:
 
 
 def remove_leftovers(path: Path, older_than: float = 0.0) -> list[OSError]:
-    """
-    Remove temporary files of killed processes beside a file, at least `older_than` old [s].
-
-    Return one OSError, with its name, per file that could not be removed.
-
-    """
+    """Remove what killed processes left beside a file, this old [s]; return what failed."""
     name = glob.escape(path.name[:_LONGEST_NAME])
     failed = []
     for each in sorted(path.parent.glob(f'.{name}.*{_SUFFIX}')):

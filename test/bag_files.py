@@ -5,7 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import cache
 from pathlib import Path
 import shutil
 import sqlite3
@@ -14,11 +15,15 @@ from typing import Any
 import zlib
 
 from accel_calib.calibrate import Calibration, fit_poses
+from accel_calib.errors import InputError
+from accel_calib.logs import read_recording
+from accel_calib.messages import correct_bag
 from accel_calib.table import Recording
 from accel_calib.units import units_of
 from inside import simulate_poses, spread_directions
 import lz4.frame
 import numpy as np
+import pytest
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer as Writer2
 from rosbags.typesys import get_typestore, Stores
@@ -40,7 +45,11 @@ COUNT = 60
 START = 1_700_000_000 * 10 ** 9
 RATE_NS = 10 ** 7
 
-Write = Callable[[Path], Path]
+Write = Callable[..., Path]
+"""Write a bag into a folder: topics and messages, by default `TOPICS` and `messages`."""
+
+Made = Iterable[tuple[int, int, Any]]
+"""Number of the topic, time of receipt [ns], and message or its bytes."""
 
 
 def header(store: Any, stamp: int, frame_id: str = 'imu_link') -> Any:
@@ -61,32 +70,42 @@ def imu(store: Any, about: Any, force: Any, rate: Any = (0.0, 0.0, 0.0),
         covariances[2])
 
 
-def writer_of(path: Path, kind: str) -> tuple[Any, Any, Any]:
-    """Return a writer of bag (ROS 1), mcap or sqlite3, its types, and its serializer."""
-    store = get_typestore(Stores.ROS1_NOETIC if kind == 'bag' else Stores.ROS2_JAZZY)
-    writer = Writer1(path) if kind == 'bag' else Writer2(
-        path, version=9, storage_plugin=StoragePlugin[kind.upper()])
-    return writer, store, store.serialize_ros1 if kind == 'bag' else store.serialize_cdr
+def writer_of(path: Path, kind: str) -> tuple[Any, Any]:
+    """Return a writer of bag (ROS 1), mcap or sqlite3, and its types."""
+    if kind == 'bag':
+        return Writer1(path), get_typestore(Stores.ROS1_NOETIC)
+    writer = Writer2(path, version=9, storage_plugin=StoragePlugin[kind.upper()])
+    return writer, get_typestore(Stores.ROS2_JAZZY)
+
+
+def fill(writer: Any, store: Any, topics: Sequence[tuple[str, str]], made: Made) -> None:
+    """Write messages with a writer of `rosbags`."""
+    serialize = store.serialize_ros1 if isinstance(writer, Writer1) else store.serialize_cdr
+    with writer:
+        known = [writer.add_connection(*topic, typestore=store) for topic in topics]
+        for topic, stamp, each in made:
+            data = each if isinstance(each, bytes) else serialize(each, topics[topic][1])
+            writer.write(known[topic], stamp, data)
 
 
 def write_bag(path: Path, kind: str, recording: Recording,
               topics: Sequence[str] = ('/imu/data_raw',)) -> Path:
     """Write the samples [g] of a recording with Imu, temperature and text."""
-    writer, store, serialize = writer_of(path, kind)
-    reading = units_of('m/s2').from_g(recording.reading)
-    with writer:
-        imus = [writer.add_connection(topic, IMU, typestore=store) for topic in topics]
-        warm, words = (writer.add_connection(*each, typestore=store) for each in TOPICS[1:])
+    writer, store = writer_of(path, kind)
+    reading, count = units_of('m/s2').from_g(recording.reading), len(topics)
+
+    def made() -> Iterator[tuple[int, int, Any]]:
         for k, time in enumerate(recording['time']):
             receipt = 100 * 10 ** 9 + round(time * 1e9)
             about = header(store, receipt)
-            for connection in imus:
-                writer.write(connection, receipt, serialize(
-                    imu(store, about, reading[k], recording['rate'][k]), IMU))
+            for topic in range(count):
+                yield topic, receipt, imu(store, about, reading[k], recording['rate'][k])
             if k % 50 == 0:
-                value = store.types[TEMPERATURE](about, float(recording['temperature'][k]), 0.0)
-                writer.write(warm, receipt, serialize(value, TEMPERATURE))
-                writer.write(words, receipt, serialize(store.types[STRING](f'word {k}'), STRING))
+                warm = float(recording['temperature'][k])
+                yield count, receipt, store.types[TEMPERATURE](about, warm, 0.0)
+                yield count + 1, receipt, store.types[STRING](f'word {k}')
+
+    fill(writer, store, [*((topic, IMU) for topic in topics), *TOPICS[1:]], made())
     return path
 
 
@@ -103,22 +122,24 @@ def messages(store: Any = STORE) -> list[tuple[int, int, Any]]:
     return found
 
 
+def raw_messages() -> list[tuple[int, int, bytes]]:
+    """Return (number of the topic, time of receipt [ns], CDR)."""
+    return [(topic, stamp, bytes(STORE.serialize_cdr(each, TOPICS[topic][1])))
+            for topic, stamp, each in messages()]
+
+
 def by_hand(compression: str = '', **how: bool) -> Write:
-    def write(folder: Path) -> Path:
-        made = [(topic, stamp, bytes(STORE.serialize_cdr(each, TOPICS[topic][1])))
-                for topic, stamp, each in messages()]
-        return McapFile(TOPICS, compression, **how).write(folder / 'bag.mcap', made)
+    def write(folder: Path, topics: Any = TOPICS, made: Made = ()) -> Path:
+        return McapFile(topics, compression, **how).write(folder / 'bag.mcap',
+                                                          made or raw_messages())
     return write
 
 
 def rosbag2(plugin: StoragePlugin, mode: CompressionMode = CompressionMode.NONE) -> Write:
-    def write(folder: Path) -> Path:
+    def write(folder: Path, topics: Any = TOPICS, made: Made = ()) -> Path:
         writer = Writer2(folder / 'bag', version=9, storage_plugin=plugin)
         writer.set_compression(mode, CompressionFormat.ZSTD)
-        with writer:
-            known = [writer.add_connection(*topic, typestore=STORE) for topic in TOPICS]
-            for topic, stamp, each in messages():
-                writer.write(known[topic], stamp, STORE.serialize_cdr(each, TOPICS[topic][1]))
+        fill(writer, STORE, topics, made or messages())
         return folder / 'bag'
     return write
 
@@ -128,10 +149,7 @@ def ros1(compression: Any = None) -> Write:
         store, writer = get_typestore(Stores.ROS1_NOETIC), Writer1(folder / 'bag.bag')
         if compression is not None:
             writer.set_compression(compression)
-        with writer:
-            known = [writer.add_connection(*topic, typestore=store) for topic in TOPICS]
-            for topic, stamp, each in messages(store):
-                writer.write(known[topic], stamp, store.serialize_ros1(each, TOPICS[topic][1]))
+        fill(writer, store, TOPICS, messages(store))
         return folder / 'bag.bag'
     return write
 
@@ -143,16 +161,29 @@ MAKES: dict[str, Write] = {
     'sqlite3': rosbag2(StoragePlugin.SQLITE3), 'mcap folder': rosbag2(StoragePlugin.MCAP),
     'sqlite3 messages': rosbag2(StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
     'mcap file': rosbag2(StoragePlugin.MCAP, CompressionMode.FILE),
+    'mcap storage': rosbag2(StoragePlugin.MCAP, CompressionMode.STORAGE),
     'ros1': ros1(), 'ros1 bz2': ros1(Writer1.CompressionFormat.BZ2),
     'ros1 lz4': ros1(Writer1.CompressionFormat.LZ4)}
 
 
+@cache
 def a_calibration() -> Calibration:
     """Return a calibration for the readings of the bags."""
     rng, units = np.random.default_rng(3), units_of('m/s2')
     poses = simulate_poses(sensor(rng), spread_directions(16), rng)
     return fit_poses(poses.with_columns(reading=units.from_g(poses.reading),
                                         std=units.from_g(poses['std'])), units)
+
+
+def check_refused(path: Path, words: str, topic: str = '') -> None:
+    """Check that reading and correcting a bag end in one line, and that nothing is written."""
+    before = {*path.parent.iterdir()}
+    for work in (lambda: read_recording(path, topic),
+                 lambda: correct_bag(path, a_calibration(), path.with_name('out'), topic)):
+        with pytest.raises(InputError, match=words) as refusal:
+            work()
+        assert '\n' not in str(refusal.value)
+    assert {*path.parent.iterdir()} == before
 
 
 def copied(path: Path, folder: Path) -> Path:

@@ -14,13 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-import json
 from pathlib import Path
 import re
 from typing import Any
 
 from accel_calib.calibrate import Calibration, fit_poses
 from accel_calib.capture import capture
+from accel_calib.errors import DamagedCalibrationError
 from accel_calib.logs import read_log, write_table
 from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import Autopilot, Recording
@@ -28,7 +28,7 @@ from inside import export, ExportOptions, main, model_with, simulate_recording, 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from test_exports import ardupilot, ardupilot_force, px4_force, qgroundcontrol
+from test_exports import ardupilot, by_autopilot, qgroundcontrol
 from test_log_formats import make
 
 mavlink = pytest.importorskip('pymavlink.dialects.v20.common')
@@ -59,10 +59,11 @@ def three(start: str, end: str, values: Any) -> dict[str, float]:
     return {f'{start}{axis}{end}': float(value) for axis, value in zip('XYZ', values)}
 
 
-def recording(seed: int = 1) -> Recording:
+@pytest.fixture(scope='module')
+def raw() -> Recording:
     """Return the readings of the sensor [g], in its own axes."""
     model = model_with({'offset': OFFSET, 'axis_gain': GAIN})
-    return simulate_recording(model, spread_directions(14), np.random.default_rng(seed),
+    return simulate_recording(model, spread_directions(14), np.random.default_rng(1),
                               noise_g=0.001, rate_hz=20.0, dwell=2.0, turn=0.6,
                               temperatures=(18.0, 42.0))
 
@@ -111,6 +112,13 @@ def old_px4(number: int) -> dict[str, float]:
             **three('CAL_ACC1_', 'OFF', OLD[0]), **three('CAL_ACC1_', 'SCALE', OLD[1])}
 
 
+def undone(path: Path, raw: Recording, atol: float = 5e-5) -> Any:
+    """Return what a log holds, which must be the readings of the sensor."""
+    table = read_log(path).table
+    np.testing.assert_allclose(table.reading, raw.reading * G, atol=atol)
+    return table
+
+
 def calibrated(path: Path) -> Calibration:
     log = read_log(path)
     assert isinstance(log.table, Recording)
@@ -120,14 +128,8 @@ def calibrated(path: Path) -> Calibration:
 def check_exported(calibration: Calibration, to: str, raw: Recording, tmp_path: Path,
                    instance: int = 1) -> dict[str, float]:
     """Check that the firmware corrects the readings of the sensor with the exported parameters."""
-    made = export(calibration, to)
-    temperature, reading = raw['temperature'], raw.reading * G
-    if to == 'px4':
-        found = qgroundcontrol(made.text_or_bytes)
-        force = px4_force(found, reading, temperature, instance)
-    else:
-        found = ardupilot(made.text_or_bytes, tmp_path)
-        force = ardupilot_force(found, reading, temperature, instance)
+    text = export(calibration, to).text_or_bytes
+    found, force = by_autopilot(to, text, raw.reading * G, raw['temperature'], tmp_path, instance)
     rests = np.linalg.norm(raw['rate'], axis=1) < 0.05
     length = np.linalg.norm(force, axis=1)[rests] / G
     assert np.abs(np.mean(force[rests] / G - raw['reference'][rests], axis=0)).max() < 1e-3
@@ -136,47 +138,40 @@ def check_exported(calibration: Calibration, to: str, raw: Recording, tmp_path: 
 
 
 @pytest.mark.parametrize('number', [*NAMES, *OF_ARDUPILOT])
-def test_ardupilot_corrects_the_sensor_with_what_a_log_of_any_rotation_gives(number, tmp_path):
+def test_ardupilot_corrects_the_sensor_with_what_a_log_of_any_rotation_gives(number, raw,
+                                                                             tmp_path):
     rotation = OLD_38 if number == 38 else named({**NAMES, **OF_ARDUPILOT}[number])
-    raw = recording()
     path = ardupilot_log(tmp_path / 'log.bin', logged(raw, rotation), old_ardupilot(number))
-    log = read_log(path).table
-    np.testing.assert_allclose(log.reading, raw.reading * G, atol=5e-5)
-    np.testing.assert_allclose(log['rate'], raw['rate'], atol=1e-4)
+    np.testing.assert_allclose(undone(path, raw)['rate'], raw['rate'], atol=1e-4)
     check_exported(calibrated(path), 'ardupilot', raw, tmp_path)
 
 
 @pytest.mark.parametrize('number', NAMES)
-def test_px4_corrects_the_sensor_with_what_a_log_of_any_rotation_gives(number, tmp_path):
+def test_px4_corrects_the_sensor_with_what_a_log_of_any_rotation_gives(number, raw, tmp_path):
     level = Rotation.from_euler('xyz', [1.5, -2.5, 4.0], degrees=True).as_matrix()
-    raw = recording()
     path = px4_log(tmp_path / 'log.ulg', logged(raw, level @ named(NAMES[number])), {
         **old_px4(number), **three('SENS_BOARD_', '_OFF', [1.5, -2.5, 4.0])})
-    log = read_log(path).table
-    np.testing.assert_allclose(log.reading, raw.reading * G, atol=5e-5)
-    np.testing.assert_allclose(log['rate'], raw['rate'], atol=1e-4)
+    np.testing.assert_allclose(undone(path, raw)['rate'], raw['rate'], atol=1e-4)
     found = check_exported(calibrated(path), 'px4', raw, tmp_path, instance=1)
     assert found['CAL_ACC1_ID'] == DEVICE
 
 
-def test_an_external_accelerometer_of_px4_has_a_rotation_of_its_own(tmp_path):
-    raw = recording()
+def test_an_external_accelerometer_of_px4_has_a_rotation_of_its_own(raw, tmp_path):
     path = px4_log(tmp_path / 'log.ulg', logged(raw, named('YAW_90')),
                    {**old_px4(4), 'CAL_ACC1_ROT': 2})
-    np.testing.assert_allclose(read_log(path).table.reading, raw.reading * G, atol=5e-5)
+    undone(path, raw)
 
 
 @pytest.mark.parametrize(('number', 'names'), [
     (100, ('AHRS_CUSTOM_ROLL', 'AHRS_CUSTOM_PIT', 'AHRS_CUSTOM_YAW')),
     (101, ('CUST_ROT1_ROLL', 'CUST_ROT1_PITCH', 'CUST_ROT1_YAW')),
     (102, ('CUST_ROT2_ROLL', 'CUST_ROT2_PITCH', 'CUST_ROT2_YAW'))])
-def test_a_custom_rotation_is_undone_or_said_to_be_unknown(number, names, tmp_path):
+def test_a_custom_rotation_is_undone_or_said_to_be_unknown(number, names, raw, tmp_path):
     angles = (12.0, -70.0, 33.0)
     rotation = Rotation.from_euler('xyz', angles, degrees=True).as_matrix()
-    raw = recording()
     stated = {**old_ardupilot(number), **dict(zip(names, angles))}
     path = ardupilot_log(tmp_path / 'log.bin', logged(raw, rotation), stated)
-    np.testing.assert_allclose(read_log(path).table.reading, raw.reading * G, atol=5e-5)
+    undone(path, raw)
     del stated[names[2]]
     path = ardupilot_log(tmp_path / 'log.bin', logged(raw, rotation), stated)
     log = read_log(path)
@@ -200,9 +195,9 @@ def test_a_parameter_of_px4_that_is_no_number_is_left_out(tmp_path: Path) -> Non
     ({}, 'parameters are not in the log'), ({'AHRS_ORIENTATION': 77.0}, 'is 77'),
     ({'AHRS_ORIENTATION': 0.0, 'INS_ACCSCAL_X': 0.0}, 'scale is 0'),
     ({'INS_ACCOFFS_X': float('nan'), 'INS_ACCOFFS_Y': 0.5}, '')])
-def test_what_is_not_known_stays_with_the_readings_up_to_the_export(parameters, why, tmp_path,
+def test_what_is_not_known_stays_with_the_readings_up_to_the_export(parameters, why, raw, tmp_path,
                                                                     capsys):
-    path = ardupilot_log(tmp_path / 'log.bin', logged(recording(), np.eye(3)), parameters)
+    path = ardupilot_log(tmp_path / 'log.bin', logged(raw, np.eye(3)), parameters)
     poses, stored = tmp_path / 'poses.csv', tmp_path / 'calibration.yaml'
     assert main(['capture', str(path), '-o', str(poses)]) == 0
     assert main(['fit', str(poses), '-o', str(stored), '--model', '7']) == 0
@@ -216,11 +211,10 @@ def test_what_is_not_known_stays_with_the_readings_up_to_the_export(parameters, 
     assert why in ' '.join(said.split())
 
 
-def test_the_filtered_acceleration_of_px4_is_left_as_it_is(tmp_path):
-    samples = recording()
-    time = make.stamps_us(samples)
+def test_the_filtered_acceleration_of_px4_is_left_as_it_is(raw, tmp_path):
+    time = make.stamps_us(raw)
     fields = {'timestamp': ('uint64_t', time), 'timestamp_sample': ('uint64_t', time),
-              **{f'xyz[{k}]': ('float', (samples.reading[:, k] * G).tolist()) for k in range(3)}}
+              **{f'xyz[{k}]': ('float', (raw.reading[:, k] * G).tolist()) for k in range(3)}}
     path = tmp_path / 'log.ulg'
     path.write_bytes(make.ulog_bytes([('vehicle_acceleration', 0, fields)], old_px4(4)))
     log = read_log(path)
@@ -228,8 +222,8 @@ def test_the_filtered_acceleration_of_px4_is_left_as_it_is(tmp_path):
     assert any('bias that PX4 estimates' in note for note in log.notes)
 
 
-def test_an_older_px4_with_other_numbers_of_rotations_is_not_undone(tmp_path, monkeypatch):
-    path = px4_log(tmp_path / 'log.ulg', recording(), old_px4(27))
+def test_an_older_px4_with_other_numbers_of_rotations_is_not_undone(raw, tmp_path):
+    path = px4_log(tmp_path / 'log.ulg', raw, old_px4(27))
     data, key = path.read_bytes(), b'uint32_t ver_sw_release'
     for minor, known in ((10, False), (12, True)):
         value = (1 << 24 | minor << 16).to_bytes(4, 'little')
@@ -254,19 +248,17 @@ THERMAL = {'INS_TCAL1_ENABLE': 1.0, 'INS_TCAL1_TMIN': 20.0, 'INS_TCAL1_TMAX': 40
            **three('INS_TCAL1_ACC2_', '', [50.0, 0.0, -70.0])}
 
 
-def test_an_old_thermal_calibration_of_ardupilot_is_undone_and_replaced(tmp_path):
-    raw = recording()
+def test_an_old_thermal_calibration_of_ardupilot_is_undone_and_replaced(raw, tmp_path):
     path = ardupilot_log(tmp_path / 'log.bin', logged(raw, named('YAW_45'), thermal_ardupilot),
                          {**old_ardupilot(1), **THERMAL})
-    np.testing.assert_allclose(read_log(path).table.reading, raw.reading * G, atol=5e-5)
+    undone(path, raw)
     made = calibrated(path)
     check_exported(made, 'ardupilot', raw, tmp_path)
     found = ardupilot(export(made, 'ardupilot').text_or_bytes, tmp_path)
     assert {found[f'INS_TCAL1_ACC{order}_{axis}'] for order in (1, 2, 3) for axis in 'XYZ'} == {0}
 
 
-def test_an_old_thermal_calibration_of_px4_is_undone_and_replaced(tmp_path):
-    raw = recording()
+def test_an_old_thermal_calibration_of_px4_is_undone_and_replaced(raw, tmp_path):
     orders = np.array([[0.03, -0.01, 0.02], [3e-3, -2e-3, 1e-3], [5e-5, 0.0, -7e-5],
                        [1e-6, 2e-6, 0.0]])
 
@@ -279,19 +271,16 @@ def test_an_old_thermal_calibration_of_px4_is_undone_and_replaced(tmp_path):
            **{f'TC_A2_X{k}_{axis}': float(part[axis]) for k, part in enumerate(orders)
               for axis in range(3)}}
     path = px4_log(tmp_path / 'log.ulg', logged(raw, named('YAW_270'), thermal), old)
-    np.testing.assert_allclose(read_log(path).table.reading, raw.reading * G, atol=2e-3)
+    undone(path, raw, atol=2e-3)
     found = qgroundcontrol(export(calibrated(path), 'px4').text_or_bytes)
     assert found['TC_A2_ID'] == DEVICE
     assert {found[f'TC_A2_X{k}_{axis}'] for k in range(4) for axis in range(3)} == {0.0}
 
 
-def test_parameters_that_change_in_a_log_hold_from_then_on(tmp_path):
-    raw = recording()
+def test_parameters_that_change_in_a_log_hold_from_then_on(raw, tmp_path):
     half = len(raw) // 2
-    one = logged(raw, np.eye(3))
-    samples = replace(raw, columns={**raw.columns, 'reading': np.concatenate(
-        [one.reading[:half], raw.reading[half:]])})
-    imu = make.imu_rows(samples, 0)
+    reading = np.concatenate([logged(raw, np.eye(3)).reading[:half], raw.reading[half:]])
+    imu = make.imu_rows(raw.with_columns(reading=reading), 0)
     reset = {**three('INS_ACCOFFS_', '', np.zeros(3)), **three('INS_ACCSCAL_', '', np.ones(3))}
     rows = [*make.dataflash_forms(),
             *(('PARM', (1, name, value, 0.0)) for name, value in old_ardupilot(0).items()),
@@ -301,11 +290,10 @@ def test_parameters_that_change_in_a_log_hold_from_then_on(tmp_path):
             ('PARM', (imu[half][1][0], 'AHRS_ORIENTATION', 4.0, 0.0)), *imu[half:]]
     path = tmp_path / 'log.bin'
     path.write_bytes(make.dataflash_bytes(rows))
-    np.testing.assert_allclose(read_log(path).table.reading, raw.reading * G, atol=5e-5)
+    undone(path, raw)
 
 
-def test_the_second_accelerometer_of_ardupilot_keeps_its_place_in_every_file(tmp_path, capsys):
-    raw = recording()
+def test_the_second_accelerometer_of_ardupilot_keeps_its_place_in_every_file(raw, tmp_path):
     path = ardupilot_log(tmp_path / 'log.bin', logged(raw, named('PITCH_180')),
                          old_ardupilot(12, 2), instance=1)
     poses, stored, target = (tmp_path / name for name in ('poses.csv', 'new.yaml', 'made.param'))
@@ -323,30 +311,23 @@ def test_the_second_accelerometer_of_ardupilot_keeps_its_place_in_every_file(tmp
     assert 'CAL_ACC0_XOFF' in export(calibration, 'px4').text_or_bytes
 
 
-def test_a_corrected_copy_of_a_log_has_no_place_in_the_autopilot(tmp_path):
-    path = ardupilot_log(tmp_path / 'log.bin', logged(recording(), np.eye(3)), old_ardupilot(0))
+def test_the_place_in_the_autopilot_is_checked_and_not_that_of_a_corrected_copy(raw, tmp_path):
+    path = ardupilot_log(tmp_path / 'log.bin', logged(raw, np.eye(3)), old_ardupilot(0))
     stored, copy = tmp_path / 'calibration.yaml', tmp_path / 'copy.csv'
     write_calibration(stored, calibrated(path))
     assert main(['apply', str(path), '-c', str(stored), '-o', str(copy)]) == 0
     assert read_log(copy).table.autopilot is None
+    text = stored.read_text()
+    assert 'firmware: ardupilot' in text
+    stored.write_text(text.replace('firmware: ardupilot', 'firmware: 7'))
+    with pytest.raises(DamagedCalibrationError, match='autopilot'):
+        read_calibration(stored)
 
 
 @pytest.mark.parametrize('stated', ['{"firmware": "other"}', '{"firmware": "px4", "instance": []}',
                                     '"px4"', '{"no": 1}', '[1]'])
-def test_a_comment_that_is_no_place_in_an_autopilot_is_a_comment(stated, tmp_path):
-    raw = recording()
+def test_a_comment_that_is_no_place_in_an_autopilot_is_a_comment(stated, raw, tmp_path):
     path = tmp_path / 'table.csv'
-    write_table(path, replace(raw.with_columns(reading=raw.reading), units='g'))
+    write_table(path, replace(raw, units='g'))
     path.write_text(f'# autopilot: {stated}\n{path.read_text()}')
     assert read_log(path).table.autopilot is None
-
-
-def test_a_damaged_place_in_a_stored_calibration_is_refused(tmp_path, capsys):
-    path = ardupilot_log(tmp_path / 'log.bin', logged(recording(), np.eye(3)), old_ardupilot(0))
-    stored = tmp_path / 'calibration.yaml'
-    write_calibration(stored, calibrated(path))
-    text = stored.read_text()
-    assert 'firmware: ardupilot' in text
-    stored.write_text(text.replace('firmware: ardupilot', 'firmware: 7'))
-    assert main(['export', str(stored), '--to', 'ardupilot', '--json', '-']) == 2
-    assert 'autopilot' in json.loads(capsys.readouterr().out)['error']

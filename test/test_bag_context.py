@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +16,12 @@ from accel_calib.messages import correct_bag
 from accel_calib.stored import write_calibration
 from accel_calib.table import Recording
 from accel_calib.units import units_of
-from bag_files import header, IMU, imu, writer_of
-from inside import model_with, simulate_poses, spread_directions, together
+from bag_files import fill, header, IMU, imu, writer_of
+from inside import main, model_with, simulate_poses, spread_directions, together
 import numpy as np
 import pytest
 from rosbags.typesys import get_types_from_msg
+from shared import with_effects
 
 COUNT, STEP = 400, 10 ** 7
 RECEIVED = 1_700_000_000 * 10 ** 9
@@ -57,31 +58,23 @@ def message(store: Any, msgtype: str, stamp: int, value: Any) -> Any:
     return kind(about, value, 0.0)
 
 
-def write(path: Path, topics: Mapping[str, tuple[str, Values]], kind: str = 'mcap', *,
-          stamped: int = RECEIVED, own_stamp: int | None = None,
-          force: Sequence[float] = (0.1, -0.2, 9.8)) -> Path:
-    """
-    Write a bag of 4 s with an Imu and other topics.
-
-    `stamped` is the first stamp of the Imu, `own_stamp` that of the others [ns], and `force` the
-    acceleration.
-
-    """
-    writer, store, serialize = writer_of(path, kind)
+def write(folder: Path, topics: Mapping[str, tuple[str, Values]], kind: str = 'mcap', *,
+          stamped: int = RECEIVED, own_stamp: int | None = None) -> Path:
+    """Write a bag of 4 s with an Imu and other topics, and their first stamps [ns]."""
+    path = folder / ('in.bag' if kind == 'bag' else 'in')
+    writer, store = writer_of(path, kind)
     store.register(get_types_from_msg(OWN_DEFINITION, OWN))
-    with writer:
-        own = writer.add_connection('/imu/data', IMU, typestore=store)
-        others = {name: writer.add_connection(name, msgtype, typestore=store)
-                  for name, (msgtype, _) in topics.items()}
+
+    def made() -> Iterator[tuple[int, int, Any]]:
         for k in range(COUNT):
-            made = imu(store, header(store, stamped + k * STEP), force)
-            writer.write(own, RECEIVED + k * STEP, serialize(made, IMU))
-            if k % 10:
-                continue
-            for name, (msgtype, value) in topics.items():
-                stamp = (stamped if own_stamp is None else own_stamp) + k * STEP
-                made = message(store, msgtype, stamp, value(k * STEP * 1e-9))
-                writer.write(others[name], RECEIVED + k * STEP, serialize(made, msgtype))
+            at = k * STEP
+            yield 0, RECEIVED + at, imu(store, header(store, stamped + at), (0.1, -0.2, 9.8))
+            for topic, (msgtype, value) in enumerate(topics.values(), 1) if k % 10 == 0 else ():
+                stamp = (stamped if own_stamp is None else own_stamp) + at
+                yield topic, RECEIVED + at, message(store, msgtype, stamp, value(at * 1e-9))
+
+    names = [('/imu/data', IMU), *((name, msgtype) for name, (msgtype, _) in topics.items())]
+    fill(writer, store, names, made())
     return path
 
 
@@ -103,45 +96,53 @@ def test_a_number_without_stamp_has_the_time_of_its_receipt(number: str, kind: s
                                                             tmp_path: Path) -> None:
     whole = number == 'Int16'
     value = (lambda seconds: round(100 * warming(seconds)) // 100) if whole else warming
-    path = write(tmp_path / 'r.bag' if kind == 'bag' else tmp_path / kind,
-                 {'/imu/temp': (f'std_msgs/msg/{number}', value)}, kind)
+    path = write(tmp_path, {'/imu/temp': (f'std_msgs/msg/{number}', value)}, kind)
     found, notes = read(path, temperature_topic='/imu/temp')
     np.testing.assert_allclose(found['temperature'], EXPECTED, atol=1.0 if whole else 1e-5)
     assert notes == (f'the messages on /imu/temp (std_msgs/msg/{number}) have no stamp of the '
                      'clock of the Imu: their times are those at which the bag received them',)
 
 
-def test_a_topic_that_looks_like_a_temperature_is_named_and_not_used(tmp_path: Path) -> None:
-    path = write(tmp_path / 'bag', {'/imu/temp': ('std_msgs/msg/Float32', warming),
-                                    '/speed': ('std_msgs/msg/Float32', warming)})
-    found, notes = read(path)
-    assert 'temperature' not in found
-    assert notes == ('topic /imu/temp (std_msgs/msg/Float32) looks like a temperature and is not '
-                     'used: name it with --temperature-topic /imu/temp',)
-
-
-def test_times_of_receipt_are_converted_to_the_clock_of_the_imu(tmp_path: Path) -> None:
-    path = write(tmp_path / 'bag', {'/imu/temp': ('std_msgs/msg/Float64', warming)},
-                 stamped=12 * 10 ** 9)
-    found, _ = read(path, temperature_topic='/imu/temp')
-    assert found['time'][0] == 12.0
-    np.testing.assert_allclose(found['temperature'], EXPECTED, atol=1e-5)
-
-
-@pytest.mark.parametrize('own_stamp', [0, 5 * 10 ** 9])
-def test_a_stamp_of_another_clock_is_replaced_by_the_time_of_receipt(own_stamp: int,
-                                                                     tmp_path: Path) -> None:
-    path = write(tmp_path / 'bag', {'/t': ('sensor_msgs/msg/Temperature', warming)},
-                 own_stamp=own_stamp)
-    found, notes = read(path)
+@pytest.mark.parametrize(('msgtype', 'clock'), [
+    ('std_msgs/msg/Float64', {'stamped': 12 * 10 ** 9}),
+    ('sensor_msgs/msg/Temperature', {'own_stamp': 0}),
+    ('sensor_msgs/msg/Temperature', {'own_stamp': 5 * 10 ** 9})])
+def test_times_of_receipt_are_converted_to_the_clock_of_the_imu(
+        msgtype: str, clock: Mapping[str, int], tmp_path: Path) -> None:
+    found, notes = read(write(tmp_path, {'/t': (msgtype, warming)}, **clock),
+                        temperature_topic='/t')
+    assert found['time'][0] == clock.get('stamped', RECEIVED) * 1e-9
     np.testing.assert_allclose(found['temperature'], EXPECTED, atol=1e-5)
     assert 'have no stamp of the clock of the Imu' in notes[0]
 
 
+FLOAT, WARM = 'std_msgs/msg/Float32', ('sensor_msgs/msg/Temperature', warming)
+PRESSURE = {'/pressure': ('sensor_msgs/msg/FluidPressure', lambda seconds: 101325.0)}
+
+
+@pytest.mark.parametrize(('topics', 'note'), [
+    ({'/imu/temp': (FLOAT, warming), '/speed': (FLOAT, warming)},
+     'topic /imu/temp (std_msgs/msg/Float32) looks like a temperature and is not used: name it '
+     'with --temperature-topic /imu/temp'),
+    ({'/a/t': WARM, '/b/t': WARM},
+     'topics /a/t (sensor_msgs/msg/Temperature), /b/t (sensor_msgs/msg/Temperature) look like a '
+     'temperature and are not used: name one with --temperature-topic TOPIC'),
+    (PRESSURE, 'topic /pressure (sensor_msgs/msg/FluidPressure): a pressure is no temperature, '
+     'and the bag has no other topic that looks like one'),
+    ({'/t': ('sensor_msgs/msg/Temperature', lambda seconds: np.nan)},
+     'there is no temperature: 40 messages on /t (sensor_msgs/msg/Temperature) with no finite '
+     'number')])
+def test_a_topic_that_is_not_clearly_the_temperature_is_named_and_not_used(
+        topics: Mapping[str, tuple[str, Values]], note: str, tmp_path: Path) -> None:
+    found, notes = read(write(tmp_path, topics))
+    assert 'temperature' not in found
+    assert notes[0] == note
+
+
 def test_of_several_temperatures_that_of_the_imu_is_used(tmp_path: Path) -> None:
-    path = write(tmp_path / 'bag', {
+    path = write(tmp_path, {
         '/motor/temperature': ('sensor_msgs/msg/Temperature', lambda seconds: 70.0),
-        '/imu/temperature': ('sensor_msgs/msg/Temperature', warming)})
+        '/imu/temperature': WARM})
     found, notes = read(path)
     np.testing.assert_allclose(found['temperature'], EXPECTED, atol=1e-9)
     assert notes == ('topic /motor/temperature (sensor_msgs/msg/Temperature) looks like a '
@@ -151,19 +152,10 @@ def test_of_several_temperatures_that_of_the_imu_is_used(tmp_path: Path) -> None
     assert set(found['temperature']) == {70.0}
 
 
-def test_none_of_several_temperatures_is_used_if_it_is_not_clear_which(tmp_path: Path) -> None:
-    one = ('sensor_msgs/msg/Temperature', warming)
-    found, notes = read(write(tmp_path / 'bag', {'/a/t': one, '/b/t': one}))
-    assert 'temperature' not in found
-    assert notes == ('topics /a/t (sensor_msgs/msg/Temperature), /b/t (sensor_msgs/msg/'
-                     'Temperature) look like a temperature and are not used: name one with '
-                     '--temperature-topic TOPIC',)
-
-
 @pytest.mark.parametrize('kind', ['mcap', 'sqlite3', 'bag'])
 def test_the_voltage_of_a_battery_is_the_supply_where_it_is_named(kind: str,
                                                                   tmp_path: Path) -> None:
-    path = write(tmp_path / 'r.bag' if kind == 'bag' else tmp_path / kind, {
+    path = write(tmp_path, {
         '/battery': ('sensor_msgs/msg/BatteryState', lambda seconds: 12.0 - seconds)}, kind)
     found, notes = read(path, supply_topic='/battery')
     np.testing.assert_allclose(found['supply_voltage'], 12.0 - (EXPECTED - 20.0) / 2.0, atol=1e-5)
@@ -176,8 +168,7 @@ def test_the_voltage_of_a_battery_is_the_supply_where_it_is_named(kind: str,
 
 @pytest.mark.parametrize('kind', ['mcap', 'sqlite3', 'bag'])
 def test_fields_of_a_type_of_the_user_are_found(kind: str, tmp_path: Path) -> None:
-    path = write(tmp_path / 'r.bag' if kind == 'bag' else tmp_path / kind,
-                 {'/board': (OWN, warming)}, kind)
+    path = write(tmp_path, {'/board': (OWN, warming)}, kind)
     found, notes = read(path, temperature_topic='/board', supply_topic='/board')
     np.testing.assert_allclose(found['temperature'], EXPECTED, atol=1e-5)
     assert set(found['supply_voltage']) == {5.0}
@@ -191,7 +182,7 @@ def test_fields_of_a_type_of_the_user_are_found(kind: str, tmp_path: Path) -> No
 
 
 def test_kelvin_and_millivolts_are_converted_and_noted(tmp_path: Path) -> None:
-    path = write(tmp_path / 'bag', {
+    path = write(tmp_path, {
         '/k': ('std_msgs/msg/Float64', lambda seconds: 273.15 + warming(seconds)),
         '/mv': ('std_msgs/msg/UInt16', lambda seconds: 3300)})
     found, notes = read(path, temperature_topic='/k', supply_topic='/mv')
@@ -199,9 +190,6 @@ def test_kelvin_and_millivolts_are_converted_and_noted(tmp_path: Path) -> None:
     np.testing.assert_allclose(found['supply_voltage'], 3.3)
     assert 'the numbers on /k (std_msgs/msg/Float64) are read as K' in notes
     assert 'the numbers on /mv (std_msgs/msg/UInt16) are read as mV' in notes
-
-
-PRESSURE = {'/pressure': ('sensor_msgs/msg/FluidPressure', lambda seconds: 101325.0)}
 
 
 @pytest.mark.parametrize(('topics', 'asked', 'words'), [
@@ -215,66 +203,9 @@ PRESSURE = {'/pressure': ('sensor_msgs/msg/FluidPressure', lambda seconds: 10132
     ({}, '/none', 'has the topics /imu/data .*, expected /none; choose one of them with')])
 def test_a_topic_without_a_temperature_is_refused(
         topics: Mapping[str, tuple[str, Values]], asked: str, words: str, tmp_path: Path) -> None:
-    path = write(tmp_path / 'bag', topics)
+    path = write(tmp_path, topics)
     with pytest.raises(InputError, match=words):
         read(path, temperature_topic=asked)
-
-
-def test_a_pressure_is_mentioned_where_there_is_no_temperature(tmp_path: Path) -> None:
-    _, notes = read(write(tmp_path / 'bag', PRESSURE))
-    assert notes == ('topic /pressure (sensor_msgs/msg/FluidPressure): a pressure is no '
-                     'temperature, and the bag has no other topic that looks like one',)
-
-
-def test_a_temperature_without_numbers_is_not_used(tmp_path: Path) -> None:
-    found, notes = read(write(tmp_path / 'bag', {
-        '/t': ('sensor_msgs/msg/Temperature', lambda seconds: np.nan)}))
-    assert 'temperature' not in found
-    assert notes[0].startswith('there is no temperature: 40 messages on /t')
-
-
-@pytest.fixture(scope='module')
-def thermal() -> Calibration:
-    """Return a calibration in g that depends on the temperature."""
-    rng, directions = np.random.default_rng(4), spread_directions(24)
-    model = model_with({'offset': (0.02, -0.01, 0.03), 'axis_gain': (0.01, -0.01, 0.02),
-                        'offset_temperature': (0.002, -0.001, 0.003)})
-    poses = simulate_poses(model, directions, rng, noise_g=1e-4, context={
-        'temperature': rng.uniform(10.0, 40.0, len(directions))})
-    from accel_calib.refine import refine
-
-    found = refine(poses, units_of('g'), base='7').calibration
-    assert 'offset_temperature' in found.model.effects
-    return found
-
-
-def test_a_bag_is_corrected_with_a_named_temperature(thermal: Calibration, tmp_path: Path
-                                                     ) -> None:
-    path = write(tmp_path / 'bag', {'/imu/temp': ('std_msgs/msg/Float64', warming)})
-    raw, _ = read(path, temperature_topic='/imu/temp')
-    notes: list[str] = []
-    assert correct_bag(path, thermal, tmp_path / 'out', temperature_topic='/imu/temp',
-                       note=notes.append) == COUNT
-    found, _ = read(tmp_path / 'out')
-    expected = thermal.correct(raw.reading / 9.80665, {'temperature': raw['temperature']})
-    np.testing.assert_allclose(found.reading, expected * 9.80665, atol=1e-9)
-    assert np.ptp(found.reading, axis=0).max() > 0.05
-    assert 'have no stamp' in notes[0]
-
-
-def test_a_calibration_that_depends_on_a_temperature_names_the_topics(
-        thermal: Calibration, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from inside import main
-
-    path = write(tmp_path / 'bag', {'/imu/temp': ('std_msgs/msg/Float64', warming)})
-    write_calibration(tmp_path / 'c.yaml', thermal)
-    with pytest.raises(InputError, match='looks like a temperature .* but the calibration depends '
-                                         'on the temperature; name the topic with'):
-        correct_bag(path, thermal, tmp_path / 'out')
-    given = ['apply', str(path), '-c', str(tmp_path / 'c.yaml'), '-o', str(tmp_path / 'out')]
-    assert main(given) == 2
-    assert main([*given, '--temperature-topic', '/imu/temp']) == 0
-    assert 'corrected 400 samples' in capsys.readouterr().out
 
 
 @pytest.fixture(scope='module')
@@ -284,23 +215,38 @@ def calibration_in_g() -> Calibration:
                      units_of('g'))
 
 
+@pytest.fixture(scope='module')
+def thermal(calibration_in_g: Calibration) -> Calibration:
+    """Return a calibration in g that depends on the temperature."""
+    return with_effects(calibration_in_g, {'offset_temperature': (0.002, -0.001, 0.003)},
+                        temperature=np.linspace(10.0, 40.0, 16))
+
+
+def test_a_bag_is_corrected_with_a_named_temperature(
+        thermal: Calibration, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, out = write(tmp_path, {'/imu/temp': ('std_msgs/msg/Float64', warming)}), tmp_path / 'out'
+    with pytest.raises(InputError, match='looks like a temperature .* but the calibration depends '
+                                         'on the temperature; name the topic with'):
+        correct_bag(path, thermal, out)
+    notes: list[str] = []
+    assert correct_bag(path, thermal, out, temperature_topic='/imu/temp',
+                       note=notes.append) == COUNT
+    assert 'have no stamp' in notes[0]
+    raw, found = read(path, temperature_topic='/imu/temp')[0], read(out)[0]
+    expected = thermal.correct(raw.reading / 9.80665, {'temperature': raw['temperature']})
+    np.testing.assert_allclose(found.reading, expected * 9.80665, atol=1e-9)
+    assert np.ptp(found.reading, axis=0).max() > 0.05
+
+    write_calibration(tmp_path / 'c.yaml', thermal)
+    given = ['apply', str(path), '-c', str(tmp_path / 'c.yaml'), '-o', str(tmp_path / 'other')]
+    assert main(given) == 2
+    assert main([*given, '--temperature-topic', '/imu/temp']) == 0
+    assert 'corrected 400 samples' in capsys.readouterr().out
+
+
 def test_a_calibration_without_temperature_needs_no_topic(calibration_in_g: Calibration,
                                                           tmp_path: Path) -> None:
-    path = write(tmp_path / 'bag', {'/imu/temp': ('std_msgs/msg/Float64', warming)})
+    path = write(tmp_path, {'/imu/temp': ('std_msgs/msg/Float64', warming)})
     notes: list[str] = []
     assert correct_bag(path, calibration_in_g, tmp_path / 'out', note=notes.append) == COUNT
     assert notes == []
-
-
-def test_a_calibration_in_g_corrects_a_bag_in_m_s2_and_refuses_one_in_g(
-        calibration_in_g: Calibration, tmp_path: Path) -> None:
-    path = write(tmp_path / 'bag', {})
-    assert correct_bag(path, calibration_in_g, tmp_path / 'out') == COUNT
-    raw, found = read(path)[0], read(tmp_path / 'out')[0]
-    np.testing.assert_allclose(
-        found.reading, calibration_in_g.correct(raw.reading / 9.80665) * 9.80665, rtol=1e-12)
-    wrong = write(tmp_path / 'wrong', {}, force=(0.01, -0.02, 1.0))
-    with pytest.raises(InputError, match='the length of the readings is about 1, expected about '
-                                         '9.807 at rest in m/s2'):
-        correct_bag(wrong, calibration_in_g, tmp_path / 'out2')
-    assert not (tmp_path / 'out2').exists()

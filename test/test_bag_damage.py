@@ -10,29 +10,18 @@ import shutil
 import sqlite3
 from typing import Any
 
-from accel_calib.calibrate import Calibration
 from accel_calib.errors import InputError
 from accel_calib.logs import open_log, read_recording
 from accel_calib.messages import correct_bag
 from accel_calib.stored import write_calibration
 from bag_files import (
-    a_calibration, copied, COUNT, execute, MAKES, McapFile, messages, ros1, rosbag2, STORE, TOPICS)
+    a_calibration, by_hand, check_refused, COUNT, execute, MAKES, raw_messages, ros1, rosbag2)
 from faults.fuzz import ended, read_bag
 from faults.sample import sample
 import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin
 from shared import run_on_small_disk
-
-
-@pytest.fixture(scope='module')
-def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    return {make: write(tmp_path_factory.mktemp('whole')) for make, write in MAKES.items()}
-
-
-@pytest.fixture(scope='module')
-def calibration() -> Calibration:
-    return a_calibration()
 
 
 def check(path: Path) -> None:
@@ -50,153 +39,148 @@ TABLES = {'messages': ('topic_id', 'timestamp', 'data'),
 @pytest.mark.parametrize(('table', 'column', 'cell'), sample(
     [(table, column, cell) for table in TABLES for column in TABLES[table] for cell in CELLS], 8))
 def test_sqlite_cells_of_another_type_end_in_one_line_or_in_a_result(
-        table: str, column: str, cell: Any, whole: dict[str, Path], tmp_path: Path) -> None:
-    path = copied(whole['sqlite3'], tmp_path / 'in')
-    with_loose_columns(path / 'bag.db3', table)
+        table: str, column: str, cell: Any, tmp_path: Path) -> None:
+    path = with_loose_columns(tmp_path, table)
     execute(path / 'bag.db3', f'UPDATE {table} SET {column} = ? WHERE rowid = '
             f'(SELECT max(rowid) FROM {table})', cell)
     check(path)
     check(path / 'bag.db3')
 
 
-def with_loose_columns(file: Path, table: str) -> None:
-    """Replace a table by one without types and constraints."""
-    execute(file, f'CREATE TABLE loose AS SELECT * FROM {table}')
-    execute(file, f'DROP TABLE {table}')
-    execute(file, f'ALTER TABLE loose RENAME TO {table}')
+def in_its_folder(folder: Path) -> Path:
+    """Return a db3 bag in a folder that has nothing else."""
+    (folder / 'in').mkdir()
+    return MAKES['sqlite3'](folder / 'in')
+
+
+def with_loose_columns(folder: Path, table: str) -> Path:
+    """Return a db3 bag with a table that has no types and constraints."""
+    path = in_its_folder(folder)
+    for statement in (f'CREATE TABLE loose AS SELECT * FROM {table}', f'DROP TABLE {table}',
+                      f'ALTER TABLE loose RENAME TO {table}'):
+        execute(path / 'bag.db3', statement)
+    return path
 
 
 @pytest.mark.parametrize(('column', 'cell', 'words'), [
     ('data', None, 'a message on /imu has the content None'),
     ('data', 'words', "a message on /imu has the content 'words'"),
     ('timestamp', 'words', "a message on /imu has the time of receipt 'words'")])
-def test_a_cell_of_another_type_is_named(column: str, cell: Any, words: str,
-                                         whole: dict[str, Path], tmp_path: Path) -> None:
-    path = copied(whole['sqlite3'], tmp_path / 'in')
-    with_loose_columns(path / 'bag.db3', 'messages')
+def test_a_cell_of_another_type_is_named(column: str, cell: Any, words: str, tmp_path: Path
+                                         ) -> None:
+    path = with_loose_columns(tmp_path, 'messages')
     execute(path / 'bag.db3', f'UPDATE messages SET {column} = ? WHERE rowid = 1', cell)
     with pytest.raises(InputError, match=f'is damaged or not a bag .{words}'):
         read_recording(path)
 
 
-def test_the_messages_in_the_journal_of_a_killed_recorder_are_read(
-        whole: dict[str, Path], calibration: Calibration, tmp_path: Path) -> None:
-    (tmp_path / 'recorded').mkdir()
-    path = copied(whole['sqlite3'], tmp_path / 'recorded')
-    database = sqlite3.connect(path / 'bag.db3')
-    database.execute('PRAGMA journal_mode = WAL')
-    database.execute('PRAGMA wal_autocheckpoint = 0')
-    database.execute('INSERT INTO messages SELECT id + 1000, topic_id, timestamp + ?, data '
-                     'FROM messages WHERE topic_id = 1', (10 ** 9,))
-    database.commit()
-    killed = Path(shutil.copytree(path, tmp_path / 'bag'))
-    database.close()
-    (killed / 'bag.db3-shm').unlink()
-    before = {each.name: each.read_bytes() for each in killed.iterdir()}
-    for each in (killed, killed / 'bag.db3'):
-        with open_log(each) as opened:
-            assert sum(map(len, opened.blocks)) == 2 * COUNT
-            assert 'its last messages are read from bag.db3-wal' in opened.notes[0]
-    assert correct_bag(killed, calibration, tmp_path / 'out') == 2 * COUNT
-    assert {each.name: each.read_bytes() for each in killed.iterdir()} == before
+def read(path: Path) -> tuple[int, tuple[str, ...]]:
+    """Return the number of samples in a bag, and the notes."""
+    with open_log(path) as opened:
+        return sum(map(len, opened.blocks)), opened.notes
 
 
-def test_an_interrupted_transaction_is_undone(whole: dict[str, Path], tmp_path: Path) -> None:
-    (tmp_path / 'recorded').mkdir()
-    path = copied(whole['sqlite3'], tmp_path / 'recorded')
+def killed(folder: Path, *statements: str) -> Path:
+    """Return a bag as a recorder leaves it that is killed after these statements."""
+    path = MAKES['sqlite3'](folder)
     database = sqlite3.connect(path / 'bag.db3', isolation_level=None)
-    database.execute('PRAGMA cache_size = 1')
-    database.execute('BEGIN')
-    database.execute("UPDATE messages SET data = x'00'")
-    killed = Path(shutil.copytree(path, tmp_path / 'bag'))
-    database.execute('ROLLBACK')
+    for each in statements:
+        database.execute(each)
+    copy = Path(shutil.copytree(path, folder / 'killed'))
     database.close()
-    assert (killed / 'bag.db3-journal').stat().st_size
-    assert len(read_recording(killed)) == COUNT
+    return copy
+
+
+def test_the_messages_in_the_journal_of_a_killed_recorder_are_read(tmp_path: Path) -> None:
+    path = killed(tmp_path, 'PRAGMA journal_mode = WAL', 'PRAGMA wal_autocheckpoint = 0',
+                  'INSERT INTO messages SELECT id + 1000, topic_id, timestamp + 1000000000, data '
+                  'FROM messages WHERE topic_id = 1')
+    (path / 'bag.db3-shm').unlink()
+    before = {each.name: each.read_bytes() for each in path.iterdir()}
+    for each in (path, path / 'bag.db3'):
+        count, notes = read(each)
+        assert count == 2 * COUNT
+        assert 'its last messages are read from bag.db3-wal' in notes[0]
+    assert correct_bag(path, a_calibration(), tmp_path / 'out') == 2 * COUNT
+    assert {each.name: each.read_bytes() for each in path.iterdir()} == before
+
+
+def test_an_interrupted_transaction_is_undone(tmp_path: Path) -> None:
+    path = killed(tmp_path, 'PRAGMA cache_size = 1', 'BEGIN', "UPDATE messages SET data = x'00'")
+    assert (path / 'bag.db3-journal').stat().st_size
+    assert len(read_recording(path)) == COUNT
 
 
 @pytest.mark.parametrize('name', ['run #1', 'what?', '100%20'])
-def test_letters_of_a_uri_in_a_name_are_read(name: str, whole: dict[str, Path], tmp_path: Path
-                                             ) -> None:
-    path = copied(whole['sqlite3'], tmp_path).rename(tmp_path / name)
+def test_letters_of_a_uri_in_a_name_are_read(name: str, tmp_path: Path) -> None:
+    path = MAKES['sqlite3'](tmp_path).rename(tmp_path / name)
     for each in (path, path / 'bag.db3'):
         assert len(read_recording(each)) == COUNT
 
 
 @pytest.mark.parametrize('suffix', ['-wal', '-journal'])
-def test_a_damaged_journal_ends_in_one_line_or_in_a_result(
-        suffix: str, whole: dict[str, Path], tmp_path: Path) -> None:
-    path = copied(whole['sqlite3'], tmp_path / 'in')
+def test_a_damaged_journal_ends_in_one_line_or_in_a_result(suffix: str, tmp_path: Path) -> None:
+    path = in_its_folder(tmp_path)
     for content in (b'x', bytes(4096), b'SQLite format 3' * 500):
         (path / f'bag.db3{suffix}').write_bytes(content)
         check(path)
 
 
-def test_a_folder_without_metadata_is_read(whole: dict[str, Path], tmp_path: Path) -> None:
-    path = copied(whole['mcap folder'], tmp_path)
+def test_a_folder_without_metadata_is_read(tmp_path: Path) -> None:
+    path = MAKES['mcap folder'](tmp_path)
     (path / 'metadata.yaml').unlink()
-    with open_log(path) as opened:
-        assert sum(map(len, opened.blocks)) == COUNT
-    assert opened.notes == (f'{path} has no metadata.yaml, as after a recorder was killed; '
-                            'bag.mcap is read without it',)
+    assert read(path) == (COUNT, (f'{path} has no metadata.yaml, as after a recorder was killed; '
+                                  'bag.mcap is read without it',))
 
 
-def test_a_file_that_the_metadata_do_not_list_is_noted(whole: dict[str, Path],
-                                                       tmp_path: Path) -> None:
-    path = copied(whole['mcap folder'], tmp_path)
+def test_a_file_that_the_metadata_do_not_list_is_noted(tmp_path: Path) -> None:
+    path = MAKES['mcap folder'](tmp_path)
     shutil.copy(path / 'bag.mcap', path / 'later.mcap')
-    with open_log(path) as opened:
-        assert sum(map(len, opened.blocks)) == COUNT
-    assert 'does not list file later.mcap' in opened.notes[0]
+    count, notes = read(path)
+    assert count == COUNT
+    assert 'does not list file later.mcap' in notes[0]
 
 
-def test_damaged_metadata_print_nothing(whole: dict[str, Path], tmp_path: Path,
+def test_damaged_metadata_print_nothing(tmp_path: Path,
                                         recwarn: pytest.WarningsRecorder) -> None:
-    path = copied(whole['mcap folder'], tmp_path)
+    path = MAKES['mcap folder'](tmp_path)
     metadata = path / 'metadata.yaml'
     text = metadata.read_text()
     assert text.count('message_count: ') > 1
     metadata.write_text(text.replace('message_count: ', 'message_count: &a '))
-    with open_log(path) as opened:
-        assert sum(map(len, opened.blocks)) == COUNT
+    assert read(path)[0] == COUNT
     assert not [str(each.message) for each in recwarn]
 
 
-def test_lost_messages_are_noted(whole: dict[str, Path], calibration: Calibration,
-                                 tmp_path: Path) -> None:
-    path = copied(whole['sqlite3'], tmp_path)
+def test_lost_messages_are_noted(tmp_path: Path) -> None:
+    path = MAKES['sqlite3'](tmp_path)
     execute(path / 'bag.db3', 'DELETE FROM messages WHERE rowid % 2')
-    with open_log(path) as opened:
-        found = sum(map(len, opened.blocks))
+    found, said = read(path)
     assert 0 < found < COUNT
-    expected = (f'{COUNT - found} of {COUNT} messages on /imu are lost: the index of {path} '
-                'states them, but they are not in the bag')
-    assert opened.notes == (expected,)
+    assert said == (f'{COUNT - found} of {COUNT} messages on /imu are lost: the index of {path} '
+                    'states them, but they are not in the bag',)
     notes: list[str] = []
-    assert correct_bag(path, calibration, tmp_path / 'out', note=notes.append) == found
-    assert notes == [expected]
+    assert correct_bag(path, a_calibration(), tmp_path / 'out', note=notes.append) == found
+    assert notes == [*said]
 
 
 @pytest.mark.parametrize(('value', 'words'), [
     (1e300, r'Imu message 8 has the acceleration 1e\+300'),
-    (np.inf, 'Imu message 8 contains NaN or infinity')])
-def test_an_acceleration_beyond_any_sensor_is_refused(
-        value: float, words: str, calibration: Calibration, tmp_path: Path) -> None:
-    made = [(topic, stamp, bytearray(STORE.serialize_cdr(each, TOPICS[topic][1])))
-            for topic, stamp, each in messages() if topic == 0]
-    made[7][2][-96:-88] = np.float64(value).tobytes()
-    path = McapFile(TOPICS).write(tmp_path / 'bag.mcap', made)
-    for work in (lambda: read_recording(path),
-                 lambda: correct_bag(path, calibration, tmp_path / 'out')):
-        with pytest.raises(InputError, match=words):
-            work()
+    (np.inf, 'Imu message 8 contains NaN or infinity'),
+    (np.nan, 'Imu message 8 contains NaN or infinity')])
+def test_an_acceleration_beyond_any_sensor_is_refused(value: float, words: str, tmp_path: Path
+                                                      ) -> None:
+    made = [each for each in raw_messages() if each[0] == 0]
+    topic, stamp, raw = made[7]
+    made[7] = (topic, stamp, raw[:-96] + np.float64(value).tobytes() + raw[-88:])
+    check_refused(by_hand()(tmp_path, made=made), words)
 
 
 @pytest.mark.parametrize('size_kb', [8, 24])
 @pytest.mark.parametrize('name', ['out', 'out.db3', 'out.mcap', 'out.bag'])
 def test_a_copy_on_a_full_disk_is_one_line_and_nothing_stored(
-        name: str, size_kb: int, calibration: Calibration, tmp_path: Path) -> None:
-    write_calibration(tmp_path / 'c.yaml', calibration)
+        name: str, size_kb: int, tmp_path: Path) -> None:
+    write_calibration(tmp_path / 'c.yaml', a_calibration())
     path = (ros1() if name.endswith('.bag') else rosbag2(StoragePlugin.SQLITE3))(tmp_path)
     disk = tmp_path / 'disk'
     done, copy = run_on_small_disk(

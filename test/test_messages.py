@@ -1,64 +1,116 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Serialized Imu messages: layout and correction."""
+"""
+Correction of Imu messages: their bytes (`Rewriter`), their numbers (`corrected`), one reading.
 
+All correct the same random messages, with extreme values in every field. The number of messages is
+the variable IMU_MESSAGES, 800 by default. Bytes that are no message never raise anything but an
+error of this package.
+
+"""
+
+from dataclasses import replace
 from itertools import product
+import math
+import os
 import struct
 
-from accel_calib.calibrate import fit_poses, level, thermal_stream
-from accel_calib.errors import InputError
+from accel_calib.calibrate import fit_poses, thermal_stream
+from accel_calib.effects import EFFECTS
+from accel_calib.errors import AccelCalibError, InputError
 from accel_calib.logs import (
     ACCELERATION, ACCELERATION_COVARIANCE, ANGULAR_VELOCITY, ANGULAR_VELOCITY_COVARIANCE,
-    doubles_at, IMU_DOUBLES, joined, layout_of, ORIENTATION, ORIENTATION_COVARIANCE, renamed,
-    samples_of)
+    doubles_at, IMU_DOUBLES, joined, layout_of, LITTLE_ENDIAN, ORIENTATION, ORIENTATION_COVARIANCE,
+    renamed, samples_of)
 from accel_calib.messages import corrected, output_frame, Rewriter
 from accel_calib.units import STANDARD_GRAVITY, units_of
-from inside import frame_ids, rotation_from_rpy, simulate_poses, spread_directions, stamps_of
+from inside import (
+    frame_ids, Model, OneReading, rotation_from_rpy, simulate_poses, spread_directions, stamps_of)
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from shared import sensor, with_effects
+from shared import random_directions, sensor, with_effects
 
-UNITS = units_of('m/s2')
-NAMES = ['', 'i', 'imu', 'imu_li', 'imu_link', 'base/imu_link_7', 'übung', 'x' * 300]
-COVARIANCES = ['absent', 'unknown', 'known', 'full', 'other']
+COUNT = int(os.environ.get('IMU_MESSAGES', '800'))
+COVARIANCES = ORIENTATION_COVARIANCE, ANGULAR_VELOCITY_COVARIANCE, ACCELERATION_COVARIANCE
+EXTREMES = (0.0, -0.0, -1.0, math.nan, math.inf, -math.inf, 5e-324, -5e-324, 1e-310, 2.0 ** 53,
+            1e16, 1e300, -1e300, 1.7e308)
+NAMES = ('', 'i', 'imu', 'imu_li', 'imu_link', 'base/imu_link_7', 'a b', 'übung', '日本/フレーム',
+         'é' * 77, 'x' * 300)
+TEMPERATURES = (25.0, -40.0, 125.0, -273.15, 1e4)
+SECONDS = (0, 1, -1, 2 ** 31 - 1, -2 ** 31, 1_700_000_000)
+NANOSECONDS = (0, 1, 999_999_999, 2 ** 32 - 1)
+LAGS = {'offset_temperature': [1e-3, 2e-3, -1e-3, 8.0, 1.0],
+        'gain_temperature': [1e-3, -1e-3, 5e-4, 5.0, 0.0],
+        'temperature_rate': [0.02, -0.03, 0.01]}
+CASES = {
+    'linear': {},
+    'bent': {'quadratic': [1e-3, -2e-3, 1e-3], 'cubic': [1e-4, 2e-4, -1e-4],
+             'odd_quadratic': [1e-4, -1e-4, 2e-4], 'gain_asymmetry': [1e-3, -1e-3, 2e-3]},
+    'context': {'gain_temperature': [3e-4, -2e-4, 1e-4], 'lever_arm': [0.1, -0.05, 0.02],
+                'offset_temperature': [1e-3, 2e-3, -1e-3],
+                'warm_up': [0.01, 0.005, -0.01, 900.0, 600.0]},
+    'lag': LAGS}
 
 
-@pytest.fixture
-def calibration():
-    rng = np.random.default_rng(1)
+def calibration_of(effects, *, unit='m/s2', turned=False):
+    """Return a linear fit with these effects, and a covariance of all values."""
+    rng, units = np.random.default_rng(1), units_of(unit)
     poses = simulate_poses(sensor(rng), spread_directions(20), rng)
-    poses = poses.with_columns(reading=UNITS.from_g(poses.reading), std=UNITS.from_g(poses['std']))
-    return fit_poses(poses, UNITS)
+    poses = poses.with_columns(reading=units.from_g(poses.reading), std=units.from_g(poses['std']))
+    fitted = fit_poses(poses, units, model='10')
+    values = {**fitted.model.values,
+              **{name: np.array(each, float) for name, each in effects.items()}}
+    model = Model(values, rotation_from_rpy(0.3, -0.2, 1.0) if turned else np.eye(3))
+    root = rng.normal(size=(len(model.vector), len(model.vector))) * 1e-4
+    return replace(fitted, model=model, covariance=root @ root.T)
 
 
-@pytest.fixture
-def levelled(calibration):
-    flat = rotation_from_rpy(0.4, 0.2, -1.0) @ np.array([0, 0, 1.0])
-    return level(calibration, calibration.predict(flat[np.newaxis] * UNITS.per_g)[0], 'ros')
+@pytest.fixture(scope='module')
+def calibration():
+    return calibration_of({})
 
 
-def messages(count=6):
+@pytest.fixture(scope='module')
+def levelled():
+    return calibration_of({}, turned=True)
+
+
+def message(doubles, name='imu', stamp=(100, 0), padding=bytes(7)):
+    """Return a message in little-endian CDR."""
+    letters = name.encode() + b'\0'
+    head = struct.pack('<iII', *stamp, len(letters)) + letters
+    return LITTLE_ENDIAN + head + padding[:-len(head) % 8] + doubles.tobytes()
+
+
+def doubles_of(data):
+    return np.frombuffer(data[-8 * IMU_DOUBLES:], '<f8')
+
+
+def rewriter_of(data, calibration, name='imu'):
+    return Rewriter(layout_of(data), calibration, 1.0, STANDARD_GRAVITY, name)
+
+
+def fields_of(count=6):
+    """Return the (n, 37) doubles of messages with known covariances."""
     fields = np.random.default_rng(2).normal(size=(count, IMU_DOUBLES))
-    for part in (ORIENTATION_COVARIANCE, ANGULAR_VELOCITY_COVARIANCE,
-                 ACCELERATION_COVARIANCE):
+    for part in COVARIANCES:
         root = fields[:, part].reshape(-1, 3, 3) * 0.01
         fields[:, part] = (root @ np.swapaxes(root, 1, 2)).reshape(-1, 9)
     return fields
 
 
 def test_without_a_mounting_only_the_acceleration_changes(calibration):
-    fields = messages()
+    fields = fields_of()
     found = corrected(calibration, fields)
     np.testing.assert_allclose(found[:, ACCELERATION],
                                calibration.correct(fields[:, ACCELERATION]))
-    rest = np.r_[0:ACCELERATION.start]
-    np.testing.assert_array_equal(found[:, rest], fields[:, rest])
+    np.testing.assert_array_equal(found[:, :ACCELERATION.start], fields[:, :ACCELERATION.start])
 
 
 def test_with_a_mounting_all_fields_are_in_one_frame(levelled):
-    fields, rotation = messages(), levelled.model.rotation
+    fields, rotation = fields_of(), levelled.model.rotation
     found = corrected(levelled, fields)
     np.testing.assert_allclose(found[:, ANGULAR_VELOCITY],
                                fields[:, ANGULAR_VELOCITY] @ rotation)
@@ -78,27 +130,42 @@ def test_corrected_messages_have_the_frame_they_are_in(calibration, levelled):
     assert output_frame(levelled.in_sensor_frame, 'imu_link', 'base') == 'imu_link'
 
 
+def test_a_known_covariance_is_transformed_and_grows_by_that_of_the_calibration(levelled):
+    fields = fields_of()
+    found = corrected(levelled, fields)
+    inverse = levelled.model.rotation.T @ np.linalg.inv(levelled.gain)
+    own = inverse @ fields[:, ACCELERATION_COVARIANCE].reshape(-1, 3, 3) @ inverse.T
+    added = found[:, ACCELERATION_COVARIANCE].reshape(-1, 3, 3) - own
+    np.testing.assert_allclose(added, levelled.force_covariance(found[:, ACCELERATION]),
+                               atol=1e-15)
+    assert np.all(np.linalg.eigvalsh(added) > 0)
+
+
 @pytest.mark.parametrize('turned', [False, True])
-def test_the_bias_of_the_gyro_is_subtracted_before_the_rate_is_turned(calibration, levelled,
-                                                                      turned):
-    used, bias = levelled if turned else calibration, np.array([0.01, -0.02, 0.03])
-    data = random_message(np.random.default_rng(6), 'imu')
-    fields = every(data)
+def test_the_bias_of_the_gyro_is_subtracted_before_the_rate_is_turned(turned):
+    used, bias, fields = calibration_of({}, turned=turned), (0.01, -0.02, 0.03), fields_of(1)[0]
     for first, known in ((4e-4, True), (-1.0, False)):
-        fields[0, ANGULAR_VELOCITY_COVARIANCE.start] = first
-        data = data[:-296] + fields.tobytes()
-        rewriter = Rewriter(layout_of(data), used, 1.0, STANDARD_GRAVITY, 'imu')
-        rewriter.bias = tuple(bias)
-        rate = every(rewriter(data, {}))[0, ANGULAR_VELOCITY]
-        expected = fields[0, ANGULAR_VELOCITY] - bias * known
-        np.testing.assert_allclose(rate, used.rotation.T @ expected, rtol=1e-12)
+        fields[ANGULAR_VELOCITY_COVARIANCE.start] = first
+        data = message(fields)
+        rewriter = rewriter_of(data, used)
+        rewriter.bias = bias
+        expected = fields[ANGULAR_VELOCITY] - np.array(bias) * known
+        np.testing.assert_allclose(doubles_of(rewriter(data, {}))[ANGULAR_VELOCITY],
+                                   used.rotation.T @ expected, rtol=1e-12)
+
+
+def swapped(data):
+    """Return a little-endian message as a big-endian machine writes it."""
+    begin = layout_of(data).begin
+    stamp = struct.unpack_from('<iII', data, 4)
+    return b'\0\0\0\0' + struct.pack('>iII', *stamp) + data[16:begin] + doubles_of(data).astype(
+        '>f8').tobytes()
 
 
 @pytest.mark.parametrize('ros2', [False, True])
 @pytest.mark.parametrize('name', NAMES)
 def test_messages_get_another_frame_id(ros2, name):
-    rng = np.random.default_rng(7)
-    raws = [random_message(rng, 'imu_link') for _ in range(4)]
+    raws = [message(each, 'imu_link', (k - 1, 5 * k)) for k, each in enumerate(fields_of(4))]
     if ros2:
         raws[1] = swapped(raws[1])
     else:  # the serialization of ROS 1: four bytes of seq, no NUL, no padding
@@ -109,119 +176,241 @@ def test_messages_get_another_frame_id(ros2, name):
     for found in (after, again):
         assert frame_ids(found) == [name]
         np.testing.assert_array_equal(stamps_of(found), stamps_of(before))
-        np.testing.assert_array_equal(doubles_at(found, slice(0, 37)),
-                                      doubles_at(before, slice(0, 37)))
-
-
-def test_a_known_covariance_is_transformed_and_grows_by_that_of_the_calibration(levelled):
-    fields = messages()
-    found = corrected(levelled, fields)
-    inverse = levelled.model.rotation.T @ np.linalg.inv(levelled.gain)
-    own = inverse @ fields[:, ACCELERATION_COVARIANCE].reshape(-1, 3, 3) @ inverse.T
-    added = found[:, ACCELERATION_COVARIANCE].reshape(-1, 3, 3) - own
-    np.testing.assert_allclose(added, levelled.force_covariance(found[:, ACCELERATION]),
-                               atol=1e-15)
-    assert np.all(np.linalg.eigvalsh(added) > 0)
-
-
-def covariance(kind, rng):
-    """Return a covariance as drivers send it."""
-    values = np.zeros(9)
-    root = rng.normal(size=(3, 3)) * 0.01
-    if kind == 'absent':
-        values[0] = -1.0
-    elif kind == 'known':
-        values[[0, 4, 8]] = 4e-4
-    elif kind == 'full':
-        values = (root @ root.T).ravel()
-    elif kind == 'other':
-        values[4] = 1e-3
-    return values
-
-
-def random_message(rng, frame_id=None):
-    """Return a serialized message with random fields and padding."""
-    name = (rng.choice(NAMES) if frame_id is None else frame_id).encode() + b'\0'
-    doubles = rng.normal(size=37) * 5.0
-    for part in (ORIENTATION_COVARIANCE, ANGULAR_VELOCITY_COVARIANCE,
-                 ACCELERATION_COVARIANCE):
-        doubles[part] = covariance(rng.choice(COVARIANCES), rng)
-    if rng.uniform() < 0.05:
-        doubles[ANGULAR_VELOCITY.start + 1] = np.nan
-    stamp = struct.pack('<iI', rng.integers(-2 ** 31, 2 ** 31), rng.integers(0, 10 ** 9))
-    head = stamp + struct.pack('<I', len(name)) + name
-    return b'\0\1\0\0' + head + rng.bytes(-len(head) % 8) + doubles.tobytes()
-
-
-@pytest.mark.parametrize('name', ['', 'imu_link', 'robot/imü'])
-def test_a_layout_has_the_frame_id_of_its_messages(name):
-    assert layout_of(random_message(np.random.default_rng(1), name)).frame_id == name
-
-
-def swapped(data):
-    """Return a little-endian message as a big-endian machine writes it."""
-    begin = layout_of(data).begin
-    stamp, doubles = struct.unpack_from('<iII', data, 4), np.frombuffer(data, '<f8', -1, begin)
-    return b'\0\0\0\0' + struct.pack('>iII', *stamp) + data[16:begin] + doubles.astype(
-        '>f8').tobytes()
-
-
-def every(data):
-    return doubles_at(joined([data], 37, 'imu'), slice(0, 37))
-
-
-def lagged(calibration):
-    """Return a calibration with lags of both kinds."""
-    return with_effects(calibration, {
-        'temperature_rate': [0.02, -0.03, 0.01], 'gain_temperature': [1e-3, -1e-3, 5e-4, 5.0, 0.0],
-        'offset_temperature': [1e-3, 2e-3, -1e-3, 8.0, 1.0]}, 1e-8)
+        np.testing.assert_array_equal(doubles_at(found, slice(0, 37)), fields_of(4))
 
 
 def test_single_messages_and_arrays_have_the_same_lag(calibration):
-    calibration, rng = lagged(calibration), np.random.default_rng(7)
-    first = bytearray(random_message(rng, 'imu'))
-    rewriter = Rewriter(layout_of(first), calibration, 1.0, STANDARD_GRAVITY, 'imu')
-    datas = []
-    for k in range(400):
-        struct.pack_into('<II', first, 4, 100 + k // 10, k % 10 * 100_000_000)
-        datas.append(bytes(first))
-    together = joined(datas, 37, 'imu')
+    calibration, fields = with_effects(calibration, LAGS, 1e-8), fields_of(1)[0]
+    datas = [message(fields, stamp=(100 + k // 10, k % 10 * 100_000_000)) for k in range(400)]
+    rewriter, together = rewriter_of(datas[0], calibration), joined(datas, 37, 'imu')
     temperature = 25.0 + 3.0 * np.sin(np.arange(400) / 90.0)
     expected = corrected(calibration, doubles_at(together, slice(0, 37)),
                          {**samples_of(together), 'temperature': temperature})
-    found = [every(rewriter(data, {'temperature': warm}))[0]
+    found = [doubles_of(rewriter(data, {'temperature': warm}))
              for data, warm in zip(datas, temperature.tolist(), strict=True)]
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
     assert np.ptp(expected[:, ACCELERATION.start]) > 1e-3
 
 
 def test_lag_carries_over_from_block_to_block(calibration):
-    calibration = lagged(calibration)
-    doubles = np.repeat(every(random_message(np.random.default_rng(7), 'imu')), 300, axis=0)
+    calibration = with_effects(calibration, LAGS, 1e-8)
+    doubles = np.repeat(fields_of(1), 300, axis=0)
     context = {'time': 100.0 + np.arange(300) * 0.1, 'rate': np.zeros((300, 3)),
                'temperature': 25.0 + np.arange(300) * 0.01}
-    expected = corrected(calibration, doubles, context)
-    stream = thermal_stream(calibration.model)
-    parts = [corrected(calibration, doubles[rows],
-                       {key: values[rows] for key, values in context.items()}, stream)
-             for rows in (slice(0, 77), slice(77, 300))]
+
+    def part(rows, *stream):
+        return corrected(calibration, doubles[rows],
+                         {key: values[rows] for key, values in context.items()}, *stream)
+
+    expected, stream = part(slice(None)), thermal_stream(calibration.model)
+    parts = [part(slice(0, 77), stream), part(slice(77, 300), stream)]
     np.testing.assert_allclose(np.concatenate(parts), expected, rtol=1e-9)
-    alone = corrected(calibration, doubles[77:], {key: values[77:] for key, values in
-                                                  context.items()})
-    assert np.max(np.abs(alone - expected[77:])) > 1e-3
+    assert np.max(np.abs(part(slice(77, 300)) - expected[77:])) > 1e-3
 
 
 def test_no_force_beyond_100_g_is_published(calibration):
-    data = bytearray(random_message(np.random.default_rng(9), 'imu'))
-    layout = layout_of(bytes(data))
-    rewriter = Rewriter(layout, calibration, 1.0, STANDARD_GRAVITY, 'imu')
-    place = layout.place(ACCELERATION)
+    raw = message(fields_of(1)[0])
+    rewriter, place = rewriter_of(raw, calibration), layout_of(raw).place(ACCELERATION)
+    data = bytearray(raw)
     for reading, axis in product((1e3, -1e300), range(3)):
-        values = [0.0, 0.0, 0.0]
-        values[axis] = reading
-        struct.pack_into('<3d', data, place, *values)
+        struct.pack_into('<3d', data, place, *(reading * np.eye(3)[axis]))
         with pytest.raises(InputError, match='expected less than 100 g; check the calibration'):
             rewriter(bytes(data), {'temperature': 20.0})
     for reading in (np.nan, np.inf):
         struct.pack_into('<3d', data, place, 0.0, reading, 9.8)
         assert rewriter(bytes(data), {'temperature': 20.0}) is None
+
+
+def random_covariance(rng):
+    """Return a covariance: absent, of independent axes, of any numbers, with an extreme, zero."""
+    values, kind = np.zeros(9), rng.integers(5)
+    if kind == 0:
+        values[0] = -1.0
+    elif kind == 1:
+        values[[0, 4, 8]] = 4e-4
+    elif kind == 2:
+        values[:] = rng.normal(size=9)
+    elif kind == 3:
+        values[rng.integers(9)] = rng.choice(EXTREMES)
+    return values
+
+
+def random_message(rng):
+    """Return a message with random padding, its 37 doubles, its stamp [s] and its frame_id."""
+    doubles = rng.normal(size=37) * 5.0
+    for part in COVARIANCES:
+        doubles[part] = random_covariance(rng)
+    for _ in range(rng.integers(3)):
+        doubles[rng.integers(37)] = rng.choice(EXTREMES)
+    name, stamp = str(rng.choice(NAMES)), (rng.choice(SECONDS), rng.choice(NANOSECONDS))
+    return message(doubles, name, stamp, rng.bytes(7)), doubles, stamp[0] + stamp[1] * 1e-9, name
+
+
+def expected_of(calibration, doubles, time, temperature):
+    """Return the corrected doubles of a message, or an error."""
+    rate = doubles[ANGULAR_VELOCITY]
+    absent = doubles[ANGULAR_VELOCITY.stop] == -1.0 or not np.all(np.isfinite(rate))
+    context = {'time': np.array([time]), 'temperature': np.array([temperature]),
+               'rate': np.full((1, 3), np.nan) if absent else rate[np.newaxis]}
+    try:
+        return corrected(calibration, doubles[np.newaxis], context)[0]
+    except AccelCalibError as error:
+        return error
+
+
+def check_equal(found, wanted):
+    """Check all fields of a corrected message."""
+    assert np.max(np.abs(wanted[ACCELERATION])) <= 100.0 * STANDARD_GRAVITY * (1.0 + 1e-9)
+    np.testing.assert_allclose(found[ACCELERATION], wanted[ACCELERATION], rtol=1e-9, atol=1e-9)
+    for part in (ORIENTATION, ANGULAR_VELOCITY, *COVARIANCES):
+        finite = np.abs(wanted[part][np.isfinite(wanted[part])])
+        np.testing.assert_allclose(found[part], wanted[part], rtol=1e-9,
+                                   atol=1e-12 * max(1.0, finite.max(initial=0.0)))
+
+
+@pytest.mark.filterwarnings('ignore:overflow', 'ignore:invalid value')
+@pytest.mark.parametrize('turned', [False, True])
+@pytest.mark.parametrize('effects', CASES)
+def test_bytes_are_corrected_as_numbers_are(effects, turned):
+    calibration = calibration_of(CASES[effects], turned=turned)
+    rng, published = np.random.default_rng([3, len(effects), turned]), 0
+    for _ in range(COUNT // 8):
+        data, doubles, time, frame_id = random_message(rng)
+        temperature = float(rng.choice(TEMPERATURES))
+        assert layout_of(data).frame_id == frame_id
+        name = output_frame(calibration, frame_id)
+        wanted = expected_of(calibration, doubles, time, temperature)
+        try:
+            found = rewriter_of(data, calibration, name)(data, {'temperature': temperature})
+        except AccelCalibError:
+            assert isinstance(wanted, AccelCalibError) or not (
+                np.max(np.abs(wanted[ACCELERATION])) < 100.0 * STANDARD_GRAVITY)
+            continue
+        if found is None:
+            assert not np.isfinite(np.sum(doubles[ACCELERATION]))
+            continue
+        published += 1
+        assert found[4:12] == data[4:12]
+        assert layout_of(found).frame_id == name
+        check_equal(doubles_of(found), wanted)
+    assert published > COUNT // 16
+
+
+@pytest.mark.parametrize('turned', [False, True])
+@pytest.mark.parametrize('part', COVARIANCES)
+def test_a_covariance_that_is_not_finite_becomes_unknown(part, turned):
+    doubles = np.zeros(37)
+    doubles[ACCELERATION], doubles[part.start + 4] = (0.0, 0.0, STANDARD_GRAVITY), math.nan
+    data = message(doubles)
+    found = rewriter_of(data, calibration_of({}, turned=turned))(data, {'temperature': 25.0})
+    np.testing.assert_array_equal(doubles_of(found)[part], 0.0)
+
+
+def damaged(data, rng):
+    """Return a message with bytes changed, removed or added."""
+    changed = bytearray(data)
+    kind = rng.integers(4)
+    if kind == 0:
+        changed[rng.integers(16)] = rng.integers(256)
+    elif kind == 1:
+        del changed[rng.integers(len(changed)):]
+    elif kind == 2:
+        changed[12:16] = rng.bytes(4)
+    else:
+        changed += rng.bytes(rng.integers(1, 9))
+    return bytes(changed)
+
+
+def refusal(data):
+    """Return why a message is refused; empty if it is not."""
+    try:
+        joined([data], 37, 'imu')
+    except AccelCalibError as error:
+        return str(error)
+    return ''
+
+
+def test_bytes_that_are_no_message_have_no_layout_or_end_in_one_error():
+    rng, refused = np.random.default_rng(5), 0
+    for _ in range(COUNT):
+        data = damaged(random_message(rng)[0], rng)
+        layout, error = layout_of(data), refusal(data)
+        assert layout is None or (len(data) == layout.size and not error)
+        assert not error or 'damaged, expected a whole message' in error
+        refused += bool(error)
+    assert refused > COUNT // 2
+
+
+OTHERS = [name for name, effect in EFFECTS.items() if not effect.linear]
+KNOWN = {'temperature': 31.0, 'supply_voltage': 3.1, 'time': 4000.0, 'rate': (1.0, -2.0, 0.5),
+         'std': (0.01, 0.02, 0.03), 'previous': (0.0, 0.6, -0.8)}
+OWN = [4e-8, 1e-8, -1e-8, 1e-8, 5e-8, 2e-8, -1e-8, 2e-8, 6e-8]
+SHAPES = {'start': 1000.0, 'tau': 1800.0, 'instant': 3000.0, 'lag': 0.0, 'of_sensor': 0.0,
+          'form': 0.0}
+SIZES = {'g/h': 1.0, 'm': 0.1, 'g': 0.01, '1/°C': 1e-3, 'g/°C': 1e-3}
+
+
+def values_of(*names):
+    """Return random values of effects."""
+    rng, effects = np.random.default_rng(1), {name: EFFECTS[name] for name in names}
+    return {name: [*rng.normal(size=len(effect.parameters)) * SIZES.get(effect.unit, 0.003),
+                   *(SHAPES[part] for part in effect.shape)] for name, effect in effects.items()}
+
+
+def several(seed):
+    return tuple(np.random.default_rng(seed).choice(OTHERS, size=4, replace=False))
+
+
+@pytest.mark.parametrize(('names', 'unit', 'scale', 'turned'), [
+    *(((), *each, turned) for each in (('m/s2', 1.0), ('g', 9.80665), ('native', 9.81))
+      for turned in (False, True)),
+    *(((name,), 'm/s2', 1.0, True) for name in OTHERS),
+    *((several(seed), 'g', 9.80665, True) for seed in range(5))])
+def test_one_reading_and_its_covariance_are_corrected_as_arrays_are(names, unit, scale, turned):
+    calibration = calibration_of(values_of(*names), unit=unit, turned=turned)
+    here = OneReading(calibration, scale).at(KNOWN)
+    known, rng = {key: np.array([value]) for key, value in KNOWN.items()}, np.random.default_rng(5)
+    for reading in random_directions(20, rng) * rng.uniform(0.1, 3.0, (20, 1)):
+        reading = calibration.units.from_g(reading)
+        force = calibration.correct(reading[np.newaxis], known)
+        found = here.correct(*reading.tolist())
+        np.testing.assert_allclose(found, force[0] * scale, rtol=0, atol=1e-12)
+        expected = calibration.force_covariance(force, known)[0] * scale ** 2
+        spreads = here.with_spread(found, [0.0] * 9), here.with_spread(found, OWN)
+        np.testing.assert_allclose(np.reshape(spreads[0], (3, 3)), expected, rtol=1e-9,
+                                   atol=1e-18)
+        np.testing.assert_allclose(np.subtract(*spreads), -np.array(OWN), atol=1e-18)
+
+
+def test_acting_temperature_is_limited_to_its_range_at_the_poses():
+    calibration = calibration_of({'offset_temperature': [2e-3, -1e-3, 1e-3, 50.0, 1.0]})
+    count = len(calibration.poses)
+    poses = calibration.poses.with_columns(temperature=20.0 + np.arange(count),
+                                           time=100.0 * np.arange(count))
+    calibration = replace(calibration, poses=poses)
+    low, high = calibration.ranges['temperature_of_offset']
+    assert (low, high) == pytest.approx((20.5, 19.5 + count), abs=0.02)
+    assert 'time' not in calibration.ranges
+    at = [calibration.apply([[0.0, 0.0, 9.8]] * 200, time=1e6 + np.arange(200.0),
+                            temperature=np.full(200, each))[-1] for each in (high, 90.0, 25.0)]
+    np.testing.assert_allclose(at[0], at[1], atol=1e-6)
+    assert np.max(np.abs(at[0] - at[2])) > 1e-3
+
+
+def test_context_of_one_reading_is_limited_to_the_ranges():
+    calibration = calibration_of({'offset_temperature': [2e-3, -1e-3, 1e-3]}, turned=True)
+    poses = calibration.poses.with_columns(temperature=np.linspace(20.0, 30.0, 20))
+    calibration = replace(calibration, poses=poses)
+    reader = OneReading(calibration)
+    for temperature, edge in ((80.0, 30.0), (-40.0, 20.0)):
+        beyond, at_edge = (reader.at({'temperature': each}).correct(1.0, 2.0, 9.0)
+                           for each in (temperature, edge))
+        assert beyond == at_edge
+        context = {'temperature': np.array([temperature])}
+        np.testing.assert_allclose(beyond, calibration.correct(np.array([[1.0, 2.0, 9.0]]),
+                                                               context)[0], atol=1e-12)
+
+
+def test_effects_too_large_to_be_corrected_are_refused():
+    with pytest.raises(InputError, match='too large'):
+        OneReading(calibration_of({'cubic': [-0.5] * 3})).at({}).correct(30.0, 0.0, 0.0)

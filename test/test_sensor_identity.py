@@ -44,37 +44,21 @@ def tables(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize('command', ['verify', 'apply'])
-@pytest.mark.parametrize('data', ['', 'a', 'b'])
-@pytest.mark.parametrize('owner', ['', 'a'])
+@pytest.mark.parametrize(('command', 'owner', 'data', 'stated', 'accepted'), [
+    *((command, owner, data, '', not owner or data in ('', owner))
+      for command in ('verify', 'apply') for owner in ('', 'a') for data in ('', 'a', 'b')),
+    *(('refine', 'a', data, stated, {data, stated} <= {'', 'a'})
+      for data in ('', 'a', 'b') for stated in ('', 'a', 'b'))])
 def test_commands_refuse_data_of_another_sensor(
         tables: Path, tmp_path: Path, stored: Stored, capsys: pytest.CaptureFixture[str],
-        command: str, data: str, owner: str) -> None:
-    kind = 'recording' if command == 'apply' else 'poses'
-    out = tmp_path / 'out.csv'
-    target = ['-o', str(out)] if command == 'apply' else []
+        command: str, owner: str, data: str, stated: str, accepted: bool) -> None:
+    kind, out = 'recording' if command == 'apply' else 'poses', tmp_path / 'out.csv'
+    options = {'apply': ['-o', str(out)], 'refine': ['--sensor', stated] if stated else []}
     status = main([command, str(tables / f'{kind}_{data}.csv'), '-c', str(stored(sensor=owner)),
-                   *target])
-    if owner and data and owner != data:
-        assert status == 2
-        assert f'belongs to sensor {owner!r}, but the readings come from {data!r}' in (
-            capsys.readouterr().err)
-        assert not out.exists()
-    else:
-        assert status == 0
-
-
-@pytest.mark.parametrize(('data', 'stated', 'accepted'), [
-    ('a', '', True), ('', '', True), ('', 'a', True), ('b', '', False), ('', 'b', False),
-    ('a', 'b', False), ('b', 'a', False), ('b', 'b', False)])
-def test_refine_refuses_another_name_in_the_table_or_in_the_option(
-        tables: Path, stored: Stored, capsys: pytest.CaptureFixture[str], data: str, stated: str,
-        accepted: bool) -> None:
-    option = ['--sensor', stated] if stated else []
-    status = main(['refine', str(tables / f'poses_{data}.csv'), '-c', str(stored(sensor='a')),
-                   *option])
+                   *options.get(command, [])])
     assert status == (0 if accepted else 2)
-    assert ("belongs to sensor 'a', but" in capsys.readouterr().err) is not accepted
+    assert (f'belongs to sensor {owner!r}, but' in capsys.readouterr().err) is not accepted
+    assert out.exists() is (accepted and command == 'apply')
 
 
 @pytest.mark.parametrize(('data', 'stated', 'name'), [
@@ -115,34 +99,24 @@ def test_node_uses_a_stored_calibration_only_for_its_sensor(
     assert path.read_bytes() == before
 
 
-def test_a_fit_that_ends_after_another_sensor_took_over_is_not_used_for_it(
-        readings: Readings) -> None:
-    driver = Driver()
-    driver.feed(readings(spread_directions(12)))
-    task = driver.session.commands.fit()
-    found = result(next(task))
-    driver.now += 3.0
-    driver.feed(readings([[0, 0, 1]])[:30], 'other')
-    with pytest.raises(AccelCalibError, match='call ~/fit again'):
-        task.send(found)
-    assert driver.session.name == 'other'
-    assert driver.session.sensor.calibration is None
-
-
-@pytest.mark.parametrize('name', ['undo', 'load', 'reset'])
+@pytest.mark.parametrize(('name', 'words'), [
+    ('fit', 'call ~/fit again'),
+    *((name, "'other' has replaced 'imu_link' meanwhile") for name in ('undo', 'load', 'reset'))])
 def test_a_command_that_ends_after_another_sensor_took_over_changes_nothing_of_it(
-        readings: Readings, name: str) -> None:
+        readings: Readings, name: str, words: str) -> None:
     driver = Driver()
     turned = readings(spread_directions(12))
     driver.feed(turned)
-    driver.done(driver.session.commands.fit())
+    if name != 'fit':
+        driver.done(driver.session.commands.fit())
     task = getattr(driver.session.commands, name)()
     found = result(next(task))
     driver.now += 3.0
     driver.feed(turned[:200], 'other')
     poses = len(driver.session.sensor.live.book.poses())
-    with pytest.raises(AccelCalibError, match="'other' has replaced 'imu_link' meanwhile"):
+    with pytest.raises(AccelCalibError, match=words):
         task.send(found)
+    assert driver.session.name == 'other'
     assert driver.session.sensor.calibration is None
     assert len(driver.session.sensor.live.book.poses()) == poses > 0
 

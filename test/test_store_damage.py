@@ -14,21 +14,16 @@ import stat
 import tempfile
 from typing import Any
 
-from accel_calib.calibrate import fit_poses
 from accel_calib.errors import InputError, StoredCalibrationError
 from accel_calib.session import Level
-from accel_calib.stored import read_calibration, write_calibration
-from accel_calib.units import units_of
+from accel_calib.stored import read_calibration
 from inside import (
-    aside, Identity, load_store, Lock, model_with, MOST_BYTES, SensorStore, simulate_poses,
-    spread_directions, store_of)
+    aside, Identity, load_store, Lock, MOST_BYTES, SensorStore, spread_directions, store_of)
 import numpy as np
 import pytest
 from test_session import Driver
 
 NOBODY = 65534
-EFFECTS = {'offset': np.array([0.03, -0.02, 0.04]),
-           'axis_gain': np.array([0.012, -0.015, 0.008])}
 IDENTITY = Identity('imu_link', '/imu/data_raw')
 
 Readings = Callable[..., Any]
@@ -86,26 +81,12 @@ OF_POSES: dict[str, Callable[[Path], object]] = {
 }
 
 
-@pytest.fixture(scope='module')
-def files() -> dict[str, bytes]:
-    """Return the files of a store with a calibration and 12 poses, by name."""
-    model, units, rng = model_with(EFFECTS), units_of('m/s2'), np.random.default_rng(3)
-    poses = simulate_poses(model, spread_directions(12), rng, noise_g=0.0005)
-    poses = poses.with_columns(reading=units.from_g(poses.reading), std=units.from_g(poses['std']))
-    with tempfile.TemporaryDirectory() as folder:
-        store = SensorStore(Path(folder) / 'known.yaml', IDENTITY, 'm/s2')
-        store.save_poses(poses)
-        write_calibration(store.calibration, fit_poses(poses, units, sensor='imu_link',
-                                                       date='2026-01-01T00:00:00+00:00'))
-        return {path.name: path.read_bytes() for path in (store.calibration, store.poses)}
-
-
 @pytest.fixture
-def store(tmp_path: Path, files: dict[str, bytes]) -> SensorStore:
+def store(stored: Callable[..., Path]) -> SensorStore:
     """Return a store with a calibration and 12 poses."""
-    for name, data in files.items():
-        (tmp_path / name).write_bytes(data)
-    return SensorStore(tmp_path / 'known.yaml', IDENTITY, 'm/s2')
+    made = SensorStore(stored(sensor='imu_link'), IDENTITY, 'm/s2')
+    made.save_poses(read_calibration(made.calibration).poses.take(slice(0, 12)))
+    return made
 
 
 def kept(path: Path) -> str:
@@ -169,33 +150,35 @@ def test_a_table_of_impossible_readings_does_not_stop_the_calibrator(
     works(store.calibration, readings)
 
 
-def test_a_device_is_never_renamed_or_replaced(tmp_path: Path, readings: Readings) -> None:
-    path = tmp_path / 'null'
+def works_without_storing(path: Path, readings: Readings) -> tuple[str, Level]:
+    """Check that a calibrator uses a fit that it cannot store; return log and level."""
+    driver = Driver(calibration_file=str(path))
+    said = driver.logged()
+    driver.feed(readings(spread_directions(10)))
+    level = driver.finding('storage').level
+    with pytest.raises(InputError, match='in use but could not be stored.*another calibration_'):
+        driver.done(driver.session.commands.fit())
+    assert driver.session.sensor.calibration is not None
+    driver.session.close()
+    return said, level
+
+
+def make_device(path: Path) -> None:
     try:
         os.mknod(path, stat.S_IFCHR | 0o666, os.makedev(1, 3))
     except PermissionError:
         pytest.skip('only root makes devices')
-    refuses(path, 'a character device', readings)
-    assert stat.S_ISCHR(path.lstat().st_mode)
 
 
-def test_a_folder_that_does_not_look_like_a_file_is_never_renamed(tmp_path: Path,
-                                                                  readings: Readings) -> None:
+@pytest.mark.parametrize(('make', 'kind'), [
+    (make_device, 'a character device'), (fill_folder, 'a folder')])
+def test_what_does_not_look_like_a_file_is_never_renamed_or_replaced(
+        make: Callable[[Path], object], kind: str, tmp_path: Path, readings: Readings) -> None:
     path = tmp_path / 'documents'
-    fill_folder(path)
-    refuses(path, 'a folder', readings)
-    assert (path / 'mine').read_text() == 'kept'
-
-
-def refuses(path: Path, kind: str, readings: Readings) -> None:
-    """Check that a calibrator works without storing."""
-    driver = Driver(calibration_file=str(path))
-    assert f'{path} is {kind}' in driver.logged()
-    driver.feed(readings(spread_directions(10)))
-    with pytest.raises(InputError, match='could not be stored.*another calibration_file'):
-        driver.done(driver.session.commands.fit())
-    assert driver.session.sensor.calibration is not None
-    driver.session.close()
+    make(path)
+    before = kept(path)
+    assert f'{path} is {kind}' in works_without_storing(path, readings)[0]
+    assert kept(path) == before
 
 
 # Rights
@@ -223,14 +206,9 @@ def test_a_folder_without_rights_is_reported_and_nothing_is_lost(
     (inner / '.imu.yaml.123.tmp').write_text('left behind')
     (inner / 'imu_poses.csv').write_text('ax,ay,az\n1,2,words\n')
     inner.chmod(mode)
-    driver = Driver(calibration_file=str(inner / 'imu.yaml'))
-    assert 'Permission denied' in driver.logged()
-    driver.feed(readings(spread_directions(10)))
-    assert driver.finding('storage').level == Level.ERROR
-    with pytest.raises(InputError, match='in use but could not be stored'):
-        driver.done(driver.session.commands.fit())
-    assert driver.session.sensor.calibration is not None
-    driver.session.close()
+    said, level = works_without_storing(inner / 'imu.yaml', readings)
+    assert 'Permission denied' in said
+    assert level == Level.ERROR
     inner.chmod(0o700)
     assert (inner / 'imu_poses.csv').read_text() == 'ax,ay,az\n1,2,words\n'
 
@@ -243,12 +221,8 @@ def test_a_path_that_no_file_can_have_is_reported(name: str, tmp_path: Path, rea
                                                   ) -> None:
     (tmp_path / 'file').touch()
     (tmp_path / 'loop').symlink_to('loop')
-    driver = Driver(calibration_file=str(tmp_path / name))
-    driver.feed(readings(spread_directions(10)))
-    assert (driver.finding('storage').level == Level.OK) is (name[0] == 'x')
-    with pytest.raises(InputError, match='could not be stored.*another calibration_file'):
-        driver.done(driver.session.commands.fit())
-    driver.session.close()
+    _, level = works_without_storing(tmp_path / name, readings)
+    assert (level == Level.OK) is (name[0] == 'x')
 
 
 def test_a_home_that_is_not_known_is_refused_in_one_line() -> None:

@@ -5,15 +5,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 import os
 from pathlib import Path
+import re
 
 from accel_calib.calibrate import Calibration, fit_poses, Rejected
-from accel_calib.errors import DamagedCalibrationError, InputError, StoredCalibrationError
+from accel_calib.effects import know, OwnEffect
+from accel_calib.errors import (
+    AccelCalibError, DamagedCalibrationError, InputError, StoredCalibrationError)
 from accel_calib.finding import has
-from accel_calib.stored import read_calibration, write_calibration
+from accel_calib.stored import read_calibration, read_prior, write_calibration
 from accel_calib.units import units_of
 from faults.fuzz import LONGEST_LINE
 from faults.inputs import intact
@@ -23,6 +27,7 @@ from inside import (
     spread_directions, values_in)
 import numpy as np
 import pytest
+from shared import with_effects
 import yaml
 
 MOST_EVENTS = 100
@@ -86,12 +91,24 @@ def test_the_number_of_values_is_bounded(monkeypatch: pytest.MonkeyPatch) -> Non
             read_plain(text)
 
 
-def test_the_size_of_a_file_is_bounded_before_it_is_parsed(tmp_path: Path) -> None:
-    path = tmp_path / 'calibration.yaml'
+@pytest.mark.usefixtures('in_time')
+@pytest.mark.parametrize('read', [read_calibration, read_prior])
+def test_the_size_of_a_file_is_bounded_before_it_is_parsed(
+        read: Callable[[Path], object], tmp_path: Path) -> None:
+    path = tmp_path / 'large.yaml'
     path.write_text(FIRST)
     os.truncate(path, 2**40)  # without blocks on the disk, and more than a memory holds
-    with pytest.raises(DamagedCalibrationError, match=f'more than {MOST_BYTES} bytes'):
-        read_calibration(path)
+    with pytest.raises(AccelCalibError, match=f'more than {MOST_BYTES} bytes'):
+        read(path)
+    os.mkfifo(tmp_path / 'pipe')
+    with pytest.raises(InputError, match='is a pipe'):
+        read(tmp_path / 'pipe')
+
+
+def test_another_format_of_typical_values_is_refused_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / 'fleet.yaml').write_text('format: "a\\nb"\n')
+    with pytest.raises(InputError, match=r"has format 'a\\nb', expected 1"):
+        read_prior(tmp_path / 'fleet.yaml')
 
 
 def with_poses(count: int) -> Calibration:
@@ -134,13 +151,20 @@ def test_one_long_label_cannot_take_the_memory_of_all(monkeypatch: pytest.Monkey
         parse_calibration(text, 'x.yaml')
 
 
-def test_a_long_name_is_refused_and_not_repeated() -> None:
+def test_a_long_name_and_a_value_far_beyond_all_sensors_are_refused() -> None:
     content = yaml.safe_load(intact()[0])
-    content['sensor'] = 5000 * 'x'
-    with pytest.raises(DamagedCalibrationError, match='sensor has 5000 characters, expected at'):
-        parse_calibration(yaml.dump(content, sort_keys=False), 'x.yaml')
-    content['sensor'] = 4000 * 'x'
-    assert parse_calibration(yaml.dump(content, sort_keys=False), 'x.yaml').sensor == 4000 * 'x'
+
+    def parsed() -> Calibration:
+        return parse_calibration(yaml.dump(content, sort_keys=False), 'x.yaml')
+
+    content['sensor'] = 4096 * 'x'
+    assert parsed().sensor == 4096 * 'x'
+    content['sensor'] += 'x'
+    with pytest.raises(DamagedCalibrationError, match='sensor has 4097 characters, expected at'):
+        parsed()
+    content['sensor'], content['effects']['offset']['x'] = '', -1e31
+    with pytest.raises(DamagedCalibrationError, match='x is .*, expected at most 1e.30'):
+        parsed()
 
 
 # Kinds of content
@@ -231,18 +255,25 @@ def test_damage_is_refused_in_one_line_that_names_it(old: str, new: str, words: 
     assert '\n' not in str(refusal.value)
 
 
+@pytest.mark.parametrize(('stated', 'words'), [
+    ('', 'own_rms is missing'), (', own_rms: much', "own_rms is 'much', expected a finite")])
+def test_an_own_effect_without_the_size_of_its_contribution_is_refused(stated: str, words: str
+                                                                       ) -> None:
+    know([OwnEffect('field', 'offset by a field', typical=1e-4, variable='motor_current')])
+    calibration = parse_calibration(intact()[-1], 'x.yaml')
+    text = format_calibration(with_effects(
+        calibration, {'field': [1e-3, 2e-3, 3e-3]},
+        motor_current=np.linspace(-1.0, 1.0, len(calibration.poses))))
+    assert 'field' in parse_calibration(text, 'x.yaml').model.effects
+    with pytest.raises(DamagedCalibrationError, match=words):
+        parse_calibration(re.sub(r',\s+own_rms: [-+.e\d]+', stated, text), 'x.yaml')
+
+
 def test_numbers_without_a_point_in_an_edited_file_are_read() -> None:
     text = intact()[-1]
     number = text.split('offset: {')[1].split('x: ')[1].split(',')[0]
     edited = parse_calibration(text.replace(number, '1e-2', 1), 'x.yaml')
     assert edited.model.values['offset'][0] == 0.01
-
-
-def test_a_value_far_beyond_all_sensors_is_refused() -> None:
-    content = yaml.safe_load(intact()[0])
-    content['effects']['offset']['x'] = -1e31
-    with pytest.raises(DamagedCalibrationError, match='x is .*, expected at most 1e.30'):
-        parse_calibration(yaml.dump(content, sort_keys=False), 'x.yaml')
 
 
 @pytest.mark.parametrize('value', [

@@ -4,8 +4,8 @@
 """
 Open bags without ROS: rosbag2 (folder, mcap, db3) and ROS 1.
 
-`rosbags` reads the serialized messages. Damaged bytes cause many kinds of errors there, also long
-after the bag is open. `damage_as_input_error` is the only place that converts them.
+Damaged bytes cause many kinds of errors in `rosbags`, also long after the bag is open.
+`damage_as_input_error` is the only place that converts them.
 
 """
 
@@ -67,8 +67,7 @@ class Bag:
     """
     An open bag; `open_bag` makes it.
 
-    `reader` is that of `rosbags`, for a rosbag2 or a ROS 1 bag. Notes state which parts of the bag
-    are not read or were recovered.
+    Notes state which parts of the bag are not read or were recovered.
 
     """
 
@@ -78,7 +77,6 @@ class Bag:
     notes: tuple[str, ...] = ()
 
     def topics(self, msgtype: str) -> list[str]:
-        """Return the topics of a type, sorted."""
         return sorted({c.topic for c in self.reader.connections if c.msgtype == msgtype})
 
     def connections(self, topic: str, msgtype: str = IMU) -> list[Connection]:
@@ -115,7 +113,6 @@ class Bag:
             yield block
 
     def first(self, topic: str, msgtype: str = IMU, size: int = 1) -> list[Received]:
-        """Return the first messages of a topic."""
         return next(self.blocks(self.connections(topic, msgtype), size), [])
 
     def joined(self, raws: Sequence[bytes], topic: str, before: int, doubles: int = IMU_DOUBLES
@@ -163,12 +160,10 @@ class Bag:
             others = sorted(f'{c.topic} ({c.msgtype})' for c in self.reader.connections)
             raise InputError(f'{self.path} has {some(others) or "no topics"}, expected a topic of '
                              f'type {IMU}', 'record the Imu topic')
-        if topic and topic not in topics:
-            raise InputError(f'{self.path} has the Imu topics {some(topics)}, expected '
-                             f'{topic}', 'choose one of them with --topic')
-        if not topic and len(topics) > 1:
-            raise InputError(f'{self.path} has {len(topics)} Imu topics, expected one: '
-                             f'{some(topics)}', 'choose one of them with --topic')
+        if topic not in topics and (topic or len(topics) > 1):
+            found = (f'the Imu topics {some(topics)}, expected {topic}' if topic else
+                     f'{len(topics)} Imu topics, expected one: {some(topics)}')
+            raise InputError(f'{self.path} has {found}', 'choose one of them with --topic')
         return topic or topics[0]
 
     def first_frame_id(self, topic: str) -> str:
@@ -184,9 +179,8 @@ class Bag:
         """
         Return Imu messages as arrays and as columns of a recording, and which are of a sensor.
 
-        `before` is the number of earlier messages. Messages of another sensor are an InputError
-        unless the user chose the sensor. So are an acceleration that is not finite, and a number
-        beyond any sensor.
+        Messages of another sensor are an InputError unless the user chose the sensor. So are an
+        acceleration that is not finite, and a number beyond any sensor.
 
         """
         messages = self.joined(raws, topic, before)
@@ -244,14 +238,9 @@ def open_bag(path: Path) -> Iterator[Bag]:
                 warnings.simplefilter('ignore')  # of the YAML of damaged metadata
                 reader = (Reader2 if ros2 else Reader1)(source)
                 reader.open()
-            stack.callback(_close, path, reader)
+            stack.callback(damage_as_input_error(path)(reader.close))
             _check(reader)
         yield Bag(path, reader, ros2, tuple(notes))
-
-
-def _close(path: Path, reader: Reader1 | Reader2) -> None:
-    with damage_as_input_error(path):
-        reader.close()
 
 
 @contextmanager

@@ -2,10 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The samples of a bag, with temperature and supply voltage from its other topics.
-
-Serialized messages are joined to blocks of arrays (`accel_calib.logs.serialized`), so the memory
-needed does not depend on the length of the bag.
+The samples of a bag in blocks, with temperature and supply voltage from its other topics.
 
 A topic of type sensor_msgs/Temperature is used without being asked for, if it is clear which. All
 other topics are used where the user names them: any message with a number that is a temperature or
@@ -13,9 +10,9 @@ a voltage, such as std_msgs/Float32, sensor_msgs/BatteryState or a type of the u
 contains the definition of such a type, except for old db3 files. Topics that look like one of both
 quantities and are not used are reported.
 
-**Time.** Readings have the stamps of their headers. A message without a header, or with an unset
-stamp, has only the time at which the bag received it. The median difference of both times, over
-the first messages of the Imu, converts this time to that of the stamps.
+**Time.** Readings have the stamps of their headers. Other messages without a stamp of this clock
+have only the time at which the bag received them. The median difference of both times, over the
+first messages of the Imu, converts this time to that of the stamps.
 
 """
 
@@ -71,8 +68,7 @@ class Quantity:
 
     `fields` are names of fields that hold it, the best first, and `parts` are parts of the name of
     a topic or field that is likely to hold it. `units` are the name of a unit, its lowest and
-    highest plausible value, and factor and summand that convert it to the unit of the column; the
-    unit of the column comes first.
+    highest plausible value, and factor and summand that convert it to the first of them.
 
     """
 
@@ -148,12 +144,10 @@ class ContextTopic:
 
     @property
     def what(self) -> str:
-        """Return topic and type for messages."""
         return f'{self.topic} ({self.msgtype})'
 
     @property
     def connections(self) -> list[Connection]:
-        """Return the connections of the topic."""
         return self.bag.connections(self.topic, self.msgtype)
 
     def values(self, block: Sequence[Received]) -> tuple[Floats, Floats]:
@@ -387,7 +381,10 @@ def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool, context: Con
                 key = source.quantity.key
                 tracks[key] = tracks[key].plus(*source.values(block))
         if imus:
-            waiting.append(_samples(bag, topic, imus, before, sensor, chosen=chosen))
+            _, columns, which = bag.imus(imus, topic, before, sensor, chosen=chosen)
+            rows = np.arange(before, before + len(imus)) + 1
+            samples = Recording(columns, rows, 'm/s2', sensor)
+            waiting.append(samples if np.all(which) else samples.take(which))
             before += len(imus)
         parts += _ready(waiting, tracks)
         if sum(map(len, parts)) >= _ROWS:
@@ -420,13 +417,6 @@ def _blocks(bag: Bag, topic: str, used: Sequence[ContextTopic]
     for block in bag.blocks(wanted, BLOCK):
         yield ([raw for connection, _, raw in block if id(connection) in imu],
                [[message for message in block if id(message[0]) in ids] for ids in own])
-
-
-def _samples(bag: Bag, topic: str, raws: list[bytes], before: int, sensor: str, *, chosen: bool
-             ) -> Recording:
-    _, columns, which = bag.imus(raws, topic, before, sensor, chosen=chosen)
-    samples = Recording(columns, np.arange(before, before + len(raws)) + 1, 'm/s2', sensor)
-    return samples if np.all(which) else samples.take(which)
 
 
 def _with_context(samples: Recording, tracks: dict[str, Track]) -> Recording:

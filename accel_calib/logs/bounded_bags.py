@@ -15,8 +15,6 @@ check the stated sizes before they allocate, and stop as soon as a size is excee
 - A db3 file consists of plain tables, which are read in a number of steps that depends on its
   size. A view, a trigger or a computed column could run any statement without end.
 
-`bag.damage_as_input_error` converts the errors here and those of `rosbags`, of many kinds.
-
 A recorder that was killed leaves the last messages of a db3 file in a second file, the journal of
 SQLite (``-wal`` or ``-journal``). `rosbags` ignores it. SQLite joins both files, in a copy.
 
@@ -176,11 +174,12 @@ class _Mcap(storage_mcap.McapReader):
 
     def open(self) -> None:  # noqa: A003
         super().open()
-        with ExitStack() as stack:
-            stack.callback(self.close)
+        try:
             _check_places(self.chunks)
             _check_together(self.chunks)
-            stack.pop_all()
+        except ValueError:
+            self.close()
+            raise
 
 
 def _check_places(chunks: Sequence[storage_mcap.ChunkInfo]) -> None:

@@ -75,11 +75,9 @@ class Layout:
 
     @property
     def frame_id(self) -> str:
-        """Return the frame_id as text."""
         return self.name[4:-1].decode(errors='replace')
 
     def place(self, field: slice) -> int:
-        """Return the place of a field."""
         return self.begin + 8 * int(field.start)
 
 
@@ -116,18 +114,9 @@ class Messages:
     """
     Serialized messages with a header and doubles, in one buffer; `joined` makes them.
 
-    Parameters
-    ----------
-    data : (m,) array of bytes
-        The buffer.
-    start, stop, begin : (n,) array
-        Places of the beginning, the end and the first double of each message.
-    head : (n, 4) array of uint32
-        First four words of each message.
-    swapped : (n,) array of bool
-        Whether the message is big endian.
-    ros2 : bool
-        Whether the messages are CDR; otherwise they have the serialization of ROS 1.
+    `start`, `stop` and `begin` (n,) are the places of the beginning, the end and the first double
+    of each message, `head` (n, 4) its first four words, and `swapped` (n,) whether it is big
+    endian. Messages of ROS 1 are not CDR.
 
     """
 
@@ -152,9 +141,8 @@ class Messages:
 def joined(raws: Sequence[bytes | memoryview], doubles: int, name: str, *, ros2: bool = True,
            before: int = 0) -> Messages:
     """
-    Copy messages into one writable buffer.
+    Copy messages with a header and this number of doubles into one writable buffer.
 
-    The messages have a header and this number of doubles, in CDR, or as in ROS 1 if not `ros2`.
     For errors, `name` is the topic, and `before` the number of its earlier messages.
 
     Raises

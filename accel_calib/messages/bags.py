@@ -62,8 +62,8 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
     calibration : Calibration
         The calibration. One in g is converted to m/s², and one in m/s² to g.
     out : Path
-        The copy; it must not exist. A copy of a rosbag2 is a folder, or a file if `out` has the
-        suffix of the storage. A copy of a ROS 1 bag is a ROS 1 bag.
+        The copy, a bag of the same kind. A copy of a rosbag2 is a folder, or a file if `out` has
+        the suffix of the storage.
     topic : str
         Imu topic, for a bag with several Imu topics.
     progress, note : callable
@@ -81,9 +81,8 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
     ------
     InputError
         If the bag is damaged, has no Imu messages or those of several sensors, or lacks a topic
-        that the calibration needs, if the readings are clearly in another unit, if only one of
-        calibration and messages is in native units, if the mounting is in the frame win8, or if
-        `out` exists.
+        that the calibration needs; if the readings are clearly in another unit; if the mounting is
+        in the frame win8; or if `out` exists.
     StoredCalibrationError
         If the calibration belongs to another sensor.
     OSError
@@ -111,10 +110,9 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
 def _check_kind(bag: Bag, out: Path) -> None:
     """Check that the name of the copy is that of a bag of the same kind."""
     if (out.suffix == '.bag') is bag.ros2:
-        raise InputError(f'{bag.path} is a ROS {2 if bag.ros2 else 1} bag, but {out} is not the '
-                         'name of one', 'choose a name that ends in .mcap or .db3, or the '
-                         'name of a folder' if bag.ros2 else
-                         'choose a name that ends in .bag')
+        kind, names = ((2, '.mcap or .db3, or the name of a folder') if bag.ros2 else (1, '.bag'))
+        raise InputError(f'{bag.path} is a ROS {kind} bag, but {out} is not the name of one',
+                         f'choose a name that ends in {names}')
 
 
 @contextmanager

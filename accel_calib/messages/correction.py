@@ -25,9 +25,9 @@ The conventions for covariances are kept: a first element of -1 means no data, a
 unknown. A covariance that is not finite becomes unknown. The covariance of the calibration is
 added to a known covariance of the acceleration.
 
-**Single messages.** The result is the same as that of `corrected`, but computed with Python floats
-(`one_reading`); a test compares both. Covariances rarely change from message to message, so each
-covariance is transformed only once.
+**Single messages.** `Rewriter` has the result of `corrected`, but computes with Python floats
+(`one_reading`). Covariances rarely change from message to message, so that each is transformed
+only once.
 
 """
 
@@ -64,7 +64,7 @@ def output_scale(calibration: Calibration, gravity: float) -> float:
 def corrected(calibration: Calibration, doubles: Floats, context: Context | None = None,
               stream: ThermalStream | None = None, scale: float = 1.0) -> Floats:
     """
-    Return the corrected doubles of Imu messages, (n, 37).
+    Return the corrected doubles of Imu messages.
 
     Parameters
     ----------
@@ -104,12 +104,7 @@ def corrected(calibration: Calibration, doubles: Floats, context: Context | None
 
 
 def output_frame(calibration: Calibration, frame_id: str, chosen: str = '') -> str:
-    """
-    Return the frame_id of corrected messages, from that of the raw messages.
-
-    `chosen` is the name of the levelled frame; empty: ``<frame_id>_levelled``.
-
-    """
+    """Return the frame_id of corrected messages; `chosen` is that of the levelled frame."""
     return (chosen or f'{frame_id}_levelled') if calibration.is_levelled else frame_id
 
 
@@ -153,11 +148,17 @@ _PER_MESSAGE = {'time', 'rate'}
 
 
 class _Seen(NamedTuple):
-    """A covariance as given, whether its quantity is in the message, and the corrected one."""
+    """
+    A covariance as given, whether its quantity is in the message, and the corrected one.
+
+    `turned` has the numbers of the corrected one; None if it is not known.
+
+    """
 
     given: bytes
     present: bool
     new: bytes
+    turned: list[float] | None
 
 
 class Rewriter:
@@ -166,16 +167,12 @@ class Rewriter:
 
     Parameters
     ----------
-    layout : Layout
-        Layout of the messages.
-    calibration : Calibration
-        The calibration, in the unit of the readings.
-    scale : float
-        m/s² per unit of the corrected force.
-    gravity : float
-        Local gravity [m/s²].
+    layout, calibration
+        Layout of the messages, and the calibration in the unit of the readings.
+    scale, gravity : float
+        m/s² per unit of the corrected force, and local gravity [m/s²].
     frame_id : str
-        frame_id of the corrected messages.
+        frame_id of the corrected messages, whose layout is the attribute `layout`.
     noise : SampleNoise, optional
         Noise of the samples, stated in messages whose covariance is unknown.
     thermal : ThermalStream, optional
@@ -183,8 +180,6 @@ class Rewriter:
 
     Attributes
     ----------
-    layout : Layout
-        Layout of the corrected messages.
     bias : (float, float, float)
         Bias that is subtracted from the angular velocity [rad/s].
 
@@ -213,17 +208,14 @@ class Rewriter:
         self._name = self.layout.name + bytes(self.layout.begin - self.layout.name_end)
         self._fill_force = _UNKNOWN if noise is None else _diagonal(noise.force)
         self._fill_rate = _UNKNOWN if noise is None else _diagonal(noise.rate)
-        self._seen_force = self._new_force = b''
-        self._own: list[float] | None = None
-        self._seen_rate = self._seen_orientation = _Seen(b'', True, b'')
+        self._seen_force = self._seen_rate = self._seen_orientation = _Seen(b'', True, b'', None)
 
     def __call__(self, data: bytes, context: Mapping[str, float]) -> bytes | None:
         """
-        Return the corrected message with the layout ``self.layout``.
+        Return the corrected message; None for a reading that is not finite.
 
-        `context` has the known columns; it is another mapping if it has changed. A reading that is
-        not finite gives None. Missing context and a corrected force that is not plausible are an
-        InputError.
+        `context` is another mapping if it has changed. Missing context and a corrected force that
+        is not plausible are an InputError.
 
         """
         given = _WHOLE.unpack_from(data, self._given.begin)
@@ -238,23 +230,23 @@ class Rewriter:
         a, b, c = force
         if not (-largest < a < largest and -largest < b < largest and -largest < c < largest):
             raise _implausible(force)
-        covariance = data[self._force_spread:]
-        if covariance != self._seen_force:
-            self._see_force(covariance)
+        covariance, seen = data[self._force_spread:], self._seen_force
+        if covariance != seen.given:
+            seen = self._seen_force = _seen(self._inverse, covariance, self._fill_force)
         before = self._before(data, given)
-        if self._own is None:
-            return before + THREE.pack(a, b, c) + self._new_force
-        return before + _FORCE.pack(a, b, c, *at.with_spread(force, self._own))
+        if seen.turned is None:
+            return before + THREE.pack(a, b, c) + seen.new
+        return before + _FORCE.pack(a, b, c, *at.with_spread(force, seen.turned))
 
     def _before(self, data: bytes, given: tuple[Any, ...]) -> bytes:
         """Return the message before the acceleration."""
         x, y, z, w, orientation_spread, p, q, r, rate_spread = given[:9]
         if rate_spread != self._seen_rate.given:
-            self._seen_rate = self._seen(rate_spread, self._fill_rate)
+            self._seen_rate = _seen(self._turn, rate_spread, self._fill_rate)
         if orientation_spread != self._seen_orientation.given:
-            self._seen_orientation = self._seen(orientation_spread, _UNKNOWN)
-        _, has_rate, new_rate = self._seen_rate
-        _, has_orientation, new_orientation = self._seen_orientation
+            self._seen_orientation = _seen(self._turn, orientation_spread, _UNKNOWN)
+        _, has_rate, new_rate, _ = self._seen_rate
+        _, has_orientation, new_orientation, _ = self._seen_orientation
         u, v, t = self.bias
         if not (self._turns or u or v or t or new_rate != rate_spread
                 or new_orientation != orientation_spread):
@@ -294,20 +286,6 @@ class Rewriter:
         self._at = self._calibration.at(known)
         return self._at
 
-    def _see_force(self, covariance: bytes) -> None:
-        """Cache the transformed covariance of the acceleration."""
-        self._seen_force = covariance
-        self._own = _transformed(self._inverse, covariance, self._fill_force)
-        self._new_force = covariance if covariance[:8] == _ABSENT else _UNKNOWN
-
-    def _seen(self, covariance: bytes, fill: bytes) -> _Seen:
-        """Return a covariance of rate or orientation with that in the new axes."""
-        present = covariance[:8] != _ABSENT
-        turned = _transformed(np.reshape(self._turn, (3, 3)), covariance, fill)
-        if turned is not None:
-            return _Seen(covariance, present, NINE.pack(*turned))
-        return _Seen(covariance, present, _UNKNOWN if present else covariance)
-
 
 def _implausible(force: Triple) -> InputError:
     words = ', '.join(f'{part:.3g}' for part in force)
@@ -322,14 +300,16 @@ def _diagonal(deviation: Floats) -> bytes:
     return np.diag(np.square(deviation)).astype('<f8').tobytes()
 
 
-def _transformed(matrix: Floats, covariance: bytes, fill: bytes) -> list[float] | None:
-    """Return A C Aᵀ, with `fill` for an unknown covariance; None if it is not known then."""
-    for candidate in (covariance, fill) if covariance[:8] != _ABSENT else ():
+def _seen(matrix: Any, covariance: bytes, fill: bytes) -> _Seen:
+    """Return a covariance C with A C Aᵀ, and `fill` in place of an unknown C."""
+    if covariance[:8] == _ABSENT:
+        return _Seen(covariance, False, covariance, None)
+    for candidate in (covariance, fill):
         numbers = np.frombuffer(candidate, '<f8')[np.newaxis]
         if is_known(numbers)[0]:
-            found: list[float] = transformed(matrix, numbers)[0].tolist()
-            return found
-    return None
+            turned = transformed(np.reshape(matrix, (3, 3)), numbers)[0].tolist()
+            return _Seen(covariance, True, NINE.pack(*turned), turned)
+    return _Seen(covariance, True, _UNKNOWN, None)
 
 
 def motion_of(data: bytes, layout: Layout, gravity: Floats) -> bytes:

@@ -4,10 +4,10 @@
 """
 Correction of one reading at a time, for a stream of messages.
 
-Each call of numpy takes about 1 µs, and `Calibration.correct` makes dozens of calls. This does not
-matter for a recording, but it is too slow for single messages. Here the terms of the catalogue
-(`accel_calib.effects`) are summed as Python floats. With the context fixed, the affine terms sum
-to an offset and a gain; only the bending terms are iterated, as in `accel_calib.effects.model`.
+Each call of numpy takes about 1 µs, and `Calibration.correct` makes dozens of calls, which is too
+slow for single messages. Here the terms of the catalogue (`accel_calib.effects`) are summed as
+Python floats. With the context fixed, the affine terms sum to an offset and a gain; only the
+bending terms are iterated, as in `accel_calib.effects.model`.
 
 """
 
@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from operator import add
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -34,30 +34,12 @@ Known = Mapping[str, Any]
 """Context of one reading: floats and triples, with the keys of `accel_calib.effects.Context`."""
 
 
-class _Term(NamedTuple):
-    """A term of an effect: axis, monomial, and weight times value."""
+_Term = tuple[int, int, float]
+"""Axis, monomial, and weight times value of a term of an effect."""
 
-    axis: int
-    monomial: int
-    size: float
-
-
-class _Part(NamedTuple):
-    """An effect whose factor depends on the context: its shape and terms."""
-
-    effect: Effect
-    shape: list[float]
-    terms: list[_Term]
-
-
-class _Bend(NamedTuple):
-    """A bending term with its context fixed: axis, coefficient, value and gradient."""
-
-    axis: int
-    size: float
-    value: Callable[[float, float, float], float]
-    gradient: Callable[[float, float, float], Triple]
-
+_Bend = tuple[int, float, Callable[[float, float, float], float],
+              Callable[[float, float, float], Triple]]
+"""Axis, coefficient, value and gradient of a bending term with its context fixed."""
 
 _NO_BEND: Matrix = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 _SLOW = 3
@@ -75,14 +57,14 @@ class OneReading:
         self.turn = _flat(model.rotation.T * self._unit)
         self.back = _flat(model.rotation / self._unit)
         self.per_g = calibration.units.per_g
-        self._fixed, self._varying = [0.0] * 12, []
-        self._bends: list[_Bend] = []
+        self._fixed, self._bends = [0.0] * 12, list[_Bend]()
+        self._varying: list[tuple[Effect, list[float], list[_Term]]] = []
         for effect, values in zip(model.terms.effects, model.values.values(), strict=True):
             size, shape = effect.split(values)
-            terms = [_Term(each.axis, each.monomial, each.weight * float(size[each.parameter]))
+            terms = [(each.axis, each.monomial, each.weight * float(size[each.parameter]))
                      for each in effect.terms]
             if effect.factor is not None:
-                self._varying.append(_Part(effect, shape.tolist(), terms))
+                self._varying.append((effect, shape.tolist(), terms))
             else:
                 self._add(terms, None, self._fixed, self._bends)
 
@@ -97,7 +79,8 @@ class OneReading:
             elif monomial < AFFINE:
                 affine[3 + 3 * axis + monomial - FORCE] += size
             else:
-                bends.append(_Bend(axis, size, *MONOMIALS[monomial]))
+                value, gradient = MONOMIALS[monomial]
+                bends.append((axis, size, value, gradient))
 
     def at(self, known: Known) -> AtReading:
         """Return the calibration at a context; a quantity that is missing is an InputError."""

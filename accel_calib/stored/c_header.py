@@ -28,8 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .made import (
-    Format, frame_words, head, Made, Options, polynomial, single, steady_at, steady_grid,
-    temperature_range)
+    about, Format, frame_words, Made, Options, polynomial, single, steady_at, steady_grid,
+    temperature_range, TITLE)
 from ..calibrate import Calibration
 from ..effects import (
     CUBE, MONOMIALS, ODD_SQUARE, PRODUCT, REFERENCE_TEMPERATURE, SIZE, SQUARE, WAVE)
@@ -128,10 +128,12 @@ def _header_of(calibration: Calibration) -> Header:
     count, units = 4 * _LARGEST_DEGREE, calibration.units
     nodes = np.cos(np.pi * (np.arange(count) + 0.5) / count)
     here = steady_at(calibration, middle + half * nodes)
-    vec_v, mat_w, bend = (_without_rounding(polynomial(
-        nodes, values, 0.1 * _SMALL_G, _LARGEST_DEGREE)) for values in (
-            np.broadcast_to(here.vec_v, (count, 3)), np.broadcast_to(here.mat_w, (count, 3, 3)),
-            np.broadcast_to(here.bend, (len(here.bend), count)).T))
+    vec_v, mat_w, bend = (polynomial(nodes, values, 0.1 * _SMALL_G, _LARGEST_DEGREE)
+                          for values in (np.broadcast_to(here.vec_v, (count, 3)),
+                                         np.broadcast_to(here.mat_w, (count, 3, 3)),
+                                         np.broadcast_to(here.bend, (len(here.bend), count)).T))
+    for part in (vec_v, mat_w, bend):
+        part[np.abs(part) < _NOTHING_G] = 0.0
     terms, which = here.terms, here.terms.bending
     made = Header(
         vec_v=single(units.from_g(vec_v)), mat_w=single(mat_w), bend=single(bend),
@@ -141,10 +143,6 @@ def _header_of(calibration: Calibration) -> Header:
         per_g=float(np.float32(units.per_g)), middle=float(np.float32(middle)),
         half=float(np.float32(half)), steps=0)
     return made if made.is_affine else _with_steps(made, calibration)
-
-
-def _without_rounding(coefficients: Floats) -> Floats:
-    return np.where(np.abs(coefficients) < _NOTHING_G, 0.0, coefficients)
 
 
 def _with_steps(header: Header, calibration: Calibration) -> Header:
@@ -189,8 +187,7 @@ def identifier(text: str) -> str:
 def _text(header: Header, calibration: Calibration, name: str, use: Sequence[str]) -> str:
     unit = 'm/s^2' if calibration.units.is_si else 'g'
     temperature = 'temperature, ' if header.of_temperature else ''
-    title, *about = head(calibration)
-    comment = [title, '', *about, '',
+    comment = [TITLE, '', *about(calibration), '',
                f'force: {unit}, {frame_words(calibration)}; at rest +1 g on the axis that points '
                'up', *_equation(header), '',
                *(line.format(name=name, temperature=temperature) for line in use)]
@@ -252,14 +249,18 @@ def _general(header: Header, name: str) -> list[str]:
             '    float d[3], e[3], u[3];', '    int i, step;', '',
             *(f'    d[{axis}] = (raw[{axis}] - {_horner(header.vec_v[:, axis])}) * per_unit;'
               for axis in range(3)),
-            '    for (i = 0; i < 3; ++i) {',
-            '        u[i] = N[i][0] * d[0] + N[i][1] * d[1] + N[i][2] * d[2];', '    }',
+            *_product('u', 'N', 'd', '    '),
             f'    for (step = 0; step < {header.steps}; ++step) {{',
             *(f'        e[{axis}] = d[{axis}]{_added(header, axis)};' for axis in range(3)),
-            '        for (i = 0; i < 3; ++i) {',
-            '            u[i] = N[i][0] * e[0] + N[i][1] * e[1] + N[i][2] * e[2];', '        }',
-            '    }', '    for (i = 0; i < 3; ++i) {',
-            '        force[i] = R[i][0] * u[0] + R[i][1] * u[1] + R[i][2] * u[2];', '    }', '}']
+            *_product('u', 'N', 'e', '        '), '    }', *_product('force', 'R', 'u', '    '),
+            '}']
+
+
+def _product(left: str, matrix: str, right: str, indent: str) -> list[str]:
+    """Return the lines of C that set a vector to a matrix times another vector."""
+    row = ' + '.join(f'{matrix}[i][{column}] * {right}[{column}]' for column in range(3))
+    return [f'{indent}for (i = 0; i < 3; ++i) {{', f'{indent}    {left}[i] = {row};',
+            f'{indent}}}']
 
 
 def _scaled_temperature(header: Header) -> list[str]:

@@ -4,21 +4,19 @@
 """
 Stored calibrations, and typical values of a fleet: readable, versioned YAML.
 
-`calibration_bytes` and `calibration_from` convert between records and the content of files. Only
-`write_calibration` and `read_calibration` access the disk. The reader bounds size and nesting
-(`.plain_yaml`) and checks every value, and the calibration then passes the same gate as a fit
-(`accel_calib.calibrate.gate`). The last line of a file is a checksum of the text before it; it
-reveals a file that was edited by hand.
+The reader bounds size and nesting (`.plain_yaml`) and checks every value, and the calibration then
+passes the same gate as a fit (`accel_calib.calibrate.gate`). The last line of a file is a checksum
+of the text before it; it reveals a file that was edited by hand.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields, replace
 import hashlib
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, get_args, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +44,8 @@ try:  # eight times as fast, but not in every build of PyYAML
     from yaml import CSafeDumper as SafeDumper
 except ImportError:
     from yaml import SafeDumper  # type: ignore[assignment]
+
+T = TypeVar('T')
 
 _VERSION = 3
 """The only version that is read; earlier ones were never released."""
@@ -190,39 +190,55 @@ def _or_null(value: float) -> float | None:
 
 def calibration_from(data: bytes, name: str) -> Calibration:
     """Return the calibration in a file; with ``edited`` if its checksum does not match."""
-    text = _text_of(data, name)
     try:
-        content = read_plain(text)
-    except ValueError as err:
-        raise _damaged(name, str(err)) from err
+        return _checked(data, name)
+    except StoredCalibrationError:
+        raise
+    except RefusedFitError as err:
+        raise DamagedCalibrationError(f'{name} contains an implausible calibration: {err.message}',
+                                      err.advice) from err
+    except (AccelCalibError, KeyError, TypeError, ValueError, OverflowError,
+            AttributeError) as err:
+        what = (err.message if isinstance(err, AccelCalibError) else
+                f'{err.args[0]} is missing' if isinstance(err, KeyError) else str(err))
+        raise DamagedCalibrationError(f'{name} is damaged ({" ".join(what.split())}), expected a '
+                                      'whole calibration',
+                                      'fit again, or use the previous file (.before)') from err
+
+
+def _checked(data: bytes, name: str) -> Calibration:
+    """Return the calibration in a file after all checks; other errors are those of damage."""
+    text = _text_of(data, name)
+    content = read_plain(text)
     _check_version(content, name)
-    body, found, digest = text.rpartition(_CHECKSUM)
     _check_known(content, name)
-    calibration = _checked(content, name)
+    with np.errstate(all='ignore'):  # the checks refuse what is not finite
+        calibration = gated(_calibration(content))
     _check_own(calibration, content, name)
+    body, found, digest = text.rpartition(_CHECKSUM)
     if not found:
-        raise _damaged(name, 'its last line, the checksum, is missing')
+        raise ValueError('its last line, the checksum, is missing')
     if digest.strip() == _digest(body.rstrip()):
         return calibration
-    other = _other_correction(content, calibration, name)
-    _check_keys(content, calibration, name)
+    other = _other_correction(content, calibration)
+    _check_keys(content, calibration)
     return replace(calibration, noted=(*calibration.noted, OF_FILE['edited'], *other))
 
 
 def _text_of(data: bytes, name: str) -> str:
     """Return the text of a file of this format."""
     if not data.strip(b'\0 \t\r\n'):
-        raise _damaged(name, 'it is empty')
+        raise ValueError('it is empty')
     if not data.startswith(FIRST_LINE.encode()):
         raise StoredCalibrationError(f'{name} is not a calibration of accel_calib, expected the '
                                      f'first line "{FIRST_LINE}"', 'use a file that fit wrote')
     if len(data) > MOST_BYTES:
-        raise _damaged(name, f'it has more than {MOST_BYTES} bytes')
+        raise ValueError(f'it has more than {MOST_BYTES} bytes')
     try:
         return data.decode().replace('\r\n', '\n').replace('\r', '\n')
     except UnicodeDecodeError as err:
         line = 1 + data.count(b'\n', 0, err.start)
-        raise _damaged(name, f'line {line} is not text in UTF-8') from err
+        raise ValueError(f'line {line} is not text in UTF-8') from err
 
 
 def _check_known(content: Mapping[str, Any], name: str) -> None:
@@ -250,43 +266,28 @@ def _check_own(calibration: Calibration, content: Mapping[str, Any], name: str) 
 
 def _check_version(content: Any, name: str) -> None:
     if not isinstance(content, Mapping):
-        raise _damaged(name, 'it is not a YAML mapping')
+        raise ValueError('it is not a YAML mapping')
     version = content.get('version')
     if not isinstance(version, int) or isinstance(version, bool) or version < 1:
-        raise _damaged(name, f'its version is {shown(version)}')
+        raise ValueError(f'its version is {shown(version)}')
     if version != _VERSION:
         raise StoredCalibrationError(f'{name} has version {version}, expected {_VERSION}',
                                      'fit the poses again' if version < _VERSION else
                                      'update accel_calib, or fit the poses again')
 
 
-def _checked(content: Mapping[str, Any], name: str) -> Calibration:
-    """Return the calibration with the content of a file, after all checks."""
-    try:
-        with np.errstate(all='ignore'):  # the checks refuse what is not finite
-            return gated(_calibration(content))
-    except RefusedFitError as err:
-        raise DamagedCalibrationError(f'{name} contains an implausible calibration: {err.message}',
-                                      err.advice) from err
-    except AccelCalibError as err:
-        raise _damaged(name, err.message) from err
-    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as err:
-        what = f'{err.args[0]} is missing' if isinstance(err, KeyError) else str(err)
-        raise _damaged(name, what) from err
-
-
-def _check_keys(content: Mapping[str, Any], calibration: Calibration, name: str) -> None:
+def _check_keys(content: Mapping[str, Any], calibration: Calibration) -> None:
     """Refuse unknown keys in a file that was changed: a damaged key would be ignored."""
     written = {**dict.fromkeys(_NOT_ALWAYS), **_content(calibration)}
     for place, found, known in (('', content, written), *(
             (f'of {key} ', content.get(key), written[key]) for key in _MAPPINGS)):
         for key in found or ():
             if key not in (known or ()):
-                raise _damaged(name, f'the key {shown(key)} {place}is not known, expected one of '
-                                     f'{", ".join(known or ())}')
+                raise ValueError(f'the key {shown(key)} {place}is not known, expected one of '
+                                 f'{", ".join(known or ())}')
 
 
-def _other_correction(content: Mapping[str, Any], calibration: Calibration, name: str
+def _other_correction(content: Mapping[str, Any], calibration: Calibration
                       ) -> tuple[Finding, ...]:
     """Return a finding if a file states a correction that is not that of its effects."""
     if content.get('correction') is None:
@@ -295,21 +296,14 @@ def _other_correction(content: Mapping[str, Any], calibration: Calibration, name
         stated = value_at(content, 'correction', dict)
         offset, matrix = array_at(stated, 'offset', (3,)), array_at(stated, 'matrix', (3, 3))
     except (KeyError, ValueError) as err:
-        raise _damaged(name, f'correction: {err}') from err
+        raise ValueError(f'correction: {err}') from err
     scale = np.max(np.abs(calibration.matrix))
     same = (np.allclose(offset, calibration.offset, 0.0, _SAME * calibration.units.per_g)
             and np.allclose(matrix, calibration.matrix, 0.0, _SAME * float(scale)))
     return () if same else (OF_FILE['correction_in_file'],)
 
 
-def _damaged(name: str, what: str) -> DamagedCalibrationError:
-    return DamagedCalibrationError(f'{name} is damaged ({" ".join(what.split())}), expected a '
-                                   'whole calibration',
-                                   'fit again, or use the previous file (.before)')
-
-
 def _calibration(content: Mapping[str, Any]) -> Calibration:
-    """Return the record with the content of a file; raise ValueError for an unexpected value."""
     model = Model(_effects(value_at(content, 'effects', dict)),
                   array_at(content, 'rotation', (3, 3)))
     units, size = _units(value_at(content, 'units', dict)), int(np.sum(model.stated))
@@ -324,14 +318,21 @@ def _calibration(content: Mapping[str, Any]) -> Calibration:
         frame=choice_at(content, 'frame', FRAMES), date=name_at(content, 'date', _LONGEST_NAME),
         covariance=array_at(content, 'covariance', (size, size), finite=False, most=LARGEST),
         quality=_quality(value_at(content, 'quality', dict)),
-        poses=_poses(value_at(content, 'poses', dict), _autopilot(content)), rejected=rejected,
-        reason=value_at(content, 'reason', str),
+        poses=_poses(value_at(content, 'poses', dict), _optional(
+            content, 'autopilot', lambda stated: Autopilot(**stated))),
+        rejected=rejected, reason=value_at(content, 'reason', str),
         noted=tuple(map(_finding, values_at(content, 'findings', dict))),
-        gyro=_gyro_bias(content), noise=_sample_noise(content))
+        gyro=_optional(content, 'gyro_bias', _gyro_bias),
+        noise=_optional(content, 'noise', _sample_noise))
+
+
+def _optional(content: Mapping[str, Any], key: str, make: Callable[[dict[str, Any]], T]
+              ) -> T | None:
+    """Return the record made from a mapping that not every file has, or None."""
+    return None if content.get(key) is None else make(value_at(content, key, dict))
 
 
 def _units(stated: Mapping[str, Any]) -> Units:
-    """Return the unit of the readings; raise ValueError if 1 g in it is implausible."""
     name, per_g = choice_at(stated, 'readings', UNIT_NAMES), number_at(stated, 'per_g')
     low, high = _PER_G[name]
     if not low <= per_g <= high:
@@ -372,11 +373,7 @@ def _finding(stated: Mapping[str, Any]) -> Finding:
                    value_at(stated, 'advice', str), choice_at(stated, 'level', LEVELS), rows)
 
 
-def _gyro_bias(content: Mapping[str, Any]) -> GyroBias | None:
-    """Return the gyro bias; None for files without it."""
-    if content.get('gyro_bias') is None:
-        return None
-    stated = value_at(content, 'gyro_bias', dict)
+def _gyro_bias(stated: Mapping[str, Any]) -> GyroBias:
     bias, sd, slope = (array_at(stated, key, (3,)) for key in ('bias', 'sd', 'slope'))
     temperature = np.nan if stated['temperature'] is None else number_at(stated, 'temperature')
     limits = array_at(stated, 'temperatures', (len(value_at(stated, 'temperatures', list)),))
@@ -384,11 +381,7 @@ def _gyro_bias(content: Mapping[str, Any]) -> GyroBias | None:
                     tuple(limits.tolist()))
 
 
-def _sample_noise(content: Mapping[str, Any]) -> SampleNoise | None:
-    """Return the noise of a sample; None for files without it."""
-    if content.get('noise') is None:
-        return None
-    stated = value_at(content, 'noise', dict)
+def _sample_noise(stated: Mapping[str, Any]) -> SampleNoise:
     return SampleNoise(*(array_at(stated, key, (3,), finite=False) for key in ('force', 'rate')))
 
 
@@ -406,13 +399,6 @@ def _poses(stated: Mapping[str, Any], autopilot: Autopilot | None) -> Poses:
         columns[key] = array_at(stated['quantities'], key, (len(rows),))
     check_values(columns, 'poses')
     return Poses(columns, rows, autopilot=autopilot)
-
-
-def _autopilot(content: Mapping[str, Any]) -> Autopilot | None:
-    """Return the place in an autopilot; None for readings that are not from a flight log."""
-    if content.get('autopilot') is None:
-        return None
-    return Autopilot(**value_at(content, 'autopilot', dict))
 
 
 def _labels(stated: Mapping[str, Any]) -> NDArray[Any]:
@@ -442,9 +428,14 @@ def read_calibration(path: Path) -> Calibration:
         If the file cannot be read.
 
     """
+    return calibration_from(_beginning_of(path), str(path))
+
+
+def _beginning_of(path: Path) -> bytes:
+    """Return the content of a regular file, with one byte too many if it is too large."""
     check_regular(path)
     with path.open('rb') as file:
-        return calibration_from(file.read(MOST_BYTES + 1), str(path))
+        return file.read(MOST_BYTES + 1)
 
 
 def write_calibration(path: Path, calibration: Calibration, *, keep_before: bool = True) -> None:
@@ -503,9 +494,12 @@ def read_prior(path: Path, model: str = '') -> FleetPrior:
 
     """
     try:
-        content = read_plain(path.read_text(encoding='utf-8'))
+        data = _beginning_of(path)
+        if len(data) > MOST_BYTES:
+            raise ValueError(f'it has more than {MOST_BYTES} bytes')
+        content = read_plain(data.decode())
         if content['format'] != _PRIORS:
-            raise InputError(f'{path} has format {content["format"]}, expected {_PRIORS}',
+            raise InputError(f'{path} has format {shown(content["format"])}, expected {_PRIORS}',
                              'update accel_calib, or make the file again')
         found = [_fleet_of(each) for each in values_at(content, 'models', dict)]
     except (KeyError, TypeError, ValueError, np.linalg.LinAlgError) as err:
@@ -520,7 +514,6 @@ def read_prior(path: Path, model: str = '') -> FleetPrior:
 
 
 def _fleet_of(content: Mapping[str, Any]) -> FleetPrior:
-    """Return typical values from their mapping; raise ValueError if they are not sound."""
     size = len(_PRIOR_NAMES)
     if tuple(content['names']) != _PRIOR_NAMES:
         raise ValueError(f'names are {content["names"]}, expected {list(_PRIOR_NAMES)}')

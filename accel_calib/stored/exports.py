@@ -4,9 +4,7 @@
 """
 Exports of a calibration to the places where it is used, and the plan of poses as CSV.
 
-`FORMATS` is the list of formats and `export` makes the file of one of them. What a format does not
-hold is measured (`.made`) and returned with the file. `.c_header` and `.flight_controllers` make
-headers and parameters; the other files are made here:
+`.c_header` and `.flight_controllers` make headers and parameters; the other files are made here:
 
 ========= ================================================ ==================================
 format    equation                                         source
@@ -208,7 +206,6 @@ def _of_noise(calibration: Calibration, text: str, notes: tuple[str, ...]) -> Ma
 
 
 def _noise_number(value: float) -> str:
-    """Return a figure of the noise with more digits than it has meaning."""
     return _yaml_number(float(f'{value:.9g}'))
 
 
@@ -232,37 +229,26 @@ def _noise_figures(noise: Noise | None, label: str) -> tuple[dict[str, float], t
                          'noise.json')
     figures, notes = {}, []
     for key in _NOISE:
-        limit = _upper_limit(noise, key)
-        figures[key] = _figure(noise, key, label) if limit is None else limit
-        if limit is not None:
-            reason = plain_text(str(noise.get(f'{key}_reason') or 'no reason is stated'))
-            notes.append(f'{key} is not seen ({reason}): its upper limit {limit:.3g} is used')
+        value, limits = noise.get(key), noise.get(f'{key}_axes_upper')
+        reason = plain_text(str(noise.get(f'{key}_reason') or ''))
+        if (value is None and 'random_walk' in key and isinstance(limits, list) and limits
+                and all(map(_is_positive, limits))):
+            value = max(limits)
+            notes.append(f'{key} is not seen ({reason or "no reason is stated"}): its upper limit '
+                         f'{value:.3g} is used')
+        if not _is_positive(value):
+            found = f'has no {key}' if value is None else f'has {key} {value!r}'
+            raise InputError(f'the file of the noise {found}{reason and ": "}{reason}, but '
+                             f'{label} needs a positive number', 'record a longer rest and run '
+                             'accel-calib noise again, or write the figure of the data sheet into '
+                             'the file')
+        figures[key] = float(value)
     return figures, tuple(notes)
-
-
-def _upper_limit(noise: Noise, key: str) -> float | None:
-    """Return the upper limit of a random walk that is not seen; None for other figures."""
-    limits = noise.get(f'{key}_axes_upper')
-    if noise.get(key) is not None or 'random_walk' not in key or not isinstance(limits, list):
-        return None
-    known = [float(limit) for limit in limits if _is_positive(limit)]
-    return max(known) if known and len(known) == len(limits) else None
 
 
 def _is_positive(value: object) -> bool:
     return (isinstance(value, int | float) and not isinstance(value, bool)
             and 0.0 < value < np.inf)
-
-
-def _figure(noise: Noise, key: str, label: str) -> float:
-    value = noise.get(key)
-    if _is_positive(value):
-        return float(value)  # type: ignore[arg-type]
-    reason = plain_text(str(noise.get(f'{key}_reason') or ''))
-    found = f'has no {key}' if value is None else f'has {key} {value!r}'
-    raise InputError(f'the file of the noise {found}{reason and ": "}{reason}, but {label} needs '
-                     'a positive number', 'record a longer rest and run accel-calib noise again, '
-                     'or write the figure of the data sheet into the file')
 
 
 def read_noise(path: Path) -> Noise:
@@ -329,12 +315,10 @@ class Exported:
 
     @property
     def data(self) -> bytes:
-        """Return the content as bytes."""
         content = self.text_or_bytes
         return content.encode() if isinstance(content, str) else content
 
     def write(self, file: TextIO) -> None:
-        """Write the content to an open file."""
         file.buffer.write(self.data)
 
 

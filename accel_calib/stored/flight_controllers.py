@@ -19,16 +19,12 @@ those of the vehicle; the log also states the place of the sensor in the paramet
 turn readings to x forward, y left, z up;
 ``axes='flu'`` turns them back by 180° about x, which changes the sign of the offsets of y and z.
 
-Sources: [1]_ PX4, [2]_ its temperature compensation, [3]_ ArduPilot, [4]_ its temperature
-calibration, [5]_ Betaflight, [6]_ the parameter file of QGroundControl.
+Sources beside the code of the firmware (the URLs below): temperature of PX4 [1]_ and of
+ArduPilot [2]_, and the parameter file of QGroundControl [3]_.
 
-.. [1] https://github.com/PX4/PX4-Autopilot/blob/main/src/lib/sensor_calibration/Accelerometer.hpp
-.. [2] https://docs.px4.io/main/en/advanced_config/sensor_thermal_calibration
-.. [3] https://github.com/ArduPilot/ardupilot/blob/master/libraries/AP_InertialSensor/
-   AP_InertialSensor_Backend.cpp
-.. [4] https://ardupilot.org/copter/docs/common-imutempcal.html
-.. [5] https://github.com/betaflight/betaflight/blob/master/src/main/sensors/acceleration.c
-.. [6] https://docs.qgroundcontrol.com/master/en/qgc-dev-guide/file_formats/parameters.html
+.. [1] https://docs.px4.io/main/en/advanced_config/sensor_thermal_calibration
+.. [2] https://ardupilot.org/copter/docs/common-imutempcal.html
+.. [3] https://docs.qgroundcontrol.com/master/en/qgc-dev-guide/file_formats/parameters.html
 
 """
 
@@ -78,9 +74,10 @@ Parameters = dict[str, float]
 """Parameters of a firmware by name; whole numbers are of type int."""
 
 
-def _fit_by_axis(calibration: Calibration, reference: float | None = None) -> ByAxis:
+def _fit_by_axis(calibration: Calibration, options: Options, reference: float | None = None
+                 ) -> ByAxis:
     """
-    Return the correction by axis that is nearest to a calibration in m/s².
+    Return the correction by axis that is nearest to a calibration in m/s², in the firmware's axes.
 
     Without a reference, the temperature of the polynomial is the middle of the range [°C].
 
@@ -101,6 +98,7 @@ def _fit_by_axis(calibration: Calibration, reference: float | None = None) -> By
     for axis in range(3):  # from a polynomial in s to one in T - reference
         parts = Polynomial(offset[:, axis])(inner).coef
         shifted[:len(parts), axis] = parts
+    shifted *= _signs(options)
     return ByAxis(shifted[0], scale, shifted[1:], reference, (low, high))
 
 
@@ -114,11 +112,10 @@ def _degree(calibration: Calibration) -> int:
 
 
 def _make_px4(calibration: Calibration, options: Options) -> Made:
-    """Return a parameter file of QGroundControl for PX4."""
     place, options = _place(calibration, options, 'px4')
     instance = _instance(options, _PX4_INSTANCES, 'PX4')
     metric = _in_metric(calibration, 'PX4')
-    found = _turned(_fit_by_axis(metric), options)
+    found = _fit_by_axis(metric, options)
     prefix = f'CAL_ACC{instance}_'
     thermal = f'TC_A{instance if place.thermal is None else place.thermal}_'
     rows = {**_device(options, prefix), **_three(prefix, 'OFF', found.offset),
@@ -143,11 +140,10 @@ def _make_px4(calibration: Calibration, options: Options) -> Made:
 
 
 def _make_ardupilot(calibration: Calibration, options: Options) -> Made:
-    """Return a parameter file of Mission Planner and MAVProxy for ArduPilot."""
     place, options = _place(calibration, options, 'ardupilot')
     instance = _instance(options, _ARDUPILOT_INSTANCES, 'ArduPilot')
     metric = _in_metric(calibration, 'ArduPilot')
-    found = _turned(_fit_by_axis(metric, ARDUPILOT_REFERENCE), options)
+    found = _fit_by_axis(metric, options, ARDUPILOT_REFERENCE)
     prefix = f'INS_ACC{"" if instance == 1 else instance}'
     # The firmware adds the polynomial at CALTEMP, so that it is zero there.
     offset = found.offset + found.moved(ARDUPILOT_REFERENCE)
@@ -199,7 +195,6 @@ def _made(text: str, found: ByAxis, metric: Calibration, calibration: Calibratio
 
 
 def _make_betaflight(calibration: Calibration, options: Options) -> Made:
-    """Return commands for Betaflight; raise InputError if a setting cannot hold an offset."""
     signs, per_g, units = _signs(options), _counts_per_g(calibration, options), calibration.units
     factor = 1.0 if units.is_native else per_g / (STANDARD_GRAVITY if units.is_si else 1.0)
     grid = steady_grid(calibration)
@@ -234,19 +229,12 @@ def _in_metric(calibration: Calibration, label: str) -> Calibration:
 
 
 def _instance(options: Options, known: tuple[int, ...], label: str) -> int:
-    """Return the number of the accelerometer; raise InputError if there is none with it."""
     if options.instance is None:
         return known[0]
     if options.instance not in known:
         raise InputError(f'--instance is {options.instance}, but {label} has accelerometers '
                          f'{known[0]} to {known[-1]}', 'use one of these numbers')
     return options.instance
-
-
-def _turned(found: ByAxis, options: Options) -> ByAxis:
-    """Return the correction of the same sensor in the axes of the firmware."""
-    signs = _signs(options)
-    return replace(found, offset=found.offset * signs, thermal=found.thermal * signs)
 
 
 def _signs(options: Options) -> Floats:

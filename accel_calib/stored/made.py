@@ -9,9 +9,9 @@ made from the steady model: the model in the state in which a sensor is used lat
 only the temperature is free. The time is that of the last pose, the supply voltage is the mean of
 the poses, and vibration, rotation, lag and rate of the temperature are zero.
 
-The loss of a format is measured, not derived. The written parameters are applied to readings by
-the equation of the format. The readings are those of forces of 1 g over the sphere, with the
-context of the poses. The loss is the RMS difference to the full correction.
+The loss of a format is the RMS difference to the full correction, measured: the equation of the
+format, with the written parameters, corrects readings of 1 g over the sphere, with the context of
+the poses.
 
 """
 
@@ -39,6 +39,7 @@ _DIRECTIONS = 100
 LEAST_LOSS_MG = 0.005
 """Smaller losses are not mentioned: rounding to single precision causes about 0.0001 mg."""
 
+TITLE = 'Calibration of an accelerometer, written by accel-calib export.'
 _LARGEST_TEXT = 200
 _TEMPERATURE_KEYS = ('temperature', 'temperature_of_offset', 'temperature_of_gain')
 _AXES = {'ros': 'x forward, y left, z up', 'ned': 'x north, y east, z down, read along gravity',
@@ -116,7 +117,7 @@ class Loss:
     """
     What a format does not hold: the RMS difference to the full correction that is left [mg].
 
-    The effect is ``mounting`` for ΔR, and empty for all effects together. `words` is one line.
+    The effect is ``mounting`` for ΔR, and empty for all effects together.
 
     """
 
@@ -301,13 +302,7 @@ def _full_grid(calibration: Calibration) -> Grid:
 
 
 def plain_text(text: str) -> str:
-    """
-    Return foreign text that is safe in a comment of any file, C included.
-
-    It is one line of ASCII. It does not end a comment, start one, or contain a trigraph or a
-    backslash.
-
-    """
+    """Return one line of ASCII that is safe in a comment of any file, also of trigraphs in C."""
     line = ' '.join(text.split())[:_LARGEST_TEXT]
     safe = ''.join(each if ' ' <= each <= '~' and each not in '?\\' else '.' for each in line)
     while '*/' in safe or '/*' in safe:
@@ -340,15 +335,9 @@ def about(calibration: Calibration) -> list[str]:
     return lines
 
 
-def head(calibration: Calibration) -> list[str]:
-    """Return the first lines of the comment on top of a file."""
-    return ['Calibration of an accelerometer, written by accel-calib export.',
-            *about(calibration)]
-
-
 def commented(calibration: Calibration, comment: Sequence[str], lines: Sequence[str]) -> str:
     """Return the text of a file with these lines, and a comment on top."""
-    above = [*head(calibration), *comment]
+    above = [TITLE, *about(calibration), *comment]
     return '\n'.join([*(f'# {line}' for line in above), *lines, ''])
 
 

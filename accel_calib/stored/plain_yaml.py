@@ -6,13 +6,12 @@ Plain YAML, read within limits: mappings, lists, text, numbers, true, false and 
 
 A small file can describe more data than a memory holds (aliases), or more levels than a stack
 holds (nesting). The text is therefore read event by event, and the first event beyond a limit ends
-the reading. (The loader of PyYAML makes a node of each value before anything can be checked:
-100,000 poses of three numbers take 210 MB with it, and 16 MB here.) Anchors, aliases, tags, keys
-that are not text, a key that is stated twice, dates, and numbers in other forms than the decimal
-one are refused.
+the reading. (The loader of PyYAML makes a node of each value first: 100,000 poses of three numbers
+take 210 MB with it, and 16 MB here.) Anchors, aliases, tags, keys that are not text, a key that is
+stated twice, dates, and numbers in other forms than the decimal one are refused.
 
-`value_at` and its siblings then check the type of the value under a key. They raise KeyError if
-the key is missing, and ValueError if the value is of another type.
+`value_at` and its siblings raise KeyError if a key is missing, and ValueError if its value is of
+another type.
 
 """
 
@@ -29,10 +28,8 @@ from yaml.resolver import Resolver
 
 from ..table import Floats
 
-try:  # eight times as fast, but not in every build of PyYAML
-    from yaml import CSafeLoader as SafeLoader
-except ImportError:
-    from yaml import SafeLoader  # type: ignore[assignment]
+# The first is eight times as fast, but not in every build of PyYAML.
+SafeLoader: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
 Kind = TypeVar('Kind')
 
@@ -77,7 +74,6 @@ def read_plain(text: str) -> Any:
 
 
 class _Reader:
-    """The events that are left, and the place in the content."""
 
     def __init__(self, events: Iterator[yaml.Event]) -> None:
         self._events = events
@@ -179,7 +175,6 @@ def value_at(content: Mapping[str, Any], key: str, kind: type[Kind]) -> Kind:
 
 
 def values_at(content: Mapping[str, Any], key: str, kind: type[Kind]) -> list[Kind]:
-    """Return the list of values of this type under a key."""
     return [_checked(each, f'{key} contains', kind) for each in value_at(content, key, list)]
 
 
@@ -243,7 +238,7 @@ def _number(value: Any) -> float | None:
 
 
 def shown(value: Any) -> str:
-    """Return a value as one short line for an error message."""
+    """Return a value as one short line."""
     if isinstance(value, dict):
         return 'a mapping'
     if isinstance(value, list):
