@@ -20,8 +20,8 @@ from accel_calib.session import Level
 from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.units import units_of
 from inside import (
-    aside, Identity, load_store, Lock, model_with, MOST_BYTES, SensorStore, simulate_poses,
-    spread_directions, store_of)
+    aside, Identity, Lock, model_with, MOST_BYTES, SensorStore, simulate_poses, spread_directions,
+    store_of)
 import numpy as np
 import pytest
 from test_session import Driver
@@ -165,7 +165,9 @@ def test_a_table_of_impossible_readings_does_not_stop_the_calibrator(
     rows = [f'{reading},{std},{std},{std},{count}\n' for reading in largest
             for std, count in ((0, 1), (most, 1.0 / most), (1.0 / most, most))]
     store.poses.write_text('ax,ay,az,std_x,std_y,std_z,count\n' + ''.join(rows))
-    assert bool(load_store(store).notes) is (most > 1e30)
+    driver = Driver(calibration_file=str(store.calibration))
+    assert bool(driver.logged()) is (most > 1e30)
+    driver.session.close()
     works(store.calibration, readings)
 
 

@@ -152,13 +152,13 @@ class Guide:
         return bool(self._planned) or self._all_taken
 
     @property
-    def action(self) -> Action | None:
-        """Return what to do next with the poses; None before the first choice."""
+    def action(self) -> Action:
+        """Return what to do next with the poses; `NOT_KNOWN` before the first choice."""
         if self._all_taken:
             return _calling('refine', 'all poses of the plan are taken')
         plan = self.plan
         if plan is None:
-            return None
+            return NOT_KNOWN
         asked = plan.asked
         if asked.direction is None:
             return _calling('fit', asked.words)
@@ -197,14 +197,14 @@ class Guide:
         self._rest = max(start, self._rest)
         return new
 
-    def line(self, poses: Poses, units: Units, action: Action | None, *, added: bool) -> str:
+    def line(self, poses: Poses, units: Units, action: Action, *, added: bool) -> str:
         """
         Return the line about the latest pose; empty if there is nothing new to report.
 
         `added`: the number of poses has increased; otherwise the rest repeats a pose.
 
         """
-        if self.plan is None or action is None:
+        if self.plan is None or action is NOT_KNOWN:
             return ''
         more, total = action.kind == 'poses', self.plan.asked.total
         if not added:
@@ -240,10 +240,12 @@ class Action:
     command: str = ''
 
 
+NOT_KNOWN = Action('', '')
+
 _SERVICES = {'fit': 'fit', 'refine': 'refine', 'level': 'set_level', 'save': 'save'}
 """Service for each kind of step that has one."""
 
-_NEEDS_SAMPLES = ('poses', 'level', 'done')
+_NEEDS_SAMPLES = ('poses', 'level', 'done', NOT_KNOWN.kind)
 """Kinds of steps that wait for the stream; the others use the poses so far."""
 
 _FAULTS = {'connect': ('mismatches', 'no_publisher', 'silence', 'publishers', 'stamps'),
@@ -257,38 +259,35 @@ def _calling(kind: str, text: str) -> Action:
     return Action(kind, f'{text}; call ~/{command}' if command else text, command)
 
 
-def next_action(session: Session) -> Action | None:
-    """Return the next step; None while it is not known."""
+def next_action(session: Session) -> Action:
+    """Return the next step; `NOT_KNOWN` while the poses or the rating are being computed."""
     action = _with_sensor(session.sensor)
-    if action is not None and action.kind not in _NEEDS_SAMPLES:
+    if action.kind not in _NEEDS_SAMPLES:
         return action
     if session.ended:  # nothing can be levelled any more
-        done = action is not None and action.kind == 'level'
-        return Action('done', 'use the calibration') if done else action
+        return Action('done', 'use the calibration') if action.kind == 'level' else action
     faults = stream_faults(session)
     for kind, names in _FAULTS.items():
         words = '; '.join(faults[name] for name in names if name in faults)
         if words:
             return Action(kind, words)
-    if action is None or action.kind != 'poses':
+    if action.kind != 'poses':
         return action
     action, held = _within_reach(session, action), slow_turn(session)
     return replace(action, words=f'{held}; {action.words}') if held else action
 
 
 def next_words(session: Session) -> str:
-    """Return the end of an answer: the next step."""
+    """Return the next step as the end of an answer."""
     action = next_action(session)
-    return '' if action is None else f'; next: {action.words}'
+    return '' if action is NOT_KNOWN else f'; next: {action.words}'
 
 
 def _within_reach(session: Session, action: Action) -> Action:
     """Return a step that a robot which cannot be turned further can do, too."""
-    sensor = session.sensor
-    if not sensor.guide.is_stuck(session.statistics.stamp) or sensor.has_changed:
+    sensor, guide, present = session.sensor, session.sensor.guide, session.sensor.present
+    if not guide.is_stuck(session.statistics.stamp) or sensor.has_changed:
         return action
-    present = sensor.present
-    guide = sensor.guide
     if present is None and not guide.refused_advice and guide.poses >= FEWEST_IN_CONE:
         return Action('poses', f'{action.words}; if it cannot be turned further, call ~/fit',
                       'fit')
@@ -301,7 +300,7 @@ def _within_reach(session: Session, action: Action) -> Action:
                    f'{action.words}') if present.is_levelled else _level_step())
 
 
-def _with_sensor(sensor: Sensor) -> Action | None:
+def _with_sensor(sensor: Sensor) -> Action:
     """Return the next step with the poses and calibrations of a sensor."""
     rating = sensor.rating
     if sensor.offered is not None:
@@ -313,7 +312,7 @@ def _with_sensor(sensor: Sensor) -> Action | None:
     if sensor.drift is not None and sensor.has_changed:
         return Action('poses', status(sensor.drift), sensor.drift.remedy[1])
     if sensor.calibration is not None and rating is None:
-        return None
+        return NOT_KNOWN
     if rating is not None and rating.name == 'GOOD':
         return _after_good(sensor, rating.next)
     if rating is not None and rating.findings and rating.findings[0].kind == 'flat_pose':
