@@ -477,12 +477,12 @@ def test_steps_back_are_kept_for_changes_only_and_have_a_limit(
     store = SensorStore(path, Identity('imu_link', '/imu/data_raw'), 'm/s2')
     first = store.load_calibration()
     assert first is not None
-    store.save_calibration(first)
+    store.write(store.prepared(first))
     before = len(store.steps())
-    store.save_calibration(first)
+    store.write(store.prepared(first))
     assert len(store.steps()) == before
     for k in range(most + 5):
-        store.save_calibration(replace(first, date=f'{k}'))
+        store.write(store.prepared(replace(first, date=f'{k}')))
     assert len(store.steps()) == most
     shutil.copy(path, path.with_name(f'{path.name}.before999'))  # a write failed after this copy
     for k in reversed(range(5, most + 4)):

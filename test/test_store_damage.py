@@ -292,7 +292,8 @@ def test_undo_passes_over_what_is_not_a_step(store: SensorStore) -> None:
     back = store.step_back()
     assert back is not None
     assert back.date.startswith('2025')
-    store.save_calibration(read_calibration(store.calibration.with_name('known.yaml.undone1')))
+    undone = read_calibration(store.calibration.with_name('known.yaml.undone1'))
+    store.write(store.prepared(undone))
     assert store.steps() == [4]
 
 

@@ -50,23 +50,12 @@ _WITHOUT_NEW = 60.0
 @dataclass(frozen=True)
 class Plan:
     """
-    The next pose, and the poses for which it was chosen.
+    The next pose, or that more poses no longer help, and the poses for which it was chosen.
 
-    Parameters
-    ----------
-    asked : NextPose
-        The next pose, or that more poses no longer help.
-    poses : int
-        Number of poses.
-    up : (n, 3) array
-        Approximate direction of up in each pose, unit vectors in the sensor axes; n = 0 if they
-        are not known.
-    noise_g : float
-        Median noise of the poses [g]; NaN if not known.
-    coverage : float
-        Share of the sphere within 45° of a pose.
-    zero : tuple of float
-        Approximate zero of native readings, before a fit; empty if it is not known.
+    `up` are the (n, 3) approximate directions of up in the sensor axes, unit vectors; n = 0 if
+    they are not known. `noise_g` is the median noise of the poses [g], NaN if not known.
+    `coverage` is the share of the sphere within 45° of a pose. `zero` is the approximate zero of
+    native readings before a fit; empty if it is not known.
 
     """
 
@@ -103,7 +92,7 @@ def plan_for(poses: Poses, units: Units, model: str) -> Plan:
 
 
 def _poses_up(poses: Poses, units: Units) -> Floats:
-    """Return the approximate up in each pose, (n, 3); n = 0: native centre is not known."""
+    """Return the `up` of a `Plan`."""
     if units.is_native and len(poses) < _FEWEST_NATIVE:
         return np.zeros((0, 3))
     try:
@@ -198,12 +187,7 @@ class Guide:
         return new
 
     def line(self, poses: Poses, units: Units, action: Action, *, added: bool) -> str:
-        """
-        Return the line about the latest pose; empty if there is nothing new to report.
-
-        `added`: the number of poses has increased; otherwise the rest repeats a pose.
-
-        """
+        """Return the line about a rest that `added` a pose or repeats one; empty if no news."""
         if self.plan is None or action is NOT_KNOWN:
             return ''
         more, total = action.kind == 'poses', self.plan.asked.total
@@ -227,13 +211,7 @@ def _as_asked(planned: Sequence[PlannedPose], plan: Plan) -> NextPose:
 
 @dataclass(frozen=True)
 class Action:
-    """
-    The next step of the person.
-
-    `kind` is one of `accel_calib.finding.STEPS`, `words` are without a full stop, and `command` is
-    the service that does it; empty if there is none.
-
-    """
+    """The next step: one of `accel_calib.finding.STEPS`, its words, and its service or ''."""
 
     kind: str
     words: str
@@ -246,7 +224,7 @@ _SERVICES = {'fit': 'fit', 'refine': 'refine', 'level': 'set_level', 'save': 'sa
 """Service for each kind of step that has one."""
 
 _NEEDS_SAMPLES = ('poses', 'level', 'done', NOT_KNOWN.kind)
-"""Kinds of steps that wait for the stream; the others use the poses so far."""
+"""Kinds of steps that need samples; the others use the poses so far."""
 
 _FAULTS = {'connect': ('mismatches', 'no_publisher', 'silence', 'publishers', 'stamps'),
            'unit': ('unit',)}

@@ -46,12 +46,7 @@ _BANDS = 5
 
 
 class PoseBook:
-    """
-    Poses in the order of their capture; repeated ones are kept, merged or refused as set.
-
-    They are stored as dwells, so that poses can be merged and the last pose undone.
-
-    """
+    """Poses in the order of their capture, as dwells, so that the last pose can be undone."""
 
     def __init__(self, settings: CaptureSettings, units: Units) -> None:
         self._settings, self._units = settings, units
@@ -242,18 +237,13 @@ class LiveCapture:
 
     @property
     def still(self) -> bool:
-        """
-        Return whether the sensor is still.
-
-        Before the first rest, the noise of the sensor is not known, and motion can be taken for
-        noise. The first rest must therefore be as long as a pose.
-
-        """
+        """Return whether the sensor is still."""
+        # Until a rest is as long as a pose, the noise is not known, and may be a motion.
         return self.detector.still and self._rest is not None
 
     def push(self, samples: Floats, capture: bool) -> Iterator[Change]:
         """
-        Add (n, 7 + k) samples as `StillDetector.push`; yield each change before the next samples.
+        Add samples as `StillDetector.push`, and yield each change before the next samples.
 
         `capture`: every rest becomes a pose.
 

@@ -63,7 +63,7 @@ _SEVERITY: dict[str, Severity] = {'GOOD': 'info', 'USABLE': 'warning', 'BAD': 'e
 
 class Session:
     """
-    The calibrator of one sensor.
+    The calibrator of one sensor; InputError if the settings contradict each other.
 
     Parameters
     ----------
@@ -92,11 +92,6 @@ class Session:
         Number of fits and refinements that are running.
     ended : bool
         Whether no more samples can come, because a recording has ended.
-
-    Raises
-    ------
-    InputError
-        If the settings contradict each other.
 
     """
 
@@ -182,10 +177,9 @@ class Session:
 
     def accepts(self, frame_id: str) -> bool:
         """
-        Return whether messages with this frame_id belong to the sensor.
+        Return whether messages with this frame_id belong to the sensor; the first one defines it.
 
-        The first message defines the sensor. A message of another sensor ends the ongoing rest.
-        After a time without messages of the sensor, the session switches to the other sensor.
+        A message of another sensor ends the ongoing rest. After `SILENT`, it replaces the sensor.
 
         """
         if frame_id == self.frame_id:
@@ -305,12 +299,7 @@ class Session:
         return store
 
     def _load(self, store: Store, sensor: Sensor) -> Task:
-        """
-        Read the files of a sensor, and use them unless another one has replaced it.
-
-        Damaged files are renamed, and no file keeps the node from starting.
-
-        """
+        """Read the files of a sensor, and use them unless another one has replaced it."""
         calibration: Calibration | None = None
         poses: Poses | None = None
         problem = ''
@@ -346,12 +335,7 @@ class Session:
 
     def adopt(self, calibration: Calibration | None, refinement: Refinement | None = None,
               rating: Rating | None = None) -> None:
-        """
-        Use this calibration for the correction, with the given mounting if there is one.
-
-        The refinement that it is from, and the rating if it is known, are those of `Sensor`.
-
-        """
+        """Correct with this calibration, and with the given mounting if there is one."""
         self.problem = ''
         if calibration is None:
             self.sensor.adopt(None)

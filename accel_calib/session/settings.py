@@ -54,7 +54,7 @@ def parameter(default: Any, words: str, *, limits: tuple[float, float] | None = 
     choices : tuple of str
         Possible values of a text; empty: any text.
     live : bool
-        Whether the parameter can be set while the node runs.
+        Whether it can be set while the node runs.
 
     """
     about = {'words': words, 'limits': limits, 'choices': choices, 'live': live}

@@ -114,12 +114,9 @@ class Progress:
     @classmethod
     def from_figures(cls, figures: Mapping[str, str]) -> Progress:
         """
-        Return the progress with these figures, as `figures` yields them.
+        Return the progress with these figures, as `figures` yields them; ignore others.
 
-        Raises
-        ------
-        InputError
-            If a figure is missing or cannot be read; other figures are ignored.
+        InputError if a figure is missing or cannot be read.
 
         """
         found = {}
