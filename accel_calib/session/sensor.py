@@ -186,19 +186,16 @@ class Sensor:
         self._hold()
         part = self._uncounted(rest)
         if part is not None and part.end - part.start >= LONG_REST:
-            self._past, self._counted = self._with(part, least), _as_noisy_as(part, rest)
+            self._past, self._counted = self._with(rest, least), _as_noisy_as(part, rest)
         self._compare(least)
 
     def end(self, rest: Dwell, least: float) -> None:
         """Compare a rest that ended with 1 g; `least` is as in `update`."""
-        part = self._uncounted(rest)
-        self._past = self._past if part is None else self._with(part, least)
-        self._counted = rest
+        self._past, self._counted = self._with(rest, least), rest
         self._compare(least)
 
     def _compare(self, least: float) -> None:
-        part = None if self.rest is None else self._uncounted(self.rest)
-        self.drift = self._past if part is None else self._with(part, least)
+        self.drift = self._past if self.rest is None else self._with(self.rest, least)
         found, past = self.drift, self._past
         if found is not None and past is not None and found.change and not past.change:
             # What was reported during a rest ends by the rule of `drift`, not with the rest.
@@ -212,11 +209,13 @@ class Sensor:
         return rest_after(before, rest) if rest.end - before.end >= _SHORT_REST else None
 
     def _with(self, rest: Dwell, least: float) -> Drift | None:
-        context = self._context(rest)
-        if self._past is None or self.calibration is None or context is None:
+        """Return the state of the monitor after what was not counted yet of a rest."""
+        part = self._uncounted(rest)
+        context = None if part is None else self._context(part)
+        if self._past is None or self.calibration is None or part is None or context is None:
             return self._past
-        noise = rest.std[np.newaxis] / math.sqrt(rest.count)
-        found = rest_errors(self.calibration, rest.mean[np.newaxis], noise, context)
+        noise = part.std[np.newaxis] / math.sqrt(part.count)
+        found = rest_errors(self.calibration, part.mean[np.newaxis], noise, context)
         return compared(self._past, found[0], least)
 
     def _hold(self) -> None:
