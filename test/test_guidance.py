@@ -30,7 +30,7 @@ def warming(up: Any, temperature: float) -> Any:
 
 
 def figures(driver: Driver) -> dict[str, Any]:
-    return json.loads(driver.results[-1])  # type: ignore[no-any-return]
+    return json.loads(driver.results[-1])
 
 
 def test_a_healthy_sensor_is_done_after_poses_fit_and_level() -> None:
@@ -60,8 +60,7 @@ def test_an_effect_of_temperature_leads_to_refine_and_is_kept_by_a_fit() -> None
     again = driver.calibration
     assert again.model.effects == refined.model.effects
     assert len(again.poses) == len(driver.poses)
-    np.testing.assert_allclose(again.model.values['offset_temperature'][:3],
-                               EFFECT, atol=5e-5)
+    np.testing.assert_allclose(again.model.values['offset_temperature'][:3], EFFECT, atol=5e-5)
     assert again.is_levelled
     assert next_action(driver.session).kind == 'done'
 
@@ -85,7 +84,6 @@ def test_each_fit_refinement_and_levelling_is_reported_as_on_the_command_line(
     assert kinds[-1] == 'done'
     assert {'refine', 'level'} <= set(kinds)
     store = driver.session.files.store
-    assert store is not None
     _, fit = run_json(capsys, 'fit', store.poses)
     _, refined = run_json(capsys, 'refine', store.poses)
     found, calibration = figures(driver), driver.calibration
@@ -195,7 +193,7 @@ def test_an_effect_far_beyond_those_of_parts_is_reported_and_not_used() -> None:
         return healthy(up, temperature) + 3.0 * EFFECT * (temperature - 25.0)
 
     feed = driver.feed
-    driver.feed = lambda readings, temperature: feed(readings)  # type: ignore[method-assign]
+    driver.feed = lambda readings, temperature: feed(readings)
     person = Person(driver, unseen, warming=1.2)
     for up in spread_directions(24)[np.random.default_rng(2).permutation(24)]:
         person.rest(up)

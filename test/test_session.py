@@ -188,8 +188,7 @@ def test_nothing_is_captured_from_a_sensor_that_fell_silent(stored: Stored, read
 
 def captured(driver: Driver) -> list[list[int]]:
     """Return the directions of the captured poses."""
-    found: list[list[int]] = np.round(driver.poses.reading / GRAVITY).astype(int).tolist()
-    return found
+    return np.round(driver.poses.reading / GRAVITY).astype(int).tolist()
 
 
 def test_nothing_of_a_rest_before_a_silence_is_used_after_it(readings: Readings) -> None:
@@ -418,7 +417,6 @@ def test_steps_back_are_kept_for_changes_only_and_have_a_limit(
     path = stored(sensor='imu_link')
     store = SensorStore(path, Identity('imu_link', '/imu/data_raw'), 'm/s2')
     first = store.load_calibration()
-    assert first is not None
     store.write(store.prepared(first))
     before = len(store.steps())
     store.write(store.prepared(first))
@@ -428,9 +426,7 @@ def test_steps_back_are_kept_for_changes_only_and_have_a_limit(
     assert len(store.steps()) == most
     shutil.copy(path, path.with_name(f'{path.name}.before999'))  # a write failed after this copy
     for k in reversed(range(5, most + 4)):
-        back = store.step_back()
-        assert back is not None
-        assert back.date == f'{k}'
+        assert store.step_back().date == f'{k}'
 
 
 def test_a_step_that_cannot_be_used_leaves_the_file_in_use(stored: Stored) -> None:
