@@ -16,7 +16,7 @@ from inside import (
     attitude_words, Guide, levels_of, model_with, NOTHING_TO_PLAN, Plan, simulate_poses)
 import numpy as np
 import pytest
-from shared import random_directions, run
+from shared import random_directions, run, run_json
 
 G = units_of('g')
 
@@ -27,28 +27,11 @@ def read_plan(path):
     return list(csv.DictReader(line for line in lines if not line.startswith('#')))
 
 
-def numbers(pose, *names):
-    return [float(pose[name]) for name in names]
-
-
 def table(path, hidden, *, size, seed, temperature='wandering'):
     made = simulate(np.random.default_rng(seed), {hidden: size},
                     Setup(poses=24, rates='small', temperature=temperature))
     write_csv(path, made.columns)
     return path
-
-
-@pytest.fixture
-def trends(tmp_path):
-    """Return a table in which offset_temperature and offset_drift are rivals."""
-    return table(tmp_path / 'trends.csv', 'offset_temperature', size=2, seed=[0, 2],
-                 temperature='rising')
-
-
-def refined(path, capsys, *more):
-    capsys.readouterr()
-    assert run('refine', path, '--json', '-', *more) == 0
-    return json.loads(capsys.readouterr().out)
 
 
 def test_a_plan_that_separates_rivals_is_written_and_shown(tmp_path, capsys):
@@ -68,7 +51,7 @@ def test_a_plan_that_separates_rivals_is_written_and_shown(tmp_path, capsys):
         assert set(step['rivals']) < {*step['probabilities'], *step['data_probabilities']}
     step = next(step for step in result['steps'] if step['effect'] in ('cubic', 'odd_quadratic'))
     for pose in poses:
-        up = np.array(numbers(pose, 'up_x', 'up_y', 'up_z'))
+        up = np.array([float(pose[f'up_{axis}']) for axis in 'xyz'])
         assert set(pose['separates'].split(' / ')) == {'cubic', 'odd_quadratic'}
         assert np.linalg.norm(up) == pytest.approx(1.0, abs=1e-5)
         assert pose['attitude'] == attitude_words(up)
@@ -82,16 +65,20 @@ def test_a_plan_that_separates_rivals_is_written_and_shown(tmp_path, capsys):
 def test_without_rivals_nothing_is_written(tmp_path, capsys):
     made = simulate(np.random.default_rng([5, 6]), {'quadratic': 10.0}, Setup(poses=24))
     write_csv(tmp_path / 'clear.csv', made.columns)
-    result = refined(tmp_path / 'clear.csv', capsys, '--plan', tmp_path / 'plan.csv')
+    status, result = run_json(capsys, 'refine', tmp_path / 'clear.csv', '--plan',
+                              tmp_path / 'plan.csv')
+    assert status == 0
     assert [step['effect'] for step in result['steps']][-1] == 'quadratic'
     assert result['plan'] == [NOTHING_TO_PLAN]
     assert not (tmp_path / 'plan.csv').exists()
 
 
-def test_temperature_and_drift_are_separated_at_other_temperatures(trends, tmp_path, capsys):
-    path = tmp_path / 'plan.csv'
-    result = refined(trends, capsys, '--plan', path)
+def test_temperature_and_drift_are_separated_at_other_temperatures(tmp_path, capsys):
+    path, rivals = tmp_path / 'plan.csv', table(
+        tmp_path / 'rivals.csv', 'offset_temperature', size=2, seed=[0, 2], temperature='rising')
+    status, result = run_json(capsys, 'refine', rivals, '--plan', path)
     poses = read_plan(path)
+    assert status == 0
     pair = {'offset_temperature', 'offset_drift'}
     assert all(pair <= set(pose['separates'].split(' / ')) for pose in poses)
     assert all(-20.0 <= float(pose['temperature']) <= 70.0 for pose in poses)
