@@ -34,6 +34,14 @@ def table(path, hidden, *, size, seed, temperature='wandering'):
     return path
 
 
+def simulated(rng, up=None, *, noise_g, context=None, **effects):
+    """Return poses of a sensor with an offset and these effects."""
+    model = model_with({'offset': np.array([0.02, -0.01, 0.03]),
+                        **{name: np.array(values) for name, values in effects.items()}})
+    return simulate_poses(model, random_directions(24, rng) if up is None else up, rng,
+                          noise_g=noise_g, context=context)
+
+
 def test_a_plan_that_separates_rivals_is_written_and_shown(tmp_path, capsys):
     path, found = tmp_path / 'plan.csv', tmp_path / 'found.json'
     twins = table(tmp_path / 'twins.csv', 'cubic', size=3, seed=[5, 3])
@@ -92,10 +100,8 @@ def test_voltages_of_a_plan_are_the_ends_and_the_middle_of_those_of_the_poses():
     rng = np.random.default_rng(0)
     time = np.arange(24) * 60.0
     supply = 3.2 + 0.2 * (time / time[-1] + 0.1 * rng.normal(size=24))
-    model = model_with({'offset': np.array([0.02, -0.01, 0.03]),
-                        'supply_ratio': np.array([0.002, 0.04, -0.04, 0.04])})
-    poses = simulate_poses(model, random_directions(24, rng), rng, noise_g=0.005, samples=100,
-                           context={'time': time, 'supply_voltage': supply})
+    poses = simulated(rng, noise_g=0.005, supply_ratio=[0.002, 0.04, -0.04, 0.04],
+                      context={'time': time, 'supply_voltage': supply})
     planned = refine(poses, G, base='10').plan.poses
     low, high = np.min(supply), np.max(supply)
     assert planned
@@ -116,14 +122,12 @@ def test_temperatures_of_a_plan_are_those_of_the_poses_and_some_beyond(taken, ex
 
 
 def test_the_poses_of_the_plan_name_the_hidden_effect():
-    rng = np.random.default_rng(11)
-    model = model_with({'offset': np.array([0.02, -0.01, 0.03]),
-                        'cubic': np.array([0.004, -0.003, 0.004])})
-    poses = simulate_poses(model, random_directions(24, rng), rng, noise_g=0.004, samples=100)
+    rng, hidden = np.random.default_rng(11), {'cubic': [0.004, -0.003, 0.004], 'noise_g': 0.004}
+    poses = simulated(rng, **hidden)
     before = refine(poses, G, base='10')
     planned = np.array([pose.up for pose in before.plan.poses])
     assert len(planned)
-    more = simulate_poses(model, np.repeat(planned, 40, axis=0), rng, noise_g=0.004, samples=100)
+    more = simulated(rng, np.repeat(planned, 40, axis=0), **hidden)
     joined = replace(poses, columns={key: np.concatenate([poses[key], more[key]])
                                      for key in poses.columns},
                      row=np.arange(1, len(poses) + len(more) + 1))
@@ -136,10 +140,7 @@ def test_what_is_usual_does_not_replace_a_pose_that_would_show_it(seed):
     rng, count = np.random.default_rng(seed), 24
     at = np.arange(count, dtype=float)
     known = {'time': 30.0 * at, 'temperature': 20.0 + at / 2.0}  # a ramp: both are one line
-    model = model_with({'offset': np.array([0.02, -0.01, 0.03]),
-                        'offset_drift': np.array([0.05, -0.04, 0.06, 0.0])})
-    poses = simulate_poses(model, random_directions(count, rng), rng, noise_g=0.003, samples=100,
-                           context=known)
+    poses = simulated(rng, noise_g=0.003, context=known, offset_drift=[0.05, -0.04, 0.06, 0.0])
     found = refine(poses, G, base='7')
     step = found.steps[-1]
     assert {step.effect, *step.rivals} >= {'offset_temperature', 'offset_drift'}
