@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -118,14 +118,16 @@ def test_without_auto_capture_only_requested_poses_are_captured(readings: Readin
     assert poses['reading'][0, 2] > 9.0
 
 
-def merging() -> PoseBook:
-    return PoseBook(CaptureSettings(repeated='merge'), UNITS)
+def book_of(rests: Iterable[Any], repeated: Any = 'merge') -> PoseBook:
+    """Return the poses of rests, each with its time, direction and perhaps temperature."""
+    book = PoseBook(CaptureSettings(repeated=repeated), UNITS)
+    for time, direction, *warm in rests:
+        book.end(replace(dwell(time, direction), context=dict(zip(['temperature'], warm))))
+    return book
 
 
 def test_repeated_poses_are_merged_and_undone_one_by_one() -> None:
-    book = merging()
-    for time, direction in ((0.0, [0, 0, 1]), (10.0, [1, 0, 0]), (20.0, [0.01, 0, 1])):
-        book.end(dwell(time, direction))
+    book = book_of([(0.0, [0, 0, 1]), (10.0, [1, 0, 0]), (20.0, [0.01, 0, 1])])
     assert len(book.poses()) == 2
     assert book.poses()['count'].max() == pytest.approx(100.0)
     assert book.undo()
@@ -134,19 +136,16 @@ def test_repeated_poses_are_merged_and_undone_one_by_one() -> None:
 
 
 def test_poses_of_a_robot_that_parks_for_years_need_bounded_memory() -> None:
-    book, directions = merging(), spread_directions(6)
-    for k in range(600):
-        book.end(dwell(10.0 * k, directions[k % 6]))
+    directions = spread_directions(6)
+    book = book_of((10.0 * k, directions[k % 6]) for k in range(600))
     assert len(book.poses()) == 6
     assert book.poses()['count'].sum() == pytest.approx(600 * 50.0)
     assert len(book._earlier) + len(book._dwells) < 80
 
 
 def test_stored_poses_are_added_as_they_were() -> None:
-    book, again = merging(), merging()
-    for k, direction in enumerate(spread_directions(8)):
-        book.end(dwell(10.0 * k, direction))
-    poses = book.poses()
+    poses = book_of((10.0 * k, up) for k, up in enumerate(spread_directions(8))).poses()
+    again = book_of([])
     again.add_stored(poses)
     for key in poses.columns:
         np.testing.assert_allclose(again.poses()[key], poses[key], err_msg=key)
@@ -229,20 +228,16 @@ def test_robot_that_stands_for_hours_is_monitored_all_the_time(
 
 
 def test_pose_before_the_first_temperature_gets_that_of_the_next_pose() -> None:
-    book = merging()
-    book.end(dwell(0.0, [0, 0, 1]))
-    for time, direction in ((10.0, [1, 0, 0]), (20.0, [0, 0, 1])):
-        book.end(replace(dwell(time, direction), context={'temperature': 30.0 + 0.1 * time}))
+    book = book_of([(0.0, [0, 0, 1]), (10.0, [1, 0, 0], 31.0), (20.0, [0, 0, 1], 32.0)])
     np.testing.assert_allclose(book.poses()['temperature'], [31.5, 31.0])
-    early = replace(dwell(-500.0, [0, 1, 0]), context={})
+    early = dwell(-500.0, [0, 1, 0])
     assert 'temperature' not in poses_from(with_temperature([early, *book._dwells]))
 
 
 @pytest.mark.parametrize(('repeated', 'count'), [('merge', 100.0), ('refuse', 50.0)])
 def test_pose_at_another_temperature_is_not_repeated(repeated: Any, count: float) -> None:
-    book = PoseBook(CaptureSettings(repeated=repeated), UNITS)
-    for time, temperature in ((0.0, 24.0), (10.0, 25.0), (20.0, 38.0)):
-        book.end(replace(dwell(time, [0, 0, 1]), context={'temperature': temperature}))
+    book = book_of([(0.0, [0, 0, 1], 24.0), (10.0, [0, 0, 1], 25.0), (20.0, [0, 0, 1], 38.0)],
+                   repeated)
     np.testing.assert_allclose(book.poses()['count'], [count, 50.0])
     assert book.poses()['temperature'][1] == 38.0
 
