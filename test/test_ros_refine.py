@@ -180,12 +180,9 @@ def test_messages_are_corrected_as_offline(bench: Any, readings: Readings, name:
     meet(bench, publisher, 20.0)
     bench.exchange(corrected, lambda: bench.imu(reading))
     # So long after the messages so far that the temperature before does not matter.
-    first = bench.stamp + 1e5
-    times, warm = [], []
-    found: list[Any] = []
+    times, warm, found = bench.stamp + 1e5 + np.arange(60), 20.0 + 0.25 * np.arange(60), []
     for k in range(60):
-        temperature = 20.0 + 0.25 * k
-        published(bench, publisher, temperature)
+        published(bench, publisher, warm[k])
         if k == 30:
             calibration, turn = read_calibration(path), np.arange(20)
             calibration = with_effects(
@@ -194,16 +191,13 @@ def test_messages_are_corrected_as_offline(bench: Any, readings: Readings, name:
             write_calibration(path, calibration)
             answer = bench.call('load')
             assert answer.success, answer.message
-        bench.stamp = first + k
+        bench.stamp = times[k] - 0.02  # the next message has the next stamp
         found += bench.echo([bench.imu(reading)], corrected)
-        times.append(bench.stamp)
-        warm.append(temperature)
-    expected = calibration.apply(np.tile(reading, (60, 1)), time=np.array(times),
-                                 temperature=np.array(warm))
+    expected = calibration.apply(np.tile(reading, (60, 1)), time=times, temperature=warm)
     # The history has a point every 2 s, so that the rate of the past differs slightly.
     np.testing.assert_allclose([*map(force_of, found[30:])], expected[30:], atol=2e-3)
     assert np.ptp(expected[30:], axis=0).max() > 0.02
-    begun_now = calibration.apply(np.tile(reading, (30, 1)), time=np.array(times[30:]),
-                                  temperature=np.array(warm[30:]))
+    begun_now = calibration.apply(np.tile(reading, (30, 1)), time=times[30:],
+                                  temperature=warm[30:])
     if 'lag' in calibration.model.terms.effects[-1].shape:
         assert np.abs(begun_now - expected[30:]).max() > 0.02
