@@ -325,13 +325,6 @@ def domain() -> Iterator[int]:
         yield number
 
 
-@pytest.fixture(scope='module')
-def domain_of_module() -> Iterator[int]:
-    """Yield a DDS domain of the tests of a module."""
-    with own_domain() as number:
-        yield number
-
-
 @pytest.fixture
 def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, domain: int) -> Iterator[Bench]:
     """Yield a bench in a DDS domain of its own."""

@@ -8,10 +8,12 @@ from __future__ import annotations
 from collections.abc import Generator
 from typing import Any
 
+from accel_calib.errors import AccelCalibError
 from accel_calib.session import (
     answered, CalibratorSettings, checks, columns_of, Log, Result, Session, state, Task)
 from inside import next_action
 import numpy as np
+import pytest
 
 GRAVITY = 9.80665
 RATE = 50.0
@@ -43,6 +45,34 @@ class Driver:
         answer: str = answered(task)
         self.handle()
         return answer
+
+    def ask(self, name: str, **options: bool) -> str:
+        """Return the answer of a command."""
+        return self.done(getattr(self.session.commands, name)(**options))
+
+    def refuses(self, words: str, *names: str) -> None:
+        """Check that commands are refused with these words, a regular expression."""
+        for name in names:
+            with pytest.raises(AccelCalibError, match=words):
+                self.ask(name)
+
+    def tick(self, seconds: float = 0.0) -> None:
+        """Let time pass, and check the stream."""
+        self.now += seconds
+        self.session.tick()
+        self.handle()
+
+    @property
+    def sensor(self) -> Any:
+        return self.session.sensor
+
+    @property
+    def calibration(self) -> Any:
+        return self.session.sensor.calibration
+
+    @property
+    def poses(self) -> Any:
+        return self.session.sensor.live.book.poses()
 
     def feed(self, readings: Any, frame_id: str = 'imu_link', **context: float) -> int:
         """Push readings [m/s²] with their context, and return the number of accepted messages."""
@@ -124,7 +154,7 @@ class Person:
                 if action.kind == 'level':
                     self.rest(self.flat, 4.0)
                 self.called.append(action.command)
-                self.driver.done(getattr(self.driver.session.commands, action.command)())
+                self.driver.ask(action.command)
             else:
                 break
         return self.steps[-1]

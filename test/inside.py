@@ -91,16 +91,16 @@ from accel_calib.report.residuals import residuals_of, residuals_of_refinement
 from accel_calib.report.sheet import sheet
 from accel_calib.report.stability import comparison_page, history_page
 from accel_calib.ros.run import own_domain
-from accel_calib.session import answered, store as session_store, worker
+from accel_calib.session import store as session_store, worker
+from accel_calib.session.commands import fitted as fit_in_node
 from accel_calib.session.guidance import Guide, next_action, Plan, plan_for
-from accel_calib.session.live_capture import dwells_of, LiveCapture, PoseBook, with_temperature
+from accel_calib.session.live_capture import LiveCapture, PoseBook, with_temperature
 from accel_calib.session.sensor import rest_after, Sensor, TemperatureHistory
 from accel_calib.session.settings import capture_settings, changed, default_of, expected
 from accel_calib.session.state import figures
 from accel_calib.session.store import (
     aside, Identity, Lock, MOST_STEPS, Store as SensorStore, store_of, writing_advice)
 from accel_calib.session.stream import StreamStatistics
-from accel_calib.session.work import fit as fit_in_node, load
 from accel_calib.session.worker import Worker, WorkerProcess
 from accel_calib.stored import calibration_yaml, plain_yaml
 from accel_calib.stored.calibration_yaml import (
@@ -118,11 +118,6 @@ NODES = {
 """Arguments of Python that run a node, by its name."""
 
 CALIBRATOR = NODES['calibrator']
-
-
-def load_store(store: SensorStore) -> Any:
-    """Return what is usable of a store."""
-    return answered(load(store))
 
 
 def format_calibration(calibration: Calibration) -> str:

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,8 @@ from accel_calib.session import CalibratorSettings
 from accel_calib.stored import read_calibration
 from accel_calib.units import units_of
 from inside import (
-    dwells_of, LiveCapture, model_with, PoseBook, rest_after, Sensor, simulate_recording,
-    spread_directions, with_temperature)
+    LiveCapture, model_with, PoseBook, rest_after, Sensor, simulate_recording, spread_directions,
+    with_temperature)
 import numpy as np
 import pytest
 
@@ -37,6 +37,13 @@ def push_all(live: LiveCapture, readings: Any, *, start: float = 0.0, rate: floa
         samples[:, 4:7] = omega
     blocks = np.array_split(samples, max(1, len(samples) // block))
     return [change for block in blocks for change in live.push(block, capture)]
+
+
+def monitored(stored: Callable[..., Path]) -> tuple[Any, Any]:
+    """Return a calibration, and a sensor that uses it."""
+    calibration, sensor = read_calibration(stored()), Sensor(CalibratorSettings(), UNITS)
+    sensor.adopt(calibration)
+    return calibration, sensor
 
 
 def dwell(time: float, direction: Any, count: float = 50.0) -> Dwell:
@@ -62,7 +69,7 @@ def test_a_board_that_sends_counts_is_still_within_3_s(up: Any, noise: float, se
     assert len(live.book.poses()) == 1
 
 
-def test_rest_counts_before_it_ends_and_is_updated_later(readings: Readings) -> None:
+def test_rest_counts_before_it_ends_and_its_final_average_replaces_it(readings: Readings) -> None:
     live = LiveCapture(CaptureSettings(), UNITS)
     changes = push_all(live, readings([[0, 0, 1]], dwell=9.0))
     counts = [change.rest.samples for change in changes if change.poses]
@@ -70,9 +77,6 @@ def test_rest_counts_before_it_ends_and_is_updated_later(readings: Readings) -> 
     assert counts == sorted(counts)
     assert counts[0] < 80
     assert counts[-1] > 150
-
-
-def test_provisional_poses_are_replaced_by_their_final_average(readings: Readings) -> None:
     live = LiveCapture(CaptureSettings(repeated='keep'), UNITS)
     changes = push_all(live, readings(FACES, dwell=2.0))
     assert len(live.book.poses()) == 3
@@ -95,8 +99,7 @@ def test_no_pose_of_a_turned_sensor_is_doubtful(dwell: float, turn: float, rate:
 
 
 def test_removed_pose_is_not_captured_again_in_the_same_rest(readings: Readings) -> None:
-    live = LiveCapture(CaptureSettings(), UNITS)
-    rest = readings([[0, 0, 1]], dwell=12.0)
+    live, rest = LiveCapture(CaptureSettings(), UNITS), readings([[0, 0, 1]], dwell=12.0)
     push_all(live, rest[:150])
     assert live.undo()
     push_all(live, rest[150:], start=3.0)
@@ -115,10 +118,16 @@ def test_without_auto_capture_only_requested_poses_are_captured(readings: Readin
     assert poses['reading'][0, 2] > 9.0
 
 
+def book_of(rests: Iterable[Any], repeated: Any = 'merge') -> PoseBook:
+    """Return the poses of rests, each with its time, direction and perhaps temperature."""
+    book = PoseBook(CaptureSettings(repeated=repeated), UNITS)
+    for time, direction, *warm in rests:
+        book.end(replace(dwell(time, direction), context=dict(zip(['temperature'], warm))))
+    return book
+
+
 def test_repeated_poses_are_merged_and_undone_one_by_one() -> None:
-    book = PoseBook(CaptureSettings(repeated='merge'), UNITS)
-    for time, direction in ((0.0, [0, 0, 1]), (10.0, [1, 0, 0]), (20.0, [0.01, 0, 1])):
-        book.end(dwell(time, direction))
+    book = book_of([(0.0, [0, 0, 1]), (10.0, [1, 0, 0]), (20.0, [0.01, 0, 1])])
     assert len(book.poses()) == 2
     assert book.poses()['count'].max() == pytest.approx(100.0)
     assert book.undo()
@@ -127,32 +136,24 @@ def test_repeated_poses_are_merged_and_undone_one_by_one() -> None:
 
 
 def test_poses_of_a_robot_that_parks_for_years_need_bounded_memory() -> None:
-    book = PoseBook(CaptureSettings(repeated='merge'), UNITS)
     directions = spread_directions(6)
-    for k in range(600):
-        book.end(dwell(10.0 * k, directions[k % 6]))
+    book = book_of((10.0 * k, directions[k % 6]) for k in range(600))
     assert len(book.poses()) == 6
     assert book.poses()['count'].sum() == pytest.approx(600 * 50.0)
     assert len(book._earlier) + len(book._dwells) < 80
 
 
 def test_stored_poses_are_added_as_they_were() -> None:
-    book = PoseBook(CaptureSettings(repeated='merge'), UNITS)
-    for k, direction in enumerate(spread_directions(8)):
-        book.end(dwell(10.0 * k, direction))
-    poses = book.poses()
-    again = PoseBook(CaptureSettings(repeated='merge'), UNITS)
+    poses = book_of((10.0 * k, up) for k, up in enumerate(spread_directions(8))).poses()
+    again = book_of([])
     again.add_stored(poses)
     for key in poses.columns:
         np.testing.assert_allclose(again.poses()[key], poses[key], err_msg=key)
-    assert len(dwells_of(poses)) == 8
 
 
 def test_change_is_reported_during_the_third_rest_and_survives_a_new_level(
         stored: Callable[..., Path]) -> None:
-    calibration = read_calibration(stored())
-    sensor = Sensor(CalibratorSettings(), UNITS)
-    sensor.adopt(calibration)
+    calibration, sensor = monitored(stored)
 
     def rest(time: float, off: float) -> Dwell:
         reading = calibration.predict(np.array([[0.0, 0.0, (1.0 + off) * GRAVITY]]))[0]
@@ -161,7 +162,6 @@ def test_change_is_reported_during_the_third_rest_and_survives_a_new_level(
     for time, off in ((0.0, 0.0), (10.0, 0.05), (20.0, 0.0), (30.0, 0.005), (40.0, 0.005)):
         sensor.update(rest(time, off), 0.001)
         sensor.end(rest(time, off), 0.001)
-        assert sensor.drift is not None
         assert sensor.drift.change is None
     sensor.update(rest(50.0, 0.005), 0.001)
     assert sensor.drift.change is not None
@@ -179,14 +179,11 @@ def test_change_is_reported_during_the_third_rest_and_survives_a_new_level(
 
 def test_rest_that_is_reported_late_does_not_hide_the_ongoing_rest(
         stored: Callable[..., Path]) -> None:
-    calibration = read_calibration(stored())
-    sensor = Sensor(CalibratorSettings(), UNITS)
-    sensor.adopt(calibration)
+    _, sensor = monitored(stored)
     early, late = dwell(0.0, [0, 0, 1]), dwell(10.0, [0, 0, 1.01])
     sensor.update(early, 0.001)
     sensor.update(late, 0.001)
     sensor.end(early, 0.001)
-    assert sensor.drift is not None
     assert sensor.drift.count == 2
     sensor.end(late, 0.001)
     assert sensor.drift.count == 2
@@ -211,9 +208,7 @@ def test_remainder_of_a_rest_is_what_came_after_its_part() -> None:
 
 def test_robot_that_stands_for_hours_is_monitored_all_the_time(
         stored: Callable[..., Path]) -> None:
-    calibration = read_calibration(stored())
-    sensor, live = Sensor(CalibratorSettings(), UNITS), LiveCapture(CaptureSettings(), UNITS)
-    sensor.adopt(calibration)
+    (calibration, sensor), live = monitored(stored), LiveCapture(CaptureSettings(), UNITS)
     rng = np.random.default_rng(1)
     counts, left_at = [], 0.0
     base = calibration.predict(np.array([[0.0, 0.0, GRAVITY]]))[0]
@@ -225,28 +220,24 @@ def test_robot_that_stands_for_hours_is_monitored_all_the_time(
         for change in push_all(live, readings, start=time[0], rate=4.0, capture=False, block=40):
             if change.rest is not None:
                 sensor.update(change.rest, 0.001)
-        if sensor.drift is not None and sensor.drift.change is not None:
+        if sensor.drift.change is not None:
             left_at = left_at or time[0]
-        counts.append(0 if sensor.drift is None else sensor.drift.count)
+        counts.append(sensor.drift.count)
     assert max(counts) >= 5  # long rests are compared in parts of 5 minutes
     assert 1000.0 < left_at < 1800.0
 
 
 def test_pose_before_the_first_temperature_gets_that_of_the_next_pose() -> None:
-    book = PoseBook(CaptureSettings(repeated='merge'), UNITS)
-    book.end(dwell(0.0, [0, 0, 1]))
-    for time, direction in ((10.0, [1, 0, 0]), (20.0, [0, 0, 1])):
-        book.end(replace(dwell(time, direction), context={'temperature': 30.0 + 0.1 * time}))
+    book = book_of([(0.0, [0, 0, 1]), (10.0, [1, 0, 0], 31.0), (20.0, [0, 0, 1], 32.0)])
     np.testing.assert_allclose(book.poses()['temperature'], [31.5, 31.0])
-    early = replace(dwell(-500.0, [0, 1, 0]), context={})
+    early = dwell(-500.0, [0, 1, 0])
     assert 'temperature' not in poses_from(with_temperature([early, *book._dwells]))
 
 
 @pytest.mark.parametrize(('repeated', 'count'), [('merge', 100.0), ('refuse', 50.0)])
 def test_pose_at_another_temperature_is_not_repeated(repeated: Any, count: float) -> None:
-    book = PoseBook(CaptureSettings(repeated=repeated), UNITS)
-    for time, temperature in ((0.0, 24.0), (10.0, 25.0), (20.0, 38.0)):
-        book.end(replace(dwell(time, [0, 0, 1]), context={'temperature': temperature}))
+    book = book_of([(0.0, [0, 0, 1], 24.0), (10.0, [0, 0, 1], 25.0), (20.0, [0, 0, 1], 38.0)],
+                   repeated)
     np.testing.assert_allclose(book.poses()['count'], [count, 50.0])
     assert book.poses()['temperature'][1] == 38.0
 

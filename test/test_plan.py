@@ -16,7 +16,7 @@ from inside import (
     attitude_words, Guide, levels_of, model_with, NOTHING_TO_PLAN, Plan, simulate_poses)
 import numpy as np
 import pytest
-from shared import random_directions, run
+from shared import random_directions, run, run_json
 
 G = units_of('g')
 
@@ -27,10 +27,6 @@ def read_plan(path):
     return list(csv.DictReader(line for line in lines if not line.startswith('#')))
 
 
-def numbers(pose, *names):
-    return [float(pose[name]) for name in names]
-
-
 def table(path, hidden, *, size, seed, temperature='wandering'):
     made = simulate(np.random.default_rng(seed), {hidden: size},
                     Setup(poses=24, rates='small', temperature=temperature))
@@ -38,17 +34,12 @@ def table(path, hidden, *, size, seed, temperature='wandering'):
     return path
 
 
-@pytest.fixture
-def trends(tmp_path):
-    """Return a table in which offset_temperature and offset_drift are rivals."""
-    return table(tmp_path / 'trends.csv', 'offset_temperature', size=2, seed=[0, 2],
-                 temperature='rising')
-
-
-def refined(path, capsys, *more):
-    capsys.readouterr()
-    assert run('refine', path, '--json', '-', *more) == 0
-    return json.loads(capsys.readouterr().out)
+def simulated(rng, up=None, *, noise_g, context=None, **effects):
+    """Return poses of a sensor with an offset and these effects."""
+    model = model_with({'offset': np.array([0.02, -0.01, 0.03]),
+                        **{name: np.array(values) for name, values in effects.items()}})
+    return simulate_poses(model, random_directions(24, rng) if up is None else up, rng,
+                          noise_g=noise_g, context=context)
 
 
 def test_a_plan_that_separates_rivals_is_written_and_shown(tmp_path, capsys):
@@ -68,7 +59,7 @@ def test_a_plan_that_separates_rivals_is_written_and_shown(tmp_path, capsys):
         assert set(step['rivals']) < {*step['probabilities'], *step['data_probabilities']}
     step = next(step for step in result['steps'] if step['effect'] in ('cubic', 'odd_quadratic'))
     for pose in poses:
-        up = np.array(numbers(pose, 'up_x', 'up_y', 'up_z'))
+        up = np.array([float(pose[f'up_{axis}']) for axis in 'xyz'])
         assert set(pose['separates'].split(' / ')) == {'cubic', 'odd_quadratic'}
         assert np.linalg.norm(up) == pytest.approx(1.0, abs=1e-5)
         assert pose['attitude'] == attitude_words(up)
@@ -82,16 +73,20 @@ def test_a_plan_that_separates_rivals_is_written_and_shown(tmp_path, capsys):
 def test_without_rivals_nothing_is_written(tmp_path, capsys):
     made = simulate(np.random.default_rng([5, 6]), {'quadratic': 10.0}, Setup(poses=24))
     write_csv(tmp_path / 'clear.csv', made.columns)
-    result = refined(tmp_path / 'clear.csv', capsys, '--plan', tmp_path / 'plan.csv')
+    status, result = run_json(capsys, 'refine', tmp_path / 'clear.csv', '--plan',
+                              tmp_path / 'plan.csv')
+    assert status == 0
     assert [step['effect'] for step in result['steps']][-1] == 'quadratic'
     assert result['plan'] == [NOTHING_TO_PLAN]
     assert not (tmp_path / 'plan.csv').exists()
 
 
-def test_temperature_and_drift_are_separated_at_other_temperatures(trends, tmp_path, capsys):
-    path = tmp_path / 'plan.csv'
-    result = refined(trends, capsys, '--plan', path)
+def test_temperature_and_drift_are_separated_at_other_temperatures(tmp_path, capsys):
+    path, rivals = tmp_path / 'plan.csv', table(
+        tmp_path / 'rivals.csv', 'offset_temperature', size=2, seed=[0, 2], temperature='rising')
+    status, result = run_json(capsys, 'refine', rivals, '--plan', path)
     poses = read_plan(path)
+    assert status == 0
     pair = {'offset_temperature', 'offset_drift'}
     assert all(pair <= set(pose['separates'].split(' / ')) for pose in poses)
     assert all(-20.0 <= float(pose['temperature']) <= 70.0 for pose in poses)
@@ -105,10 +100,8 @@ def test_voltages_of_a_plan_are_the_ends_and_the_middle_of_those_of_the_poses():
     rng = np.random.default_rng(0)
     time = np.arange(24) * 60.0
     supply = 3.2 + 0.2 * (time / time[-1] + 0.1 * rng.normal(size=24))
-    model = model_with({'offset': np.array([0.02, -0.01, 0.03]),
-                        'supply_ratio': np.array([0.002, 0.04, -0.04, 0.04])})
-    poses = simulate_poses(model, random_directions(24, rng), rng, noise_g=0.005, samples=100,
-                           context={'time': time, 'supply_voltage': supply})
+    poses = simulated(rng, noise_g=0.005, supply_ratio=[0.002, 0.04, -0.04, 0.04],
+                      context={'time': time, 'supply_voltage': supply})
     planned = refine(poses, G, base='10').plan.poses
     low, high = np.min(supply), np.max(supply)
     assert planned
@@ -129,14 +122,12 @@ def test_temperatures_of_a_plan_are_those_of_the_poses_and_some_beyond(taken, ex
 
 
 def test_the_poses_of_the_plan_name_the_hidden_effect():
-    rng = np.random.default_rng(11)
-    model = model_with({'offset': np.array([0.02, -0.01, 0.03]),
-                        'cubic': np.array([0.004, -0.003, 0.004])})
-    poses = simulate_poses(model, random_directions(24, rng), rng, noise_g=0.004, samples=100)
+    rng, hidden = np.random.default_rng(11), {'cubic': [0.004, -0.003, 0.004], 'noise_g': 0.004}
+    poses = simulated(rng, **hidden)
     before = refine(poses, G, base='10')
     planned = np.array([pose.up for pose in before.plan.poses])
     assert len(planned)
-    more = simulate_poses(model, np.repeat(planned, 40, axis=0), rng, noise_g=0.004, samples=100)
+    more = simulated(rng, np.repeat(planned, 40, axis=0), **hidden)
     joined = replace(poses, columns={key: np.concatenate([poses[key], more[key]])
                                      for key in poses.columns},
                      row=np.arange(1, len(poses) + len(more) + 1))
@@ -149,10 +140,7 @@ def test_what_is_usual_does_not_replace_a_pose_that_would_show_it(seed):
     rng, count = np.random.default_rng(seed), 24
     at = np.arange(count, dtype=float)
     known = {'time': 30.0 * at, 'temperature': 20.0 + at / 2.0}  # a ramp: both are one line
-    model = model_with({'offset': np.array([0.02, -0.01, 0.03]),
-                        'offset_drift': np.array([0.05, -0.04, 0.06, 0.0])})
-    poses = simulate_poses(model, random_directions(count, rng), rng, noise_g=0.003, samples=100,
-                           context=known)
+    poses = simulated(rng, noise_g=0.003, context=known, offset_drift=[0.05, -0.04, 0.06, 0.0])
     found = refine(poses, G, base='7')
     step = found.steps[-1]
     assert {step.effect, *step.rivals} >= {'offset_temperature', 'offset_drift'}

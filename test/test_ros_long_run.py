@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from pathlib import Path
 import sys
-from typing import Any
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / 'benchmarks'))
 
@@ -34,32 +33,18 @@ ones take no more.
 """
 
 
-@pytest.fixture(scope='module')
-def run(domain_of_module: int) -> Any:
-    if FACTOR == 1:
-        pytest.skip('two minutes: make faults')
-    return long_run(ROUNDS, ROUND, INTERVAL, RATE, domain=domain_of_module)
-
-
-def test_no_message_is_lost_while_services_are_called(run: Any) -> None:
+@pytest.mark.skipif(FACTOR == 1, reason='two minutes: make faults')
+def test_a_long_run_loses_no_message_answers_every_call_and_keeps_its_memory(domain: int) -> None:
+    run = long_run(ROUNDS, ROUND, INTERVAL, RATE, domain=domain)
     assert np.all(run.count(run.sent) > 0.5 * RATE * INTERVAL)
     assert not np.any(run.lost(run.ours))
-
-
-def test_every_capture_fit_and_refinement_succeeds(run: Any) -> None:
     assert [each for each in run.answers if not each.success] == []
     for name in ('fit', 'refine'):
         assert len(run.called(name)) == ROUNDS
     poses = [int(each.words.partition(' from ')[2].split()[0]) for each in run.called('fit')]
     assert all(count >= 10 for count in poses), poses
-
-
-@pytest.mark.parametrize('name', GROWTH)
-def test_memory_is_flat_after_the_first_round(run: Any, name: str) -> None:
-    assert run.grown(name) < GROWTH[name]
-
-
-def test_the_node_reports_no_defect(run: Any) -> None:
+    for name, most in GROWTH.items():
+        assert run.grown(name) < most, name
     assert 'correcting with model' in run.log
     assert 'Traceback' not in run.log
     assert 'unexpected error' not in run.log

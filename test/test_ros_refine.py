@@ -9,7 +9,6 @@ import re
 import signal
 from typing import Any
 
-from accel_calib.calibrate import Calibration
 from accel_calib.effects import empirical_name
 from accel_calib.stored import read_calibration, write_calibration
 from diagnostic_msgs.msg import DiagnosticArray
@@ -19,22 +18,16 @@ import pytest
 from sensor_msgs.msg import BatteryState, FluidPressure, Imu, Temperature
 from shared import run_snippets, with_effects
 from std_msgs.msg import Float32, Float64
-from visualization_msgs.msg import MarkerArray
 
 Readings = Callable[..., Any]
 POSES = 26
 MOVES = np.array([0.002, -0.0015, 0.001])
-"""Offset per °C [g]."""
+"""Offset per ampere [g]."""
 
 
-def warmed(bench: Any, readings: Readings, publisher: Any, name: str = 'temperature [°C]',
-           change: Callable[[float], float] = float) -> None:
-    """Publish poses, each at another temperature, or other quantity that changes the offset."""
-    meet(bench, publisher, 25.0, name)
-    for k, direction in enumerate(spread_directions(POSES)):
-        value = 25.0 + 12.0 * np.sin(2.1 * k)
-        published(bench, publisher, value)
-        bench.feed(readings([direction], dwell=1.8) + MOVES * change(value - 25.0) * 9.80665)
+def force_of(message: Imu) -> list[float]:
+    force = message.linear_acceleration
+    return [force.x, force.y, force.z]
 
 
 def message(publisher: Any, value: float) -> Any:
@@ -63,52 +56,6 @@ def meet(bench: Any, publisher: Any, value: float, name: str = 'temperature [°C
     bench.spin(known)
 
 
-def test_temperature_effect_is_named_stored_and_corrected(bench: Any, readings: Readings) -> None:
-    markers = bench.listen(MarkerArray, 'calibrator/poses', latched=True)
-    corrected = bench.listen(Imu, 'imu/data_calibrated')
-    publisher = bench.node.create_publisher(Temperature, 'temperature', 10)
-    bench.calibrator(sensor='arm', passthrough=True)
-    bench.spin(lambda: publisher.get_subscription_count() > 0)
-    warmed(bench, readings, publisher)
-    bench.spin(lambda: sum(m.ns == 'poses' for m in markers[-1].markers) >= POSES - 1)
-    answer = bench.call('refine')
-    assert answer.success, answer.message
-    assert 'offset_temperature' in answer.message
-    found = read_calibration(bench.home / 'accel_calib' / 'arm.yaml')
-    np.testing.assert_allclose(found.model.values['offset_temperature'], [*MOVES, 0.0, 0.0],
-                               atol=2e-4)
-
-    check_corrected(bench, readings, publisher, corrected)
-
-
-def check_corrected(bench: Any, readings: Readings, publisher: Any, corrected: list[Any],
-                    name: str = 'temperature [°C]', change: Callable[[float], float] = float
-                    ) -> None:
-    """Check that messages at two temperatures, or other quantities, are corrected."""
-    for value in (15.0, 35.0):
-        meet(bench, publisher, value, name)
-        shift = MOVES * change(value - 25.0) * 9.80665
-        bench.echo([bench.imu(reading + shift) for reading in readings([[0, 0, 1]])[:40]],
-                   corrected)
-        up = np.mean([[m.linear_acceleration.x, m.linear_acceleration.y, m.linear_acceleration.z]
-                      for m in corrected], axis=0)
-        assert np.linalg.norm(up) == pytest.approx(9.80665, abs=0.02)
-
-
-def test_a_quantity_of_a_robot_is_named_stored_and_corrected(bench: Any, readings: Readings
-                                                             ) -> None:
-    corrected = bench.listen(Imu, 'imu/data_calibrated')
-    publisher = bench.node.create_publisher(Float64, 'motor/current', 10)
-    bench.calibrator(sensor='arm', passthrough=True, context=['motor_current:=motor/current'])
-    warmed(bench, readings, publisher, 'motor_current')
-    answer = bench.call('refine')
-    assert answer.success, answer.message
-    found = read_calibration(bench.home / 'accel_calib' / 'arm.yaml')
-    np.testing.assert_allclose(found.model.values['offset_covariate-motor_current'][:3], MOVES,
-                               atol=2e-4)
-    check_corrected(bench, readings, publisher, corrected, 'motor_current')
-
-
 OWN = """
 import accel_calib as ac
 
@@ -124,11 +71,21 @@ def test_an_own_effect_is_named_corrected_and_needed_by_the_node(
     corrected = bench.listen(Imu, 'imu/data_calibrated')
     publisher = bench.node.create_publisher(Float64, 'motor/current', 10)
     first = bench.calibrator(**about, also=tmp_path / 'own.py')
-    warmed(bench, readings, publisher, 'motor_current', abs)
+    meet(bench, publisher, 25.0, 'motor_current')
+    for k, direction in enumerate(spread_directions(POSES)):
+        current = 25.0 + 12.0 * np.sin(2.1 * k)
+        published(bench, publisher, current)
+        bench.feed(readings([direction], dwell=1.8) + MOVES * abs(current - 25.0) * 9.80665)
     answer = bench.call('refine')
     assert answer.success, answer.message
     assert 'field_of_motor' in answer.message
-    check_corrected(bench, readings, publisher, corrected, 'motor_current', abs)
+    for current in (15.0, 30.0):
+        meet(bench, publisher, current, 'motor_current')
+        shift = MOVES * abs(current - 25.0) * 9.80665
+        bench.echo([bench.imu(reading + shift) for reading in readings([[0, 0, 1]])[:40]],
+                   corrected)
+        assert np.linalg.norm(np.mean([*map(force_of, corrected)], axis=0)) == pytest.approx(
+            9.80665, abs=0.02)
     assert bench.end(first, signal.SIGINT)[0] == 0
     bench.join_anew()
     second = bench.start('calibrator', **about)
@@ -165,8 +122,8 @@ def test_the_examples_of_the_page_are_corrected_live(
         def as_offline(reading: Any = reading, current: float = current,
                        expected: Any = expected) -> bool:
             publisher.publish(Float64(data=float(current)))
-            force = bench.echo([bench.imu(reading)], corrected)[-1].linear_acceleration
-            return np.allclose([force.x, force.y, force.z], expected, rtol=0.0, atol=1e-9)
+            force = force_of(bench.echo([bench.imu(reading)], corrected)[-1])
+            return np.allclose(force, expected, rtol=0.0, atol=1e-9)
 
         bench.spin(as_offline)
         errors.append(1e3 * (np.linalg.norm(expected) / 9.80665 - 1.0))
@@ -202,15 +159,6 @@ def test_each_type_of_context_is_read_and_what_cannot_be_read_is_said(bench: Any
     assert shown['none'] == 'not known'
 
 
-def with_effect(path: Path, name: str, values: list[float]) -> Calibration:
-    """Add an effect of the temperature, seen from 15 to 35 °C, to a stored calibration."""
-    found, turn = read_calibration(path), np.arange(20)
-    write_calibration(path, with_effects(
-        found, {name: values}, 1e-14, temperature=25.0 + 10.0 * np.cos(turn * 2.0),
-        time=turn * 100.0))
-    return read_calibration(path)
-
-
 CURVE = [2e-3, -1e-3, 3e-3, 1e-3, 2e-3, -2e-3, 15.0, 35.0]
 
 
@@ -232,28 +180,24 @@ def test_messages_are_corrected_as_offline(bench: Any, readings: Readings, name:
     meet(bench, publisher, 20.0)
     bench.exchange(corrected, lambda: bench.imu(reading))
     # So long after the messages so far that the temperature before does not matter.
-    first = bench.stamp + 1e5
-    times, warm = [], []
-    found: list[Any] = []
+    times, warm, found = bench.stamp + 1e5 + np.arange(60), 20.0 + 0.25 * np.arange(60), []
     for k in range(60):
-        temperature = 20.0 + 0.25 * k
-        published(bench, publisher, temperature)
+        published(bench, publisher, warm[k])
         if k == 30:
-            calibration = with_effect(path, name, values)
+            calibration, turn = read_calibration(path), np.arange(20)
+            calibration = with_effects(
+                calibration, {name: values}, 1e-14,
+                temperature=25.0 + 10.0 * np.cos(turn * 2.0), time=turn * 100.0)
+            write_calibration(path, calibration)
             answer = bench.call('load')
             assert answer.success, answer.message
-        bench.stamp = first + k
+        bench.stamp = times[k] - 0.02  # the next message has the next stamp
         found += bench.echo([bench.imu(reading)], corrected)
-        times.append(bench.stamp)
-        warm.append(temperature)
-    expected = calibration.apply(np.tile(reading, (60, 1)), time=np.array(times),
-                                 temperature=np.array(warm))
-    vectors = np.array([[m.linear_acceleration.x, m.linear_acceleration.y,
-                         m.linear_acceleration.z] for m in found])
+    expected = calibration.apply(np.tile(reading, (60, 1)), time=times, temperature=warm)
     # The history has a point every 2 s, so that the rate of the past differs slightly.
-    np.testing.assert_allclose(vectors[30:], expected[30:], atol=2e-3)
+    np.testing.assert_allclose([*map(force_of, found[30:])], expected[30:], atol=2e-3)
     assert np.ptp(expected[30:], axis=0).max() > 0.02
-    begun_now = calibration.apply(np.tile(reading, (30, 1)), time=np.array(times[30:]),
-                                  temperature=np.array(warm[30:]))
+    begun_now = calibration.apply(np.tile(reading, (30, 1)), time=times[30:],
+                                  temperature=warm[30:])
     if 'lag' in calibration.model.terms.effects[-1].shape:
         assert np.abs(begun_now - expected[30:]).max() > 0.02

@@ -14,40 +14,43 @@ import shutil
 from typing import Any
 
 from accel_calib.calibrate import level, set_heading
-from accel_calib.errors import AccelCalibError, InputError, StoredCalibrationError
+from accel_calib.errors import InputError, StoredCalibrationError
 from accel_calib.finding import Finding, LEVELS
 from accel_calib.logs import read_poses, write_table
 from accel_calib.session import CalibratorSettings, changed, Level, state
 from accel_calib.stored import read_calibration, write_calibration
+from accel_calib.table import Poses
 from driven import Driver, RATE
 from inside import (
-    Identity, LARGEST_NUMBER_OF_STEPS, load_store, Model, next_action, rotation_from_rpy,
-    SensorStore, spread_directions, store_of, StreamStatistics, writing_advice)
+    Identity, LARGEST_NUMBER_OF_STEPS, Model, next_action, rotation_from_rpy, SensorStore,
+    spread_directions, store_of, StreamStatistics, writing_advice)
 import numpy as np
 import pytest
 from shared import with_effects
 
 GRAVITY = 9.80665
 UP, LEFT, FORWARD = [0, 0, 1], [0, 1, 0], [1, 0, 0]
+NOSE_DOWN = [-0.6, 0.0, 0.8]
+MOTOR = 'motor_current:=/motor/current'
+MOUNTING = rotation_from_rpy(*np.radians((5.0, -3.0, 40.0))).T
 
 pytestmark = pytest.mark.usefixtures('home')
 
 Readings = Callable[..., Any]
 Stored = Callable[..., Path]
 
+IDENTITIES = [
+    Identity('imu_link', '/left/imu/data_raw'), Identity('imu_link', '/right/imu/data_raw'),
+    *(Identity(name, '/imu') for name in (
+        'left/imu', 'left_imu', '/imu_link', 'imu link', 'übung', 'ßbung', '', 'imu', 'a')),
+    *(Identity(name, '/imu', True) for name in (
+        'left/imu', 'left_imu', 'x' * 300, 'x' * 301, 'imu@a'))]
 
-@pytest.mark.parametrize(('one', 'other'), [
-    (Identity('imu_link', '/left/imu/data_raw'), Identity('imu_link', '/right/imu/data_raw')),
-    (Identity('left/imu', '/imu'), Identity('left_imu', '/imu')),
-    (Identity('/imu_link', '/imu'), Identity('imu link', '/imu')),
-    (Identity('übung', '/imu'), Identity('ßbung', '/imu')),
-    (Identity('', '/imu'), Identity('imu', '/imu')),
-    (Identity('left/imu', '/imu', True), Identity('left_imu', '/imu', True)),
-    (Identity('x' * 300, '/imu', True), Identity('x' * 301, '/imu', True)),
-    (Identity('a', '/imu'), Identity('imu@a', '/imu', True))])
-def test_each_sensor_has_files_of_its_own(one: Identity, other: Identity) -> None:
-    assert one.file_name != other.file_name
-    for name in (one.file_name, other.file_name):
+
+def test_each_sensor_has_files_of_its_own() -> None:
+    names = [each.file_name for each in IDENTITIES]
+    assert len(set(names)) == len(names)
+    for name in names:
         assert name == Path(name).name
         assert len(name) < 200
         assert not name.startswith('.')
@@ -67,7 +70,7 @@ def test_plain_names_of_files_are_readable(home: Path, monkeypatch: pytest.Monke
 
 def test_second_node_on_the_same_files_is_refused_until_the_first_ends(
         stored: Stored, readings: Readings) -> None:
-    path = stored(sensor='imu_link')
+    path, words = stored(sensor='imu_link'), 'is used by the node with process id'
     before = path.read_bytes()
     first, second = Driver(calibration_file=str(path)), Driver(calibration_file=str(path))
     for driver in (first, second):
@@ -75,18 +78,14 @@ def test_second_node_on_the_same_files_is_refused_until_the_first_ends(
     assert first.session.files.locked
     assert not second.session.files.locked
     assert second.finding('calibration').level == Level.ERROR
-    assert 'is used by the node with process id' in second.finding('calibration').words
-    commands = second.session.commands
-    for command in (commands.fit, commands.save, commands.load):
-        with pytest.raises(AccelCalibError, match='is used by the node with process id'):
-            second.done(command())
+    assert words in second.finding('calibration').words
+    second.refuses(words, 'fit', 'save', 'load')
     assert path.read_bytes() == before
     assert len(read_poses(path.with_name('known_poses.csv'))) == 12
     first.session.close()
-    second.session.tick()
-    second.handle()
+    second.tick()
     assert second.session.files.locked
-    assert second.session.sensor.calibration is not None
+    assert second.calibration is not None
     assert second.finding('calibration').level == Level.OK
 
 
@@ -102,34 +101,26 @@ def test_files_that_cannot_be_used_are_never_overwritten(tmp_path: Path, stored:
     assert (tmp_path / 'use.yaml').read_text() == other
     assert (tmp_path / 'use_poses.csv.damaged1').read_text() == table
     assert not (tmp_path / '.use.yaml.12345.tmp').exists()
-    assert driver.done(driver.session.commands.fit())
+    assert driver.ask('fit')
     assert (tmp_path / 'use.yaml.other1').read_text() == other
     assert read_calibration(tmp_path / 'use.yaml').sensor == 'imu_link'
     assert len(read_poses(tmp_path / 'use_poses.csv')) == 12
 
 
 @pytest.mark.parametrize('changes', [{'sensor': 'another'}, {'units': 'g'}])
-def test_poses_of_another_sensor_or_unit_are_renamed(tmp_path: Path, changes: Any) -> None:
-    store = SensorStore(tmp_path / 'arm.yaml', Identity('arm', '/imu'), 'm/s2')
-    store.save_poses(read_poses(_table(tmp_path / 'poses.csv')))
-    assert len(load_store(store).poses) == 1
-    write_table(store.poses, replace(load_store(store).poses, **changes))
-    loaded = load_store(store)
-    assert loaded.poses is None
-    assert 'arm_poses.csv.damaged1' in loaded.notes[0]
-
-
-def _table(path: Path) -> Path:
-    path.write_text('ax,ay,az\n0.1,0.2,9.8\n')
-    return path
+def test_poses_of_another_sensor_or_unit_are_renamed(changes: Any) -> None:
+    store = store_of('', Identity('arm', '/imu', True), 'm/s2')
+    store.save_poses(Poses({'reading': np.array([[0.1, 0.2, 9.8]])}, np.array([1])))
+    write_table(store.poses, replace(read_poses(store.poses), **changes))
+    driver = Driver(sensor='arm')
+    assert len(driver.poses) == 0
+    assert 'arm_poses.csv.damaged1' in driver.logged()
 
 
 def test_calibration_in_g_corrects_messages_in_m_s2(stored: Stored) -> None:
-    path = stored(unit='g')
-    loaded = SensorStore(path, Identity('', '/imu'), 'm/s2').load_calibration()
-    assert loaded is not None
+    path, reading = stored(unit='g'), np.array([[1.0, -2.0, 9.0]])
+    loaded = Driver(calibration_file=str(path)).calibration
     assert (loaded.units.name, loaded.units.per_g) == ('m/s2', GRAVITY)
-    reading = np.array([[1.0, -2.0, 9.0]])
     np.testing.assert_allclose(
         loaded.correct(reading), read_calibration(path).correct(reading / GRAVITY) * GRAVITY,
         rtol=1e-14)
@@ -137,11 +128,11 @@ def test_calibration_in_g_corrects_messages_in_m_s2(stored: Stored) -> None:
 
 def test_messages_of_another_sensor_are_dropped_and_end_the_rest(readings: Readings) -> None:
     driver = Driver()
-    rest = readings([[0, 0, 1]], dwell=6.0)
+    rest = readings([UP], dwell=6.0)
     driver.feed(rest[:100])
-    assert driver.session.sensor.live.detector.still
+    assert driver.sensor.live.detector.still
     assert driver.feed(rest[:1], 'another') == 0
-    assert not driver.session.sensor.live.detector.still
+    assert not driver.sensor.live.detector.still
     assert "frame_id 'another', expected 'imu_link'" in driver.logged()
     assert driver.feed(rest[100:]) == len(rest) - 100
     assert driver.session.statistics.foreign == 1
@@ -169,41 +160,35 @@ def test_silent_sensor_can_be_replaced_by_another_with_its_own_files(
     driver = Driver()
     turned = readings(spread_directions(12))
     driver.feed(turned)
-    assert driver.done(driver.session.commands.fit())
+    assert driver.ask('fit')
     driver.now += 3.0
     assert driver.feed(turned[:50], 'another') == 50
     assert driver.session.name == 'another'
-    assert driver.session.sensor.calibration is None
-    assert len(driver.session.sensor.live.book.poses()) < 2
+    assert driver.calibration is None
+    assert len(driver.poses) < 2
     assert "now have frame_id 'another'" in driver.logged('warning')
     driver.now += 3.0
     driver.feed(turned[:50])
-    assert driver.session.sensor.calibration is not None
+    assert driver.calibration is not None
     assert {path.stem for path in home.glob('*.yaml')} == {'imu.data_raw@imu_link'}
 
 
 def test_nothing_is_captured_from_a_sensor_that_fell_silent(stored: Stored, readings: Readings
                                                             ) -> None:
     driver = Driver(calibration_file=str(stored()))
-    rest = readings([[0, 0, 1]], dwell=6.0)
-    for name in ('capture_pose', 'set_level'):
-        with pytest.raises(AccelCalibError, match='no Imu message yet'):
-            driver.done(getattr(driver.session.commands, name)())
+    rest = readings([UP], dwell=6.0)
+    driver.refuses('no Imu message yet', 'capture_pose', 'set_level')
     driver.feed(rest[:150])
     driver.now += 6.0
-    for name in ('capture_pose', 'set_level'):
-        with pytest.raises(AccelCalibError, match=r'arrived 6\.0 s ago, expected one within'):
-            driver.done(getattr(driver.session.commands, name)())
+    driver.refuses(r'arrived 6\.0 s ago, expected one within', 'capture_pose', 'set_level')
     driver.feed(rest[150:160])
-    assert driver.done(driver.session.commands.capture_pose()).startswith('1 pose:')
-    assert 'levelled by this pose' in driver.done(driver.session.commands.set_level())
+    assert driver.ask('capture_pose').startswith('1 pose:')
+    assert 'levelled by this pose' in driver.ask('set_level')
 
 
 def captured(driver: Driver) -> list[list[int]]:
     """Return the directions of the captured poses."""
-    reading = driver.session.sensor.live.book.poses().reading
-    found: list[list[int]] = np.round(reading / GRAVITY).astype(int).tolist()
-    return found
+    return np.round(driver.poses.reading / GRAVITY).astype(int).tolist()
 
 
 def test_nothing_of_a_rest_before_a_silence_is_used_after_it(readings: Readings) -> None:
@@ -211,9 +196,7 @@ def test_nothing_of_a_rest_before_a_silence_is_used_after_it(readings: Readings)
     driver.feed(readings([UP], dwell=3.0))
     driver.now, driver.stamp = driver.now + 2.3, driver.stamp + 2.3
     driver.feed(np.tile([GRAVITY, 0.0, 0.0], (5, 1)))
-    for name in ('capture_pose', 'set_level'):
-        with pytest.raises(AccelCalibError, match='still'):
-            driver.done(getattr(driver.session.commands, name)())
+    driver.refuses('still', 'capture_pose', 'set_level')
     assert 'jumped' not in driver.logged('warning')  # the stamps are as late as the messages
 
 
@@ -229,7 +212,7 @@ def test_a_jump_of_the_clock_is_logged_and_no_pose_counts_twice(
         driver.stamp += jump
     assert captured(driver) == [UP, LEFT, FORWARD]
     assert driver.logged('warning').count(words) == 2
-    assert len(driver.session.sensor.live.detector.interruptions) == 2
+    assert len(driver.sensor.live.detector.interruptions) == 2
 
 
 def test_poses_of_a_recording_that_is_played_in_a_loop_count_once(readings: Readings) -> None:
@@ -238,7 +221,7 @@ def test_poses_of_a_recording_that_is_played_in_a_loop_count_once(readings: Read
         driver.stamp = 10_000.0
         driver.feed(turned)
     assert captured(driver) == [UP, LEFT, FORWARD]
-    assert np.all(driver.session.sensor.live.book.poses()['count'] < 2.5 * RATE * 1.1)
+    assert np.all(driver.poses['count'] < 2.5 * RATE * 1.1)
 
 
 def test_a_rest_is_not_used_while_the_stamps_stand(readings: Readings) -> None:
@@ -250,8 +233,7 @@ def test_a_rest_is_not_used_while_the_stamps_stand(readings: Readings) -> None:
         driver.now += 0.3
         driver.session.push(rows, driver.now)
         driver.handle()
-    with pytest.raises(AccelCalibError, match='the stamps have not changed for'):
-        driver.done(driver.session.commands.set_level())
+    driver.refuses('the stamps have not changed for', 'set_level')
     driver.feed(readings([LEFT, UP], dwell=3.0))
     assert captured(driver) == [UP, LEFT]
 
@@ -263,41 +245,11 @@ def test_one_absurd_first_reading_does_not_spoil_the_capture(readings: Readings)
     assert captured(driver) == [UP, LEFT]
 
 
-def test_the_heading_is_set_with_the_nose_down_and_kept(
-        stored: Stored, readings: Readings) -> None:
-    path = stored()
-    found = read_calibration(path)
-    write_calibration(path, replace(found, model=Model(found.model.values)))
-    driver = Driver(calibration_file=str(path))
-    mounting = rotation_from_rpy(*np.radians((5.0, -3.0, 60.0)))
-    flat, nose_down = mounting @ [0.0, 0.0, 1.0], mounting @ [-0.6, 0.0, 0.8]
-    driver.feed(readings([nose_down], dwell=6.0)[:200])
-    with pytest.raises(InputError, match=r'not levelled; .*~/set_level first'):
-        driver.done(driver.session.commands.set_heading())
-
-    def yaw() -> float:
-        x = driver.session.sensor.calibration.rotation[:, 0]  # type: ignore[union-attr]
-        return float(np.degrees(np.arccos(x @ mounting[:, 0])))
-
-    driver.feed(readings([flat], dwell=6.0)[:200])
-    driver.done(driver.session.commands.set_level())
-    assert yaw() > 50.0
-    with pytest.raises(InputError, match=r'within 10° of the flat pose'):
-        driver.done(driver.session.commands.set_heading())
-    driver.feed(readings([nose_down], dwell=6.0)[:200])
-    assert 'the heading is set by this pose' in driver.done(driver.session.commands.set_heading())
-    assert yaw() < 1.0
-    driver.feed(readings([flat], dwell=6.0)[:200])
-    driver.done(driver.session.commands.set_level())
-    assert yaw() < 1.0
-
-
 def test_a_level_pose_that_contradicts_the_given_mounting_is_refused(
         stored: Stored, readings: Readings) -> None:
     driver = Driver(calibration_file=str(stored()), mounting_rpy=[0.5, 0.0, 0.0])
     driver.feed(readings([UP], dwell=6.0)[:200])
-    with pytest.raises(InputError, match='differs by more than 10° of tilt from the mounting'):
-        driver.done(driver.session.commands.set_level())
+    driver.refuses('differs by more than 10° of tilt from the mounting', 'set_level')
 
 
 @pytest.mark.parametrize(('old', 'new', 'words'), [
@@ -309,21 +261,21 @@ def test_a_load_that_is_refused_keeps_the_calibration_in_use(
     path = stored(sensor='imu_link')
     driver = Driver(calibration_file=str(path))
     driver.feed(readings([UP])[:30])
-    used = driver.session.sensor.calibration
+    used = driver.calibration
     path.write_text(path.read_text().replace(old, new, 1))
     with pytest.raises(StoredCalibrationError, match=words):
-        driver.done(driver.session.commands.load())
-    assert driver.session.sensor.calibration is used is not None
+        driver.ask('load')
+    assert driver.calibration is used is not None
 
 
 def test_reset_removes_poses_and_calibration_but_keeps_the_files(
         home: Path, readings: Readings) -> None:
     driver = Driver(sensor='arm')
     driver.feed(readings(spread_directions(12)))
-    driver.done(driver.session.commands.fit())
+    driver.ask('fit')
     stored = (home / 'arm.yaml').read_bytes()
-    driver.done(driver.session.commands.reset())
-    assert driver.session.sensor.calibration is None
+    driver.ask('reset')
+    assert driver.calibration is None
     assert captured(driver) == []
     assert not {'arm.yaml', 'arm_poses.csv'} & {path.name for path in home.iterdir()}
     assert (home / 'arm.yaml.reset1').read_bytes() == stored
@@ -336,31 +288,14 @@ def test_context_outside_of_the_ranges_is_limited_with_a_warning(
     write_calibration(path, with_effects(
         read_calibration(path), {'offset_temperature': [1e-3, 0.0, 0.0]},
         temperature=np.linspace(20.0, 30.0, 20)))
-    driver = Driver(calibration_file=str(path))
-    for temperature, severity in ((25.0, Level.OK), (40.0, Level.WARN)):
-        driver.session.around.take('temperature', temperature)
-        driver.feed(readings([[0, 0, 1]])[:50], temperature=temperature)
+    driver, forces = Driver(calibration_file=str(path)), []
+    for temperature, severity in ((25.0, Level.OK), (30.0, Level.OK), (40.0, Level.WARN)):
+        driver.feed(readings([UP])[:50], temperature=temperature)
         assert driver.finding('calibration').level == severity
+        forces.append(driver.sensor.force_of((0.0, 0.0, GRAVITY), driver.session.context)[0])
     assert 'temperature is 40 °C, but the range of the calibration is 20 to 30 °C' in (
         driver.finding('calibration').words)
-    calibration = read_calibration(path)
-    at = [calibration.apply([0.0, 0.0, GRAVITY], temperature=each) for each in (30.0, 40.0, 25.0)]
-    np.testing.assert_array_equal(at[0], at[1])
-    assert abs(at[0][0] - at[2][0]) == pytest.approx(5e-3 * GRAVITY, rel=0.05)
-
-
-def test_refinement_that_the_poses_do_not_determine_is_reported_and_not_used(
-        home: Path, readings: Readings) -> None:
-    rng = np.random.default_rng(2)
-    cone = np.array([0.0, 0.0, 1.0]) + 0.35 * rng.normal(size=(14, 3))
-    cone /= np.linalg.norm(cone, axis=1, keepdims=True)
-    driver = Driver(repeated='keep')
-    driver.feed(readings(cone))
-    with pytest.raises(AccelCalibError) as refusal:
-        driver.done(driver.session.commands.refine())
-    assert '\n' not in str(refusal.value)
-    assert driver.session.sensor.calibration is None
-    assert not list(home.glob('*.yaml'))
+    assert forces[0] != forces[1] == forces[2]
 
 
 # Guidance
@@ -373,32 +308,19 @@ def test_advice_changes_only_with_the_number_of_poses(readings: Readings) -> Non
     driver.feed(readings([spread_directions(5)[0]], dwell=20.0))
     assert next_action(driver.session) == before
     assert driver.logged('info').count('this rest repeats an earlier pose') == 1
-
-
-def test_nothing_is_advised_that_would_be_refused(readings: Readings) -> None:
-    driver = Driver()
-    for direction in spread_directions(12):
-        driver.feed(readings([direction]))
-        if next_action(driver.session).command == 'fit':
-            assert driver.done(driver.session.commands.fit())
-    assert next_action(driver.session).kind == 'level'
+    driver.feed(readings(spread_directions(30)))
+    lines = len(driver.log)
+    driver.feed(readings(spread_directions(30)[:4]))  # after the last useful pose
+    assert not [line.words for line in driver.log[lines:] if 'pose' in line.words]
 
 
 def test_findings_are_logged_by_their_level(stored: Stored) -> None:
     driver = Driver(calibration_file=str(stored()))
-    driver.session.adopt(replace(driver.session.sensor.calibration, noted=tuple(
+    driver.session.adopt(replace(driver.calibration, noted=tuple(
         Finding('note', f'about {level}', level=level) for level in LEVELS)))
     driver.handle()
     assert [line.severity for line in driver.log if 'about ' in line.words] == [
         'info', 'warning', 'error']
-
-
-def test_rests_after_the_last_useful_pose_have_no_line(readings: Readings) -> None:
-    driver = Driver()
-    driver.feed(readings(spread_directions(30)))
-    lines = len(driver.log)
-    driver.feed(readings(spread_directions(30)[:4]))
-    assert not [line.words for line in driver.log[lines:] if 'pose' in line.words]
 
 
 # Automatic fits
@@ -408,27 +330,24 @@ def test_automatic_fits_wait_a_minute_and_keep_a_calibration_that_agrees(
         home: Path, readings: Readings) -> None:
     driver = Driver(auto_fit=True)
     driver.feed(readings(spread_directions(12)))
-    first = driver.session.sensor.calibration
+    first = driver.calibration
     assert first is not None
     driver.feed(readings(spread_directions(31)[:8]))
-    driver.now += 60.0
-    driver.session.tick()
-    driver.handle()
-    assert driver.session.sensor.fitted_poses > 12  # a fit has been made, and agrees
-    assert driver.session.sensor.calibration is first
+    driver.tick(60.0)
+    assert driver.sensor.fitted_poses > 12  # a fit has been made, and agrees
+    assert driver.calibration is first
     assert len(list(home.glob('*.before*'))) == 1
 
 
 def test_a_refined_calibration_is_not_replaced_by_an_automatic_fit(readings: Readings) -> None:
     driver = Driver(auto_fit=True, auto_fit_poses=30)
     driver.feed(readings(spread_directions(14)))
-    assert driver.done(driver.session.commands.fit())
-    fitted = driver.session.sensor.calibration
-    refined = with_effects(fitted, {'quadratic': np.zeros(3)}, 1e-8)
+    assert driver.ask('fit')
+    refined = with_effects(driver.calibration, {'quadratic': np.zeros(3)}, 1e-8)
     driver.session.adopt(refined)
     driver.feed(readings(spread_directions(33)))
-    assert driver.session.sensor.fitted_poses >= 30
-    assert driver.session.sensor.calibration is refined
+    assert driver.sensor.fitted_poses >= 30
+    assert driver.calibration is refined
 
 
 # The stream
@@ -459,11 +378,18 @@ def test_rate_and_faults_of_the_stamps_follow_the_last_seconds() -> None:
     assert statistics_of(*times[:1]).rate == 0.0
 
 
-def test_settings_of_the_mounting_must_not_contradict_each_other() -> None:
-    with pytest.raises(InputError, match='both mounting_rpy and base_frame'):
-        Driver(mounting_rpy=[0.0, 0.0, 1.0], base_frame='base_link')
-    with pytest.raises(InputError, match='publish_tf would make'):
-        Driver(publish_tf=True, base_frame='base_link', output_frame_id='base_link')
+@pytest.mark.parametrize(('settings', 'words'), [
+    ({'mounting_rpy': [0.0, 0.0, 1.0], 'base_frame': 'base_link'},
+     'both mounting_rpy and base_frame'),
+    ({'publish_tf': True, 'base_frame': 'base_link', 'output_frame_id': 'base_link'},
+     'publish_tf would make'),
+    *(({'context': [entry]}, f'entry {entry!r}, expected column:=topic') for entry in (
+        'motor_current', ':=/motor/current', 'time:=/clock', 'ax:=/x', 'two words:=/x',
+        'a__b:=/x')),
+    ({'context': ['a:=/x', 'a:=/y']}, 'each column once')])
+def test_settings_that_contradict_each_other_are_refused(settings: Any, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        Driver(**settings)
 
 
 # Steps back
@@ -476,19 +402,16 @@ def test_steps_back_are_kept_for_changes_only_and_have_a_limit(
     path = stored(sensor='imu_link')
     store = SensorStore(path, Identity('imu_link', '/imu/data_raw'), 'm/s2')
     first = store.load_calibration()
-    assert first is not None
-    store.save_calibration(first)
+    store.write(store.prepared(first))
     before = len(store.steps())
-    store.save_calibration(first)
+    store.write(store.prepared(first))
     assert len(store.steps()) == before
     for k in range(most + 5):
-        store.save_calibration(replace(first, date=f'{k}'))
+        store.write(store.prepared(replace(first, date=f'{k}')))
     assert len(store.steps()) == most
     shutil.copy(path, path.with_name(f'{path.name}.before999'))  # a write failed after this copy
     for k in reversed(range(5, most + 4)):
-        back = store.step_back()
-        assert back is not None
-        assert back.date == f'{k}'
+        assert store.step_back().date == f'{k}'
 
 
 def test_a_step_that_cannot_be_used_leaves_the_file_in_use(stored: Stored) -> None:
@@ -520,44 +443,46 @@ def test_lag_of_the_temperature_is_followed_while_the_node_runs(
         read_calibration(path), {'offset_temperature': values}, 0.0,
         temperature=25.0 + 20.0 * np.sin(turn * 2.0), time=turn * 100.0))
     driver = Driver(calibration_file=str(path))
-    still = readings([[0, 0, 1]], dwell=4.0)[:10]
+    still = readings([UP], dwell=4.0)[:10]
     warm = 20.0 + 0.02 * np.arange(900)  # 0.1 °C/s, for 180 s
     for each in warm:
         driver.feed(still, temperature=each)
-    calibration, rest = driver.session.sensor.calibration, driver.session.sensor.rest
-    gravity = driver.session.sensor.gravity
-    assert calibration is not None
-    assert rest is not None
-    assert gravity is not None
-    time = 1000.0 + np.arange(9000) / RATE
-    during = (time >= rest.start) & (time <= rest.end)
-    expected, plain = (each.apply(
-        np.tile(still, (900, 1)), time=time, temperature=np.repeat(warm, 10))[during].mean(axis=0)
-        for each in (calibration, replace(calibration, model=Model(
-            {**calibration.model.values, 'offset_temperature': values[:3]}))))
-    np.testing.assert_allclose(gravity, expected, atol=0.01)
+    calibration, time = driver.calibration, 1000.0 + np.arange(9000) / RATE
+    during = (time >= driver.sensor.rest.start) & (time <= driver.sensor.rest.end)
+
+    def with_values(*lag: float) -> Any:
+        return replace(calibration, model=Model(
+            {**calibration.model.values, 'offset_temperature': np.array(lag)}))
+
+    def offline(found: Any) -> Any:
+        return found.apply(np.tile(still, (900, 1)), time=time, temperature=np.repeat(warm, 10))
+
+    expected, plain = (offline(each)[during].mean(axis=0) for each in (
+        calibration, with_values(*values[:3])))
+    np.testing.assert_allclose(driver.sensor.gravity, expected, atol=0.01)
     assert abs(expected[2] - plain[2]) > 0.15
-    offered = replace(calibration, model=Model(
-        {**calibration.model.values, 'offset_temperature': values * [1.0, 1.0, 1.0, 2.0, 1.0]}))
-    driver.session.sensor.offered = offered
-    driver.session.around.take('temperature', warm[-1])
-    corrected = offered.apply(np.tile(still, (900, 1)), time=time,
-                              temperature=np.repeat(warm, 10))[-1]
+    driver.sensor.offered = offered = with_values(*values * [1.0, 1.0, 1.0, 2.0, 1.0])
     assert state.progress(driver.session).corrected == pytest.approx(
-        np.linalg.norm(corrected) / GRAVITY, abs=1e-3)
+        np.linalg.norm(offline(offered)[-1]) / GRAVITY, abs=1e-3)
 
 
 # Frames
 
 
-def levelled(driver: Driver, readings: Readings) -> Any:
-    """Level a sensor that is turned by 40°, with the heading measured; return its ΔR."""
-    mounting = rotation_from_rpy(*np.radians((5.0, -3.0, 40.0))).T
-    driver.feed(readings([mounting @ [0.0, 0.0, 1.0]], dwell=6.0)[:200])
-    driver.done(driver.session.commands.set_level())
-    driver.feed(readings([mounting @ [-0.6, 0.0, 0.8]], dwell=6.0)[:200])
-    driver.done(driver.session.commands.set_heading())
-    return mounting
+def put(driver: Driver, readings: Readings, up: Any) -> None:
+    """Let the robot rest with this direction of up, in its own frame."""
+    driver.feed(readings([MOUNTING @ up], dwell=6.0)[:200])
+
+
+def test_the_heading_needs_a_level_mounting_and_the_nose_down(
+        stored: Stored, readings: Readings) -> None:
+    driver = Driver(calibration_file=str(stored()))
+    put(driver, readings, UP)
+    driver.refuses(r'not levelled; .*~/set_level first', 'set_heading')
+    driver.ask('set_level')
+    driver.refuses('within 10° of the flat pose', 'set_heading')
+    put(driver, readings, NOSE_DOWN)
+    assert 'the heading is set by this pose' in driver.ask('set_heading')
 
 
 @pytest.mark.parametrize(('frame', 'axes'), [
@@ -566,23 +491,22 @@ def levelled(driver: Driver, readings: Readings) -> Any:
 def test_messages_are_specific_force_in_every_frame_also_after_a_restart_with_another(
         stored: Stored, readings: Readings, frame: str, axes: Any) -> None:
     path = stored()
-    found = read_calibration(path)
-    write_calibration(path, replace(found, model=Model(found.model.values)))
     for before in ('ros', frame):
         driver = Driver(calibration_file=str(path), frame=before)
-        mounting = levelled(driver, readings)
+        for up, command in ((UP, 'set_level'), (NOSE_DOWN, 'set_heading')):
+            put(driver, readings, up)
+            driver.ask(command)
         driver.session.close()
     for after in ('ros', frame):
         driver = Driver(calibration_file=str(path), frame=after)
-        expected = mounting @ (np.eye(3) if after == 'ros' else axes)
-        np.testing.assert_allclose(driver.session.sensor.applied.rotation, expected, atol=0.01)
-        driver.feed(readings([mounting @ [0.0, 0.0, 1.0]], dwell=6.0)[:200])
-        gravity = driver.session.sensor.gravity / GRAVITY
-        np.testing.assert_allclose(gravity, np.array(expected).T @ mounting @ [0, 0, 1],
-                                   atol=0.01)
+        expected = MOUNTING @ (np.eye(3) if after == 'ros' else axes)
+        np.testing.assert_allclose(driver.sensor.applied.rotation, expected, atol=0.01)
+        put(driver, readings, UP)
+        gravity = driver.sensor.gravity / GRAVITY
+        np.testing.assert_allclose(gravity, np.array(expected).T @ MOUNTING @ UP, atol=0.01)
         assert gravity[2] * (-1.0 if after == 'ned' else 1.0) > 0.99
-        driver.done(driver.session.commands.set_level())
-        np.testing.assert_allclose(driver.session.sensor.applied.rotation, expected, atol=0.01)
+        driver.ask('set_level')
+        np.testing.assert_allclose(driver.sensor.applied.rotation, expected, atol=0.01)
         assert ('it is turned' in driver.logged('warning')) is (frame == 'android')
         driver.session.close()
 
@@ -591,14 +515,12 @@ def test_messages_are_specific_force_in_every_frame_also_after_a_restart_with_an
 def test_a_stored_mounting_of_the_documents_is_turned_before_it_is_used(
         stored: Stored, frame: Any) -> None:
     path = stored()
-    mounting = rotation_from_rpy(*np.radians((5.0, -3.0, 40.0))).T
-    found = replace(read_calibration(path), model=Model(read_calibration(path).model.values))
-    per_g = found.predict(np.array([mounting @ [0, 0, 1.0], mounting @ [-0.6, 0, 0.8]]) * GRAVITY)
-    documents = set_heading(level(found, per_g[0], frame), per_g[1])
-    write_calibration(path, documents)
+    found = read_calibration(path)
+    flat, nose_down = found.predict(np.array([UP, NOSE_DOWN]) @ MOUNTING.T * GRAVITY)
+    write_calibration(path, set_heading(level(found, flat, frame), nose_down))
     driver = Driver(calibration_file=str(path), frame='ned')
-    np.testing.assert_allclose(driver.session.sensor.applied.rotation,
-                               mounting @ np.diag([1.0, -1.0, -1.0]), atol=1e-6)
+    np.testing.assert_allclose(driver.sensor.applied.rotation,
+                               MOUNTING @ np.diag([1.0, -1.0, -1.0]), atol=1e-6)
     assert f'is for the frame {frame}, but frame is ned: it is turned' in driver.logged('warning')
 
 
@@ -609,94 +531,67 @@ def test_a_frame_whose_readings_are_gravity_is_refused_for_messages() -> None:
 
 # Further context
 
-MOTOR = np.array([2e-3, -1.5e-3, 1e-3])
+PER_AMPERE = np.array([2e-3, -1.5e-3, 1e-3])
 """Offset per ampere of the motor [g]."""
 
 
-def with_motor(driver: Driver, readings: Readings, poses: int = 26) -> None:
-    """Feed poses, each at another current of the motor."""
-    for k, direction in enumerate(spread_directions(poses)):
+def test_a_quantity_is_a_column_of_poses_is_corrected_live_and_left_out_when_it_stops(
+        readings: Readings) -> None:
+    driver = Driver(sensor='arm', context=[MOTOR])
+    for k, direction in enumerate(spread_directions(26)):
         current = 6.0 + 5.0 * np.sin(2.1 * k)
-        driver.feed(readings([direction]) + MOTOR * (current - 6.0) * GRAVITY,
+        driver.feed(readings([direction]) + PER_AMPERE * (current - 6.0) * GRAVITY,
                     motor_current=current)
     driver.feed(readings([UP])[:15], motor_current=6.0)
-
-
-def test_a_quantity_is_a_column_of_poses_is_named_and_corrected_live(readings: Readings) -> None:
-    driver = Driver(sensor='arm', context=['motor_current:=/motor/current'])
-    with_motor(driver, readings)
-    poses = driver.session.sensor.live.book.poses()
+    poses, around = driver.poses, driver.session.around
     assert np.ptp(poses['motor_current']) > 8.0
-    answer = driver.done(driver.session.commands.refine())
-    assert 'offset_covariate-motor_current' in driver.session.sensor.calibration.model.effects
-    assert 'motor_current' in answer
-    sizes = []
-    for current in (2.0, 10.0):
-        reading = np.array([0.0, 0.0, GRAVITY]) + MOTOR * (current - 6.0) * GRAVITY
-        force = driver.session.sensor.force_of(tuple(reading), {'motor_current': current})
-        sizes.append(np.array(force))
-    np.testing.assert_allclose(sizes[0], sizes[1], atol=1e-3)
-    driver.session.close()
-    again = Driver(sensor='arm', context=['motor_current:=/motor/current'])
-    np.testing.assert_allclose(again.session.sensor.live.book.poses()['motor_current'],
-                               poses['motor_current'], atol=1e-6)
+    assert 'motor_current' in driver.ask('refine')
+    assert 'offset_covariate-motor_current' in driver.calibration.model.effects
 
+    def force(current: float) -> Any:
+        reading = np.array([0.0, 0.0, GRAVITY]) + PER_AMPERE * (current - 6.0) * GRAVITY
+        return np.array(driver.sensor.force_of(tuple(reading), {'motor_current': current}))
 
-def test_a_quantity_that_stops_is_left_out_with_one_warning(readings: Readings) -> None:
-    driver = Driver(sensor='arm', context=['motor_current:=/motor/current'])
-    with_motor(driver, readings)
-    driver.done(driver.session.commands.refine())
+    np.testing.assert_allclose(force(2.0), force(10.0), atol=1e-3)
     driver.session.missing['motor_current'] = 'nothing comes on /motor/current'
-    driver.session.around.take('motor_current', 10.0)
+    around.take('motor_current', 10.0)
     for seconds, known in ((29.0, True), (2.0, False), (100.0, False)):
         driver.now += seconds
-        driver.session.around.expire()
-        driver.session.tick()
-        driver.handle()
-        assert ('motor_current' in driver.session.around.values) is known
+        around.expire()
+        driver.tick()
+        assert ('motor_current' in around.values) is known
     line = ('no motor_current arrives: nothing comes on /motor/current; '
             'offset_covariate-motor_current is left out')
     assert driver.logged('warning').count(line) == 1
     assert line in driver.finding('stream').words
-    neutral = driver.session.sensor.calibration.model.neutral['motor_current']
-    reading = (0.0, 0.0, GRAVITY)
-    assert driver.session.sensor.force_of(reading, driver.session.context) == pytest.approx(
-        driver.session.sensor.force_of(reading, {'motor_current': neutral}))
-    driver.session.around.take('motor_current', 3.0)
-    driver.session.tick()
-    driver.handle()
+    neutral, reading = driver.calibration.model.neutral['motor_current'], (0.0, 0.0, GRAVITY)
+    assert driver.sensor.force_of(reading, driver.session.context) == pytest.approx(
+        driver.sensor.force_of(reading, {'motor_current': neutral}))
+    around.take('motor_current', 3.0)
+    driver.tick()
     assert 'motor_current arrives' in driver.logged('info')
     assert 'motor_current' not in driver.finding('stream').words
+    driver.session.close()
+    np.testing.assert_allclose(Driver(sensor='arm', context=[MOTOR]).poses['motor_current'],
+                               poses['motor_current'], atol=1e-6)
 
 
 def test_poses_in_one_direction_are_not_merged_over_a_quantity(readings: Readings) -> None:
-    driver = Driver(context=['motor_current:=/motor/current'])
+    driver = Driver(context=[MOTOR])
     for current in (0.0, 10.0, 0.1):
         for direction in (LEFT, UP):
             driver.feed(readings([direction]), motor_current=current)
     driver.feed(readings([LEFT])[:15], motor_current=0.0)
-    poses = driver.session.sensor.live.book.poses()
-    assert len(poses) == 4
-    assert np.sum(poses['motor_current'] > 5.0) == 2
+    assert np.sort(driver.poses['motor_current'] > 5.0).tolist() == [False, False, True, True]
 
 
 def test_poses_that_lack_a_quantity_are_said(readings: Readings) -> None:
     first = Driver(sensor='arm')
     first.feed(readings([UP, LEFT, FORWARD]))
     first.session.close()
-    driver = Driver(sensor='arm', context=['motor_current:=/motor/current'])
+    driver = Driver(sensor='arm', context=[MOTOR])
     driver.feed(readings([[0, 0, -1], [0, -1, 0]]), motor_current=1.0)
-    driver.session.tick()
-    driver.handle()
-    assert 'motor_current' not in driver.session.sensor.live.book.poses()
+    driver.tick()
+    assert 'motor_current' not in driver.poses
     assert re.search(r'\d of \d poses have no motor_current, so that ~/refine cannot use it: call '
                      '~/reset', driver.logged('warning'))
-
-
-@pytest.mark.parametrize('entry', [
-    'motor_current', ':=/motor/current', 'time:=/clock', 'ax:=/x', 'two words:=/x', 'a__b:=/x'])
-def test_an_entry_of_context_that_cannot_be_used_is_refused(entry: str) -> None:
-    with pytest.raises(InputError, match=f'entry {entry!r}, expected column:=topic'):
-        Driver(context=[entry])
-    with pytest.raises(InputError, match='each column once'):
-        Driver(context=['a:=/x', 'a:=/y'])

@@ -18,7 +18,7 @@ from accel_calib.errors import InputError, StoredCalibrationError
 from accel_calib.session import Level
 from accel_calib.stored import read_calibration
 from inside import (
-    aside, Identity, load_store, Lock, MOST_BYTES, SensorStore, spread_directions, store_of)
+    aside, Identity, Lock, MOST_BYTES, SensorStore, spread_directions, store_of)
 import numpy as np
 import pytest
 from test_session import Driver
@@ -146,7 +146,9 @@ def test_a_table_of_impossible_readings_does_not_stop_the_calibrator(
     rows = [f'{reading},{std},{std},{std},{count}\n' for reading in largest
             for std, count in ((0, 1), (most, 1.0 / most), (1.0 / most, most))]
     store.poses.write_text('ax,ay,az,std_x,std_y,std_z,count\n' + ''.join(rows))
-    assert bool(load_store(store).notes) is (most > 1e30)
+    driver = Driver(calibration_file=str(store.calibration))
+    assert bool(driver.logged()) is (most > 1e30)
+    driver.session.close()
     works(store.calibration, readings)
 
 
@@ -264,7 +266,8 @@ def test_undo_passes_over_what_is_not_a_step(store: SensorStore) -> None:
     back = store.step_back()
     assert back is not None
     assert back.date.startswith('2025')
-    store.save_calibration(read_calibration(store.calibration.with_name('known.yaml.undone1')))
+    undone = read_calibration(store.calibration.with_name('known.yaml.undone1'))
+    store.write(store.prepared(undone))
     assert store.steps() == [4]
 
 

@@ -214,7 +214,7 @@ def test_points_do_not_depend_on_the_batches() -> None:
         during = history.during(known, START + 60.0, START + 70.0)[KEY]
         stream = history.stream(later)
         assert stream is not None
-        found.append([history.columns[KEY], *during, stream.value[KEY]])
+        found.append([history.columns_of(known)[KEY], *during, stream.value[KEY]])
     np.testing.assert_allclose(found, np.tile(found[0], (4, 1)), atol=1e-9)
     assert found[0][0] == pytest.approx(warm[-1] + 30.0 * 0.25, abs=0.2)
 

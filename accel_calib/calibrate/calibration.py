@@ -223,7 +223,7 @@ class Calibration(Record):
         """ΔR, (3, 3): transforms from the levelled frame to the sensor frame."""
         return self.model.rotation
 
-    @property
+    @cached_property
     def is_levelled(self) -> bool:
         """Whether ΔR is known."""
         return not np.array_equal(self.rotation, np.eye(3))

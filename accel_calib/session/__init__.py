@@ -6,9 +6,8 @@ The calibrator without ROS: it takes samples and commands, and returns answers a
 
 `session` is the entry point, and `commands` contains what the user can ask for. `sensor` is what
 belongs to one sensor: `live_capture` captures its poses, and `guidance` says which pose is next.
-`store` manages and locks files. `work` contains the computations and the session's own tasks, and
-`worker` runs the tasks and defines the events. `stream` describes the messages, `state` the state.
-`settings` defines the parameters.
+`store` manages and locks files. `worker` runs the tasks and defines the events. `stream` describes
+the messages, `state` the state. `settings` defines the parameters.
 
 """
 

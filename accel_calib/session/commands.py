@@ -2,34 +2,42 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The commands of a session: what the services of the node do.
+The commands of a session: what the services of the node do, and their computations.
 
 A command is a generator. It yields what is to be computed or stored, and returns its answer, or
 raises an error that says what to do. If the parameter ``confirm`` is set, or a command is called
 with `offered`, a new calibration is only offered: it is published on ~/preview, until ~/save
-stores it or ~/undo discards it.
+stores it or ~/undo discards it. Most computations run in the worker process.
 
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 import math
-from typing import Any, TYPE_CHECKING
+from typing import Any, cast, TYPE_CHECKING
 
 import numpy as np
 
 from .guidance import next_words, plan_for
-from .sensor import Sensor
+from .sensor import gyro_bias_of_rest, Sensor
+from .settings import CalibratorSettings
 from .store import writing_advice
 from .stream import thermometer_words
-from .work import at_rest, change_words, fit, Fitted, refined
 from .worker import Compute, Files, Parse, Part, Task
-from ..calibrate import angle_words, Calibration, level, mounting_only, mounting_words, set_heading
+from ..calibrate import (
+    angle_words, Calibration, fit_partial, level, mounting_only, outlook, set_heading)
 from ..capture import Dwell, poses_from
+from ..effects import Model
 from ..errors import AccelCalibError, InputError, RefusedFitError, StoredCalibrationError
-from ..pipeline import is_partial
-from ..text import counted, now
+from ..findings import calibration_json, rate, rate_refinement, Rating, refinement_json
+from ..geometry import spread_directions
+from ..pipeline import calibrated, is_partial, is_refined, Plan
+from ..refine import refine, Refinement, residual_words, shown_name, times_typical, verdict_words
+from ..table import Poses
+from ..text import counted, listed, now, plain
+from ..units import MG, Units
 
 if TYPE_CHECKING:
     from .session import Session
@@ -39,6 +47,12 @@ _OLD = 0.5
 
 _AUTO_FIT_EVERY = 60.0
 """Shortest time between two automatic fits [s]."""
+
+_DIRECTIONS = 100
+"""Number of directions over which two calibrations are compared."""
+
+_BEYOND = 100.0
+"""Ratio to the typical size above which an effect is not caused by the sensor."""
 
 
 class ChangedError(AccelCalibError):
@@ -91,7 +105,7 @@ class Commands:
 
     def fit(self, *, offered: bool = False) -> Task:
         """Fit the poses; use and store the calibration, or only offer it."""
-        fitted = yield from _fitted(self._session)
+        fitted = yield from _fit(self._session)
         return (yield from _use(self._session, fitted, offered=offered))
 
     def due(self) -> list[Task]:
@@ -110,7 +124,7 @@ class Commands:
         if self._session.sensor is not sensor:
             return ''
         try:
-            fitted = yield from _fitted(self._session)
+            fitted = yield from _fit(self._session)
         except ChangedError:
             sensor.auto_fit_waits = True
             return ''
@@ -240,10 +254,10 @@ class Commands:
 
 # ----------------------------------------------------------------------------- parts of commands
 
-def _fitted(session: Session) -> Part[Fitted]:
+def _fit(session: Session) -> Part[Fitted]:
     """Return a fit to the poses; the values of a refined calibration are fitted anew."""
-    return (yield from _sound(session, 'fit', fit, session.units, session.settings, session.name,
-                              session.sensor.present))
+    return (yield from _sound(session, 'fit', fitted, session.units, session.settings,
+                              session.name, session.sensor.present))
 
 
 def _sound(session: Session, name: str, function: Callable[..., Fitted], *given: Any
@@ -255,7 +269,7 @@ def _sound(session: Session, name: str, function: Callable[..., Fitted], *given:
     poses = sensor.live.book.poses()
     session.computing += 1
     try:
-        fitted: Fitted = yield Compute(function, poses, *given)
+        found: Fitted = yield Compute(function, poses, *given)
     except RefusedFitError as error:
         sensor.guide.refuse(len(poses), error.advice)
         raise
@@ -264,14 +278,14 @@ def _sound(session: Session, name: str, function: Callable[..., Fitted], *given:
     if session.sensor is not sensor or sensor.changes != changes:
         raise ChangedError(f'another command changed the calibration during ~/{name}; '
                            'the result is discarded', f'call ~/{name} again')
-    if fitted.refusal:
-        why, advice = fitted.refusal
+    if found.refusal:
+        why, advice = found.refusal
         sensor.guide.refuse(len(poses), advice)
-        if fitted.refinement is not None:
-            session.rate(fitted.refinement)
-        raise RefusedFitError(f'{fitted.words}; not used: {why}', advice)
+        if found.refinement is not None:
+            session.rate(found.refinement)
+        raise RefusedFitError(f'{found.words}; not used: {why}', advice)
     sensor.fitted_poses = len(poses)
-    return fitted
+    return found
 
 
 def _levelled(session: Session, calibration: Calibration, rest: Dwell) -> Calibration:
@@ -298,8 +312,7 @@ def _use_mounting(session: Session, calibration: Calibration, words: str, *, off
 def _use(session: Session, fitted: Fitted, *, offered: bool = False) -> Part[str]:
     """Store and use, or offer, a new calibration; log the details, and return the answer."""
     calibration, words, store = fitted.calibration, fitted.words, session.files.usable()
-    mounting = '' if not calibration.is_levelled else mounting_words(
-        calibration.rotation, session.frame_id or '', session.settings.base_frame)
+    mounting = session.mounting_words(calibration)
     if offered or session.settings.confirm:
         session.sensor.offer(calibration)
         session.rate(fitted.refinement, fitted.rating)
@@ -365,3 +378,152 @@ def _not_still(session: Session) -> InputError:
                           'check ~/still')
     return InputError(f'the sensor has been still for less than {least:g} s',
                       'hold it still for longer')
+
+
+# ----------------------------------------------------------------------------- computations
+
+@dataclass(frozen=True)
+class Fitted:
+    """
+    A new calibration: a fit, a refinement or another mounting.
+
+    `words` are the answer, one sentence, and `details` are for the log. `rating` is None if it is
+    not known yet. `differs`: an automatic fit replaces the calibration before it. `refusal` is why
+    it must not be used, and what to do instead; empty if it can be used.
+
+    """
+
+    calibration: Calibration
+    words: str
+    details: list[str]
+    rating: Rating | None = None
+    refinement: Refinement | None = None
+    differs: bool = True
+    refusal: tuple[str, ...] = ()
+
+
+def _refusal(rating: Rating) -> tuple[str, ...]:
+    return (rating.reason, rating.next.text) if rating.name == 'BAD' else ()
+
+
+def fitted(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str,
+           before: Calibration | None) -> Fitted:
+    """
+    Return a fit of all poses with its rating, in the levelled frame of the calibration before.
+
+    Errors are as in `pipeline.calibrated`; the advice is how to turn the sensor next.
+
+    """
+    found = calibrated(poses, units, Plan(
+        settings.model, settings.method, refined=False, sensor=sensor, before=before,
+        in_cone=True))
+    calibration, rating, quality = found.calibration, found.rating, found.calibration.quality
+    about = calibration.reason if is_partial(calibration) else (
+        f'model {calibration.name} from {len(calibration.used_poses)} of '
+        f'{counted(len(calibration.poses), "pose")}')
+    floor = quality.noise_floor_mg
+    details = [*([] if floor is None else [f'noise floor {floor:.3f} mg']),
+               *(f'pose {each.row} left out: {each.reason}' for each in calibration.rejected),
+               *calibration.warnings, change_words(before, calibration)]
+    return Fitted(
+        calibration, f'{rating.name}: {about}, residual {quality.rms_before_mg:.2f} mg before, '
+        f'{quality.rms_after_mg:.3f} mg after', details, rating,
+        differs=_replaces(before, calibration), refusal=_refusal(rating))
+
+
+def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None, hint: str,
+            own: tuple[str, ...]) -> Fitted:
+    """
+    Return the refinement of a calibration (None: of a fit).
+
+    An effect far beyond those of parts is refused; `hint` says which quantity may be missing. The
+    own effects of these names are tried beside the catalogue.
+    RefusedFitError if there are too few poses; InputError if the readings are clearly in another
+    unit.
+
+    """
+    refinement = refine(poses, units, base='auto' if before is None else before, sensor=sensor,
+                        date=now(), also=own)
+    beyond = [step for step in refinement.steps if times_typical(step) > _BEYOND]
+    if beyond and not refinement.refusal:
+        refinement = replace(refinement, refusal=(
+            f'{beyond[0].effect} is {times_typical(beyond[0]):.0f} times that of typical parts',
+            f'find what else changed with it; {hint}' if hint else 'find what else changed with '
+            'it: check the mounting and the setup, and take the poses again'))
+    rating, calibration = rate_refinement(refinement), refinement.calibration
+    details = [verdict_words(refinement).rstrip('.'), *(
+        f'{shown_name(step.name)} {step.gap_before_mg:.3f} to {step.gap_after_mg:.3f} mg, '
+        f'{step.where}' for step in refinement.steps)]
+    if refinement.disturbed_poses:
+        details.append(f'left out: {listed("pose", refinement.disturbed_poses)}')
+    details += [*calibration.warnings, *refinement.advice]
+    if not refinement.refusal:
+        details.append(change_words(before, calibration))
+    return Fitted(calibration, f'{rating.name}: {_verdict(refinement)}, '
+                  f'{residual_words(refinement)}', details, rating, refinement,
+                  refusal=refinement.refusal or _refusal(rating))
+
+
+def _verdict(refinement: Refinement) -> str:
+    names = [shown_name(step.name) + (f' (or {", ".join(step.likely_rivals)})' if step.rivals
+                                      else '') for step in refinement.steps]
+    found, verb = ' and '.join(names), 's' if len(names) == 1 else ''
+    return {'no_gap': 'no gap beyond the noise', 'explained': f'{found} explain{verb} the gap',
+            'described': f'{found} describe{verb} the gap'}.get(
+        refinement.verdict, f'a gap remains beyond {found}' if names else 'a gap remains that no '
+        'effect explains')
+
+
+def at_rest(rest: Dwell, units: Units, sensor: str, before: Calibration | None) -> Calibration:
+    """
+    Return a calibration from one rest: the offset along gravity, and the bias of the gyro.
+
+    The offset and gain of a full fit before are kept.
+
+    """
+    if before is None or is_partial(before):
+        rotation = np.eye(3) if before is None else before.rotation
+        found = fit_partial(poses_from([rest]), units, sensor=sensor, date=now())
+        before = replace(found, model=Model(found.model.values, rotation))
+    return replace(before, gyro=gyro_bias_of_rest(rest) or before.gyro)
+
+
+def change_words(before: Calibration | None, after: Calibration) -> str:
+    """Return what changes with a new calibration, as one line; empty without an earlier one."""
+    if before is None:
+        return ''
+    offset = after.units.to_g(after.offset - before.offset) * MG
+    gain = 100.0 * (np.linalg.solve(before.gain, after.gain) - np.eye(3))
+    turn = before.rotation.T @ after.rotation
+    angle = float(np.degrees(np.arccos(np.clip(0.5 * (np.trace(turn) - 1.0), -1.0, 1.0))))
+    effects = sorted(set(before.model.effects) ^ set(after.model.effects))
+    words = [f'offset by ({", ".join(f"{part:+.2f}" for part in offset)}) mg',
+             f'gain by up to {np.max(np.abs(gain)):.3f} %', f'mounting by {angle:.2f}°']
+    words += [f'{"with" if name in after.model.effects else "without"} {name}' for name in effects]
+    return f'changes {", ".join(words)}'
+
+
+def _replaces(before: Calibration | None, after: Calibration) -> bool:
+    """
+    Return whether an automatic fit replaces a calibration.
+
+    It does if it differs by more than its own uncertainty, unless the other one is refined.
+
+    """
+    if before is None or is_refined(before) or is_partial(before):
+        return before is None or not is_refined(before)
+    up = spread_directions(_DIRECTIONS)
+    (gain, offset), (gain_before, offset_before) = (
+        each.model.linear_part for each in (after, before))
+    change = up @ (gain - gain_before).T + offset - offset_before
+    covariance = after.force_covariance(up * after.force_per_g) / after.force_per_g ** 2
+    return bool(np.sum(change ** 2) > np.sum(np.trace(covariance, axis1=1, axis2=2)))
+
+
+def rated(calibration: Calibration, refinement: Refinement | None, rating: Rating | None,
+          model: str) -> tuple[Rating, dict[str, Any]]:
+    """Return the rating of a calibration, if it is not known, and its JSON as of commands."""
+    found = {} if refinement is None else refinement_json(refinement)
+    whole = {**calibration_json(calibration, outlook(calibration, model)), **found}
+    return (rate(calibration, refinement=refinement) if rating is None else rating,
+            cast('dict[str, Any]', plain(whole)))

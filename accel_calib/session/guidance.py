@@ -50,23 +50,12 @@ _WITHOUT_NEW = 60.0
 @dataclass(frozen=True)
 class Plan:
     """
-    The next pose, and the poses for which it was chosen.
+    The next pose, or that more poses no longer help, and the poses for which it was chosen.
 
-    Parameters
-    ----------
-    asked : NextPose
-        The next pose, or that more poses no longer help.
-    poses : int
-        Number of poses.
-    up : (n, 3) array
-        Approximate direction of up in each pose, unit vectors in the sensor axes; n = 0 if they
-        are not known.
-    noise_g : float
-        Median noise of the poses [g]; NaN if not known.
-    coverage : float
-        Share of the sphere within 45° of a pose.
-    zero : tuple of float
-        Approximate zero of native readings, before a fit; empty if it is not known.
+    `up` are the (n, 3) approximate directions of up in the sensor axes, unit vectors; n = 0 if
+    they are not known. `noise_g` is the median noise of the poses [g], NaN if not known.
+    `coverage` is the share of the sphere within 45° of a pose. `zero` is the approximate zero of
+    native readings before a fit; empty if it is not known.
 
     """
 
@@ -103,7 +92,7 @@ def plan_for(poses: Poses, units: Units, model: str) -> Plan:
 
 
 def _poses_up(poses: Poses, units: Units) -> Floats:
-    """Return the approximate up in each pose, (n, 3); n = 0: native centre is not known."""
+    """Return the `up` of a `Plan`."""
     if units.is_native and len(poses) < _FEWEST_NATIVE:
         return np.zeros((0, 3))
     try:
@@ -152,13 +141,13 @@ class Guide:
         return bool(self._planned) or self._all_taken
 
     @property
-    def action(self) -> Action | None:
-        """Return what to do next with the poses; None before the first choice."""
+    def action(self) -> Action:
+        """Return what to do next with the poses; `NOT_KNOWN` before the first choice."""
         if self._all_taken:
             return _calling('refine', 'all poses of the plan are taken')
         plan = self.plan
         if plan is None:
-            return None
+            return NOT_KNOWN
         asked = plan.asked
         if asked.direction is None:
             return _calling('fit', asked.words)
@@ -197,14 +186,9 @@ class Guide:
         self._rest = max(start, self._rest)
         return new
 
-    def line(self, poses: Poses, units: Units, action: Action | None, *, added: bool) -> str:
-        """
-        Return the line about the latest pose; empty if there is nothing new to report.
-
-        `added`: the number of poses has increased; otherwise the rest repeats a pose.
-
-        """
-        if self.plan is None or action is None:
+    def line(self, poses: Poses, units: Units, action: Action, *, added: bool) -> str:
+        """Return the line about a rest that `added` a pose or repeats one; empty if no news."""
+        if self.plan is None or action is NOT_KNOWN:
             return ''
         more, total = action.kind == 'poses', self.plan.asked.total
         if not added:
@@ -227,24 +211,20 @@ def _as_asked(planned: Sequence[PlannedPose], plan: Plan) -> NextPose:
 
 @dataclass(frozen=True)
 class Action:
-    """
-    The next step of the person.
-
-    `kind` is one of `accel_calib.finding.STEPS`, `words` are without a full stop, and `command` is
-    the service that does it; empty if there is none.
-
-    """
+    """The next step: one of `accel_calib.finding.STEPS`, its words, and its service or ''."""
 
     kind: str
     words: str
     command: str = ''
 
 
+NOT_KNOWN = Action('', '')
+
 _SERVICES = {'fit': 'fit', 'refine': 'refine', 'level': 'set_level', 'save': 'save'}
 """Service for each kind of step that has one."""
 
-_NEEDS_SAMPLES = ('poses', 'level', 'done')
-"""Kinds of steps that wait for the stream; the others use the poses so far."""
+_NEEDS_SAMPLES = ('poses', 'level', 'done', NOT_KNOWN.kind)
+"""Kinds of steps that need samples; the others use the poses so far."""
 
 _FAULTS = {'connect': ('mismatches', 'no_publisher', 'silence', 'publishers', 'stamps'),
            'unit': ('unit',)}
@@ -257,38 +237,35 @@ def _calling(kind: str, text: str) -> Action:
     return Action(kind, f'{text}; call ~/{command}' if command else text, command)
 
 
-def next_action(session: Session) -> Action | None:
-    """Return the next step; None while it is not known."""
+def next_action(session: Session) -> Action:
+    """Return the next step; `NOT_KNOWN` while the poses or the rating are being computed."""
     action = _with_sensor(session.sensor)
-    if action is not None and action.kind not in _NEEDS_SAMPLES:
+    if action.kind not in _NEEDS_SAMPLES:
         return action
     if session.ended:  # nothing can be levelled any more
-        done = action is not None and action.kind == 'level'
-        return Action('done', 'use the calibration') if done else action
+        return Action('done', 'use the calibration') if action.kind == 'level' else action
     faults = stream_faults(session)
     for kind, names in _FAULTS.items():
         words = '; '.join(faults[name] for name in names if name in faults)
         if words:
             return Action(kind, words)
-    if action is None or action.kind != 'poses':
+    if action.kind != 'poses':
         return action
     action, held = _within_reach(session, action), slow_turn(session)
     return replace(action, words=f'{held}; {action.words}') if held else action
 
 
 def next_words(session: Session) -> str:
-    """Return the end of an answer: the next step."""
+    """Return the next step as the end of an answer."""
     action = next_action(session)
-    return '' if action is None else f'; next: {action.words}'
+    return '' if action is NOT_KNOWN else f'; next: {action.words}'
 
 
 def _within_reach(session: Session, action: Action) -> Action:
     """Return a step that a robot which cannot be turned further can do, too."""
-    sensor = session.sensor
-    if not sensor.guide.is_stuck(session.statistics.stamp) or sensor.has_changed:
+    sensor, guide, present = session.sensor, session.sensor.guide, session.sensor.present
+    if not guide.is_stuck(session.statistics.stamp) or sensor.has_changed:
         return action
-    present = sensor.present
-    guide = sensor.guide
     if present is None and not guide.refused_advice and guide.poses >= FEWEST_IN_CONE:
         return Action('poses', f'{action.words}; if it cannot be turned further, call ~/fit',
                       'fit')
@@ -301,7 +278,7 @@ def _within_reach(session: Session, action: Action) -> Action:
                    f'{action.words}') if present.is_levelled else _level_step())
 
 
-def _with_sensor(sensor: Sensor) -> Action | None:
+def _with_sensor(sensor: Sensor) -> Action:
     """Return the next step with the poses and calibrations of a sensor."""
     rating = sensor.rating
     if sensor.offered is not None:
@@ -313,7 +290,7 @@ def _with_sensor(sensor: Sensor) -> Action | None:
     if sensor.drift is not None and sensor.has_changed:
         return Action('poses', status(sensor.drift), sensor.drift.remedy[1])
     if sensor.calibration is not None and rating is None:
-        return None
+        return NOT_KNOWN
     if rating is not None and rating.name == 'GOOD':
         return _after_good(sensor, rating.next)
     if rating is not None and rating.findings and rating.findings[0].kind == 'flat_pose':

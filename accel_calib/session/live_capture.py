@@ -6,16 +6,13 @@ Capture of poses while samples arrive.
 
 A rest becomes a provisional pose as soon as its length is `min_dwell`, so that the user can turn
 the sensor to the next pose. Its average is updated each time its length has doubled, at intervals
-of `LONG_REST` during a long rest, and at its end. The detector reports an end only when it is
-certain that the rest does not continue after a knock. The next rest may have started by then.
+of `LONG_REST` during a long rest, and at its end: the final dwell replaces the provisional one,
+which it overlaps in time. The detector reports an end only when it is certain that the rest does
+not continue after a knock. The next rest may have started by then.
 
-**Pose book.** The captured poses, stored as dwells, so that poses can be merged and the last pose
-undone.
-
-The pose of an ongoing rest is provisional. The final average replaces it: the dwell that overlaps
-it in time. A recording that is played again repeats its stamps and readings, and its poses do not
-count twice. Only the user removes poses. If later rests show that the sensor may have moved during
-a pose, the pose is marked as doubtful, and the fit leaves it out if possible.
+A recording that is played again repeats its stamps and readings, and its poses do not count twice.
+Only the user removes poses. If later rests show that the sensor may have moved during a pose, the
+pose is marked as doubtful, and the fit leaves it out if possible.
 
 """
 
@@ -49,7 +46,7 @@ _BANDS = 5
 
 
 class PoseBook:
-    """Poses in the order of their capture; repeated ones are kept, merged or refused as set."""
+    """Poses in the order of their capture, as dwells, so that the last pose can be undone."""
 
     def __init__(self, settings: CaptureSettings, units: Units) -> None:
         self._settings, self._units = settings, units
@@ -59,7 +56,7 @@ class PoseBook:
         self._made: tuple[list[Dwell], Poses] | None = None
 
     def poses(self) -> Poses:
-        """Return the pose table, with repeated poses merged or left out."""
+        """Return the pose table."""
         dwells = [*self._earlier, *self._dwells, *self._held]
         made = self._made
         if made is None or len(made[0]) != len(dwells) or not all(map(is_, made[0], dwells)):
@@ -83,7 +80,8 @@ class PoseBook:
 
     def add_stored(self, poses: Poses) -> None:
         """Insert stored poses before the others."""
-        self._earlier = [*dwells_of(poses), *self._earlier]
+        stored = [_dwell_of(poses, k) for k in range(len(poses))]
+        self._earlier = [*stored, *self._earlier]
 
     def holds(self, dwell: Dwell) -> bool:
         """Return whether this rest is a provisional pose."""
@@ -150,12 +148,7 @@ def _bands(dwells: list[Dwell]) -> NDArray[np.int64]:
 
 
 def with_temperature(dwells: list[Dwell]) -> list[Dwell]:
-    """
-    Return dwells with missing temperatures set to that of the nearest dwell.
-
-    The pose table has temperatures only if all its poses have one.
-
-    """
+    """Return dwells with missing temperatures set to that of the nearest one; tables need all."""
     known = [dwell for dwell in dwells if 'temperature' in dwell.context]
     if not known:
         return dwells
@@ -184,12 +177,8 @@ def _same_samples(one: Dwell, other: Dwell) -> bool:
             and bool(np.all(np.abs(one.mean - other.mean) <= _SAME_MEAN * noise)))
 
 
-def dwells_of(poses: Poses) -> list[Dwell]:
-    """Return the poses of a table as dwells with different orientations."""
-    return [_dwell_of(poses, k) for k in range(len(poses))]
-
-
 def _dwell_of(poses: Poses, k: int) -> Dwell:
+    """Return a row of a table as a dwell, with an orientation of its own."""
     time = float(poses['time'][k]) if 'time' in poses else 0.0
     count = float(poses['count'][k]) if 'count' in poses else 1.0
     std = poses['std'][k] if 'std' in poses else poses.reading[k] * 0.0
@@ -222,8 +211,8 @@ class Change:
     """
     The changes that samples caused.
 
-    The latest rest, if it is new or has a new average; rests that ended; whether the poses
-    changed; and the number of poses newly marked as doubtful.
+    `rest` is the latest rest, if it is new or has a new average, `poses` whether the poses
+    changed, and `doubted` the number of poses newly marked as doubtful.
 
     """
 
@@ -248,18 +237,13 @@ class LiveCapture:
 
     @property
     def still(self) -> bool:
-        """
-        Return whether the sensor is still.
-
-        Before the first rest, the noise of the sensor is not known, and motion can be taken for
-        noise. The first rest must therefore be as long as a pose.
-
-        """
+        """Return whether the sensor is still."""
+        # Until a rest is as long as a pose, the noise is not known, and may be a motion.
         return self.detector.still and self._rest is not None
 
     def push(self, samples: Floats, capture: bool) -> Iterator[Change]:
         """
-        Add (n, 7 + k) samples as `StillDetector.push`; yield each change before the next samples.
+        Add samples as `StillDetector.push`, and yield each change before the next samples.
 
         `capture`: every rest becomes a pose.
 

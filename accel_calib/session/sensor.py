@@ -11,9 +11,6 @@ Every rest is compared with 1 g (`accel_calib.compare.drift`) as soon as it is l
 final average replaces this first comparison. A robot can stand for weeks, so each interval
 `LONG_REST` of a long rest counts as one rest.
 
-The history of temperatures lets a calibration that changes while the node runs start with the lag
-that the sensor has, and not in equilibrium.
-
 """
 
 from __future__ import annotations
@@ -65,17 +62,13 @@ class Sensor:
 
     Attributes
     ----------
-    calibration : Calibration or None
-        The calibration in use.
-    applied : Calibration or None
-        The calibration that corrects messages: in their frame, or without the mounting if
-        `rotates` is false.
+    calibration, applied : Calibration or None
+        The calibration in use, and the same as it corrects messages: in their frame, or without
+        the mounting if `rotate` is false.
     offered, previewed : Calibration or None
         A calibration that waits for ~/save or ~/undo, and the same in the frame of messages.
-    rating : Rating or None
-        Rating of the calibration that is offered or in use; None while it is not known.
-    refinement : Refinement or None
-        The refinement that this calibration is from.
+    rating, refinement : Rating, Refinement or None
+        Rating of the `present` calibration, None while it is not known; and where it is from.
     unsaved : bool
         Whether the calibration in use could not be stored.
     changes : int
@@ -88,10 +81,8 @@ class Sensor:
         Sensors that the stored files name.
     drift : Drift or None
         State of the drift monitor; None without a calibration.
-    rest : Dwell or None
-        The last rest.
     gravity : (3,) array or None
-        Corrected force of the last rest [m/s²].
+        Corrected force of the last `rest` [m/s²].
 
     """
 
@@ -195,19 +186,16 @@ class Sensor:
         self._hold()
         part = self._uncounted(rest)
         if part is not None and part.end - part.start >= LONG_REST:
-            self._past, self._counted = self._with(part, least), _as_noisy_as(part, rest)
+            self._past, self._counted = self._with(rest, least), _as_noisy_as(part, rest)
         self._compare(least)
 
     def end(self, rest: Dwell, least: float) -> None:
         """Compare a rest that ended with 1 g; `least` is as in `update`."""
-        part = self._uncounted(rest)
-        self._past = self._past if part is None else self._with(part, least)
-        self._counted = rest
+        self._past, self._counted = self._with(rest, least), rest
         self._compare(least)
 
     def _compare(self, least: float) -> None:
-        part = None if self.rest is None else self._uncounted(self.rest)
-        self.drift = self._past if part is None else self._with(part, least)
+        self.drift = self._past if self.rest is None else self._with(self.rest, least)
         found, past = self.drift, self._past
         if found is not None and past is not None and found.change and not past.change:
             # What was reported during a rest ends by the rule of `drift`, not with the rest.
@@ -221,23 +209,22 @@ class Sensor:
         return rest_after(before, rest) if rest.end - before.end >= _SHORT_REST else None
 
     def _with(self, rest: Dwell, least: float) -> Drift | None:
-        context = self._context(rest)
-        if self._past is None or self.calibration is None or context is None:
+        """Return the state of the monitor after what was not counted yet of a rest."""
+        part = self._uncounted(rest)
+        context = None if part is None else self._context(part)
+        if self._past is None or self.calibration is None or part is None or context is None:
             return self._past
-        noise = rest.std[np.newaxis] / math.sqrt(rest.count)
-        found = rest_errors(self.calibration, rest.mean[np.newaxis], noise, context)
+        noise = part.std[np.newaxis] / math.sqrt(part.count)
+        found = rest_errors(self.calibration, part.mean[np.newaxis], noise, context)
         return compared(self._past, found[0], least)
 
     def _hold(self) -> None:
-        self.gravity = None if self.rest is None else self._force(self.rest)
-
-    def _force(self, rest: Dwell) -> Floats | None:
-        """Return the corrected force of a rest [m/s²], or None if it cannot be corrected."""
-        context = self._context(rest)
-        if self.applied is None or context is None:
-            return None
-        force = self.applied.correct(rest.mean[np.newaxis], context)[0]
-        return force * output_scale(self.applied, self._g)
+        """Set the gravity: the corrected force of the last rest, if that can be corrected."""
+        context = None if self.rest is None else self._context(self.rest)
+        self.gravity = None
+        if self.rest is not None and self.applied is not None and context is not None:
+            force = self.applied.correct(self.rest.mean[np.newaxis], context)[0]
+            self.gravity = force * output_scale(self.applied, self._g)
 
     def _context(self, rest: Dwell) -> Context | None:
         """Return the context of a rest, or None if the calibration needs more context."""
@@ -263,7 +250,8 @@ class Sensor:
         if self.calibration is None:
             return {}
         now = {key: np.array([value]) for key, value in {
-            **known, 'std': np.zeros(3), **self.temperatures.columns}.items()}
+            **known, 'std': np.zeros(3),
+            **self.temperatures.columns_of(self.calibration.model)}.items()}
         return {key: each for key, each in outside(self.calibration, now).items()
                 if each.count and key != 'time'}
 
@@ -359,24 +347,29 @@ _RECENT = int(2.0 * LONG_REST / _APART)
 """Number of recent points whose columns are kept; they cover the longest rest."""
 
 
+_Columns = deque[tuple[float, dict[str, float]]]
+"""Columns by time [s]."""
+
+
 class TemperatureHistory:
-    """Temperatures of the last hours, and the columns that a model needs from them."""
+    """
+    Temperatures of the last hours, and the columns that a model needs from them.
+
+    A calibration that changes while the node runs thus starts with the lag that the sensor has.
+
+    """
 
     def __init__(self) -> None:
         self._points: deque[tuple[float, float]] = deque(maxlen=_POINTS)
-        self._columns: deque[tuple[float, dict[str, float]]] = deque(maxlen=_RECENT)
+        self._columns = _Columns(maxlen=_RECENT)
         self._stream: ThermalStream | None = None
         self._followed = Model({})
 
     def follow(self, model: Model) -> None:
         """Compute the columns of this model from now on, and for the history."""
         same, self._followed = _key(model) == _key(self._followed), model
-        if same:
-            return
-        self._columns.clear()
-        self._stream = thermal_stream(model)
-        if self._stream is not None:
-            self._columns.extend(_replayed(self._stream, self._points))
+        if not same:
+            self._stream, self._columns = self._replayed(model)
 
     def add(self, time: Floats, temperature: Floats) -> None:
         """
@@ -408,49 +401,38 @@ class TemperatureHistory:
                     self._columns.append((now, self._stream.value))
             begin = end
 
-    @property
-    def columns(self) -> Mapping[str, float]:
-        """Return the present columns of the followed model; empty if it needs none."""
-        return {} if self._stream is None else self._stream.value
-
     def columns_of(self, model: Model) -> Mapping[str, float]:
-        """Return the present columns of any model; those of another one are computed anew."""
-        if _key(model) == _key(self._followed):
-            return self.columns
-        stream = self.stream(model)
+        """Return the present columns of a model; those of the followed one are at hand."""
+        stream = self._stream if _key(model) == _key(self._followed) else self.stream(model)
         return {} if stream is None else stream.value
 
     def stream(self, model: Model) -> ThermalStream | None:
         """Return the lag and rate for a model after this history; None if it needs none."""
-        stream = thermal_stream(model)
-        if stream is not None:
-            _replayed(stream, self._points)
-        return stream
+        return self._replayed(model)[0]
 
     def during(self, model: Model, start: float, end: float) -> Context:
         """Return the mean columns that a model needs between two times; empty if not known."""
         columns = self._columns
         if model is not self._followed and _key(model) != _key(self._followed):
-            stream = thermal_stream(model)
-            columns = deque() if stream is None else _replayed(stream, self._points)
+            columns = self._replayed(model)[1]
         inside = [each for time, each in columns if start - _APART <= time <= end]
         if not inside:
             return {}
         return {key: np.array([np.mean([each[key] for each in inside])]) for key in inside[0]}
 
+    def _replayed(self, model: Model) -> tuple[ThermalStream | None, _Columns]:
+        """Return the stream of a model after this history, and the columns at its last points."""
+        stream, columns = thermal_stream(model), _Columns(maxlen=_RECENT)
+        if stream is None:
+            return None, columns
+        old = max(len(self._points) - _RECENT, 0)
+        if old:
+            stream.add_all(*np.array(list(islice(self._points, old))).T)
+        for time, temperature in islice(self._points, old, None):
+            stream.add(time, temperature)
+            columns.append((time, stream.value))
+        return stream, columns
+
 
 def _key(model: Model) -> tuple[object, ...]:
     return dict(model.lags), 'temperature_rate' in model.over
-
-
-def _replayed(stream: ThermalStream, points: deque[tuple[float, float]]
-              ) -> deque[tuple[float, dict[str, float]]]:
-    """Add a history to a stream, and return the columns at its last points."""
-    old = max(len(points) - _RECENT, 0)
-    if old:
-        stream.add_all(*np.array(list(islice(points, old))).T)
-    columns: deque[tuple[float, dict[str, float]]] = deque()
-    for time, temperature in islice(points, old, None):
-        stream.add(time, temperature)
-        columns.append((time, stream.value))
-    return columns

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The calibrator without ROS: it takes samples and commands, and returns answers and events.
+The entry point of a session: samples, the sensor that they belong to, its files and calibration.
 
 Only one thread may use a session. Long work (fits, files) is a `Task`, which runs in this thread
 and yields `Step`s; their `run` can be called in any thread. All durations of the measurement use
@@ -14,25 +14,30 @@ uses a steady clock.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+import json
 import math
 from time import monotonic
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .commands import Commands
+from .commands import Commands, rated
+from .guidance import next_action, NOT_KNOWN, plan_for
 from .live_capture import Change
 from .sensor import Sensor, title
 from .settings import CalibratorSettings, own_effects
-from .store import SensorFiles, Store
-from .stream import Around, Reports, SILENT, StreamStatistics
-from .work import draw_poses, load_files, report_rating
-from .worker import answered, Event, Log, Mounting, Severity, ShowPoses, Still
+from .store import SensorFiles, Store, tidied, unusable, writing_advice
+from .stream import AGAIN, Around, Reports, SILENT, StreamStatistics
+from .worker import (
+    answered, Compute, Event, Files, Log, Mounting, Parse, Result, Severity, ShowPoses, Still,
+    Task)
 from ..calibrate import (
-    Calibration, in_frame, mounting_of, mounting_words, on_topics, with_given_mounting)
+    Calibration, in_frame, mounting_figures, mounting_of, mounting_words, on_topics,
+    with_given_mounting)
 from ..compare import status
 from ..errors import InputError
-from ..table import Floats
+from ..findings import rating_json
+from ..table import Floats, Poses
 from ..text import counted
 from ..units import FrameName, units_of
 
@@ -58,7 +63,7 @@ _SEVERITY: dict[str, Severity] = {'GOOD': 'info', 'USABLE': 'warning', 'BAD': 'e
 
 class Session:
     """
-    The calibrator of one sensor.
+    The calibrator of one sensor; InputError if the settings contradict each other.
 
     Parameters
     ----------
@@ -77,25 +82,16 @@ class Session:
         Whether messages are corrected.
     publishers : tuple of str or None
         Names of the nodes that publish the messages; None: the samples come from a board.
-    around : Around
-        The last values of the context.
     missing : dict of str to str
         Why a column of the parameter `context` does not arrive, for the log.
     imus, thermometers : tuple of str
         Topics with messages of Imus and of temperatures that other nodes publish.
-    own : tuple of str
-        Names of the own effects of the user.
     mismatches : tuple of str
         Publishers and subscribers with another QoS, which exchange no messages with this node.
     computing : int
         Number of fits and refinements that are running.
     ended : bool
         Whether no more samples can come, because a recording has ended.
-
-    Raises
-    ------
-    InputError
-        If the settings contradict each other.
 
     """
 
@@ -129,7 +125,7 @@ class Session:
         if store is None:
             self.show_poses(store=False)
         else:
-            answered(load_files(self, store, self.sensor))
+            answered(self._load(store, self.sensor))
 
     @property
     def name(self) -> str:
@@ -168,7 +164,7 @@ class Session:
         """Check the stream, and try to lock the files; to be called about once per second."""
         store = self.files.try_again()
         if store is not None:
-            self.report(load_files(self, store, self.sensor))
+            self.report(self._load(store, self.sensor))
         self._report_still()
         self.reports.tick()
         self._events += self.commands.due()
@@ -181,10 +177,9 @@ class Session:
 
     def accepts(self, frame_id: str) -> bool:
         """
-        Return whether messages with this frame_id belong to the sensor.
+        Return whether messages with this frame_id belong to the sensor; the first one defines it.
 
-        The first message defines the sensor. A message of another sensor ends the ongoing rest.
-        After a time without messages of the sensor, the session switches to the other sensor.
+        A message of another sensor ends the ongoing rest. After `SILENT`, it replaces the sensor.
 
         """
         if frame_id == self.frame_id:
@@ -293,7 +288,7 @@ class Session:
         self.sensor = Sensor(self.settings, self.units)
         store = self._take_files(self.name)
         if store is not None:
-            self.report(load_files(self, store, self.sensor))
+            self.report(self._load(store, self.sensor))
 
     def _take_files(self, sensor: str) -> Store | None:
         """Lock the files of a sensor and return the store; None if another node uses them."""
@@ -303,14 +298,44 @@ class Session:
             self.log('error', self.problem)
         return store
 
+    def _load(self, store: Store, sensor: Sensor) -> Task:
+        """Read the files of a sensor, and use them unless another one has replaced it."""
+        calibration: Calibration | None = None
+        poses: Poses | None = None
+        problem = ''
+        notes: list[str] = yield Files(tidied, store)
+        try:
+            calibration = yield Parse(store.load_calibration)
+        except Exception as error:  # the node starts in any case
+            problem = yield Files(unusable, store.calibration, error)
+        if calibration is not None and calibration.stream not in ('', store.identity.topic):
+            notes.append(f'{store.calibration} was made for {calibration.stream}, but it is used '
+                         f'for {store.identity.topic}')
+        try:
+            poses = yield Files(store.load_poses)
+        except Exception as error:
+            notes.append((yield Files(unusable, store.poses, error, True)))
+        if self.sensor is not sensor:
+            return ''
+        sensor.owners = {each.sensor for each in (calibration, poses)
+                         if each is not None and each.sensor}
+        if poses is not None:
+            sensor.live.book.add_stored(poses)
+            self.log('info', f'read {counted(len(poses), "pose")} from the store')
+        if calibration is not None:
+            self.adopt(calibration)
+            sensor.fitted_poses = len(calibration.poses)
+        self.problem = problem
+        for line in filter(None, (problem, *notes)):
+            self.log('error', line)
+        self.show_poses(store=False)
+        return ''
+
+    # The calibration
+
     def adopt(self, calibration: Calibration | None, refinement: Refinement | None = None,
               rating: Rating | None = None) -> None:
-        """
-        Use this calibration for the correction, with the given mounting if there is one.
-
-        The refinement that it is from, and the rating if it is known, are those of `Sensor`.
-
-        """
+        """Correct with this calibration, and with the given mounting if there is one."""
         self.problem = ''
         if calibration is None:
             self.sensor.adopt(None)
@@ -348,7 +373,26 @@ class Session:
         if rating is not None or sensor.present is None:
             sensor.rating = rating
         if sensor.present is not None:
-            self.report(report_rating(self, sensor, sensor.present, rating))
+            self.report(self._report_rating(sensor, sensor.present, rating))
+
+    def _report_rating(self, sensor: Sensor, calibration: Calibration, rating: Rating | None
+                       ) -> Task:
+        """Rate a calibration, and report it, unless another one has replaced it."""
+        rating, found = yield Compute(rated, calibration, sensor.refinement, rating,
+                                      self.settings.model)
+        if sensor.present is not calibration:
+            return ''
+        sensor.rating = rating
+        action = next_action(self)
+        if action is not NOT_KNOWN:
+            found['in_use'] = sensor.offered is not calibration
+            if calibration.is_levelled:
+                found['mounting'] = mounting_figures(
+                    calibration.rotation, self.frame_id or '', self.settings.base_frame)
+            command = action.command and f'~/{action.command}'
+            self.report(Result(json.dumps({
+                **found, **rating_json(rating, action.kind, action.words, command)})))
+        return ''
 
     def set_mounting(self, rotation: Floats) -> None:
         """Use a mounting ΔR that is known from elsewhere, (3, 3)."""
@@ -361,9 +405,14 @@ class Session:
 
     def with_given(self, calibration: Calibration) -> Calibration:
         """Return a calibration with the given mounting, if there is one."""
-        if self._given is None:
-            return calibration
-        return with_given_mounting(calibration, self._given)
+        return (calibration if self._given is None
+                else with_given_mounting(calibration, self._given))
+
+    def mounting_words(self, calibration: Calibration | None) -> str:
+        """Return the mounting of a calibration as one line; empty if it is not known."""
+        if calibration is None or not calibration.is_levelled:
+            return ''
+        return mounting_words(calibration.rotation, self.frame_id or '', self.settings.base_frame)
 
     # Poses
 
@@ -379,8 +428,29 @@ class Session:
         sensor = self.sensor
         poses = sensor.live.book.poses()
         added = sensor.guide.added(len(poses), self.statistics.stamp)
-        self.report(draw_poses(self, sensor, poses, added, new_rest,
-                               self.files.store if store else None))
+        self.report(self._draw_poses(sensor, poses, added, new_rest,
+                                     self.files.store if store else None))
+
+    def _draw_poses(self, sensor: Sensor, poses: Poses, added: int, new_rest: bool,
+                    store: Store | None) -> Task:
+        """Store and draw poses, this number more than before; return the line of a new rest."""
+        guide, given = sensor.guide, (poses, self.units, self.settings.model)
+        due = added != 0 or guide.plan is None
+        try:
+            yield Files() if store is None else Files(store.save_poses, poses)
+        except OSError as error:
+            self.log('error', f'the poses could not be stored: {error}; {writing_advice(error)}',
+                     'not_stored', AGAIN)
+        # Computed even where only an average has changed, so that the lines keep their order.
+        plan = yield Compute(plan_for, *given) if due and len(poses) else Compute()
+        if due and not len(poses):  # without the start of the worker process
+            plan = plan_for(*given)
+        if plan is not None and sensor is self.sensor:
+            guide.plan = plan
+            self.report(ShowPoses(plan.up, plan.asked, self.frame_id or ''))
+        if not new_rest or sensor is not self.sensor:
+            return ''
+        return guide.line(poses, self.units, next_action(self), added=added > 0)
 
 
 def _check_frames(settings: CalibratorSettings) -> None:

@@ -54,7 +54,7 @@ def parameter(default: Any, words: str, *, limits: tuple[float, float] | None = 
     choices : tuple of str
         Possible values of a text; empty: any text.
     live : bool
-        Whether the parameter can be set while the node runs.
+        Whether it can be set while the node runs.
 
     """
     about = {'words': words, 'limits': limits, 'choices': choices, 'live': live}
@@ -69,18 +69,19 @@ def default_of(given: Field[Any]) -> Any:
     return given.default if factory is MISSING else factory()
 
 
+_ACCEPTED: dict[type, tuple[type, ...]] = {
+    int: (int,), float: (int, float), str: (int, float, str)}
+
+
 def _converted(given: Field[Any], value: Any) -> Any:
     """Return a value converted to the type of the default, or None if that is not possible."""
     default = default_of(given)
-    if isinstance(default, bool) or isinstance(value, bool):
-        return value if isinstance(value, bool) and isinstance(default, bool) else None
-    if isinstance(default, float):
-        return float(value) if isinstance(value, int | float) else None
-    if isinstance(default, str):
-        return str(value) if isinstance(value, str | int | float) else None
-    if isinstance(default, int):
-        return value if isinstance(value, int) else None
-    return _converted_list(default, value)
+    kind = type(default)
+    if kind is list:
+        return _converted_list(default, value)
+    if kind is bool or isinstance(value, bool):
+        return value if type(value) is kind else None
+    return kind(value) if isinstance(value, _ACCEPTED[kind]) else None
 
 
 def _converted_list(default: list[Any], value: Any) -> list[Any] | None:

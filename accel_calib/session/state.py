@@ -23,7 +23,7 @@ from .guidance import next_action
 from .sensor import title
 from .settings import context_topics
 from .stream import missing_context, SILENT, stream_faults, thermometer_words
-from ..calibrate import mounting_words, USES_LIMIT
+from ..calibrate import USES_LIMIT
 from ..compare import Drift, status
 from ..errors import InputError
 from ..finding import has
@@ -114,12 +114,9 @@ class Progress:
     @classmethod
     def from_figures(cls, figures: Mapping[str, str]) -> Progress:
         """
-        Return the progress with these figures, as `figures` yields them.
+        Return the progress with these figures, as `figures` yields them; ignore others.
 
-        Raises
-        ------
-        InputError
-            If a figure is missing or cannot be read; other figures are ignored.
+        InputError if a figure is missing or cannot be read.
 
         """
         found = {}
@@ -147,8 +144,7 @@ def progress(session: Session, reading: Triple | None = None) -> Progress:
     plan, silent = sensor.guide.plan, statistics.age > SILENT
     up, length, corrected = _NOT_KNOWN if silent else _newest(session, reading)
     action = next_action(session)
-    asked = plan is not None and action is not None and action.kind == 'poses'
-    direction = plan.asked.direction if plan is not None and asked else None
+    direction = None if plan is None or action.kind != 'poses' else plan.asked.direction
     return Progress(
         still=session.still and not silent,
         stillness=math.nan if silent else sensor.stillness(statistics),
@@ -156,9 +152,8 @@ def progress(session: Session, reading: Triple | None = None) -> Progress:
         min_dwell=session.settings.min_dwell, poses=sensor.guide.poses,
         total=0 if plan is None else plan.asked.total,
         coverage=0.0 if plan is None else plan.coverage,
-        accuracy=_accuracy(session), step='' if action is None else action.kind,
-        advice='' if action is None else action.words,
-        command='' if action is None else action.command,
+        accuracy=_accuracy(session), step=action.kind, advice=action.words,
+        command=action.command,
         direction=() if direction is None else tuple(direction.tolist()),
         up=up, length=length, corrected=corrected, temperature=session.around.temperature)
 
@@ -269,8 +264,7 @@ def _calibration(session: Session) -> Check:
 
 
 def _advice(session: Session) -> str:
-    action = next_action(session)
-    return 'turn the sensor' if action is None else action.words
+    return next_action(session).words or 'turn the sensor'
 
 
 def _drift(drift: Drift | None) -> Check:
@@ -344,8 +338,7 @@ def _pose_figures(session: Session) -> Iterator[tuple[str, str]]:
 def _sensor_figures(session: Session) -> Iterator[tuple[str, str]]:
     calibration, gyro, noise = (
         session.sensor.calibration, session.sensor.gyro, session.sensor.noise)
-    yield 'mounting', 'not known' if calibration is None or not calibration.is_levelled else (
-        mounting_words(calibration.rotation, session.frame_id or '', session.settings.base_frame))
+    yield 'mounting', session.mounting_words(calibration) or 'not known'
     if gyro is not None:
         yield 'gyro bias [rad/s]', _vector(gyro.at(session.around.temperature))
         yield 'gyro bias, standard deviation [rad/s]', _vector(gyro.sd)

@@ -4,11 +4,10 @@
 """
 The files of a sensor: calibration and poses, and the lock for one node at a time.
 
-A sensor is identified by its topic (with namespace) and the frame_id of its messages, or by a name
-that the user sets. Each sensor has its own files. Stored data are never lost: files that cannot be
-used, or that belong to another sensor, are renamed and never overwritten. So are folders with such
-a name, pipes, sockets and links to nothing. Devices, and folders without a suffix in their name,
-are left where they are: the node then works without storing.
+Each sensor has its own files (`Identity`). Stored data are never lost: files that cannot be used,
+or that belong to another sensor, are renamed and never overwritten. So are folders with such a
+name, pipes, sockets and links to nothing. Devices, and folders without a suffix in their name, are
+left where they are: the node then works without storing.
 
 Calibrations are formatted and parsed apart from writing, so that another process can do it
 (`Store.load_calibration`, `Store.prepared`). Files are written in the process that holds the lock.
@@ -64,12 +63,7 @@ _LARGEST_TABLE = 32 * 2**20
 
 @dataclass(frozen=True)
 class Identity:
-    """
-    The identity of a sensor: its topic with namespace and frame_id, or the name set by the user.
-
-    `named`: `sensor` is that name, and the topic is ignored.
-
-    """
+    """A sensor: frame_id and topic, with namespace, of its messages; or `named` by the user."""
 
     sensor: str
     topic: str
@@ -117,17 +111,17 @@ class Store:
         return self.calibration.with_name(f'{self.calibration.stem}_poses.csv')
 
     def load_calibration(self) -> Calibration | None:
+        """Return the stored calibration as `read` does, or None if there is none."""
+        return self.read(self.calibration) if _exists(self.calibration) else None
+
+    def read(self, path: Path) -> Calibration:
         """
-        Return the stored calibration in the unit of the readings, or None if there is none.
+        Return a calibration of this sensor in the unit of the readings.
 
         StoredCalibrationError if it is damaged, of another version, for another sensor, or in
         a unit that cannot be converted. InputError if it is not a regular file.
 
         """
-        return self.read(self.calibration) if _exists(self.calibration) else None
-
-    def read(self, path: Path) -> Calibration:
-        """Read a calibration for this sensor; errors are as in `load_calibration`."""
         calibration = read_calibration(path)
         check_sensor(calibration, self.identity.sensor)
         try:
@@ -166,7 +160,7 @@ class Store:
         return poses
 
     def prepared(self, calibration: Calibration) -> tuple[bytes, bool]:
-        """Return the content of the file of a calibration, and whether the present one is good."""
+        """Return the content of the file of a calibration, and whether the present `is_good`."""
         named = replace(calibration, sensor=self.identity.sensor, stream=self.identity.topic)
         return calibration_bytes(named), self.is_good()
 
@@ -181,10 +175,6 @@ class Store:
                 raise
             return False
         return True
-
-    def save_calibration(self, calibration: Calibration) -> None:
-        """Write the calibration, and keep the file before as a step."""
-        self.write(self.prepared(calibration))
 
     def write(self, prepared: tuple[bytes, bool]) -> None:
         """Write what `prepared` returned, and keep the file before as a step."""
@@ -291,13 +281,7 @@ def _exists(path: Path) -> bool:
 
 
 def store_of(calibration_file: str, identity: Identity, units: UnitName) -> Store:
-    """
-    Return the store of a sensor; InputError if the home folder is not known.
-
-    `calibration_file` is set by the user, with ``~`` for home; empty: in ``accel_calib`` in
-    `ros_home`.
-
-    """
+    """Return the store at `calibration_file`, by default in `ros_home`; InputError: no home."""
     if calibration_file:
         try:
             path = Path(calibration_file).expanduser()
@@ -309,12 +293,7 @@ def store_of(calibration_file: str, identity: Identity, units: UnitName) -> Stor
 
 
 def aside(path: Path, word: str) -> Path:
-    """
-    Rename a file to ``<name>.<word><k>`` with the first free k, and return the new path.
-
-    OSError also for a device, and for a folder that does not have the name of a file.
-
-    """
+    """Rename to the `free_name`, and return it; OSError for devices and folders without suffix."""
     mode = path.lstat().st_mode
     if stat.S_ISCHR(mode) or stat.S_ISBLK(mode) or (stat.S_ISDIR(mode) and not path.suffix):
         kind = 'folder' if stat.S_ISDIR(mode) else 'device'

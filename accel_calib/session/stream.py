@@ -65,8 +65,8 @@ class StreamStatistics:
     Attributes
     ----------
     messages, not_finite, foreign, implausible : int
-        Number of messages, and of dropped ones: readings that are not finite, messages of another
-        sensor, and corrected messages that are not plausible.
+        Number of messages, and of dropped ones: not finite or absurd, of another sensor, and
+        corrected ones that are not plausible.
     stamp, arrived : float
         Stamp of the last message, and its arrival by the steady clock [s].
     reading, newest : (3,) array or None
@@ -179,15 +179,10 @@ HELD = 30.0
 
 class Around:
     """
-    The last value of each column of the context, by arrival.
+    The last value of each column of the context; `values` is another mapping after each change.
 
     A quantity holds for `HELD`: after that, its effect is left out. Temperature and supply voltage
     hold until the next value, because their effects cannot be left out without a jump.
-
-    Attributes
-    ----------
-    values : mapping of str to float
-        Values by column; another mapping after each change.
 
     """
 

@@ -37,8 +37,8 @@ def start(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 assert COMMANDS[task](folder) == 0
     run('fit', folder / 'poses.csv', '-o', folder / 'imu.yaml', '--sensor', 'imu')
     store = SensorStore(folder / 'imu.yaml', Identity('imu', '/imu'), 'm/s2')
-    store.save_calibration(read_calibration(folder / 'new.yaml'))
-    store.save_calibration(read_calibration(folder / 'imu.yaml.before1'))
+    store.write(store.prepared(read_calibration(folder / 'new.yaml')))
+    store.write(store.prepared(read_calibration(folder / 'imu.yaml.before1')))
     return folder
 
 

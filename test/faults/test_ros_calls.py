@@ -36,17 +36,6 @@ _SLOW = ('fit', 'refine')
 _QUICK_S = 0.1
 
 
-def answer_to(bench: Any, message: Any) -> Any:
-    """Publish a message, and return the corrected acceleration of this message."""
-    bench.send(message)
-
-    def found() -> list[Any]:
-        return [each for each in bench.came_out if each.header.stamp == message.header.stamp]
-
-    bench.spin(found)
-    return found()[0].linear_acceleration
-
-
 def calls_of(printed: str) -> list[Call]:
     """Return the calls that a caller printed."""
     return [Call(**json.loads(line)) for line in printed.splitlines() if line.startswith('{')]
@@ -75,7 +64,7 @@ def test_each_call_is_answered_and_all_agree_with_some_order(
                60.0 + 2.0 * CALLS)
     clients = [calls_of(each.communicate()[0]) for each in callers]
     assert bench.call('enable', data=True).success
-    force = answer_to(bench, bench.imu(READING))
+    force = bench.echo([bench.imu(READING)], bench.came_out)[0].linear_acceleration
     status, printed = bench.end(node, signal.SIGINT)
     sys.stdout.write(f'{figures(clients)}\n')
     assert status == 0, printed

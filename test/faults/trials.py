@@ -54,7 +54,7 @@ def _save(folder: Path) -> int:
     store = _store(folder)
     calibration = read_calibration(folder / 'new.yaml')
     store.save_poses(calibration.poses)
-    store.save_calibration(calibration)
+    store.write(store.prepared(calibration))
     return 0
 
 
