@@ -18,7 +18,7 @@ succeeds on a slow machine.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, ExitStack
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 import os
@@ -95,10 +95,9 @@ Rest = dict[str, Floats]
 @dataclass(frozen=True)
 class Errors:
     """
-    Errors of a topic over rests in several poses.
+    Errors of a topic over rests: RMS of the vector, RMS and largest | |a| - 1 g |.
 
-    RMS of the difference from the truth, as a vector; RMS and largest | |a| - 1 g |; RMS angle
-    between measured and true direction of up.
+    The tilt is the RMS angle between measured and true direction of up.
 
     """
 
@@ -132,10 +131,6 @@ class Outcome:
         """Return whether the errors are smaller, and the hidden effect is found."""
         return (self.after.vector_mg < self.before.vector_mg
                 and (not self.hidden or self.hidden in self.found))
-
-
-class DemoError(AccelCalibError):
-    """The demonstration failed."""
 
 
 class User(Node):
@@ -258,7 +253,7 @@ class Demonstration:
         raise _refused('calibrator/set_level', answer)
 
     def call(self, service: str) -> str:
-        """Call a service, and return its answer; raise DemoError if it fails."""
+        """Call a service, and return its answer; AccelCalibError if it fails."""
         answer = self._request(service)
         if not answer.success:
             raise _refused(service, answer)
@@ -272,36 +267,27 @@ class Demonstration:
         return future.result()
 
 
-def _refused(service: str, answer: Trigger.Response) -> DemoError:
-    return DemoError(f'{service} answered: {answer.message}', 'run the demonstration again')
+def _refused(service: str, answer: Trigger.Response) -> AccelCalibError:
+    return AccelCalibError(f'{service} answered: {answer.message}', 'run the demonstration again')
 
 
 def demonstrate(report: Callable[[str], None], hidden: str = '') -> Outcome:
     """
     Run the demonstration, and compare the errors.
 
-    Parameters
-    ----------
-    report : callable
-        Function that is called with a line for each step.
-    hidden : str
-        Effect that the sensor hides, such as ``quadratic=0.004``; empty: none.
-
-    Raises
-    ------
-    DemoError
-        If a step takes too long, or a service refuses.
+    `report` is called with a line for each step. `hidden` is the effect that the sensor hides,
+    such as ``quadratic=0.004``; empty: none. AccelCalibError if a step takes too long, or a
+    service refuses.
 
     """
     began = time.monotonic()
-    with tempfile.TemporaryDirectory(prefix='accel_calib_demo_') as folder, ExitStack() as stack:
-        set_environment(Path(folder), stack.enter_context(own_domain()))
-        report('starting the calibrator node and a simulated Imu, turned by hand'
-               + (f', that hides {hidden}' if hidden else ''))
-        simulated = {**_HELD, 'effects': [*_EFFECTS, *([hidden] if hidden else [])]}
-        processes = [stack.enter_context(running('node', _NODE)),
-                     stack.enter_context(running('simulator', simulated))]
-        demo = Demonstration(*stack.enter_context(user_of(processes)), report)
+    report('starting the calibrator node and a simulated Imu, turned by hand'
+           + (f', that hides {hidden}' if hidden else ''))
+    simulated = {**_HELD, 'effects': [*_EFFECTS, *([hidden] if hidden else [])]}
+    with (_isolated() as folder, running('node', _NODE) as node,
+          running('simulator', simulated) as simulator,
+          user_of([node, simulator]) as (user, spin)):
+        demo = Demonstration(user, spin, report)
         demo.capture(_POSES_HIDDEN if hidden else _POSES)
         report(f'~/fit: {demo.call("calibrator/fit")}')
         report(f'~/set_level: {demo.level()}')
@@ -309,7 +295,7 @@ def demonstrate(report: Callable[[str], None], hidden: str = '') -> Outcome:
         raw, calibrated = (_errors(rests, name) for name in ('raw', 'corrected'))
         if not hidden:
             return Outcome(len(rests), raw, calibrated, time.monotonic() - began)
-        found, lag_s = _refined(demo, report, Path(folder) / 'accel_calib' / 'demo.yaml')
+        found, lag_s = _refined(demo, report, folder / 'accel_calib' / 'demo.yaml')
         again = _errors(demo.measure(_CHECKED_HIDDEN), 'corrected')
         return Outcome(len(rests), calibrated, again, time.monotonic() - began,
                        parse_effect(hidden)[0], found, lag_s)
@@ -344,24 +330,25 @@ def _rms(values: Floats) -> float:
 
 def demonstrate_page(port: int, report: Callable[[str], None],
                      is_over: Callable[[], bool]) -> None:
-    """Run simulator and calibrator with its live page, until it is over; raises DemoError."""
-    with tempfile.TemporaryDirectory(prefix='accel_calib_demo_') as folder, ExitStack() as stack:
-        set_environment(Path(folder), stack.enter_context(own_domain()))
-        report('a simulated Imu is turned by hand; open the link of the live page in a browser, '
-               'wait for the poses, and press Fit. Ctrl-C ends it')
-        processes = [
-            stack.enter_context(running('node', {'sensor': 'demo', 'web_port': port}, 'info')),
-            stack.enter_context(running('simulator', _TIMED))]
+    """Run simulator and calibrator with its live page, until it is over or a node has ended."""
+    report('a simulated Imu is turned by hand; open the link of the live page in a browser, wait '
+           'for the poses, and press Fit. Ctrl-C ends it')
+    with (_isolated(),
+          running('node', {'sensor': 'demo', 'web_port': port}, 'info') as node,
+          running('simulator', _TIMED) as simulator):
         while not is_over():
-            _check_running(processes)
+            _check_running([node, simulator])
             time.sleep(_LOOK_EVERY)
 
 
-def set_environment(folder: Path, domain: int) -> None:
-    """Isolate the demonstration: own domain, local machine only, own files."""
-    os.environ.update(ROS_DOMAIN_ID=str(domain),
-                      ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_HOME=str(folder),
-                      ROS_LOG_DIR=str(folder / 'log'))
+@contextmanager
+def _isolated() -> Iterator[Path]:
+    """Yield a folder for the files, and let processes use it and a domain on this machine."""
+    with (tempfile.TemporaryDirectory(prefix='accel_calib_demo_') as folder,
+          own_domain() as domain):
+        os.environ.update(ROS_DOMAIN_ID=str(domain), ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST',
+                          ROS_HOME=folder, ROS_LOG_DIR=os.path.join(folder, 'log'))
+        yield Path(folder)
 
 
 @contextmanager
@@ -401,9 +388,9 @@ def user_of(processes: Sequence[subprocess.Popen[bytes]]) -> Iterator[tuple[User
         while not until():
             _check_running(processes)
             if time.monotonic() > ends:
-                raise DemoError(f'{what}: not available within {_PATIENCE:.0f} s, '
-                                f'{counted(len(user.poses), "pose")} so far',
-                                'check whether a firewall blocks DDS on this machine')
+                raise AccelCalibError(f'{what}: not available within {_PATIENCE:.0f} s, '
+                                      f'{counted(len(user.poses), "pose")} so far',
+                                      'check whether a firewall blocks DDS on this machine')
             look_again = time.monotonic() + _LOOK_EVERY
             while time.monotonic() < look_again:
                 executor.spin_once(timeout_sec=_LOOK_EVERY)
@@ -418,4 +405,4 @@ def user_of(processes: Sequence[subprocess.Popen[bytes]]) -> Iterator[tuple[User
 
 def _check_running(processes: Sequence[subprocess.Popen[bytes]]) -> None:
     if any(process.poll() is not None for process in processes):
-        raise DemoError('a node has ended unexpectedly', 'see its output above')
+        raise AccelCalibError('a node has ended unexpectedly', 'see its output above')
