@@ -66,6 +66,7 @@ _ASKED_FOR = (1.0, 0.6, 0.0, 1.0)
 _WORDS = (1.0, 1.0, 1.0, 1.0)
 _SPHERE = (0.6, 0.6, 0.7, 0.15)
 _NUMBER_AT, _WORDS_AT = 1.12, 1.35
+_CENTRE = np.zeros(3)
 _ABOVE = np.array([0.0, 0.0, _WORDS_AT])
 _DOT, _LETTER, _SHAFT = 0.1, 0.1, 0.04
 
@@ -80,8 +81,8 @@ def pose_markers(directions: Floats, asked: NextPose, frame_id: str) -> MarkerAr
     markers = [Marker(action=Marker.DELETEALL),
                _marker('sphere', 0, Marker.SPHERE, _SPHERE, 2.0)]
     for k, direction in enumerate(directions):
-        markers.append(_at(_marker('poses', k, Marker.SPHERE, _CAPTURED, _DOT), direction))
-        markers.append(_text('numbers', k, str(k + 1), direction * _NUMBER_AT))
+        markers += [_marker('poses', k, Marker.SPHERE, _CAPTURED, _DOT, direction),
+                    _text('numbers', k, str(k + 1), direction * _NUMBER_AT)]
     if asked.direction is None:
         markers.append(_text('next', 1, asked.words, _ABOVE))
     else:
@@ -93,26 +94,21 @@ def pose_markers(directions: Floats, asked: NextPose, frame_id: str) -> MarkerAr
     return MarkerArray(markers=markers)
 
 
-def _marker(namespace: str, number: int, kind: int, color: tuple[float, ...],
-            size: float) -> Marker:
+def _marker(namespace: str, number: int, kind: int, color: tuple[float, ...], size: float,
+            at: Floats = _CENTRE) -> Marker:
     red, green, blue, alpha = color
     marker = Marker(ns=namespace, id=number, type=kind, action=Marker.ADD,
                     color=ColorRGBA(r=red, g=green, b=blue, a=alpha))
     marker.scale.x = marker.scale.y = marker.scale.z = size
     if kind == Marker.ARROW:
         marker.scale.y = marker.scale.z = 2.0 * size
-    marker.pose.orientation.w = 1.0
+    marker.pose.position, marker.pose.orientation.w = _point(at), 1.0
     return marker
 
 
 def _text(namespace: str, number: int, text: str, at: Floats) -> Marker:
-    marker = _marker(namespace, number, Marker.TEXT_VIEW_FACING, _WORDS, _LETTER)
+    marker = _marker(namespace, number, Marker.TEXT_VIEW_FACING, _WORDS, _LETTER, at)
     marker.text = text
-    return _at(marker, at)
-
-
-def _at(marker: Marker, position: Floats) -> Marker:
-    marker.pose.position = _point(position)
     return marker
 
 
@@ -125,10 +121,7 @@ class Calibrator:
     """
     The topics, services and parameters of a calibrator in a node.
 
-    Raises
-    ------
-    InputError
-        If a parameter does not accept its value, or the settings contradict each other.
+    InputError if a parameter does not accept its value, or the settings contradict each other.
 
     """
 
