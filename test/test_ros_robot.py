@@ -19,6 +19,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from faults.sample import sample
 from geometry_msgs.msg import Vector3
 from inside import CALIBRATOR, NODES, rotation_from_rpy, spread_directions
+from inside_ros import publish_static
 import numpy as np
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -38,57 +39,31 @@ def status(diagnostics: list[DiagnosticArray], concern: str = '') -> DiagnosticS
     return next(each for each in diagnostics[-1].status if each.name == name)
 
 
-def values(found: DiagnosticStatus) -> dict[str, str]:
-    return {each.key: each.value for each in found.values}
-
-
 def force_of(message: Imu) -> Any:
     vector = message.linear_acceleration
     return np.array([vector.x, vector.y, vector.z])
 
 
-def rest(bench: Any, still: list[Bool], reading: Any) -> Callable[[], Imu]:
-    """Let the sensor rest with this reading until the node says so; return more messages."""
-    rng = np.random.default_rng(3)
-
-    def now() -> Any:
-        return np.asarray(reading) + 0.005 * rng.normal(size=3)
-
-    bench.feed([now() for _ in range(110)])
-    bench.spin(lambda: still and still[-1].data)
-    return lambda: bench.imu(now())
-
-
 def test_the_mounting_comes_from_the_static_transforms_and_is_published(
         tf_message: Any, bench: Any, stored: Stored) -> None:
-    from geometry_msgs.msg import TransformStamped
-    latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    robot = bench.node.create_publisher(tf_message, '/tf_static', latched)
-    heard: list[Any] = []
-    bench.node.create_subscription(tf_message, '/tf_static', heard.append, latched)
-    steps = []
-    for parent, child, half in (('base_link', 'mast', 0.3), ('mast', 'imu_link', 0.2)):
-        step = TransformStamped(child_frame_id=child)
-        step.header.frame_id = parent
-        step.transform.rotation.z, step.transform.rotation.w = math.sin(half), math.cos(half)
-        steps.append(step)
-    robot.publish(tf_message(transforms=steps))
+    heard = bench.listen(tf_message, '/tf_static', latched=True)
+    publish_static(bench.node, *(
+        (parent, child, (0.0, 0.0, math.sin(half), math.cos(half)))
+        for parent, child, half in (('base_link', 'mast', 0.3), ('mast', 'imu_link', 0.2))))
     path = stored()
     bench.calibrator(calibration_file=path, base_frame='base_link', publish_tf=True)
     reading = np.array([1.0, 2.0, 9.5])
     bench.exchange(bench.came_out, lambda: bench.imu(reading))
     expected = rotation_from_rpy(0.0, 0.0, 1.0) @ read_calibration(path).correct(reading[None])[0]
 
-    def turned() -> bool:
-        bench.send(bench.imu(reading))
-        return bool(np.allclose(force_of(bench.came_out[-1]), expected, atol=1e-6)
-                    if bench.came_out else False)
+    def levelled() -> Any:
+        return [each for message in heard for each in message.transforms
+                if each.child_frame_id == 'imu_link_levelled']
 
-    bench.spin(turned)
-    bench.spin(lambda: any(each.child_frame_id == 'imu_link_levelled'
-                           for message in heard for each in message.transforms))
-    found = next(each for message in heard for each in message.transforms
-                 if each.child_frame_id == 'imu_link_levelled')
+    bench.spin(lambda: bench.send(bench.imu(reading)) or np.allclose(
+        force_of(bench.came_out[-1]), expected, atol=1e-6))
+    bench.spin(levelled)
+    found = levelled()[0]
     assert found.header.frame_id == 'imu_link'
     # It undoes the mounting: the levelled frame is parallel to the base.
     assert found.transform.rotation.z == pytest.approx(-math.sin(0.5))
@@ -113,21 +88,26 @@ def test_two_publishers_on_the_topic_are_named(bench: Any) -> None:
     assert status(diagnostics, 'stream').level == DiagnosticStatus.WARN
 
 
-def test_an_incompatible_qos_is_named_with_both_nodes_and_what_to_do(bench: Any) -> None:
+def test_the_qos_can_be_overridden_and_an_incompatible_one_is_named_with_what_to_do(
+        bench: Any) -> None:
     diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
-    node = bench.run(*CALIBRATOR, '--ros-args', '-p',
-                     'qos_overrides./imu/data_raw.subscription.reliability:=reliable')
+    node = bench.run(
+        *CALIBRATOR, '--ros-args',
+        '-p', 'qos_overrides./imu/data_raw.subscription.reliability:=reliable',
+        '-p', 'qos_overrides./imu/data_calibrated.publisher.reliability:=best_effort')
     bench.client('self_test')
     bench.spin(lambda: diagnostics)
     best_effort = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
-    latched = QoSProfile(depth=5, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    latched = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT,
+                         durability=DurabilityPolicy.TRANSIENT_LOCAL)
     bench.node.create_publisher(Imu, 'imu/data_raw', best_effort)
-    heard: list[Imu] = []
-    bench.node.create_subscription(Imu, 'imu/data_calibrated', heard.append, latched)
+    bench.node.create_subscription(Imu, 'imu/data_calibrated', print, latched)
     wanted = ('/bench publishes on /imu/data_raw with the QoS best effort, but the subscriber '
               'expects reliable', '/imu/data_calibrated has the QoS volatile, but the subscriber '
               'expects transient local, so that /bench receives nothing')
     bench.spin(lambda: all(words in diagnostics[-1].status[0].message for words in wanted))
+    info, = bench.node.get_publishers_info_by_topic('/imu/data_calibrated')
+    assert info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
     status, printed = bench.end(node, signal.SIGTERM)
     assert status == 0, printed
     assert all(printed.count(words) == 1 for words in wanted)
@@ -177,14 +157,15 @@ def test_the_diagnostics_have_the_true_rate_and_the_resolved_names(
     assert set(found) == {f'left/calibrator: {concern}' for concern in (
         'state', 'stream', 'calibration', 'drift', 'storage')}
     assert {each.hardware_id for each in found.values()} == {'imu_link'}
-    assert values(found['left/calibrator: state'])['rate [Hz]']
+    assert 'rate [Hz]' in {each.key for each in found['left/calibrator: state'].values}
     assert bench.end(process, signal.SIGINT)[0] == 0
 
 
-def test_the_log_says_what_the_node_waits_for_and_the_unit_that_is_likely(bench: Any) -> None:
+def test_the_log_says_what_the_node_waits_for_the_likely_unit_and_what_it_does_not_know(
+        bench: Any) -> None:
     from rcl_interfaces.msg import Log
     lines = bench.listen(Log, '/rosout', latched=True)
-    process = bench.calibrator()
+    process = bench.calibrator(unit='g')
     bench.spin(lambda: any('although /bench publishes' in line.msg for line in lines))
 
     def said() -> bool:
@@ -196,6 +177,7 @@ def test_the_log_says_what_the_node_waits_for_and_the_unit_that_is_likely(bench:
     assert 'waiting: no Imu messages on /imu/data_raw, although /bench publishes' in printed
     assert 'Imu messages arrive on /imu/data_raw' in printed
     assert 'start the node with units:=g' in printed
+    assert 'there is no parameter unit, expected ' in printed
 
 
 def test_topics_of_imus_and_thermometers_that_exist_are_named(bench: Any) -> None:
@@ -282,13 +264,6 @@ def test_a_fit_waits_for_confirmation_on_the_preview(bench: Any, readings: Readi
 # Start and end
 
 
-def test_a_parameter_that_does_not_exist_is_named(bench: Any) -> None:
-    diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
-    process = bench.start('calibrator', unit='g')
-    bench.spin(lambda: diagnostics)
-    assert 'there is no parameter unit, ' in bench.end(process, signal.SIGINT)[1]
-
-
 def test_a_signal_at_any_time_of_the_start_ends_the_node_without_a_traceback(bench: Any) -> None:
     for regions in sample((20, 100, 250, 400, 600, 800, 1000), 3):  # 1300 after the start
         process = bench.start('calibrator')
@@ -340,15 +315,4 @@ def test_the_managed_node_loads_on_configure_and_publishes_when_active(
         bench.go(Transition.TRANSITION_CLEANUP)
         state = bench.ask(GetState, 'calibrator/get_state').current_state
         assert state.label == 'unconfigured'
-    assert bench.end(process, signal.SIGINT)[0] == 0
-
-
-def test_the_quality_of_service_can_be_overridden(bench: Any, stored: Stored) -> None:
-    process = bench.run(
-        *CALIBRATOR, '--ros-args',
-        '-p', f'calibration_file:={stored()}', '-p',
-        'qos_overrides./imu/data_calibrated.publisher.reliability:=best_effort')
-    bench.spin(lambda: bench.node.get_publishers_info_by_topic('/imu/data_calibrated'))
-    info = bench.node.get_publishers_info_by_topic('/imu/data_calibrated')[0]
-    assert info.qos_profile.reliability.name == 'BEST_EFFORT'
     assert bench.end(process, signal.SIGINT)[0] == 0
