@@ -362,21 +362,16 @@ def test_a_browser_without_a_voice_says_so(idle: LivePage, viewers: Viewers) -> 
     expect(button(page, 'Speech')).to_have_attribute('aria-pressed', 'false')
 
 
-def test_a_browser_without_speech_and_wake_lock_shows_the_page(
-        idle: LivePage, viewers: Viewers) -> None:
-    page = viewers.visit(idle.link, script="""
-      delete window.speechSynthesis;
-      delete Navigator.prototype.wakeLock;
-    """)
-    assert not page.evaluate('"speechSynthesis" in window || "wakeLock" in navigator')
-    expect(button(page, 'Speech')).to_be_hidden()
-    expect(page.locator('#next')).to_have_text(re.compile(' up$'))
-
-
-def test_the_page_is_served_over_ipv6(tmp_path: Path, viewers: Viewers) -> None:
+def test_a_browser_without_speech_and_wake_lock_shows_the_page_over_ipv6(
+        tmp_path: Path, viewers: Viewers) -> None:
     with live_page(tmp_path, web_host='::1') as live:
         assert live.link.startswith('http://[::1]:')
-        page = viewers.visit(live.link)
+        page = viewers.visit(live.link, script="""
+          delete window.speechSynthesis;
+          delete Navigator.prototype.wakeLock;
+        """)
+        assert not page.evaluate('"speechSynthesis" in window || "wakeLock" in navigator')
+        expect(button(page, 'Speech')).to_be_hidden()
         expect(page.locator('#next')).to_have_text(re.compile(' up$'))
         viewers.close()
 

@@ -27,16 +27,9 @@ from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool, String
 
 GRAVITY = 9.80665
-NODE = 'calibrator'
 
 Readings = Callable[..., Any]
 Stored = Callable[..., Path]
-
-
-def status(diagnostics: list[DiagnosticArray], concern: str = '') -> DiagnosticStatus:
-    """Return the last status of a concern; without a concern, that of the state."""
-    name = f'{NODE}: {concern or "state"}'
-    return next(each for each in diagnostics[-1].status if each.name == name)
 
 
 def force_of(message: Imu) -> Any:
@@ -60,7 +53,7 @@ def test_the_mounting_comes_from_the_static_transforms_and_is_published(
         return [each for message in heard for each in message.transforms
                 if each.child_frame_id == 'imu_link_levelled']
 
-    bench.spin(lambda: bench.send(bench.imu(reading)) or np.allclose(
+    bench.send_until(lambda: bench.imu(reading), lambda: np.allclose(
         force_of(bench.came_out[-1]), expected, atol=1e-6))
     bench.spin(levelled)
     found = levelled()[0]
@@ -78,14 +71,14 @@ def test_two_publishers_on_the_topic_are_named(bench: Any) -> None:
     bench.calibrator(passthrough=True)
     bench.start('simulator')
 
-    def said() -> bool:
-        bench.send(bench.imu([0.1, 0.2, 9.8]))
-        found = status(diagnostics, 'stream').message if diagnostics else ''
-        return all(words in found for words in (
-            'two publishers on the topic /imu/data_raw', '/bench', '/simulator'))
+    def stream() -> DiagnosticStatus:
+        return next((each for message in diagnostics[-1:] for each in message.status
+                     if each.name == 'calibrator: stream'), DiagnosticStatus())
 
-    bench.spin(said)
-    assert status(diagnostics, 'stream').level == DiagnosticStatus.WARN
+    bench.send_until(lambda: bench.imu([0.1, 0.2, 9.8]), lambda: all(
+        words in stream().message for words in (
+            'two publishers on the topic /imu/data_raw', '/bench', '/simulator')))
+    assert stream().level == DiagnosticStatus.WARN
 
 
 def test_the_qos_can_be_overridden_and_an_incompatible_one_is_named_with_what_to_do(
@@ -122,11 +115,8 @@ def test_every_qos_of_a_driver_fits_and_is_not_reported(bench: Any, publisher: Q
     bench.client('self_test')
     driver = bench.node.create_publisher(Imu, 'imu/data_raw', publisher)
 
-    def arrived() -> bool:
-        driver.publish(bench.imu([0.0, 0.0, GRAVITY]))
-        return bool(diagnostics) and 'no calibration yet' in diagnostics[-1].status[0].message
-
-    bench.spin(arrived)
+    bench.spin(lambda: driver.publish(bench.imu([0.0, 0.0, GRAVITY])) or (
+        diagnostics and 'no calibration yet' in diagnostics[-1].status[0].message))
     assert 'QoS' not in bench.end(node, signal.SIGTERM)[1]
 
 
@@ -168,11 +158,8 @@ def test_the_log_says_what_the_node_waits_for_the_likely_unit_and_what_it_does_n
     process = bench.calibrator(unit='g')
     bench.spin(lambda: any('although /bench publishes' in line.msg for line in lines))
 
-    def said() -> bool:
-        bench.send(bench.imu([0.0, 0.1, 1.0]))
-        return any('start the node with units:=g' in line.msg for line in lines)
-
-    bench.spin(said)
+    bench.send_until(lambda: bench.imu([0.0, 0.1, 1.0]), lambda: any(
+        'start the node with units:=g' in line.msg for line in lines))
     printed = bench.end(process, signal.SIGINT)[1]
     assert 'waiting: no Imu messages on /imu/data_raw, although /bench publishes' in printed
     assert 'Imu messages arrive on /imu/data_raw' in printed
@@ -194,11 +181,8 @@ def test_topics_of_imus_and_thermometers_that_exist_are_named(bench: Any) -> Non
     bench.spin(lambda: said('no Imu messages on /elsewhere', 'such as /arm/imu'))
     bench.calibrator()
 
-    def named() -> bool:
-        bench.send(bench.imu([0.1, 0.2, 9.8]))
-        return said('no temperature arrives', 'temperature:=/board/temperature')
-
-    bench.spin(named)
+    bench.send_until(lambda: bench.imu([0.1, 0.2, 9.8]), lambda: said(
+        'no temperature arrives', 'temperature:=/board/temperature'))
 
 
 def test_one_rest_gives_gyro_bias_mounting_and_the_offset_along_gravity(bench: Any) -> None:
@@ -221,8 +205,7 @@ def test_one_rest_gives_gyro_bias_mounting_and_the_offset_along_gravity(bench: A
     found = read_calibration(bench.home / 'accel_calib' / 'arm.yaml')
     np.testing.assert_allclose(found.gyro.bias, bias, atol=5 * found.gyro.sd.max() + 1e-4)
     bench.exchange(bench.came_out, make)
-    bench.spin(lambda: bench.came_out[-1].header.frame_id == 'imu_link_levelled' or bench.send(
-        make()))
+    bench.send_until(make, lambda: bench.came_out[-1].header.frame_id == 'imu_link_levelled')
     got = bench.echo((make() for _ in range(40)), bench.came_out)
     rates = np.array([[m.angular_velocity.x, m.angular_velocity.y, m.angular_velocity.z]
                       for m in got])
@@ -256,9 +239,8 @@ def test_a_fit_waits_for_confirmation_on_the_preview(bench: Any, readings: Readi
     bench.spin(lambda: results and json.loads(results[-1].data)['in_use'])
     np.testing.assert_allclose(json.loads(results[-1].data)['offset'],
                                read_calibration(path).offset, atol=1e-9)
-    bench.exchange(bench.came_out, lambda: bench.imu([0.3, 0.4, 9.7]))
-    bench.spin(lambda: np.linalg.norm(force_of(bench.came_out[-1]) - [0.3, 0.4, 9.7]) > 0.05
-               or bench.send(bench.imu([0.3, 0.4, 9.7])))
+    bench.send_until(lambda: bench.imu([0.3, 0.4, 9.7]), lambda: np.linalg.norm(
+        force_of(bench.came_out[-1]) - [0.3, 0.4, 9.7]) > 0.05)
 
 
 # Start and end

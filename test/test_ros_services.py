@@ -67,12 +67,9 @@ def test_poses_are_captured_and_removed_on_request(bench: Any, readings: Reading
     asked = markers[-1].markers[-1].text
     assert answer.message.endswith(asked)
 
-    def reported() -> bool:
-        bench.send(bench.imu(poses[130]))
-        return bool(diagnostics) and any(value.key == 'next' and value.value == asked
-                                         for value in diagnostics[-1].status[0].values)
-
-    bench.spin(reported)
+    bench.send_until(lambda: bench.imu(poses[130]), lambda: diagnostics and any(
+        value.key == 'next' and value.value == asked
+        for value in diagnostics[-1].status[0].values))
     bench.feed(poses[140:165])
     bench.spin(lambda: not still[-1].data)
     rng = np.random.default_rng(1)
@@ -108,11 +105,7 @@ def test_self_test_names_what_fails(bench: Any, stored: Stored) -> None:
     bench.exchange(corrected, moving)
     diagnostics.clear()
 
-    def running() -> bool:
-        bench.send(moving())
-        return len(diagnostics) > 1
-
-    bench.spin(running)
+    bench.send_until(moving, lambda: len(diagnostics) > 1)
     answer = bench.call('self_test')
     assert answer.passed == b'\x01', [status.message for status in answer.status]
     assert answer.id == 'imu_link'
