@@ -18,15 +18,15 @@ import os
 from pathlib import Path
 import re
 import shutil
-from threading import Event, Thread
 import time
 
-from accel_calib.session import CalibratorSettings, Log
+from accel_calib.session import Log
 from accel_calib.table import Floats
 from inside import Host, model_with, predict, unit
 import numpy as np
 from playwright.sync_api import Browser, expect, Page, Playwright
 import pytest
+from viewer import hosted
 
 GRAVITY = 9.80665
 TRUTH = {'offset': (0.03, -0.02, 0.04), 'axis_gain': (0.01, -0.02, 0.005)}
@@ -155,17 +155,9 @@ def asked_on(page: Page) -> Floats | None:
 def live_page(folder: Path, *, speed: float = 20.0, name: str = 'imu_link', file: str = 'imu.yaml',
               web_host: str = '127.0.0.1') -> Iterator[LivePage]:
     """Serve the page of a simulated sensor; the calibration is stored in this folder."""
-    sensor, lines, over = TurnedSensor(speed, name), list[Log](), Event()
-    host = Host(sensor, CalibratorSettings(calibration_file=str(folder / file),
-                                           web_host=web_host), lines.append)
-    thread = Thread(target=host.run, args=(over.is_set,), name='host')
-    thread.start()
-    try:
+    sensor = TurnedSensor(speed, name)
+    with hosted(sensor, calibration_file=str(folder / file), web_host=web_host) as (host, lines):
         yield LivePage(sensor, host, lines)
-    finally:
-        over.set()
-        thread.join()
-        host.close()
 
 
 def chromium(playwright: Playwright) -> Browser:

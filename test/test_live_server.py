@@ -6,17 +6,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import closing, ExitStack, suppress
+from contextlib import ExitStack, suppress
 from functools import partial
 import json
 from pathlib import Path
 import re
 import socket
 import sys
-from threading import Event, Thread
+from threading import Event
 import time
 from types import SimpleNamespace
-from typing import Any
 
 from accel_calib.errors import InputError
 from accel_calib.session import CalibratorSettings, Log
@@ -27,7 +26,7 @@ from inside import (
     PERIOD_OF_A_COMPLAINT, qr_code, reachable, simulate_recording, spread_directions, STUCK)
 import numpy as np
 import pytest
-from viewer import fetch, Viewer, wait
+from viewer import fetch, hosted, Viewer, wait
 
 GRAVITY = 9.80665
 OFFSET = (0.03, -0.02, 0.04)
@@ -55,28 +54,23 @@ def played(rows: Floats, over: Event) -> Iterator[Floats]:
 
 
 class Bench:
-    """A host that runs in a thread; `played` is set when its source has ended."""
+    """A host with a source of samples, and viewers; `played` is set when the source has ended."""
 
-    def __init__(self, folder: Path, poses: int = 1,
+    def __init__(self, stack: ExitStack, folder: Path, poses: int = 1,
                  blocks: Callable[[Floats, Event], Iterator[Floats]] = played) -> None:
-        self.logged: list[Log] = []
-        self.path, self.played = folder / 'c.yaml', Event()
-        rows = rows_of(spread_directions(poses))
-        source: Any = SimpleNamespace(name='bench.csv', sensor='imu_link', problem=str,
-                                      blocks=blocks(rows, self.played))
-        self.host = Host(source, CalibratorSettings(calibration_file=str(self.path)),
-                         self.logged.append)
+        self._stack, self.path, self.played = stack, folder / 'c.yaml', Event()
+        source = SimpleNamespace(name='bench.csv', sensor='imu_link', problem=str,
+                                 blocks=blocks(rows_of(spread_directions(poses)), self.played))
+        self.host, self.logged = stack.enter_context(
+            hosted(source, calibration_file=str(self.path)))
         self.base = self.host.server.link.partition('/#')[0]
         self.port = int(self.base.rpartition(':')[2])
-        self._over = Event()
-        self._thread = Thread(target=self.host.run, args=[self._over.is_set])
-        self._viewers: list[Viewer] = []
-        self._thread.start()
 
     def viewer(self, *, token: str | None = None, seen: int = 0) -> Viewer:
         link = self.host.server.link if token is None else f'{self.base}/#{token}'
-        self._viewers.append(Viewer(link, seen=seen))
-        return self._viewers[-1]
+        viewer = Viewer(link, seen=seen)
+        self._stack.callback(viewer.close)
+        return viewer
 
     def sent(self, request: str | bytes) -> bytes:
         """Send a request, and return all that is answered until the connection ends."""
@@ -93,33 +87,26 @@ class Bench:
         client.sendall(request.encode() if isinstance(request, str) else request)
         return client
 
-    def close(self) -> None:
-        self.played.set()
-        self._over.set()
-        self._thread.join()
-        self.host.close()
-        for viewer in self._viewers:
-            viewer.close()
-
 
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[Bench]:
     """Yield a host with a short recording."""
-    with closing(Bench(tmp_path, 3)) as made:
-        yield made
+    with ExitStack() as stack:
+        yield Bench(stack, tmp_path, 3)
 
 
 @pytest.fixture(scope='module')
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     """Yield a host for requests that do not change its session."""
-    with closing(Bench(tmp_path_factory.mktemp('shared'))) as made:
-        yield made
+    with ExitStack() as stack:
+        yield Bench(stack, tmp_path_factory.mktemp('shared'))
 
 
 @pytest.fixture
 def turned(tmp_path: Path) -> Iterator[Bench]:
     """Yield a host whose recording has been played, with poses for a fit."""
-    with closing(Bench(tmp_path, 14)) as made:
+    with ExitStack() as stack:
+        made = Bench(stack, tmp_path, 14)
         assert made.played.wait(60.0)
         yield made
 
@@ -456,7 +443,8 @@ def test_a_source_that_fails_is_reported_and_the_page_continues(tmp_path: Path) 
         yield rows[:40]
         raise InputError('the port has ended', 'connect the sensor again')
 
-    with closing(Bench(tmp_path, blocks=broken)) as bench:
+    with ExitStack() as stack:
+        bench = Bench(stack, tmp_path, blocks=broken)
         viewer = bench.viewer()
         wait(lambda: any('the port has ended' in line['words'] for line in viewer.of('log')))
         wait(lambda: 'the port has ended' in viewer.state['problem'])
@@ -473,7 +461,8 @@ def test_a_board_that_falls_silent_is_reported_until_it_sends_again(tmp_path: Pa
             time.sleep(PAUSE)
             yield row[np.newaxis]
 
-    with closing(Bench(tmp_path, blocks=interrupted)) as bench:
+    with ExitStack() as stack:
+        bench = Bench(stack, tmp_path, blocks=interrupted)
         viewer = bench.viewer()
         wait(lambda: 'bench.csv sends no samples' in viewer.state['problem'])
         assert 'publisher' not in viewer.state['problem']

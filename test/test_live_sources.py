@@ -212,7 +212,7 @@ def live(*arguments: str) -> Iterator[tuple[str, list[str], subprocess.Popen[str
     """Run the command, and yield the link of its page, its lines, and the process."""
     lines: list[str] = []
     with (tempfile.TemporaryDirectory() as home,
-          subprocess.Popen([*LIVE, *arguments], stdout=subprocess.PIPE, text=True,
+          subprocess.Popen([*LIVE, *arguments], stdout=subprocess.PIPE, text=True, umask=0,
                            env={**os.environ, 'ROS_HOME': home}) as process):
         try:
             for line in process.stdout or ():
@@ -268,11 +268,15 @@ def flat(folder: Path) -> Path:
     return path
 
 
-def test_idle_connections_do_not_keep_the_owner_out(tmp_path: Path) -> None:
+def test_only_its_owner_has_the_link_and_idle_connections_do_not_keep_it_out(
+        tmp_path: Path) -> None:
     most = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (max(2000, most[0]), most[1]))
-    with (live(str(flat(tmp_path)), '-o', str(tmp_path / 'c.yaml')) as (link, _, run),
+    with (live(str(flat(tmp_path)), '-o', str(tmp_path / 'c.yaml')) as (link, lines, run),
           ExitStack() as idle):
+        file, token = Path(lines[-1].rpartition(' is in ')[2]), link.partition('#')[2]
+        assert (stat.S_IMODE(file.stat().st_mode), len(token)) == (0o600, 22)
+        assert token not in '\n'.join(lines)
         resource.prlimit(run.pid, resource.RLIMIT_NOFILE, (1024, 1024))
         at = urlsplit(link)
         for _ in range(1100):
@@ -288,24 +292,10 @@ def test_idle_connections_do_not_keep_the_owner_out(tmp_path: Path) -> None:
         run.send_signal(signal.SIGINT)
         printed = run.communicate(timeout=PATIENCE)[0].splitlines()
         assert run.returncode == 0
+        assert not file.exists()
     assert sum('ended a connection' in line for line in printed) == 1
     assert len(printed) < 20
     resource.setrlimit(resource.RLIMIT_NOFILE, most)
-
-
-def test_the_link_with_the_token_is_only_in_a_file_of_its_owner(tmp_path: Path) -> None:
-    before = os.umask(0)
-    try:
-        with live(str(flat(tmp_path)), '-o', str(tmp_path / 'c.yaml')) as (link, lines, run):
-            file = Path(lines[-1].rpartition(' is in ')[2])
-            assert stat.S_IMODE(file.stat().st_mode) == 0o600
-            assert len(link.partition('#')[2]) == 22
-            assert link.partition('#')[2] not in '\n'.join(lines)
-            run.send_signal(signal.SIGINT)
-            assert run.wait(PATIENCE) == 0
-            assert not file.exists()
-    finally:
-        os.umask(before)
 
 
 def test_without_a_folder_for_the_link_the_page_only_shows(
