@@ -18,7 +18,7 @@ import time
 from types import SimpleNamespace
 
 from accel_calib.errors import InputError
-from accel_calib.session import CalibratorSettings, Log
+from accel_calib.session import CalibratorSettings
 from accel_calib.table import Floats
 from inside import (
     CALIBRATION_ALONE, Host, LARGEST_LIVE_MESSAGE, LIVE_COMMANDS, live_log, LIVE_PERIOD, main,
