@@ -85,9 +85,6 @@ _PATIENCE = 120.0
 _LOOK_EVERY = 0.05
 """Interval at which conditions are checked [s]."""
 
-Spin = Callable[[Callable[[], bool], str], None]
-"""Function that spins until a condition is true; the text names the condition in errors."""
-
 Rest = dict[str, Floats]
 """Means of raw, corrected and true acceleration over a rest [g], (3,) arrays."""
 
@@ -134,13 +131,17 @@ class Outcome:
 
 
 class User(Node):
-    """A node that receives the messages of both nodes, and calls their services."""
+    """A node that receives the messages of both nodes, and calls their services step by step."""
 
-    def __init__(self) -> None:
+    def __init__(self, processes: Sequence[subprocess.Popen[bytes]],
+                 report: Callable[[str], None]) -> None:
         super().__init__('demo')
-        self.temperature = float('nan')
-        self.poses = np.zeros((0, 3))
-        self.messages: dict[str, dict[int, tuple[float, float, float]]] = {
+        self._processes, self._report = processes, report
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self)
+        self._temperature = float('nan')
+        self._poses = np.zeros((0, 3))
+        self._messages: dict[str, dict[int, tuple[float, float, float]]] = {
             'raw': {}, 'corrected': {}, 'truth': {}}
         self.create_subscription(MarkerArray, 'calibrator/poses', self._on_poses, LATCHED)
         self.create_subscription(Temperature, 'temperature', self._on_temperature, SENSOR)
@@ -149,17 +150,17 @@ class User(Node):
                                   ('truth', 'simulator/truth', Vector3Stamped)):
             self.create_subscription(kind, topic, self._keeper(name), SENSOR)
         # Made once: DDS drops an answer to a client that the node has not discovered yet.
-        self.triggers = {name: self.create_client(Trigger, name) for name in _SERVICES}
+        self._triggers = {name: self.create_client(Trigger, name) for name in _SERVICES}
 
     def _on_poses(self, markers: MarkerArray) -> None:
         at = [marker.pose.position for marker in markers.markers if marker.ns == 'poses']
-        self.poses = np.array([[point.x, point.y, point.z] for point in at]).reshape(-1, 3)
+        self._poses = np.array([[point.x, point.y, point.z] for point in at]).reshape(-1, 3)
 
     def _on_temperature(self, message: Temperature) -> None:
-        self.temperature = message.temperature
+        self._temperature = message.temperature
 
     def _keeper(self, name: str) -> Callable[[Any], None]:
-        kept = self.messages[name]
+        kept = self._messages[name]
 
         def keep(message: Any) -> None:
             stamp = message.header.stamp
@@ -168,56 +169,48 @@ class User(Node):
 
         return keep
 
-    def forget(self) -> None:
-        """Forget the messages so far."""
-        for kept in self.messages.values():
-            kept.clear()
-
     @property
-    def up(self) -> tuple[float, ...]:
+    def _up(self) -> tuple[float, ...]:
         """Return the newest truth [m/s²]; empty before the first one."""
-        truth = self.messages['truth']
+        truth = self._messages['truth']
         return truth[max(truth)] if truth else ()
 
-    def rest(self, *names: str) -> list[Rest]:
+    def _rest(self, *names: str) -> list[Rest]:
         """Return the messages of these kinds in the ongoing rest, oldest first [g]."""
-        truth = self.messages['truth']
-        common = sorted(set.intersection(*(set(self.messages[name]) for name in names)))
-        moving = next((k for k in range(len(common), 0, -1) if truth[common[k - 1]] != self.up), 0)
-        return [{name: np.array(self.messages[name][stamp]) / STANDARD_GRAVITY for name in names}
+        truth = self._messages['truth']
+        common = sorted(set.intersection(*(set(self._messages[name]) for name in names)))
+        moving = next((k for k in range(len(common), 0, -1) if truth[common[k - 1]] != self._up),
+                      0)
+        return [{name: np.array(self._messages[name][stamp]) / STANDARD_GRAVITY for name in names}
                 for stamp in common[moving:]]
 
-    def has_captured(self) -> bool:
+    def _has_captured(self) -> bool:
         """Return whether there is a pose in the direction of the ongoing rest."""
-        rest = self.rest('raw', 'truth')
+        rest = self._rest('raw', 'truth')
         if not rest:
             return False
         up = np.mean([each['raw'] for each in rest], axis=0)
-        return bool(np.any(self.poses @ up > _SAME_POSE * np.linalg.norm(up)))
+        return bool(np.any(self._poses @ up > _SAME_POSE * np.linalg.norm(up)))
 
-
-class Demonstration:
-    """The steps of a user, each reported in a line."""
-
-    def __init__(self, user: User, spin: Spin, report: Callable[[str], None]) -> None:
-        self._user, self._spin, self._report = user, spin, report
+    def _has_rested(self, count: int) -> bool:
+        return len(self._rest('raw', 'truth')) >= count
 
     def turn(self, service: str = 'next') -> None:
         """Turn the sensor, and wait until it rests."""
-        user = self._user
-        self._spin(lambda: bool(user.up), 'a message of the simulator')
-        before = user.up
+        self._spin(lambda: bool(self._up), 'a message of the simulator')
+        before = self._up
         self.call(f'simulator/{service}')
-        user.forget()
-        self._spin(lambda: user.up not in ((), before)
-                   and len(user.rest('truth')) >= _SETTLED, 'rest of the simulated sensor')
+        for kept in self._messages.values():
+            kept.clear()
+        self._spin(lambda: self._up not in ((), before)
+                   and len(self._rest('truth')) >= _SETTLED, 'rest of the simulated sensor')
 
     def capture(self, count: int) -> None:
         """Let the calibrator capture this number of poses."""
         for done in range(1, count + 1):
             if done > 1:
                 self.turn()
-            self._spin(self._user.has_captured, f'pose {done}')
+            self._spin(self._has_captured, f'pose {done}')
             if done % 4 == 0:
                 self._report(f'captured {done} poses')
 
@@ -226,21 +219,15 @@ class Demonstration:
         rests = []
         for done in range(1, count + 1):
             self.turn()
-            self._spin(lambda: len(self._common()) >= _SAMPLES and self._user.has_captured(),
-                       f'rest {done}')
-            samples = self._common()
+            self._spin(lambda: len(self._rest('raw', 'corrected', 'truth')) >= _SAMPLES
+                       and self._has_captured(), f'rest {done}')
+            samples = self._rest('raw', 'corrected', 'truth')
             rests.append({name: np.mean([each[name] for each in samples], axis=0)
                           for name in samples[0]})
             error = np.linalg.norm(rests[-1]['corrected'] - rests[-1]['truth']) * MG
-            self._report(f'  rest {done:2d} of {count}, now {self._user.temperature:.1f} °C: '
+            self._report(f'  rest {done:2d} of {count}, now {self._temperature:.1f} °C: '
                          f'imu/data_calibrated is {error:5.2f} mg from the truth')
         return rests
-
-    def _common(self) -> list[Rest]:
-        return self._user.rest('raw', 'corrected', 'truth')
-
-    def _has_rested(self, count: int) -> bool:
-        return len(self._user.rest('raw', 'truth')) >= count
 
     def level(self) -> str:
         """Put the robot flat, and call ``~/set_level`` as soon as the rest is long enough."""
@@ -260,11 +247,29 @@ class Demonstration:
         return str(answer.message)
 
     def _request(self, service: str) -> Trigger.Response:
-        client = self._user.triggers[service]
+        client = self._triggers[service]
         self._spin(client.service_is_ready, f'the service {service}')
         future = client.call_async(Trigger.Request())
         self._spin(future.done, f'the answer of {service}')
         return future.result()
+
+    def _spin(self, until: Callable[[], bool], what: str) -> None:
+        """Spin until a condition is true; the text names the condition in errors."""
+        ends = time.monotonic() + _PATIENCE
+        while not until():
+            _check_running(self._processes)
+            if time.monotonic() > ends:
+                raise AccelCalibError(f'{what}: not available within {_PATIENCE:.0f} s, '
+                                      f'{counted(len(self._poses), "pose")} so far',
+                                      'check whether a firewall blocks DDS on this machine')
+            look_again = time.monotonic() + _LOOK_EVERY
+            while time.monotonic() < look_again:
+                self._executor.spin_once(timeout_sec=_LOOK_EVERY)
+
+    def close(self) -> None:
+        """Leave DDS."""
+        self._executor.shutdown()
+        self.destroy_node()
 
 
 def _refused(service: str, answer: Trigger.Response) -> AccelCalibError:
@@ -286,8 +291,7 @@ def demonstrate(report: Callable[[str], None], hidden: str = '') -> Outcome:
     simulated = {**_HELD, 'effects': [*_EFFECTS, *([hidden] if hidden else [])]}
     with (_isolated() as folder, running('node', _NODE) as node,
           running('simulator', simulated) as simulator,
-          user_of([node, simulator]) as (user, spin)):
-        demo = Demonstration(user, spin, report)
+          user_of([node, simulator], report) as demo):
         demo.capture(_POSES_HIDDEN if hidden else _POSES)
         report(f'~/fit: {demo.call("calibrator/fit")}')
         report(f'~/set_level: {demo.level()}')
@@ -301,7 +305,7 @@ def demonstrate(report: Callable[[str], None], hidden: str = '') -> Outcome:
                        parse_effect(hidden)[0], found, lag_s)
 
 
-def _refined(demo: Demonstration, report: Callable[[str], None], stored: Path
+def _refined(demo: User, report: Callable[[str], None], stored: Path
              ) -> tuple[tuple[str, ...], float]:
     """Refine and level; return the effects that are new in the stored model, and their lag [s]."""
     fitted = read_calibration(stored).model
@@ -376,30 +380,15 @@ def _in_yaml(value: Any) -> str:
 
 
 @contextmanager
-def user_of(processes: Sequence[subprocess.Popen[bytes]]) -> Iterator[tuple[User, Spin]]:
-    """Yield the user of the nodes, and a function that spins until a condition is true."""
+def user_of(processes: Sequence[subprocess.Popen[bytes]], report: Callable[[str], None]
+            ) -> Iterator[User]:
+    """Yield the user of the nodes."""
     rclpy.init(args=[])
-    user = User()
-    executor = SingleThreadedExecutor()
-    executor.add_node(user)
-
-    def spin(until: Callable[[], bool], what: str) -> None:
-        ends = time.monotonic() + _PATIENCE
-        while not until():
-            _check_running(processes)
-            if time.monotonic() > ends:
-                raise AccelCalibError(f'{what}: not available within {_PATIENCE:.0f} s, '
-                                      f'{counted(len(user.poses), "pose")} so far',
-                                      'check whether a firewall blocks DDS on this machine')
-            look_again = time.monotonic() + _LOOK_EVERY
-            while time.monotonic() < look_again:
-                executor.spin_once(timeout_sec=_LOOK_EVERY)
-
+    user = User(processes, report)
     try:
-        yield user, spin
+        yield user
     finally:
-        executor.shutdown()
-        user.destroy_node()
+        user.close()
         rclpy.try_shutdown()
 
 
