@@ -151,6 +151,10 @@ class Bench:
             while time.monotonic() < look_again:
                 self._executor.spin_once(timeout_sec=0.02)
 
+    def send_until(self, make: Callable[[], Any], until: Callable[[], Any]) -> None:
+        """Publish one Imu after the other until a condition holds."""
+        self.spin(lambda: self.send(make()) or until())
+
     def listen(self, kind: Any, topic: str, *, latched: bool = False) -> list[Any]:
         """Return a list to which the messages of a topic are added."""
         from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -269,12 +273,7 @@ class Bench:
     def exchange(self, heard: list[Any], make: Callable[[], Any]) -> Any:
         """Publish messages of `make` until there is output, and return the first output."""
         heard.clear()
-
-        def sent() -> bool:
-            self.send(make())
-            return bool(heard)
-
-        self.spin(sent)
+        self.send_until(make, lambda: heard)
         return heard[0]
 
     def close(self) -> None:

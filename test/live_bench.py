@@ -10,22 +10,23 @@ The person knows only what the page shows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 import math
 import os
 from pathlib import Path
 import re
 import shutil
-from threading import Event, Thread
 import time
 
-from accel_calib.session import CalibratorSettings, Log
+from accel_calib.session import Log
 from accel_calib.table import Floats
 from inside import Host, model_with, predict, unit
 import numpy as np
 from playwright.sync_api import Browser, expect, Page, Playwright
 import pytest
+from viewer import hosted
 
 GRAVITY = 9.80665
 TRUTH = {'offset': (0.03, -0.02, 0.04), 'axis_gain': (0.01, -0.02, 0.005)}
@@ -50,12 +51,8 @@ class TurnedSensor:
     """
     A sensor that is turned by hand; it is the source of a host.
 
-    Parameters
-    ----------
-    speed : float
-        Speed of its time until it has been at rest for a pose; later it is 1.
-    sensor : str
-        Its name.
+    `speed` is that of its time until it has been at rest for a pose; later it is 1. `up` points up
+    in the last pose.
 
     """
 
@@ -67,19 +64,14 @@ class TurnedSensor:
         self.silent = False
         self._model = model_with(TRUTH)
         self._rng = np.random.default_rng(5)
-        self._start = self._end = np.array([0.0, 0.0, 1.0])
+        self._start = self.up = np.array([0.0, 0.0, 1.0])
         self._since, self._stamp = math.inf, 0.0
 
     def turn_to(self, direction: Floats) -> None:
         """Turn the sensor so that about this direction points up."""
         self._start = self._forces(np.array([self._stamp]))[0]
         shaky = np.asarray(direction) + 0.03 * self._rng.normal(size=3)
-        self._end, self._since = unit(shaky[np.newaxis])[0], self._stamp
-
-    @property
-    def up(self) -> Floats:
-        """Direction that points up in the last pose."""
-        return self._end
+        self.up, self._since = unit(shaky[np.newaxis])[0], self._stamp
 
     def _forces(self, stamps: Floats) -> Floats:
         """Return the (n, 3) force at these times."""
@@ -87,8 +79,8 @@ class TurnedSensor:
         if not math.isfinite(self._since):  # it tumbles until it is turned
             return unit(np.hstack([np.sin(2.0 * at), np.full_like(at, 0.4), np.cos(2.0 * at)]))
         share = np.clip((at - self._since) / _TURN, 0.0, 1.0)
-        aside = np.cross(self._start, self._end)
-        between = self._start + share * (self._end - self._start) + np.sin(np.pi * share) * aside
+        aside = np.cross(self._start, self.up)
+        between = self._start + share * (self.up - self._start) + np.sin(np.pi * share) * aside
         shaken = np.where(share < 1.0, 0.1 * np.sin(20.0 * at), 0.0)
         force: Floats = unit(between) * (1.0 + shaken)
         return force
@@ -115,72 +107,57 @@ class TurnedSensor:
             yield rows[:0] if self.silent else rows
 
 
+@dataclass
 class LivePage:
     """A host with a turned sensor, and its page."""
 
-    def __init__(self, sensor: TurnedSensor, host: Host, lines: list[Log]) -> None:
-        self.sensor, self.host, self.lines = sensor, host, lines
+    sensor: TurnedSensor
+    host: Host
+    lines: list[Log]
 
     @property
     def link(self) -> str:
         """Link with the token."""
         return self.host.server.link
 
-    @property
-    def bare_link(self) -> str:
-        """Link without the token."""
-        return self.link.partition('#')[0]
-
     def follow(self, page: Page, poses: int = 100) -> None:
         """Turn the sensor as the page says, until it has so many poses, or asks for the fit."""
-        follow(page, self.sensor.turn_to, poses)
+        while True:
+            expect(page.locator('#next')).to_have_text(re.compile(r' up$|^Press Fit$'))
+            asked = asked_on(page)
+            count = int(page.locator('#poses').inner_text().split()[0])
+            if asked is None or count >= poses:
+                return
+            self.sensor.turn_to(asked)
+            expect(page.locator('#poses')).not_to_have_text(re.compile(rf'^{count}\b'))
 
     def turn_half(self, page: Page) -> None:
         """Begin the turn that the page asks for, and stop when about half of it is done."""
-        asked = _GOAL.fullmatch(page.locator('#next').inner_text())
+        asked = asked_on(page)
         assert asked is not None
-        goal = direction_of(asked.group(1))
-        self.sensor.turn_to(self.sensor.up + goal)
+        self.sensor.turn_to(self.sensor.up + asked)
         expect(page.locator('#ring')).to_have_attribute('data-kind', 'holding')
 
 
-def follow(page: Page, turn_to: Callable[[Floats], object], poses: int = 100) -> None:
-    """Turn a sensor as the page says, until it has so many poses, or asks for the fit."""
-    while True:
-        expect(page.locator('#next')).to_have_text(re.compile(r' up$|^Press Fit$'))
-        words = page.locator('#next').inner_text()
-        count = int(page.locator('#poses').inner_text().split()[0])
-        asked = _GOAL.fullmatch(words)
-        if asked is None or count >= poses:
-            return
-        turn_to(direction_of(asked.group(1)))
-        expect(page.locator('#poses')).not_to_have_text(re.compile(rf'^{count}\b'))
-
-
-def direction_of(sides: str) -> Floats:
-    """Return the unit vector of sides such as “front left”."""
+def asked_on(page: Page) -> Floats | None:
+    """Return the direction of the sides, such as “Front left edge up”; None: another action."""
+    found = _GOAL.fullmatch(page.locator('#next').inner_text())
+    if found is None:
+        return None
     direction = np.zeros(3)
-    for side in sides.lower().split():
+    for side in found[1].lower().split():
         axis, sign = _SIDES[side]
         direction[axis] = sign
-    return direction / np.linalg.norm(direction)
+    return unit(direction[np.newaxis])[0]
 
 
 @contextmanager
 def live_page(folder: Path, *, speed: float = 20.0, name: str = 'imu_link', file: str = 'imu.yaml',
               web_host: str = '127.0.0.1') -> Iterator[LivePage]:
     """Serve the page of a simulated sensor; the calibration is stored in this folder."""
-    sensor, lines, over = TurnedSensor(speed, name), list[Log](), Event()
-    host = Host(sensor, CalibratorSettings(calibration_file=str(folder / file),
-                                           web_host=web_host), lines.append)
-    thread = Thread(target=host.run, args=(over.is_set,), name='host')
-    thread.start()
-    try:
+    sensor = TurnedSensor(speed, name)
+    with hosted(sensor, calibration_file=str(folder / file), web_host=web_host) as (host, lines):
         yield LivePage(sensor, host, lines)
-    finally:
-        over.set()
-        thread.join()
-        host.close()
 
 
 def chromium(playwright: Playwright) -> Browser:

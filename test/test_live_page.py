@@ -11,7 +11,6 @@ import re
 
 from accel_calib.logs import write_table
 from accel_calib.stored import read_calibration
-from accel_calib.table import Poses
 from inside import model_with, simulate_poses, spread_directions
 from live_bench import chromium, GRAVITY, live_page, LivePage, SIZES, TRUTH, Viewers
 import numpy as np
@@ -88,9 +87,8 @@ def with_poses(tmp_path: Path) -> Iterator[LivePage]:
     """Serve the page of a sensor whose stored poses are enough for a fit."""
     found = simulate_poses(model_with(TRUTH), spread_directions(14), np.random.default_rng(3),
                            noise_g=0.002)
-    columns = {**found.columns, 'reading': found.reading * GRAVITY,
-               'std': found.columns['std'] * GRAVITY}
-    write_table(tmp_path / 'imu_poses.csv', Poses(columns, found.row))
+    write_table(tmp_path / 'imu_poses.csv', found.with_columns(
+        reading=found.reading * GRAVITY, std=found['std'] * GRAVITY))
     with live_page(tmp_path) as served:
         yield served
 
@@ -111,13 +109,20 @@ def fit(page: Page) -> None:
     expect(answer(page)).not_to_contain_text('~/')  # a page has buttons, and no services
 
 
-def accept(page: Page) -> None:
-    button(page, 'Accept').click()
+def decide(page: Page, name: str) -> None:
+    """Accept what is offered, or take it back."""
+    button(page, name).click()
     expect(page.locator('#offer')).to_be_hidden()
 
 
-def emphasised(page: Page) -> list[str]:
-    return page.locator('button.primary:visible').all_inner_texts()
+def shows(page: Page, title: str, *emphasised: str) -> None:
+    """Wait for the title of the next action, and compare the buttons that are emphasised."""
+    expect(page.locator('#next')).to_have_text(title)
+    assert page.locator('button.primary:visible').all_inner_texts() == [*emphasised]
+
+
+def has_poses(page: Page, count: str) -> None:
+    expect(page.locator('#poses')).to_have_text(re.compile(rf'^{count}\b'))
 
 
 def log_numbers(page: Page) -> list[str]:
@@ -138,7 +143,7 @@ def test_a_person_who_follows_the_page_gets_a_good_calibration(
         expect(page.locator('#next')).to_have_text('Press Fit')
         fit(page)
         assert not (tmp_path / name).exists()
-        accept(page)
+        decide(page, 'Accept')
         expect(answer(page)).to_contain_text('stored in')
         expect(answer(page)).to_contain_text('<img')
         page.locator('#log summary').click()
@@ -157,30 +162,25 @@ def test_a_person_who_follows_the_page_gets_a_good_calibration(
 def test_the_page_names_the_next_action_until_nothing_is_left(
         with_poses: LivePage, viewers: Viewers, tmp_path: Path) -> None:
     page = viewers.visit(with_poses.link, SIZES[0])
-    title = page.locator('#next')
-    expect(page.locator('#poses')).to_have_text(re.compile('^14'))
+    has_poses(page, '14')
     fit(page)
-    expect(title).to_have_text('Good. Accept it?')
-    assert emphasised(page) == ['Accept']
-    button(page, 'Take back').click()
-    expect(page.locator('#offer')).to_be_hidden()
+    shows(page, 'Good. Accept it?', 'Accept')
+    decide(page, 'Take back')
     expect(answer(page)).to_contain_text('discarded')
-    expect(title).to_have_text('Press Fit')
+    shows(page, 'Press Fit', 'Fit')
     assert not (tmp_path / 'imu.yaml').exists()
     fit(page)
-    accept(page)
+    decide(page, 'Accept')
     assert (tmp_path / 'imu.yaml').exists()
-    expect(title).to_have_text('Set level')
-    assert emphasised(page) == ['Set level']
+    shows(page, 'Set level', 'Set level')
     with_poses.sensor.turn_to(np.array([0.0, 0.0, 1.0]))
     expect(page.locator('#ring')).to_have_attribute('data-kind', 'captured')
-    expect(title).to_have_text('Set level')  # although this rest is a pose more
+    shows(page, 'Set level', 'Set level')  # although this rest is a pose more
     button(page, 'Set level').click()
     expect(page.locator('#offer')).to_be_visible()
-    accept(page)
-    expect(title).to_have_text('Done')
+    decide(page, 'Accept')
+    shows(page, 'Done')
     expect(page.locator('#advice')).to_contain_text('Use the calibration')
-    assert emphasised(page) == []
     expect(button(page, 'Set heading')).to_be_visible()
     assert '--' not in page.locator('main').inner_text()
 
@@ -188,27 +188,26 @@ def test_the_page_names_the_next_action_until_nothing_is_left(
 def test_more_poses_after_a_good_calibration_change_nothing_and_reset_asks_first(
         with_poses: LivePage, viewers: Viewers) -> None:
     page = viewers.visit(with_poses.link)
-    poses = page.locator('#poses')
     fit(page)
-    accept(page)
+    decide(page, 'Accept')
     button(page, 'Export …').click()
     with page.expect_download() as started:
         button(page, 'c').click()
     assert started.value.suggested_filename == 'calibration.h'
     assert 'accel' in Path(started.value.path()).read_text(encoding='utf-8')
     expect(page.locator('dialog[open]')).to_have_count(0)
-    for count, direction in ((15, [0.6, 0.8, 0.0]), (16, [-0.6, 0.0, 0.8])):
+    for count, direction in (('15', [0.6, 0.8, 0.0]), ('16', [-0.6, 0.0, 0.8])):
         with_poses.sensor.turn_to(np.array(direction))
-        expect(poses).to_have_text(re.compile(f'^{count}'))
+        has_poses(page, count)
     expect(page.locator('#next')).to_have_text('Set level')
     button(page, 'Reset …').click()
     expect(button(page, 'Cancel')).to_be_focused()
     page.keyboard.press('Escape')
     button(page, 'Undo pose').click()
-    expect(poses).to_have_text(re.compile('^15'))
+    has_poses(page, '15')
     button(page, 'Reset …').click()
     button(page, 'Reset').click()
-    expect(poses).to_have_text(re.compile('^[01] '))
+    has_poses(page, '[01]')
 
 
 def test_the_keyboard_alone_performs_a_fit_that_blocks_the_buttons_of_other_viewers(
@@ -245,23 +244,24 @@ def test_the_keyboard_alone_performs_a_fit_that_blocks_the_buttons_of_other_view
 
 def test_all_viewers_see_the_same_and_change_nothing_without_the_token(
         live: LivePage, viewers: Viewers) -> None:
-    page, guest = viewers.visit(live.link), viewers.visit(f'{live.bare_link}#wrong')
-    assert page.url == live.bare_link
+    bare = live.link.partition('#')[0]
+    page, guest = viewers.visit(live.link), viewers.visit(f'{bare}#wrong')
+    assert page.url == bare
     page.reload()
     expect(page.locator('#showing')).to_be_hidden()
     expect(button(page, 'Fit')).to_have_attribute('aria-disabled', 'false')
     expect(guest.locator('#showing')).to_contain_text('only shows')
     live.follow(page, 2)
     for each in (page, guest):
-        expect(each.locator('#poses')).to_have_text(re.compile('^2 '))
+        has_poses(each, '2')
     for name in ('Undo pose', 'Reset …', 'Export …'):
         assert button(guest, name).get_attribute('aria-disabled') == 'true'
         button(guest, name).click(force=True)
         expect(answer(guest)).to_contain_text('token')
     expect(guest.locator('dialog[open]')).to_have_count(0)
-    expect(page.locator('#poses')).to_have_text(re.compile('^2 '))
+    has_poses(page, '2')
     button(page, 'Undo pose').click()
-    expect(guest.locator('#poses')).to_have_text(re.compile('^1 '))
+    has_poses(guest, '1')
     expect(guest.locator('#log li').first).to_contain_text('the last pose is removed')
 
 
@@ -279,7 +279,7 @@ def test_a_viewer_that_sleeps_has_lost_nothing(live: LivePage, browser: Browser)
     live.follow(awake, 2)
     button(awake, 'Undo pose').click()
     expect(answer(awake)).to_contain_text('the last pose is removed')
-    expect(awake.locator('#poses')).to_have_text(re.compile(r'^1\b'))
+    has_poses(awake, '1')
     asleep.context.set_offline(False)
     expect(asleep.locator('body')).to_have_attribute('data-connection', 'open')
     expect(asleep.locator('#poses')).to_have_text(awake.locator('#poses').inner_text())
@@ -300,13 +300,12 @@ def test_speech_names_captured_poses_and_the_next_one_if_it_is_switched_on(
     """)
     live.follow(page, 1)
     assert page.evaluate('window.spoken') == []
-    speech = button(page, 'Speech')
-    speech.click()
-    expect(speech).to_have_attribute('aria-pressed', 'true')
+    button(page, 'Speech').click()
+    expect(button(page, 'Speech')).to_have_attribute('aria-pressed', 'true')
     live.follow(page, 2)
     assert page.evaluate('window.spoken')[-1] == (
         f'Pose 2 captured. {page.locator("#next").inner_text()}.')
-    speech.click()
+    button(page, 'Speech').click()
     live.follow(page, 5)
     assert len(page.evaluate('window.spoken')) == 2
     page.locator('#log summary').click()  # the keyboard scrolls its lines
@@ -348,14 +347,10 @@ def test_nothing_is_wider_than_the_screen_and_targets_are_large_enough_for_a_fin
 
 def test_a_sensor_that_falls_silent_is_noticed(idle: LivePage, viewers: Viewers) -> None:
     page = viewers.visit(idle.link)
-    ring = page.locator('#ring')
-    expect(ring).to_have_attribute('data-kind', 'moving')
-    idle.sensor.silent = True
-    expect(ring).to_have_attribute('data-kind', 'silent')
-    expect(page.locator('#problem')).to_be_visible()
-    idle.sensor.silent = False
-    expect(ring).to_have_attribute('data-kind', 'moving')
-    expect(page.locator('#problem')).to_be_hidden()
+    for silent, kind in ((False, 'moving'), (True, 'silent'), (False, 'moving')):
+        idle.sensor.silent = silent
+        expect(page.locator('#ring')).to_have_attribute('data-kind', kind)
+        expect(page.locator('#problem')).to_be_visible(visible=silent)
 
 
 def test_a_browser_without_a_voice_says_so(idle: LivePage, viewers: Viewers) -> None:
@@ -367,35 +362,26 @@ def test_a_browser_without_a_voice_says_so(idle: LivePage, viewers: Viewers) -> 
     expect(button(page, 'Speech')).to_have_attribute('aria-pressed', 'false')
 
 
-def test_a_browser_without_speech_and_wake_lock_shows_the_page(
-        idle: LivePage, viewers: Viewers) -> None:
-    page = viewers.visit(idle.link, script="""
-      delete window.speechSynthesis;
-      delete Navigator.prototype.wakeLock;
-    """)
-    assert not page.evaluate('"speechSynthesis" in window || "wakeLock" in navigator')
-    expect(button(page, 'Speech')).to_be_hidden()
-    expect(page.locator('#next')).to_have_text(re.compile(' up$'))
-
-
-def test_the_page_is_served_over_ipv6(tmp_path: Path, viewers: Viewers) -> None:
+def test_a_browser_without_speech_and_wake_lock_shows_the_page_over_ipv6(
+        tmp_path: Path, viewers: Viewers) -> None:
     with live_page(tmp_path, web_host='::1') as live:
         assert live.link.startswith('http://[::1]:')
-        page = viewers.visit(live.link)
+        page = viewers.visit(live.link, script="""
+          delete window.speechSynthesis;
+          delete Navigator.prototype.wakeLock;
+        """)
+        assert not page.evaluate('"speechSynthesis" in window || "wakeLock" in navigator')
+        expect(button(page, 'Speech')).to_be_hidden()
         expect(page.locator('#next')).to_have_text(re.compile(' up$'))
         viewers.close()
 
 
-def test_the_sound_switch_is_remembered(idle: LivePage, viewers: Viewers) -> None:
+def test_the_sound_switch_is_remembered_and_the_ball_turns_by_keys_until_it_follows_again(
+        idle: LivePage, viewers: Viewers) -> None:
     page = viewers.visit(idle.link)
     button(page, 'Sound').click()
     page.reload()
     expect(button(page, 'Sound')).to_have_attribute('aria-pressed', 'false')
-
-
-def test_the_ball_turns_by_arrow_keys_until_it_follows_again(
-        idle: LivePage, viewers: Viewers) -> None:
-    page = viewers.visit(idle.link)
     ball, follow = page.locator('#ball-frame'), button(page, 'Follow the sensor')
     expect(follow).to_be_hidden()
     ball.focus()

@@ -6,18 +6,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import suppress
-from dataclasses import dataclass, field
+from contextlib import ExitStack, suppress
+from functools import partial
 import json
 from pathlib import Path
 import re
 import socket
 import sys
-from threading import Event, Thread
+from threading import Event
 import time
+from types import SimpleNamespace
 
 from accel_calib.errors import InputError
-from accel_calib.session import CalibratorSettings, Log
+from accel_calib.session import CalibratorSettings
 from accel_calib.table import Floats
 from inside import (
     CALIBRATION_ALONE, Host, LARGEST_LIVE_MESSAGE, LIVE_COMMANDS, live_log, LIVE_PERIOD, main,
@@ -25,99 +26,89 @@ from inside import (
     PERIOD_OF_A_COMPLAINT, qr_code, reachable, simulate_recording, spread_directions, STUCK)
 import numpy as np
 import pytest
-from viewer import fetch, Viewer, wait
+from viewer import fetch, hosted, Viewer, wait
 
 GRAVITY = 9.80665
 OFFSET = (0.03, -0.02, 0.04)
 PAUSE = 0.02
+UPGRADE = 'Upgrade: websocket\r\nConnection: Upgrade\r\n'
+VERSION = 'Sec-WebSocket-Version: 13\r\n'
 
 
-def rows_of(directions: Floats, seed: int = 7) -> Floats:
+def rows_of(directions: Floats) -> Floats:
     """Return the samples of a sensor that is turned; its temperature is 21 °C."""
     recording = simulate_recording(
-        model_with({'offset': np.array(OFFSET)}), directions, np.random.default_rng(seed),
+        model_with({'offset': np.array(OFFSET)}), directions, np.random.default_rng(7),
         noise_g=0.0005, rate_hz=50.0, dwell=1.8, turn=0.4)
     rows = np.full((len(recording), 9), np.nan)
     rows[:, 0], rows[:, 1:4], rows[:, 7] = recording['time'], recording.reading * GRAVITY, 21.0
     return rows
 
 
-@dataclass
-class Recording:
-    """A source that plays rows faster than real time."""
-
-    rows: Floats
-    name: str = 'bench.csv'
-    sensor: str = 'imu_link'
-    problem: Callable[[], str] = str
-    played: Event = field(default_factory=Event)
-
-    @property
-    def blocks(self) -> Iterator[Floats]:
-        for block in np.array_split(self.rows, max(1, len(self.rows) // 40)):
-            time.sleep(PAUSE)
-            yield block
-        self.played.set()
+def played(rows: Floats, over: Event) -> Iterator[Floats]:
+    """Yield rows in blocks, faster than real time."""
+    for block in np.array_split(rows, max(1, len(rows) // 40)):
+        time.sleep(PAUSE)
+        yield block
+    over.set()
 
 
 class Bench:
-    """A host that runs in a thread."""
+    """A host with a source of samples, and viewers; `played` is set when the source has ended."""
 
-    def __init__(self, source: Recording, path: Path) -> None:
-        self.logged: list[Log] = []
-        self.source, self.path = source, path
-        self.host = Host(source, CalibratorSettings(calibration_file=str(path)),
-                         self.logged.append)
-        self._over = Event()
-        self._thread = Thread(target=self.host.run, args=[self._over.is_set])
-        self._viewers: list[Viewer] = []
-        self._thread.start()
-
-    @property
-    def base(self) -> str:
-        return self.host.server.link.partition('/#')[0]
-
-    @property
-    def port(self) -> int:
-        return int(self.base.rpartition(':')[2])
+    def __init__(self, stack: ExitStack, folder: Path, poses: int = 1,
+                 blocks: Callable[[Floats, Event], Iterator[Floats]] = played) -> None:
+        self._stack, self.path, self.played = stack, folder / 'c.yaml', Event()
+        source = SimpleNamespace(name='bench.csv', sensor='imu_link', problem=str,
+                                 blocks=blocks(rows_of(spread_directions(poses)), self.played))
+        self.host, self.logged = stack.enter_context(
+            hosted(source, calibration_file=str(self.path)))
+        self.base = self.host.server.link.partition('/#')[0]
+        self.port = int(self.base.rpartition(':')[2])
 
     def viewer(self, *, token: str | None = None, seen: int = 0) -> Viewer:
         link = self.host.server.link if token is None else f'{self.base}/#{token}'
-        self._viewers.append(Viewer(link, seen=seen))
-        return self._viewers[-1]
+        viewer = Viewer(link, seen=seen)
+        self._stack.callback(viewer.close)
+        return viewer
 
-    def close(self) -> None:
-        self._over.set()
-        self._thread.join()
-        self.host.close()
-        for viewer in self._viewers:
-            viewer.close()
+    def sent(self, request: str | bytes) -> bytes:
+        """Send a request, and return all that is answered until the connection ends."""
+        with self.connected(request) as client:
+            found = b''
+            with suppress(ConnectionError):
+                while part := client.recv(4096):
+                    found += part
+            return found
+
+    def connected(self, request: str | bytes = b'') -> socket.socket:
+        """Return a connection, after a request was sent."""
+        client = socket.create_connection(('127.0.0.1', self.port))
+        client.sendall(request.encode() if isinstance(request, str) else request)
+        return client
 
 
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[Bench]:
     """Yield a host with a short recording."""
-    made = Bench(Recording(rows_of(spread_directions(3))), tmp_path / 'c.yaml')
-    yield made
-    made.close()
+    with ExitStack() as stack:
+        yield Bench(stack, tmp_path, 3)
 
 
 @pytest.fixture(scope='module')
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     """Yield a host for requests that do not change its session."""
-    made = Bench(Recording(rows_of(spread_directions(1))),
-                 tmp_path_factory.mktemp('shared') / 'c.yaml')
-    yield made
-    made.close()
+    with ExitStack() as stack:
+        yield Bench(stack, tmp_path_factory.mktemp('shared'))
 
 
 @pytest.fixture
 def turned(tmp_path: Path) -> Iterator[Bench]:
     """Yield a host whose recording has been played, with poses for a fit."""
-    made = Bench(Recording(rows_of(spread_directions(14))), tmp_path / 'c.yaml')
-    assert made.source.played.wait(60.0)
-    yield made
-    made.close()
+    with ExitStack() as stack:
+        made = Bench(stack, tmp_path, 14)
+        assert made.played.wait(60.0)
+        yield made
 
 
 def test_a_new_viewer_gets_all_kinds_of_messages(bench: Bench) -> None:
@@ -127,7 +118,7 @@ def test_a_new_viewer_gets_all_kinds_of_messages(bench: Bench) -> None:
     assert viewer.got[0]['kind'] == 'welcome'
     assert viewer.got[0]['may']
     assert set(viewer.got[0]['commands']) == set(LIVE_COMMANDS)
-    bench.source.played.wait(60.0)
+    bench.played.wait(60.0)
     wait(lambda: viewer.of('progress')[-1]['poses'] == 3)
     now = [each for each in viewer.of('progress') if each['up']][-1]  # before the end
     assert abs(np.linalg.norm(now['up']) - 1.0) < 1e-6
@@ -206,6 +197,19 @@ def test_the_page_and_the_exports_of_a_calibration_are_served(turned: Bench) -> 
     assert b'noise' in words[2]
 
 
+def test_a_page_that_is_asked_for_after_a_change_is_that_of_the_new_state(turned: Bench) -> None:
+    viewer, exchange = turned.viewer(), turned.host.exchange
+    for command in ('fit', 'save', 'undo_pose', 'fit'):
+        assert viewer.ask(command)['success']
+    answers: list[str] = []
+    for ask in (exchange.page, partial(exchange.ask, 'undo'), exchange.page):
+        ask(lambda success, words: answers.append(words))
+    wait(lambda: len(answers) == 3)
+    undone, offered, stored = answers
+    assert 'discarded' in undone
+    assert fetch(f'{turned.base}/calibration.html')[2].decode() == stored != offered
+
+
 @pytest.mark.parametrize(('token', 'words'), [('', 'no token'), ('x' * 22, 'another start'),
                                               ('\ud83d\ude00', 'another start')])
 def test_without_the_token_the_page_only_shows(shared: Bench, token: str, words: str) -> None:
@@ -217,12 +221,6 @@ def test_without_the_token_the_page_only_shows(shared: Bench, token: str, words:
         answer = viewer.ask(command)
         assert (answer['success'], answer['words']) == (False, viewer.got[0]['why'])
     assert shared.host.server.token not in str(viewer.got)
-
-
-def test_unknown_commands_are_refused(shared: Bench) -> None:
-    answer = shared.viewer().ask('close')
-    assert not answer['success']
-    assert "'close', expected one of capture_pose" in answer['words']
 
 
 @pytest.mark.parametrize('headers', [
@@ -257,86 +255,69 @@ def test_pages_have_the_headers_of_security(shared: Bench) -> None:
                 headers['Cache-Control']) == ('nosniff', 'no-referrer', 'no-store')
 
 
+def request(bench: Bench, method: str, path: str, headers: str = '') -> str:
+    return f'{method} {path} HTTP/1.1\r\nHost: 127.0.0.1:{bench.port}\r\n{headers}\r\n'
+
+
 def test_the_page_consists_of_its_files_and_nothing_else(shared: Bench) -> None:
-    folder = PAGE_FOLDER
-    assert fetch(shared.base)[2] == (folder / 'index.html').read_bytes()
-    for path in folder.glob('*.*'):
-        status, headers, content = fetch(f'{shared.base}/page/{path.name}')
-        assert (status, content) == (200, path.read_bytes())
+    assert fetch(shared.base)[2] == (PAGE_FOLDER / 'index.html').read_bytes()
+    for file in PAGE_FOLDER.glob('*.*'):
+        status, headers, content = fetch(f'{shared.base}/page/{file.name}')
+        assert (status, content) == (200, file.read_bytes())
         assert headers['Content-Type'].split(';')[0] == {
-            '.js': 'text/javascript', '.css': 'text/css', '.html': 'text/html',
-            '.svg': 'image/svg+xml', '.png': 'image/png'}[path.suffix]
-
-
-def test_all_other_paths_and_methods_are_not_found(shared: Bench) -> None:
+            '.js': 'text/javascript', '.css': 'text/css', '.html': 'text/html'}[file.suffix]
     for path in ('/page/', '/page', '/page/../__init__.py', '/page/..%2f__init__.py',
                  '/page/%2e%2e/__init__.py', '/__init__.py', '//etc/passwd', '/page//etc/passwd',
                  '/page/main.js/', '/page/main.js%00', '/export/', '/export/../c', '/export/exe',
                  '/stream/', '/index.html', '/calibration.html/'):
-        assert raw_status(shared.port, 'GET', path) == 404, path
+        assert shared.sent(request(shared, 'GET', path)).split()[1] == b'404', path
     for method in ('POST', 'PUT', 'DELETE', 'OPTIONS', 'HEAD', 'TRACE'):
-        assert raw_status(shared.port, method, '/') == 404, method
+        assert shared.sent(request(shared, method, '/')).split()[1] == b'404', method
 
 
-def raw_status(port: int, method: str, path: str) -> int:
-    """Return the status of a request whose path no client has changed."""
-    with socket.create_connection(('127.0.0.1', port)) as client:
-        client.sendall(f'{method} {path} HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n'
-                       'Connection: close\r\n\r\n'.encode())
-        return int(client.recv(4096).split()[1])
-
-
-@pytest.mark.parametrize('text', ['x', '[]', '{}', '{"ask": {"id": 1}}', '{"ask": []}', '7',
-                                  '{"ask": {"id": "1", "command": "fit"}}', '[' * 4000])
-def test_messages_that_are_not_understood_close_the_connection(shared: Bench, text: str) -> None:
+@pytest.mark.parametrize(('text', 'code'), [
+    *((text, 1008) for text in (
+        'x', '[]', '{}', '{"ask": {"id": 1}}', '{"ask": []}', '7',
+        '{"ask": {"id": "1", "command": "fit"}}', '[' * 4000)),
+    ('{"ask": {"id": 1, "command": "' + 'x' * LARGEST_LIVE_MESSAGE, 1009)])
+def test_an_unknown_command_is_refused_and_another_message_closes_the_connection(
+        shared: Bench, text: str, code: int) -> None:
     viewer, other = shared.viewer(), shared.viewer()
+    assert "'close', expected one of capture_pose" in viewer.ask('close')['words']
     viewer.send(text)
     wait(lambda: viewer.code)
-    assert viewer.code == 1008
+    assert viewer.code == code
     count = len(other.got)
     wait(lambda: len(other.got) > count)
 
 
-def test_a_big_message_closes_the_connection(shared: Bench) -> None:
-    viewer = shared.viewer()
-    viewer.send(json.dumps({'ask': {'id': 1, 'command': 'x' * LARGEST_LIVE_MESSAGE}}))
-    wait(lambda: viewer.code)
-    assert viewer.code == 1009
-
-
-def test_the_seventeenth_viewer_is_refused_until_another_ends(bench: Bench) -> None:
-    viewers = [bench.viewer() for _ in range(16)]
-    assert bench.viewer().code == 1013
-    viewers[0].close()
-    wait(lambda: bench.viewer().code is None)
-    assert all(viewer.code is None for viewer in viewers[1:])
-
-
-def test_viewers_without_the_token_do_not_keep_its_owner_out(bench: Bench) -> None:
+def test_of_too_many_viewers_those_without_the_token_give_way(bench: Bench) -> None:
     guests = [bench.viewer(token='') for _ in range(16)]
+    assert bench.viewer(token='').code == 1013
     owners = [bench.viewer() for _ in range(2)]
-    assert [owner.got[0]['may'] for owner in owners] == [True, True]
     wait(lambda: guests[0].code is not None and guests[1].code is not None)
     assert all(guest.code is None for guest in guests[2:])
-    assert bench.viewer(token='').code == 1013
+    owners += [bench.viewer() for _ in range(14)]
+    assert all(owner.got[0]['may'] for owner in owners)
+    assert bench.viewer().code == 1013
+    owners[0].close()
+    wait(lambda: bench.viewer().code is None)
+    assert all(owner.code is None for owner in owners[1:])
 
 
-def open_stream(connection: socket.socket, port: int) -> None:
+def stream(bench: Bench) -> socket.socket:
     """Ask for the stream as a viewer does, without a hello."""
-    connection.sendall((f'GET /stream HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n'
-                        'Upgrade: websocket\r\nConnection: Upgrade\r\n'
-                        'Sec-WebSocket-Version: 13\r\n'
-                        'Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n').encode())
-    assert b'101' in connection.recv(64)
+    client = bench.connected(request(bench, 'GET', '/stream', f'{UPGRADE}{VERSION}'
+                                     'Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n'))
+    assert b'101' in client.recv(64)
+    return client
 
 
 def test_connections_that_say_nothing_do_not_keep_anybody_out(bench: Bench) -> None:
-    silent = [socket.create_connection(('127.0.0.1', bench.port)) for _ in range(40)]
-    for each in silent:
-        open_stream(each, bench.port)
-    assert bench.viewer().got[0]['may']
-    for each in silent:
-        each.close()
+    with ExitStack() as silent:
+        for _ in range(40):
+            silent.enter_context(stream(bench))
+        assert bench.viewer().got[0]['may']
 
 
 def test_a_viewer_that_comes_back_gets_the_lines_it_missed(bench: Bench) -> None:
@@ -344,7 +325,7 @@ def test_a_viewer_that_comes_back_gets_the_lines_it_missed(bench: Bench) -> None
     wait(lambda: viewer.of('log'))
     viewer.close()
     last = viewer.of('log')[-1]['number']
-    assert bench.source.played.wait(60.0)
+    assert bench.played.wait(60.0)
     again, whole = bench.viewer(seen=last), bench.viewer()
     wait(lambda: any('has ended' in line['words'] for line in again.of('log')))
     wait(lambda: len(whole.of('log')) >= len(viewer.of('log')) + len(again.of('log')))
@@ -361,13 +342,12 @@ def test_a_stuck_viewer_is_closed_and_the_others_go_on(
         bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(*STUCK, 2.0)
     other = bench.viewer()
-    with socket.socket() as stuck:
+    with stream(bench) as stuck:
         stuck.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        stuck.connect(('127.0.0.1', bench.port))
-        open_stream(stuck, bench.port)
-        stuck.sendall(masked(json.dumps({'hello': {'token': '', 'seen': 0}}).encode()))
+        hello = b'{"hello": {"token": "", "seen": 0}}'
+        stuck.sendall(bytes([0x81, 0x80 | len(hello), 0, 0, 0, 0]) + hello)  # masked with zeros
         wait(lambda: len(bench.host.server.viewers) == 2)
-        for number in range(300):  # more than the buffers of a connection hold
+        for number in range(500):  # more than the buffers of a connection hold
             bench.host.server.show(live_log(10 ** 15 + number, 'info', 'x' * 1000, 0.0))
         wait(lambda: len(bench.host.server.viewers) == 1)
     count = len(other.of('progress'))
@@ -375,16 +355,9 @@ def test_a_stuck_viewer_is_closed_and_the_others_go_on(
     assert other.code is None
 
 
-def masked(text: bytes) -> bytes:
-    """Return a short text as a frame of a client, with a mask of zeros."""
-    assert len(text) < 126
-    return bytes([0x81, 0x80 | len(text), 0, 0, 0, 0]) + text
-
-
 def test_a_viewer_without_hello_is_closed(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(*PATIENCE_FOR_A_HELLO, 0.3)
-    with socket.create_connection(('127.0.0.1', bench.port)) as silent:
-        open_stream(silent, bench.port)
+    with stream(bench) as silent:
         received = b''
         while part := silent.recv(4096):
             received += part
@@ -397,7 +370,7 @@ def test_a_viewer_without_hello_is_closed(bench: Bench, monkeypatch: pytest.Monk
 def test_a_port_in_use_is_an_error_in_one_line(shared: Bench, tmp_path: Path) -> None:
     settings = CalibratorSettings(calibration_file=str(tmp_path / 'd.yaml'), web_port=shared.port)
     with pytest.raises(InputError, match=f'port {shared.port} of 127.0.0.1 is in use'):
-        Host(Recording(np.zeros((0, 9))), settings, lambda line: None)
+        Host(SimpleNamespace(name='bench.csv'), settings, print)
     with pytest.raises(InputError, match='cannot be served at 192.0.2.7'):
         PageServer(shared.host.exchange, '192.0.2.7', 0).start()
 
@@ -412,7 +385,6 @@ def test_a_missing_package_is_an_error_in_one_line(
 
 def send_slowly(client: socket.socket) -> None:
     """Send a header that does not end."""
-    client.sendall(b'GET / HTTP/1.1\r\nX: ')
     while True:
         client.sendall(b'x')
         time.sleep(PAUSE)
@@ -422,8 +394,7 @@ def test_a_request_that_does_not_end_is_closed(
         bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(*PATIENCE_FOR_A_REQUEST, 0.3)
     viewer = bench.viewer()
-    with (socket.create_connection(('127.0.0.1', bench.port)) as slow,
-          pytest.raises(ConnectionError)):
+    with bench.connected('GET / HTTP/1.1\r\nX: ') as slow, pytest.raises(ConnectionError):
         send_slowly(slow)
     count = len(viewer.of('progress'))
     wait(lambda: len(viewer.of('progress')) > count)
@@ -443,14 +414,14 @@ def test_requests_that_are_not_http_are_counted_in_one_line(
     def complaints() -> list[str]:
         return [line.words for line in bench.logged if 'not HTTP' in line.words]
 
-    for request in MALFORMED:
-        head, _, body = sent(bench.port, request).partition(b'\r\n\r\n')
-        assert re.match(rb'HTTP/1\.[01] 400 ', head), request
-        assert (b'Server: accel_calib\r\n' in head, body.count(b'\n')) == (True, 1), request
+    for text in MALFORMED:
+        head, _, body = bench.sent(text).partition(b'\r\n\r\n')
+        assert re.match(rb'HTTP/1\.[01] 400 ', head), text
+        assert (b'Server: accel_calib\r\n' in head, body.count(b'\n')) == (True, 1), text
         assert b'Content-Security-Policy' in head
     wait(complaints)
     monkeypatch.setattr(*PERIOD_OF_A_COMPLAINT, 0.0)
-    sent(bench.port, MALFORMED[0])
+    bench.sent(MALFORMED[0])
     wait(lambda: len(complaints()) > 1)
     assert [words.partition('(')[2] for words in complaints()] == [
         '1 so far)', f'{len(MALFORMED) + 1} so far)']
@@ -458,69 +429,45 @@ def test_requests_that_are_not_http_are_counted_in_one_line(
 
 
 @pytest.mark.parametrize('headers', [
-    '', 'Upgrade: websocket\r\nConnection: Upgrade\r\n',
-    'Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 7\r\n',
-    'Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n'
-    'Sec-WebSocket-Key: x\r\n'])
+    '', UPGRADE, f'{UPGRADE}Sec-WebSocket-Version: 7\r\n',
+    f'{UPGRADE}{VERSION}Sec-WebSocket-Key: x\r\n'])
 def test_a_stream_that_is_no_websocket_is_refused(shared: Bench, headers: str) -> None:
-    found = sent(shared.port, f'GET /stream HTTP/1.1\r\nHost: 127.0.0.1:{shared.port}\r\n{headers}'
-                 '\r\n'.encode())
+    found = shared.sent(request(shared, 'GET', '/stream', headers))
     head, _, body = found.partition(b'\r\n\r\n')
     assert (head.split()[1], body.count(b'\n')) == (b'400', 1)
     assert b'Server: accel_calib\r\n' in head
 
 
-def sent(port: int, request: bytes) -> bytes:
-    """Send a request, and return all that is answered until the connection ends."""
-    with socket.create_connection(('127.0.0.1', port)) as client:
-        client.sendall(request)
-        found = b''
-        with suppress(ConnectionError):
-            while part := client.recv(4096):
-                found += part
-        return found
-
-
 def test_a_source_that_fails_is_reported_and_the_page_continues(tmp_path: Path) -> None:
-    class Broken(Recording):
-        @property
-        def blocks(self) -> Iterator[Floats]:
-            yield self.rows[:40]
-            raise InputError('the port has ended', 'connect the sensor again')
+    def broken(rows: Floats, over: Event) -> Iterator[Floats]:
+        yield rows[:40]
+        raise InputError('the port has ended', 'connect the sensor again')
 
-    bench = Bench(Broken(rows_of(spread_directions(1))), tmp_path / 'c.yaml')
-    try:
+    with ExitStack() as stack:
+        bench = Bench(stack, tmp_path, blocks=broken)
         viewer = bench.viewer()
         wait(lambda: any('the port has ended' in line['words'] for line in viewer.of('log')))
         wait(lambda: 'the port has ended' in viewer.state['problem'])
         assert not viewer.ask('fit')['success']
-    finally:
-        bench.close()
 
 
 def test_a_board_that_falls_silent_is_reported_until_it_sends_again(tmp_path: Path) -> None:
-    class Silent(Recording):
-        @property
-        def blocks(self) -> Iterator[Floats]:
-            yield self.rows[:40]
-            while not self.played.wait(PAUSE):
-                yield self.rows[:0]
-            later = self.rows.copy()
-            later[:, 0] += 100.0
-            for row in later:
-                time.sleep(PAUSE)
-                yield row[np.newaxis]
+    def interrupted(rows: Floats, over: Event) -> Iterator[Floats]:
+        yield rows[:40]
+        while not over.wait(PAUSE):
+            yield rows[:0]
+        rows[:, 0] += 100.0
+        for row in rows:
+            time.sleep(PAUSE)
+            yield row[np.newaxis]
 
-    bench = Bench(Silent(rows_of(spread_directions(1))), tmp_path / 'c.yaml')
-    try:
+    with ExitStack() as stack:
+        bench = Bench(stack, tmp_path, blocks=interrupted)
         viewer = bench.viewer()
         wait(lambda: 'bench.csv sends no samples' in viewer.state['problem'])
         assert 'publisher' not in viewer.state['problem']
-        bench.source.played.set()
+        bench.played.set()
         wait(lambda: 'sends no samples' not in viewer.state['problem'])
-    finally:
-        bench.source.played.set()
-        bench.close()
 
 
 def test_the_link_names_a_reachable_address() -> None:

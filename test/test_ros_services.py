@@ -67,12 +67,9 @@ def test_poses_are_captured_and_removed_on_request(bench: Any, readings: Reading
     asked = markers[-1].markers[-1].text
     assert answer.message.endswith(asked)
 
-    def reported() -> bool:
-        bench.send(bench.imu(poses[130]))
-        return bool(diagnostics) and any(value.key == 'next' and value.value == asked
-                                         for value in diagnostics[-1].status[0].values)
-
-    bench.spin(reported)
+    bench.send_until(lambda: bench.imu(poses[130]), lambda: diagnostics and any(
+        value.key == 'next' and value.value == asked
+        for value in diagnostics[-1].status[0].values))
     bench.feed(poses[140:165])
     bench.spin(lambda: not still[-1].data)
     rng = np.random.default_rng(1)
@@ -108,57 +105,47 @@ def test_self_test_names_what_fails(bench: Any, stored: Stored) -> None:
     bench.exchange(corrected, moving)
     diagnostics.clear()
 
-    def running() -> bool:
-        bench.send(moving())
-        return len(diagnostics) > 1
-
-    bench.spin(running)
+    bench.send_until(moving, lambda: len(diagnostics) > 1)
     answer = bench.call('self_test')
     assert answer.passed == b'\x01', [status.message for status in answer.status]
     assert answer.id == 'imu_link'
 
 
 CONFIG = Path(__file__).parent.parent / 'config' / 'calibrator.yaml'
-SETTINGS = [CalibratorSettings, SimulatorSettings]
 WIDTH = 99
 COMMENT = '    # '
 
 
-def yaml_lines(settings: type[Any]) -> Iterator[str]:
+def yaml_lines() -> Iterator[str]:
     """Yield the lines of a parameter file with all defaults, for any node name."""
     yield '# Parameters of the calibrator with their defaults; generated from'
     yield '# accel_calib/session/settings.py. Parameters with * can be set while the node runs.'
     yield '/**:'
     yield '  ros__parameters:'
-    for each in fields(settings):
+    for each in fields(CalibratorSettings):
         live = ' *' if each.metadata['live'] else ''
         words = f"{each.metadata['words']} ({expected(each)}){live}"
         yield from wrap(words, WIDTH, initial_indent=COMMENT, subsequent_indent=COMMENT)
-        yield f'    {each.name}: {yaml_value(default_of(each))}'
+        value = default_of(each)
+        yield f'    {each.name}: {str(value).lower() if isinstance(value, bool) else repr(value)}'
 
 
-def yaml_value(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    return repr(value)
-
-
-def test_parameter_file_is_the_table() -> None:
+def test_parameter_file_describes_all_parameters_and_has_their_defaults() -> None:
     """Check the file; write it with: python test/test_ros_services.py."""
-    assert CONFIG.read_text(encoding='utf-8').splitlines() == list(yaml_lines(CalibratorSettings))
-
-
-def test_parameter_file_holds_the_defaults() -> None:
-    given = yaml.safe_load(CONFIG.read_text(encoding='utf-8'))['/**']['ros__parameters']
+    text = CONFIG.read_text(encoding='utf-8')
+    assert text.splitlines() == list(yaml_lines())
+    given = yaml.safe_load(text)['/**']['ros__parameters']
     assert CalibratorSettings(**given) == CalibratorSettings()
     assert list(given) == [parameter.name for parameter in fields(CalibratorSettings)]
 
 
-def test_parameters_accept_numbers_of_other_types() -> None:
+def test_parameters_accept_numbers_of_other_types_and_lists() -> None:
     settings = changed(CalibratorSettings(), {'model': 10, 'min_dwell': 2, 'sensor': 7,
                                               'use_sim_time': True})
     assert (settings.model, settings.min_dwell, settings.sensor) == ('10', 2.0, '7')
     assert isinstance(settings.min_dwell, float)
+    lists = changed(SimulatorSettings(), {'mounting': [1, 2.5, 3], 'effects': []})
+    assert (lists.mounting, lists.effects) == ([1.0, 2.5, 3.0], [])
 
 
 @pytest.mark.parametrize(('name', 'value'), [
@@ -170,15 +157,9 @@ def test_values_that_parameters_do_not_accept_are_refused(name: str, value: Any)
         changed(CalibratorSettings(), {name: value})
 
 
-def test_lists_are_checked() -> None:
-    settings = changed(SimulatorSettings(), {'mounting': [1, 2.5, 3], 'effects': []})
-    assert settings.mounting == [1.0, 2.5, 3.0]
-    assert settings.effects == []
+def test_lists_of_another_length_and_settings_that_contradict_each_other_are_refused() -> None:
     with pytest.raises(InputError, match='a list of 3 numbers'):
         changed(SimulatorSettings(), {'mounting': [1.0]})
-
-
-def test_settings_that_contradict_each_other_are_refused() -> None:
     with pytest.raises(InputError, match='max_dwell'):
         capture_settings(CalibratorSettings(min_dwell=2.0, max_dwell=3.0))
 
@@ -238,35 +219,23 @@ def used(bench: Any, node: str) -> Names:
     return {right: {name for name, _ in look(node, '/')} for right, look in looks.items()}
 
 
-def compare(bench: Any, node: str, expected: Names) -> None:
-    """Wait until all that is allowed is seen, and check that there is nothing else."""
+@pytest.mark.parametrize(('executable', 'parameters'), [
+    ('calibrator', {}),
+    ('calibrator', {'use_sim_time': True, 'base_frame': 'base_link', 'publish_tf': True}),
+    ('calibrator_lifecycle', {}), ('simulator', {})])
+def test_each_node_uses_all_that_the_policy_grants_and_nothing_else(
+        executable: str, parameters: dict[str, Any], bench: Any,
+        request: pytest.FixtureRequest) -> None:
+    if parameters:
+        request.getfixturevalue('tf_message')
+    bench.start(executable, **parameters)
+    if executable == 'calibrator_lifecycle':
+        bench.go(1)  # TRANSITION_CONFIGURE
+    node, expected = executable.partition('_')[0], allowed(executable, *parameters)
     bench.spin(lambda: node in bench.node.get_node_names())
     bench.spin(lambda: all(expected[right] <= names for right, names in used(bench, node).items()))
     assert used(bench, node) == expected
 
 
-def test_calibrator_uses_all_that_the_policy_grants_and_nothing_else(bench: Any) -> None:
-    bench.calibrator()
-    compare(bench, 'calibrator', allowed('calibrator'))
-
-
-def test_rights_in_comments_are_those_that_the_parameters_need(
-        bench: Any, tf_message: Any) -> None:
-    bench.calibrator(use_sim_time=True, base_frame='base_link', publish_tf=True)
-    compare(bench, 'calibrator', allowed('calibrator', 'use_sim_time', 'base_frame', 'publish_tf'))
-
-
-def test_simulator_uses_all_that_the_policy_grants_and_nothing_else(bench: Any) -> None:
-    bench.start('simulator', poses=2, dwell=1.0)
-    compare(bench, 'simulator', allowed('simulator'))
-
-
-def test_managed_calibrator_uses_all_that_the_policy_grants_and_nothing_else(bench: Any) -> None:
-    from lifecycle_msgs.msg import Transition
-    bench.start('calibrator_lifecycle')
-    bench.go(Transition.TRANSITION_CONFIGURE)
-    compare(bench, 'calibrator', allowed('calibrator_lifecycle'))
-
-
 if __name__ == '__main__':
-    CONFIG.write_text('\n'.join(yaml_lines(CalibratorSettings)) + '\n', encoding='utf-8')
+    CONFIG.write_text('\n'.join(yaml_lines()) + '\n', encoding='utf-8')

@@ -19,7 +19,6 @@ import subprocess
 import sys
 import termios
 import threading
-import time
 from typing import Any
 
 from accel_calib.stored import read_calibration
@@ -53,21 +52,20 @@ def turn(bench: Any, readings: Readings, seen: Callable[[int], bool]) -> None:
         bench.spin(lambda count=count: seen(count))
 
 
-def environment(bench: Any) -> dict[str, str]:
-    """Return the environment of a process in the domain of a bench."""
-    return {**os.environ, 'TERM': 'xterm',
-            'ROS_DOMAIN_ID': str(bench.node.context.get_domain_id())}
-
-
 @pytest.mark.parametrize('number', sample([signal.SIGINT, signal.SIGTERM], 1))
-def test_pipe_gets_a_line_for_each_pose(bench: Any, readings: Readings, number: int) -> None:
-    bench.calibrator(sensor='arm', passthrough=True)
+def test_pipe_gets_a_line_for_each_pose_and_for_a_silence_of_the_node(
+        bench: Any, readings: Readings, number: int) -> None:
+    node = bench.calibrator(sensor='arm', passthrough=True)
     process = bench.run(*WATCH)
     lines, thread = lines_of(process)
     bench.spin(lambda: any(line.startswith('poses: 0 of about 12; ') for line in lines))
     turn(bench, readings, lambda count: any(f'captured pose {count} of' in x for x in lines))
     assert all(character.isprintable() for line in lines for character in line.rstrip('\n'))
     assert {'moving\n', 'still: hold it for 1 s\n'} <= set(lines)
+    bench.end(node, signal.SIGINT)
+    bench.spin(lambda: any('expected a message' in line for line in lines))
+    bench.calibrator(sensor='arm')
+    bench.spin(lambda: any(line.endswith('arrive again\n') for line in lines))
     process.send_signal(number)
     assert process.wait(60) == 0
     thread.join()
@@ -79,7 +77,8 @@ def test_terminal_is_drawn_with_a_bell_for_each_pose(bench: Any, readings: Readi
     reader, terminal = pty.openpty()
     fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack('HHHH', 24, 80, 0, 0))
     process = subprocess.Popen([sys.executable, *WATCH], stdin=terminal, stdout=terminal,
-                               stderr=terminal, env=environment(bench), start_new_session=True)
+                               stderr=terminal, env={**bench._environment, 'TERM': 'xterm'},
+                               start_new_session=True)
     os.close(terminal)
     shown = bytearray()
 
@@ -108,17 +107,16 @@ def test_terminal_is_drawn_with_a_bell_for_each_pose(bench: Any, readings: Readi
     assert 'Traceback' not in shown.decode()
 
 
-def test_once_without_a_node_is_one_line(bench: Any) -> None:
-    process = bench.run(*WATCH, '--once')
-    printed = process.communicate(timeout=60)[0]
-    assert process.returncode == 2
-    assert printed == (
-        'accel-calib watch: found no calibrator /calibrator, expected a message on '
+def test_node_is_found_by_its_name_or_what_is_there_is_named(bench: Any) -> None:
+    def once(*arguments: str) -> tuple[int, str]:
+        process = bench.run(*WATCH, '--once', *arguments)
+        printed = process.communicate(timeout=60)[0]
+        return process.returncode, printed
+
+    assert once() == (
+        2, 'accel-calib watch: found no calibrator /calibrator, expected a message on '
         '/calibrator/progress every second; start it with accel-calib node, or check --node and '
         'ROS_DOMAIN_ID\n')
-
-
-def test_node_in_a_namespace_is_found_by_its_name(bench: Any) -> None:
     bench.run(*CALIBRATOR, '--ros-args', '-r', '__ns:=/left')
     bench.spin(lambda: bench.node.count_publishers('/left/calibrator/progress'))
     for arguments, status, words in (
@@ -126,29 +124,14 @@ def test_node_in_a_namespace_is_found_by_its_name(bench: Any) -> None:
             (['--ros-args', '-r', '__ns:=/left'], 0, 'poses: 0 of about 12'),
             ([], 2, 'set --node left/calibrator\n'),
             (['--node', 'left calibrator'], 2, 'expected the name of a node')):
-        process = bench.run(*WATCH, '--once', *arguments)
-        printed = process.communicate(timeout=60)[0]
-        assert process.returncode == status, printed
-        assert words in printed
-
-
-def test_silence_of_the_node_is_reported(bench: Any) -> None:
-    node = bench.calibrator()
-    process = bench.run(*WATCH)
-    lines, thread = lines_of(process)
-    bench.spin(lambda: lines)
-    bench.end(node, signal.SIGINT)
-    bench.spin(lambda: any('expected a message' in line for line in lines))
-    bench.calibrator()
-    bench.spin(lambda: any(line.endswith('arrive again\n') for line in lines))
-    process.send_signal(signal.SIGINT)
-    assert process.wait(60) == 0
-    thread.join()
+        found = once(*arguments)
+        assert found[0] == status, found
+        assert words in found[1]
 
 
 def test_reader_of_the_pipe_may_end(bench: Any) -> None:
     node = bench.calibrator()
-    with subprocess.Popen([sys.executable, *WATCH], env=environment(bench), text=True,
+    with subprocess.Popen([sys.executable, *WATCH], env=bench._environment, text=True,
                           stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout is not None
         assert process.stderr is not None
@@ -167,16 +150,13 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def printed_until(node: subprocess.Popen[str], words: str, seconds: float = 60.0) -> str:
+def printed_until(node: Any, words: str) -> str:
     """Return the first line of a node that contains some words."""
-    ends, text = time.monotonic() + seconds, ''
-    while time.monotonic() < ends:
-        if select.select([node.stdout], [], [], 0.1)[0]:
-            assert node.stdout is not None
-            text = node.stdout.readline()
-            if words in text:
-                return text
-    raise AssertionError(f'the node has not printed {words!r} within {seconds} s')
+    text = ''
+    while words not in text:
+        assert select.select([node.stdout], [], [], 60.0)[0]
+        text = node.stdout.readline()
+    return text
 
 
 @pytest.fixture
@@ -192,7 +172,12 @@ def viewer(bench: Any, tmp_path: Path) -> Iterator[Viewer]:
 
 def test_a_whole_calibration_through_the_commands_of_the_page(
         bench: Any, viewer: Viewer, readings: Callable[..., Any], tmp_path: Path) -> None:
-    path = tmp_path / 'c.yaml'
+    path, key = tmp_path / 'c.yaml', f'Bearer {viewer.token}'
+    refusal = bench.call('fit').message
+    bench.spin(lambda: refusal in [line['words'] for line in viewer.of('log')])
+    assert viewer.ask('fit', bench.spin)['words'] == refusal
+    numbers = [line['number'] for line in viewer.of('log')]
+    assert numbers == sorted(set(numbers))
     bench.feed(readings(DIRECTIONS))
     bench.spin(lambda: len(viewer.of('poses')[-1]['up']) >= len(DIRECTIONS))
 
@@ -203,7 +188,7 @@ def test_a_whole_calibration_through_the_commands_of_the_page(
     assert residuals['residual after'] < 1.0 < residuals['residual before']
     assert not path.exists()
     bench.spin(lambda: viewer.state['rating'])
-    assert fetch(viewer.base + '/export/c', Authorization=f'Bearer {viewer.token}')[0] == 409
+    assert fetch(viewer.base + '/export/c', Authorization=key)[0] == 409
 
     assert viewer.ask('save', bench.spin)['success']
     np.testing.assert_allclose(read_calibration(path).offset / 9.80665, [0.03, -0.02, 0.04],
@@ -211,50 +196,29 @@ def test_a_whole_calibration_through_the_commands_of_the_page(
     assert not viewer.state['preview']
     bench.feed(readings(DIRECTIONS[:1]))
     bench.spin(lambda: abs((viewer.of('progress')[-1]['corrected'] or 0.0) - 1.0) < 0.003)
+    count = len(viewer.of('progress'))
+    for k in range(10):  # the last one is shown, and not the batch of the session
+        bench.send(bench.imu([0.0, 0.0, 9.80665 * (1.0 + 0.01 * k)]))
+    bench.spin(lambda: any(math.isclose(each['raw'] or 0.0, 1.09, abs_tol=1e-6)
+                           for each in viewer.of('progress')[count:]))
 
     status, headers, page = fetch(viewer.base + viewer.state['page'])
     assert (status, b'<svg' in page) == (200, True)
     assert "frame-ancestors 'self'" in headers['Content-Security-Policy']
-    status, _, export = fetch(viewer.base + '/export/c', Authorization=f'Bearer {viewer.token}')
+    status, _, export = fetch(viewer.base + '/export/c', Authorization=key)
     assert (status, b'void' in export) == (200, True)
 
     assert viewer.ask('undo', bench.spin)['success']
     assert viewer.state['result'] is None
 
 
-def test_commands_of_services_and_of_the_page_are_shown_in_the_same_log(
-        bench: Any, viewer: Viewer, readings: Callable[..., Any]) -> None:
-    bench.feed(readings(DIRECTIONS[:2]))
-    refusal = bench.call('fit').message
-    bench.spin(lambda: refusal in [line['words'] for line in viewer.of('log')])
-    assert viewer.ask('fit', bench.spin)['words'] == refusal
-    numbers = [line['number'] for line in viewer.of('log')]
-    assert numbers == sorted(set(numbers))
-
-
-def test_the_newest_message_is_shown_and_not_the_batch_of_the_session(
-        bench: Any, viewer: Viewer, readings: Callable[..., Any]) -> None:
-    bench.feed(readings(DIRECTIONS[:1]))
-    count = len(viewer.of('progress'))
-    for k in range(10):
-        bench.send(bench.imu([0.0, 0.0, 9.80665 * (1.0 + 0.01 * k)]))
-    bench.spin(lambda: any(math.isclose(each['raw'] or 0.0, 1.09, abs_tol=1e-6)
-                           for each in viewer.of('progress')[count:]))
-
-
-def test_a_node_with_viewers_ends_cleanly(viewer: Viewer, bench: Any) -> None:
-    code, printed = bench.end(viewer.node, signal.SIGINT)  # type: ignore[attr-defined]
-    assert (code, 'Traceback' in printed) == (0, False)
-    wait(lambda: viewer.code)
-
-
-def test_the_token_is_neither_in_the_log_of_the_node_nor_in_rosout(
-        bench: Any, viewer: Viewer) -> None:
+def test_a_node_with_viewers_ends_cleanly_and_logs_no_token(bench: Any, viewer: Viewer) -> None:
     node = viewer.node  # type: ignore[attr-defined]
     heard = bench.listen(rcl_interfaces.msg.Log, '/rosout', latched=True)
     bench.spin(lambda: any('live page: ' in line.msg for line in heard))
     code, printed = bench.end(node, signal.SIGINT)
-    assert code == 0
+    assert (code, 'Traceback' in printed) == (0, False)
+    wait(lambda: viewer.code)
     folder = Path(os.environ.get('ROS_LOG_DIR') or bench.home / 'log')
     file, = folder.glob(f'*_{node.pid}_*.log')
     logged = file.read_text(encoding='utf-8')
@@ -270,8 +234,7 @@ def test_a_node_whose_port_is_in_use_says_so_and_works_on(
         port = taken.getsockname()[1]
         node = bench.calibrator(calibration_file=tmp_path / 'c.yaml', web_port=port,
                                 passthrough=True)
-        line = printed_until(node, 'in use')
-        assert f'the port {port} of 127.0.0.1 is in use' in line
+        printed_until(node, f'the port {port} of 127.0.0.1 is in use')
         bench.feed(readings(DIRECTIONS[:1]))
         assert 'pose' in bench.call('capture_pose').message
         assert node.poll() is None

@@ -1,19 +1,37 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A viewer of the live page: a client of its WebSocket, in a thread of its own."""
+"""A host in a thread, and viewers of its page: clients of its WebSocket in their own threads."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 import json
 from pathlib import Path
-from threading import Thread
+from threading import Event, Thread
 import time
 from typing import Any
 
+from accel_calib.session import CalibratorSettings, Log
 import aiohttp
+from inside import Host
+
+
+@contextmanager
+def hosted(source: Any, **settings: Any) -> Iterator[tuple[Host, list[Log]]]:
+    """Run a host with its page in a thread, and yield it with its log."""
+    lines, over = list[Log](), Event()
+    host = Host(source, CalibratorSettings(**settings), lines.append)
+    thread = Thread(target=host.run, args=[over.is_set])
+    thread.start()
+    try:
+        yield host, lines
+    finally:
+        over.set()
+        thread.join()
+        host.close()
 
 
 def link_of(line: str) -> str:
@@ -25,19 +43,8 @@ class Viewer:
     """
     A viewer, which keeps what it gets.
 
-    Parameters
-    ----------
-    link : str
-        Address of the page; the fragment is the token.
-    seen : int
-        Number of the last log line that the viewer has.
-
-    Attributes
-    ----------
-    got : list of dict
-        The messages, in their order.
-    code : int or None
-        Why the server closed the connection; None while it is open.
+    The fragment of the link is the token, and `seen` the last log line that the viewer has. It has
+    got messages in their order, and the code with which the server closed the connection.
 
     """
 

@@ -30,7 +30,6 @@ from .viewer import Message, OFFERED
 from ..calibrate import Calibration
 from ..errors import AccelCalibError, InputError, system_error
 from ..findings import rate, residual_figures
-from ..geometry import words_of
 from ..messages.one_reading import Triple
 from ..report import calibration_page, STORED
 from ..session import (
@@ -48,24 +47,15 @@ Show = Callable[[Message], object]
 
 _DIGITS = 7
 _DECIMALS = 6
-_NEAR = 0.38
-"""Component of a unit vector above which a side points up: about half of that of an edge."""
 
 _NO_CALIBRATION = InputError('there is no calibration yet', 'capture poses and press Fit')
 
 
 class Exchange:
     """
-    The messages of a session, and its answers.
+    The messages of a session, and its answers, which are logged.
 
-    Parameters
-    ----------
-    session, worker : Session, Worker
-        The session, and its worker.
-    call_soon : callable
-        Function that lets the thread of the session call a function.
-    log : callable
-        Function that logs the answers to commands.
+    `call_soon` lets the thread of the session call a function.
 
     Attributes
     ----------
@@ -85,8 +75,7 @@ class Exchange:
         self._shown: Calibration | None = None
         self._number = 0
         self._page: tuple[int, str] = (-1, '')
-        self._drawing = -1
-        self._waiting: list[Answer] = []
+        self._waiting: dict[int, list[Answer]] = {}
         self._line = int(time()) * 1000  # a viewer of an earlier server has smaller numbers
 
     # The session has news
@@ -96,8 +85,8 @@ class Exchange:
         self.show(_progress(monotonic(), state.progress(self._session, reading)))
 
     def show_poses(self, event: ShowPoses) -> None:
-        """Show the poses, and the state that may have changed with them."""
-        self.show(_poses(event.up))
+        """Show the directions of up of the poses, and the state that may have changed."""
+        self.show({'kind': 'poses', 'up': _rounded(event.up)})
         self.show_state()
 
     def show_line(self, line: Log) -> None:
@@ -164,17 +153,17 @@ class Exchange:
         if self._page[0] == number:
             answer(True, self._page[1])
             return
-        self._waiting.append(answer)
-        if self._drawing == number:
-            return
-        self._drawing = number
+        waiting = self._waiting.setdefault(number, [])
+        waiting.append(answer)
+        if len(waiting) > 1:
+            return  # it is being drawn
         store = self._session.files.store
         drawing = self._drawn(calibration, store.calibration.name if store else STORED)
 
         def answer_all(success: bool, words: str) -> None:
-            self._page, self._drawing = (number if success else -1, words), -1
-            waiting, self._waiting = self._waiting, []
-            for each in waiting:
+            if success:
+                self._page = number, words
+            for each in self._waiting.pop(number):
                 each(success, words)
 
         self._worker.run(drawing, answer_all)
@@ -208,12 +197,6 @@ def _progress(time: float, now: Progress) -> Message:
         'corrected': _fixed(now.corrected), 'temperature': _fixed(now.temperature)}
 
 
-def _poses(up: Floats) -> Message:
-    """Return the poses: (n, 3) directions of up in the sensor axes, unit vectors."""
-    return {'kind': 'poses', 'up': _rounded(up),
-            'words': [_side_up(direction) for direction in up]}
-
-
 def log_line(number: int, severity: Severity, words: str, time: float) -> Message:
     """Return a log line with its number; `time` is that since 1970 [s]."""
     return {'kind': 'log', 'number': number, 'severity': severity, 'words': words,
@@ -222,18 +205,10 @@ def log_line(number: int, severity: Severity, words: str, time: float) -> Messag
 
 def _state(session: Session, problem: str, *, busy: str, page: int) -> Message:
     """
-    Return the state of a session.
+    Return the state of a session, with the calibration that is offered, or else the one in use.
 
-    Parameters
-    ----------
-    session : Session
-        The session; the calibration that is offered, or otherwise the one in use, is shown.
-    problem : str
-        What the user must know before all else; empty: the most severe finding.
-    busy : str
-        Name of the command that runs; may be empty.
-    page : int
-        Number of the calibration page.
+    `problem` may be empty: then the most severe finding is shown. `busy` is the name of the
+    command that runs, and `page` the number of the calibration page.
 
     """
     sensor = session.sensor
@@ -297,33 +272,15 @@ def _rounded(values: Any) -> Any:
     return [_rounded(each) for each in array]
 
 
-def _side_up(direction: Floats) -> str:
-    """Return the side, edge or corner nearest to a direction, such as ``front side``."""
-    signs = np.where(np.abs(direction) > _NEAR, np.sign(direction), 0.0)
-    return words_of(signs).removeprefix('the ')
-
-
 _TICK = 1.0
 """Interval between two checks of the stream [s]."""
 
 
 class Host:
     """
-    A session, its page, and the samples of a source.
+    A session, its page, and the samples of a source; `log` prints a log line.
 
-    Parameters
-    ----------
-    source : Source
-        Where the samples come from.
-    settings : CalibratorSettings
-        The parameters; ``web_host`` and ``web_port`` are those of the page.
-    log : callable
-        Function that prints a log line.
-
-    Raises
-    ------
-    InputError
-        If the settings contradict each other, or the page cannot be served.
+    InputError if the settings contradict each other, or the page cannot be served.
 
     """
 
@@ -419,7 +376,7 @@ class Host:
             self._shown = now
             self.exchange.show_progress(self._newest())
 
-    def _newest(self) -> tuple[float, float, float] | None:
+    def _newest(self) -> Triple | None:
         if not self._waiting:
             return None
         x, y, z = self._waiting[-1][-1, 1:4].tolist()

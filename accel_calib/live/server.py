@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import hmac
 from importlib.resources import files
 from ipaddress import ip_address
+from pathlib import PurePath
 import secrets
 import socket
 from threading import Thread
@@ -30,11 +31,12 @@ from urllib.parse import urlsplit
 from aiohttp import web
 
 from .viewer import (
-    announce, Connection, HISTORY_S, LARGEST, Message, not_bound, reachable, secured, STUCK_S,
-    text_of, TooManyError, Viewer, welcome)
+    announce, COMMANDS, Connection, LARGEST, Message, not_bound, reachable, secured, STUCK_S,
+    text_of, TooManyError, Viewer)
+from .. import __version__
 from ..report import policy
 from ..session import Log, LogFilter
-from ..stored.exports import FORMATS
+from ..stored.exports import CALIBRATION_ALONE, FORMATS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -61,11 +63,13 @@ _ENDING_S = 1.0
 _LINES = 500
 """Number of log lines that are kept."""
 
+_HISTORY_S = 60.0
+"""Time for which a new viewer gets the history [s]."""
+
 _RARELY_S = 0.2
 """Interval at which the server looks for viewers while there is none [s]."""
 
-_KINDS = {'.html': 'text/html', '.css': 'text/css', '.js': 'text/javascript',
-          '.svg': 'image/svg+xml', '.png': 'image/png'}
+_KINDS = {'.html': 'text/html', '.css': 'text/css', '.js': 'text/javascript'}
 """Types of the files of the page, by the end of their name."""
 
 _ITS_LINK = 'open the link with the token, which the program showed on its terminal at its last ' \
@@ -81,7 +85,7 @@ class Board:
     def __init__(self) -> None:
         self._newest: dict[str, tuple[Message, str]] = {}
         self._lines: deque[tuple[int, str]] = deque(maxlen=_LINES)
-        self.history: deque[Message] = deque(maxlen=int(HISTORY_S / PERIOD))
+        self.history: deque[Message] = deque(maxlen=int(_HISTORY_S / PERIOD))
 
     def take(self, message: Message, *, is_seen: bool) -> bool:
         """Keep a message; return whether it is new. `is_seen`: there are viewers."""
@@ -109,8 +113,13 @@ class Board:
         return [line for line in self._lines if line[0] > number]
 
     def welcome(self, why: str) -> str:
-        """Return the answer to ``hello``; the parameter is as in `viewer.welcome`."""
-        return text_of(welcome(why, self.history.copy()))
+        """Return the answer to ``hello``; `why` commands are not accepted is empty if they are."""
+        kept = self.history.copy()
+        return text_of({
+            'kind': 'welcome', 'may': not why, 'why': why, 'version': __version__,
+            'seconds': _HISTORY_S, 'commands': COMMANDS, 'exports': CALIBRATION_ALONE,
+            'history': {key: [each[key] for each in kept]
+                        for key in ('time', 'raw', 'corrected', 'temperature')}})
 
 
 @dataclass(frozen=True)
@@ -157,16 +166,9 @@ class Address:
 
 class PageServer:
     """
-    The server of the live page.
+    The server of the live page; `desk` answers the viewers, in the thread of the server.
 
-    Parameters
-    ----------
-    desk : Exchange
-        What answers the viewers; it is called in the thread of the server.
-    host : str
-        Address to bind to.
-    port : int
-        Port; 0: any free one.
+    It listens at the address `host`; port 0 is any free one.
 
     Attributes
     ----------
@@ -192,8 +194,7 @@ class PageServer:
         self._address = Address(port, frozenset(), frozenset())
         page = files(__package__) / 'page'
         self._files: dict[str, Traversable] = {
-            f'/page/{each.name}': each for each in page.iterdir()
-            if _kind_of(each.name) and each.is_file()}
+            f'/page/{each.name}': each for each in page.iterdir() if _suffix_of(each) in _KINDS}
         self._files['/'] = page / 'index.html'
 
     # In any thread
@@ -339,8 +340,8 @@ class PageServer:
         file = self._files.get(path)
         if file is None:
             return web.Response(status=404, text='there is no such page; open /\n')
-        return web.Response(body=file.read_bytes(), content_type=_kind_of(file.name),
-                            charset=None if file.name.endswith('.png') else 'utf-8')
+        return web.Response(body=file.read_bytes(), content_type=_KINDS[_suffix_of(file)],
+                            charset='utf-8')
 
     async def _page(self) -> web.Response:
         success, text = await self._asked(self._desk.page)
@@ -426,6 +427,5 @@ class PageServer:
             lambda: answer(success, words)))
 
 
-def _kind_of(name: str) -> str:
-    """Return the type of a file of the page; empty for other files."""
-    return _KINDS.get(f'.{name.rpartition(".")[2]}', '')
+def _suffix_of(file: Traversable) -> str:
+    return PurePath(file.name).suffix

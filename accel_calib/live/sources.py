@@ -157,22 +157,8 @@ class _Port:
     """
     A serial port; it is opened again when it returns after it was removed.
 
-    Parameters
-    ----------
-    name : str
-        Device of the port, or its URL.
-    baud : int
-        Baud rate.
-
-    Attributes
-    ----------
-    problem : str
-        Why the port sends nothing at present; empty if it is open.
-
-    Raises
-    ------
-    InputError
-        If the port cannot be opened.
+    `problem` is why it sends nothing at present; empty if it is open. InputError if it cannot be
+    opened.
 
     """
 

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 import errno
 from http import HTTPStatus
@@ -37,10 +37,8 @@ from typing import Any, TYPE_CHECKING, TypeVar
 
 from aiohttp import web, WSCloseCode, WSMsgType
 
-from .. import __version__
 from ..errors import InputError
 from ..session import ros_home
-from ..stored.exports import CALIBRATION_ALONE
 
 if TYPE_CHECKING:
     from .server import PageServer
@@ -77,11 +75,6 @@ COMMANDS = ('capture_pose', 'undo_pose', *OFFERED, 'save', 'undo', 'load', 'rese
 LARGEST = 4096
 """Largest message of a viewer [bytes]."""
 
-HISTORY_S = 60.0
-"""Time for which a new viewer gets the history [s]."""
-
-_HISTORY = ('time', 'raw', 'corrected', 'temperature')
-
 Answered = TypeVar('Answered', bound=web.StreamResponse)
 
 _BUFFER = 65536
@@ -105,15 +98,7 @@ class Ask:
 
 
 def request_of(text: str) -> Hello | Ask:
-    """
-    Return the message of a viewer.
-
-    Raises
-    ------
-    InputError
-        If the text is not such a message.
-
-    """
+    """Return the message of a viewer; InputError if the text is none."""
     wrong = InputError('the message is not understood, expected {"hello": {"token", "seen"}} or '
                        '{"ask": {"id", "command"}}', 'load the page again')
     try:
@@ -131,29 +116,6 @@ def request_of(text: str) -> Hello | Ask:
 def text_of(message: Message) -> str:
     """Return a message as JSON."""
     return json.dumps(message, ensure_ascii=False, allow_nan=False, separators=(',', ':'))
-
-
-def welcome(why: str, history: Iterable[Message]) -> Message:
-    """
-    Return the answer to ``hello``.
-
-    Parameters
-    ----------
-    why : str
-        Why commands are not accepted; empty if they are.
-    history : iterable of dict
-        Messages of `progress`, the oldest first.
-
-    """
-    kept = list(history)
-    return {'kind': 'welcome', 'may': not why, 'why': why, 'version': __version__,
-            'seconds': HISTORY_S, 'commands': COMMANDS, 'exports': CALIBRATION_ALONE,
-            'history': {key: [each[key] for each in kept] for key in _HISTORY}}
-
-
-def answer_of(number: int, success: bool, words: str) -> Message:
-    """Return the answer to ``ask``."""
-    return {'kind': 'answer', 'id': number, 'success': success, 'words': words}
 
 
 def qr_code(link: str) -> str:
@@ -230,15 +192,7 @@ def secured(response: Answered) -> Answered:
 
 
 class Connection(web.RequestHandler):
-    """
-    A connection.
-
-    Attributes
-    ----------
-    stage : int
-        0: its request has not arrived; 1: it is being answered; 2: it is a viewer.
-
-    """
+    """A connection; `stage` 0: its request has not arrived; 1: it is answered; 2: a viewer."""
 
     def __init__(self, server: PageServer, http: web.Server) -> None:
         super().__init__(http, loop=asyncio.get_running_loop(),
@@ -286,12 +240,8 @@ class Viewer:
     """
     A viewer.
 
-    Attributes
-    ----------
-    why : str
-        Why it only looks; empty: its commands are accepted. Set when it is admitted.
-    abort : callable
-        Function that ends the connection without waiting.
+    `why` it only looks is set when it is admitted, and empty if its commands are accepted. `abort`
+    ends the connection without waiting.
 
     """
 
@@ -329,28 +279,28 @@ class Viewer:
                 while request := await self._next(None):
                     if isinstance(request, Ask):
                         self._ask(request)
-        except TooManyError as error:
-            await self._socket.close(code=WSCloseCode.TRY_AGAIN_LATER, message=str(error).encode())
         except InputError as error:
-            await self._socket.close(code=WSCloseCode.POLICY_VIOLATION,
-                                     message=str(error).encode())
-        except asyncio.TimeoutError:
-            await self._socket.close(code=WSCloseCode.POLICY_VIOLATION,
-                                     message=b'no hello came; load the page again')
+            code = (WSCloseCode.TRY_AGAIN_LATER if isinstance(error, TooManyError) else
+                    WSCloseCode.POLICY_VIOLATION)
+            await self._socket.close(code=code, message=str(error).encode())
         finally:
             if sending is not None:
                 sending.cancel()
 
     async def _next(self, timeout: float | None) -> Hello | Ask | None:
         """Return the next message of the viewer; None: it has ended."""
-        message = await self._socket.receive(timeout=timeout)
+        try:
+            message = await self._socket.receive(timeout=timeout)
+        except asyncio.TimeoutError:
+            raise InputError('no hello came', 'load the page again') from None
         return request_of(message.data) if message.type is WSMsgType.TEXT else None
 
     def _ask(self, request: Ask) -> None:
         """Run a command, if the viewer may."""
         def answer(success: bool, words: str) -> None:
             self._asking -= 1
-            self._answers.append(text_of(answer_of(request.id, success, words)))
+            self._answers.append(text_of({'kind': 'answer', 'id': request.id,
+                                          'success': success, 'words': words}))
             self.wake()
 
         if self._asking + len(self._answers) >= _COMMANDS:

@@ -44,7 +44,7 @@ from ..live import check_installed
 from ..messages.correction import output_frame
 from ..session import (
     CalibratorSettings, Check, checks, context_topics, Event, figures, Level, Log, LogFilter,
-    Mounting, Progress, Result, Session, ShowPoses, state, Still, Worker, worst)
+    Mounting, Result, Session, ShowPoses, state, Still, Worker, worst)
 from ..table import Floats
 
 if TYPE_CHECKING:
@@ -61,39 +61,12 @@ _PROGRESS_EVERY = 0.25
 """Shortest time between two messages of ~/progress without a new pose [s]."""
 
 
-def diagnostics_of(session: Session, node: str) -> list[DiagnosticStatus]:
-    """Return the state with all values, and one status for each concern."""
-    found = checks(session)
-    state = _status(worst(session, found), node, session.name)
-    state.values = _values(figures(session))
-    return [state, *(_status(check, node, session.name) for check in found)]
-
-
-def self_test_of(session: Session, node: str) -> list[DiagnosticStatus]:
-    """Return one status for each check; the test passes if all are OK."""
-    return [_status(check, node, session.name) for check in checks(session)]
-
-
-def progress_of(progress: Progress, node: str, sensor: str) -> DiagnosticStatus:
-    """Return the progress of a calibration as a message."""
-    return DiagnosticStatus(level=bytes([Level.OK]), name=f'{node}: progress', hardware_id=sensor,
-                            message=progress.advice, values=_values(progress.figures()))
-
-
-def _status(check: Check, node: str, sensor: str) -> DiagnosticStatus:
-    return DiagnosticStatus(level=bytes([check.level]), name=f'{node}: {check.name}',
-                            message=check.words, hardware_id=sensor)
-
-
-def _values(named: Iterable[tuple[str, str]]) -> list[KeyValue]:
-    return [KeyValue(key=key, value=value) for key, value in named]
-
-
 _CAPTURED = (0.2, 0.7, 0.3, 1.0)
 _ASKED_FOR = (1.0, 0.6, 0.0, 1.0)
 _WORDS = (1.0, 1.0, 1.0, 1.0)
 _SPHERE = (0.6, 0.6, 0.7, 0.15)
 _NUMBER_AT, _WORDS_AT = 1.12, 1.35
+_CENTRE = np.zeros(3)
 _ABOVE = np.array([0.0, 0.0, _WORDS_AT])
 _DOT, _LETTER, _SHAFT = 0.1, 0.1, 0.04
 
@@ -102,21 +75,14 @@ def pose_markers(directions: Floats, asked: NextPose, frame_id: str) -> MarkerAr
     """
     Return markers of the captured poses and of the next pose; they replace all earlier markers.
 
-    Parameters
-    ----------
-    directions : (n, 3) array
-        Directions of up in the sensor axes, unit vectors.
-    asked : NextPose
-        The next pose, or that more poses no longer help.
-    frame_id : str
-        Frame of the sensor.
+    The (n, 3) directions of up are unit vectors in the sensor axes.
 
     """
     markers = [Marker(action=Marker.DELETEALL),
                _marker('sphere', 0, Marker.SPHERE, _SPHERE, 2.0)]
     for k, direction in enumerate(directions):
-        markers.append(_at(_marker('poses', k, Marker.SPHERE, _CAPTURED, _DOT), direction))
-        markers.append(_text('numbers', k, str(k + 1), direction * _NUMBER_AT))
+        markers += [_marker('poses', k, Marker.SPHERE, _CAPTURED, _DOT, direction),
+                    _text('numbers', k, str(k + 1), direction * _NUMBER_AT)]
     if asked.direction is None:
         markers.append(_text('next', 1, asked.words, _ABOVE))
     else:
@@ -128,26 +94,21 @@ def pose_markers(directions: Floats, asked: NextPose, frame_id: str) -> MarkerAr
     return MarkerArray(markers=markers)
 
 
-def _marker(namespace: str, number: int, kind: int, color: tuple[float, ...],
-            size: float) -> Marker:
+def _marker(namespace: str, number: int, kind: int, color: tuple[float, ...], size: float,
+            at: Floats = _CENTRE) -> Marker:
     red, green, blue, alpha = color
     marker = Marker(ns=namespace, id=number, type=kind, action=Marker.ADD,
                     color=ColorRGBA(r=red, g=green, b=blue, a=alpha))
     marker.scale.x = marker.scale.y = marker.scale.z = size
     if kind == Marker.ARROW:
         marker.scale.y = marker.scale.z = 2.0 * size
-    marker.pose.orientation.w = 1.0
+    marker.pose.position, marker.pose.orientation.w = _point(at), 1.0
     return marker
 
 
 def _text(namespace: str, number: int, text: str, at: Floats) -> Marker:
-    marker = _marker(namespace, number, Marker.TEXT_VIEW_FACING, _WORDS, _LETTER)
+    marker = _marker(namespace, number, Marker.TEXT_VIEW_FACING, _WORDS, _LETTER, at)
     marker.text = text
-    return _at(marker, at)
-
-
-def _at(marker: Marker, position: Floats) -> Marker:
-    marker.pose.position = _point(position)
     return marker
 
 
@@ -160,10 +121,7 @@ class Calibrator:
     """
     The topics, services and parameters of a calibrator in a node.
 
-    Raises
-    ------
-    InputError
-        If a parameter does not accept its value, or the settings contradict each other.
+    InputError if a parameter does not accept its value, or the settings contradict each other.
 
     """
 
@@ -208,10 +166,8 @@ class Calibrator:
         for name in _TRIGGERS:
             command = getattr(self.session.commands, name)
             serve(self._node, name, command, self._worker, self._log)
-        self._node.create_service(SetBool, '~/enable', self._on_enable,
-                                  qos_profile=CALLS)
-        self._node.create_service(SelfTest, '~/self_test', self._on_self_test,
-                                  qos_profile=CALLS)
+        self._node.create_service(SetBool, '~/enable', self._on_enable, qos_profile=CALLS)
+        self._node.create_service(SelfTest, '~/self_test', self._on_self_test, qos_profile=CALLS)
 
     def start(self) -> None:
         """Start; to be called when the node has an executor."""
@@ -265,10 +221,19 @@ class Calibrator:
         self.session.tick()
         self._on_transforms()
         self._handle_events()
-        array = DiagnosticArray(status=diagnostics_of(self.session, self._name))
+        found = checks(self.session)
+        array = DiagnosticArray(status=[
+            self._status(worst(self.session, found), figures(self.session)),
+            *map(self._status, found)])
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._diagnostics.publish(array)
         self._show_state()
+
+    def _status(self, check: Check, values: Iterable[tuple[str, str]] = ()) -> DiagnosticStatus:
+        return DiagnosticStatus(
+            level=bytes([check.level]), name=f'{self._name}: {check.name}', message=check.words,
+            hardware_id=self.session.name,
+            values=[KeyValue(key=key, value=value) for key, value in values])
 
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> Any:
         response.success, response.message = True, self.session.commands.enable(request.data)
@@ -276,10 +241,9 @@ class Calibrator:
 
     def _on_self_test(self, request: SelfTest.Request, response: SelfTest.Response) -> Any:
         self.stream.flush()
-        response.id = self.session.name
-        response.status = self_test_of(self.session, self._name)
-        passed = all(status.level == DiagnosticStatus.OK for status in response.status)
-        response.passed = b'\x01' if passed else b'\x00'
+        found = checks(self.session)
+        response.id, response.status = self.session.name, list(map(self._status, found))
+        response.passed = bytes([all(each.level == Level.OK for each in found)])
         return response
 
     def _handle_events(self) -> None:
@@ -290,8 +254,9 @@ class Calibrator:
         due = monotonic() - self._progress_at >= _PROGRESS_EVERY
         if shown or (due and self._progress.get_subscription_count()):
             self._progress_at = monotonic()
-            self._progress.publish(progress_of(state.progress(self.session), self._name,
-                                               self.session.name))
+            now = state.progress(self.session)
+            self._progress.publish(self._status(Check('progress', Level.OK, now.advice),
+                                                now.figures()))
 
     def _handle(self, event: Event) -> None:
         if isinstance(event, Log):
@@ -354,15 +319,8 @@ class CalibratorNode(Node):
 
     def __init__(self) -> None:
         super().__init__('calibrator')
-        self._calibrator = Calibrator(self)
-
-    def start(self) -> None:
-        """Start; to be called when the node has an executor."""
-        self._calibrator.start()
-
-    def close(self) -> None:
-        """Finish writing, and release the files."""
-        self._calibrator.close()
+        calibrator = Calibrator(self)
+        self.start, self.close = calibrator.start, calibrator.close
 
 
 class ManagedCalibrator(LifecycleNode):
@@ -374,7 +332,7 @@ class ManagedCalibrator(LifecycleNode):
         self._own = [*self.publishers, *self.subscriptions, *self.services, *self.timers]
         self._settings = CalibratorSettings()
         try:
-            self._set_settings(declared(self, CalibratorSettings, fixed=False))
+            self._settings = declared(self, CalibratorSettings, fixed=False)
         except AccelCalibError as error:
             self.get_logger().error(f'{error}; set it before configuring')
         follow(self, lambda: self._settings, self._set_settings, runs=False)
@@ -396,33 +354,28 @@ class ManagedCalibrator(LifecycleNode):
             return TransitionCallbackReturn.FAILURE
         self._set_active(active=False)
         self._calibrator.start()
-        return super().on_configure(state)
+        return TransitionCallbackReturn.SUCCESS
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Publish corrected messages."""
-        self._set_active(active=True)
-        return super().on_activate(state)
+        return self._set_active(active=True)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop publishing corrected messages."""
-        self._set_active(active=False)
-        return super().on_deactivate(state)
+        return self._set_active(active=False)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Close the files and remove all topics and services."""
         self.close()
         self._destroy_entities()
-        return super().on_cleanup(state)
+        return TransitionCallbackReturn.SUCCESS
 
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Close the files and remove all topics and services."""
-        self.close()
-        self._destroy_entities()
-        return super().on_shutdown(state)
+    on_shutdown = on_cleanup
 
-    def _set_active(self, *, active: bool) -> None:
+    def _set_active(self, *, active: bool) -> TransitionCallbackReturn:
         if self._calibrator is not None:
             self._calibrator.stream.set_active(active=active)
+        return TransitionCallbackReturn.SUCCESS
 
     def close(self) -> None:
         """Finish writing, and release the files."""

@@ -79,9 +79,8 @@ def follow(node: Node, settings: Callable[[], Settings],
     """
     Pass new settings to `adopt` when parameters are set; refuse invalid values.
 
-    `runs`: refuse those that cannot change while the node runs, too.
-
-    Returns the callback, which ``node.remove_on_set_parameters_callback`` removes.
+    `runs`: refuse those that cannot change while the node runs, too. Returns the callback, which
+    ``node.remove_on_set_parameters_callback`` removes.
 
     """
     def on_set(parameters: list[Parameter]) -> SetParametersResult:
@@ -109,14 +108,12 @@ def _descriptor(parameter: Field[Any], fixed: bool) -> ParameterDescriptor:
         type=Parameter.Type.from_parameter_value(default).value,
         additional_constraints=expected(parameter),
         read_only=fixed and not parameter.metadata['live'], dynamic_typing=True)
-    if limits is None:
-        return descriptor
-    if isinstance(default, float):
-        descriptor.floating_point_range = [
-            FloatingPointRange(from_value=limits[0], to_value=limits[1])]
-    else:
-        descriptor.integer_range = [
-            IntegerRange(from_value=int(limits[0]), to_value=int(limits[1]))]
+    if limits is not None and isinstance(default, float):
+        least, most = limits
+        descriptor.floating_point_range = [FloatingPointRange(from_value=least, to_value=most)]
+    elif limits is not None:
+        least, most = map(int, limits)
+        descriptor.integer_range = [IntegerRange(from_value=least, to_value=most)]
     return descriptor
 
 
@@ -131,13 +128,7 @@ LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
 """For latched topics; late subscribers receive the last message."""
 
 CALLS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
-"""
-For services.
-
-The default depth is 10. If more calls than these wait for the node, the oldest ones are never
-answered. The depth of the answers that wait for a client is set by the client.
-
-"""
+"""For services. If more calls than the depth wait for the node, the oldest are never answered."""
 
 _UNKNOWN = '_NODE_NAME_UNKNOWN_'
 """Name of a node of which DDS knows only the topic so far."""
@@ -163,19 +154,10 @@ def published_by_others(node: Node, types: Iterable[str]) -> list[tuple[str, ...
 def mismatches(node: Node, subscriptions: Iterable[Any], publishers: Iterable[Any]
                ) -> tuple[str, ...]:
     """
-    Return one line for each endpoint that cannot exchange messages with a node.
+    Return one line for each endpoint that cannot exchange messages with these of a node.
 
-    Parameters
-    ----------
-    node : Node
-        The node.
-    subscriptions, publishers
-        Subscriptions and publishers of the node.
-
-    Returns
-    -------
-    tuple of str
-        What is wrong and what to do. Of other policies than these two, rclpy reports a difference.
+    A line is what is wrong and what to do. Of other policies than reliability and durability,
+    rclpy reports a difference.
 
     """
     lines = []
@@ -277,25 +259,11 @@ class StaticTransforms:
 
     def add(self, parent: str, child: str, quaternion: Sequence[float]) -> bool:
         """
-        Add a transform, or replace the previous one of this child.
+        Add a transform, or replace the previous one of this child; return whether it is new.
 
-        Parameters
-        ----------
-        parent, child : str
-            Names of the frames; a leading slash is ignored.
-        quaternion : sequence of 4 floats
-            x, y, z, w of the rotation that transforms a vector from `child` to `parent`.
-
-        Returns
-        -------
-        bool
-            Whether the tree has changed.
-
-        Raises
-        ------
-        InputError
-            If a name is empty, the quaternion is not a rotation, or the frames form a loop. The
-            tree is then unchanged.
+        The quaternion (x, y, z, w) is that of the rotation of vectors from `child` to `parent`.
+        InputError if a name is empty, the quaternion is not a rotation, or the frames form a loop:
+        the tree is then unchanged.
 
         """
         parent, child = _plain(parent), _plain(child)
@@ -340,18 +308,16 @@ def watch_static(node: Node, on_change: Callable[[], None]) -> StaticTransforms:
     """
     transforms = StaticTransforms()
 
-    def added(stamped: TransformStamped) -> bool:
-        q = stamped.transform.rotation
-        try:
-            return transforms.add(stamped.header.frame_id, stamped.child_frame_id,
-                                  (q.x, q.y, q.z, q.w))
-        except InputError as error:
-            node.get_logger().warning(str(error))
-            return False
-
     def on_message(message: Any) -> None:
-        changed = [added(stamped) for stamped in message.transforms]
-        if any(changed):
+        is_new = False
+        for stamped in message.transforms:
+            q = stamped.transform.rotation
+            try:
+                is_new |= transforms.add(stamped.header.frame_id, stamped.child_frame_id,
+                                         (q.x, q.y, q.z, q.w))
+            except InputError as error:
+                node.get_logger().warning(str(error))
+        if is_new:
             on_change()
 
     node.create_subscription(needs_tf2('base_frame'), TOPIC, on_message, _ALL_STATIC)

@@ -18,7 +18,7 @@ succeeds on a slow machine.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, ExitStack
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 import os
@@ -85,9 +85,6 @@ _PATIENCE = 120.0
 _LOOK_EVERY = 0.05
 """Interval at which conditions are checked [s]."""
 
-Spin = Callable[[Callable[[], bool], str], None]
-"""Function that spins until a condition is true; the text names the condition in errors."""
-
 Rest = dict[str, Floats]
 """Means of raw, corrected and true acceleration over a rest [g], (3,) arrays."""
 
@@ -95,10 +92,9 @@ Rest = dict[str, Floats]
 @dataclass(frozen=True)
 class Errors:
     """
-    Errors of a topic over rests in several poses.
+    Errors of a topic over rests: RMS of the vector, RMS and largest | |a| - 1 g |.
 
-    RMS of the difference from the truth, as a vector; RMS and largest | |a| - 1 g |; RMS angle
-    between measured and true direction of up.
+    The tilt is the RMS angle between measured and true direction of up.
 
     """
 
@@ -134,18 +130,18 @@ class Outcome:
                 and (not self.hidden or self.hidden in self.found))
 
 
-class DemoError(AccelCalibError):
-    """The demonstration failed."""
-
-
 class User(Node):
-    """A node that receives the messages of both nodes, and calls their services."""
+    """A node that receives the messages of both nodes, and calls their services step by step."""
 
-    def __init__(self) -> None:
+    def __init__(self, processes: Sequence[subprocess.Popen[bytes]],
+                 report: Callable[[str], None]) -> None:
         super().__init__('demo')
-        self.temperature = float('nan')
-        self.poses = np.zeros((0, 3))
-        self.messages: dict[str, dict[int, tuple[float, float, float]]] = {
+        self._processes, self._report = processes, report
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self)
+        self._temperature = float('nan')
+        self._poses = np.zeros((0, 3))
+        self._messages: dict[str, dict[int, tuple[float, float, float]]] = {
             'raw': {}, 'corrected': {}, 'truth': {}}
         self.create_subscription(MarkerArray, 'calibrator/poses', self._on_poses, LATCHED)
         self.create_subscription(Temperature, 'temperature', self._on_temperature, SENSOR)
@@ -154,17 +150,17 @@ class User(Node):
                                   ('truth', 'simulator/truth', Vector3Stamped)):
             self.create_subscription(kind, topic, self._keeper(name), SENSOR)
         # Made once: DDS drops an answer to a client that the node has not discovered yet.
-        self.triggers = {name: self.create_client(Trigger, name) for name in _SERVICES}
+        self._triggers = {name: self.create_client(Trigger, name) for name in _SERVICES}
 
     def _on_poses(self, markers: MarkerArray) -> None:
         at = [marker.pose.position for marker in markers.markers if marker.ns == 'poses']
-        self.poses = np.array([[point.x, point.y, point.z] for point in at]).reshape(-1, 3)
+        self._poses = np.array([[point.x, point.y, point.z] for point in at]).reshape(-1, 3)
 
     def _on_temperature(self, message: Temperature) -> None:
-        self.temperature = message.temperature
+        self._temperature = message.temperature
 
     def _keeper(self, name: str) -> Callable[[Any], None]:
-        kept = self.messages[name]
+        kept = self._messages[name]
 
         def keep(message: Any) -> None:
             stamp = message.header.stamp
@@ -173,56 +169,48 @@ class User(Node):
 
         return keep
 
-    def forget(self) -> None:
-        """Forget the messages so far."""
-        for kept in self.messages.values():
-            kept.clear()
-
     @property
-    def up(self) -> tuple[float, ...]:
+    def _up(self) -> tuple[float, ...]:
         """Return the newest truth [m/s²]; empty before the first one."""
-        truth = self.messages['truth']
+        truth = self._messages['truth']
         return truth[max(truth)] if truth else ()
 
-    def rest(self, *names: str) -> list[Rest]:
+    def _rest(self, *names: str) -> list[Rest]:
         """Return the messages of these kinds in the ongoing rest, oldest first [g]."""
-        truth = self.messages['truth']
-        common = sorted(set.intersection(*(set(self.messages[name]) for name in names)))
-        moving = next((k for k in range(len(common), 0, -1) if truth[common[k - 1]] != self.up), 0)
-        return [{name: np.array(self.messages[name][stamp]) / STANDARD_GRAVITY for name in names}
+        truth = self._messages['truth']
+        common = sorted(set.intersection(*(set(self._messages[name]) for name in names)))
+        moving = next((k for k in range(len(common), 0, -1) if truth[common[k - 1]] != self._up),
+                      0)
+        return [{name: np.array(self._messages[name][stamp]) / STANDARD_GRAVITY for name in names}
                 for stamp in common[moving:]]
 
-    def has_captured(self) -> bool:
+    def _has_captured(self) -> bool:
         """Return whether there is a pose in the direction of the ongoing rest."""
-        rest = self.rest('raw', 'truth')
+        rest = self._rest('raw', 'truth')
         if not rest:
             return False
         up = np.mean([each['raw'] for each in rest], axis=0)
-        return bool(np.any(self.poses @ up > _SAME_POSE * np.linalg.norm(up)))
+        return bool(np.any(self._poses @ up > _SAME_POSE * np.linalg.norm(up)))
 
-
-class Demonstration:
-    """The steps of a user, each reported in a line."""
-
-    def __init__(self, user: User, spin: Spin, report: Callable[[str], None]) -> None:
-        self._user, self._spin, self._report = user, spin, report
+    def _has_rested(self, count: int) -> bool:
+        return len(self._rest('raw', 'truth')) >= count
 
     def turn(self, service: str = 'next') -> None:
         """Turn the sensor, and wait until it rests."""
-        user = self._user
-        self._spin(lambda: bool(user.up), 'a message of the simulator')
-        before = user.up
+        self._spin(lambda: bool(self._up), 'a message of the simulator')
+        before = self._up
         self.call(f'simulator/{service}')
-        user.forget()
-        self._spin(lambda: user.up not in ((), before)
-                   and len(user.rest('truth')) >= _SETTLED, 'rest of the simulated sensor')
+        for kept in self._messages.values():
+            kept.clear()
+        self._spin(lambda: self._up not in ((), before)
+                   and len(self._rest('truth')) >= _SETTLED, 'rest of the simulated sensor')
 
     def capture(self, count: int) -> None:
         """Let the calibrator capture this number of poses."""
         for done in range(1, count + 1):
             if done > 1:
                 self.turn()
-            self._spin(self._user.has_captured, f'pose {done}')
+            self._spin(self._has_captured, f'pose {done}')
             if done % 4 == 0:
                 self._report(f'captured {done} poses')
 
@@ -231,21 +219,15 @@ class Demonstration:
         rests = []
         for done in range(1, count + 1):
             self.turn()
-            self._spin(lambda: len(self._common()) >= _SAMPLES and self._user.has_captured(),
-                       f'rest {done}')
-            samples = self._common()
+            self._spin(lambda: len(self._rest('raw', 'corrected', 'truth')) >= _SAMPLES
+                       and self._has_captured(), f'rest {done}')
+            samples = self._rest('raw', 'corrected', 'truth')
             rests.append({name: np.mean([each[name] for each in samples], axis=0)
                           for name in samples[0]})
             error = np.linalg.norm(rests[-1]['corrected'] - rests[-1]['truth']) * MG
-            self._report(f'  rest {done:2d} of {count}, now {self._user.temperature:.1f} °C: '
+            self._report(f'  rest {done:2d} of {count}, now {self._temperature:.1f} °C: '
                          f'imu/data_calibrated is {error:5.2f} mg from the truth')
         return rests
-
-    def _common(self) -> list[Rest]:
-        return self._user.rest('raw', 'corrected', 'truth')
-
-    def _has_rested(self, count: int) -> bool:
-        return len(self._user.rest('raw', 'truth')) >= count
 
     def level(self) -> str:
         """Put the robot flat, and call ``~/set_level`` as soon as the rest is long enough."""
@@ -258,50 +240,58 @@ class Demonstration:
         raise _refused('calibrator/set_level', answer)
 
     def call(self, service: str) -> str:
-        """Call a service, and return its answer; raise DemoError if it fails."""
+        """Call a service, and return its answer; AccelCalibError if it fails."""
         answer = self._request(service)
         if not answer.success:
             raise _refused(service, answer)
         return str(answer.message)
 
     def _request(self, service: str) -> Trigger.Response:
-        client = self._user.triggers[service]
+        client = self._triggers[service]
         self._spin(client.service_is_ready, f'the service {service}')
         future = client.call_async(Trigger.Request())
         self._spin(future.done, f'the answer of {service}')
         return future.result()
 
+    def _spin(self, until: Callable[[], bool], what: str) -> None:
+        """Spin until a condition is true; the text names the condition in errors."""
+        ends = time.monotonic() + _PATIENCE
+        while not until():
+            _check_running(self._processes)
+            if time.monotonic() > ends:
+                raise AccelCalibError(f'{what}: not available within {_PATIENCE:.0f} s, '
+                                      f'{counted(len(self._poses), "pose")} so far',
+                                      'check whether a firewall blocks DDS on this machine')
+            look_again = time.monotonic() + _LOOK_EVERY
+            while time.monotonic() < look_again:
+                self._executor.spin_once(timeout_sec=_LOOK_EVERY)
 
-def _refused(service: str, answer: Trigger.Response) -> DemoError:
-    return DemoError(f'{service} answered: {answer.message}', 'run the demonstration again')
+    def close(self) -> None:
+        """Leave DDS."""
+        self._executor.shutdown()
+        self.destroy_node()
+
+
+def _refused(service: str, answer: Trigger.Response) -> AccelCalibError:
+    return AccelCalibError(f'{service} answered: {answer.message}', 'run the demonstration again')
 
 
 def demonstrate(report: Callable[[str], None], hidden: str = '') -> Outcome:
     """
     Run the demonstration, and compare the errors.
 
-    Parameters
-    ----------
-    report : callable
-        Function that is called with a line for each step.
-    hidden : str
-        Effect that the sensor hides, such as ``quadratic=0.004``; empty: none.
-
-    Raises
-    ------
-    DemoError
-        If a step takes too long, or a service refuses.
+    `report` is called with a line for each step. `hidden` is the effect that the sensor hides,
+    such as ``quadratic=0.004``; empty: none. AccelCalibError if a step takes too long, or a
+    service refuses.
 
     """
     began = time.monotonic()
-    with tempfile.TemporaryDirectory(prefix='accel_calib_demo_') as folder, ExitStack() as stack:
-        set_environment(Path(folder), stack.enter_context(own_domain()))
-        report('starting the calibrator node and a simulated Imu, turned by hand'
-               + (f', that hides {hidden}' if hidden else ''))
-        simulated = {**_HELD, 'effects': [*_EFFECTS, *([hidden] if hidden else [])]}
-        processes = [stack.enter_context(running('node', _NODE)),
-                     stack.enter_context(running('simulator', simulated))]
-        demo = Demonstration(*stack.enter_context(user_of(processes)), report)
+    report('starting the calibrator node and a simulated Imu, turned by hand'
+           + (f', that hides {hidden}' if hidden else ''))
+    simulated = {**_HELD, 'effects': [*_EFFECTS, *([hidden] if hidden else [])]}
+    with (_isolated() as folder, running('node', _NODE) as node,
+          running('simulator', simulated) as simulator,
+          user_of([node, simulator], report) as demo):
         demo.capture(_POSES_HIDDEN if hidden else _POSES)
         report(f'~/fit: {demo.call("calibrator/fit")}')
         report(f'~/set_level: {demo.level()}')
@@ -309,13 +299,13 @@ def demonstrate(report: Callable[[str], None], hidden: str = '') -> Outcome:
         raw, calibrated = (_errors(rests, name) for name in ('raw', 'corrected'))
         if not hidden:
             return Outcome(len(rests), raw, calibrated, time.monotonic() - began)
-        found, lag_s = _refined(demo, report, Path(folder) / 'accel_calib' / 'demo.yaml')
+        found, lag_s = _refined(demo, report, folder / 'accel_calib' / 'demo.yaml')
         again = _errors(demo.measure(_CHECKED_HIDDEN), 'corrected')
         return Outcome(len(rests), calibrated, again, time.monotonic() - began,
                        parse_effect(hidden)[0], found, lag_s)
 
 
-def _refined(demo: Demonstration, report: Callable[[str], None], stored: Path
+def _refined(demo: User, report: Callable[[str], None], stored: Path
              ) -> tuple[tuple[str, ...], float]:
     """Refine and level; return the effects that are new in the stored model, and their lag [s]."""
     fitted = read_calibration(stored).model
@@ -344,24 +334,25 @@ def _rms(values: Floats) -> float:
 
 def demonstrate_page(port: int, report: Callable[[str], None],
                      is_over: Callable[[], bool]) -> None:
-    """Run simulator and calibrator with its live page, until it is over; raises DemoError."""
-    with tempfile.TemporaryDirectory(prefix='accel_calib_demo_') as folder, ExitStack() as stack:
-        set_environment(Path(folder), stack.enter_context(own_domain()))
-        report('a simulated Imu is turned by hand; open the link of the live page in a browser, '
-               'wait for the poses, and press Fit. Ctrl-C ends it')
-        processes = [
-            stack.enter_context(running('node', {'sensor': 'demo', 'web_port': port}, 'info')),
-            stack.enter_context(running('simulator', _TIMED))]
+    """Run simulator and calibrator with its live page, until it is over or a node has ended."""
+    report('a simulated Imu is turned by hand; open the link of the live page in a browser, wait '
+           'for the poses, and press Fit. Ctrl-C ends it')
+    with (_isolated(),
+          running('node', {'sensor': 'demo', 'web_port': port}, 'info') as node,
+          running('simulator', _TIMED) as simulator):
         while not is_over():
-            _check_running(processes)
+            _check_running([node, simulator])
             time.sleep(_LOOK_EVERY)
 
 
-def set_environment(folder: Path, domain: int) -> None:
-    """Isolate the demonstration: own domain, local machine only, own files."""
-    os.environ.update(ROS_DOMAIN_ID=str(domain),
-                      ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_HOME=str(folder),
-                      ROS_LOG_DIR=str(folder / 'log'))
+@contextmanager
+def _isolated() -> Iterator[Path]:
+    """Yield a folder for the files, and let processes use it and a domain on this machine."""
+    with (tempfile.TemporaryDirectory(prefix='accel_calib_demo_') as folder,
+          own_domain() as domain):
+        os.environ.update(ROS_DOMAIN_ID=str(domain), ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST',
+                          ROS_HOME=folder, ROS_LOG_DIR=os.path.join(folder, 'log'))
+        yield Path(folder)
 
 
 @contextmanager
@@ -389,33 +380,18 @@ def _in_yaml(value: Any) -> str:
 
 
 @contextmanager
-def user_of(processes: Sequence[subprocess.Popen[bytes]]) -> Iterator[tuple[User, Spin]]:
-    """Yield the user of the nodes, and a function that spins until a condition is true."""
+def user_of(processes: Sequence[subprocess.Popen[bytes]], report: Callable[[str], None]
+            ) -> Iterator[User]:
+    """Yield the user of the nodes."""
     rclpy.init(args=[])
-    user = User()
-    executor = SingleThreadedExecutor()
-    executor.add_node(user)
-
-    def spin(until: Callable[[], bool], what: str) -> None:
-        ends = time.monotonic() + _PATIENCE
-        while not until():
-            _check_running(processes)
-            if time.monotonic() > ends:
-                raise DemoError(f'{what}: not available within {_PATIENCE:.0f} s, '
-                                f'{counted(len(user.poses), "pose")} so far',
-                                'check whether a firewall blocks DDS on this machine')
-            look_again = time.monotonic() + _LOOK_EVERY
-            while time.monotonic() < look_again:
-                executor.spin_once(timeout_sec=_LOOK_EVERY)
-
+    user = User(processes, report)
     try:
-        yield user, spin
+        yield user
     finally:
-        executor.shutdown()
-        user.destroy_node()
+        user.close()
         rclpy.try_shutdown()
 
 
 def _check_running(processes: Sequence[subprocess.Popen[bytes]]) -> None:
     if any(process.poll() is not None for process in processes):
-        raise DemoError('a node has ended unexpectedly', 'see its output above')
+        raise AccelCalibError('a node has ended unexpectedly', 'see its output above')

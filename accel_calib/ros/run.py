@@ -75,19 +75,10 @@ EXECUTABLES = {each.__name__: each for each in (calibrator, calibrator_lifecycle
 
 def run(node: str, args: Sequence[str] | None = None) -> int:
     """
-    Run a node until it is ended, and return the exit status.
+    Run a node until it is ended; return 0, or 2 if the input is invalid or ROS is not available.
 
-    Parameters
-    ----------
-    node : str
-        ``module:class`` of the node, in this package.
-    args : sequence of str, optional
-        Command line, starting with the program name; by default that of the process.
-
-    Returns
-    -------
-    int
-        0, or 2 if the input is invalid or ROS is not available.
+    The node is ``module:class`` in this package. `args` is the command line, starting with the
+    program name; by default that of the process.
 
     """
     came, written = os.pipe()

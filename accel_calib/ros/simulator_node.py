@@ -122,11 +122,19 @@ class SimulatedImu:
 
     def turn_on(self) -> bool:
         """Let the sensor turn to the next pose now; return whether there is one."""
-        if self.next_pose >= len(self.directions) and not self._settings.loop:
+        if self._is_over:
             return False
-        self.turn_to(self.directions[self.next_pose % len(self.directions)])
-        self.next_pose += 1
+        self.turn_to(self._next())
         return True
+
+    @property
+    def _is_over(self) -> bool:
+        return self.next_pose >= len(self.directions) and not self._settings.loop
+
+    def _next(self) -> Floats:
+        """Return the direction of the next pose, which is then one of those so far."""
+        self.next_pose += 1
+        return self.directions[(self.next_pose - 1) % len(self.directions)]
 
     def samples(self, count: int) -> Recording:
         """Return the next samples [g], at most this number; none after the end."""
@@ -150,15 +158,12 @@ class SimulatedImu:
 
     def _extend(self, lacking: int) -> bool:
         """Append the next pose, or this number of samples at rest; return whether there is any."""
-        settings = self._settings
-        over = self.next_pose >= len(self.directions) and not settings.loop
-        if not self._resting or (over and settings.hold):
+        if not self._resting or (self._is_over and self._settings.hold):
             self._path = np.concatenate([self._path, self._rest(lacking)])
-        elif over:
+        elif self._is_over:
             return False
         else:
-            self._append(self.directions[self.next_pose % len(self.directions)])
-            self.next_pose += 1
+            self._append(self._next())
         return True
 
     def _append(self, up: Floats) -> None:

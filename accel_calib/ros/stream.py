@@ -136,15 +136,8 @@ class Stream:
     """
     The messages of one sensor.
 
-    Parameters
-    ----------
-    session : Session
-        The session; it receives the samples and contains the calibration.
-    publishers : sequence of 3 Publishers
-        For corrected messages, those by an offered calibration, and the acceleration without
-        gravity.
-    on_events : callable
-        Function that is called after the session received samples.
+    The `publishers` are those of corrected messages, of those by an offered calibration, and of
+    the acceleration without gravity. `on_events` is called after the session received samples.
 
     """
 

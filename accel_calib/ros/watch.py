@@ -49,8 +49,8 @@ class _Receiver:
 
     def __init__(self, node: Node, executor: SingleThreadedExecutor, name: str) -> None:
         self._node, self._executor = node, executor
-        self._last: DiagnosticStatus | None = None
         self._arrived = monotonic()
+        self.progress: Progress | None = None
         self.messages = 0
         topic = f'{name.rstrip("/")}{_SUFFIX}'
         try:
@@ -63,19 +63,13 @@ class _Receiver:
         self.name = self._topic.removesuffix(_SUFFIX)
 
     def _on_message(self, message: DiagnosticStatus) -> None:
-        self._last, self._arrived = message, monotonic()
+        self.progress = Progress.from_figures({each.key: each.value for each in message.values})
+        self._arrived = monotonic()
         self.messages += 1
 
     def spin(self) -> None:
         """Wait a short time for a message."""
         self._executor.spin_once(timeout_sec=_LOOK_EVERY)
-
-    @property
-    def progress(self) -> Progress | None:
-        """Return the last progress; None before the first message."""
-        last = self._last
-        return None if last is None else Progress.from_figures(
-            {each.key: each.value for each in last.values})
 
     @property
     def silence(self) -> float:
@@ -108,21 +102,10 @@ def watch(name: str, show: Show, is_over: Callable[[], bool], args: Sequence[str
     """
     Show the progress of a calibrator at each message, and problems, until it is over.
 
-    Parameters
-    ----------
-    name : str
-        Name of the node, with or without namespace.
-    show : callable
-        Function that is called for each message, and each time the problem changes.
-    is_over : callable
-        Function that returns whether to end; it is called about ten times per second.
-    args : sequence of str, optional
-        Arguments for ROS, starting with ``--ros-args``.
-
-    Raises
-    ------
-    InputError
-        If ROS does not start, the name is not valid, or the node has another version.
+    `name` is with or without namespace. `show` is called for each message, and each time the
+    problem changes; `is_over` about ten times per second. `args` are those of ROS, starting with
+    ``--ros-args``. InputError if ROS does not start, the name is not valid, or the node has
+    another version.
 
     """
     with _receiver(name, args) as receiver:

@@ -35,17 +35,6 @@ _PAUSE = 0.05
 """Longest pause between two calls [s]."""
 
 
-def _client(node: Node, service: str, name: str) -> Any:
-    kind = {'enable': SetBool, 'self_test': SelfTest}.get(name, Trigger)
-    return node.create_client(kind, f'{service}/{name}')
-
-
-def _words(name: str, answer: Any) -> str:
-    if name == 'self_test':
-        return '; '.join(f'{each.name}: {each.message}' for each in answer.status)
-    return str(answer.message)
-
-
 def called(executor: SingleThreadedExecutor, client: Any, name: str,
            rng: np.random.Generator) -> dict[str, Any]:
     """Call a service, and return what came of it; ``words`` is None without a response."""
@@ -56,7 +45,8 @@ def called(executor: SingleThreadedExecutor, client: Any, name: str,
     found = {'name': name, 'begun': begun, 'ended': time.monotonic(), 'words': None, 'good': False}
     if future.done():
         answer = future.result()
-        found['words'] = _words(name, answer)
+        found['words'] = answer.message if name != 'self_test' else '; '.join(
+            f'{each.name}: {each.message}' for each in answer.status)
         found['good'] = bool(getattr(answer, 'success', True))
     return found
 
@@ -70,7 +60,9 @@ def main() -> None:
     node = Node(f'caller_{seed}')
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    clients = {name: _client(node, service, name) for name in SHARES}
+    kinds = {'enable': SetBool, 'self_test': SelfTest}
+    clients = {name: node.create_client(kinds.get(name, Trigger), f'{service}/{name}')
+               for name in SHARES}
     for client in clients.values():
         client.wait_for_service(_LIMIT)
     weights = np.array(list(SHARES.values()), float)

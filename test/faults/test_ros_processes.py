@@ -34,6 +34,7 @@ READER = Path(__file__).with_name('reader.py')
 COMMANDS = ('capture_pose', 'fit', 'set_level', 'fit', 'undo_pose', 'save', 'capture_pose', 'undo',
             'fit', 'refine', 'calibrate_at_rest', 'load', 'reset')
 _POSES = 12
+_SENSOR = {'sensor': 'arm', 'passthrough': True, 'auto_capture': False}
 _LATEST_KILL_S = 1.5
 
 
@@ -104,17 +105,21 @@ def call_until_killed(bench: Any, node: Any, turned: Any, rng: np.random.Generat
         assert states, call
 
 
-def test_a_killed_node_has_stored_all_that_it_answered(
-        bench: Any, readings: Callable[..., Any], tmp_path: Path) -> None:
-    folder = bench.home / 'accel_calib'
-    start_poses(folder / 'arm_poses.csv', _POSES)
+@pytest.fixture
+def folder(bench: Any, tmp_path: Path) -> Path:
+    """Return the folder of a store with poses; nodes may be killed."""
     log_to_files(bench, tmp_path)
     bench.without_shared_memory()
-    turned = readings(spread_directions(14), dwell=4.0)
-    rng = np.random.default_rng(FACTOR)
+    start_poses(bench.home / 'accel_calib' / 'arm_poses.csv', _POSES)
+    return Path(bench.home / 'accel_calib')
+
+
+def test_a_killed_node_has_stored_all_that_it_answered(
+        bench: Any, readings: Callable[..., Any], folder: Path) -> None:
+    turned, rng = readings(spread_directions(14), dwell=4.0), np.random.default_rng(FACTOR)
     states = [State(_POSES)]
     for _ in range(KILLS):
-        node = bench.calibrator(sensor='arm', passthrough=True, auto_capture=False)
+        node = bench.calibrator(**_SENSOR)
         bench.feed(turned[:100])
         found = call_until_killed(bench, node, turned, rng, states)
         bench.join_anew()
@@ -129,27 +134,18 @@ def test_a_killed_node_has_stored_all_that_it_answered(
                   for state in set(states)]
 
 
-def second(bench: Any) -> Any:
-    """Start a second calibrator for the same sensor."""
-    return bench.run(*CALIBRATOR, '--ros-args', '-r', '__node:=second',
-                     '-p', 'sensor:=arm', '-p', 'passthrough:=true', '-p', 'auto_capture:=false')
-
-
 def test_of_two_nodes_one_stores_and_the_other_says_so(
-        bench: Any, readings: Callable[..., Any], tmp_path: Path) -> None:
+        bench: Any, readings: Callable[..., Any], folder: Path) -> None:
     from std_srvs.srv import Trigger
-    folder = bench.home / 'accel_calib'
-    start_poses(folder / 'arm_poses.csv', _POSES)
-    log_to_files(bench, tmp_path)
-    bench.without_shared_memory()
-    first = bench.calibrator(sensor='arm', passthrough=True, auto_capture=False)
-    other, reader = second(bench), bench.run(str(READER), str(folder / 'arm.yaml'))
-    turned = readings(spread_directions(14), dwell=4.0)
+    turned, rng = readings(spread_directions(14), dwell=4.0), np.random.default_rng(FACTOR)
+    first = bench.calibrator(**_SENSOR)
+    other = bench.run(*CALIBRATOR, '--ros-args', '-r', '__node:=second', '-p', 'sensor:=arm',
+                      '-p', 'passthrough:=true', '-p', 'auto_capture:=false')
+    reader = bench.run(str(READER), str(folder / 'arm.yaml'))
     names = ('capture_pose', 'fit', 'undo', 'undo_pose', 'set_level', 'save', 'reset')
     clients = {(node, name): bench.node.create_client(Trigger, f'{node}/{name}')
                for node in ('calibrator', 'second') for name in names}
     bench.spin(lambda: all(client.service_is_ready() for client in clients.values()))
-    rng = np.random.default_rng(FACTOR)
     states, ends, refused, called = [State(_POSES)], time.monotonic() + SECONDS, 0, 0
     while time.monotonic() < ends:
         name = str(rng.choice(names, p=[0.3, 0.2, 0.15, 0.1, 0.1, 0.1, 0.05]))

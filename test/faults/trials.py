@@ -76,10 +76,8 @@ TASKS = {**COMMANDS, 'save': _save, 'step_back': _step_back}
 """The commands, and what the node does to its own files."""
 
 
-def trial(task: str, start: Path, work: Path, kind: str, at: int) -> dict[str, Any]:
-    """Run a task in a copy of a folder; change number `at` fails. Return how the task ended."""
-    shutil.rmtree(work, ignore_errors=True)
-    shutil.copytree(start, work)
+def trial(task: str, work: Path, kind: str = 'kill', at: int = _NEVER) -> dict[str, Any]:
+    """Run a task in a folder; change number `at` fails. Return how the task ended."""
     reader, writer = os.pipe()
     child = os.fork()
     if not child:
@@ -104,6 +102,8 @@ def _child(task: str, work: Path, kind: str, at: int, writer: int) -> None:
         status = TASKS[task](work)
     except OSError as err:
         status, sys.stderr = 2, io.StringIO(f'{err.strerror}\n')
+    except Exception:  # any: the status shows it
+        status = 99
     count = shim.fault_count()
     shim.fault_arm(None, -1, 0, 0)
     os.write(writer, f'{count}\n{sys.stderr.getvalue()}'.encode())  # type: ignore[attr-defined]
@@ -134,43 +134,29 @@ def main() -> None:
     start, work = Path(sys.argv[1]), Path(sys.argv[2])
     before = contents(start)
     for seed, task in enumerate(sys.argv[3:]):
-        _load_modules(task, start, work)
-        changes = trial(task, start, work, 'kill', _NEVER)['changes']
+        with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+            TASKS[task](_copied(start, work))  # so that the forks need not import what it uses
+        changes = trial(task, _copied(start, work))['changes']
         complete = contents(work)
         kinds = [*KINDS] if FACTOR > 1 else [[*KINDS][seed % len(KINDS)]]
         cases = [(kind, at) for kind in kinds for at in range(changes)]
         for kind, at in sample(cases, FEW, seed):
-            found = trial(task, start, work, kind, at)
+            found = trial(task, _copied(start, work), kind, at)
             after = contents(work)
             refusal = [_REFUSAL] if found['status'] == 2 else []
             found['torn'] = [name for name in {*before, *after} if after.get(name) not in (
                 before.get(name), complete.get(name), *refusal)]
             found['left'] = [path.name for path in work.iterdir() if path.name[0] == '.']
-            found['again'] = trial_again(task, work)
+            found['again'] = trial(task, work)['status']
             after = contents(work)
             found['undone'] = [name for name in complete if task in COMMANDS
                                and not name.endswith('.before') and after[name] != complete[name]]
             sys.__stdout__.write(f'{json.dumps(found)}\n')  # type: ignore[union-attr]
 
 
-def _load_modules(task: str, start: Path, work: Path) -> None:
-    """Run a task once in this process, so that the forks need not import what it uses."""
+def _copied(start: Path, work: Path) -> Path:
     shutil.rmtree(work, ignore_errors=True)
-    shutil.copytree(start, work)
-    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
-        TASKS[task](work)
-
-
-def trial_again(task: str, work: Path) -> int:
-    """Return the exit status of the task in the folder as the failure left it."""
-    child = os.fork()
-    if not child:
-        sys.stdout, sys.stderr = io.StringIO(), io.StringIO()
-        try:
-            os._exit(TASKS[task](work))
-        except Exception:  # any: the status shows it
-            os._exit(99)
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    return Path(shutil.copytree(start, work))
 
 
 if __name__ == '__main__':

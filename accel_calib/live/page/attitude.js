@@ -6,7 +6,7 @@
 // drawing therefore never jumps.
 
 import {
-  apply, camera, cross, dot, orthonormal, product, rotation, shortest, transposed, unit,
+  apply, camera, cross, dot, orthonormal, product, radians, rotation, shortest, transposed, unit,
 } from './geometry.js';
 
 const Z = [0, 0, 1];
@@ -16,13 +16,13 @@ const SMOOTHING = 0.08;  // time constant [s]
 export const VIEW = camera(32, 24);
 
 /** Return the attitude with this direction up that shows most of front, left and top. */
-export function attitudeOf(up) {
+function attitudeOf(up) {
   const first = unit(cross(up, Math.abs(up[2]) < 0.9 ? Z : [1, 0, 0]));
   const level = [first, cross(up, first), up];
   let best = level;
   let most = -Infinity;
   for (let degrees = 0; degrees < 360; degrees += 5) {
-    const turned = product(rotation(Z, degrees * Math.PI / 180), level);
+    const turned = product(rotation(Z, radians(degrees)), level);
     const shown = dot([1, 0.8, 0.6], apply(transposed(turned), VIEW[2]));
     if (shown > most + 1e-9) [best, most] = [turned, shown];
   }

@@ -35,26 +35,27 @@ export function cleared(canvas) {
   return { context, width, height };
 }
 
+export const element = (id) => document.getElementById(id);
+
 const waiting = new Map();
 
-/** Set the label of an element, at most every 2 s; the last of several is used. */
-export function label(element, words) {
-  const known = waiting.get(element);
-  if (known !== undefined) {
-    waiting.set(element, words);
+/** Set the label of a drawing, at most every 2 s; the last of several is used. */
+export function label(drawing, words) {
+  if (waiting.has(drawing)) {
+    waiting.set(drawing, words);
     return;
   }
-  if (element.getAttribute('aria-label') === words) return;
-  element.setAttribute('aria-label', words);
-  waiting.set(element, null);
+  if (drawing.getAttribute('aria-label') === words) return;
+  drawing.setAttribute('aria-label', words);
+  waiting.set(drawing, null);
   setTimeout(() => {
-    const next = waiting.get(element);
-    waiting.delete(element);
-    if (next !== null) label(element, next);
+    const next = waiting.get(drawing);
+    waiting.delete(drawing);
+    if (next !== null) label(drawing, next);
   }, LABEL_EVERY);
 }
 
-/** Set the text of an element if it differs. */
-export function text(element, words) {
-  if (element.textContent !== words) element.textContent = words;
+/** Set the text of a node if it differs. */
+export function text(node, words) {
+  if (node.textContent !== words) node.textContent = words;
 }

@@ -32,7 +32,6 @@ export class Chart {
 
   /** Add |a| of the newest message [g]. */
   add(time, raw, corrected) {
-    if (time === null || time === undefined) return;
     const last = this.#rows.at(-1);
     if (last && time === last[0]) return;
     if (last && time < last[0]) this.#rows = [];  // a recording that starts again
@@ -105,7 +104,7 @@ export class Chart {
   }
 }
 
-const inMg = (length) => (length === null || length === undefined ? null : 1000 * (length - 1));
+const inMg = (length) => (length === null ? null : 1000 * (length - 1));
 
 /** Return 1, 2 or 5 times a power of ten that is not less than this. */
 function niceStep(least) {
@@ -128,7 +127,6 @@ function drawAxes(context, { low, high, step, newest, x, y, width, height }) {
     const words = fixed(k * step, step < 1 ? 1 : 0);
     context.fillText(k > 0 ? `+${words}` : words, MARGIN.left - 8, y(k * step));
   }
-  context.textAlign = 'center';
   for (const ago of [60, 40, 20, 0]) {
     const words = ago ? `−${ago} s` : 'now';
     context.textAlign = ago === 60 ? 'left' : ago ? 'center' : 'right';

@@ -3,13 +3,13 @@
 
 // The buttons: they send commands and show the answers in their own words.
 
+import { element } from './canvas.js';
 import { token } from './connection.js';
 import { buttonOf, withButtons } from './words.js';
 
 const SHOWN = 10000;  // time for which the answer of a command that succeeded is shown [ms]
 const MOVED = ['set_level', 'refine'];  // the last one comes first
 
-const element = (id) => document.getElementById(id);
 const buttonFor = (command) => document.querySelector(`#commands [data-command=${command}]`);
 
 export class Commands {

@@ -4,13 +4,11 @@
 // What matters now, in large: the ring of stillness, the next action, and how far the sensor still
 // has to be turned.
 
-import { label, text } from './canvas.js';
+import { element, label, text } from './canvas.js';
 import { degreesBetween, unit } from './geometry.js';
 import { fixed } from './words.js';
 
 const REACHED = 17;  // a pose within this angle of the next one counts as it [°]
-
-const element = (id) => document.getElementById(id);
 
 export class Hero {
   #ring = element('ring');

@@ -26,7 +26,7 @@ export class LogView {
     line.dataset.severity = severity;
     line.dataset.number = number;
     const at = document.createElement('time');
-    at.textContent = clock(time);
+    at.textContent = new Date(1000 * time).toLocaleTimeString([], { hour12: false });
     const readable = withButtons(words);
     const what = severity === 'info' ? '' : `${severity}: `;
     line.append(at, ` ${what}${readable}`);
@@ -35,9 +35,4 @@ export class LogView {
     this.#latest.textContent = readable;
     this.#latest.dataset.severity = severity;
   }
-}
-
-function clock(time) {
-  if (time === null || time === undefined) return '';
-  return new Date(1000 * time).toLocaleTimeString([], { hour12: false });
 }

@@ -7,7 +7,7 @@ import { Attitude, Wanted } from './attitude.js';
 import { Awake } from './awake.js';
 import { Ball } from './ball.js';
 import { drawBox } from './box.js';
-import { label, onColours, text } from './canvas.js';
+import { element, label, onColours, text } from './canvas.js';
 import { Chart } from './chart.js';
 import { Commands } from './commands.js';
 import { Connection } from './connection.js';
@@ -18,8 +18,6 @@ import { Result } from './result.js';
 import { Sound } from './sound.js';
 import { Speech } from './speech.js';
 import { countOf, figure, fixed, sideOf, withButtons } from './words.js';
-
-const element = (id) => document.getElementById(id);
 
 const attitude = new Attitude();
 const wanted = new Wanted();
@@ -63,7 +61,7 @@ function takeWelcome({ may, why, version: now, history, exports = [] }) {
 
 function takeProgress(now) {
   const isNew = progress !== null && now.poses > progress.poses;
-  progress = { ...now, direction: now.direction ?? [], up: now.up ?? [] };
+  progress = now;
   if (isNew) {
     hero.captured();
     sound.captured();

@@ -3,10 +3,8 @@
 
 // The result: the verdict, the numbers, and the calibration page in a frame.
 
-import { text } from './canvas.js';
+import { element, text } from './canvas.js';
 import { figure, fixed, withButtons } from './words.js';
-
-const element = (id) => document.getElementById(id);
 
 const diagonal = (rows) => rows.map((row, k) => row[k]);
 const joined = (values, decimals) => values.map((value) => fixed(value, decimals)).join('  ');
@@ -37,7 +35,7 @@ export class Result {
     showFigures(result ?? {});
     element('warnings').replaceChildren(
       ...(result?.warnings ?? []).map((words) => made('li', withButtons(words))));
-    this.#page = page ?? '';
+    this.#page = page;
     this.#report.hidden = this.#page === '';
     this.#load();
   }
@@ -73,7 +71,7 @@ function showFigures(result) {
 }
 
 function made(tag, words) {
-  const element_ = document.createElement(tag);
-  element_.textContent = words;
-  return element_;
+  const node = document.createElement(tag);
+  node.textContent = words;
+  return node;
 }

@@ -38,18 +38,17 @@ export const buttonOf = (command) => BUTTONS[command] ?? command.replaceAll('_',
 
 export const capitalised = (words) => words.charAt(0).toUpperCase() + words.slice(1);
 
-/** Return a number with a number of significant digits, without exponent. */
-export function figure(value, digits = 2) {
-  if (value === null || value === undefined) return '–';
+/** Return a number with 2 significant digits, without exponent. */
+export function figure(value) {
   const size = Math.abs(value);
-  if (size >= 10 ** digits || size === 0) return value.toFixed(0);
-  return value.toFixed(Math.max(0, Math.min(6, digits - 1 - Math.floor(Math.log10(size)))))
+  if (size >= 100 || size === 0) return value.toFixed(0);
+  return value.toFixed(Math.max(0, Math.min(6, 1 - Math.floor(Math.log10(size)))))
     .replace('-', '−');
 }
 
 /** Return a number with this many decimals; a dash if it is not known. */
 export function fixed(value, decimals, unitName = '') {
-  if (value === null || value === undefined) return '–';
+  if (value === null) return '–';
   return value.toFixed(decimals).replace('-', '−') + unitName;
 }
 
