@@ -13,7 +13,8 @@ from accel_calib.errors import InputError
 from accel_calib.logs import read_recording
 from accel_calib.table import numbered, Recording
 from accel_calib.units import units_of
-from inside import excess_of_means, Extremes, lines_through, long_run, oscillation
+from inside import (
+    excess_of_means, Extremes, lines_through, long_run, Model, oscillation, simulate_recording)
 import numpy as np
 import pytest
 from scipy.signal import butter, lfilter
@@ -332,13 +333,9 @@ def test_waves_of_half_periods_beside_a_slope_are_oscillations(periods):
 
 
 def visited(directions):
-    """Return times and readings at 100 Hz of rests in these directions, and shaking between."""
-    rng, parts = np.random.default_rng(0), []
-    for direction in np.array(directions):
-        parts += [direction + 2e-3 * rng.normal(size=(300, 3)),
-                  direction + 0.5 * rng.normal(size=(80, 3))]
-    reading = np.concatenate(parts)
-    return np.arange(len(reading)) / 100.0, reading
+    """Return times and readings of a sensor that is turned to these directions."""
+    found = simulate_recording(Model({}), np.array(directions, float), np.random.default_rng(0))
+    return found['time'], found.reading
 
 
 def test_a_sensor_that_lay_still_for_days_has_one_pose_per_orientation_unless_split():
