@@ -4,14 +4,13 @@
 """
 From samples to chunks: sums over short intervals of header time; and the settings of the capture.
 
-All later steps work on chunks of a fifth of the still window. The cost per sample is thus a few
-additions for any window length, and a recording of any length becomes a short table. Windows and
-dwells are sums of chunks. The first sample of the stream is subtracted before squaring, which
-preserves the digits of a small noise on a large offset.
+Windows and dwells are sums of chunks of a fifth of the still window, so that the cost per sample
+is a few additions for any window length. The first sample of the stream is subtracted before
+squaring, which preserves the digits of a small noise on a large offset.
 
 The sample period is estimated from the first samples of a segment and then kept, so that a stream
 and a recording are divided at the same places. A segment is a part of the stream without an
-interruption of the stamps. After an interruption the period is estimated again.
+interruption of the stamps.
 
 **Limits.** A sensor that reaches the end of its range repeats its largest or smallest reading. The
 samples that repeat the extreme of their axis so far are therefore counted. A new extreme is not
@@ -99,19 +98,10 @@ class CaptureSettings:
 
 def settings_from(given: Mapping[str, Any], units: Units) -> CaptureSettings:
     """
-    Return settings with these values, and the defaults for all others.
+    Return settings with these values by name, and the defaults for all others.
 
-    Parameters
-    ----------
-    given : mapping of str to object
-        Values by the names of `CaptureSettings`; ``still_std_max`` is in the unit of the readings.
-    units : Units
-        Unit of the readings.
-
-    Raises
-    ------
-    InputError
-        If a name is not known, or a value is out of range.
+    ``still_std_max`` is in the unit of the readings. Raise InputError if a name is not known, or a
+    value is out of range.
 
     """
     names = [each.name for each in fields(CaptureSettings)]
@@ -134,8 +124,7 @@ Records = NDArray[Any]
 """One-dimensional structured array."""
 
 CONTEXT = ('temperature', 'supply_voltage')
-"""Columns of `accel_calib.table.COLUMNS` that are averaged together with reading and rate, as
-quantities are."""
+"""Columns that are averaged together with reading and rate, as quantities are."""
 
 MOTION = 7
 """Numbers of a sample before its context: time, reading, rate (NaN: none)."""
@@ -262,9 +251,8 @@ class Interruption(NamedTuple):
     """
     An interruption of the stamps [s], which ends a dwell.
 
-    Samples are missing (gap), time jumped back (a bag played again, simulated time reset), or the
-    stamps did not change while samples arrived (stopped). `seconds` is the next stamp minus the
-    last one.
+    Samples are missing (gap), time jumped back, or the stamps did not change while samples arrived
+    (stopped). `seconds` is the next stamp minus the last one.
 
     """
 
@@ -320,12 +308,7 @@ def together(found: Sequence[Chunks]) -> Iterator[Chunks]:
 
 
 class Chunker:
-    """
-    Convert blocks of samples, with this number of columns of context, to chunks.
-
-    The division into blocks does not affect the chunks.
-
-    """
+    """Convert samples in any blocks, with this number of columns of context, to chunks."""
 
     def __init__(self, settings: CaptureSettings, columns: int) -> None:
         self._kind = sums_type(columns)
@@ -341,11 +324,11 @@ class Chunker:
         self.fresh = True  # the present segment has no chunk yet
         self.interruptions: deque[Interruption] = deque(maxlen=_INTERRUPTIONS_MAX)
 
-    def feed(self, samples: Floats, last: bool = False) -> list[Chunks]:
+    def feed(self, samples: Floats, last: bool) -> list[Chunks]:
         """
         Return the chunks that samples complete: time [s], reading, rate and context as rows.
 
-        `last`: no more samples follow, so the period is estimated from few samples, too.
+        If they are the last ones, the period is estimated from few samples, too.
 
         """
         pending = _joined(self._pending, samples)
@@ -412,10 +395,10 @@ class Chunker:
         np.floor(index, out=index)
         edges = np.flatnonzero(index[1:] != index[:-1]) + 1
         whole = int(edges[-1]) if len(edges) else 0
-        starts = np.concatenate([[0], edges[:-1]]) if whole else np.empty(0, dtype=np.int64)
         if whole:
             self._latest = float(latest[whole - 1])
-        return self._chunks(samples[:, :whole], starts.astype(np.intp)), samples[:, whole:]
+        starts = np.concatenate([[0], edges])[:-1].astype(np.intp)
+        return self._chunks(samples[:, :whole], starts), samples[:, whole:]
 
     def _chunks(self, samples: Floats, starts: Indices) -> Chunks:
         assert self._origin is not None

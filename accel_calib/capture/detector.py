@@ -38,18 +38,17 @@ from ..units import Units
 _BLOCK = 1 << 14     # samples summed at a time; they fit in the cache
 _AT_ONCE = 1 << 17   # samples passed to the detector at a time
 
-
 _EARLIER = 100
 """Number of earlier dwells that are used in the test of a new dwell."""
 
 
 class StillDetector:
     """
-    Find the dwells of one sensor, block by block.
+    Find the dwells of one sensor, in blocks of samples of any size.
 
-    The dwells do not depend on the division into blocks; a stream and a recording have the same
-    dwells. `keep` is the number of finished dwells to keep; None: all. `context` are the keys of
-    the further columns of the samples: temperature, supply voltage, and quantities.
+    `keep` is the number of finished dwells to keep; None: all. `context` are the keys of the
+    further columns of the samples: temperature, supply voltage, and quantities. `still` is whether
+    the sensor is still now.
 
     """
 
@@ -61,7 +60,7 @@ class StillDetector:
         self._tracker: Tracker | None = None
         self._most = keep
         self._kept = np.empty(0, figures_type(len(context)))
-        self._still = False
+        self.still = False
         self._mean = np.full(6, np.nan)
         self._number = 0
 
@@ -94,11 +93,6 @@ class StillDetector:
         self._chunker.restart()
         return self._last(count)
 
-    @property
-    def still(self) -> bool:
-        """Whether the sensor is still now."""
-        return self._still
-
     def current(self) -> Dwell | None:
         """Return the ongoing dwell so far, or None if it is too short or not still."""
         dwell = None if self._tracker is None else self._tracker.current()
@@ -121,8 +115,7 @@ class StillDetector:
         """
         Return the largest standard deviation of a still window now [unit of the readings].
 
-        It is the largest over the axes, and infinite before the first samples of a sensor in
-        native units.
+        It is infinite before the first samples of a sensor in native units.
 
         """
         mean = np.nan_to_num(self._mean)[:, np.newaxis]
@@ -149,7 +142,7 @@ class StillDetector:
             if self._tracker is None:
                 self._tracker = Tracker(self._settings, self._rule, verdict, self._number)
             found += self._tracker.feed(verdict)
-            self._still = bool(verdict.still[-1])
+            self.still = bool(verdict.still[-1])
             self._mean = chunks.origin
         if self._chunker.fresh:  # the stamps were interrupted: what is known of the rest is over
             found += self._leave()
@@ -161,7 +154,7 @@ class StillDetector:
         found = self._tracker.close()
         self._number = self._tracker.number
         self._tracker = None
-        self._still = False
+        self.still = False
         return found
 
     def _keep(self, found: list[OngoingDwell]) -> int:
@@ -247,7 +240,7 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
     """
     parts = iter([recording] if isinstance(recording, Recording) else recording)
     first = next(parts, None)
-    context = context_of(first)
+    context = CONTEXT if first is None else (*CONTEXT, *first.quantities)
     detector = StillDetector(settings, units, keep=None, context=context)
     spans: list[tuple[float, float]] = []
     recorded = 0
@@ -271,15 +264,10 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
                     interruptions, recorded, detector.quietest)
 
 
-def context_of(recording: Recording | None) -> tuple[str, ...]:
-    """Return the keys of the context of a recording that poses have: `CONTEXT` and quantities."""
-    return CONTEXT if recording is None else (*CONTEXT, *recording.quantities)
-
-
 def samples_of(recording: Recording, start: int, stop: int, context: Sequence[str] = CONTEXT
                ) -> Floats:
     """
-    Return samples start to stop for `StillDetector.add`: (k, n), a row for each of its columns.
+    Return samples start to stop as (k, n) rows for `StillDetector.add`.
 
     A time or a reading that is not finite is an InputError.
 
@@ -319,8 +307,8 @@ def poses_from(dwells: Sequence[Dwell], settings: CaptureSettings = CaptureSetti
     """
     Return the pose table of these dwells.
 
-    The table has the columns of context that all dwells have; ``rate_std`` likewise. It has the
-    column ``orientation`` if ``max_dwell`` is finite, and ``doubtful`` if a dwell is doubtful.
+    It has the columns that all dwells have, ``orientation`` if ``max_dwell`` is finite, and
+    ``doubtful`` if a dwell is doubtful.
 
     """
     columns: dict[str, NDArray[Any]] = {
