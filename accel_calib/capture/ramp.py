@@ -5,18 +5,18 @@
 From the samples of a still board whose temperature changes to stretches of equal duration.
 
 The samples are summed over cells of 1 s, so that the memory does not grow with the sample rate.
-Cells in which the board shakes are left out. The other cells are averaged over at most
-`_STRETCHES` stretches. The noise of a stretch is that of its mean: it comes from the second
-differences of successive means, which neither a slope nor a slow change contributes to, and which
-contain the noise that is correlated within a stretch.
+Cells in which the board shakes are left out, and the others are averaged over at most `_STRETCHES`
+stretches. The noise of the mean of a stretch comes from the second differences of successive
+means, which a slope does not change, and which contain the noise that is correlated within a
+stretch.
 
-A ramp is refused, in one line, if it cannot show what temperature does:
+A ramp is refused if it cannot show what temperature does:
 
 - there is no temperature, or it spans less than `LEAST_RANGE`;
 - the board was turned: its direction leaves the first one by more than `_TURNED`;
-- the board was shifted: the readings jump between two neighbours by more than `_JUMP_G`, and by
-  more than their noise, while a polynomial in the temperature does not. A slow tilt during a
-  single ramp looks like the temperature, and is not seen;
+- the board was shifted: the readings jump by more than `_JUMP_G` and their noise, while a
+  polynomial in the temperature does not. A slow tilt during a ramp looks like the temperature, and
+  is not seen;
 - the ramp is too fast for the thermometer. Stretches with a rate above `FASTEST` are left out, and
   the others must span `LEAST_RANGE`. A thermometer in the package of the sensor lags by about
   10 s. At 5 °C/min it is then 0.8 °C behind, which is 0.8 mg in a common part of 1 mg/°C.
@@ -55,9 +55,6 @@ _TURNED, _FIRST = np.radians(6.0), 10
 _LEAST_DIRECTIONS = 4
 _APART = np.radians(20.0)
 """Number of rests in directions this far apart that make a log one of poses."""
-
-_REST_S = 2
-"""Successive still cells of a rest in `is_turned_over`."""
 
 _JUMP_G, _JUMP_NOISES, _NEIGHBOURS = 0.003, 8.0, 4
 _DEGREE = 3
