@@ -187,8 +187,9 @@ def curve_of(ramps: Sequence[Ramp]) -> Curve:
     warm, rate = stretches['temperature'], np.concatenate([each.rate for each in ramps])
     low, high = float(warm.min()), float(warm.max())
     reference = float(np.clip(REFERENCE_TEMPERATURE, low, high))
-    rising, falling = _directions(warm, rate)
-    both = bool(np.any(rising & _shared(warm, falling)) and np.any(falling))
+    limit = _MOVING * float(np.quantile(np.abs(rate), 0.95))
+    rising, falling = rate > limit, rate < -limit
+    both = bool(np.any(rising & _shared(warm, falling)))
     powers = _powers(warm - reference, DEGREE)[:, 1:]
     beside = np.eye(len(ramps))[group]
     if both:
@@ -284,12 +285,6 @@ def _lowest(errors: Sequence[Floats], fits: Sequence[tuple[Floats, Floats]]) -> 
 
 def _solved(design: Floats, reading: Floats) -> Floats:
     return np.asarray(np.linalg.lstsq(design, reading, rcond=None)[0])
-
-
-def _directions(warm: Floats, rate: Floats) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return where the temperature clearly rises, and where it falls."""
-    limit = _MOVING * float(np.quantile(np.abs(rate), 0.95))
-    return rate > limit, rate < -limit
 
 
 def _shared(warm: Floats, other: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -429,8 +424,8 @@ def with_curve(fitted: Calibration, curve: Curve, poses: Poses) -> Calibration:
     powers = {name: values for name, values in thermal.items() if name in OFFSET_POWERS[1:]}
     model, own = Model({**fitted.model.values, **powers}), len(fitted.model.vector)
     used_g = in_g(fitted.used_poses, fitted.units)
-    used_g = _of_norm(used_g.with_columns(reading=used_g.reading + _added(curve, used_g)))
-    columns = judge(model, used_g).columns
+    moved = only_norm(used_g.with_columns(reading=used_g.reading + _added(curve, used_g)))
+    columns = judge(model, moved.with_columns(temperature=used_g['temperature'])).columns
     move = -np.linalg.pinv(columns[:, :own]) @ columns[:, own:]
     of_curve = spread[-3 * len(powers):, -3 * len(powers):]
     covariance = np.block([[fitted.covariance + move @ of_curve @ move.T, move @ of_curve],
@@ -446,11 +441,6 @@ def with_curve(fitted: Calibration, curve: Curve, poses: Poses) -> Calibration:
         noted=(*fitted.noted, *findings_of_curve(curve)))
     return gated(replace(made, gyro=fitted.gyro, noise=fitted.noise, sensor=fitted.sensor,
                          date=fitted.date))
-
-
-def _of_norm(poses_g: Poses) -> Poses:
-    """Return the poses with |force| = 1 g and their temperature alone."""
-    return only_norm(poses_g).with_columns(temperature=poses_g['temperature'])
 
 
 def _together(poses: Poses, rows: Poses) -> Poses:
