@@ -8,20 +8,18 @@ A still board reads, by axis and with g = W ΔR force + V at the reference tempe
 
     reading(T) = g + Σ_k c_k (T - R)^k,   k = 1 to degree.
 
-g is not observable from one orientation: neither offset, gain nor tilt. Only the change with the
-temperature is, and it is attributed to the offset; a gain that changes with the temperature looks
-the same along gravity. R is 25 °C, or the end of the range that is nearest to it.
+One orientation does not show offset, gain or tilt, but only the change with the temperature. It is
+attributed to the offset; a gain that changes with the temperature looks the same along gravity.
+R is 25 °C, or the end of the range that is nearest to it.
 
 **Fit.** Least squares by axis, with one g for each ramp. If the temperature rises and falls, a
-term in its rate is fitted, too, and then left out: a thermometer that lags shows another reading
-when it warms than when it cools, and this must not bend the polynomial. `hysteresis_mg` is the
-mean difference between the two directions at equal temperatures. The rate that explains it best is
-a lag of the thermometer, `lag_s`.
+term in its rate is fitted, too, and then left out: a thermometer that lags differs between warming
+and cooling, which must not bend the polynomial. `hysteresis_mg` is the mean difference between the
+two directions at equal temperatures, and `lag_s` the lag that explains it best.
 
-**Deviations.** The noise of a long log is correlated: a slow wander of the offset looks like a
-change with the temperature. The noise of a stretch is taken as white noise of variance σ², for a
-stretch of mean size, plus a random walk, which grows by ρ σ² a second. The part of the readings
-outside of the fit has the covariance
+**Deviations.** A slow wander of the offset looks like a change with the temperature. The noise of
+a stretch of mean size is therefore white noise of variance σ² plus a random walk, which grows by
+ρ σ² a second. The part of the readings outside of the fit has the covariance
 
     σ² (A + ρ B),   A of the white noise, B of the walk
 
@@ -29,10 +27,10 @@ The generalised eigenvectors of B and A make it diagonal for each ρ. The restri
 of all three axes weights a grid of ρ, each with its σ². The covariance of the values is that of
 least squares with this noise, averaged over the grid.
 
-**Degree.** With all samples, or with the usual tests, the degree would grow with the wander. Here
-each of `_BLOCKS` contiguous parts of the log is predicted from a fit of the others. The lowest
-degree is taken at which no higher one predicts better by `_BETTER`, in all and in `_MOST_BLOCKS`
-of the parts, with last coefficients that differ from 0 at `_LEVEL` (χ² over the axes).
+**Degree.** With the usual tests, the degree would grow with the wander. Here each of `_BLOCKS`
+contiguous parts of the log is predicted from a fit of the others. The lowest degree is taken at
+which no higher one predicts better by `_BETTER`, in all and in `_MOST_BLOCKS` of the parts, with
+last coefficients that differ from 0 at `_LEVEL` (χ² over the axes).
 
 .. [1] D. A. Harville, Maximum likelihood approaches to variance component estimation, Journal of
    the American Statistical Association 72 (1977) 320.
@@ -96,14 +94,10 @@ class Curve:
 
     Parameters
     ----------
-    reference_c : float
-        Temperature at which the curve is zero [°C].
-    range_c : tuple of float
-        Lowest and highest temperature [°C].
-    values : (degree, 3) array
-        c_1, c_2, … by axis [g/°C^k].
-    covariance : (3, degree, degree) array
-        Covariance of the values of each axis.
+    reference_c, range_c : float, tuple of float
+        Temperature at which the curve is zero, and the lowest and highest temperature [°C].
+    values, covariance : (degree, 3) array, (3, degree, degree) array
+        c_1, c_2, … by axis [g/°C^k], and the covariance of those of each axis.
     held_out_mg : tuple of float
         Error of held-out parts for degree 0 to 3, RMS of the vector [mg].
     hysteresis_mg, lag_s : float or None
@@ -326,10 +320,9 @@ def findings_of_curve(curve: Curve) -> tuple[Finding, ...]:
 
 def ramp_rows(curve: Curve, units: Units) -> Poses:
     """
-    Return the rows that stand for the ramps among poses, in the unit of the readings.
+    Return means of successive stretches that stand for the ramps, in the unit of the readings.
 
-    Each is the mean of successive stretches. Its noise is the RMS of what the curve leaves, which
-    includes the slow wander.
+    Their noise is the RMS of what the curve leaves, which includes the slow wander.
 
     """
     stretches = curve.stretches
@@ -362,8 +355,7 @@ def thermal_alone(curve: Curve, units: Units, *, sensor: str = '', date: str = '
     """
     Return a calibration with the offset over the temperature alone, zero at the reference.
 
-    Its residuals are those of the vector: the change of the reading with the temperature, before
-    and after the correction.
+    Its residuals are the changes of the reading with the temperature, before and after.
 
     """
     values, covariance = curve.effects
@@ -415,9 +407,9 @@ def with_curve(fitted: Calibration, curve: Curve, poses: Poses) -> Calibration:
     """
     Return a calibration of poses with the curve, and with the ramps among its poses.
 
-    `fitted` is that of `without_curve`. The values of the curve stay as they are. Their
-    uncertainty moves those of the fit: by least squares, d values = -(J⁺ K) d curve, with J and K
-    the derivatives of the equations of the poses.
+    `fitted` is that of `without_curve`. The uncertainty of the curve moves the values of the fit:
+    by least squares, d values = -(J⁺ K) d curve, with J and K the derivatives of the equations of
+    the poses.
 
     """
     thermal, spread = curve.effects
