@@ -136,11 +136,11 @@ class Curve:
 
     def at(self, temperature: Floats) -> Floats:
         """Return the (n, 3) offset at temperatures, relative to the reference [g]."""
-        return _powers(temperature - self.reference_c, self.degree)[:, 1:] @ self.values
+        return _powers(temperature - self.reference_c, self.degree) @ self.values
 
     def deviation_at(self, temperature: Floats) -> Floats:
         """Return the (n, 3) standard deviation of `at` [g]."""
-        rows = _powers(temperature - self.reference_c, self.degree)[:, 1:]
+        rows = _powers(temperature - self.reference_c, self.degree)
         return np.sqrt(np.maximum(np.einsum('np,apq,nq->na', rows, self.covariance, rows), 0.0))
 
     @property
@@ -184,7 +184,7 @@ def curve_of(ramps: Sequence[Ramp]) -> Curve:
     limit = _MOVING * float(np.quantile(np.abs(rate), 0.95))
     rising, falling = rate > limit, rate < -limit
     both = bool(np.any(rising & _shared(warm, falling)))
-    powers = _powers(warm - reference, DEGREE)[:, 1:]
+    powers = _powers(warm - reference, DEGREE)
     beside = np.eye(len(ramps))[group]
     if both:
         beside = np.column_stack([beside, rate])
@@ -218,7 +218,8 @@ def _joined(ramps: Sequence[Ramp]) -> tuple[Poses, NDArray[np.intp]]:
 
 
 def _powers(warm: Floats, degree: int) -> Floats:
-    return np.asarray(warm[:, np.newaxis] ** np.arange(degree + 1))
+    """Return the (n, degree) powers from 1 on."""
+    return np.asarray(warm[:, np.newaxis] ** np.arange(1, degree + 1))
 
 
 def _parts(time: Floats, warm: Floats) -> NDArray[np.intp]:

@@ -171,8 +171,7 @@ def sums_of(samples: Floats, starts: Indices, epoch: float, origin: Floats, kind
     Return the (m,) records of a `sums_type` over the samples from each start to the next.
 
     `samples` are (k, n): time and reading (k = 4), with rate (7), with the columns of the context
-    (more). `epoch` and `origin` (6,) are subtracted from time, and from reading and rate. Sums of
-    a missing rate are NaN.
+    (more). `epoch` and `origin` (6,) are subtracted. Sums of a missing rate are NaN.
 
     """
     sums = blank(kind, len(starts))
@@ -264,23 +263,14 @@ class Interruption(NamedTuple):
 @dataclass(frozen=True)
 class Chunks:
     """
-    Consecutive chunks of one segment.
+    m consecutive chunks of one segment.
 
-    Parameters
-    ----------
-    sums : (m,) array of a `sums_type`
-        Time relative to `epoch`, readings and rates relative to `origin`.
-    begin, end : (m,) array
-        First and last stamp [s].
-    step : (2, m) array
-        Smallest nonzero step between successive readings, and rates; infinite if no step is
-        smaller than before.
-    epoch, origin : float, (6,) array
-        Start of the segment [s]; first reading and rate of the stream.
-    length, period : float
-        Length of a chunk, and sample period [s].
-    fresh : bool
-        Whether these are the first chunks of a segment.
+    `sums` (m,) are of a `sums_type`, with the time relative to `epoch`, the start of the segment,
+    and readings and rates relative to `origin` (6,), the first ones of the stream. `begin` and
+    `end` (m,) are the first and last stamp. `step` (2, m) is the smallest nonzero step between
+    successive readings, and rates; infinite if no step is smaller than before. `length` and
+    `period` are those of a chunk and of the samples; times are in s. `fresh` is whether these are
+    the first chunks of the segment.
 
     """
 
@@ -382,8 +372,8 @@ class Chunker:
         if not len(breaks):
             return len(time), False
         cut = int(breaks[0])
-        kind: Literal['gap', 'jump_back'] = 'gap' if step[cut] > 0.0 else 'jump_back'
-        self.interruptions.append(Interruption(float(before[cut]), kind, float(step[cut])))
+        self.interruptions.append(Interruption(
+            float(before[cut]), 'gap' if step[cut] > 0.0 else 'jump_back', float(step[cut])))
         return cut, False
 
     def _split(self, samples: Floats, in_order: bool) -> tuple[Chunks, Floats]:

@@ -9,10 +9,9 @@ The stillness detector of one sensor, and from recordings to poses.
 half the largest range of the readings over the axes. Until the sensor has been turned over, this r
 is too small and the angle too large. Then too few poses count as repeated, not too many.
 
-**Merging.** The mean of two readings on a sphere lies inside the sphere: for weights w and 1 - w
-by w (1 - w) c²/2r², which is 1.25 mg for 0.1 rad. If 1 g is known, the mean is moved outwards by
-this distance. The weights are the inverse variances of the means, and std/√count of the merged
-pose is the noise of the weighted mean.
+**Merging.** The mean of two readings on a sphere lies inside the sphere: for weights w and 1 - w,
+the inverse variances, by w (1 - w) c²/2r², which is 1.25 mg for 0.1 rad. If 1 g is known, the mean
+is moved outwards by this distance.
 
 """
 
@@ -81,11 +80,17 @@ class StillDetector:
         """
         Add samples as (k, n) arrays, and return how many dwells ended.
 
-        The rows are the columns of `push`. Those of the context can be omitted, and those of the
-        rate before them. `dwells` returns the still ones.
+        The rows are the columns of `push`, without those at the end that are not known.
 
         """
         return self._keep(self._feed(blocks, last=False))
+
+    def add_recording(self, recording: Recording) -> None:
+        """Add the samples of a recording; raise InputError if one is not finite."""
+        for start in range(0, len(recording), _AT_ONCE):
+            stop = min(start + _AT_ONCE, len(recording))
+            self.add(samples_of(recording, begin, min(begin + _BLOCK, stop), self._context)
+                     for begin in range(start, stop, _BLOCK))
 
     def close(self) -> list[Dwell]:
         """End the ongoing dwell, because the stream is interrupted; return it if it is still."""
@@ -246,10 +251,7 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
     recorded = 0
     about: dict[str, Any] = {}
     for part in parts if first is None else chain((first,), parts):
-        for start in range(0, len(part), _AT_ONCE):
-            stop = min(start + _AT_ONCE, len(part))
-            detector.add(samples_of(part, begin, min(begin + _BLOCK, stop), context)
-                         for begin in range(start, stop, _BLOCK))
+        detector.add_recording(part)
         if len(part):
             spans = [*spans[:1], (float(part['time'][0]), float(part['time'][-1]))]
             recorded += len(part)
@@ -266,12 +268,7 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
 
 def samples_of(recording: Recording, start: int, stop: int, context: Sequence[str] = CONTEXT
                ) -> Floats:
-    """
-    Return samples start to stop as (k, n) rows for `StillDetector.add`.
-
-    A time or a reading that is not finite is an InputError.
-
-    """
+    """Return samples start to stop as (k, n) rows for `StillDetector.add`; InputError if bad."""
     which = slice(start, stop)
     time = recording['time'][which]
     samples = np.empty((_width(recording, context), len(time)))
@@ -311,21 +308,21 @@ def poses_from(dwells: Sequence[Dwell], settings: CaptureSettings = CaptureSetti
     ``doubtful`` if a dwell is doubtful.
 
     """
+    def of(name: str) -> Floats:
+        return np.array([getattr(each, name) for each in dwells], dtype=float)
+
     columns: dict[str, NDArray[Any]] = {
-        'time': np.array([each.time for each in dwells], dtype=float),
-        'reading': np.array([each.mean for each in dwells], dtype=float).reshape(-1, 3),
-        'std': np.array([each.std for each in dwells], dtype=float).reshape(-1, 3),
-        'count': np.array([each.count for each in dwells], dtype=float)}
+        'time': of('time'), 'reading': of('mean').reshape(-1, 3), 'std': of('std').reshape(-1, 3),
+        'count': of('count')}
     for name in dwells[0].context if dwells else ():
         if all(name in each.context for each in dwells):
             columns[name] = np.array([each.context[name] for each in dwells])
-    rate_std = np.array([each.rate_std for each in dwells], dtype=float)
-    if 'rate' in columns and np.isfinite(rate_std).all():
-        columns['rate_std'] = rate_std
+    if 'rate' in columns and np.isfinite(of('rate_std')).all():
+        columns['rate_std'] = of('rate_std')
     if np.isfinite(settings.max_dwell):
-        columns['orientation'] = np.array([each.orientation for each in dwells], dtype=np.int64)
+        columns['orientation'] = of('orientation').astype(np.int64)
     if any(each.doubtful for each in dwells):
-        columns['doubtful'] = np.array([each.doubtful for each in dwells], dtype=float)
+        columns['doubtful'] = of('doubtful')
     return Poses(columns, numbered(columns))
 
 
@@ -345,12 +342,7 @@ def select(dwells: Sequence[Dwell], settings: CaptureSettings, units: Units) -> 
 
 
 def merged(first: Dwell, second: Dwell, units: Units) -> Dwell:
-    """
-    Return the weighted mean of two dwells in nearly the same direction.
-
-    Time and context are weighted by the number of samples. The first dwell sets the orientation.
-
-    """
+    """Return the mean of two dwells in nearly one direction, with the orientation of the first."""
     weight = _weight(first, second)
     mean = weight * first.mean + (1.0 - weight) * second.mean
     if not units.is_native:

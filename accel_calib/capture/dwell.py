@@ -219,8 +219,7 @@ def judged(table: Records, rule: Rule, context: Sequence[str], first: int = 0
     """
     Return each dwell from `first` on, or None if it is not still according to the noise known now.
 
-    Excess and bias of the gyro are estimated from all dwells of the table of `figures`. `context`
-    names its columns of context.
+    All dwells of the table of `figures` are used. `context` names its columns of context.
 
     """
     slopes = trend_of(table)
@@ -315,8 +314,8 @@ class OngoingDwell:
     """
     The accumulated chunks of a dwell.
 
-    `begin` and `end` are the first and last stamp [s], `cells` the sums over `size` chunks each,
-    and `beside_slope` tells whether the reading has a slope directly before or after the dwell.
+    `begin` and `end` are the first and last stamp [s], and `cells` the sums over `size` chunks
+    each. `beside_slope`: the reading has a slope directly before or after the dwell.
 
     """
 

@@ -63,16 +63,11 @@ _DEGREE = 3
 @dataclass(frozen=True)
 class Cells:
     """
-    Averages of a log over cells of 1 s, in order of time.
+    Averages of a log over m cells of 1 s, in order of time.
 
-    Parameters
-    ----------
-    time, temperature, count : (m,) array
-        Means [s], [°C], and number of samples; the temperature is NaN where it is not known.
-    reading, std : (m, 3) array
-        Mean and standard deviation of the readings [g].
-    sensor, autopilot : str, Autopilot or None
-        As in `accel_calib.table.Table`.
+    `time` [s] and `temperature` [°C] are means, NaN where the temperature is not known. `count` is
+    the number of samples, and `reading` and `std` (m, 3) are in g. `sensor` and `autopilot` are as
+    in `accel_calib.table.Table`.
 
     """
 
@@ -109,8 +104,7 @@ def cells_of(blocks: Iterable[Recording], units: Units) -> Cells:
     Raises
     ------
     InputError
-        If there are no samples, a time or a reading is not finite, or the readings are in native
-        units, whose scale one orientation does not show.
+        If there are no samples, one is not finite, or the readings are in native units.
 
     """
     if units.is_native:
@@ -169,16 +163,9 @@ class Ramp:
     """
     Stretches of a still board whose temperature changes, in order of time.
 
-    Parameters
-    ----------
-    stretches : Poses
-        Means [g] with time, temperature, std and count; std/√count is the noise of a mean.
-    rate : (n,) array
-        Rate of the temperature [°C/s].
-    seconds : float
-        Duration of the log [s].
-    notes : tuple of str
-        What was left out.
+    `stretches` are means [g] with time, temperature, std and count; std/√count is the noise of a
+    mean. `rate` (n,) is that of the temperature [°C/s], and `seconds` the duration of the log [s].
+    `notes` state what was left out.
 
     """
 

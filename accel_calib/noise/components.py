@@ -77,8 +77,8 @@ class Component:
     """
     One component of the noise of one axis, in the unit of the figure.
 
-    `value`, `sd` and the 95 % `interval` are NaN if it is not seen. `upper` is then the upper
-    limit with 95 % probability, otherwise the end of the interval.
+    `value`, `sd` and the 95 % `interval` are NaN if it is not seen. `upper` is then its upper
+    limit, otherwise the end of the interval.
 
     """
 
@@ -308,20 +308,15 @@ class AxisNoise:
     axis : {'x', 'y', 'z'}
     unit : {'m/s²', 'rad/s', 'native'}
         Unit of the deviation.
-    tau : (k,) array
-        Averaging times [s].
-    deviation, low, high : (k,) array
-        Allan deviation, and its 95 % interval.
-    model : (k,) array
-        Deviation of the components that were found.
+    tau, deviation, low, high, model : (k,) array
+        Averaging times [s], Allan deviation, its 95 % interval, and the deviation of the
+        components that were found.
     slope, slope_sd : (k - 1,) array
         Slope of the logarithms between successive τ, and its standard deviation.
     figures : mapping of str to Component
         Keys of `COMPONENTS`; Q, N, B, K and drift in the unit times s, √s, 1, 1/√s and 1/s.
-    used : (2,) tuple of float
-        Range of τ that the figures are from [s].
-    p_value : float
-        Probability of the χ² of the fit.
+    used, p_value : (2,) tuple of float, float
+        Range of τ that the figures are from [s], and the probability of the χ² of the fit.
     step : float
         Step of the output, if its noise is smaller; otherwise 0.
 
@@ -383,12 +378,7 @@ class NoiseFigures:
         return tuple(kind for kind in KINDS if self.of(kind))
 
     def common(self, kind: Kind, figure: str) -> tuple[float, float]:
-        """
-        Return a figure of all axes together and its standard deviation.
-
-        It is the root of the mean square over the axes on which it is seen; NaN if there is none.
-
-        """
+        """Return the RMS of a figure over the axes that show it, and its sd; NaN without one."""
         found = [axis.figures[figure] for axis in self.of(kind) if axis.figures[figure].seen]
         if not found:
             return np.nan, np.nan

@@ -64,7 +64,7 @@ from importlib.util import find_spec
 import numpy as np
 from numpy.typing import NDArray
 
-from ..capture import CaptureSettings, samples_of, StillDetector
+from ..capture import CaptureSettings, StillDetector
 from ..errors import InputError
 from ..table import Floats, numbered, Recording
 from ..text import counted
@@ -85,7 +85,6 @@ _RANDOM = 4
 LEAST_SAMPLES = 64
 """Smallest number of samples of a rest: five octaves of τ."""
 
-_BLOCK = 1 << 16
 _LONG = 1.5
 """Interval between stamps that indicates a missing sample, in units of the usual interval."""
 
@@ -291,9 +290,7 @@ def _uninterrupted(time: Floats, start: float, end: float) -> Iterator[tuple[int
 def _still(recording: Recording, units: Units) -> list[tuple[float, float]]:
     """Return first and last stamp of each rest."""
     detector = StillDetector(CaptureSettings(), units, keep=None)
-    count = len(recording)
-    detector.add(samples_of(recording, first, min(first + _BLOCK, count))
-                 for first in range(0, count, _BLOCK))
+    detector.add_recording(recording)
     detector.close()
     return [(dwell.start, dwell.end) for dwell in detector.dwells()]
 
