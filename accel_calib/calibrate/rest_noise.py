@@ -129,7 +129,12 @@ class GyroBias(Record):
                              'lowest and the highest, or none and no slope')
 
     def at(self, temperature: float) -> Floats:
-        """Return the (3,) bias at a temperature [°C], limited to the range; `bias` for NaN."""
+        """
+        Return the (3,) bias at a temperature [°C], which is limited to that of the rests.
+
+        It is `bias` if the temperature is NaN, or the rests have no temperatures.
+
+        """
         if not self.temperatures or math.isnan(temperature):
             return self.bias
         held = min(max(temperature, self.temperatures[0]), self.temperatures[1])

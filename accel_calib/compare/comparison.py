@@ -111,9 +111,16 @@ class Parameter:
     """
     Values of one parameter over the runs.
 
-    The names are those of `RotationFree`. `values` and `stated_sd` are (n,), by run, and `spread`
-    is the standard deviation over the runs [g]. `ratio` is the spread over the stated standard
-    deviation (RMS); None if the latter is zero.
+    Parameters
+    ----------
+    name : str
+        ``offset.x``, ``gain.xy``, …: entries of V, and of the symmetric gain.
+    values, stated_sd : (n,) array
+        Value and stated standard deviation in each run [g].
+    spread : float
+        Standard deviation over the runs [g].
+    ratio : float or None
+        Spread over the stated standard deviation (RMS); None if the latter is zero.
 
     """
 
@@ -134,8 +141,10 @@ class Run:
     rms_mg, expected_mg : float
         Difference of the corrected |a| from the mean of the others, RMS over all directions, and
         the same as predicted from the uncertainties [mg].
-    largest_mg, direction : float, (3,) array
-        Largest difference [mg], and the direction of up, in the sensor axes, where it occurs.
+    largest_mg : float
+        Largest difference over all directions [mg].
+    direction : (3,) array
+        Direction of up, in the sensor axes, where the difference is largest.
     p_value : float
         Probability of a difference at least this large, if this run agrees with the others.
 
@@ -165,8 +174,10 @@ class Comparison:
         Expected value of T², if the calibrations agree.
     outlier : int or None
         Index of the run without which the others agree, 0-based.
-    runs, parameters : tuple of Run, tuple of Parameter
-        Each run compared with the others; spread of each parameter over the runs.
+    runs : tuple of Run
+        Each run compared with the others.
+    parameters : tuple of Parameter
+        Spread of each parameter over the runs.
     tilt_deg : float or None
         Largest angle between the directions of up of levelled runs [°]; None with fewer than two.
     notes : tuple of str
