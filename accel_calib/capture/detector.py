@@ -271,7 +271,10 @@ def samples_of(recording: Recording, start: int, stop: int, context: Sequence[st
     """Return samples start to stop as (k, n) rows for `StillDetector.add`; InputError if bad."""
     which = slice(start, stop)
     time = recording['time'][which]
-    samples = np.empty((_width(recording, context), len(time)))
+    width = MOTION if 'rate' in recording else 4
+    if any(name in recording for name in context):
+        width = MOTION + len(context)
+    samples = np.empty((width, len(time)))
     samples[0] = time
     samples[1:4] = recording.reading[which].T
     samples[4:] = np.nan
@@ -292,12 +295,6 @@ def check_finite(given: Floats, row: NDArray[np.int64]) -> None:
         message = (f'row {row[bad[0]]} holds a time or reading that is not finite, expected '
                    'finite numbers')
         raise InputError(message, 'remove that row, or repair the recording')
-
-
-def _width(recording: Recording, context: Sequence[str]) -> int:
-    if any(name in recording for name in context):
-        return MOTION + len(context)
-    return MOTION if 'rate' in recording else 4
 
 
 def poses_from(dwells: Sequence[Dwell], settings: CaptureSettings = CaptureSettings()) -> Poses:

@@ -262,8 +262,10 @@ class Comparable:
 def comparable(calibrations: Sequence[Calibration]) -> tuple[Comparable, ...]:
     """Prepare two or more calibrations of one sensor for any number of comparisons among them."""
     _refuse_if_unlike(calibrations)
-    return tuple(Comparable(run, sure, scatter_of(sure)) for run, sure in
-                 zip(calibrations, _with_largest_model(calibrations), strict=True))
+    names = {run.form.norm for run in calibrations}
+    largest = max(names.intersection(NORM_MODELS), key=NORM_MODELS.index, default=NORM_MODELS[0])
+    every = [(run, _fitted_with(largest, run)) for run in calibrations]
+    return tuple(Comparable(run, sure, scatter_of(sure)) for run, sure in every)
 
 
 def _refuse_if_unlike(calibrations: Sequence[Calibration]) -> None:
@@ -288,13 +290,6 @@ def _refuse_if_unlike(calibrations: Sequence[Calibration]) -> None:
         if not np.all(np.isfinite(run.covariance)):
             raise InputError(f'run {k} has no uncertainty, expected a finite covariance',
                              'fit it again with more poses')
-
-
-def _with_largest_model(calibrations: Sequence[Calibration]) -> tuple[Calibration, ...]:
-    """Return each run, or the fit of the largest model of all runs to its poses."""
-    names = {run.form.norm for run in calibrations}
-    largest = max(names.intersection(NORM_MODELS), key=NORM_MODELS.index, default=NORM_MODELS[0])
-    return tuple(_fitted_with(largest, run) for run in calibrations)
 
 
 def _fitted_with(name: str, run: Calibration) -> Calibration:

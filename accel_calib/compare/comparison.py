@@ -276,7 +276,7 @@ def _into(names: tuple[str, ...], run: RotationFree, rows: Floats) -> Floats:
 
 
 def _parameter(name: str, values: Floats, stated: Floats) -> Parameter:
-    spread, typical = float(np.std(values, ddof=1)), float(np.sqrt(np.mean(stated ** 2)))
+    spread, typical = float(np.std(values, ddof=1)), _rms(stated)
     return Parameter(name, values, stated, spread, spread / typical if typical > 0.0 else None)
 
 

@@ -119,7 +119,6 @@ def shares(lengths: Counts) -> Floats:
 
 def allan_variances(values: Floats, lengths: Counts) -> Floats:
     """Return the overlapping Allan variances of (n,) samples at (k,) lengths of at most n/2."""
-    check_allantools()
     found = import_module('allantools').oadev(values - np.mean(values), rate=1.0,
                                               data_type='freq', taus=lengths.astype(float))
     return np.asarray(found[1], dtype=float) ** 2

@@ -353,7 +353,8 @@ def to_json(found: NoiseFigures) -> dict[str, Any]:
         result[f'{kind}_unit'] = axes[0].unit if axes else None
         for figure in FIGURES:
             result.update(_figure_json(found, kind, figure))
-    result['curves'] = [_curve_json(axis) for axis in found.axes]
+    result['curves'] = [{'sensor': axis.kind, **{name: getattr(axis, name) for name in _CURVE}}
+                        for axis in found.axes]
     return result
 
 
@@ -374,7 +375,3 @@ def _figure_json(found: NoiseFigures, kind: Kind, figure: str) -> dict[str, Any]
             f'{name}_axes_interval': [each and each.interval for each in every],
             f'{name}_axes_upper': [each and each.upper for each in every],
             f'{name}_reason': reason}
-
-
-def _curve_json(axis: AxisNoise) -> dict[str, Any]:
-    return {'sensor': axis.kind, **{name: getattr(axis, name) for name in _CURVE}}
