@@ -54,24 +54,17 @@ def px4_fit(log: Recording):
     """Return reference [°C] and coefficients (4, 3) of powers 0 to 3 [m/s²/°C^k]."""
     warm = log['temperature']
     reference, edges = (warm.min() + warm.max()) / 2.0, np.linspace(warm.min(), warm.max(), 2001)
-    place = np.clip(np.digitize(warm, edges) - 1, 0, 1999)
-    size = np.bincount(place, minlength=2000)
-    full = size > 0
-    found = []
-    for axis in medfilt(log.reading, (31, 1)).T:
-        x, y = (np.bincount(place, each, 2000)[full] / size[full] for each in (
-            warm - reference, axis - np.median(axis)))
-        found.append(np.polyfit(x, y, 3)[::-1])
-    return reference, np.array(found).T
+    place = np.unique(np.digitize(warm, edges[1:-1]), return_inverse=True)[1]
+    x, *axes = (np.bincount(place, each) / np.bincount(place) for each in (
+        warm - reference, *medfilt(log.reading, (31, 1)).T))
+    return reference, np.polyfit(x, np.transpose(axes), 3)[::-1]
 
 
-def ardupilot_fit(log: Recording, rate_hz: float = 5.0):
+def ardupilot_fit(log: Recording):
     """Return reference [°C] and coefficients (4, 3) of powers 0 to 3 [m/s²/°C^k]."""
-    width = int(2 * rate_hz)
-    smooth = [np.convolve(each, np.full(width, 1.0 / width), 'valid') for each in (
-        log['temperature'], *log.reading.T)]
-    return 35.0, np.array([np.polyfit(smooth[0] - 35.0, axis - axis.mean(), 3)[::-1]
-                           for axis in smooth[1:]]).T
+    warm, *axes = (np.convolve(each, np.full(10, 0.1), 'valid')  # 2 s at 5 Hz
+                   for each in (log['temperature'], *log.reading.T))
+    return 35.0, np.polyfit(warm - 35.0, np.transpose(axes), 3)[::-1]
 
 
 def vendor_at(fit, temperature, reference_c):
