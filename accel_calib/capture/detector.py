@@ -199,17 +199,10 @@ class Captured:
     """
     The result of a capture.
 
-    Parameters
-    ----------
-    samples, recorded : int
-        Number of samples in the poses, and in the recording.
-    threshold, quietest : float
-        Standard deviation below which a window is still, at the end, and that of the quietest
-        window, each of the axis with the largest one [unit of the readings].
-    seconds : float
-        Duration of the recording without interruptions [s].
-    interruptions : tuple of Interruption
-        Interruptions of the stamps.
+    `samples` and `recorded` are the numbers of samples in the poses, and in the recording.
+    `threshold` is the standard deviation below which a window is still, at the end, and `quietest`
+    that of the quietest window, each of the axis with the largest one [unit of the readings].
+    `seconds` is the duration of the recording without interruptions [s].
 
     """
 

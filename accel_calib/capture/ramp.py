@@ -205,8 +205,8 @@ def ramp_of(cells: Cells) -> Ramp:
         notes.append(f'{counted(int(np.sum(~still)), "second")} left out, in which the board '
                      'shook')
     if not np.all(slow):
-        notes.append(f'{int(np.sum(~slow))} of {counted(len(slow), "stretch")[:-1]}es left out, '
-                     f'in which the temperature changes by more than {FASTEST:g} °C/min')
+        notes.append(f'{int(np.sum(~slow))} of {len(slow)} stretches left out, in which the '
+                     f'temperature changes by more than {FASTEST:g} °C/min')
     return Ramp(stretches.take(slow), warm_rate[slow], seconds, tuple(notes))
 
 

@@ -303,20 +303,12 @@ class Stretch:
     """
     Figures of the last chunks up to each of m chunks.
 
-    Parameters
-    ----------
-    trend : Trend
-        Slopes of the reading, (3, m).
-    excess : (groups, m) array
-        Excess of the noise of the mean, for reading and rate.
-    variance, highest : (axes, m) array, (3, m) array
-        Mean variance of the windows, and the largest one of the reading.
-    samples, at_limit : (m,) array, (3, m) array
-        Number of samples, and the share that repeats the extreme of its axis so far.
-    means : (3, m + length - 1) array
-        Means of the chunks of the reading.
-    scatter, white : (m,) array
-        Mean square of the residuals of `means`, sum over the axes; the same for white noise.
+    `trend` has the slopes of the reading, (3, m), and `excess` (groups, m) is that of the noise of
+    the mean, for reading and rate. `variance` (axes, m) is the mean variance of the windows, and
+    `highest` (3, m) the largest one of the reading. `samples` (m,) is their number, and `at_limit`
+    (3, m) the share that repeats the extreme of its axis so far. `means` (3, m + length - 1) are
+    those of the chunks of the reading. `scatter` (m,) is the mean square of their residuals, sum
+    over the axes, and `white` (m,) the same for independent samples.
 
     """
 

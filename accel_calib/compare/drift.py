@@ -184,22 +184,11 @@ class Drift:
     """
     The state of the monitor: the last rests since a calibration, and the number of all.
 
-    Parameters
-    ----------
-    covariance : (p, p) array
-        Covariance of the calibration [g²].
-    repeats : float
-        Variance of the poses of the calibration beyond the noise of their samples [g²].
-    temperatures : tuple of float
-        Lowest and highest temperature of these poses [°C]; empty if not known.
-    scatter : float
-        Factor on the stated scatter of the rests.
-    change : LastingChange or None
-        The lasting change; None if the sensor is unchanged.
-    since : int
-        Number of the first rest with the change, 1-based; 0 without a change.
-    without : int
-        Number of rests in succession in which a reported change was clearly absent.
+    `covariance` (p, p) is that of the calibration [g²], `repeats` the variance of its poses beyond
+    the noise of their samples [g²], and `temperatures` their lowest and highest temperature [°C],
+    empty if not known. `scatter` is the factor on the stated scatter of the rests. `change` is the
+    lasting change, None if the sensor is unchanged, and `since` the number of the first rest with
+    it, 1-based, or 0. It was clearly absent in the last `without` rests.
 
     """
 

@@ -343,19 +343,11 @@ class NoiseFigures:
     """
     The noise of a sensor at rest.
 
-    Parameters
-    ----------
-    axes : tuple of AxisNoise
-        Accelerometer x, y, z, then gyro x, y, z if the recording has rates. An axis whose reading
-        does not change is missing.
-    start, seconds, rate : float
-        First stamp and duration of the rest [s], and samples per second [Hz].
-    temperature : (2,) tuple of float or None
-        Lowest and highest temperature [°C], averaged over a hundredth of the rest.
-    notes : tuple of str
-        What limits the figures.
-    needs : mapping of (Kind, str) to str
-        For each sensor and figure that is not seen on all axes: the reason and what to do.
+    `axes` are accelerometer x, y, z, then gyro x, y, z if the recording has rates, without those
+    whose reading does not change. `start` and `seconds` are the first stamp and duration of the
+    rest [s], and `rate` is in Hz. `temperature` is the lowest and highest one [°C], averaged over
+    a hundredth of the rest. `notes` state what limits the figures. `needs` has, for each sensor
+    and figure that is not seen on all axes, the reason and what to do.
 
     """
 

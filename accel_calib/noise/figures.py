@@ -259,7 +259,7 @@ def _in_rad_s(rest: LongRest) -> bool:
 
 def _channel(row: int, units: Units, gravity: float, *, rad_s: bool
              ) -> tuple[Kind, str, float, str]:
-    """Return sensor, axis, factor from g or rad/s, and unit of a row of `Rest.values`."""
+    """Return sensor, axis, factor from g or rad/s, and unit of a row of `LongRest.values`."""
     if row > 2:
         return 'gyroscope', 'xyz'[row - 3], 1.0, 'rad/s' if rad_s else 'native'
     if units.is_native:
