@@ -6,8 +6,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 import json
 from pathlib import Path
+import re
 import sys
 from typing import Any
 
@@ -18,10 +20,11 @@ from accel_calib.noise import noise_of, NoiseFigures, to_json
 from accel_calib.table import Floats, numbered, Poses, Recording
 from accel_calib.units import STANDARD_GRAVITY, units_of
 from inside import (
-    ALLAN_COMPONENTS, allan_variances, fit_components, longest_rest, main, octaves, shares,
+    ALLAN_COMPONENTS, allan_variances, fit_components, longest_rest, octaves, shares,
     spread_directions, spread_of)
 import numpy as np
 import pytest
+from shared import run, run_json
 
 allantools = pytest.importorskip('allantools')
 
@@ -49,12 +52,16 @@ def resting(seed: int, count: int, white: float = 1e-4, *, flat: float = 0.0, wa
             gyro: float = 0.0, mean: Sequence[float] = UP) -> Recording:
     """Return a rest with these densities, in g/√Hz, g, g/s/√Hz and rad/s/√Hz."""
     rng = np.random.default_rng(seed)
-    columns = {'time': np.arange(count) / RATE, 'reading': np.column_stack(
-        [noise(rng, count, white * np.sqrt(RATE), flat, walk / np.sqrt(RATE))
-         for _ in range(3)]) + mean}
-    if gyro:
-        columns['rate'] = gyro * np.sqrt(RATE) * rng.normal(size=(count, 3))
-    return Recording(columns, numbered(columns))
+    reading = np.column_stack([noise(rng, count, white * np.sqrt(RATE), flat, walk / np.sqrt(RATE))
+                               for _ in range(3)]) + mean
+    rates = {'rate': gyro * np.sqrt(RATE) * rng.normal(size=(count, 3))} if gyro else {}
+    return sampled(reading, **rates)
+
+
+def sampled(reading: Floats, **columns: Floats) -> Recording:
+    """Return a recording [g]."""
+    known = {'time': np.arange(len(reading)) / RATE, 'reading': reading, **columns}
+    return Recording(known, numbered(known), 'g')
 
 
 def figure_of(found: NoiseFigures, name: str, axis: int = 0) -> Any:
@@ -161,9 +168,7 @@ def test_rates_in_counts_are_not_taken_for_rad_s() -> None:
 def test_the_longest_rest_of_a_recording_with_turns_is_used() -> None:
     parts = [resting(6, 3000), resting(7, 20_000, mean=(0.0, 1.0, 0.0)),
              resting(8, 5000, mean=(1.0, 0.0, 0.0))]
-    columns = {'time': np.arange(28_000) / RATE,
-               'reading': np.concatenate([part.reading for part in parts])}
-    rest = longest_rest(Recording(columns, numbered(columns)), G)
+    rest = longest_rest(sampled(np.concatenate([part.reading for part in parts])), G)
     assert 28.0 < rest.start < 35.0
     assert 19_000 < rest.samples <= 20_000
     assert rest.values[1].mean() == pytest.approx(1.0, abs=0.01)
@@ -177,44 +182,40 @@ def test_a_rest_ends_at_an_interruption() -> None:
     assert 19_000 < rest.samples <= 20_000
 
 
-def test_single_missing_samples_do_not_shorten_the_rest() -> None:
-    recording = resting(10, 30_000)
-    kept = np.random.default_rng(0).random(30_000) > 0.005
-    found = noise_of(recording.take(kept), G)
-    assert found.rate == pytest.approx(RATE, rel=1e-3)
-    assert found.samples > 29_000
-    assert any('missing' in note for note in found.notes)
-    assert figure_of(found, 'noise_density').value == pytest.approx(
-        1e-4 * STANDARD_GRAVITY, rel=0.05)
-
-
-def test_jitter_of_the_stamps_does_not_change_the_figures() -> None:
-    recording = resting(11, 30_000)
-    late = np.random.default_rng(0).uniform(0.0, 0.008, 30_000)
-    found = noise_of(recording.with_columns(time=recording['time'] + late), G)
-    assert any('uneven' in note for note in found.notes)
-    assert figure_of(found, 'noise_density').value == pytest.approx(
-        1e-4 * STANDARD_GRAVITY, rel=0.05)
+def test_single_missing_samples_and_jitter_of_the_stamps_do_not_change_the_figures() -> None:
+    recording, rng = resting(10, 30_000), np.random.default_rng(0)
+    late = recording['time'] + rng.uniform(0.0, 0.008, 30_000)
+    for changed, word in ((recording.take(rng.random(30_000) > 0.005), 'missing'),
+                          (recording.with_columns(time=late), 'uneven')):
+        found = noise_of(changed, G)
+        assert found.rate == pytest.approx(RATE, rel=1e-3)
+        assert found.samples > 29_000
+        assert any(word in note for note in found.notes)
+        assert figure_of(found, 'noise_density').value == pytest.approx(
+            1e-4 * STANDARD_GRAVITY, rel=0.05)
 
 
 def test_a_low_pass_filter_is_noted_and_the_density_is_that_of_long_times() -> None:
     rng = np.random.default_rng(12)
     raw = 1e-4 * np.sqrt(RATE) * rng.normal(size=(60_007, 3))
     smooth = np.cumsum(raw, axis=0)
-    columns = {'time': np.arange(60_000) / RATE,
-               'reading': (smooth[7:] - smooth[:-7])[:60_000] / 7.0 + UP}
-    found = noise_of(Recording(columns, numbered(columns)), G)
+    found = noise_of(sampled((smooth[7:] - smooth[:-7])[:60_000] / 7.0 + UP), G)
     assert any('low-pass filter' in note for note in found.notes)
     density = figure_of(found, 'noise_density')
     assert abs(density.value - 1e-4 * STANDARD_GRAVITY) < 4.0 * density.sd
 
 
-def test_a_coarse_output_is_noted() -> None:
-    recording = resting(13, 20_000, mean=(0.0002, 0.0004, 0.9998))
-    coarse = recording.with_columns(reading=np.round(recording.reading / 0.004) * 0.004)
-    found = noise_of(coarse, G)
-    assert any('one step of the output' in note or 'all samples of the rest are the same' in note
-               for note in found.notes)
+def test_a_coarse_output_and_a_change_of_temperature_are_noted() -> None:
+    rest = resting(13, 20_000, mean=(0.0002, 0.0004, 0.9998)).with_columns(
+        temperature=np.full(20_000, 20.0))
+    warm = rest.with_columns(temperature=np.linspace(20.0, 26.0, 20_000))
+    coarse = rest.with_columns(reading=np.round(rest.reading / 0.004) * 0.004)
+    for words, changed in (
+            ('one step of the output|all samples of the rest are the same', coarse),
+            ('temperature changed by', warm)):
+        noted, otherwise = (' '.join(noise_of(each, G).notes) for each in (changed, rest))
+        assert re.search(words, noted)
+        assert not re.search(words, otherwise)
 
 
 def test_an_axis_without_noise_is_left_out_with_a_note() -> None:
@@ -227,59 +228,40 @@ def test_an_axis_without_noise_is_left_out_with_a_note() -> None:
     assert to_json(found)['accelerometer_noise_density_axes'][1] is None
 
 
-def test_a_change_of_temperature_is_noted() -> None:
-    recording = resting(15, 20_000)
-    warm = recording.with_columns(temperature=np.linspace(20.0, 26.0, 20_000))
-    assert any('temperature changed by' in note for note in noise_of(warm, G).notes)
-    same = recording.with_columns(temperature=np.full(20_000, 20.0))
-    assert not any('temperature' in note for note in noise_of(same, G).notes)
-
-
-def test_a_drift_is_not_taken_for_a_random_walk() -> None:
-    recording = resting(16, 200_000)
-    drift = 2e-6 * recording['time'][:, np.newaxis]
-    found = noise_of(recording.with_columns(reading=recording.reading + drift), G)
-    assert not figure_of(found, 'random_walk').seen
-    drift = figure_of(found, 'drift')
+def test_drift_and_swing_of_the_temperature_are_not_taken_for_a_random_walk() -> None:
+    rest, time = resting(16, 200_000), np.arange(200_000)[:, np.newaxis] / RATE
+    drifting, swinging = (noise_of(sampled(rest.reading + shift), G) for shift in (
+        2e-6 * time, 5e-4 * np.sin(time / 200.0)))
+    assert not figure_of(drifting, 'random_walk').seen
+    drift = figure_of(drifting, 'drift')
     assert abs(drift.value - 2e-6 * STANDARD_GRAVITY) < 4.0 * drift.sd
-    assert any('steady drift of 7' in note and 'µg per hour' in note for note in found.notes)
-
-
-def test_a_swing_of_the_temperature_is_not_taken_for_a_random_walk() -> None:
-    recording = resting(16, 200_000)
-    swing = 5e-4 * np.sin(recording['time'] / 200.0)[:, np.newaxis]
-    found = noise_of(recording.with_columns(reading=recording.reading + swing), G)
-    assert not figure_of(found, 'random_walk').seen
-    assert any('slope +' in note for note in found.notes)
-    assert 'another form' in found.needs['accelerometer', 'random_walk']
+    assert any('steady drift of 7' in note and 'µg per hour' in note for note in drifting.notes)
+    assert not figure_of(swinging, 'random_walk').seen
+    assert any('slope +' in note for note in swinging.notes)
+    assert 'another form' in swinging.needs['accelerometer', 'random_walk']
 
 
 def test_a_recording_without_a_rest_is_refused() -> None:
-    rng = np.random.default_rng(17)
-    columns = {'time': np.arange(3000) / RATE, 'reading': rng.normal(size=(3000, 3)) + UP}
     with pytest.raises(InputError, match='longest rest .* expected at least 64'):
-        noise_of(Recording(columns, numbered(columns)), G)
+        noise_of(sampled(np.random.default_rng(17).normal(size=(3000, 3)) + UP), G)
 
 
-@pytest.fixture(scope='module')
-def table(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp('noise') / 'rest.csv'
-    recording = resting(19, 12_000, gyro=1e-4)
-    write_table(path, Recording(recording.columns, recording.row, 'g'))
-    return path
-
-
-def test_the_figures_are_printed_written_and_drawn(
-        table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+def test_the_figures_are_printed_beside_those_of_common_parts_written_and_drawn(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str],
         monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip('matplotlib')
     monkeypatch.setenv('COLUMNS', '60')
-    assert main(['noise', str(table), '--json', str(tmp_path / 'noise.json'), '--report',
-                 str(tmp_path / 'noise.html')]) == 0
+    write_table(tmp_path / 'rest.csv', resting(19, 12_000, gyro=1e-4))
+    assert run('noise', tmp_path / 'rest.csv', '--json', tmp_path / 'noise.json', '--report',
+               tmp_path / 'noise.html') == 0
     printed = capsys.readouterr().out
-    assert all(len(line) <= 60 or str(tmp_path) in line for line in printed.splitlines())
+    lines = printed.splitlines()
+    assert all(len(line) <= 60 or str(tmp_path) in line for line in lines)
     assert '±' in printed
     assert '…' not in printed
+    assert [line for line in lines if line.startswith('typical')] == [
+        'typical white noise: 49 to 280 µg/√Hz', 'typical white noise: 2 to 3.5 m°/s/√Hz']
+    assert any(line.startswith('USABLE') for line in lines)
     made = json.loads((tmp_path / 'noise.json').read_text())
     assert made['gyroscope_noise_density'] == pytest.approx(1e-4, rel=0.05)
     assert made['update_rate'] == pytest.approx(RATE, rel=1e-3)
@@ -289,42 +271,32 @@ def test_the_figures_are_printed_written_and_drawn(
     for words in ('<svg', 'white noise', 'bias instability', 'accelerometer_noise_density',
                   '49 to 280', 'class="verdict USABLE"'):
         assert words in text
-    assert 'http:' not in text
-    assert 'https:' not in text
-
-
-def test_figures_are_beside_those_of_common_parts(capsys: pytest.CaptureFixture[str],
-                                                  tmp_path: Path) -> None:
-    path = tmp_path / 'rest.csv'
-    write_table(path, resting(20, 6000, gyro=1e-4))
-    assert main(['noise', str(path)]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert [line for line in lines if line.startswith('typical')] == [
-        'typical white noise: 49 to 280 µg/√Hz', 'typical white noise: 2 to 3.5 m°/s/√Hz']
-    assert any(line.startswith('USABLE') for line in lines)
+    assert not re.search('https?:', text)
 
 
 @pytest.mark.parametrize(('white', 'kind'), [(1e-4, 'not_seen'), (1e-3, 'noisy')])
 def test_a_rest_is_rated(white: float, kind: str) -> None:
     rating = rate_noise(noise_of(resting(20, 6000, white), G))
     assert rating.name == 'USABLE'
-    assert kind in {each.kind for each in rating.findings}
-    assert ('noisy' in {each.kind for each in rating.findings}) is (kind == 'noisy')
+    found = {each.kind for each in rating.findings}
+    assert kind in found
+    assert ('noisy' in found) is (kind == 'noisy')
 
 
-def test_a_calibration_turns_counts_into_g(tmp_path: Path) -> None:
+def test_a_calibration_turns_counts_into_g(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rng = np.random.default_rng(21)
     directions = spread_directions(24)
     readings = directions * 16384.0 + [100.0, -50.0, 20.0] + rng.normal(size=(24, 3))
     columns = {'reading': readings, 'std': np.full((24, 3), 10.0), 'count': np.full(24, 100.0)}
     write_table(tmp_path / 'poses.csv', Poses(columns, numbered(columns), 'native'))
-    recording = resting(22, 6000)
-    counts = recording.with_columns(reading=recording.reading * 16384.0 + 20.0)
-    write_table(tmp_path / 'rest.csv', Recording(counts.columns, counts.row, 'native'))
-    assert main(['fit', str(tmp_path / 'poses.csv'), '-o', str(tmp_path / 'c.yaml')]) == 0
-    assert main(['noise', str(tmp_path / 'rest.csv'), '-c', str(tmp_path / 'c.yaml'), '--json',
-                 str(tmp_path / 'noise.json')]) == 0
-    made = json.loads((tmp_path / 'noise.json').read_text())
+    rest = resting(22, 6000)
+    counts = replace(rest.with_columns(reading=rest.reading * 16384.0 + 20.0), units='native')
+    write_table(tmp_path / 'rest.csv', counts)
+    assert run('fit', tmp_path / 'poses.csv', '-o', tmp_path / 'c.yaml') == 0
+    capsys.readouterr()
+    status, made = run_json(capsys, 'noise', tmp_path / 'rest.csv', '-c', tmp_path / 'c.yaml')
+    assert status == 0
     assert made['accelerometer_noise_density'] == pytest.approx(1e-4 * STANDARD_GRAVITY, rel=0.05)
 
 

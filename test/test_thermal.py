@@ -26,13 +26,12 @@ class Wave:
         self.speed, self.lag = 2.0 * np.pi / rng.uniform(400.0, 1500.0, 2), lag
 
     def true(self, time):
-        angle = np.multiply.outer(time, self.speed) + self.phase
-        return 25.0 + np.sin(angle) @ self.size
+        return self.low_passed(time, 0.0)
 
-    def low_passed(self, time):
-        angle = np.multiply.outer(time, self.speed) + self.phase
-        angle = angle - np.arctan(self.speed * self.lag)
-        return 25.0 + np.sin(angle) @ (self.size / np.hypot(1.0, self.speed * self.lag))
+    def low_passed(self, time, lag=None):
+        turned = self.speed * (self.lag if lag is None else lag)
+        angle = np.multiply.outer(time, self.speed) + self.phase - np.arctan(turned)
+        return 25.0 + np.sin(angle) @ (self.size / np.hypot(1.0, turned))
 
 
 def rms(errors):
@@ -43,22 +42,17 @@ def stepped(temperature, step):
     return np.round(temperature / step) * step
 
 
-def test_low_pass_of_a_ramp_falls_behind_by_slope_times_lag():
-    time = np.array([0.0, 3.0, 50.0, 51.0, 400.0, 9000.0])
-    expected = 20.0 + 0.01 * time - 0.01 * 60.0 * (1.0 - np.exp(-time / 60.0))
-    for rate in (None, np.full(6, 0.01)):
-        found = low_passed(START + time, 20.0 + 0.01 * time, 60.0, rate)
-        np.testing.assert_allclose(found, expected, atol=1e-9)
-
-
-def test_low_pass_of_a_cubic_temperature_is_exact_with_its_rates():
+@pytest.mark.parametrize(('a', 'b', 'known'), [
+    (0.0, 0.0, False), (0.0, 0.0, True), (2e-7, -3e-5, True)])
+def test_low_pass_of_a_ramp_and_of_a_cubic_temperature_with_its_rates_is_exact(a, b, known):
     time = np.array([0.0, 7.0, 30.0, 31.0, 95.0, 400.0]) - 40.0
-    a, b, c, lag = 2e-7, -3e-5, 0.01, 25.0
+    c, lag = 0.01, 25.0
     warm, rate = a * time ** 3 + b * time ** 2 + c * time, 3 * a * time ** 2 + 2 * b * time + c
     bend, twist = 6 * a * time + 2 * b, 6 * a
     steady = warm - lag * rate + lag ** 2 * bend - lag ** 3 * twist
     expected = steady + (warm - steady)[0] * np.exp(-(time - time[0]) / lag)
-    np.testing.assert_allclose(low_passed(time, warm, lag, rate), expected, atol=1e-12)
+    found = low_passed(START + time, warm, lag, rate if known else None)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
 def test_order_of_the_rows_and_rows_without_values_do_not_matter():
@@ -72,29 +66,20 @@ def test_order_of_the_rows_and_rows_without_values_do_not_matter():
         np.testing.assert_allclose(function(*given, *of), expected, atol=1e-9)
 
 
-@pytest.mark.parametrize(('step', 'most'), [(0.01, 0.1), (0.06, 0.25)])
 @pytest.mark.parametrize('spacing', [10.0, 20.0, 30.0, 60.0])
 @pytest.mark.parametrize('lag', [30.0, 100.0, 300.0])
-def test_temperature_ahead_of_a_lagging_sensor_is_found_at_poses(spacing, lag, step, most):
-    rng = np.random.default_rng(int(spacing + lag))
-    time = START + np.cumsum(rng.uniform(0.7, 1.3, 80) * spacing)
-    wave = Wave(rng, lag)
-    context = {'time': time, 'temperature': stepped(wave.low_passed(time), step)}
-    found = acting_temperature(context, KEY, lag, True)
-    behind = rms(context['temperature'] - wave.true(time))
-    assert rms(found - wave.true(time)) < min(most, 0.3 * behind)
-
-
-@pytest.mark.parametrize('spacing', [10.0, 30.0, 60.0])
-@pytest.mark.parametrize('lag', [30.0, 300.0])
-def test_temperature_of_a_lagging_die_is_found_at_poses(spacing, lag):
+def test_temperatures_ahead_of_a_lagging_sensor_and_of_a_lagging_die_are_found(spacing, lag):
     rng = np.random.default_rng(int(spacing + lag))
     time = np.cumsum(rng.uniform(0.7, 1.3, 400) * spacing)
     wave = Wave(rng, lag)
-    context = {'time': START + time, 'temperature': stepped(wave.true(time), 0.01)}
+    true, behind = wave.true(time), wave.low_passed(time)
+    for step, most in ((0.01, 0.1), (0.06, 0.25)):
+        context = {'time': START + time, 'temperature': stepped(behind, step)}
+        ahead = acting_temperature(context, KEY, lag, True)
+        assert rms(ahead - true) < min(most, 0.3 * rms(behind - true))
+    context['temperature'] = stepped(true, 0.01)
     found = acting_temperature(context, KEY, lag, False)
-    settled = time > time[0] + 8.0 * lag
-    assert rms((found - wave.low_passed(time))[settled]) < 0.03
+    assert rms((found - behind)[time > time[0] + 8.0 * lag]) < 0.03
 
 
 @pytest.mark.parametrize('lag', [30.0, 300.0])
@@ -110,22 +95,16 @@ def test_temperature_ahead_of_a_lagging_sensor_is_found_in_a_stream(lag):
     assert rms((found['temperature_rate'] - true_rate)[settled]) < 0.2 * rms(true_rate)
 
 
-def samples(count=3000):
-    """Return uneven times with a pause, and a stepped temperature; some are missing."""
-    rng = np.random.default_rng(3)
-    time = START + np.cumsum(rng.uniform(0.0, 0.4, count))
-    time[count // 2:] += 500.0
-    warm = stepped(25.0 + 6.0 * np.sin(time / 90.0), 0.06)
-    warm[rng.random(count) < 0.05] = np.nan
-    warm[3::50] = 0.0
-    return time, warm
-
-
 LAGS = {KEY: Lag(40.0, True), 'temperature_of_gain': Lag(25.0, False)}
 
 
-def test_stream_and_array_give_the_same_numbers():
-    time, warm = samples()
+def test_stream_and_array_give_the_same_numbers_over_a_pause_and_missing_temperatures():
+    rng = np.random.default_rng(3)
+    time = START + np.cumsum(rng.uniform(0.0, 0.4, 3000))
+    time[1500:] += 500.0
+    warm = stepped(25.0 + 6.0 * np.sin(time / 90.0), 0.06)
+    warm[rng.random(3000) < 0.05] = np.nan
+    warm[3::50] = 0.0
     expected = ThermalStream(LAGS, rate=True).add_all(time, warm)
     stream = ThermalStream(LAGS, rate=True)
     for k, (moment, temperature) in enumerate(zip(time.tolist(), warm.tolist(), strict=True)):
@@ -137,20 +116,16 @@ def test_stream_and_array_give_the_same_numbers():
             assert all(np.isnan(values[k]) for values in expected.values())
 
 
-def test_stream_is_empty_before_the_first_temperature():
+def test_stream_begins_with_the_first_temperature_and_again_if_the_time_jumps_back():
     stream = ThermalStream(LAGS, rate=True)
     stream.add(1.0, np.nan)
     assert stream.value == {}
     stream.add(2.0, 20.0)
     assert stream.value == {'temperature_rate': 0.0, **dict.fromkeys(LAGS, 20.0)}
-
-
-def test_stream_starts_again_if_the_time_jumps_back():
-    stream = ThermalStream(LAGS, rate=False)
     stream.add_all(START + np.arange(100.0), 20.0 + np.arange(100.0))
     assert stream.value['temperature_of_gain'] < 110.0
     stream.add(START - 3600.0, 30.0)
-    assert stream.value == dict.fromkeys(LAGS, 30.0)
+    assert stream.value == {'temperature_rate': 0.0, **dict.fromkeys(LAGS, 30.0)}
 
 
 BASE = {'offset': [0.02, -0.01, 0.03], 'axis_gain': [0.01, -0.02, 0.005],
@@ -190,21 +165,20 @@ def test_fit_leaves_a_lag_of_zero_as_it_is():
     np.testing.assert_array_equal(fit.covariance[6:], 0.0)
 
 
-def test_a_lag_needs_the_time():
-    model = Model({'offset_temperature': np.array([1e-3, 1e-3, 1e-3, 60.0, 0.0])})
-    with pytest.raises(InputError, match='need time'):
-        predict(model, np.ones((1, 3)), {'temperature': np.array([20.0])})
-
-
-def lagging(lag: float, *, of_sensor: bool) -> Model:
+def lagging(lag, of_sensor):
     """Return a model with a temperature that lags."""
-    return Model({'offset_temperature': np.array([1e-3, 1e-3, 1e-3, lag, float(of_sensor)])})
+    return Model({'offset_temperature': np.array([1e-3, 1e-3, 1e-3, lag, of_sensor])})
 
 
-def test_points_do_not_depend_on_the_batches() -> None:
+def test_a_lag_needs_the_time():
+    with pytest.raises(InputError, match='need time'):
+        predict(lagging(60.0, 0.0), np.ones((1, 3)), {'temperature': np.array([20.0])})
+
+
+def test_points_do_not_depend_on_the_batches():
     time = START + np.arange(0.0, 120.0, 0.5)
     warm = 20.0 + 0.25 * (time - START)
-    known, later = lagging(30.0, of_sensor=True), lagging(20.0, of_sensor=True)
+    known, later = lagging(30.0, 1.0), lagging(20.0, 1.0)
     found = []
     for batch in (1, 7, 40, len(time)):  # a recording that is played fast has long ones
         history = TemperatureHistory()
@@ -212,21 +186,17 @@ def test_points_do_not_depend_on_the_batches() -> None:
         for begin in range(0, len(time), batch):
             history.add(time[begin:begin + batch], warm[begin:begin + batch])
         during = history.during(known, START + 60.0, START + 70.0)[KEY]
-        stream = history.stream(later)
-        assert stream is not None
-        found.append([history.columns_of(known)[KEY], *during, stream.value[KEY]])
+        found.append([history.columns_of(known)[KEY], *during, history.stream(later).value[KEY]])
     np.testing.assert_allclose(found, np.tile(found[0], (4, 1)), atol=1e-9)
     assert found[0][0] == pytest.approx(warm[-1] + 30.0 * 0.25, abs=0.2)
 
 
-def test_history_starts_again_if_the_time_jumps_back_within_a_batch() -> None:
+def test_history_starts_again_if_the_time_jumps_back_within_a_batch():
     jumped, again = TemperatureHistory(), TemperatureHistory()
     jumped.add(START + np.arange(100.0, 200.0), np.full(100, 50.0))
     jumped.add(START + np.array([200.0, 201.0, 0.0, 1.0, 2.0, 30.0]),
                np.array([50.0, 50.0, 20.0, 21.0, 22.0, 20.0]))
     again.add(START + np.array([0.0, 1.0, 2.0, 30.0]), np.array([20.0, 21.0, 22.0, 20.0]))
-    found, expected = (each.stream(lagging(30.0, of_sensor=False)) for each in (jumped, again))
-    assert found is not None
-    assert expected is not None
-    assert found.value == expected.value
-    assert expected.value[KEY] == pytest.approx(21.0, abs=1.0)
+    found, expected = (each.stream(lagging(30.0, 0.0)).value for each in (jumped, again))
+    assert found == expected
+    assert expected[KEY] == pytest.approx(21.0, abs=1.0)

@@ -17,10 +17,10 @@ ratio of the Student to the normal quantile. Successive rests can have similar e
 drifts. With the correlation ρ between neighbours, the variance is multiplied by (1 + ρ) / (1 - ρ),
 as for slopes in `accel_calib.capture.trend`.
 
-**Turning rests.** A sensor that turns steadily about the vertical has a constant reading. Only its
-rate differs. A rest is left out if its rate on any axis is further from the others than noise and
-scatter explain. Until then, the centre is the median, and τ is the median absolute deviation, with
-the factors of Croux and Rousseeuw for few values [2]_. A few such rests do not affect either.
+**Turning rests.** A sensor that turns steadily about the vertical has a constant reading. A rest
+is therefore left out if its rate on any axis is further from the others than noise and scatter
+explain. For this, the centre is the median, and τ is the median absolute deviation, with the
+factors of Croux and Rousseeuw for few values [2]_, which a few such rests do not affect.
 
 **Temperature.** With a temperature for each rest, a line is fitted, too. An axis has a slope if
 the line shows it with p < 0.001. A bias that drifts while the temperature rises looks the same.
@@ -29,8 +29,8 @@ of all pairs, weighted by their difference of temperature [3]_.
 
 **Noise.** The noise of a sample is the median over the rests, by axis, so that disturbed rests do
 not affect it. For the rate, `accel_calib.capture` measures it in windows of 0.5 s, without slow
-drift. For the reading it is ``std``, over the whole rest, because pose tables of all sources have
-it. On real recordings with rests of some seconds, the medians of both agree within 4 %.
+drift. For the reading it is ``std``, over the whole rest, because all pose tables have it. On real
+recordings with rests of some seconds, both agree within 4 %.
 
 References
 ----------
@@ -205,8 +205,8 @@ def gyro_bias_of(poses: Poses) -> GyroBias | None:
     """
     Return the bias of the gyro, from the rates of the rests that did not turn.
 
-    It is None if there are no rates or fewer than `LEAST_RESTS` rests, if the rates are all 0 or
-    not in rad/s, or if they differ so much that the poses are not rests.
+    It is None with fewer than `LEAST_RESTS` rests, if the rates are missing, all 0 or not in
+    rad/s, or if they differ so much that the poses are not rests.
 
     """
     if 'rate' not in poses or len(poses) < LEAST_RESTS:

@@ -8,20 +8,18 @@ A still board reads, by axis and with g = W ΔR force + V at the reference tempe
 
     reading(T) = g + Σ_k c_k (T - R)^k,   k = 1 to degree.
 
-g is not observable from one orientation: neither offset, gain nor tilt. Only the change with the
-temperature is, and it is attributed to the offset; a gain that changes with the temperature looks
-the same along gravity. R is 25 °C, or the end of the range that is nearest to it.
+One orientation does not show offset, gain or tilt, but only the change with the temperature. It is
+attributed to the offset; a gain that changes with the temperature looks the same along gravity.
+R is 25 °C, or the end of the range that is nearest to it.
 
 **Fit.** Least squares by axis, with one g for each ramp. If the temperature rises and falls, a
-term in its rate is fitted, too, and then left out: a thermometer that lags shows another reading
-when it warms than when it cools, and this must not bend the polynomial. `hysteresis_mg` is the
-mean difference between the two directions at equal temperatures. The rate that explains it best is
-a lag of the thermometer, `lag_s`.
+term in its rate is fitted, too, and then left out: a thermometer that lags differs between warming
+and cooling, which must not bend the polynomial. `hysteresis_mg` is the mean difference between the
+two directions at equal temperatures, and `lag_s` the lag that explains it best.
 
-**Deviations.** The noise of a long log is correlated: a slow wander of the offset looks like a
-change with the temperature. The noise of a stretch is taken as white noise of variance σ², for a
-stretch of mean size, plus a random walk, which grows by ρ σ² a second. The part of the readings
-outside of the fit has the covariance
+**Deviations.** A slow wander of the offset looks like a change with the temperature. The noise of
+a stretch of mean size is therefore white noise of variance σ² plus a random walk, which grows by
+ρ σ² a second. The part of the readings outside of the fit has the covariance
 
     σ² (A + ρ B),   A of the white noise, B of the walk
 
@@ -29,10 +27,10 @@ The generalised eigenvectors of B and A make it diagonal for each ρ. The restri
 of all three axes weights a grid of ρ, each with its σ². The covariance of the values is that of
 least squares with this noise, averaged over the grid.
 
-**Degree.** With all samples, or with the usual tests, the degree would grow with the wander. Here
-each of `_BLOCKS` contiguous parts of the log is predicted from a fit of the others. The lowest
-degree is taken at which no higher one predicts better by `_BETTER`, in all and in `_MOST_BLOCKS`
-of the parts, with last coefficients that differ from 0 at `_LEVEL` (χ² over the axes).
+**Degree.** With the usual tests, the degree would grow with the wander. Here each of `_BLOCKS`
+contiguous parts of the log is predicted from a fit of the others. The lowest degree is taken at
+which no higher one predicts better by `_BETTER`, in all and in `_MOST_BLOCKS` of the parts, with
+last coefficients that differ from 0 at `_LEVEL` (χ² over the axes).
 
 .. [1] D. A. Harville, Maximum likelihood approaches to variance component estimation, Journal of
    the American Statistical Association 72 (1977) 320.
@@ -96,14 +94,10 @@ class Curve:
 
     Parameters
     ----------
-    reference_c : float
-        Temperature at which the curve is zero [°C].
-    range_c : tuple of float
-        Lowest and highest temperature [°C].
-    values : (degree, 3) array
-        c_1, c_2, … by axis [g/°C^k].
-    covariance : (3, degree, degree) array
-        Covariance of the values of each axis.
+    reference_c, range_c : float, tuple of float
+        Temperature at which the curve is zero, and the lowest and highest temperature [°C].
+    values, covariance : (degree, 3) array, (3, degree, degree) array
+        c_1, c_2, … by axis [g/°C^k], and the covariance of those of each axis.
     held_out_mg : tuple of float
         Error of held-out parts for degree 0 to 3, RMS of the vector [mg].
     hysteresis_mg, lag_s : float or None
@@ -142,11 +136,11 @@ class Curve:
 
     def at(self, temperature: Floats) -> Floats:
         """Return the (n, 3) offset at temperatures, relative to the reference [g]."""
-        return _powers(temperature - self.reference_c, self.degree)[:, 1:] @ self.values
+        return _powers(temperature - self.reference_c, self.degree) @ self.values
 
     def deviation_at(self, temperature: Floats) -> Floats:
         """Return the (n, 3) standard deviation of `at` [g]."""
-        rows = _powers(temperature - self.reference_c, self.degree)[:, 1:]
+        rows = _powers(temperature - self.reference_c, self.degree)
         return np.sqrt(np.maximum(np.einsum('np,apq,nq->na', rows, self.covariance, rows), 0.0))
 
     @property
@@ -187,9 +181,10 @@ def curve_of(ramps: Sequence[Ramp]) -> Curve:
     warm, rate = stretches['temperature'], np.concatenate([each.rate for each in ramps])
     low, high = float(warm.min()), float(warm.max())
     reference = float(np.clip(REFERENCE_TEMPERATURE, low, high))
-    rising, falling = _directions(warm, rate)
-    both = bool(np.any(rising & _shared(warm, falling)) and np.any(falling))
-    powers = _powers(warm - reference, DEGREE)[:, 1:]
+    limit = _MOVING * float(np.quantile(np.abs(rate), 0.95))
+    rising, falling = rate > limit, rate < -limit
+    both = bool(np.any(rising & _shared(warm, falling)))
+    powers = _powers(warm - reference, DEGREE)
     beside = np.eye(len(ramps))[group]
     if both:
         beside = np.column_stack([beside, rate])
@@ -223,7 +218,8 @@ def _joined(ramps: Sequence[Ramp]) -> tuple[Poses, NDArray[np.intp]]:
 
 
 def _powers(warm: Floats, degree: int) -> Floats:
-    return np.asarray(warm[:, np.newaxis] ** np.arange(degree + 1))
+    """Return the (n, degree) powers from 1 on."""
+    return np.asarray(warm[:, np.newaxis] ** np.arange(1, degree + 1))
 
 
 def _parts(time: Floats, warm: Floats) -> NDArray[np.intp]:
@@ -286,12 +282,6 @@ def _solved(design: Floats, reading: Floats) -> Floats:
     return np.asarray(np.linalg.lstsq(design, reading, rcond=None)[0])
 
 
-def _directions(warm: Floats, rate: Floats) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return where the temperature clearly rises, and where it falls."""
-    limit = _MOVING * float(np.quantile(np.abs(rate), 0.95))
-    return rate > limit, rate < -limit
-
-
 def _shared(warm: Floats, other: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return which temperatures lie in the range of the other rows, if that is wide enough."""
     if np.sum(other) < 2 or np.ptp(warm[other]) < _OVERLAP * np.ptp(warm):
@@ -331,10 +321,9 @@ def findings_of_curve(curve: Curve) -> tuple[Finding, ...]:
 
 def ramp_rows(curve: Curve, units: Units) -> Poses:
     """
-    Return the rows that stand for the ramps among poses, in the unit of the readings.
+    Return means of successive stretches that stand for the ramps, in the unit of the readings.
 
-    Each is the mean of successive stretches. Its noise is the RMS of what the curve leaves, which
-    includes the slow wander.
+    Their noise is the RMS of what the curve leaves, which includes the slow wander.
 
     """
     stretches = curve.stretches
@@ -367,8 +356,7 @@ def thermal_alone(curve: Curve, units: Units, *, sensor: str = '', date: str = '
     """
     Return a calibration with the offset over the temperature alone, zero at the reference.
 
-    Its residuals are those of the vector: the change of the reading with the temperature, before
-    and after the correction.
+    Its residuals are the changes of the reading with the temperature, before and after.
 
     """
     values, covariance = curve.effects
@@ -420,17 +408,17 @@ def with_curve(fitted: Calibration, curve: Curve, poses: Poses) -> Calibration:
     """
     Return a calibration of poses with the curve, and with the ramps among its poses.
 
-    `fitted` is that of `without_curve`. The values of the curve stay as they are. Their
-    uncertainty moves those of the fit: by least squares, d values = -(J⁺ K) d curve, with J and K
-    the derivatives of the equations of the poses.
+    `fitted` is that of `without_curve`. The uncertainty of the curve moves the values of the fit:
+    by least squares, d values = -(J⁺ K) d curve, with J and K the derivatives of the equations of
+    the poses.
 
     """
     thermal, spread = curve.effects
     powers = {name: values for name, values in thermal.items() if name in OFFSET_POWERS[1:]}
     model, own = Model({**fitted.model.values, **powers}), len(fitted.model.vector)
     used_g = in_g(fitted.used_poses, fitted.units)
-    used_g = _of_norm(used_g.with_columns(reading=used_g.reading + _added(curve, used_g)))
-    columns = judge(model, used_g).columns
+    moved = only_norm(used_g.with_columns(reading=used_g.reading + _added(curve, used_g)))
+    columns = judge(model, moved.with_columns(temperature=used_g['temperature'])).columns
     move = -np.linalg.pinv(columns[:, :own]) @ columns[:, own:]
     of_curve = spread[-3 * len(powers):, -3 * len(powers):]
     covariance = np.block([[fitted.covariance + move @ of_curve @ move.T, move @ of_curve],
@@ -446,11 +434,6 @@ def with_curve(fitted: Calibration, curve: Curve, poses: Poses) -> Calibration:
         noted=(*fitted.noted, *findings_of_curve(curve)))
     return gated(replace(made, gyro=fitted.gyro, noise=fitted.noise, sensor=fitted.sensor,
                          date=fitted.date))
-
-
-def _of_norm(poses_g: Poses) -> Poses:
-    """Return the poses with |force| = 1 g and their temperature alone."""
-    return only_norm(poses_g).with_columns(temperature=poses_g['temperature'])
 
 
 def _together(poses: Poses, rows: Poses) -> Poses:

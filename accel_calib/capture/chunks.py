@@ -4,14 +4,13 @@
 """
 From samples to chunks: sums over short intervals of header time; and the settings of the capture.
 
-All later steps work on chunks of a fifth of the still window. The cost per sample is thus a few
-additions for any window length, and a recording of any length becomes a short table. Windows and
-dwells are sums of chunks. The first sample of the stream is subtracted before squaring, which
-preserves the digits of a small noise on a large offset.
+Windows and dwells are sums of chunks of a fifth of the still window, so that the cost per sample
+is a few additions for any window length. The first sample of the stream is subtracted before
+squaring, which preserves the digits of a small noise on a large offset.
 
 The sample period is estimated from the first samples of a segment and then kept, so that a stream
 and a recording are divided at the same places. A segment is a part of the stream without an
-interruption of the stamps. After an interruption the period is estimated again.
+interruption of the stamps.
 
 **Limits.** A sensor that reaches the end of its range repeats its largest or smallest reading. The
 samples that repeat the extreme of their axis so far are therefore counted. A new extreme is not
@@ -99,19 +98,10 @@ class CaptureSettings:
 
 def settings_from(given: Mapping[str, Any], units: Units) -> CaptureSettings:
     """
-    Return settings with these values, and the defaults for all others.
+    Return settings with these values by name, and the defaults for all others.
 
-    Parameters
-    ----------
-    given : mapping of str to object
-        Values by the names of `CaptureSettings`; ``still_std_max`` is in the unit of the readings.
-    units : Units
-        Unit of the readings.
-
-    Raises
-    ------
-    InputError
-        If a name is not known, or a value is out of range.
+    ``still_std_max`` is in the unit of the readings. Raise InputError if a name is not known, or a
+    value is out of range.
 
     """
     names = [each.name for each in fields(CaptureSettings)]
@@ -134,8 +124,7 @@ Records = NDArray[Any]
 """One-dimensional structured array."""
 
 CONTEXT = ('temperature', 'supply_voltage')
-"""Columns of `accel_calib.table.COLUMNS` that are averaged together with reading and rate, as
-quantities are."""
+"""Columns that are averaged together with reading and rate, as quantities are."""
 
 MOTION = 7
 """Numbers of a sample before its context: time, reading, rate (NaN: none)."""
@@ -182,8 +171,7 @@ def sums_of(samples: Floats, starts: Indices, epoch: float, origin: Floats, kind
     Return the (m,) records of a `sums_type` over the samples from each start to the next.
 
     `samples` are (k, n): time and reading (k = 4), with rate (7), with the columns of the context
-    (more). `epoch` and `origin` (6,) are subtracted from time, and from reading and rate. Sums of
-    a missing rate are NaN.
+    (more). `epoch` and `origin` (6,) are subtracted. Sums of a missing rate are NaN.
 
     """
     sums = blank(kind, len(starts))
@@ -262,9 +250,8 @@ class Interruption(NamedTuple):
     """
     An interruption of the stamps [s], which ends a dwell.
 
-    Samples are missing (gap), time jumped back (a bag played again, simulated time reset), or the
-    stamps did not change while samples arrived (stopped). `seconds` is the next stamp minus the
-    last one.
+    Samples are missing (gap), time jumped back, or the stamps did not change while samples arrived
+    (stopped). `seconds` is the next stamp minus the last one.
 
     """
 
@@ -276,23 +263,14 @@ class Interruption(NamedTuple):
 @dataclass(frozen=True)
 class Chunks:
     """
-    Consecutive chunks of one segment.
+    m consecutive chunks of one segment.
 
-    Parameters
-    ----------
-    sums : (m,) array of a `sums_type`
-        Time relative to `epoch`, readings and rates relative to `origin`.
-    begin, end : (m,) array
-        First and last stamp [s].
-    step : (2, m) array
-        Smallest nonzero step between successive readings, and rates; infinite if no step is
-        smaller than before.
-    epoch, origin : float, (6,) array
-        Start of the segment [s]; first reading and rate of the stream.
-    length, period : float
-        Length of a chunk, and sample period [s].
-    fresh : bool
-        Whether these are the first chunks of a segment.
+    `sums` (m,) are of a `sums_type`, with the time relative to `epoch`, the start of the segment,
+    and readings and rates relative to `origin` (6,), the first ones of the stream. `begin` and
+    `end` (m,) are the first and last stamp. `step` (2, m) is the smallest nonzero step between
+    successive readings, and rates; infinite if no step is smaller than before. `length` and
+    `period` are those of a chunk and of the samples; times are in s. `fresh` is whether these are
+    the first chunks of the segment.
 
     """
 
@@ -320,12 +298,7 @@ def together(found: Sequence[Chunks]) -> Iterator[Chunks]:
 
 
 class Chunker:
-    """
-    Convert blocks of samples, with this number of columns of context, to chunks.
-
-    The division into blocks does not affect the chunks.
-
-    """
+    """Convert samples in any blocks, with this number of columns of context, to chunks."""
 
     def __init__(self, settings: CaptureSettings, columns: int) -> None:
         self._kind = sums_type(columns)
@@ -341,11 +314,11 @@ class Chunker:
         self.fresh = True  # the present segment has no chunk yet
         self.interruptions: deque[Interruption] = deque(maxlen=_INTERRUPTIONS_MAX)
 
-    def feed(self, samples: Floats, last: bool = False) -> list[Chunks]:
+    def feed(self, samples: Floats, last: bool) -> list[Chunks]:
         """
         Return the chunks that samples complete: time [s], reading, rate and context as rows.
 
-        `last`: no more samples follow, so the period is estimated from few samples, too.
+        If they are the last ones, the period is estimated from few samples, too.
 
         """
         pending = _joined(self._pending, samples)
@@ -399,8 +372,8 @@ class Chunker:
         if not len(breaks):
             return len(time), False
         cut = int(breaks[0])
-        kind: Literal['gap', 'jump_back'] = 'gap' if step[cut] > 0.0 else 'jump_back'
-        self.interruptions.append(Interruption(float(before[cut]), kind, float(step[cut])))
+        self.interruptions.append(Interruption(
+            float(before[cut]), 'gap' if step[cut] > 0.0 else 'jump_back', float(step[cut])))
         return cut, False
 
     def _split(self, samples: Floats, in_order: bool) -> tuple[Chunks, Floats]:
@@ -412,10 +385,10 @@ class Chunker:
         np.floor(index, out=index)
         edges = np.flatnonzero(index[1:] != index[:-1]) + 1
         whole = int(edges[-1]) if len(edges) else 0
-        starts = np.concatenate([[0], edges[:-1]]) if whole else np.empty(0, dtype=np.int64)
         if whole:
             self._latest = float(latest[whole - 1])
-        return self._chunks(samples[:, :whole], starts.astype(np.intp)), samples[:, whole:]
+        starts = np.concatenate([[0], edges])[:-1].astype(np.intp)
+        return self._chunks(samples[:, :whole], starts), samples[:, whole:]
 
     def _chunks(self, samples: Floats, starts: Indices) -> Chunks:
         assert self._origin is not None

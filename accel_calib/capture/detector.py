@@ -9,10 +9,9 @@ The stillness detector of one sensor, and from recordings to poses.
 half the largest range of the readings over the axes. Until the sensor has been turned over, this r
 is too small and the angle too large. Then too few poses count as repeated, not too many.
 
-**Merging.** The mean of two readings on a sphere lies inside the sphere: for weights w and 1 - w
-by w (1 - w) c²/2r², which is 1.25 mg for 0.1 rad. If 1 g is known, the mean is moved outwards by
-this distance. The weights are the inverse variances of the means, and std/√count of the merged
-pose is the noise of the weighted mean.
+**Merging.** The mean of two readings on a sphere lies inside the sphere: for weights w and 1 - w,
+the inverse variances, by w (1 - w) c²/2r², which is 1.25 mg for 0.1 rad. If 1 g is known, the mean
+is moved outwards by this distance.
 
 """
 
@@ -38,18 +37,17 @@ from ..units import Units
 _BLOCK = 1 << 14     # samples summed at a time; they fit in the cache
 _AT_ONCE = 1 << 17   # samples passed to the detector at a time
 
-
 _EARLIER = 100
 """Number of earlier dwells that are used in the test of a new dwell."""
 
 
 class StillDetector:
     """
-    Find the dwells of one sensor, block by block.
+    Find the dwells of one sensor, in blocks of samples of any size.
 
-    The dwells do not depend on the division into blocks; a stream and a recording have the same
-    dwells. `keep` is the number of finished dwells to keep; None: all. `context` are the keys of
-    the further columns of the samples: temperature, supply voltage, and quantities.
+    `keep` is the number of finished dwells to keep; None: all. `context` are the keys of the
+    further columns of the samples: temperature, supply voltage, and quantities. `still` is whether
+    the sensor is still now.
 
     """
 
@@ -61,7 +59,7 @@ class StillDetector:
         self._tracker: Tracker | None = None
         self._most = keep
         self._kept = np.empty(0, figures_type(len(context)))
-        self._still = False
+        self.still = False
         self._mean = np.full(6, np.nan)
         self._number = 0
 
@@ -82,22 +80,23 @@ class StillDetector:
         """
         Add samples as (k, n) arrays, and return how many dwells ended.
 
-        The rows are the columns of `push`. Those of the context can be omitted, and those of the
-        rate before them. `dwells` returns the still ones.
+        The rows are the columns of `push`, without those at the end that are not known.
 
         """
         return self._keep(self._feed(blocks, last=False))
+
+    def add_recording(self, recording: Recording) -> None:
+        """Add the samples of a recording; raise InputError if one is not finite."""
+        for start in range(0, len(recording), _AT_ONCE):
+            stop = min(start + _AT_ONCE, len(recording))
+            self.add(samples_of(recording, begin, min(begin + _BLOCK, stop), self._context)
+                     for begin in range(start, stop, _BLOCK))
 
     def close(self) -> list[Dwell]:
         """End the ongoing dwell, because the stream is interrupted; return it if it is still."""
         count = self._keep(self._feed([np.empty((4, 0))], last=True) + self._leave())
         self._chunker.restart()
         return self._last(count)
-
-    @property
-    def still(self) -> bool:
-        """Whether the sensor is still now."""
-        return self._still
 
     def current(self) -> Dwell | None:
         """Return the ongoing dwell so far, or None if it is too short or not still."""
@@ -121,8 +120,7 @@ class StillDetector:
         """
         Return the largest standard deviation of a still window now [unit of the readings].
 
-        It is the largest over the axes, and infinite before the first samples of a sensor in
-        native units.
+        It is infinite before the first samples of a sensor in native units.
 
         """
         mean = np.nan_to_num(self._mean)[:, np.newaxis]
@@ -149,7 +147,7 @@ class StillDetector:
             if self._tracker is None:
                 self._tracker = Tracker(self._settings, self._rule, verdict, self._number)
             found += self._tracker.feed(verdict)
-            self._still = bool(verdict.still[-1])
+            self.still = bool(verdict.still[-1])
             self._mean = chunks.origin
         if self._chunker.fresh:  # the stamps were interrupted: what is known of the rest is over
             found += self._leave()
@@ -161,7 +159,7 @@ class StillDetector:
         found = self._tracker.close()
         self._number = self._tracker.number
         self._tracker = None
-        self._still = False
+        self.still = False
         return found
 
     def _keep(self, found: list[OngoingDwell]) -> int:
@@ -201,17 +199,10 @@ class Captured:
     """
     The result of a capture.
 
-    Parameters
-    ----------
-    samples, recorded : int
-        Number of samples in the poses, and in the recording.
-    threshold, quietest : float
-        Standard deviation below which a window is still, at the end, and that of the quietest
-        window, each of the axis with the largest one [unit of the readings].
-    seconds : float
-        Duration of the recording without interruptions [s].
-    interruptions : tuple of Interruption
-        Interruptions of the stamps.
+    `samples` and `recorded` are the numbers of samples in the poses, and in the recording.
+    `threshold` is the standard deviation below which a window is still, at the end, and `quietest`
+    that of the quietest window, each of the axis with the largest one [unit of the readings].
+    `seconds` is the duration of the recording without interruptions [s].
 
     """
 
@@ -247,16 +238,13 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
     """
     parts = iter([recording] if isinstance(recording, Recording) else recording)
     first = next(parts, None)
-    context = context_of(first)
+    context = CONTEXT if first is None else (*CONTEXT, *first.quantities)
     detector = StillDetector(settings, units, keep=None, context=context)
     spans: list[tuple[float, float]] = []
     recorded = 0
     about: dict[str, Any] = {}
     for part in parts if first is None else chain((first,), parts):
-        for start in range(0, len(part), _AT_ONCE):
-            stop = min(start + _AT_ONCE, len(part))
-            detector.add(samples_of(part, begin, min(begin + _BLOCK, stop), context)
-                         for begin in range(start, stop, _BLOCK))
+        detector.add_recording(part)
         if len(part):
             spans = [*spans[:1], (float(part['time'][0]), float(part['time'][-1]))]
             recorded += len(part)
@@ -271,22 +259,15 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
                     interruptions, recorded, detector.quietest)
 
 
-def context_of(recording: Recording | None) -> tuple[str, ...]:
-    """Return the keys of the context of a recording that poses have: `CONTEXT` and quantities."""
-    return CONTEXT if recording is None else (*CONTEXT, *recording.quantities)
-
-
 def samples_of(recording: Recording, start: int, stop: int, context: Sequence[str] = CONTEXT
                ) -> Floats:
-    """
-    Return samples start to stop for `StillDetector.add`: (k, n), a row for each of its columns.
-
-    A time or a reading that is not finite is an InputError.
-
-    """
+    """Return samples start to stop as (k, n) rows for `StillDetector.add`; InputError if bad."""
     which = slice(start, stop)
     time = recording['time'][which]
-    samples = np.empty((_width(recording, context), len(time)))
+    width = MOTION if 'rate' in recording else 4
+    if any(name in recording for name in context):
+        width = MOTION + len(context)
+    samples = np.empty((width, len(time)))
     samples[0] = time
     samples[1:4] = recording.reading[which].T
     samples[4:] = np.nan
@@ -309,35 +290,29 @@ def check_finite(given: Floats, row: NDArray[np.int64]) -> None:
         raise InputError(message, 'remove that row, or repair the recording')
 
 
-def _width(recording: Recording, context: Sequence[str]) -> int:
-    if any(name in recording for name in context):
-        return MOTION + len(context)
-    return MOTION if 'rate' in recording else 4
-
-
 def poses_from(dwells: Sequence[Dwell], settings: CaptureSettings = CaptureSettings()) -> Poses:
     """
     Return the pose table of these dwells.
 
-    The table has the columns of context that all dwells have; ``rate_std`` likewise. It has the
-    column ``orientation`` if ``max_dwell`` is finite, and ``doubtful`` if a dwell is doubtful.
+    It has the columns that all dwells have, ``orientation`` if ``max_dwell`` is finite, and
+    ``doubtful`` if a dwell is doubtful.
 
     """
+    def of(name: str) -> Floats:
+        return np.array([getattr(each, name) for each in dwells], dtype=float)
+
     columns: dict[str, NDArray[Any]] = {
-        'time': np.array([each.time for each in dwells], dtype=float),
-        'reading': np.array([each.mean for each in dwells], dtype=float).reshape(-1, 3),
-        'std': np.array([each.std for each in dwells], dtype=float).reshape(-1, 3),
-        'count': np.array([each.count for each in dwells], dtype=float)}
+        'time': of('time'), 'reading': of('mean').reshape(-1, 3), 'std': of('std').reshape(-1, 3),
+        'count': of('count')}
     for name in dwells[0].context if dwells else ():
         if all(name in each.context for each in dwells):
             columns[name] = np.array([each.context[name] for each in dwells])
-    rate_std = np.array([each.rate_std for each in dwells], dtype=float)
-    if 'rate' in columns and np.isfinite(rate_std).all():
-        columns['rate_std'] = rate_std
+    if 'rate' in columns and np.isfinite(of('rate_std')).all():
+        columns['rate_std'] = of('rate_std')
     if np.isfinite(settings.max_dwell):
-        columns['orientation'] = np.array([each.orientation for each in dwells], dtype=np.int64)
+        columns['orientation'] = of('orientation').astype(np.int64)
     if any(each.doubtful for each in dwells):
-        columns['doubtful'] = np.array([each.doubtful for each in dwells], dtype=float)
+        columns['doubtful'] = of('doubtful')
     return Poses(columns, numbered(columns))
 
 
@@ -357,12 +332,7 @@ def select(dwells: Sequence[Dwell], settings: CaptureSettings, units: Units) -> 
 
 
 def merged(first: Dwell, second: Dwell, units: Units) -> Dwell:
-    """
-    Return the weighted mean of two dwells in nearly the same direction.
-
-    Time and context are weighted by the number of samples. The first dwell sets the orientation.
-
-    """
+    """Return the mean of two dwells in nearly one direction, with the orientation of the first."""
     weight = _weight(first, second)
     mean = weight * first.mean + (1.0 - weight) * second.mean
     if not units.is_native:

@@ -8,28 +8,27 @@ Dwells: still stretches, joined, averaged and tested.
 the noise is better known. Only then does the chunk join the dwell. A dwell that began before the
 noise was known therefore starts where the sensor came to rest, and a slope or an oscillation
 excludes all its chunks. A window that is not still ends the dwell at once; the waiting chunks are
-then decided with the noise known so far. Next to a significant slope, the slope may continue below
-significance; a weaker slope is enough to reject the dwell there.
+then decided with the noise known so far. Next to a significant slope, a weaker slope is enough to
+reject the dwell, because the slope may continue below significance.
 
 All chunks of a still window belong to the dwell, but its first and last chunk are trimmed. If the
 sensor is still again after a knock, in the same orientation, the dwell continues. A dwell is
 therefore returned `KNOCK` chunks after its end. The chunks of an ongoing dwell are combined into
-at most `2 · CELLS` cells of 2ᵏ chunks, so that a dwell of days needs no more memory than one of a
-minute.
+at most `2 · CELLS` cells of 2ᵏ chunks, so that its memory is bounded.
 
 **Mean.** Mean and standard deviation are those of all samples. The number of samples is divided by
 the excess of the noise of the mean (see `trend`), so that std/√count is the noise of the mean
 along the force. A short dwell is not enough to estimate the excess, which is a property of the
 sensor. The median over all dwells is therefore used, unless a dwell has a clearly larger excess.
 The noise is that along the mean reading if this is known to be the vertical: a sensor that settles
-tilts slightly, which changes its reading across the vertical, but its mean is correct for its mean
-attitude, and the fit uses only the noise along the force.
+tilts slightly, which changes its reading across the vertical, and the fit uses only the noise
+along the force.
 
 Samples that are rounded to steps cause an error of the mean, which averaging does not remove if
 their noise is less than a step. Its variance follows from the mean variance of the samples of each
 axis over all dwells (see `rule`). One dwell without any variance is added to this mean, because a
-few dwells that alternate between two steps look like more noise. The white noise of the angular
-rate is the mean variance of the windows, which does not include the slow drift of a gyro.
+few dwells that alternate between two steps look like more noise. The white noise of the rate is
+the mean variance of the windows, which does not include slow drift.
 
 **Tests.** The noise may become known after a dwell ended, so each query tests all dwells again. A
 dwell is rejected in three cases:
@@ -64,7 +63,7 @@ _FIGURES = [
     ('average', float, 6),    # mean variance of the windows
     ('mean', float, 6),       # reading and rate
     ('std', float, 3),        # of the samples
-    ('slope', float, 3), ('square', float, 3), ('neighbours', float, 3),  # see `sliding.Line`
+    ('slope', float, 3), ('square', float, 3), ('neighbours', float, 3),  # see `trend.Line`
     ('time_square', float), ('cells', float),
     ('white', float, 3),      # variance of a cell mean for independent samples
     ('spacing', float),       # time between cells [s]
@@ -220,8 +219,7 @@ def judged(table: Records, rule: Rule, context: Sequence[str], first: int = 0
     """
     Return each dwell from `first` on, or None if it is not still according to the noise known now.
 
-    Excess and bias of the gyro are estimated from all dwells of the table of `figures`. `context`
-    names its columns of context.
+    All dwells of the table of `figures` are used. `context` names its columns of context.
 
     """
     slopes = trend_of(table)
@@ -261,8 +259,7 @@ def _by_gyro(table: Records, quiet: NDArray[np.bool_], rule: Rule
     Return which dwells are turning according to the gyro, and which are certainly not.
 
     The bias of the gyro is the median over the quiet dwells. A rate about the vertical does not
-    change a pose and is ignored. With native units the gyro is not used, because it may be in
-    counts, too.
+    change a pose and is ignored. A gyro beside native readings may be in counts and is not used.
 
     """
     up, rates = table['mean'].T[:3], table['mean'].T[3:]
@@ -317,8 +314,8 @@ class OngoingDwell:
     """
     The accumulated chunks of a dwell.
 
-    `begin` and `end` are the first and last stamp [s], `cells` the sums over `size` chunks each,
-    and `beside_slope` tells whether the reading has a slope directly before or after the dwell.
+    `begin` and `end` are the first and last stamp [s], and `cells` the sums over `size` chunks
+    each. `beside_slope`: the reading has a slope directly before or after the dwell.
 
     """
 
@@ -417,8 +414,7 @@ class Tracker:
 
     def close(self) -> list[OngoingDwell]:
         """End the ongoing dwell because no chunk follows, and return all dwells that end."""
-        done = self._decide(last=True)
-        return done + self._end()
+        return self._decide(last=True) + self._end()
 
     def current(self) -> OngoingDwell | None:
         """Return the ongoing dwell as if it ended now, or None if it is too short."""
@@ -443,7 +439,7 @@ class Tracker:
 
     def _skip(self, chunks: Records) -> list[OngoingDwell]:
         self._pause += len(chunks)
-        self._lead = _tail(chained(self._lead, _tail(chunks, _LEAD)), _LEAD)
+        self._lead = chained(self._lead, chunks[-_LEAD:])[-_LEAD:]
         self._held = _NONE
         sloping = bool((chunks['trending'] > 0).any())
         self._beside_slope |= sloping
@@ -456,18 +452,16 @@ class Tracker:
         before = self._held
         if self._pause or self._dwell is None:
             before = _without_windows(self._lead)
-            if self._dwell is None or not self._continues(chained(before, chunks[:1])):
+            first = chained(before, chunks[:1])['sums']
+            if (self._dwell is None or not self._dwell.chunks
+                    or not self._dwell.continued_by(first, self._rule.scale)):
                 done = self._end()
                 self._dwell = OngoingDwell(self._chunks, self.number)
             self._pause = 0
         chunks = chained(before, chunks)
         self._lead = _NONE
-        self._held = _tail(chunks, 1)
+        self._held = chunks[-1:]
         return done + self._add(chunks[:-1])
-
-    def _continues(self, first: Records) -> bool:
-        return (self._dwell is not None and self._dwell.chunks > 0
-                and self._dwell.continued_by(first['sums'], self._rule.scale))
 
     def _add(self, chunks: Records) -> list[OngoingDwell]:
         assert self._dwell is not None
@@ -510,10 +504,6 @@ def _records(judged: Judged) -> Records:
     found['limit'], found['still'] = judged.limit.T, judged.still
     found['trending'] = judged.trending
     return found
-
-
-def _tail(chunks: Records, size: int) -> Records:
-    return chunks[max(len(chunks) - size, 0):]
 
 
 def _without_windows(chunks: Records) -> Records:

@@ -5,18 +5,18 @@
 From the samples of a still board whose temperature changes to stretches of equal duration.
 
 The samples are summed over cells of 1 s, so that the memory does not grow with the sample rate.
-Cells in which the board shakes are left out. The other cells are averaged over at most
-`_STRETCHES` stretches. The noise of a stretch is that of its mean: it comes from the second
-differences of successive means, which neither a slope nor a slow change contributes to, and which
-contain the noise that is correlated within a stretch.
+Cells in which the board shakes are left out, and the others are averaged over at most `_STRETCHES`
+stretches. The noise of the mean of a stretch comes from the second differences of successive
+means, which a slope does not change, and which contain the noise that is correlated within a
+stretch.
 
-A ramp is refused, in one line, if it cannot show what temperature does:
+A ramp is refused if it cannot show what temperature does:
 
 - there is no temperature, or it spans less than `LEAST_RANGE`;
 - the board was turned: its direction leaves the first one by more than `_TURNED`;
-- the board was shifted: the readings jump between two neighbours by more than `_JUMP_G`, and by
-  more than their noise, while a polynomial in the temperature does not. A slow tilt during a
-  single ramp looks like the temperature, and is not seen;
+- the board was shifted: the readings jump by more than `_JUMP_G` and their noise, while a
+  polynomial in the temperature does not. A slow tilt during a ramp looks like the temperature, and
+  is not seen;
 - the ramp is too fast for the thermometer. Stretches with a rate above `FASTEST` are left out, and
   the others must span `LEAST_RANGE`. A thermometer in the package of the sensor lags by about
   10 s. At 5 °C/min it is then 0.8 °C behind, which is 0.8 mg in a common part of 1 mg/°C.
@@ -56,9 +56,6 @@ _LEAST_DIRECTIONS = 4
 _APART = np.radians(20.0)
 """Number of rests in directions this far apart that make a log one of poses."""
 
-_REST_S = 2
-"""Successive still cells of a rest in `is_turned_over`."""
-
 _JUMP_G, _JUMP_NOISES, _NEIGHBOURS = 0.003, 8.0, 4
 _DEGREE = 3
 
@@ -66,16 +63,11 @@ _DEGREE = 3
 @dataclass(frozen=True)
 class Cells:
     """
-    Averages of a log over cells of 1 s, in order of time.
+    Averages of a log over m cells of 1 s, in order of time.
 
-    Parameters
-    ----------
-    time, temperature, count : (m,) array
-        Means [s], [°C], and number of samples; the temperature is NaN where it is not known.
-    reading, std : (m, 3) array
-        Mean and standard deviation of the readings [g].
-    sensor, autopilot : str, Autopilot or None
-        As in `accel_calib.table.Table`.
+    `time` [s] and `temperature` [°C] are means, NaN where the temperature is not known. `count` is
+    the number of samples, and `reading` and `std` (m, 3) are in g. `sensor` and `autopilot` are as
+    in `accel_calib.table.Table`.
 
     """
 
@@ -112,8 +104,7 @@ def cells_of(blocks: Iterable[Recording], units: Units) -> Cells:
     Raises
     ------
     InputError
-        If there are no samples, a time or a reading is not finite, or the readings are in native
-        units, whose scale one orientation does not show.
+        If there are no samples, one is not finite, or the readings are in native units.
 
     """
     if units.is_native:
@@ -172,16 +163,9 @@ class Ramp:
     """
     Stretches of a still board whose temperature changes, in order of time.
 
-    Parameters
-    ----------
-    stretches : Poses
-        Means [g] with time, temperature, std and count; std/√count is the noise of a mean.
-    rate : (n,) array
-        Rate of the temperature [°C/s].
-    seconds : float
-        Duration of the log [s].
-    notes : tuple of str
-        What was left out.
+    `stretches` are means [g] with time, temperature, std and count; std/√count is the noise of a
+    mean. `rate` (n,) is that of the temperature [°C/s], and `seconds` the duration of the log [s].
+    `notes` state what was left out.
 
     """
 
@@ -221,8 +205,8 @@ def ramp_of(cells: Cells) -> Ramp:
         notes.append(f'{counted(int(np.sum(~still)), "second")} left out, in which the board '
                      'shook')
     if not np.all(slow):
-        notes.append(f'{int(np.sum(~slow))} of {counted(len(slow), "stretch")[:-1]}es left out, '
-                     f'in which the temperature changes by more than {FASTEST:g} °C/min')
+        notes.append(f'{int(np.sum(~slow))} of {len(slow)} stretches left out, in which the '
+                     f'temperature changes by more than {FASTEST:g} °C/min')
     return Ramp(stretches.take(slow), warm_rate[slow], seconds, tuple(notes))
 
 

@@ -14,8 +14,8 @@ A window is the last `CHUNKS_PER_WINDOW` chunks. It is still if
    the drift of a sensor during warm-up. Turning at 0.5 °/s changes a reading by up to 8.7 mg/s
    and is not visible in any variance;
 5. the chunk means do not oscillate with one frequency. Otherwise, shaking from the first second on
-   would pass for noise of the sensor. White noise and vibration average out over a chunk. Noise
-   behind a slow low-pass filter does not, but it has no single frequency. A limit of the user
+   would pass for noise of the sensor. White noise and vibration average out over a chunk, and
+   noise behind a slow low-pass filter has no single frequency. A limit of the user
    (`still_std_max`) replaces this condition.
 
 **The noise of the sensor** is the lower envelope of the variances so far. The mean variance v of
@@ -23,12 +23,10 @@ the windows in `LONG` chunks has a standard error of about v √(2/dof), with do
 excess) for n samples. Excess is the variance of their mean over that of independent samples (exact
 for white noise and close for AR(1) noise). The upper end of this range, v exp(2 √(2/dof)), is an
 upper bound of the noise if the sensor is still, and far above it if the sensor moves; so its
-minimum so far is used. The noise is at least the variance that the resolution causes: a quantised
-reading that alternates between two steps of height q has a variance of up to q²/4, and q is the
-smallest step so far. For data without noise, it is at least a millionth of the reading. Nothing is
-learned from an axis at the limit of the sensor, whose samples scatter less (see `clipped`). Before
-the noise is known, a sensor with a standard deviation above `STD_CAP_G` is not still, if the unit
-of the readings is known.
+minimum so far is used. The noise is at least the variance that the resolution causes: a reading
+that alternates between two steps of height q has a variance of up to q²/4, and q is the smallest
+step so far. Nothing is learned from an axis at the limit of the sensor, whose samples scatter less
+(see `clipped`).
 
 **Rounding.** Samples x = μ + n with noise n of the standard deviation σ are rounded to multiples
 of q. The error of the mean of many samples depends on μ. Over all μ its variance is
@@ -63,8 +61,8 @@ LONG = 12
 """Number of chunks from which the noise is estimated."""
 
 SLOPE_CHUNKS = (LONG, 3 * LONG)
-"""Numbers of chunks over which slopes are tested; a longer stretch reveals smaller slopes.
-Oscillations are tested over the same stretches; a longer stretch reveals slower ones."""
+"""Numbers of chunks over which slopes and oscillations are tested; a longer stretch reveals
+smaller slopes and slower oscillations."""
 
 OSCILLATION = {LONG: 0.9, 3 * LONG: 0.7}
 """Largest share of one frequency in the chunk means of a still stretch, by the number of chunks.
@@ -101,11 +99,8 @@ SURE = 2.33
 """Required margin to `TURN_G` in standard errors; 1 % of the turned dwells pass."""
 
 TURNED, TURNED_NOISE = 3e-3, 3.0
-"""
-Smallest half of the range of native readings at rest that is a turn, and not noise and drift: in
-lengths of the reading, which can be 100 g of counts without sign, and in standard deviations.
-
-"""
+"""Smallest half of the range of native readings at rest that is a turn: in lengths of the reading,
+which can be 100 g of counts without sign, and in standard deviations."""
 
 SLOPE_NOISE = 0.1
 """Largest slope in standard deviations of the samples per second, while 1 g is not known."""
@@ -124,25 +119,16 @@ STD_FLOOR_G = 3.3e-4
 """Smallest noise of a sensor [g]; smaller shaking is harmless."""
 
 AT_LIMIT = 0.1
-"""Share of samples at a limit above which a variance is not that of the noise; it is then smaller
-by a sixth or more."""
+"""Share of samples at a limit above which a variance is too small by a sixth or more."""
 
 
 class Judged(NamedTuple):
     """
-    Chunks with the verdict on the window that ends with each chunk.
+    m chunks with the verdict on the window that ends with each chunk.
 
-    Parameters
-    ----------
-    chunks : Chunks
-        The m chunks.
-    level, limit : (6, m) array
-        Variance of reading and rate within the window, NaN if not known; and its largest value for
-        a still window.
-    still : (m,) array of bool
-        The verdict.
-    trending : (m,) array of int
-        Number of chunks over which the reading has a slope or oscillates; 0 if it does not.
+    `level` (6, m) is the variance of reading and rate within the window, NaN if not known, and
+    `limit` its largest value for a still window. `still` (m,) is the verdict, and `trending` (m,)
+    the number of chunks over which the reading has a slope or oscillates; 0 if it does not.
 
     """
 
@@ -190,8 +176,7 @@ class Rule:
         Return the (n,) rounding std of a sample, and the (3, n) rounding variance of the means.
 
         `mean` are the (3, n) mean readings of dwells, and `level` the (3,) mean variance of the
-        samples over many dwells. The std is always above 0. Averaging does not remove the
-        variance.
+        samples over many dwells. The std is always above 0.
 
         """
         step = float(self._step[0])
@@ -246,10 +231,9 @@ class Rule:
               strength: float | Floats = STRENGTH, drift_g: float = SLOPE_G
               ) -> NDArray[np.bool_]:
         """
-        Return whether a slope is significant and larger than a drift of `drift_g` [g/s].
+        Return whether a slope has this strength and is larger than a drift of `drift_g` [g/s].
 
-        `scale` (...) is the reading of 1 g, and `variance` (3, ...) that of the samples. A slope
-        is significant if its strength is above `strength`.
+        `scale` (...) is the reading of 1 g, and `variance` (3, ...) that of the samples.
 
         """
         drift = drift_g * scale
@@ -381,8 +365,7 @@ def rounding_left(variance: Floats) -> Floats:
     """
     Return the variance that rounding leaves in the mean of many samples [steps²].
 
-    It is 1/12 without noise, and 0 if the noise of the samples is a step or more. `variance` is
-    that of the rounded samples, as an average over many true values [steps²].
+    `variance` is that of the rounded samples, as an average over many true values [steps²].
 
     """
     small = np.pi * variance**2 + 1.0 / 12.0 - variance

@@ -5,8 +5,7 @@
 Slopes, oscillations and the noise of means, over sliding windows of a series of chunks.
 
 **Sliding sums.** A window of length L is composed of windows of length 1, 2, 4, …, so the cost
-grows with the logarithm of L. The result of a window depends only on the values in the window, not
-on earlier values or on the division into blocks.
+grows with the logarithm of L, and the result depends only on the values in the window.
 
 **Slope.** With k = 0 … L-1 and t = k - (L-1)/2, the least squares slope is Σ t x / Σ t², computed
 from Σ x and Σ k x. The power of the residuals r and the product of neighbours are computed without
@@ -32,9 +31,9 @@ share over all f is near 1 if one frequency dominates (periodogram of Lomb and S
 time of two cells, because the spectrum of noise has no peak.
 
 **Mean.** The variance of the mean of a correlated series is the sum of its autocovariances divided
-by its length. Sample autocovariances at long lags are noise. The sum therefore ends where a pair
-Γ_j = γ_2j + γ_2j+1 is not positive (initial positive sequence, Geyer [2]_). Subtracting the mean
-removes the variance of the mean from each autocovariance; it is added again.
+by its length. Those at long lags are noise, so that the sum ends where a pair Γ_j = γ_2j + γ_2j+1
+is not positive (initial positive sequence, Geyer [2]_). Subtracting the mean removes the variance
+of the mean from each autocovariance; it is added again.
 
 References
 ----------
@@ -73,8 +72,7 @@ class Line(NamedTuple):
     Least squares lines through windows, in units of one step.
 
     `slope` is (..., n). `square` and `neighbours` are the sums of the squared residuals, and of
-    the products of neighbouring residuals. `time_square` is Σ t², and `length` that of the
-    windows.
+    the products of neighbouring residuals. `time_square` is Σ t².
 
     """
 
@@ -136,8 +134,7 @@ def lines(values: Floats, length: int) -> Line:
     product -= mean * (2.0 * total - first - last) - (length - 1) * mean * mean
     product -= slope * (2.0 * moment - (time[-1] + 1.0) * (last - first))
     product += slope * slope * float(np.sum(time[1:] * time[:-1]))
-    return Line(slope, np.maximum(square, 0.0), product, time_square,
-                length)
+    return Line(slope, np.maximum(square, 0.0), product, time_square, length)
 
 
 def lines_through(centred: Floats, sizes: Floats) -> Line:
@@ -160,10 +157,9 @@ def lines_through(centred: Floats, sizes: Floats) -> Line:
 
 def oscillation(values: Floats, length: int, index: NDArray[np.intp]) -> Floats:
     """
-    Return the (m,) largest shares, 0 to 1, of the residuals that one frequency explains.
+    Return the (m,) largest shares of the residuals of all axes that one frequency explains.
 
-    `values` are (axes, n); a share is over all axes together. `index` (m,) are the first values of
-    the windows of this length.
+    `values` are (axes, n), and `index` (m,) the first values of the windows of this length.
 
     """
     line, waves = _waves(length)
@@ -194,18 +190,11 @@ def _waves(length: int) -> tuple[Floats, Floats]:
 
 class Trend(NamedTuple):
     """
-    A slope over cells, and its significance.
+    Slopes (3, ...) over cells, in the unit of the cells per second, and their significance.
 
-    Parameters
-    ----------
-    slope : (3, ...) array
-        Slope in the unit of the cells per second.
-    strength : (...) array
-        Sum over the axes of (slope / its standard error)².
-    excess : (...) array
-        Ratio of the variance of a mean to that of white noise, at least 1.
-    error : (...) array
-        Standard error of the slope of the noisiest axis, for independent samples.
+    `strength` (...) is the sum over the axes of (slope / its standard error)². `excess` is the
+    ratio of the variance of a mean to that of white noise, at least 1. `error` is the standard
+    error of the slope of the noisiest axis, for independent samples.
 
     """
 
@@ -217,10 +206,9 @@ class Trend(NamedTuple):
 
 def strength_of(line: Line, spacing: float | Floats, white: Floats) -> Trend:
     """
-    Return the slopes of (3, ...) lines through cells with their significance.
+    Return the slopes of (3, ...) lines through cells at this spacing [s].
 
-    `spacing` is the time between cells [s], and `white` the (3, ...) variance of a cell mean for
-    independent samples.
+    `white` (3, ...) is the variance of a cell mean for independent samples.
 
     """
     size = line.length
@@ -315,23 +303,12 @@ class Stretch:
     """
     Figures of the last chunks up to each of m chunks.
 
-    Parameters
-    ----------
-    trend : Trend
-        Slopes of the reading, (3, m).
-    excess : (groups, m) array
-        Excess of the noise of the mean, for reading and rate.
-    variance, highest : (axes, m) array, (3, m) array
-        Mean variance of the windows, and the largest one of the reading.
-    samples : (m,) array
-        Number of samples.
-    at_limit : (3, m) array
-        Share of samples that repeat the extreme of their axis so far.
-    means : (3, m + length - 1) array
-        Means of the chunks of the reading.
-    scatter, white : (m,) array
-        Mean square of the residuals of the means of the reading, sum over the axes; and the same
-        for independent samples.
+    `trend` has the slopes of the reading, (3, m), and `excess` (groups, m) is that of the noise of
+    the mean, for reading and rate. `variance` (axes, m) is the mean variance of the windows, and
+    `highest` (3, m) the largest one of the reading. `samples` (m,) is their number, and `at_limit`
+    (3, m) the share that repeats the extreme of its axis so far. `means` (3, m + length - 1) are
+    those of the chunks of the reading. `scatter` (m,) is the mean square of their residuals, sum
+    over the axes, and `white` (m,) the same for independent samples.
 
     """
 

@@ -11,10 +11,10 @@ symmetric factor of the polar decomposition W = S Q. The derivative of S solves
 S dS + dS S = dW Wᵀ + W dWᵀ. Effects that depend on the context are evaluated at one context, as
 parts of V and W. Effects with bending terms add their own parameters.
 
-**Common scale.** A fit with few degrees of freedom estimates its noise badly. With three, the
-stated variance is often wrong by a factor of three, and a test based on it would raise a false
-alarm in a third of all pairs. The shape of the covariance, (JᵀJ)⁻¹ of the poses, does not depend
-on the noise. The scale is therefore estimated from all runs together,
+**Common scale.** A fit with few degrees of freedom estimates its noise badly. With three, a test
+based on its stated variance would raise a false alarm in a third of all pairs. The shape of the
+covariance, (JᵀJ)⁻¹ of the poses, does not depend on the noise. The scale is therefore estimated
+from all runs together,
 
     s² = (b + Σ chi²) / (b + Σ dof)
 
@@ -22,9 +22,9 @@ where the measured noise of the runs counts as b degrees of freedom (for each ru
 `accel_calib.estimate.fit.Fit.variance`), unless the residuals contradict it. A run whose poses
 repeat significantly worse than those of the others keeps its own scale.
 
-A smaller model assumes that the omitted effects are exactly zero. However, `auto` omits effects
-that are hidden in the noise. The uncertainty of a run with a smaller model is therefore that of
-the largest model of the runs, fitted to its poses, if they determine it.
+A smaller model assumes that the omitted effects are exactly zero, but `auto` omits effects that
+are hidden in the noise. The uncertainty of such a run is therefore that of the largest model of
+the runs, fitted to its poses, if they determine it.
 
 **Agreement.** Runs of one sensor have parameters x_i with covariances C_i. The squared differences
 from their mean m, weighted by C_i⁻¹,
@@ -100,10 +100,9 @@ class RotationFree:
 
 def rotation_free(calibration: Calibration, context: Context, per_g: float) -> RotationFree:
     """
-    Return the parameters of a calibration that do not depend on its axes.
+    Return the parameters of a calibration that do not depend on its axes, in a context of one row.
 
-    The context has one row. `per_g` is the native reading that counts as 1 g; other units do not
-    use it.
+    `per_g` is the native reading that counts as 1 g.
 
     """
     model = calibration.model
@@ -191,11 +190,11 @@ def on_one_scale(runs: Sequence[Scatter]) -> CommonScale:
     for measured in (True, False):  # without measured noise, chi² has no unit
         group = [k for k, run in enumerate(runs) if (run.belief > 0.0) is measured]
         scale, dof, worse = _pooled([runs[k] for k in group])
-        for k in group:
-            own = runs[k].chi2 / max(runs[k].dof, 1) if k in (group[j] for j in worse) else scale
+        for j, k in enumerate(group):
+            own = runs[k].chi2 / runs[k].dof if j in worse else scale
             factors[k] = own / runs[k].stated if runs[k].stated > 0.0 and dof > 0.0 else 1.0
         noisier += [group[j] for j in worse]
-        dofs += [dof] if group and dof > 0.0 else []
+        dofs += [dof] if dof > 0.0 else []
     scaled = tuple(run.covariance * factor for run, factor in zip(runs, factors, strict=True))
     return CommonScale(scaled, min(dofs, default=np.inf), tuple(sorted(noisier)))
 
@@ -263,8 +262,10 @@ class Comparable:
 def comparable(calibrations: Sequence[Calibration]) -> tuple[Comparable, ...]:
     """Prepare two or more calibrations of one sensor for any number of comparisons among them."""
     _refuse_if_unlike(calibrations)
-    return tuple(Comparable(run, sure, scatter_of(sure)) for run, sure in
-                 zip(calibrations, _with_largest_model(calibrations), strict=True))
+    names = {run.form.norm for run in calibrations}
+    largest = max(names.intersection(NORM_MODELS), key=NORM_MODELS.index, default=NORM_MODELS[0])
+    every = [(run, _fitted_with(largest, run)) for run in calibrations]
+    return tuple(Comparable(run, sure, scatter_of(sure)) for run, sure in every)
 
 
 def _refuse_if_unlike(calibrations: Sequence[Calibration]) -> None:
@@ -289,13 +290,6 @@ def _refuse_if_unlike(calibrations: Sequence[Calibration]) -> None:
         if not np.all(np.isfinite(run.covariance)):
             raise InputError(f'run {k} has no uncertainty, expected a finite covariance',
                              'fit it again with more poses')
-
-
-def _with_largest_model(calibrations: Sequence[Calibration]) -> tuple[Calibration, ...]:
-    """Return each run, or the fit of the largest model of all runs to its poses."""
-    names = {run.form.norm for run in calibrations}
-    largest = max(names.intersection(NORM_MODELS), key=NORM_MODELS.index, default=NORM_MODELS[0])
-    return tuple(_fitted_with(largest, run) for run in calibrations)
 
 
 def _fitted_with(name: str, run: Calibration) -> Calibration:

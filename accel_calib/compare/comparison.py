@@ -4,10 +4,9 @@
 """
 Comparison of calibrations of one sensor, also in order of their dates.
 
-The test of `.agreement` is applied to parameters that do not depend on the axes, with covariances
-on a common scale, and in one unit and one context for all calibrations. So a change of the
-temperature between two dates does not appear as a change of the sensor, if the calibrations
-contain the effect of the temperature.
+The test of `.agreement` is applied in one unit and one context for all calibrations. So a change
+of the temperature between two dates does not appear as a change of the sensor, if the calibrations
+contain its effect.
 
 """
 
@@ -93,7 +92,7 @@ def _left_out(names: tuple[str, ...], deviation: Floats) -> list[str]:
             notes.setdefault(without, []).append(name)
     return [f'the model of {listed("run", runs)} omits {", ".join(found)} and so assumes zero; '
             'for an equal comparison, fit all runs with one model'
-            for runs, found in notes.items() if found]
+            for runs, found in notes.items()]
 
 
 def _temperatures(calibrations: Sequence[Calibration]) -> list[str]:
@@ -277,7 +276,7 @@ def _into(names: tuple[str, ...], run: RotationFree, rows: Floats) -> Floats:
 
 
 def _parameter(name: str, values: Floats, stated: Floats) -> Parameter:
-    spread, typical = float(np.std(values, ddof=1)), float(np.sqrt(np.mean(stated ** 2)))
+    spread, typical = float(np.std(values, ddof=1)), _rms(stated)
     return Parameter(name, values, stated, spread, spread / typical if typical > 0.0 else None)
 
 
@@ -321,8 +320,8 @@ class Moment:
     """
     One calibration of a history, with its index among those given, 0-based.
 
-    The date is in UTC, the temperature [°C] is the median over the poses used, and both are None
-    if they are not known. The residual is that over the poses used [mg].
+    The date is in UTC, and the temperature [°C] is the median over the poses used; None if not
+    known.
 
     """
 
@@ -338,8 +337,8 @@ class DatedChange:
     """
     The comparison of two successive calibrations.
 
-    The parameter that changed most, relative to its standard deviation, is named, with its change
-    and the stated standard deviation of the change [g].
+    `parameter` is the one that changed most, relative to the stated standard deviation `sd` of the
+    change [g].
 
     """
 
@@ -352,11 +351,9 @@ class DatedChange:
 @dataclass(frozen=True)
 class History:
     """
-    Calibrations of one sensor over time.
+    Calibrations of one sensor in order of date, and the values of each parameter.
 
-    The n calibrations, and the values of each parameter, are in order of date. There are n - 1
-    changes from each to the next, and `whole` compares all. Notes limit the meaning of the
-    history.
+    There are n - 1 changes from each to the next, and `whole` compares all.
 
     """
 
@@ -397,7 +394,7 @@ def history_of(calibrations: Sequence[Calibration]) -> History:
     moments = [_moment(k, run) for k, run in enumerate(calibrations)]
     undated = [moment.index + 1 for moment in moments if moment.when is None]
     if not undated:
-        moments.sort(key=lambda moment: (moment.when or _FIRST, moment.index))
+        moments.sort(key=lambda moment: moment.when or _FIRST)
     ordered = tuple(runs[moment.index] for moment in moments)
     whole = compare_runs(ordered)
     notes = [f'calibration {number} has no date: the order is that of the input'
@@ -428,10 +425,7 @@ def _when(index: int, date: str) -> datetime | None:
 
 def _change_in(comparison: Comparison) -> DatedChange:
     """Return the change from the first to the second of two calibrations."""
-    changes = np.array([each.values[1] - each.values[0] for each in comparison.parameters])
-    deviations = np.array([np.hypot(*each.stated_sd) for each in comparison.parameters])
-    known = deviations > 0.0
-    sizes = np.where(known, np.abs(changes) / np.where(known, deviations, 1.0), 0.0)
-    most = int(np.argmax(sizes))
-    return DatedChange(comparison, comparison.parameters[most].name, float(changes[most]),
-                       float(deviations[most]))
+    changes = [(each.name, float(each.values[1] - each.values[0]),
+                float(np.hypot(*each.stated_sd))) for each in comparison.parameters]
+    most = max(changes, key=lambda each: abs(each[1]) / each[2] if each[2] > 0.0 else 0.0)
+    return DatedChange(comparison, *most)

@@ -8,8 +8,8 @@ A rest has the error e = |force| - 1. The variance of e has three parts: the noi
 along the force, the uncertainty of the calibration (common to rests in similar orientations), and
 the part by which the poses of the calibration repeat worse than the noise of their samples
 predicts. The last part is badly known from few poses. A factor on the stated scatter is therefore
-estimated from the rests. It follows the median of the differences of successive rests, which a
-lasting change does not affect. The state is one record of bounded size.
+estimated from the median of the differences of successive rests, which a lasting change does not
+affect.
 
 **Lasting change.** It is detected by a likelihood ratio. The errors of the last n rests are
 jointly normal with covariance S. S contains the noise of each rest, and the uncertainty of the
@@ -184,22 +184,11 @@ class Drift:
     """
     The state of the monitor: the last rests since a calibration, and the number of all.
 
-    Parameters
-    ----------
-    covariance : (p, p) array
-        Covariance of the calibration [g²].
-    repeats : float
-        Variance of the poses of the calibration beyond the noise of their samples [g²].
-    temperatures : tuple of float
-        Lowest and highest temperature of these poses [°C]; empty if not known.
-    scatter : float
-        Factor on the stated scatter of the rests.
-    change : LastingChange or None
-        The lasting change; None if the sensor is unchanged.
-    since : int
-        Number of the first rest with the change, 1-based; 0 without a change.
-    without : int
-        Number of rests in succession in which a reported change was clearly absent.
+    `covariance` (p, p) is that of the calibration [g²], `repeats` the variance of its poses beyond
+    the noise of their samples [g²], and `temperatures` their lowest and highest temperature [°C],
+    empty if not known. `scatter` is the factor on the stated scatter of the rests. `change` is the
+    lasting change, None if the sensor is unchanged, and `since` the number of the first rest with
+    it, 1-based, or 0. It was clearly absent in the last `without` rests.
 
     """
 
@@ -293,17 +282,14 @@ def compared(before: Drift, rest: RestError, least: float) -> Drift:
     found = change(*seen)
     if found is not None and abs(found.error) >= least:
         since = before.since or after.count - found.rests + 1
-        return replace(after, change=_of_one_kind(before.change, found), since=since, without=0)
+        # A report keeps to one cause, so that another kind than before is not clear.
+        clear = found.clear and (before.change is None or before.change.kind == found.kind)
+        return replace(after, change=replace(found, clear=clear), since=since, without=0)
     if before.change is None or not is_over(before.change, *seen):
         return replace(after, without=0)
     if before.without + 1 < MEMORY:
         return replace(after, without=before.without + 1)
     return replace(after, change=None, since=0, without=0)
-
-
-def _of_one_kind(before: LastingChange | None, found: LastingChange) -> LastingChange:
-    """Return a change whose kind is clear only if it is the kind of the report before."""
-    return replace(found, clear=found.clear and (before is None or before.kind == found.kind))
 
 
 def _covariance(state: Drift, rests: tuple[RestError, ...]) -> Floats:

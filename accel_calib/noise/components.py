@@ -16,17 +16,16 @@ a large part of the variance at some τ of the range, so that the curve has its 
 Otherwise only its upper limit is known. Quantisation and drift are in the final fit only if they
 are seen; N, B and K always, because neighbours have similar slopes.
 
-**Uncertainty.** The squared size has the variance of the fit. Its interval is that of a χ²
-variable with edf = 2 size⁴ / variance. In simulated rests, 95 % intervals hold the true value in
-93 to 98 % of those with a plain N, B or K. A figure that is just seen is more often too large than
-too small.
+**Uncertainty.** The interval of the squared size is that of a χ² variable with edf = 2 size⁴ /
+variance. In simulated rests, 95 % intervals hold the true value in 93 to 98 % of those with a
+plain N, B or K. A figure that is just seen is more often too large than too small.
 
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -50,7 +49,6 @@ because the few averages at long τ have a skewed distribution.
 
 _EVERY = [0, 1, 2, 3, 4]
 _WANTED = [1, 2, 3]
-_NUISANCE = [0, 4]
 _MARGIN = (2, 1)
 """Further octaves that are dropped at the start and at the end, if one had to be."""
 
@@ -70,7 +68,7 @@ _LEAST_RANGE = 5
 
 _ROUNDS = 12
 _CONVERGED = 1e-3
-_LEVEL = 0.95
+LEVEL = 0.95
 """Probability of intervals; upper limits are one-sided."""
 
 
@@ -79,8 +77,8 @@ class Component:
     """
     One component of the noise of one axis, in the unit of the figure.
 
-    `value`, `sd` and the 95 % `interval` are NaN if it is not seen. `upper` is then the upper
-    limit with 95 % probability, otherwise the end of the interval.
+    `value`, `sd` and the 95 % `interval` are NaN if it is not seen. `upper` is then its upper
+    limit, otherwise the end of the interval.
 
     """
 
@@ -132,7 +130,7 @@ def fit_components(variances: Floats, lengths: Counts, spread: Spread) -> Fitted
     shape = shares(lengths)
     first, last = _range(variances, shape, spread)
     curve = _RangeFit(variances, shape, spread, slice(first, last + 1))
-    free = sorted([*_WANTED, *(c for c in _NUISANCE if curve.rise(_EVERY, c) > _RISE[c])])
+    free = [c for c in _EVERY if c in _WANTED or curve.rise(_EVERY, c) > _RISE[c]]
     rises = np.array([curve.rise(free, c) if c in free else 0.0 for c in _EVERY])
     found = curve.solve(free)
     large = curve.parts(found.squares) >= _LEAST_SHARE
@@ -203,7 +201,7 @@ class _RangeFit:
         square, variance = found.squares[which], found.covariance[which, which]
         value, freedom = float(np.sqrt(square)), 2.0 * square**2 / variance
         ends = np.sqrt(square * freedom / chi2.ppf(
-            [0.5 + 0.5 * _LEVEL, 0.5 - 0.5 * _LEVEL], freedom))
+            [0.5 + 0.5 * LEVEL, 0.5 - 0.5 * LEVEL], freedom))
         return Component(value, float(np.sqrt(variance)) / (2.0 * value),
                          (float(ends[0]), float(ends[1])), float(ends[1]))
 
@@ -223,12 +221,7 @@ class _RangeFit:
 
 
 def _covariance(free: list[int], shape: Floats) -> Floats:
-    """
-    Return the (5, 5) covariance of the squares from the whitened shape.
-
-    It includes free components that are 0: their size is not known better than the others'.
-
-    """
+    """Return the (5, 5) covariance of the squares, including free ones that are 0."""
     covariance = np.zeros((len(COMPONENTS), len(COMPONENTS)))
     covariance[np.ix_(free, free)] = np.linalg.inv(shape[:, free].T @ shape[:, free])
     return covariance
@@ -315,20 +308,15 @@ class AxisNoise:
     axis : {'x', 'y', 'z'}
     unit : {'m/s²', 'rad/s', 'native'}
         Unit of the deviation.
-    tau : (k,) array
-        Averaging times [s].
-    deviation, low, high : (k,) array
-        Allan deviation, and its 95 % interval.
-    model : (k,) array
-        Deviation of the components that were found.
+    tau, deviation, low, high, model : (k,) array
+        Averaging times [s], Allan deviation, its 95 % interval, and the deviation of the
+        components that were found.
     slope, slope_sd : (k - 1,) array
         Slope of the logarithms between successive τ, and its standard deviation.
     figures : mapping of str to Component
         Keys of `COMPONENTS`; Q, N, B, K and drift in the unit times s, √s, 1, 1/√s and 1/s.
-    used : (2,) tuple of float
-        Range of τ that the figures are from [s].
-    p_value : float
-        Probability of the χ² of the fit.
+    used, p_value : (2,) tuple of float, float
+        Range of τ that the figures are from [s], and the probability of the χ² of the fit.
     step : float
         Step of the output, if its noise is smaller; otherwise 0.
 
@@ -355,19 +343,11 @@ class NoiseFigures:
     """
     The noise of a sensor at rest.
 
-    Parameters
-    ----------
-    axes : tuple of AxisNoise
-        Accelerometer x, y, z, then gyro x, y, z if the recording has rates. An axis whose reading
-        does not change is missing.
-    start, seconds, rate : float
-        First stamp and duration of the rest [s], and samples per second [Hz].
-    temperature : (2,) tuple of float or None
-        Lowest and highest temperature [°C], averaged over a hundredth of the rest.
-    notes : tuple of str
-        What limits the figures.
-    needs : mapping of (Kind, str) to str
-        For each sensor and figure that is not seen on all axes: the reason and what to do.
+    `axes` are accelerometer x, y, z, then gyro x, y, z if the recording has rates, without those
+    whose reading does not change. `start` and `seconds` are the first stamp and duration of the
+    rest [s], and `rate` is in Hz. `temperature` is the lowest and highest one [°C], averaged over
+    a hundredth of the rest. `notes` state what limits the figures. `needs` has, for each sensor
+    and figure that is not seen on all axes, the reason and what to do.
 
     """
 
@@ -378,7 +358,7 @@ class NoiseFigures:
     rate: float
     temperature: tuple[float, float] | None
     notes: tuple[str, ...]
-    needs: Mapping[tuple[Kind, str], str] = field(default_factory=dict)
+    needs: Mapping[tuple[Kind, str], str]
 
     def of(self, kind: Kind) -> tuple[AxisNoise, ...]:
         """Return the axes of one sensor."""
@@ -390,12 +370,7 @@ class NoiseFigures:
         return tuple(kind for kind in KINDS if self.of(kind))
 
     def common(self, kind: Kind, figure: str) -> tuple[float, float]:
-        """
-        Return a figure of all axes together and its standard deviation.
-
-        It is the root of the mean square over the axes on which it is seen; NaN if there is none.
-
-        """
+        """Return the RMS of a figure over the axes that show it, and its sd; NaN without one."""
         found = [axis.figures[figure] for axis in self.of(kind) if axis.figures[figure].seen]
         if not found:
             return np.nan, np.nan

@@ -4,10 +4,10 @@
 """
 The longest rest of a recording, its Allan deviation, and the covariance of the estimates.
 
-**Rest.** The detector of `accel_calib.capture` finds the rests. A rest ends at an interruption of
-the stamps. Single samples that are missing are replaced by the sample before, if they are few,
-because a recording that loses one sample in a thousand would otherwise have no long rest. Stamps
-with jitter are not used one by one: samples come from a regular clock, and their order is right.
+**Rest.** The detector of `accel_calib.capture` finds the rests, which end at an interruption of
+the stamps. A few missing samples are replaced by the sample before, because a recording that loses
+one sample in a thousand would otherwise have no long rest. Stamps with jitter are not used one by
+one: samples come from a regular clock, and their order is right.
 
 **Deviation.** For the averaging time τ = m τ0, the Allan variance is half the mean square of the
 difference between successive averages of m samples. The overlapping estimate uses each start
@@ -39,12 +39,11 @@ agrees with the equivalent degrees of freedom, edf = 2 variance² / cov, of Gree
 [3]_. A drift adds its product with the mean of d, whose covariance is a sum of γ.
 The sum over the lags uses points that are dense near the kinks of γ.
 
-The deviation is that of allantools, the covariance is not: allantools has none between two τ,
-which the fit needs. In 300 simulated rests with a plain B or K, 95 % intervals from the variances
-alone hold the true N, B and K in 84 to 90 %, and those with the covariance in 95 to 99 %. The
-intervals of allantools for the deviations agree with ours in width (within 5 %) and in coverage
-where it has them, but it has none for the last two or three octaves, since it must identify the
-noise first, and that needs 30 averages.
+The deviation is that of allantools. It has no covariance between two τ, which the fit needs: in
+300 simulated rests with a plain B or K, 95 % intervals from the variances alone hold the true N, B
+and K in 84 to 90 %, and those with the covariance in 95 to 99 %. Its intervals for the deviations
+agree with ours in width (within 5 %) and in coverage, but it has none for the last two or three
+octaves, since it must identify the noise first, and that needs 30 averages.
 
 References
 ----------
@@ -65,7 +64,7 @@ from importlib.util import find_spec
 import numpy as np
 from numpy.typing import NDArray
 
-from ..capture import CaptureSettings, samples_of, StillDetector
+from ..capture import CaptureSettings, StillDetector
 from ..errors import InputError
 from ..table import Floats, numbered, Recording
 from ..text import counted
@@ -86,7 +85,6 @@ _RANDOM = 4
 LEAST_SAMPLES = 64
 """Smallest number of samples of a rest: five octaves of τ."""
 
-_BLOCK = 1 << 16
 _LONG = 1.5
 """Interval between stamps that indicates a missing sample, in units of the usual interval."""
 
@@ -121,7 +119,6 @@ def shares(lengths: Counts) -> Floats:
 
 def allan_variances(values: Floats, lengths: Counts) -> Floats:
     """Return the overlapping Allan variances of (n,) samples at (k,) lengths of at most n/2."""
-    check_allantools()
     found = import_module('allantools').oadev(values - np.mean(values), rate=1.0,
                                               data_type='freq', taus=lengths.astype(float))
     return np.asarray(found[1], dtype=float) ** 2
@@ -235,7 +232,7 @@ class LongRest:
 
     `start` is the first stamp [s], and `rate` the samples per second [Hz]. `values` (c, n) are
     readings [g], and angular rates [rad/s] if the recording has them; `temperature` (n,) is in °C.
-    `recorded` is the duration of the recording [s]. `notes` state what is not regular.
+    `notes` state what is not regular.
 
     """
 
@@ -243,7 +240,6 @@ class LongRest:
     rate: float
     values: Floats
     temperature: Floats | None
-    recorded: float
     notes: tuple[str, ...]
 
     @property
@@ -268,13 +264,13 @@ def longest_rest(recording: Recording, units: Units) -> LongRest:
             length = float(time[part[1] - 1] - time[part[0]])
             best, seconds = (part, length) if length > seconds else (best, seconds)
     count = best[1] - best[0]
-    recorded = float(np.ptp(time)) if len(time) else 0.0
     if count < LEAST_SAMPLES:
-        found = f'{counted(count, "sample")}' if count else 'no sample'
+        recorded = float(np.ptp(time)) if len(time) else 0.0
+        found = counted(count, 'sample') if count else 'no sample'
         raise InputError(f'the longest rest in {recorded:.3g} s has {found}, expected at least '
                          f'{LEAST_SAMPLES}', 'record the sensor for some minutes to hours while '
                          'nothing touches it')
-    return _regular(recording.take(slice(*best)), units, recorded)
+    return _regular(recording.take(slice(*best)), units)
 
 
 def _uninterrupted(time: Floats, start: float, end: float) -> Iterator[tuple[int, int]]:
@@ -293,14 +289,12 @@ def _uninterrupted(time: Floats, start: float, end: float) -> Iterator[tuple[int
 def _still(recording: Recording, units: Units) -> list[tuple[float, float]]:
     """Return first and last stamp of each rest."""
     detector = StillDetector(CaptureSettings(), units, keep=None)
-    count = len(recording)
-    detector.add(samples_of(recording, first, min(first + _BLOCK, count))
-                 for first in range(0, count, _BLOCK))
+    detector.add_recording(recording)
     detector.close()
     return [(dwell.start, dwell.end) for dwell in detector.dwells()]
 
 
-def _regular(rest: Recording, units: Units, recorded: float) -> LongRest:
+def _regular(rest: Recording, units: Units) -> LongRest:
     """Return the samples of a rest with equal spacing."""
     time = rest['time']
     step = np.diff(time)
@@ -320,8 +314,7 @@ def _regular(rest: Recording, units: Units, recorded: float) -> LongRest:
     values = units.to_g(rest.reading.T)
     if 'rate' in rest:
         values = np.concatenate([values, rest['rate'].T])
-    return LongRest(float(time[0]), rate, values, rest.columns.get('temperature'), recorded,
-                    tuple(notes))
+    return LongRest(float(time[0]), rate, values, rest.columns.get('temperature'), tuple(notes))
 
 
 def _jitter(step: Floats) -> list[str]:

@@ -25,7 +25,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from .components import (
-    AxisNoise, COMPONENTS, FIGURES, fit_components, Fitted, Kind, KINDS, NoiseFigures, shown_unit)
+    AxisNoise, COMPONENTS, FIGURES, fit_components, Fitted, Kind, KINDS, LEVEL, NoiseFigures,
+    shown_unit)
 from .curve import (
     allan_variances, check_allantools, Counts, FLAT, longest_rest, LongRest, octaves, shares,
     Spread, spread_of)
@@ -197,8 +198,6 @@ _POWERS = {'quantisation': 1.0, 'noise_density': 0.5, 'bias_instability': 0.0,
            'random_walk': -0.5, 'drift': -1.0}
 """Power of τ0 in each figure."""
 
-_LEVEL = 0.95
-
 _MOST_RATE = 0.03
 """Noise density that no gyro in rad/s has [rad/s/√Hz]: 100 times that of a cheap one."""
 
@@ -244,9 +243,9 @@ def noise_of(recording: Recording, units: Units, gravity: float = STANDARD_GRAVI
                          'shows no noise; record with more digits or a smaller range')
         progress(k + 1, len(rest.values))
     temperature = _temperatures(rest)
-    needs = needs_of(axes, rest)
-    return NoiseFigures(tuple(axes), rest.start, rest.seconds, rest.samples, rest.rate,
-                        temperature, (*notes, *notes_of(axes, temperature)), needs)
+    return NoiseFigures(
+        tuple(axes), rest.start, rest.seconds, rest.samples, rest.rate, temperature,
+        (*notes, *notes_of(axes, temperature)), needs_of(axes, rest))
 
 
 def _in_rad_s(rest: LongRest) -> bool:
@@ -260,7 +259,7 @@ def _in_rad_s(rest: LongRest) -> bool:
 
 def _channel(row: int, units: Units, gravity: float, *, rad_s: bool
              ) -> tuple[Kind, str, float, str]:
-    """Return sensor, axis, factor from g or rad/s, and unit of a row of `Rest.values`."""
+    """Return sensor, axis, factor from g or rad/s, and unit of a row of `LongRest.values`."""
     if row > 2:
         return 'gyroscope', 'xyz'[row - 3], 1.0, 'rad/s' if rad_s else 'native'
     if units.is_native:
@@ -296,7 +295,7 @@ def _band(variances: Floats, lengths: Counts, fitted: Fitted, spread: Spread
     within, beyond = (2.0 * (shares(lengths) @ squares)**2 / np.diag(spread.covariance(squares))
                       for squares in forms)
     freedom = np.where(np.arange(len(variances)) > fitted.last, beyond, within)
-    tail = 0.5 - 0.5 * _LEVEL
+    tail = 0.5 - 0.5 * LEVEL
     low, high = (np.sqrt(variances * freedom / chi2.ppf(part, freedom))
                  for part in (1.0 - tail, tail))
     return low, high
@@ -354,7 +353,8 @@ def to_json(found: NoiseFigures) -> dict[str, Any]:
         result[f'{kind}_unit'] = axes[0].unit if axes else None
         for figure in FIGURES:
             result.update(_figure_json(found, kind, figure))
-    result['curves'] = [_curve_json(axis) for axis in found.axes]
+    result['curves'] = [{'sensor': axis.kind, **{name: getattr(axis, name) for name in _CURVE}}
+                        for axis in found.axes]
     return result
 
 
@@ -375,7 +375,3 @@ def _figure_json(found: NoiseFigures, kind: Kind, figure: str) -> dict[str, Any]
             f'{name}_axes_interval': [each and each.interval for each in every],
             f'{name}_axes_upper': [each and each.upper for each in every],
             f'{name}_reason': reason}
-
-
-def _curve_json(axis: AxisNoise) -> dict[str, Any]:
-    return {'sensor': axis.kind, **{name: getattr(axis, name) for name in _CURVE}}
