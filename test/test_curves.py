@@ -9,8 +9,8 @@ from accel_calib.effects import (
 from accel_calib.refine import refine
 from accel_calib.units import units_of
 from inside import (
-    beginning, best_curve, fitted_state, format_calibration, is_curve, Model, parameter_basis,
-    parse_calibration, predict, simulate_poses)
+    beginning, best_curve, fitted_state, format_calibration, is_curve, Model, parse_calibration,
+    predict, simulate_poses)
 import numpy as np
 import pytest
 from shared import random_directions, sensor
@@ -130,7 +130,7 @@ def test_a_curve_is_recovered_within_its_uncertainty():
     nothing = np.zeros((21, 3))
     error = predict(fit.model, nothing, at)[:, 0] - predict(truth, nothing, at)[:, 0] - form(
         at['temperature'])
-    basis = parameter_basis(fit.model, nothing, at)[:, 0]
+    basis = fit.model.basis(nothing, at).full[:, 0]
     deviation = np.sqrt(np.einsum('np,pq,nq->n', basis, fit.covariance, basis))
     assert np.max(np.abs(error) / deviation) < 4.0
     assert np.max(deviation) < 5e-4

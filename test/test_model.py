@@ -6,8 +6,7 @@
 from accel_calib.effects import EFFECTS
 from accel_calib.errors import InputError
 from inside import (
-    correct, force_slope, Model, parameter_basis, parse_effect, predict, reading_of,
-    rotation_from_rpy, with_linear_part)
+    correct, Model, parse_effect, predict, reading_of, rotation_from_rpy, with_linear_part)
 import numpy as np
 import pytest
 from shared import random_directions
@@ -42,7 +41,7 @@ def values_of(name, rng):
 @pytest.mark.parametrize('name', ADDED)
 def test_basis_is_the_derivative_of_the_reading_by_the_values(name, rng, context):
     force, values = random_directions(40, rng), values_of(name, rng)
-    basis = parameter_basis(Model({name: values}), force, context)
+    basis = Model({name: values}).basis(force, context).full
     for k, part in enumerate(EFFECTS[name].values):
         if part in ('start', 'instant', 'of_sensor', 'form'):  # taken from the data, not fitted
             continue
@@ -61,7 +60,7 @@ def test_slope_is_the_derivative_of_the_reading(name, rng, context):
     numeric = np.stack([(reading_of(model, force + step * axis, context)
                          - reading_of(model, force - step * axis, context)) / (2 * step)
                         for axis in np.eye(3)], axis=2)
-    np.testing.assert_allclose(force_slope(model, force, context), numeric, atol=1e-7)
+    np.testing.assert_allclose(model.at(context).slope(force), numeric, atol=1e-7)
 
 
 def test_effects_of_the_output_act_on_the_whole_reading():

@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike
 
 from .context import HELD, limited, of_samples, with_acting
 from .rest_noise import GyroBias, SampleNoise
-from ..effects import (
-    AXES, Context, correct, force_slope, Model, ModelForm, MODELS, parameter_names, predict)
+from ..effects import AXES, Context, correct, Model, ModelForm, MODELS, parameter_names, predict
 from ..errors import InputError, StoredCalibrationError
 from ..finding import Finding
 from ..table import Floats, Poses, Record, Table
@@ -391,7 +390,7 @@ class Calibration(Record):
         model, known = self.model, self.held_context(context)
         u = force / self.force_per_g @ model.rotation.T
         basis = model.basis(u, known).full
-        moved = model.rotation.T @ np.linalg.solve(force_slope(model, u, known), basis)
+        moved = model.rotation.T @ np.linalg.solve(model.at(known).slope(u), basis)
         covariance: Floats = moved @ self.covariance @ np.swapaxes(moved, 1, 2)
         return covariance * self.force_per_g ** 2
 

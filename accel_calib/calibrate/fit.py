@@ -35,9 +35,7 @@ from .calibration import Calibration, ORIENTED, Rejected
 from .mounting import wiring
 from .pose_planning import determines, refuse_if_unfit, unseen
 from .quality import finished, fit_findings, in_g, LARGEST_OFFSET_G, record_of, rival_findings
-from ..effects import (
-    force_slope, length_rows, Model, MODELS, parameter_basis, sensor_force, with_linear_part,
-    with_vector)
+from ..effects import length_rows, Model, MODELS, sensor_force, with_linear_part, with_vector
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import (
     closed_form, covariance_with, dilution, estimate, faces, Fit, fit_12, fit_norm, fit_sphere,
@@ -477,7 +475,7 @@ def _rotation_onto(directions: Floats, known: Floats) -> Floats:
 
 def _tangential_variance(fit: Fit, covariance: Floats, u: Floats) -> Floats:
     """Return the (n,) variance across the force u from noise and uncertainty of the fit [g²]."""
-    moved = np.linalg.solve(force_slope(fit.model, u, {}), parameter_basis(fit.model, u, {}))
+    moved = np.linalg.solve(fit.model.at({}).slope(u), fit.model.basis(u, {}).full)
     spread = moved @ covariance @ np.swapaxes(moved, 1, 2)
     along = np.einsum('ni,nij,nj->n', unit(u), spread, unit(u))
     own = 2.0 * fit.equations.scale ** 2 * fit.variance

@@ -14,6 +14,7 @@ with which a part of the reading, the carrier, changes smoothly with a variable
 
 from __future__ import annotations
 
+from collections import ChainMap
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import cache, partial
@@ -63,11 +64,10 @@ def _from_start(context: Context) -> Iterator[Floats]:
 
 def _taus(context: Context) -> Iterator[Floats]:
     """Yield start and time constant; the constants are 1/60 to 3/2 of the time span."""
-    time = _times(context)
-    span = time[-1] - time[0] if len(time) else 0.0
-    if span > 0.0:
+    for start in _from_start(context):
+        span = _times(context)[-1] - start[0]
         for tau in np.geomspace(span / 60.0, span * 1.5, _TAUS):
-            yield np.array([time[0], tau])
+            yield np.array([start[0], tau])
 
 
 def _instants(context: Context) -> Iterator[Floats]:
@@ -103,19 +103,15 @@ def _lags(context: Context) -> Iterator[Floats]:
 
 def _forms(context: Context) -> Iterator[Floats]:
     """Yield both forms of the hysteresis."""
-    yield from (np.array([0.0]), np.array([1.0]))
+    yield from np.array([[0.0], [1.0]])
 
 
 def _warming(context: Mapping[str, Any], shape: Floats) -> Any:
     return context['temperature'] - REFERENCE_TEMPERATURE
 
 
-def _warming_squared(context: Mapping[str, Any], shape: Floats) -> Any:
-    return _warming(context, shape) ** 2
-
-
-def _warming_cubed(context: Mapping[str, Any], shape: Floats) -> Any:
-    return _warming(context, shape) ** 3
+def _warming_to(power: int) -> Factor:
+    return lambda context, shape: _warming(context, shape) ** power
 
 
 def _lagged_warming(key: str) -> Factor:
@@ -156,9 +152,8 @@ def _after(context: Mapping[str, Any], shape: Floats) -> Any:
     return np.asarray(context['time'] >= shape[0], float)
 
 
-def _columns_of(key: str, power: int = 1) -> Factor:
-    """Return the factor for a vector of the context, one component per axis."""
-    return lambda context, shape: np.asarray(context[key], float).T ** power
+def _variances(context: Mapping[str, Any], shape: Floats) -> Any:
+    return np.asarray(context['std'], float).T ** 2
 
 
 def _centripetal(context: Mapping[str, Any], shape: Floats) -> Floats:
@@ -213,7 +208,7 @@ EFFECTS: dict[str, Effect] = {
         lagged='temperature_of_offset'),
     'offset_temperature_quadratic': _in_time(
         'offset that changes with the square of temperature', 'second-order TCO', AXES, 'g/°C²',
-        1e-5, terms=by_axis(ONE), factor=_warming_squared, needs=('temperature',)),
+        1e-5, terms=by_axis(ONE), factor=_warming_to(2), needs=('temperature',)),
     'gain_temperature': _in_time(
         'gain that changes with temperature', 'sensitivity temperature coefficient TCS', AXES,
         '1/°C', 0.0003, terms=by_axis(FORCE), factor=_lagged_warming('temperature_of_gain'),
@@ -247,7 +242,7 @@ EFFECTS: dict[str, Effect] = {
         shapes=_instants),
     'vibration_rectification': Effect(
         'offset that grows with vibration', 'vibration rectification coefficient VRC', AXES,
-        'g/g²', 0.002, 0.5, by_axis(ONE), _columns_of('std', 2), ('std',)),
+        'g/g²', 0.002, 0.5, by_axis(ONE), _variances, ('std',)),
     'hysteresis': Effect('offset that depends on the previous pose', 'hysteresis', AXES, 'g',
                          0.001, 0.5, by_axis(ONE), _motion, ('previous',), ('form',), _forms,
                          usual=(0.0,)),
@@ -263,7 +258,7 @@ EFFECTS: dict[str, Effect] = {
 OF_RAMPS: dict[str, Effect] = {
     'offset_temperature_cubic': _in_time(
         'offset that changes with the cube of temperature', 'third-order TCO', AXES, 'g/°C³',
-        1e-7, terms=by_axis(ONE), factor=_warming_cubed, needs=('temperature',))}
+        1e-7, terms=by_axis(ONE), factor=_warming_to(3), needs=('temperature',))}
 """Effects that only the ramp of a still board shows (`accel_calib.calibrate.thermal`). Still poses
 are too few to distinguish them, so that `accel_calib.refine` does not try them."""
 
@@ -277,18 +272,17 @@ PROCESSES: dict[str, Effect] = {
                      'g', 0.001, terms=(), needs=('time',))}
 """Random processes. `accel_calib.refine` names them; a model cannot contain them."""
 
+LADDER = ('offset', 'gain', 'axis_gain', 'cross_axis', 'misalignment')
+"""The effects that make up V and W. Every sensor has them; models 4 to 12 consist of them."""
+
 CHANGES: dict[str, Effect] = {
     f'{name}_change': replace(EFFECTS[name], words=f'change of the {EFFECTS[name].words}',
                               factor=lambda context, shape: context['new'], needs=('new',),
                               includes=tuple(f'{each}_change' for each in EFFECTS[name].includes),
                               base=name)
-    for name in ('offset', 'gain', 'axis_gain', 'cross_axis', 'misalignment')}
+    for name in LADDER}
 """Changes of a sensor since its stored calibration; see `accel_calib.refine`. The column ``new``
 is 1 for poses taken since then and 0 for the poses of the calibration."""
-
-LADDER = ('offset', 'gain', 'axis_gain', 'cross_axis', 'misalignment')
-"""The effects that make up V and W. Every sensor has them; models 4 to 12 consist of them."""
-
 
 EMPIRICAL = 'empirical'
 """Name of a smooth curve without a physical cause; see `empirical_name`."""
@@ -362,12 +356,11 @@ def _empirical(name: str) -> Effect:
     each = len(terms) // len(modes)
     names = tuple(f'{own}_{mode}' for mode in modes for own in ((part,) if part else parts))
     words = f'{carrier.replace("_", "-")} as a smooth function of {variable_words(variable)}'
+    curve = partial(Effect, words, 'empirical curve', names, 'g', 0.001, 0.5, tuple(terms))
     if variable == 'force':
-        return Effect(words, 'empirical curve', names, 'g', 0.001, 0.5, tuple(terms),
-                      family='force')
-    return Effect(words, 'empirical curve', names, 'g', 0.001, 0.5, tuple(terms),
-                  partial(_cosines, variable, np.repeat(modes, each)), (variable,),
-                  ('low', 'high'), partial(_ends, variable))
+        return curve(family='force')
+    return curve(factor=partial(_cosines, variable, np.repeat(modes, each)), needs=(variable,),
+                 shape=('low', 'high'), shapes=partial(_ends, variable))
 
 
 def _variable(variable: str, context: Mapping[str, Any]) -> Floats:
@@ -473,9 +466,10 @@ def is_effect(name: str) -> bool:
 @cache
 def effect_named(name: str) -> Effect:
     """Return the effect with this name: of the catalogue, own, a covariate, or a curve."""
-    found = (EFFECTS.get(name) or OF_RAMPS.get(name) or PROCESSES.get(name) or CHANGES.get(name)
-             or OWN.get(name))
-    return found or (_covariate(name) if kind_of(name) in COVARIATES else _empirical(name))
+    known = ChainMap(EFFECTS, OF_RAMPS, PROCESSES, CHANGES, OWN)
+    if name in known:
+        return known[name]
+    return _covariate(name) if kind_of(name) in COVARIATES else _empirical(name)
 
 
 @cache
@@ -496,9 +490,11 @@ _WITHOUT_UNIT = ('of_sensor', 'form')
 
 def value_unit(effect_name: str, value_name: str) -> tuple[str, float]:
     """Return the unit of a value of an effect in reports, and the factor from the model's unit."""
-    effect = effect_named(effect_name)
+    if value_name in _WITHOUT_UNIT:
+        return '', 1.0
+    effect, variable = effect_named(effect_name), variable_of(effect_name)
     if value_name not in effect.parameters:
-        return _shape_unit(value_name, variable_of(effect_name)), 1.0
+        return unit_of(variable) if variable else 's', 1.0
     unit = curve_unit(effect_name) if kind_of(effect_name) == EMPIRICAL else effect.unit
     if value_name.endswith('_square'):
         unit = f'{unit}²'
@@ -508,12 +504,6 @@ def value_unit(effect_name: str, value_name: str) -> tuple[str, float]:
 def curve_unit(name: str) -> str:
     """Return the unit of an empirical curve."""
     return 'g' if empirical_parts(name)[0].startswith('offset') else 'g/g'
-
-
-def _shape_unit(name: str, variable: str) -> str:
-    if name in _WITHOUT_UNIT:
-        return ''
-    return unit_of(variable) if variable else 's'
 
 
 def unit_of(column: str) -> str:

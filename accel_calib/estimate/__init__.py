@@ -25,9 +25,9 @@ from .outliers import (
 
 __all__ = ['LARGEST_DILUTION', 'LARGEST_SHARE', 'NORM_MODELS', 'TIES', 'WEAK_DILUTION',
            'Combination', 'Equations', 'Fit', 'Identifiability', 'NotConvergedError', 'Point',
-           'Prior', 'Rival', 'believable', 'by_pose', 'closed_form', 'covariance_with',
-           'dilution', 'error_left_in', 'estimate', 'faces', 'fit_12', 'fit_norm',
-           'fit_sphere', 'free_parameters', 'identifiability', 'information_of', 'judge',
-           'kinds', 'largest_error', 'left_out', 'lower_triangular', 'originals', 'outliers',
+           'Prior', 'Rival', 'believable', 'by_pose', 'closed_form', 'covariance_with', 'dilution',
+           'error_left_in', 'estimate', 'faces', 'fit_12', 'fit_norm', 'fit_sphere',
+           'free_parameters', 'identifiability', 'information_of', 'judge', 'kinds',
+           'largest_error', 'left_out', 'lower_triangular', 'originals', 'outliers',
            'outliers_among', 'pose_noise', 'poses_needed', 'rivals', 'rows_of', 'sensing_axes',
            'solve', 'start_of', 'unseen_mistakes', 'variance_factor']

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The models 4 to 12, and the equation of models: `predict`, `correct` and simulated data.
+Simulated poses and recordings, from a model that is stated in words or as values.
 
 All readings are in g; `accel_calib.units` converts them. A direction is the direction of up in the
 levelled frame, a unit vector of specific force. Simulated noise is seeded.
@@ -12,70 +12,15 @@ levelled frame, a unit vector of specific force. Simulated noise is seeded.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .catalogue import CHANGES, effect_named, EFFECTS, is_effect, PROCESSES
 from .form import Context
-from .model import Model, times
+from .model import Model, predict
 from ..errors import InputError
-from ..geometry import unit
 from ..table import Floats, numbered, Poses, Recording
-
-
-@dataclass(frozen=True)
-class ModelForm:
-    """
-    One of the models that consist of offset and gains.
-
-    W has `gains` parameters, apart from a rotation. `norm` is the model with the same ellipsoid
-    that |force| = 1 g alone determines. A model of `known_orientation` needs poses of known
-    orientation, and then determines the axes of W. With `sensing_axes`, its axes are fixed to the
-    sensing axes.
-
-    """
-
-    effects: tuple[str, ...]
-    gains: int
-    norm: str
-    known_orientation: bool = False
-    sensing_axes: bool = False
-
-    @property
-    def largest(self) -> str:
-        """Name of the largest model for poses of the same kind."""
-        return '12' if self.known_orientation else '10'
-
-
-_WHOLE = ('offset', 'axis_gain', 'cross_axis', 'misalignment')
-
-MODELS: dict[str, ModelForm] = {
-    'ideal': ModelForm((), 0, 'ideal'),
-    '4': ModelForm(('offset', 'gain'), 1, '4'),
-    '7': ModelForm(('offset', 'axis_gain'), 3, '7'),
-    '9': ModelForm(_WHOLE, 6, '10', sensing_axes=True),
-    '10': ModelForm(('offset', 'axis_gain', 'cross_axis'), 6, '10'),
-    '12': ModelForm(_WHOLE, 6, '10', known_orientation=True),
-}
-"""The models by name. Models 9 and 10 differ only in their axes: model 9 fixes the axes to the
-sensing axes (ESGI'95 report), model 10 makes W symmetric (AN5286)."""
-
-
-def with_linear_part(mat_w: Floats, vec_v: Floats) -> Model:
-    """Return the model with gain W (3, 3), offset V (3,) [g] and ΔR = I; skew W: misalignment."""
-    values = linear_values(mat_w, vec_v)
-    turned = ('misalignment',) if np.any(values['misalignment']) else ()
-    return Model({name: values[name] for name in (*MODELS['10'].effects, *turned)})
-
-
-def linear_values(mat_w: Floats, vec_v: Floats) -> dict[str, Floats]:
-    """Return the values of the effects of `LADDER` from W (3, 3) and V (3,) [g]."""
-    symmetric, skew = (mat_w + mat_w.T) / 2, (mat_w - mat_w.T) / 2
-    return {'offset': np.array(vec_v, float), 'gain': np.array([np.trace(mat_w) / 3.0 - 1.0]),
-            'axis_gain': np.diag(mat_w) - 1.0, 'cross_axis': symmetric[[0, 0, 1], [1, 2, 2]],
-            'misalignment': skew[[2, 0, 1], [1, 2, 0]]}
 
 
 def parse_effect(text: str) -> tuple[str, Floats]:
@@ -128,71 +73,6 @@ def model_with(effects: Mapping[str, ArrayLike], rotation: Floats | None = None)
     values = {name: _values_of(name, given) for name, given in effects.items()}
     ordered = {name: values[name] for name in (*EFFECTS, *values) if name in values}
     return Model(ordered) if rotation is None else Model(ordered, rotation)
-
-
-def predict(model: Model, force: Floats, context: Context) -> Floats:
-    """
-    Return the (n, 3) readings of a sensor [g].
-
-    `force` is the (n, 3) specific force in the levelled frame [g]. `context` has the columns that
-    the effects need, n rows each. Raise `InputError` if a column is missing.
-
-    """
-    return reading_of(model, force @ model.rotation.T, context)
-
-
-def reading_of(model: Model, u: Floats, context: Context) -> Floats:
-    """Return the (n, 3) readings for the (n, 3) force u in the sensor axes [g]."""
-    reading = model.at(context).reading(u)
-    for effect, values in zip(model.terms.effects, model.values.values(), strict=True):
-        if effect.output is not None:
-            reading = effect.output(reading, values)
-    return reading
-
-
-def sensor_force(model: Model, reading: Floats, context: Context) -> Floats:
-    """Return the (n, 3) specific force in the sensor axes [g]; arguments as in `correct`."""
-    u = model.at(context).force(reading)
-    if np.any(np.isnan(u) & ~np.isnan(reading)):
-        raise too_large()
-    return u
-
-
-def too_large() -> InputError:
-    """Return the error for a reading whose force is not unique."""
-    return InputError('the effects of the model are too large to be corrected at this reading',
-                      'calibrate again, with readings in the range in which the sensor is used')
-
-
-def correct(model: Model, reading: Floats, context: Context) -> Floats:
-    """
-    Return the (n, 3) specific force in the levelled frame [g]; the inverse of `predict`.
-
-    `reading` is (n, 3) [g], and `context` as in `predict`.
-
-    Raises
-    ------
-    InputError
-        If a column is missing, or the effects are so large that the force of a reading is not
-        unique.
-
-    """
-    return sensor_force(model, reading, context) @ model.rotation
-
-
-def parameter_basis(model: Model, u: Floats, context: Context) -> Floats:
-    """Return the (n, 3, p) derivative of the reading by each value, at (n, 3) forces u [g]."""
-    return model.basis(u, context).full
-
-
-def force_slope(model: Model, u: Floats, context: Context) -> Floats:
-    """Return the (n, 3, 3) derivative of the reading by the force u in the sensor axes."""
-    return model.at(context).slope(u)
-
-
-def length_rows(model: Model, u: Floats, context: Context) -> Floats:
-    """Return the (n, 3) derivative of |u| by the reading: ûᵀA⁻¹, with A the slope."""
-    return times(np.swapaxes(model.at(context).inverse_slope(u), -1, -2), unit(u))
 
 
 def simulate_poses(model: Model, directions: Floats, rng: np.random.Generator, *,
