@@ -4,14 +4,13 @@
 
 import re
 
-from accel_calib.calibrate import fit_poses, next_pose
+from accel_calib.calibrate import dilution, error_left_in, fit_poses, identifiability, next_pose
 from accel_calib.errors import RefusedFitError
-from accel_calib.estimate import dilution, error_left_in, identifiability, poses_needed, rows_of
 from accel_calib.table import Poses
 from accel_calib.units import units_of
 from inside import (
-    determines, missing_poses, model_with, predict, refuse_if_unfit, rotation_from_rpy,
-    simulate_poses, spread_directions, unit)
+    determines, missing_poses, model_with, poses_needed, predict, refuse_if_unfit,
+    rotation_from_rpy, rows_of, simulate_poses, spread_directions, unit)
 import numpy as np
 import pytest
 from shared import random_directions, sensor

@@ -33,15 +33,16 @@ import scipy
 
 from .calibration import Calibration, ORIENTED, Rejected
 from .mounting import wiring
-from .pose_planning import determines, refuse_if_unfit, unseen
+from .pose_planning import (
+    determines, dilution, free_parameters, LARGEST_DILUTION, NORM_MODELS, poses_needed,
+    refuse_if_unfit, unseen, WEAK_DILUTION)
 from .quality import finished, fit_findings, in_g, LARGEST_OFFSET_G, record_of, rival_findings
 from ..effects import length_rows, Model, MODELS, sensor_force, with_linear_part, with_vector
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import (
-    closed_form, covariance_with, dilution, estimate, faces, Fit, fit_12, fit_norm, fit_sphere,
-    free_parameters, judge, LARGEST_DILUTION, lower_triangular, NORM_MODELS, NotConvergedError,
-    originals, outliers, Point, pose_noise, poses_needed, rivals, solve, start_of, TIES,
-    WEAK_DILUTION)
+    closed_form, covariance_with, estimate, faces, Fit, fit_12, fit_norm, fit_sphere, judge,
+    lower_triangular, NotConvergedError, originals, outliers, Point, pose_noise, rivals, solve,
+    start_of, TIES)
 from ..finding import Finding
 from ..geometry import unit
 from ..table import check_units, Poses

@@ -32,10 +32,11 @@ from numpy.typing import NDArray
 
 from .calibration import Calibration, check_sensor, PRIOR, Quality, Rejected
 from .context import with_history
+from .pose_planning import WEAK_DILUTION
 from .rest_noise import with_rest_noise
 from ..effects import correct, LADDER, length_rows, Model, sensor_force
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
-from ..estimate import believable, Fit, judge, Rival, unseen_mistakes, WEAK_DILUTION
+from ..estimate import believable, Fit, judge, Rival, unseen_mistakes
 from ..finding import Finding, without
 from ..geometry import coverage, OVER_THE_SPHERE, unit
 from ..table import Floats, Poses

@@ -51,10 +51,10 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from ..calibrate import Calibration, fit_unknown, in_g, with_history
+from ..calibrate import Calibration, fit_unknown, in_g, NORM_MODELS, with_history
 from ..effects import Context, effect_named, Model, reading_of
 from ..errors import InputError, RefusedFitError
-from ..estimate import Fit, judge, NORM_MODELS
+from ..estimate import Fit, judge
 from ..table import Floats, Poses
 from ..text import counted
 from ..units import STANDARD_GRAVITY

@@ -69,7 +69,7 @@ USUAL_NOISE_G = 5e-4
 _NO_NOISE_G = 1e-9
 """Noise below this counts as no noise [g]."""
 
-LEAST_NOISE = 0.1
+_LEAST_NOISE = 0.1
 """Smallest noise of a pose, relative to the median over the poses."""
 
 _ALIKE = 0.1
@@ -117,7 +117,17 @@ def believable(noise: Floats | None) -> Floats | None:
     if noise is None or not len(noise):
         return None
     median = np.median(noise)
-    return np.maximum(noise, LEAST_NOISE * median) if median > _NO_NOISE_G else None
+    return np.maximum(noise, _LEAST_NOISE * median) if median > _NO_NOISE_G else None
+
+
+def pose_noise(noise: Floats | None, directions: Floats) -> Floats | None:
+    """Return the (n,) noise of |reading| from the (n, 3) noise of means; None if unknown."""
+    believed = believable(noise) if len(directions) else None
+    if believed is None:
+        return None
+    along = np.linalg.norm(directions * believed, axis=1)
+    median = np.median(along)
+    return np.maximum(along, _LEAST_NOISE * median) if median > 0.0 else None
 
 
 def originals(poses_g: Poses) -> Indices:
