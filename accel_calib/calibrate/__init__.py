@@ -13,11 +13,9 @@ determine, and plans the next pose. `thermal` is for a still board whose tempera
 """
 
 from .calibration import (
-    Calibration, check_sensor, converted, FLEET, PRIOR, Quality, Rejected, RejectedKind,
-    STORED_METHODS)
-from .context import (
-    of_samples, Outside, outside, SampleContext, thermal_stream, USES_LIMIT, with_history,
-    with_previous)
+    Calibration, check_sensor, converted, FLEET, of_samples, Outside, outside, PRIOR, Quality,
+    Rejected, RejectedKind, SampleContext, STORED_METHODS, thermal_stream, USES_LIMIT,
+    with_history, with_previous)
 from .fit import directions_of, fit_poses, fit_unknown, only_norm, sound_rows, sure_rows
 from .mounting import (
     angle_words, flat_direction, in_frame, level, level_by_rows, mounting_figures, mounting_of,

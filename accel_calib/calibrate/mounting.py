@@ -51,8 +51,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from .calibration import Calibration
-from .context import with_history
+from .calibration import Calibration, with_history
 from .quality import in_g
 from ..effects import AXES, Context, Model, sensor_force
 from ..errors import InputError, RefusedFitError

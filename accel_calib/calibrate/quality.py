@@ -30,8 +30,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .calibration import Calibration, check_sensor, PRIOR, Quality, Rejected
-from .context import with_history
+from .calibration import Calibration, check_sensor, PRIOR, Quality, Rejected, with_history
 from .pose_planning import WEAK_DILUTION
 from .rest_noise import with_rest_noise
 from ..effects import correct, LADDER, length_rows, Model, sensor_force
