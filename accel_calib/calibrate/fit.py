@@ -36,7 +36,8 @@ from .mounting import wiring
 from .pose_planning import (
     determines, dilution, free_parameters, LARGEST_DILUTION, NORM_MODELS, poses_needed,
     refuse_if_unfit, unseen, WEAK_DILUTION)
-from .quality import finished, fit_findings, in_g, LARGEST_OFFSET_G, record_of, rival_findings
+from .quality import (
+    finished, fit_findings, in_g, LARGEST_OFFSET_G, record_of, rival_findings, rms_mg)
 from ..effects import length_rows, Model, MODELS, sensor_force, with_linear_part, with_vector
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import (
@@ -331,7 +332,9 @@ def _choose(fits: Mapping[str, Fit]) -> tuple[str, str]:
     reasons: list[str] = []
     for name in larger:
         chance = _by_chance(fits[chosen], fits[name])
-        change = f'{_rms_mg(fits[chosen]):.3g} to {_rms_mg(fits[name]):.3g} mg'
+        before, after = (rms_mg(fit.equations.of_poses(fit.residual))
+                         for fit in (fits[chosen], fits[name]))
+        change = f'{before:.3g} to {after:.3g} mg'
         if chance < _LEVEL_OF_MODELS:
             reasons.append(f'model {name} reduces the residual of model {chosen} from {change} '
                            f'(by chance: p = {chance:.1g})')
@@ -340,10 +343,6 @@ def _choose(fits: Mapping[str, Fit]) -> tuple[str, str]:
             reasons.append(f'model {name} would change it from {change}, which noise explains '
                            f'(p = {chance:.2g})')
     return chosen, '; '.join(reasons) or f'the poses determine only model {chosen}'
-
-
-def _rms_mg(fit: Fit) -> float:
-    return float(np.sqrt(np.mean(fit.equations.of_poses(fit.residual) ** 2))) * MG
 
 
 def _by_chance(small: Fit, large: Fit) -> float:

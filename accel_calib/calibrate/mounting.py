@@ -57,7 +57,7 @@ from ..effects import AXES, Context, Model, sensor_force
 from ..errors import InputError, RefusedFitError
 from ..estimate import fit_12
 from ..finding import Finding, Level, without
-from ..geometry import quaternion_of, rotation_from_rpy, rpy_of
+from ..geometry import angle_of, quaternion_of, rotation_from_rpy, rpy_of
 from ..table import Floats, Poses
 from ..units import FrameName
 
@@ -65,8 +65,8 @@ _NOSE_DOWN = {'ros': np.array([-1.0, 0.0, 0.0]), 'ned': np.array([1.0, 0.0, 0.0]
               'android': np.array([0.0, -1.0, 0.0]), 'win8': np.array([0.0, 1.0, 0.0])}
 """Reading of a sensor whose nose points straight down, for each frame [g]."""
 
-_ON_ITS_SIDE = 45.0
-"""Angle between a flat pose and the expected axis above which there is a warning [°]."""
+_UPRIGHT = np.cos(np.radians(45.0))
+"""Beyond 45° between a flat pose and the expected axis there is a warning."""
 
 _SAME_TILT = np.cos(np.radians(10.0))
 
@@ -318,17 +318,12 @@ def set_heading(calibration: Calibration, reading: Floats, context: Context | No
     """
     Return a levelled calibration with the heading from one pose with the nose of the robot down.
 
-    Parameters as in `level`.
-
-    Raises
-    ------
-    InputError
-        If the nose is tilted down by less than 10°.
+    Parameters as in `level`. Raise InputError if the nose is tilted down by less than 10°.
 
     """
     nose_down = _in_sensor_axes(calibration, reading, context)
-    rotation = with_heading(calibration.rotation, nose_down, calibration.frame)
-    return with_mounting(calibration, rotation)
+    return with_mounting(calibration, with_heading(calibration.rotation, nose_down,
+                                                   calibration.frame))
 
 
 def with_mounting(calibration: Calibration, rotation: Floats, *known: str) -> Calibration:
@@ -361,8 +356,7 @@ def doubts_about_flat(rotation: Floats, frame: str) -> Iterator[Finding]:
     """Yield a finding if the ΔR of a flat pose indicates a wiring fault."""
     expected = flat_direction(frame)
     force = rotation @ expected
-    off = np.degrees(np.arccos(np.clip(force @ expected, -1.0, 1.0)))
-    if off <= _ON_ITS_SIDE:
+    if force @ expected >= _UPRIGHT:
         return
     face = int(np.argmax(np.abs(force)))
     seen = f'{"-" if force[face] < 0.0 else "+"}{AXES[face]}'
@@ -384,8 +378,7 @@ def wiring(calibration: Calibration) -> Iterator[Finding]:
     if 'reference' not in poses:
         return
     mat_q = axes_of(poses.reading, poses['reference'])
-    found = None if mat_q is None else fault_of(mat_q)
-    if mat_q is None or found is None:
+    if mat_q is None or (found := fault_of(mat_q)) is None:
         return
     level: Level = 'USABLE'
     mirrored = np.linalg.det(mat_q) < 0.0
@@ -405,10 +398,9 @@ def wiring(calibration: Calibration) -> Iterator[Finding]:
 
 def axes_of(reading: Floats, reference: Floats) -> Floats | None:
     """
-    Return the orientation of the axes of the readings relative to those of the known forces.
+    Return the orthogonal (3, 3) matrix from known forces to the axes of the readings.
 
-    It is the orthogonal (3, 3) matrix from the (n, 3) known forces to the axes of the (n, 3)
-    readings, both in any units, with determinant ±1. It is None if the forces do not determine it.
+    Both are (n, 3), in any units. The determinant is ±1. None if the forces do not determine it.
 
     """
     scales = np.linalg.svd(reference - reference.mean(axis=0), compute_uv=False)
@@ -424,10 +416,10 @@ def axes_of(reading: Floats, reference: Floats) -> Floats | None:
 
 def fault_of(mat_q: Floats) -> str | None:
     """Return the wiring fault of a matrix as from `axes_of`; None if there is none."""
-    if _angle(mat_q) <= _NEAR:
+    if angle_of(mat_q) <= _NEAR:  # the angle of a mirror image is 90° or more
         return None
     nearest = max(_PERMUTATIONS, key=lambda one: float(np.sum(one * mat_q)))
-    if _angle(mat_q @ nearest.T) <= _NEAR:
+    if angle_of(mat_q @ nearest.T) <= _NEAR:
         return _words(nearest)
     if np.linalg.det(mat_q) > 0.0:
         return f'the sensor is rotated by {_turn(mat_q.T)}'
@@ -439,13 +431,6 @@ _PERMUTATIONS: list[Floats] = [
     np.diag(signs) @ np.eye(3)[list(order)]
     for order in permutations(range(3)) for signs in product((1.0, -1.0), repeat=3)]
 """The 48 signed permutations of the axes, including mirror images."""
-
-
-def _angle(mat_q: Floats) -> float:
-    """Return the angle of a rotation [°]; 180 for a mirror image."""
-    if np.linalg.det(mat_q) < 0.0:
-        return 180.0
-    return float(np.degrees(np.arccos(np.clip((np.trace(mat_q) - 1.0) / 2.0, -1.0, 1.0))))
 
 
 def _words(permutation: Floats) -> str:
