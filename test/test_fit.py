@@ -3,6 +3,7 @@
 
 """From poses to a calibration: known sensors within the stated uncertainty, and outliers."""
 
+from copy import deepcopy
 from dataclasses import replace
 from itertools import product
 
@@ -53,10 +54,9 @@ def test_native_units_find_their_own_scale():
                                  std=poses['std'] * 4060.0)
     calibration = fit_poses(shifted, units_of('native'))
     true_w, true_v = model.linear_part
-    np.testing.assert_allclose(calibration.gain, true_w * 4060.0, atol=4 * np.max(
-        calibration.gain_sd))
-    np.testing.assert_allclose(calibration.offset, true_v * 4060.0 + 33000.0,
-                               atol=4 * np.max(calibration.offset_sd))
+    assert np.all(np.abs(calibration.gain - true_w * 4060.0) < 4 * calibration.gain_sd)
+    assert np.all(np.abs(calibration.offset - true_v * 4060.0 - 33000.0)
+                  < 4 * calibration.offset_sd)
     force = calibration.correct(shifted.reading)
     np.testing.assert_allclose(np.linalg.norm(force, axis=1), 1.0, atol=2e-3)
 
@@ -92,14 +92,12 @@ def test_a_knocked_pose_is_named_and_left_out(count, limit_mg):
 def test_noisy_poses_have_less_weight():
     model, poses = simulated(8, 30)
     rng = np.random.default_rng(8)
-    std = poses['std'].copy()
-    std[::3] *= 30
-    noisy = poses.with_columns(std=std, reading=poses.reading + rng.normal(
-        size=poses.reading.shape) * np.sqrt(np.maximum(std ** 2 - poses['std'] ** 2, 0) / 100))
-    weighted, equal = (fit_poses(p, G, model='10') for p in (noisy, without(noisy, 'std')))
-    truth = model.vector
-    assert (np.linalg.norm(weighted.model.vector - truth)
-            < 0.5 * np.linalg.norm(equal.model.vector - truth))
+    std, worse = poses['std'], 1.0 + 29.0 * (np.arange(30) % 3 == 0)[:, np.newaxis]
+    added = rng.normal(size=std.shape) * std * np.sqrt((worse ** 2 - 1.0) / 100)
+    noisy = poses.with_columns(std=std * worse, reading=poses.reading + added)
+    weighted, equal = (np.linalg.norm(fit_poses(each, G, model='10').model.vector - model.vector)
+                       for each in (noisy, without(noisy, 'std')))
+    assert weighted < 0.5 * equal
 
 
 def without(poses, *keys):
@@ -126,12 +124,9 @@ def test_held_out_residual_is_that_of_a_fit_without_the_pose():
 
 
 def test_noise_floor_is_the_residual_of_the_correct_model():
-    gaps, floors = [], []
-    for seed in range(30):
-        quality = fit_poses(simulated(seed, 24)[1], G, model='10').quality
-        gaps.append(quality.rms_after_mg ** 2)
-        floors.append(quality.noise_floor_mg ** 2)
-    assert np.sqrt(np.mean(gaps)) == pytest.approx(np.sqrt(np.mean(floors)), rel=0.1)
+    found = [fit_poses(simulated(seed, 24)[1], G, model='10').quality for seed in range(30)]
+    gap, floor = np.mean([(each.rms_after_mg ** 2, each.noise_floor_mg ** 2) for each in found], 0)
+    assert np.sqrt(gap) == pytest.approx(np.sqrt(floor), rel=0.1)
 
 
 def placed(seed, degrees, **settings):
@@ -146,15 +141,14 @@ def placed(seed, degrees, **settings):
 
 @pytest.mark.parametrize('model', ['auto', '12'])
 def test_badly_placed_orientations_are_replaced_by_a_fit_of_the_norm(model):
-    found, errors, turned = [], [], []
+    errors, turned = [], []
     for seed in range(8):
         truth, poses = placed(seed, 2.0)
         calibration = fit_poses(poses, G, model=model)
-        found.append(calibration.name)
+        assert calibration.name == '10'
         errors.append(error_mg(calibration, truth))
         across = calibration.correct(predict(truth, np.eye(3), {}))
         turned.append(np.degrees(np.max(np.abs(across - across.T)) / 2))
-    assert found == ['10'] * 8
     assert 'uses only |force| = 1 g' in calibration.warnings[0]
     assert '° (RMS) from a fit' in calibration.reason
     assert np.median(errors) < 0.4
@@ -170,13 +164,9 @@ def test_one_misplaced_pose_is_named_and_does_not_rotate_the_axes():
                                atol=4e-3)
 
 
-@pytest.mark.parametrize('noise_g', [0.0003, 0.003, 0.03])
-def test_well_placed_orientations_are_used(noise_g):
-    names = [fit_poses(placed(seed, 0.0, noise_g=noise_g)[1], G).name for seed in range(10)]
-    assert names == ['12'] * 10
-
-
-def test_model_12_without_orientations_is_refused():
+def test_well_placed_orientations_are_used_and_model_12_needs_them():
+    for seed, noise_g in product(range(10), (0.0003, 0.003, 0.03)):
+        assert fit_poses(placed(seed, 0.0, noise_g=noise_g)[1], G).name == '12'
     with pytest.raises(RefusedFitError, match='needs known orientations'):
         fit_poses(simulated(15, 20)[1], G, model='12')
 
@@ -196,12 +186,10 @@ def test_force_covariance_is_that_of_repeated_fits():
 
 def test_poses_are_left_as_they_were():
     poses = simulated(18, 20)[1]
-    before = {key: values.copy() for key, values in poses.columns.items()}
+    before = deepcopy(poses)
     fit_poses(poses, G)
     in_g(poses, units_of('m/s2'))
-    for key, values in poses.columns.items():
-        np.testing.assert_array_equal(values, before[key])
-    assert list(poses.row) == list(numbered(poses.columns))
+    assert poses == before
 
 
 def test_a_reader_cannot_change_a_calibration():
