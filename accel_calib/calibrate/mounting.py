@@ -410,8 +410,7 @@ def axes_of(reading: Floats, reference: Floats) -> Floats | None:
         left, _, right = np.linalg.svd(fit_12(reading, reference)[0])
     except RefusedFitError:
         return None
-    mat_q: Floats = left @ right
-    return mat_q
+    return left @ right
 
 
 def fault_of(mat_q: Floats) -> str | None:

@@ -415,8 +415,7 @@ def _best(name: str, directions: Floats, information: Floats) -> Floats | None:
     rows = _attitude_rows(name)
     to_come = np.linalg.inv(information + _mean_information(name))
     gains = np.linalg.slogdet(np.eye(rows.shape[1]) + rows @ to_come @ np.swapaxes(rows, 1, 2))[1]
-    found: Floats = up[np.argmax(np.where(free, np.round(gains, 6), -1.0))]  # the first of equals
-    return found
+    return up[np.argmax(np.where(free, np.round(gains, 6), -1.0))]  # the first of equals
 
 
 def _attitudes(name: str) -> Floats:

@@ -366,8 +366,7 @@ def _empirical(name: str) -> Effect:
 def _variable(variable: str, context: Mapping[str, Any]) -> Floats:
     """Return the variable of an empirical curve; for vectors, its RMS over the axes."""
     values = np.asarray(context[variable], float)
-    found: Floats = np.sqrt(np.mean(values ** 2, axis=-1)) if variable == 'std' else values
-    return found
+    return np.sqrt(np.mean(values ** 2, axis=-1)) if variable == 'std' else values
 
 
 def _ends(variable: str, context: Context) -> Iterator[Floats]:

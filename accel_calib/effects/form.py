@@ -238,9 +238,8 @@ def difference(factor: Factor, context: Context, shape: Floats, place: int) -> F
     """Return the numerical derivative of a factor by one shape constant."""
     step = np.zeros(len(shape))
     step[place] = _SHAPE_STEP * max(abs(shape[place]), 1.0)
-    change: Floats = (factor(context, shape + step) - factor(context, shape - step)) / (
-        2.0 * step[place])
-    return change
+    change = factor(context, shape + step) - factor(context, shape - step)
+    return change / (2.0 * step[place])
 
 
 def fitted_places(effect: Effect, shape: Floats) -> list[int]:

@@ -113,7 +113,7 @@ class Terms:
             monomials = self.monomials_at(u)
         else:
             monomials = np.einsum('mjn,nj->mn', self.gradients_at(u), direction)
-        return np.asarray(monomials[self.place] * self.weight[:, np.newaxis])
+        return monomials[self.place] * self.weight[:, np.newaxis]
 
     def gradients_at(self, u: Floats) -> Floats:
         """Return the (m, 3, n) derivatives of the monomials by the force."""
@@ -146,8 +146,7 @@ def terms_of(names: tuple[str, ...]) -> Terms:
 
 def _sums(index: Indices, size: int) -> Floats:
     """Return the (size, t) matrix that sums t numbers by their index."""
-    found: Floats = (index == np.arange(size)[:, np.newaxis]).astype(float)
-    return found
+    return (index == np.arange(size)[:, np.newaxis]).astype(float)
 
 
 @dataclass(frozen=True)
@@ -196,8 +195,7 @@ class AtContext:
         """Return the (n, 3) reading that the bending terms add."""
         terms = self.terms
         values = terms.monomials_at(u)[terms.place[terms.bending]] * self.bend
-        found: Floats = (terms.bends_to_axis @ values).T
-        return found
+        return (terms.bends_to_axis @ values).T
 
     def reading(self, u: Floats) -> Floats:
         """Return the (n, 3) reading for the (n, 3) force u in the sensor axes [g]."""
@@ -239,8 +237,7 @@ def times(matrix: Floats, vectors: Floats) -> Floats:
     """Return matrix times vector for (n, 3) vectors and (3, 3) or (n, 3, 3) matrices."""
     if matrix.ndim == 2:
         return vectors @ matrix.T
-    found: Floats = (matrix @ vectors[:, :, np.newaxis])[:, :, 0]
-    return found
+    return (matrix @ vectors[:, :, np.newaxis])[:, :, 0]
 
 
 @dataclass(frozen=True, eq=False)

@@ -206,10 +206,9 @@ class Fit:
     @cached_property
     def undetermined(self) -> tuple[str, ...]:
         """Names of the values that the poses do not determine."""
-        size = np.linalg.norm(self.columns, axis=0)
-        size[size == 0.0] = 1.0
-        few = len(self.columns) < len(size)  # only then are there axes beyond the singular values
-        _, scales, axes = np.linalg.svd(self.columns / size, full_matrices=few)
+        columns, size = _scaled(self.columns)
+        few = len(columns) < len(size)  # only then are there axes beyond the singular values
+        _, scales, axes = np.linalg.svd(columns, full_matrices=few)
         open_ = axes[np.sum(scales > _SINGULAR * scales[0]):] if len(scales) else axes
         part = np.linalg.norm(self.ties @ (open_ / size).T, axis=1)
         names = parameter_names(self.model.effects)
@@ -222,9 +221,8 @@ class Fit:
         columns = self.columns
         if self.prior is not None:
             columns = np.vstack([columns, self.prior.columns])
-        size = np.linalg.norm(columns, axis=0)
-        size[size == 0.0] = 1.0
-        factor = self.ties @ (np.linalg.pinv(columns / size) / size[:, np.newaxis])
+        columns, size = _scaled(columns)
+        factor = self.ties @ (np.linalg.pinv(columns) / size[:, np.newaxis])
         spread: Floats = factor @ factor.T
         return spread * self.variance_factor
 
@@ -234,6 +232,13 @@ class Fit:
         if self.factor is not None:
             return self.factor
         return variance_factor(self.chi2, self.dof, self.noise_known)
+
+
+def _scaled(columns: Floats) -> tuple[Floats, Floats]:
+    """Return columns of length 1, and the lengths; 1 for a column of zeros."""
+    size = np.sqrt(np.sum(columns ** 2, axis=0))
+    size[size == 0.0] = 1.0
+    return columns / size, size
 
 
 def free_of(model: Model) -> Floats:
@@ -320,10 +325,7 @@ def _free(values: Floats, now: Point, lower: Floats, upper: Floats) -> NDArray[n
 
 def _step(now: Point, free: NDArray[np.bool_], damping: float) -> tuple[Floats, float]:
     """Return the damped step, 0 along undetermined values, and the predicted fall of the cost."""
-    columns = now.columns * free
-    size = np.sqrt(np.sum(columns ** 2, axis=0))
-    size[size == 0.0] = 1.0
-    columns = columns / size
+    columns, size = _scaled(now.columns * free)
     scales, axes = np.linalg.eigh(columns.T @ columns)
     downhill = axes.T @ (columns.T @ now.residual)
     determined = scales > now.singular * scales[-1]

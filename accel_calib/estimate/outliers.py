@@ -157,8 +157,7 @@ class _Removed:
 
 def beyond(ratio: Floats, rows: Indices, dof: Floats | float) -> Floats:
     """Return the probability of a larger ratio of variances by chance (F distribution)."""
-    chance: Floats = scipy.special.fdtrc(rows, np.maximum(dof, 1.0), ratio)
-    return chance
+    return scipy.special.fdtrc(rows, np.maximum(dof, 1.0), ratio)
 
 
 def _removed_in_turn(data: ByPose, dof: int, most: int) -> _Removed:
@@ -322,8 +321,7 @@ def _agrees(fit: Fit, kept: Indices, poses_g: Poses) -> NDArray[np.bool_]:
     spare = np.where(inside, np.maximum(1.0 - leverage, 1e-6), 1.0 + leverage)
     belief = belief_beside(fit.dof, fit.chi2, fit.noise_known)
     size = data.residual[:, 0] ** 2 / spare / ((belief + fit.chi2) / (belief + fit.dof))
-    agrees: NDArray[np.bool_] = beyond(size, data.rows, belief + fit.dof) >= LEVEL / len(poses_g)
-    return agrees
+    return beyond(size, data.rows, belief + fit.dof) >= LEVEL / len(poses_g)
 
 
 class Rival(NamedTuple):
@@ -408,8 +406,7 @@ def _explained(shift: Floats, own: Floats, others: Floats, spread: Floats) -> Fl
     left = np.eye(len(own)) - others @ spread @ np.swapaxes(others, 1, 2)
     moved = others @ (spread @ (own.T @ shift))
     solved = np.linalg.pinv(left, _ALONE, hermitian=True) @ moved[:, :, np.newaxis]
-    part: Floats = np.sum(moved * solved[:, :, 0], axis=1) / max(shift @ inverse @ shift, 1e-300)
-    return part
+    return np.sum(moved * solved[:, :, 0], axis=1) / max(shift @ inverse @ shift, 1e-300)
 
 
 def _odds(rival: Fit, fit: Fit) -> float:
