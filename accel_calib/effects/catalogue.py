@@ -4,11 +4,9 @@
 """
 The catalogue: one entry for each effect with a known cause, and curves without one.
 
-Factors are functions of the context and of the shape of the effect. Shape searches yield the
-shapes that the search tries. Two kinds of effects are made from their names: an empirical curve,
-with which a part of the reading, the carrier, changes smoothly with a variable
-(`empirical_name`), and a covariate, which is any quantity that the catalogue does not know
-(`covariate_names`).
+Two kinds of effects are made from their names: an empirical curve, with which a part of the
+reading, the carrier, changes smoothly with a variable (`empirical_name`), and a covariate, which
+is any quantity that the catalogue does not know (`covariate_names`).
 
 """
 
@@ -308,11 +306,10 @@ _CARRIED = {'offset': by_axis(ONE), 'gain': by_axis(FORCE), 'cross_axis': CROSS,
 
 def empirical_name(carrier: str, variable: str, modes: Iterable[int]) -> str:
     """
-    Return the name of an empirical curve.
+    Return the name of an empirical curve: Σ_k c_k cos(k π s) over the modes k, 1 to `MODES`.
 
-    The carrier, one of `CARRIERS` or a part of one, changes with one of `VARIABLES` or a quantity
-    by Σ_k c_k cos(k π s) over the modes k, 1 to `MODES`. s runs from 0 to 1 over the range of the
-    variable in the poses. Outside of it, the curve is constant.
+    The carrier, one of `CARRIERS` or a part of one, changes with one of `VARIABLES` or a quantity.
+    s runs from 0 to 1 over its range in the poses; outside of it, the curve is constant.
 
     """
     return '-'.join([EMPIRICAL, carrier, variable, *map(str, modes)])
@@ -394,10 +391,10 @@ _CURVED = '2'
 
 def covariate_names(quantities: Iterable[str]) -> Iterator[str]:
     """
-    Yield the names of the covariates of quantities.
+    Yield the names of the covariates of quantities, such as ``offset_covariate-pressure``.
 
-    ``offset_covariate-pressure`` adds k (pressure - zero), by axis, with the mean over the poses
-    as zero. ``offset_covariate-pressure-2`` adds a square, k₂ (pressure - zero)², too.
+    It adds k (pressure - zero), by axis, with the mean over the poses as zero. With ``-2`` at the
+    end it adds a square, k₂ (pressure - zero)², too.
 
     """
     for quantity in quantities:

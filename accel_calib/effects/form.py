@@ -1,13 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The form of an effect: terms, each the product of a factor of the context and a monomial.
-
-A term adds parameter · factor · weight · monomial to one axis of the reading. Monomials are
-functions of the components of the force.
-
-"""
+"""The form of an effect: the sum of terms that `accel_calib.effects` describes."""
 
 from __future__ import annotations
 

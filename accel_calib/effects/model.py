@@ -48,9 +48,9 @@ class Terms:
     """
     The t terms of a list of effects as arrays, so that a model adds all of them at once.
 
-    `parts` are the values of each effect among all p values. For each term, `place` is the index
-    in `monomials` (those of `MONOMIALS` that are used), `axis` that of the reading, `value` that
-    of its parameter among all values, and `weight` the constant factor.
+    `parts` are the values of each effect among all p values. Each term has its `place` in
+    `monomials` (those of `MONOMIALS` that are used), the `axis` of the reading, the place of its
+    `value` among all values, and its constant factor `weight`.
 
     """
 
@@ -449,9 +449,8 @@ class ModelForm:
     One of the models that consist of offset and gains.
 
     W has `gains` parameters, apart from a rotation. `norm` is the model with the same ellipsoid
-    that |force| = 1 g alone determines. A model of `known_orientation` needs poses of known
-    orientation, and then determines the axes of W. With `sensing_axes`, its axes are fixed to the
-    sensing axes.
+    that |force| = 1 g alone determines. Poses of `known_orientation` determine the axes of W; with
+    `sensing_axes`, they are fixed to the sensing axes.
 
     """
 

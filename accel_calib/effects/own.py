@@ -120,10 +120,9 @@ def _own_factor(variable: str, change: Callable[[Any], Any], context: Mapping[st
 
 def know(effects: Iterable[OwnEffect]) -> tuple[str, ...]:
     """
-    Make effects of the user known to this process, and return their names.
+    Make effects of the user known to this process, instead of those of the same names.
 
-    An effect replaces an earlier one of the same name. Raise InputError for a name that the
-    catalogue has.
+    Return their names. Raise InputError for a name that the catalogue has.
 
     """
     names = []
@@ -140,17 +139,18 @@ def know(effects: Iterable[OwnEffect]) -> tuple[str, ...]:
 
 
 def know_file(path: Path) -> tuple[str, ...]:
-    """
-    Execute a Python file that defines own effects, make them known, and return their names.
-
-    Raise InputError if it cannot be executed or defines none, and OSError if it cannot be read.
-
-    """
+    """Execute a Python file as `know_code` does; raise OSError if it cannot be read."""
     return know_code(str(path), path.read_bytes())
 
 
 def know_code(name: str, code: bytes) -> tuple[str, ...]:
-    """Execute the code of a file as `know_file` does, unless this process has executed it."""
+    """
+    Make the own effects that the code of a file defines known, and return their names.
+
+    The code is executed, unless this process has executed it. Raise InputError if it cannot be
+    executed, or defines no effect.
+
+    """
     before, names = _EXECUTED.get(name, (b'', ()))
     if names and before == code:
         return names

@@ -25,10 +25,9 @@ from ..table import Floats, numbered, Poses, Recording
 
 def parse_effect(text: str) -> tuple[str, Floats]:
     """
-    Return name and (p,) values from ``NAME=VALUE,…``, in the unit of the catalogue.
+    Return name and (p,) values from a text such as ``offset=0.01,-0.02,0.03``, as `model_with`.
 
-    Examples are ``offset=0.01,-0.02,0.03``, and ``quadratic=0.002`` for all axes. Raise
-    `InputError` if the text is not of this form, or as `model_with`.
+    Raise `InputError` if the text is not of this form.
 
     """
     name, equals, values = text.partition('=')
@@ -66,8 +65,7 @@ def model_with(effects: Mapping[str, ArrayLike], rotation: Floats | None = None)
     Return the model with these effects and ΔR, in the order of the catalogue.
 
     The values are in the units of the catalogue; one value is used for all axes. Raise
-    `InputError` if an effect is not in the catalogue, or has not the expected number of finite
-    values.
+    `InputError` for an effect that is not there, or has another number of finite values.
 
     """
     values = {name: _values_of(name, given) for name, given in effects.items()}
@@ -82,8 +80,7 @@ def simulate_poses(model: Model, directions: Floats, rng: np.random.Generator, *
     Simulate averaged still poses, in g, with std, count and context.
 
     `directions` are (n, 3) specific forces [g], unit vectors at rest. `noise_g` is the standard
-    deviation of a sample [g], and `samples` the number of independent samples per pose. `context`
-    is as in `predict`.
+    deviation of a sample [g], and `samples` their independent number per pose.
 
     """
     known = {'std': np.full_like(directions, noise_g), **(context or {})}
@@ -103,12 +100,7 @@ def _between(start: Floats, end: Floats) -> Floats:
 
 def turn_between(start: Floats, end: Floats, seconds: float, count: int
                  ) -> tuple[Floats, Floats]:
-    """
-    Return a smooth turn between two directions along the shortest arc, as `path` does.
-
-    It takes `seconds` and has `count` samples, all of them between both directions.
-
-    """
+    """Return a turn along the shortest arc as `path` does, with `count` samples in `seconds`."""
     tau = (np.arange(count) + 1.0)[:, np.newaxis] / (count + 1.0)
     share = tau ** 3 * (10.0 - 15.0 * tau + 6.0 * tau ** 2)
     speed = 30.0 * tau ** 2 * (1.0 - tau) ** 2 / seconds
@@ -128,15 +120,12 @@ def path(directions: Floats, rate_hz: float, dwell: float, turn: float) -> tuple
 
     """
     resting, turning = max(1, round(dwell * rate_hz)), max(1, round(turn * rate_hz))
-    forces: list[Floats] = []
-    rates: list[Floats] = []
+    parts = []
     for k, direction in enumerate(directions):
         if k:
-            force, rate = turn_between(directions[k - 1], direction, turn, turning)
-            forces.append(force)
-            rates.append(rate)
-        forces.append(np.tile(direction, (resting, 1)))
-        rates.append(np.zeros((resting, 3)))
+            parts.append(turn_between(directions[k - 1], direction, turn, turning))
+        parts.append((np.tile(direction, (resting, 1)), np.zeros((resting, 3))))
+    forces, rates = zip(*parts)
     return np.concatenate(forces), np.concatenate(rates)
 
 
@@ -145,13 +134,11 @@ def simulate_recording(model: Model, directions: Floats, rng: np.random.Generato
                        turn: float = 1.0, gyro_noise: float = 0.002,
                        temperatures: Sequence[float] = ()) -> Recording:
     """
-    Simulate a sensor that is turned through poses.
+    Simulate a sensor that is turned through (n, 3) directions of up, as `path` does.
 
-    The samples are in g, with angular rate and the true force as ``reference``. `directions` are
-    those of up in each pose, (n, 3) unit vectors in the levelled frame. `noise_g` [g] and
-    `gyro_noise` [rad/s] are standard deviations of a sample. `rate_hz`, `dwell` and `turn` are as
-    in `path`. The temperature changes linearly in time, from the first to the last of
-    `temperatures` [°C].
+    The samples are in g, with angular rate and the true force as ``reference``. `noise_g` [g] and
+    `gyro_noise` [rad/s] are standard deviations of a sample. The temperature changes linearly in
+    time, from the first to the last of `temperatures` [°C].
 
     """
     force, rate = path(directions, rate_hz, dwell, turn)

@@ -15,10 +15,9 @@ spline, Wahba 1978) estimates the rate at the poses; a Kalman filter with the sa
 it from the past samples of a stream. The noise is chosen for periods of 400 s and more: the filter
 follows them, and it averages the steps of the temperature sensor.
 
-**Low pass.** The solution of the first equation is exact for the interpolated temperature. Between
-poses that is the cubic with the temperatures and the rates at its ends; between samples it is the
-straight line. Times need not be sorted. A row without time or temperature is NaN, and the other
-rows ignore it.
+**Low pass.** The solution of the first equation is exact for the interpolated temperature: between
+poses a cubic with the temperatures and the rates at its ends, between samples a straight line.
+Times need not be sorted. A row without time or temperature is NaN, and the other rows ignore it.
 
 """
 
@@ -76,8 +75,7 @@ def acting_temperature(context: Mapping[str, Any], key: str, lag: float, of_sens
     """
     Return the (n,) temperature that acts with a lag [°C], or the column `key` if present.
 
-    The temperature sensor lags if `of_sensor`, otherwise the die. The rows of ``time`` and
-    ``temperature`` are the whole history; one row alone has no lag.
+    The rows of ``time`` and ``temperature`` are the whole history; one row alone has no lag.
 
     """
     if key in context:
@@ -312,8 +310,8 @@ class ThermalStream:
         """
         Add samples, in the order of time, and return the columns at each.
 
-        Rows without time [s] or temperature [°C] have the columns NaN. The columns are the
-        temperatures that act [°C] and ``temperature_rate`` [°C/s].
+        These are the temperatures that act [°C] and ``temperature_rate`` [°C/s]; NaN in rows
+        without time or temperature.
 
         """
         keys = (*self._lags, *(('temperature_rate',) if self._gives_rate else ()))

@@ -81,10 +81,10 @@ _SHAPE_ROOM = 5.0
 @dataclass(frozen=True)
 class ByPose:
     """
-    The equations of a fit by pose: k rows each, padded with 0.
+    The equations of a fit by pose: k rows each, padded with 0, in units of the noise.
 
-    `residual` (n, k) and the derivative `columns` (n, k, q) are in units of the noise; `rows` (n,)
-    are the numbers of equations; `prior` (r, q) are the columns of a prior.
+    They are `residual` (n, k), the derivative `columns` (n, k, q), the numbers of equations
+    `rows` (n,), and the columns of a `prior` (r, q).
 
     """
 
@@ -281,12 +281,12 @@ def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upp
           move: Callable[[Floats, Floats], Floats] = np.add, most: float = np.inf
           ) -> tuple[Floats, Point]:
     """
-    Return the (q,) values that minimise the sum of squared residuals, and the point there.
+    Return the (q,) values from `lower` to `upper` of least squares, and the point there.
 
-    The values stay between `lower` and `upper`. `point_at` computes residuals and derivative at
-    values; the step solves residual = columns · step. `move` returns the values after a step to
-    first order, by default their sum. Raise `NotConvergedError` if the fit has not converged after
-    `_MOST_STEPS` steps, or as soon as it cannot lower the cost to `most`.
+    `point_at` computes residuals and derivative at values; the step solves
+    residual = columns · step. `move` returns the values after a step to first order, by default
+    their sum. Raise `NotConvergedError` if the fit has not converged after `_MOST_STEPS` steps, or
+    as soon as it cannot lower the cost to `most`.
 
     """
     values = np.clip(start, lower, upper)
@@ -362,11 +362,9 @@ def estimate(start: Model, poses_g: Poses, prior: Prior | None = None,
         Effects with their start values, ΔR = I.
     poses_g : Poses
         Poses in g, of known, shared or unknown orientation, with the context of the effects.
-    prior : Prior, optional
-        Distribution of the values of model 10 over sensors; by default none.
-    factor : float, optional
-        Variance factor of the noise, for a fit with a prior. By default it is 1 in the fit, and
-        that of the residuals in the covariance.
+    prior, factor : Prior and float, optional
+        Distribution of the values of model 10 over sensors, and the variance factor of the noise
+        beside it. By default it is 1 in the fit, and that of the residuals in the covariance.
     most : float, optional
         Cost above which the fit is not needed. It then ends early, as one that does not converge.
 
