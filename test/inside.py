@@ -39,8 +39,8 @@ from accel_calib.compare.agreement import (
 from accel_calib.compare.drift import change, is_over, MEMORY as DRIFT_MEMORY
 from accel_calib.disk import check_regular, previous
 from accel_calib.effects import (
-    acting_temperature, correct, Model, model_with, MODELS, parse_effect, predict, reading_of,
-    sensor_force, simulate_poses, simulate_recording, ThermalStream, with_linear_part, with_vector)
+    acting_temperature, correct, linear_model, Model, model_with, MODELS, parse_effect, predict,
+    reading_of, sensor_force, simulate_poses, simulate_recording, ThermalStream, with_vector)
 from accel_calib.effects.model import terms_of
 from accel_calib.effects.thermal import Lag, low_passed, rate_of
 from accel_calib.estimate import believable, kinds, originals, unseen_mistakes

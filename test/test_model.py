@@ -5,7 +5,7 @@
 
 from accel_calib.effects import EFFECTS
 from accel_calib.errors import InputError
-from inside import correct, Model, parse_effect, predict, rotation_from_rpy, with_linear_part
+from inside import correct, linear_model, Model, parse_effect, predict, rotation_from_rpy
 import numpy as np
 import pytest
 from shared import random_directions
@@ -89,7 +89,7 @@ def test_effects_by_hand():
 def test_gain_and_offset_make_the_equation_of_an5286(rng):
     mat_w, vec_v = np.eye(3) + rng.normal(size=(3, 3)) * 0.1, rng.normal(size=3)
     rotation = rotation_from_rpy(0.1, 0.2, 0.3)
-    model = Model(with_linear_part(mat_w, vec_v).values, rotation)
+    model = Model(linear_model('12', mat_w, vec_v).values, rotation)
     force = random_directions(5, rng)
     np.testing.assert_allclose(predict(model, force, {}), force @ (mat_w @ rotation).T + vec_v)
     for found, given in zip(model.linear_part, (mat_w, vec_v), strict=True):

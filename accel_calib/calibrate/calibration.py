@@ -4,14 +4,11 @@
 """
 The record of a calibration, and the context in which it corrects readings.
 
-The record is a fitted model with its units, its sensor and its quality. Its effects are not
-extrapolated: beyond the range of the poses, the correction uses the limit of the range
-(`Calibration.ranges`), and `Outside` says how far beyond it was. A curve over the vibration has a
-range, too. A single sample does not show its vibration, so that the correction uses the lower
-limit.
-
-The order of the poses determines the previous pose of each, for `hysteresis`, and the rate of the
-temperature, for `temperature_rate` and lags.
+Effects are not extrapolated: beyond the range of the poses, the correction uses the limit of the
+range (`Calibration.ranges`), and `Outside` says how far beyond it was. A curve over the vibration
+has a range, too. A single sample does not show its vibration, so that the correction uses the
+lower limit. The order of the poses determines the previous pose of each, for `hysteresis`, and the
+rate of the temperature, for `temperature_rate` and lags.
 
 """
 
@@ -443,10 +440,10 @@ def of_samples(known: Context, count: int, model: Model,
     """
     Return the context of single samples that a model needs, ``count`` rows each.
 
-    A single sample does not show the vibration or the previous pose. Both are set to zero, and so
-    is a rate that is NaN. A quantity that is not recorded has the value of no change, which
-    `SampleContext` notes. Lag and rate of the temperature come from earlier samples, unless they
-    are known already. A `stream` has the temperature before these samples; they are added to it.
+    A single sample does not show the vibration or the previous pose; both are zero, and so is a
+    rate that is NaN. A quantity that is not recorded has the value of no change. Lag and rate of
+    the temperature come from earlier samples, unless they are known already. A `stream` has the
+    temperature before these samples; they are added to it.
 
     """
     none = np.zeros((count, 3))
@@ -480,10 +477,9 @@ def with_history(poses_g: Poses, model: Model) -> Poses:
     """
     Return poses in g with the context that comes from the poses before and after.
 
-    That is ``previous``, the unit vector towards the previous pose in order of time, or of rows,
-    and ``temperature_rate``. If successive poses have the same orientation, the last motion counts
-    for all of them; before the first motion, ``previous`` is zero. Columns that the table has
-    already are kept. Gain and offset of the model are used to compute the directions.
+    That is ``temperature_rate`` and ``previous``, the unit vector towards the previous pose in
+    order of time, or of rows; columns of the table are kept. The last motion counts for all
+    successive poses of one orientation; before the first motion, ``previous`` is zero.
 
     """
     if 'time' in poses_g and 'temperature' in poses_g and 'temperature_rate' not in poses_g:

@@ -20,16 +20,16 @@ frame      axes                                   flat reading  third column of 
 `ned` and `win8` are conventions of gravity. Messages are specific force, so that `on_topics` turns
 ΔR into another frame for them.
 
-One flat pose does not determine the heading. The heading is zero by the convention of the angles
-of each frame. For `ros`, `ned` and `android` the sensor is rolled and pitched but not yawed,
+One flat pose determines only the direction of up: an upside-down sensor and a wrong sign have the
+same reading. The heading is zero by the convention of the angles of each frame. For `ros`, `ned`
+and `android` the sensor is rolled and pitched but not yawed,
 
     x column = (√(y²+z²), -xy/√(y²+z²), -xz/√(y²+z²)) / |G|
 
 which is singular if x is vertical (90° pitch). For `win8` the x column is in the x-z plane of the
-sensor, which is singular if y is vertical (90° roll). At these singularities the limit of a level
-y axis, or a level x axis, is used. A second pose, with the nose of the robot tilted straight down,
-determines the heading (TRIAD, Black 1964). One flat pose determines only the direction of up: an
-upside-down sensor and a wrong sign have the same reading.
+sensor, which is singular if y is vertical (90° roll). There the limit of a level y axis, or a
+level x axis, is used. A second pose, with the nose of the robot tilted straight down, determines
+the heading (TRIAD, Black 1964).
 
 **Wiring.** |force| = 1 g does not reveal a wrong sign, swapped axes or a rotated sensor, because
 the sphere of poses is the same. Known orientations reveal them. A least squares fit
@@ -131,9 +131,8 @@ def with_heading(rotation: Floats, nose_down: Floats, frame: str = 'ros') -> Flo
     """
     Return a levelled ΔR with the heading from a pose with the nose of the robot down.
 
-    It matches the flat pose exactly, and the second pose in heading. In that pose the nose (front
-    of the robot, top of a screen) is tilted straight down by 10° to 170°. `nose_down` is its (3,)
-    calibrated reading in the axes of the sensor, of any length.
+    In that pose the nose (front of the robot, top of a screen) is tilted straight down by 10° to
+    170°. `nose_down` is its (3,) calibrated reading in the axes of the sensor, of any length.
 
     """
     flat = flat_direction(frame)
@@ -167,8 +166,7 @@ def in_frame(calibration: Calibration, frame: FrameName) -> Calibration:
     """
     Return a calibration with the same mounting in another frame.
 
-    A heading that is known stays; one that follows from the convention of the frame follows from
-    that of the other frame.
+    A heading that follows from the convention of the frame then follows from that of the other.
 
     """
     before, rotation = calibration.frame, calibration.rotation
@@ -210,8 +208,8 @@ def mounting_figures(rotation: Floats, sensor: str, base: str = '') -> dict[str,
     Return a mounting as numbers and as the lines for the URDF and for TF.
 
     The numbers are ``roll``, ``pitch`` and ``yaw`` [rad] of the sensor in the levelled frame, and
-    ``quaternion`` (x, y, z, w). The lines are ``urdf`` and ``static_transform_publisher``, for the
-    frame_id `sensor` (if empty ``imu_link``) and the frame `base` (if empty ``base_link``).
+    ``quaternion`` (x, y, z, w). The lines are for the frame_id `sensor` (if empty ``imu_link``)
+    and the frame `base` (if empty ``base_link``).
 
     """
     roll, pitch, yaw = (round(angle, _DIGITS) + 0.0 for angle in rpy_of(rotation.T))
@@ -249,16 +247,11 @@ def heading_is_arbitrary(rotation: Floats, frame: str) -> bool:
 def level_by_rows(calibration: Calibration, poses: Poses, frame: FrameName, flat: int | None,
                   nose_down: int | None) -> Calibration:
     """
-    Return a calibration with the mounting from rows of a pose table in its unit.
+    Return a calibration with the mounting from rows of a pose table in its unit, 1-based.
 
-    Row `flat` is a pose with the robot level. Row `nose_down` is a pose with the nose of the robot
-    tilted straight down, and determines the heading. Both are 1-based.
-
-    Raises
-    ------
-    InputError
-        If a row does not exist, `nose_down` is set without `flat`, or the nose is tilted down by
-        less than 10°.
+    In row `flat` the robot is level. In row `nose_down` its nose is tilted straight down, which
+    determines the heading. Raise InputError if a row does not exist, `nose_down` is set without
+    `flat`, or the nose is tilted down by less than 10°.
 
     """
     if flat is None:
@@ -287,16 +280,8 @@ def level(calibration: Calibration, reading: Floats, frame: FrameName,
     """
     Return a calibration with ΔR of one flat pose, and a finding if the wiring may be wrong.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration, with any ΔR. The heading of an existing mounting is kept.
-    reading : (3,) array
-        Mean reading of the flat pose, in the unit of the readings.
-    frame : {'ros', 'ned', 'android', 'win8'}
-        The levelled frame.
-    context : mapping of str to array, optional
-        Columns that the effects need, one row.
+    `reading` (3,) is the mean of the flat pose, in the unit of the readings, and `context` has one
+    row of the columns that the effects need. The heading of an existing mounting is kept.
 
     """
     rotation = mounting(_in_sensor_axes(calibration, reading, context), frame)
@@ -337,8 +322,7 @@ def with_given_mounting(calibration: Calibration, rotation: Floats) -> Calibrati
     """
     Return a calibration with a mounting that is known from elsewhere, such as a URDF.
 
-    A calibration that is levelled to within 10° of the given ΔR keeps its tilt, which a flat pose
-    measured, and takes only the heading.
+    Levelled to within 10° of it, it keeps its tilt, which a flat pose measured.
 
     """
     if calibration.is_levelled and calibration.rotation[:, 2] @ rotation[:, 2] > _SAME_TILT:

@@ -192,12 +192,10 @@ class Combination:
     A combination of parameters that the poses do not determine.
 
     `weights` has the weight of each parameter, the largest first; the sum of the squares is 1.
-    `deviation` is relative to the noise of a pose; infinite if not determined at all.
 
     """
 
     weights: Mapping[str, float]
-    deviation: float
 
     @property
     def words(self) -> str:
@@ -263,7 +261,7 @@ def identifiability(name: str, directions: Floats, noise: Floats | None = None
     errors = np.cumsum(_times(seen, deviations ** 2), axis=1)  # from all up to this one
     open_ = np.sqrt(np.max(errors, axis=0)) > LARGEST_DILUTION
     return Identifiability(name, dict(zip(names, map(float, each), strict=True)),
-                           _combinations(names, axes[open_], deviations[open_]),
+                           _combinations(names, axes[open_]),
                            float(np.sqrt(np.max(errors[:, -1]))),
                            float(np.sqrt(np.mean(errors[:, -1]))))
 
@@ -274,21 +272,17 @@ def _times(share: Floats, deviations: Floats) -> Floats:
     return np.where(none, 0.0, share) * np.where(none, 0.0, deviations)
 
 
-def _combinations(names: tuple[str, ...], axes: Floats, deviations: Floats
-                  ) -> tuple[Combination, ...]:
+def _combinations(names: tuple[str, ...], axes: Floats) -> tuple[Combination, ...]:
     """Return sparse combinations that span these (k, p) combinations."""
     if not len(axes):
         return ()
     pivots = scipy.linalg.qr(axes, mode='r', pivoting=True)[1][:len(axes)]
     mixed = np.linalg.inv(axes[:, pivots])  # each combination has its own pivot
-    mixed = mixed / np.linalg.norm(mixed, axis=1, keepdims=True)
-    uncertain = np.sqrt(np.sum(_times(mixed ** 2, deviations ** 2), axis=1))
     found = []
-    for row, deviation in zip(mixed @ axes, uncertain, strict=True):
+    for row in unit(mixed) @ axes:
         order = [k for k in np.argsort(-np.abs(row), kind='stable') if abs(row[k]) > _SMALL]
         sign = np.sign(row[order[0]])
-        found.append(Combination({names[k]: float(sign * row[k]) for k in order},
-                                 float(deviation)))
+        found.append(Combination({names[k]: float(sign * row[k]) for k in order}))
     return tuple(sorted(found, key=lambda each: names.index(next(iter(each.weights)))))
 
 
@@ -323,10 +317,9 @@ class NextPose:
 
     Parameters
     ----------
-    direction : (3,) array or None
-        Direction to point up, a unit vector in the sensor axes; None: more poses no longer help.
-    words : str
-        The same as a sentence.
+    direction, words : (3,) array or None, and str
+        Direction to point up, a unit vector in the sensor axes, and the same as a sentence; None:
+        more poses no longer help.
     error : float
         Expected error of |force| after a fit to the poses so far, RMS over the sphere, relative
         to the noise of a pose; infinite if the poses do not determine a parameter.
@@ -451,7 +444,8 @@ class Outlook:
 
     `identifiability` and `next_pose` are for the requested model; for the largest model if the
     choice was ``auto``. `uncertainty_mg` is the stated one of the corrected |force| (model 12: of
-    the force), RMS over the sphere [mg]; None if it is not known.
+    the force), RMS over the sphere, with effects in the middle of their range [mg]; None for a
+    mounting alone or an offset over temperature alone.
 
     """
 
@@ -467,13 +461,7 @@ def directions_in(poses: Poses, calibration: Calibration) -> Floats:
 
 
 def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
-    """
-    Return what the poses of a calibration determine, and the next pose for the model asked for.
-
-    Effects are taken in the middle of their range. The uncertainty of a mounting alone, and of an
-    offset over temperature alone, is not known.
-
-    """
+    """Return what the poses of a calibration determine, and the next pose for a model."""
     poses = calibration.used_poses
     directions = directions_in(poses, calibration)
     noise = pose_noise(poses.noise, directions)

@@ -165,12 +165,7 @@ def noise_floor_mg(fit: Fit) -> float:
 
 
 def errors_before(poses_g: Poses, units: Units, *, vectors: bool) -> Floats:
-    """
-    Return the (n,) errors without a calibration [g].
-
-    Native readings have no known zero; they are measured from the middle of their range.
-
-    """
+    """Return the (n,) errors without a calibration [g]; native: from the middle of the range."""
     reading = poses_g.reading
     if units.is_native:
         reading = reading - (reading.max(axis=0) + reading.min(axis=0)) / 2.0
@@ -189,10 +184,9 @@ def errors_after(model: Model, poses_g: Poses, *, vectors: bool) -> Floats:
 
 def _held_out(fit: Fit) -> Floats | None:
     """
-    Return the (n,) errors of each pose under a fit of the other poses [g].
+    Return the (n,) errors of each pose under a fit of the others, or None if they need it [g].
 
-    With H the hat matrix, this error is (I - H_ii)⁻¹ times the residual of the pose (PRESS, Allen
-    1974). The result is None if a pose alone determines a parameter.
+    With H the hat matrix, they are (I - H_ii)⁻¹ times the residuals (PRESS, Allen 1974).
 
     """
     data = fit.by_pose
@@ -359,28 +353,24 @@ def _check_gain(calibration: Calibration) -> None:
 
 def _check_effects(calibration: Calibration) -> None:
     """Refuse effects whose contribution to a pose of the calibration is not plausible."""
-    used = calibration.used_poses
+    used_g = in_g(calibration.used_poses, calibration.units)
     for name, values in calibration.model.values.items():
         model = Model({name: values})
         effect = model.terms.effects[0]
-        if name in LADDER or effect.output is not None or not len(used):
+        if name in LADDER or effect.output is not None or not len(used_g):
             continue
-        if any(key not in used for key in model.needs if key != 'previous'):
+        if any(key not in used_g for key in model.needs if key != 'previous'):
             continue
-        added = _contribution(model, used, calibration.units)
+        added = _contribution(model, used_g)
         if not added <= effect.plausible_g:
             raise RefusedFitError(f'{name} adds up to {added:.3g} g to a reading, expected less '
                                   f'than {effect.plausible_g:g} g', _CHECK_POSES)
 
 
-def _contribution(model: Model, used: Poses, units: Units) -> float:
+def _contribution(model: Model, poses_g: Poses) -> float:
     """Return the largest contribution of an effect at poses [g]."""
-    context = {**used.columns}
-    if 'std' in used:
-        context['std'] = units.to_g(used['std'])
-    context.setdefault('previous', unit(used.reading))
-    directions = unit(used.reading)
-    added = model.at(context).reading(directions) - directions
+    up = unit(poses_g.reading)
+    added = model.at({'previous': up, **poses_g.columns}).reading(up) - up
     return float(np.max(np.linalg.norm(added, axis=1)))
 
 

@@ -123,10 +123,6 @@ def _lagged_warming(key: str) -> Factor:
     return factor
 
 
-def _warming_rate(context: Mapping[str, Any], shape: Floats) -> Any:
-    return rate_at(context)
-
-
 def _motion(context: Mapping[str, Any], shape: Floats) -> Floats:
     """Return the unit vector towards the previous pose, or in form 1 its sign by axis."""
     towards: Floats = np.asarray(context['previous'], float).T
@@ -214,7 +210,7 @@ EFFECTS: dict[str, Effect] = {
         lagged='temperature_of_gain'),
     'temperature_rate': _in_time(
         'offset in proportion to the rate of the temperature', 'thermal gradient sensitivity',
-        AXES, 'g·s/°C', 0.02, terms=by_axis(ONE), factor=_warming_rate,
+        AXES, 'g·s/°C', 0.02, terms=by_axis(ONE), factor=lambda context, shape: rate_at(context),
         needs=('time', 'temperature'), over=('temperature_rate',)),
     'supply_ratio': Effect(
         'offset and gain in proportion to the supply', 'ratiometric output', ('gain', *AXES),

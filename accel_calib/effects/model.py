@@ -480,11 +480,10 @@ MODELS: dict[str, ModelForm] = {
 sensing axes (ESGI'95 report), model 10 makes W symmetric (AN5286)."""
 
 
-def with_linear_part(mat_w: Floats, vec_v: Floats) -> Model:
-    """Return the model with gain W (3, 3), offset V (3,) [g] and ΔR = I; skew W: misalignment."""
+def linear_model(name: str, mat_w: Floats, vec_v: Floats) -> Model:
+    """Return one of the models with gain W (3, 3), offset V (3,) [g] and ΔR = I."""
     values = linear_values(mat_w, vec_v)
-    turned = ('misalignment',) if np.any(values['misalignment']) else ()
-    return Model({name: values[name] for name in (*MODELS['10'].effects, *turned)})
+    return Model({effect: values[effect] for effect in MODELS[name].effects})
 
 
 def linear_values(mat_w: Floats, vec_v: Floats) -> dict[str, Floats]:

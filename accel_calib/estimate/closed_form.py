@@ -53,7 +53,7 @@ from math import comb
 import numpy as np
 
 from .equations import believable
-from ..effects import linear_values, Model, MODELS, parameter_names, with_linear_part, with_vector
+from ..effects import linear_model, Model, MODELS, parameter_names, with_vector
 from ..errors import RefusedFitError
 from ..table import Poses
 from ..text import counted
@@ -194,7 +194,7 @@ def along_quadrics(values: Floats, step: Floats) -> Floats:
             mat_w, vec_v = _stepped(values, step)
         except np.linalg.LinAlgError:
             return np.full(len(values), np.nan)
-    return with_linear_part((mat_w + mat_w.T) / 2.0, vec_v).vector[:len(values)]
+    return linear_model('10', (mat_w + mat_w.T) / 2.0, vec_v).vector
 
 
 def _stepped(values: Floats, step: Floats) -> tuple[Floats, Floats]:
@@ -255,8 +255,7 @@ def start_of(name: str, reading: Floats) -> Model:
     mat_w, vec_v = closed_form(name, reading)
     if not np.all(np.isfinite(mat_w)):
         mat_w, vec_v = closed_form('4', reading)
-    values = linear_values(mat_w, vec_v)
-    return Model({effect: values[effect] for effect in MODELS[name].effects})
+    return linear_model(name, mat_w, vec_v)
 
 
 def agreeing(name: str, poses_g: Poses, most: int) -> Indices:
@@ -330,15 +329,11 @@ def faces(reading: Floats) -> Floats | None:
 
 def _ties() -> Floats:
     """Return the (12, 9) matrix from offset and lower triangle of W to the values of the model."""
-    names = parameter_names(MODELS['9'].effects)
-    ties = np.zeros((len(names), 9))
-    for k in range(6):  # offset and axis_gain
-        ties[k, k] = 1.0
-    # An entry (i, j) below the diagonal is half cross-axis, half rotation.
-    for k, (pair, axis, sign) in enumerate((('xy', 'z', 1), ('xz', 'y', -1), ('yz', 'x', 1))):
-        ties[names.index(f'cross_axis.{pair}'), 6 + k] = 0.5
-        ties[names.index(f'misalignment.{axis}'), 6 + k] = 0.5 * sign
-    return ties
+    entries = np.zeros((6, 3, 3))
+    entries[range(6), (0, 1, 2, 1, 2, 2), (0, 1, 2, 0, 0, 1)] = 1.0
+    return np.column_stack([
+        *(linear_model('9', _IDENTITY, vec_v).vector for vec_v in _IDENTITY),
+        *(linear_model('9', _IDENTITY + entry, np.zeros(3)).vector for entry in entries)])
 
 
 TIES = _ties()
