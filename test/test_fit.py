@@ -4,7 +4,7 @@
 """From poses to a calibration: known sensors within the stated uncertainty, and outliers."""
 
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import astuple, replace
 from itertools import product
 
 import accel_calib as ac
@@ -65,10 +65,8 @@ def test_nine_parameters_are_ten_in_the_sensing_axes():
     poses = simulated(4, 20)[1]
     nine, ten = fit_poses(poses, G, model='9'), fit_poses(poses, G, model='10')
     np.testing.assert_allclose(nine.gain, lower_triangular(ten.gain), atol=1e-7)
-    axes, own = sensing_axes(ten.gain, ten.offset), sensing_axes(nine.gain, nine.offset)
-    np.testing.assert_allclose(own.scales, axes.scales, atol=1e-9)
-    np.testing.assert_allclose((own.phi, own.psi, own.theta), (axes.phi, axes.psi, axes.theta),
-                               atol=1e-9)
+    own, axes = (np.hstack(astuple(sensing_axes(fit.gain, fit.offset))) for fit in (nine, ten))
+    np.testing.assert_allclose(own, axes, atol=1e-9)
     assert np.linalg.matrix_rank(nine.covariance, tol=1e-14) == 9
 
 
@@ -115,10 +113,8 @@ def test_unknown_noise_is_estimated_from_the_residuals():
 
 def test_held_out_residual_is_that_of_a_fit_without_the_pose():
     poses = without(simulated(10, 16)[1], 'std')
-    errors = []
-    for k in range(16):
-        others = fit_poses(poses.take(np.delete(np.arange(16), k)), G, model='7')
-        errors.append(verify(others, poses.take(slice(k, k + 1))).rms_after_mg)
+    errors = [verify(fit_poses(poses.take(np.arange(16) != k), G, model='7'),
+                     poses.take(np.arange(16) == k)).rms_after_mg for k in range(16)]
     held_out = fit_poses(poses, G, model='7').quality.held_out_rms_mg
     assert held_out == pytest.approx(np.sqrt(np.mean(np.square(errors))), rel=0.02)
 

@@ -123,17 +123,6 @@ def test_shape_that_is_not_stated_has_its_usual_value(text, values):
     assert list(shown) == list(EFFECTS[name].values[:len(stated)])
 
 
-@pytest.mark.parametrize('of_sensor', [0.0, 1.0])
-def test_predict_and_correct_undo_each_other_with_a_lag(of_sensor, rng, context):
-    model = Model({'offset_temperature': np.array([1e-3, 2e-3, -1e-3, 150.0, of_sensor]),
-                   'gain_temperature': np.array([3e-4, -3e-4, 2e-4, 90.0, 1.0 - of_sensor])})
-    force = random_directions(40, rng)
-    reading = predict(model, force, context)
-    np.testing.assert_allclose(correct(model, reading, context), force, atol=1e-12)
-    plain = Model({name: values[:3] for name, values in model.values.items()})
-    assert np.max(np.abs(reading - predict(plain, force, context))) > 1e-3
-
-
 @pytest.mark.parametrize('text', ['offset', 'offset=', 'offset=1,2', 'offset=1,2,x',
                                   'offset=1,2,nan', 'tilt=1'])
 def test_effect_text_that_cannot_be_read_is_refused(text):

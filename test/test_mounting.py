@@ -6,6 +6,7 @@
 from accel_calib.calibrate import fit_poses, flat_direction, level
 from accel_calib.errors import InputError
 from accel_calib.finding import without
+from accel_calib.geometry import angle_of
 from accel_calib.units import FRAMES, units_of
 from inside import (
     axes_of, fault_of, MODELS, mounting, rotation_from_rpy, simulate_poses, spread_directions,
@@ -50,14 +51,12 @@ def test_a_pose_with_the_nose_down_fixes_the_heading(rpy, frame, nose_down):
 
 def test_levelling_again_keeps_the_heading():
     before = rotation_from_rpy(*np.radians((10.0, -20.0, 130.0)))
-    tilt = rotation_from_rpy(*np.radians((3.0, 2.0, 0.0)))
-    level = mounting(tilt @ before[:, 2])
-    found = with_heading_of(before, level)
+    level = mounting(rotation_from_rpy(*np.radians((3.0, 2.0, 0.0))) @ before[:, 2])
+    found, upright = with_heading_of(before, level), mounting(before[:, 0])
     np.testing.assert_allclose(found[:, 2], level[:, 2], atol=1e-12)
     assert np.linalg.det(found) == pytest.approx(1.0)
-    assert np.degrees(np.arccos(found[:, 0] @ before[:, 0])) < 4.0
-    np.testing.assert_array_equal(with_heading_of(before, mounting(before[:, 0])),
-                                  mounting(before[:, 0]))
+    assert angle_of(found.T @ before) < 4.0
+    np.testing.assert_array_equal(with_heading_of(before, upright), upright)
 
 
 def test_a_second_pose_near_the_first_and_a_flat_pose_without_gravity_are_refused():
