@@ -70,6 +70,12 @@ def rotation_from_quaternion(quaternion: Sequence[float]) -> Floats:
          [x * z - w * y, y * z + w * x, -x * x - y * y]])
 
 
+def angle_of(rotation: Floats) -> float:
+    """Return the angle of a rotation matrix [°], 0 to 180."""
+    cosine = (float(np.trace(rotation)) - 1.0) / 2.0
+    return math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))
+
+
 _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
 

@@ -89,9 +89,9 @@ def some(items: Iterable[object], most: int = 12) -> str:
     return ', '.join(words[:most]) + more
 
 
-def listed(noun: str, items: Sequence[object]) -> str:
-    """Return items with their noun, such as ``row 1`` or ``rows 1, 2``, at most 50."""
-    return f'{noun}{"" if len(items) == 1 else "s"} {some(items, 50)}'
+def listed(noun: str, items: Sequence[object], most: int = 50) -> str:
+    """Return the first items with their noun, such as ``row 1`` or ``rows 1, 2 and 3 more``."""
+    return f'{noun}{"" if len(items) == 1 else "s"} {some(items, most)}'
 
 
 def now() -> str:

@@ -31,7 +31,7 @@ os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')  # each process
 
 from accel_calib.calibrate import Calibration, fit_poses  # noqa: E402
 from accel_calib.capture import capture  # noqa: E402
-from accel_calib.effects.forward import path  # noqa: E402
+from accel_calib.effects.simulate import path  # noqa: E402
 from accel_calib.errors import AccelCalibError  # noqa: E402
 from accel_calib.table import Floats, numbered, Recording  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402

@@ -22,7 +22,8 @@ from accel_calib.calibrate import (
 from accel_calib.calibrate.mounting import (
     axes_of, doubts_about_flat, fault_of, mounting, with_heading, with_heading_of)
 from accel_calib.calibrate.partial import carried, common_sensors, typical_spread, without_knocked
-from accel_calib.calibrate.pose_planning import missing_poses, shape_words, unseen
+from accel_calib.calibrate.pose_planning import (
+    missing_poses, poses_needed, rows_of, shape_words, unseen)
 from accel_calib.capture import rounding_left
 from accel_calib.capture.chunks import Extremes
 from accel_calib.capture.trend import (
@@ -38,9 +39,8 @@ from accel_calib.compare.agreement import (
 from accel_calib.compare.drift import change, is_over, MEMORY as DRIFT_MEMORY
 from accel_calib.disk import check_regular, previous
 from accel_calib.effects import (
-    acting_temperature, correct, force_slope, Model, model_with, MODELS, parameter_basis,
-    parse_effect, predict, reading_of, sensor_force, simulate_poses, simulate_recording,
-    ThermalStream, with_linear_part, with_vector)
+    acting_temperature, correct, linear_model, Model, model_with, MODELS, parse_effect, predict,
+    reading_of, sensor_force, simulate_poses, simulate_recording, ThermalStream, with_vector)
 from accel_calib.effects.model import terms_of
 from accel_calib.effects.thermal import Lag, low_passed, rate_of
 from accel_calib.estimate import believable, kinds, originals, unseen_mistakes

@@ -9,7 +9,7 @@ from accel_calib.stored import read_calibration
 from inside import are_samples
 import numpy as np
 import pytest
-from shared import data, run, run_on_small_disk
+from shared import data, random_directions, run, run_on_small_disk
 
 OFFSET = (0.02, -0.01, 0.03)
 EFFECTS = ('--effect', 'offset=0.02,-0.01,0.03', '--effect', 'axis_gain=0.01,-0.02,0.005')
@@ -42,8 +42,7 @@ def test_a_recording_becomes_a_calibration_a_page_and_a_verdict(recording, tmp_p
     assert stored.is_levelled
     np.testing.assert_allclose(stored.apply(stored.poses.reading[0]), (0, 0, 9.80665), atol=0.05)
     np.testing.assert_allclose(stored.offset, result['offset'])
-    page = (tmp_path / 'c.html').read_text(encoding='utf-8')
-    assert 'GOOD' in page
+    assert 'GOOD' in (tmp_path / 'c.html').read_text(encoding='utf-8')
 
 
 def test_a_hidden_effect_is_added_unless_it_is_not_wanted(tmp_path, capsys):
@@ -62,9 +61,7 @@ def test_a_hidden_effect_is_added_unless_it_is_not_wanted(tmp_path, capsys):
 
 def bent(path, *, bend_mg):
     """Write poses of a sensor whose readings are far from an ellipsoid, without their noise."""
-    rng = np.random.default_rng(5)
-    up = rng.normal(size=(40, 3))
-    up /= np.linalg.norm(up, axis=1)[:, np.newaxis]
+    up = random_directions(40, np.random.default_rng(5))
     rough = np.sign(np.sin(9.0 * up[:, :1])) * bend_mg * 1e-3
     np.savetxt(path, 9.80665 * up * (1.0 + rough), delimiter=',', header='ax,ay,az', comments='')
     return path
@@ -75,19 +72,15 @@ def test_a_bad_calibration_is_not_stored_unless_asked_for(tmp_path, capsys):
     status, result, lines = calibrated(capsys, path, '-o', out, '--no-refine')
     assert (status, result['rating']) == (1, 'BAD')
     assert any(line.startswith('BAD ') for line in lines)
-    assert not out.exists()
-    assert out.with_suffix('.html').exists()
-    status, _, _ = calibrated(capsys, path, '-o', out, '--no-refine', '--keep-bad')
-    assert status == 1
+    assert (out.exists(), out.with_suffix('.html').exists()) == (False, True)
+    assert calibrated(capsys, path, '-o', out, '--no-refine', '--keep-bad')[0] == 1
     assert out.exists()
 
 
 def test_what_the_gate_refuses_is_never_stored(tmp_path, capsys):
     path, out = bent(tmp_path / 'poses.csv', bend_mg=150.0), tmp_path / 'c.yaml'
     status, result, _ = calibrated(capsys, path, '-o', out, '--keep-bad')
-    assert status == 2
-    assert set(result) == {'file', 'error', 'advice'}
-    assert not out.exists()
+    assert (status, {*result}, out.exists()) == (2, {'file', 'error', 'advice'}, False)
 
 
 @pytest.mark.parametrize(('flat', 'row'), [('last', 13), ('3', 2)])
@@ -108,30 +101,20 @@ def test_real_logs_become_good_calibrations_without_an_option(name, tmp_path, ca
 
 
 @pytest.mark.parametrize(('step', 'rows', 'count', 'samples'), [
-    (0.01, 20, False, True), (20.0, 60, False, False), (0.1, 60, True, False),
-    (10.0, 6000, False, True)])
+    (0.01, 20, {}, True), (20.0, 60, {}, False), (0.1, 60, {'count': np.ones(60)}, False),
+    (10.0, 6000, {}, True)])
 def test_samples_are_distinguished_from_poses(step, rows, count, samples):
-    columns = {'time': np.arange(rows) * step, 'reading': np.ones((rows, 3))}
-    if count:
-        columns['count'] = np.ones(rows)
+    columns = {'time': np.arange(rows) * step, 'reading': np.ones((rows, 3)), **count}
     assert are_samples(columns) == samples
 
 
-def test_a_page_that_does_not_fit_on_the_disk_is_a_line_beside_the_calibration(
-        recording, tmp_path):
+@pytest.mark.parametrize(('size_kb', 'status', 'left'), [(64, 0, ['c.yaml']), (4, 2, [])])
+def test_a_page_or_calibration_that_does_not_fit_on_the_disk_is_one_line(
+        size_kb, status, left, recording, tmp_path):
     disk = tmp_path / 'disk'
     done, copy = run_on_small_disk(
-        disk, 64, 'calibrate', recording, '-o', disk / 'c.yaml', '--no-refine')
-    assert (done.returncode, done.stderr) == (0, '')
-    assert 'No space left on device' in done.stdout
-    assert read_calibration(copy / 'c.yaml').name
-    assert [each.name for each in copy.iterdir()] == ['c.yaml']
-
-
-def test_a_calibration_that_does_not_fit_on_the_disk_leaves_nothing(recording, tmp_path):
-    disk = tmp_path / 'disk'
-    done, copy = run_on_small_disk(
-        disk, 4, 'calibrate', recording, '-o', disk / 'c.yaml', '--no-refine')
-    assert (done.returncode, done.stderr.count('\n')) == (2, 1)
-    assert 'No space left on device' in done.stderr
-    assert list(copy.iterdir()) == []
+        disk, size_kb, 'calibrate', recording, '-o', disk / 'c.yaml', '--no-refine')
+    assert (done.returncode, done.stderr.count('\n')) == (status, 1 if status else 0)
+    assert 'No space left on device' in (done.stderr if status else done.stdout)
+    assert [each.name for each in copy.iterdir()] == left
+    assert all(read_calibration(copy / name).name for name in left)

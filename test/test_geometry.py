@@ -4,14 +4,13 @@
 
 import re
 
-from accel_calib.calibrate import fit_poses, next_pose
+from accel_calib.calibrate import dilution, error_left_in, fit_poses, identifiability, next_pose
 from accel_calib.errors import RefusedFitError
-from accel_calib.estimate import dilution, error_left_in, identifiability, poses_needed, rows_of
 from accel_calib.table import Poses
 from accel_calib.units import units_of
 from inside import (
-    determines, missing_poses, model_with, predict, refuse_if_unfit, rotation_from_rpy,
-    simulate_poses, spread_directions, unit)
+    determines, missing_poses, model_with, poses_needed, predict, refuse_if_unfit,
+    rotation_from_rpy, rows_of, simulate_poses, spread_directions, unit)
 import numpy as np
 import pytest
 from shared import random_directions, sensor
@@ -28,23 +27,17 @@ def about(directions, count, degrees, rng):
     return unit(chosen + rng.normal(size=chosen.shape) * np.radians(degrees))
 
 
-def cone(degrees, rng, count=12):
-    z = rng.uniform(np.cos(np.radians(degrees)), 1.0, count)
-    angle = rng.uniform(0.0, 2.0 * np.pi, count)
-    radius = np.sqrt(1.0 - z ** 2)
-    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
+def cone(degrees, rng):
+    """Return 12 random directions around up."""
+    z, angle = rng.uniform((np.cos(np.radians(degrees)), 0.0), (1.0, 2.0 * np.pi), (12, 2)).T
+    return np.column_stack([np.sqrt(1.0 - z ** 2) * np.cos(angle),
+                            np.sqrt(1.0 - z ** 2) * np.sin(angle), z])
 
 
 def named(text):
-    """Return the direction that a text such as ``(+x -z)`` names."""
-    signs = dict.fromkeys('xyz', 0.0)
-    for sign, axis in re.findall(r'([+-])([xyz])', re.findall(r'\(([^)]*)\)', text)[-1]):
-        signs[axis] = float(f'{sign}1')
-    return unit(np.array([list(signs.values())]))[0]
-
-
-def all_named(text):
-    return np.array([named(part) for part in re.findall(r'\([+-xyz ]*\)', text)]).reshape(-1, 3)
+    """Return the directions that a text such as ``(+x -z)`` names, (n, 3)."""
+    return unit(np.array([[(f'+{axis}' in part) - float(f'-{axis}' in part) for axis in 'xyz']
+                          for part in re.findall(r'\([+-][+xyz -]*\)', text)]))
 
 
 @pytest.mark.parametrize('model', ['4', '7', '10', '12'])
@@ -101,17 +94,22 @@ def test_poses_are_refused_where_a_fit_would_be_wrong_and_only_there(draw, least
     assert least <= np.mean(refused) <= most
 
 
-@pytest.mark.parametrize('directions', [
-    np.repeat(FACES, 2, axis=0), FACES, FACES[:1], RING, RING @ rotation_from_rpy(1, 2, 3).T,
-    cone(45.0, np.random.default_rng(4)), np.repeat(spread_directions(5), 3, axis=0)])
+@pytest.mark.parametrize(('directions', 'message'), [
+    (np.repeat(FACES, 2, axis=0), 'have 6 directions'), (FACES[:1], '1 pose, expected'),
+    (FACES, '6 poses, expected at least 9 poses .* model 10'), (RING, 'lie in a plane'),
+    (RING @ rotation_from_rpy(1, 2, 3).T, 'lie in a plane'),
+    (cone(45.0, np.random.default_rng(4)), 'lie within'),
+    (np.repeat(FACES[:1], 12, axis=0), 'all have the same orientation'),
+    (np.repeat(spread_directions(5), 3, axis=0), 'have 5 directions')])
 @pytest.mark.parametrize('model', ['4', '7', '10'])
-def test_poses_that_a_refusal_asks_for_make_the_fit_possible(model, directions):
+def test_a_refusal_says_what_is_wrong_and_asks_for_poses_that_make_the_fit_possible(
+        model, directions, message):
     if determines(model, directions):
         assert refuse_if_unfit(model, directions) is None
         return
-    with pytest.raises(RefusedFitError) as refusal:
+    with pytest.raises(RefusedFitError, match=message if model == '10' else 'pose') as refusal:
         refuse_if_unfit(model, directions)
-    asked = all_named(refusal.value.advice)
+    asked = named(refusal.value.advice)
     assert len(asked) == len(missing_poses(model, directions))
     assert dilution(model, np.vstack([directions, asked])) <= 3.0
     one_less = np.vstack([directions, asked[:-1]])
@@ -135,28 +133,15 @@ def test_error_of_a_smaller_model_is_that_of_fits_to_common_sensors(smaller, dir
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(expected, rel=0.12)
 
 
-def test_next_pose_has_words_and_a_direction():
-    for count in range(12):
-        asked = next_pose(spread_directions(20)[:count])
-        assert asked.words.startswith('turn the sensor so that the ')
-        np.testing.assert_allclose(asked.direction, named(asked.words))
+def test_next_poses_have_words_and_are_far_fewer_than_random_poses():
     asked = next_pose(np.delete(FACES, 1, axis=0), '7')
     assert asked.words == 'turn the sensor so that the left side points up (+y)'
-
-
-def follow(count, model='10', noise=None):
-    """Return the suggested poses, at most so many."""
     directions = np.zeros((0, 3))
-    while len(directions) < count:
-        asked = next_pose(directions, model, None if noise is None else noise[:len(directions)])
-        if asked.direction is None:
-            break
+    while len(directions) < 12:
+        asked = next_pose(directions)
+        np.testing.assert_allclose([asked.direction], named(asked.words))
         directions = np.vstack([directions, asked.direction])
-    return directions
-
-
-def test_planned_poses_are_far_fewer_than_random_poses():
-    assert identifiability('10', follow(12)).mean_dilution < 0.95
+    assert identifiability('10', directions).mean_dilution < 0.95
     at_random = [identifiability('10', random_directions(12, np.random.default_rng(seed)))
                  .mean_dilution for seed in range(50)]
     assert np.median(at_random) > 1.4

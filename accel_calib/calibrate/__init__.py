@@ -7,41 +7,41 @@ From poses to a calibration.
 `fit` is the entry point, and `partial` that for few poses, with the typical values of sensors.
 `calibration` is the record. `quality` makes it, computes its figures, and has the gate, which
 rejects implausible results. `rest_noise` adds the figures of the gyro and of the samples.
-`mounting` computes the mounting and detects wiring faults. `pose_planning` explains what poses do
-not determine and plans the next pose. `context` compares samples with the range of a calibration.
-`thermal` is for a still board whose temperature changes.
+`mounting` computes the mounting and detects wiring faults. `pose_planning` computes what poses
+determine, and plans the next pose. `thermal` is for a still board whose temperature changes.
 
 """
 
 from .calibration import (
-    Calibration, check_sensor, converted, FLEET, PRIOR, Quality, Rejected, RejectedKind,
-    STORED_METHODS)
-from .context import (
-    of_samples, Outside, outside, SampleContext, thermal_stream, USES_LIMIT, with_history,
-    with_previous)
+    Calibration, check_sensor, converted, FLEET, of_samples, Outside, outside, PRIOR, Quality,
+    Rejected, RejectedKind, SampleContext, STORED_METHODS, thermal_stream, USES_LIMIT,
+    with_history, with_previous)
 from .fit import directions_of, fit_poses, fit_unknown, only_norm, sound_rows, sure_rows
 from .mounting import (
     angle_words, flat_direction, in_frame, level, level_by_rows, mounting_figures, mounting_of,
     mounting_words, on_topics, set_heading, with_given_mounting)
 from .partial import fit_partial, fit_with_fleet, FleetPrior, mounting_only, posterior
 from .pose_planning import (
-    determines, lies_in_cone, next_pose, NextPose, Outlook, outlook, refuse_if_unfit)
+    determines, dilution, directions_in, error_left_in, free_parameters, identifiability,
+    LARGEST_DILUTION, lies_in_cone, next_pose, NextPose, NORM_MODELS, Outlook, outlook,
+    refuse_if_unfit)
 from .quality import (
     deviations_g, errors_after, errors_before, fit_findings, gated, in_g, LARGEST_OFFSET_G,
     OF_A_FIT, quality_of, record_of, uncertainty_g, Verification, verify)
 from .rest_noise import gyro_bias_of, GyroBias, sample_noise_of, SampleNoise, with_rest_noise
 from .thermal import Curve, curve_of, thermal_alone, with_curve, without_curve
 
-__all__ = ['FLEET', 'LARGEST_OFFSET_G', 'OF_A_FIT', 'PRIOR', 'STORED_METHODS', 'USES_LIMIT',
-           'Calibration', 'Curve', 'FleetPrior', 'GyroBias', 'NextPose', 'Outlook', 'Outside',
-           'Quality', 'Rejected', 'RejectedKind', 'SampleContext', 'SampleNoise', 'Verification',
-           'angle_words', 'check_sensor', 'converted', 'curve_of', 'determines', 'deviations_g',
-           'directions_of', 'errors_after', 'errors_before', 'fit_findings', 'fit_partial',
-           'fit_poses', 'fit_unknown', 'fit_with_fleet', 'flat_direction', 'gated', 'gyro_bias_of',
-           'in_frame', 'in_g', 'level', 'level_by_rows', 'lies_in_cone', 'mounting_figures',
-           'mounting_of', 'mounting_only', 'mounting_words', 'next_pose', 'of_samples',
-           'on_topics', 'only_norm', 'outlook', 'outside', 'posterior', 'quality_of', 'record_of',
-           'refuse_if_unfit', 'sample_noise_of', 'set_heading', 'sound_rows', 'sure_rows',
-           'thermal_alone', 'thermal_stream', 'uncertainty_g', 'verify', 'with_curve',
-           'with_given_mounting', 'with_history', 'with_previous', 'with_rest_noise',
-           'without_curve']
+__all__ = ['FLEET', 'LARGEST_DILUTION', 'LARGEST_OFFSET_G', 'NORM_MODELS', 'OF_A_FIT', 'PRIOR',
+           'STORED_METHODS', 'USES_LIMIT', 'Calibration', 'Curve', 'FleetPrior', 'GyroBias',
+           'NextPose', 'Outlook', 'Outside', 'Quality', 'Rejected', 'RejectedKind',
+           'SampleContext', 'SampleNoise', 'Verification', 'angle_words', 'check_sensor',
+           'converted', 'curve_of', 'determines', 'deviations_g', 'dilution', 'directions_in',
+           'directions_of', 'error_left_in', 'errors_after', 'errors_before', 'fit_findings',
+           'fit_partial', 'fit_poses', 'fit_unknown', 'fit_with_fleet', 'flat_direction',
+           'free_parameters', 'gated', 'gyro_bias_of', 'identifiability', 'in_frame', 'in_g',
+           'level', 'level_by_rows', 'lies_in_cone', 'mounting_figures', 'mounting_of',
+           'mounting_only', 'mounting_words', 'next_pose', 'of_samples', 'on_topics', 'only_norm',
+           'outlook', 'outside', 'posterior', 'quality_of', 'record_of', 'refuse_if_unfit',
+           'sample_noise_of', 'set_heading', 'sound_rows', 'sure_rows', 'thermal_alone',
+           'thermal_stream', 'uncertainty_g', 'verify', 'with_curve', 'with_given_mounting',
+           'with_history', 'with_previous', 'with_rest_noise', 'without_curve']

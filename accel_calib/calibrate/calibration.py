@@ -1,28 +1,38 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The record of a calibration: a fitted model with its units, its sensor and its quality."""
+"""
+The record of a calibration, and the context in which it corrects readings.
+
+Effects are not extrapolated: beyond the range of the poses, the correction uses the limit of the
+range (`Calibration.ranges`), and `Outside` says how far beyond it was. A curve over the vibration
+has a range, too. A single sample does not show its vibration, so that the correction uses the
+lower limit. The order of the poses determines the previous pose of each, for `hysteresis`, and the
+rate of the temperature, for `temperature_rate` and lags.
+
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from html import escape
 from typing import Literal, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from .context import HELD, limited, of_samples, with_acting
 from .rest_noise import GyroBias, SampleNoise
 from ..effects import (
-    AXES, Context, correct, force_slope, Model, ModelForm, MODELS, parameter_names, predict)
+    acting_temperature, AXES, Context, correct, EMPIRICAL, empirical_parts, Model, ModelForm,
+    MODELS, parameter_names, predict, rate_at, ThermalStream, variable_of)
 from ..errors import InputError, StoredCalibrationError
 from ..finding import Finding
-from ..table import Floats, Poses, Record, Table
-from ..text import table, with_sd
-from ..units import FrameName, METHODS, UnitName, Units, units_of
+from ..geometry import unit
+from ..table import column_of, Floats, Poses, Record, Table
+from ..text import counted, table, with_sd
+from ..units import FrameName, METHODS, MG, UnitName, Units, units_of
 
 ORIENTED = '12'
 """The model of poses of known orientation."""
@@ -37,6 +47,23 @@ STORED_METHODS = (*METHODS, PRIOR, FLEET)
 """Methods of stored calibrations; the user selects one of `METHODS`."""
 
 _IN_READING_UNITS = ('reading', 'std', 'reference')
+
+_THERMAL = ('temperature_rate', 'temperature_of_offset', 'temperature_of_gain')
+"""Context that is computed from time and temperature."""
+
+_HELD = ('time', 'temperature', *_THERMAL, 'supply_voltage')
+"""Context that is limited to the range of the poses, as quantities are."""
+
+_MOVED = np.radians(3.0)
+"""Smallest change of direction of a move [rad]; less may be noise or settling."""
+
+USES_LIMIT = 'the correction uses the limit of the range'
+
+_QUANTITIES: dict[str, tuple[str, str, float]] = {
+    'time': ('time since the start of the calibration', 'h', 1.0 / 3600.0),
+    'temperature_rate': ('rate of temperature', '°C/min', 60.0),
+    'std': ('vibration', 'mg', MG)}
+"""Name, unit and factor of the quantities that are not shown as in `accel_calib.table`."""
 
 _Known = TypeVar('_Known', bound=Table)
 
@@ -153,13 +180,14 @@ class Calibration(Record):
         object.__setattr__(self, 'poses', replace(
             self.poses, units=self.units.name, sensor=self.sensor))
         size, stated = len(self.model.vector), self.model.stated
-        if self.covariance.shape == (np.sum(stated), np.sum(stated)) and not np.all(stated):
+        covariance = self.covariance.copy()
+        if covariance.shape == (np.sum(stated), np.sum(stated)):
             covariance = np.zeros((size, size))
             covariance[np.ix_(stated, stated)] = self.covariance
-            object.__setattr__(self, 'covariance', covariance)
-        if self.covariance.shape != (size, size):
-            raise ValueError(f'covariance has shape {self.covariance.shape}, expected '
-                             f'{(size, size)}')
+        if covariance.shape != (size, size):
+            raise ValueError(f'covariance has shape {covariance.shape}, expected {(size, size)}')
+        covariance.setflags(write=False)
+        object.__setattr__(self, 'covariance', covariance)
 
     def __repr__(self) -> str:
         about = [f'model {self.name}', f'{len(self.used_poses)} of {len(self.poses)} poses',
@@ -221,7 +249,7 @@ class Calibration(Record):
     @property
     def rotation(self) -> Floats:
         """ΔR, (3, 3): transforms from the levelled frame to the sensor frame."""
-        return self.model.rotation
+        return self.model.rotation.copy()
 
     @cached_property
     def is_levelled(self) -> bool:
@@ -270,13 +298,13 @@ class Calibration(Record):
         border = float(np.sqrt(own.per_g * other.units.per_g))
         return other if (length > border) is (other.units.per_g > border) else self
 
-    @cached_property
+    @property
     def offset_sd(self) -> Floats:
         """Return the standard deviation of V, (3,), in the unit of the readings."""
         rows = _linear_rows(self.model, np.zeros((1, 3)))[0]
         return self.units.from_g(_deviation(rows, self.covariance))
 
-    @cached_property
+    @property
     def gain_sd(self) -> Floats:
         """Return the standard deviation of W, (3, 3)."""
         rows = _linear_rows(self.model, np.vstack([np.zeros(3), np.eye(3)]))
@@ -284,19 +312,22 @@ class Calibration(Record):
         return np.column_stack(columns) * (self.units.per_g / self.force_per_g)
 
     @cached_property
+    def _is_used(self) -> NDArray[np.bool_]:
+        """(n,) mask of the poses that the fit uses."""
+        return ~np.isin(self.poses.row, [pose.row for pose in self.rejected])
+
+    @cached_property
     def used_poses(self) -> Poses:
         """Return the poses that the calibration was fitted to, in the unit of the readings."""
-        rejected = [pose.row for pose in self.rejected]
-        return self.poses.take(~np.isin(self.poses.row, rejected))
+        return self.poses.take(self._is_used)
 
     @cached_property
     def ranges(self) -> Mapping[str, tuple[float, float]]:
         """Range over the poses of what the effects depend on; of a lag, the acting temperature."""
-        known = with_acting(self.model, self.poses.columns)
-        used = ~np.isin(self.poses.row, [pose.row for pose in self.rejected])
+        known, used = _with_acting(self.model, self.poses.columns), self._is_used
         wanted = {*self.model.over, *({'temperature'} & {*self.model.needs})}
         return {key: (float(np.min(known[key][used])), float(np.max(known[key][used])))
-                for key in (*HELD, *self.poses.quantities)
+                for key in (*_HELD, *self.poses.quantities)
                 if key in wanted and key in known and np.any(used)}
 
     def typical_context(self, count: int) -> Context:
@@ -391,7 +422,7 @@ class Calibration(Record):
         model, known = self.model, self.held_context(context)
         u = force / self.force_per_g @ model.rotation.T
         basis = model.basis(u, known).full
-        moved = model.rotation.T @ np.linalg.solve(force_slope(model, u, known), basis)
+        moved = model.rotation.T @ np.linalg.solve(model.at(known).slope(u), basis)
         covariance: Floats = moved @ self.covariance @ np.swapaxes(moved, 1, 2)
         return covariance * self.force_per_g ** 2
 
@@ -399,8 +430,79 @@ class Calibration(Record):
         """Return a context limited to `ranges`."""
         if not context or not self.ranges:
             return context or {}
-        known = with_acting(self.model, context)
-        return {**known, **limited(known, self.ranges)}
+        known = _with_acting(self.model, context)
+        return {**known, **{key: np.clip(known[key], *limits)
+                            for key, limits in self.ranges.items() if key in known}}
+
+
+def of_samples(known: Context, count: int, model: Model,
+               stream: ThermalStream | None = None) -> Context:
+    """
+    Return the context of single samples that a model needs, ``count`` rows each.
+
+    A single sample does not show the vibration or the previous pose; both are zero, and so is a
+    rate that is NaN. A quantity that is not recorded has the value of no change. Lag and rate of
+    the temperature come from earlier samples, unless they are known already. A `stream` has the
+    temperature before these samples; they are added to it.
+
+    """
+    none = np.zeros((count, 3))
+    found = {**{key: np.full(count, value) for key, value in model.neutral.items()}, **known,
+             'std': none, 'previous': none,
+             'rate': np.nan_to_num(known['rate']) if 'rate' in known else none}
+    lacking = not all(key in known for key in model.over if key in _THERMAL)
+    stream = thermal_stream(model) if stream is None and lacking else stream
+    if stream is not None and 'time' in known and 'temperature' in known:
+        found.update(stream.add_all(known['time'], known['temperature']))
+    return found
+
+
+def thermal_stream(model: Model) -> ThermalStream | None:
+    """Return the lag and rate of the temperature that a model needs; None if it needs none."""
+    rate = 'temperature_rate' in model.over
+    return ThermalStream(model.lags, rate=rate) if model.lags or rate else None
+
+
+def _with_acting(model: Model, known: Context) -> Context:
+    """Return a context with rate and lag of the temperature, from its rows as history."""
+    wanted = [key for key in model.over if key in _THERMAL and key not in known]
+    if not wanted or 'time' not in known or 'temperature' not in known:
+        return known
+    known = {**known, 'temperature_rate': rate_at(known)}
+    return {**known, **{key: acting_temperature(known, key, *lag)
+                        for key, lag in model.lags.items()}}
+
+
+def with_history(poses_g: Poses, model: Model) -> Poses:
+    """
+    Return poses in g with the context that comes from the poses before and after.
+
+    That is ``temperature_rate`` and ``previous``, the unit vector towards the previous pose in
+    order of time, or of rows; columns of the table are kept. The last motion counts for all
+    successive poses of one orientation; before the first motion, ``previous`` is zero.
+
+    """
+    if 'time' in poses_g and 'temperature' in poses_g and 'temperature_rate' not in poses_g:
+        poses_g = poses_g.with_columns(temperature_rate=rate_at(poses_g.columns))
+    if 'previous' in poses_g:
+        return poses_g
+    mat_w, vec_v = model.linear_part
+    return with_previous(poses_g, unit((poses_g.reading - vec_v) @ np.linalg.inv(mat_w).T))
+
+
+def with_previous(poses_g: Poses, force: Floats) -> Poses:
+    """Return poses with the unit vector towards the previous pose, given (n, 3) unit forces."""
+    order = (np.argsort(poses_g['time'], kind='stable') if 'time' in poses_g
+             else np.arange(len(poses_g)))
+    previous = np.zeros_like(force)
+    towards, resting = np.zeros(3), order[0] if len(order) else 0
+    for here in order:
+        step = force[resting] - force[here]
+        length = float(np.linalg.norm(step))
+        if length > _MOVED:
+            towards, resting = step / length, here
+        previous[here] = towards
+    return poses_g.with_columns(previous=previous)
 
 
 def _conversion(before: UnitName, after: UnitName) -> float:
@@ -444,3 +546,109 @@ def _linear_rows(model: Model, u: Floats) -> Floats:
 def _deviation(rows: Floats, covariance: Floats) -> Floats:
     """Return the standard deviation of each of these (m, p) combinations of values."""
     return np.sqrt(np.maximum(np.einsum('ip,pq,iq->i', rows, covariance, rows), 0.0))
+
+
+@dataclass(frozen=True)
+class Outside:
+    """
+    A column of the context, compared with the range of a calibration.
+
+    `count` of all `samples` are outside of the range `low` to `high` of the poses. All samples
+    range from `least` to `most`.
+
+    """
+
+    key: str
+    count: int
+    samples: int
+    low: float
+    high: float
+    least: float
+    most: float
+
+    @property
+    def name(self) -> str:
+        """Return the quantity in words."""
+        return _QUANTITIES[self.key][0] if self.key in _QUANTITIES else (
+            self.key.replace('_', ' '))
+
+    def range_words(self, low: float, high: float) -> str:
+        """Return a range, or one value, with its unit; times count from the first pose."""
+        _, unit, factor = _QUANTITIES.get(self.key, ('', column_of(self.key).unit, 1.0))
+        start = self.low if self.key == 'time' else 0.0
+        first, last = (f'{(value - start) * factor:.4g}' for value in (low, high))
+        return f'{first if first == last else f"{first} to {last}"} {unit}'.rstrip()
+
+    @property
+    def words(self) -> str:
+        """Return what was found and what the range of the calibration is."""
+        return (f'{self.name} is {self.range_words(self.least, self.most)}, but the range of the '
+                f'calibration is {self.range_words(self.low, self.high)}')
+
+    @property
+    def line(self) -> str:
+        """Return a line about a recording."""
+        return (f'{self.count} of {counted(self.samples, "sample")} are outside of the range of '
+                f'the calibration: {self.words}; {USES_LIMIT}')
+
+
+def outside(calibration: Calibration, known: Context) -> dict[str, Outside]:
+    """Return the comparison of each column that has a range; ``count`` is 0 if all are inside."""
+    found = {}
+    for key, (low, high) in {**calibration.ranges, **_vibration_range(calibration)}.items():
+        values = _size(known[key]) if key in known else np.zeros(0)
+        values = values[np.isfinite(values)]
+        if len(values):
+            count = int(np.sum((values < low) | (values > high)))
+            found[key] = Outside(key, count, len(values), low, high, float(np.min(values)),
+                                 float(np.max(values)))
+    return found
+
+
+def _size(values: Floats) -> Floats:
+    """Return the values of a quantity; for vectors, the RMS over the axes."""
+    return np.sqrt(np.mean(values ** 2, axis=1)) if values.ndim > 1 else values
+
+
+def _vibration_range(calibration: Calibration) -> dict[str, tuple[float, float]]:
+    """Return the range of the empirical curves over the vibration, if there are any."""
+    ends = [values[-2:] for name, values in calibration.model.values.items()
+            if name.startswith(f'{EMPIRICAL}-') and empirical_parts(name)[1] == 'std']
+    if not ends:
+        return {}
+    return {'std': (float(np.max([low for low, _ in ends])),
+                    float(np.min([high for _, high in ends])))}
+
+
+class SampleContext:
+    """The context of the samples of a log, block by block, and what leaves its ranges."""
+
+    def __init__(self, calibration: Calibration) -> None:
+        self._calibration = calibration
+        self._thermal = thermal_stream(calibration.model)
+        self._compared: dict[str, Outside] = {}
+        self.lacking = ''
+
+    def of(self, known: Context, count: int) -> Context:
+        """Return the context of the next block as `of_samples` does."""
+        context = of_samples(known, count, self._calibration.model, self._thermal)
+        self.lacking = _lacking(self._calibration.model, known)
+        for key, block in outside(self._calibration, context).items():
+            before = self._compared.get(key)
+            self._compared[key] = block if before is None else replace(
+                block, count=before.count + block.count, samples=before.samples + block.samples,
+                least=min(before.least, block.least), most=max(before.most, block.most))
+        return context
+
+    @property
+    def left(self) -> list[Outside]:
+        """Return the quantities that have left the range of the calibration so far."""
+        return [each for each in self._compared.values() if each.count]
+
+
+def _lacking(model: Model, known: Iterable[str]) -> str:
+    """Return a line about the quantities that samples do not have; empty if they have all."""
+    lacking = [key for key in model.neutral if key not in known]
+    names = [name for name in model.effects if variable_of(name) in lacking]
+    return (f'the samples have no {" and ".join(lacking)}: {" and ".join(names)} '
+            f'{"is" if len(names) == 1 else "are"} not corrected') if lacking else ''

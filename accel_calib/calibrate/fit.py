@@ -33,17 +33,17 @@ import scipy
 
 from .calibration import Calibration, ORIENTED, Rejected
 from .mounting import wiring
-from .pose_planning import determines, refuse_if_unfit, unseen
-from .quality import finished, fit_findings, in_g, LARGEST_OFFSET_G, record_of, rival_findings
-from ..effects import (
-    force_slope, length_rows, Model, MODELS, parameter_basis, sensor_force, with_linear_part,
-    with_vector)
+from .pose_planning import (
+    determines, dilution, free_parameters, LARGEST_DILUTION, NORM_MODELS, poses_needed,
+    refuse_if_unfit, unseen, WEAK_DILUTION)
+from .quality import (
+    finished, fit_findings, in_g, LARGEST_OFFSET_G, record_of, rival_findings, rms_mg)
+from ..effects import length_rows, linear_model, Model, MODELS, sensor_force, with_vector
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import (
-    closed_form, covariance_with, dilution, estimate, faces, Fit, fit_12, fit_norm, fit_sphere,
-    free_parameters, judge, LARGEST_DILUTION, lower_triangular, NORM_MODELS, NotConvergedError,
-    originals, outliers, Point, pose_noise, poses_needed, rivals, solve, start_of, TIES,
-    WEAK_DILUTION)
+    closed_form, covariance_with, estimate, faces, Fit, fit_12, fit_norm, fit_sphere, judge,
+    lower_triangular, NotConvergedError, originals, outliers, Point, pose_noise, rivals, solve,
+    start_of, TIES)
 from ..finding import Finding
 from ..geometry import unit
 from ..table import check_units, Poses
@@ -157,12 +157,12 @@ def sound_rows(poses: Poses, units: Units) -> tuple[Poses, tuple[Rejected, ...]]
         scale = float(np.median(away)) * _NATIVE_SPREADS / _LARGEST_REST_G
         length = away
     wild = ~(length <= _LARGEST_REST_G * scale)
-    noisy = np.zeros(len(poses), bool)
-    if noise is not None and scale > 0.0:
-        noisy = ~(np.max(noise, axis=1) <= LARGEST_OFFSET_G * scale)
-    rejected = [Rejected(int(poses.row[k]), _why(poses, int(k), bool(wild[k])))
-                for k in np.flatnonzero(wild | noisy)]
-    return (poses.take(~(wild | noisy)), tuple(rejected)) if rejected else (poses, ())
+    largest = np.zeros(len(poses)) if noise is None else np.max(noise, axis=1)
+    bad = wild | ~(largest <= LARGEST_OFFSET_G * scale) & (scale > 0.0)
+    rejected = [Rejected(int(poses.row[k]), _why(reading[k]) if wild[k] else
+                         f'the uncertainty of the mean is {largest[k]:.3g}, so the sensor was not '
+                         'at rest') for k in np.flatnonzero(bad)]
+    return (poses.take(~bad), tuple(rejected)) if rejected else (poses, ())
 
 
 def sure_rows(poses: Poses) -> tuple[Poses, tuple[Rejected, ...]]:
@@ -175,20 +175,17 @@ def sure_rows(poses: Poses) -> tuple[Poses, tuple[Rejected, ...]]:
         for row in poses.row[doubtful])
 
 
-def _why(poses: Poses, index: int, wild: bool) -> str:
-    if wild:
-        reading = ', '.join(f'{value:.4g}' for value in poses.reading[index])
-        return f'the reading ({reading}) is not plausible for an accelerometer at rest'
-    noise = float(np.max(poses.noise[index])) if poses.noise is not None else np.nan
-    return f'the uncertainty of the mean is {noise:.3g}, so the sensor was not at rest'
+def _why(reading: Floats) -> str:
+    """Return why a reading is left out."""
+    shown = ', '.join(f'{value:.4g}' for value in reading)
+    return f'the reading ({shown}) is not plausible for an accelerometer at rest'
 
 
 def directions_of(poses: Poses, units: Units) -> Floats:
     """
     Return approximate directions of up before a fit, (n, 3) unit vectors in the sensor axes.
 
-    They start from the centre of the readings if the poses determine it. Native readings always
-    start from the centre of their sphere.
+    They start from the centre of the readings if the poses determine it, or the unit is native.
 
     """
     raw = unit(poses.reading)
@@ -292,9 +289,7 @@ def _in_own_axes(name: str, fit: Fit, poses_g: Poses) -> Fit:
 def _in_sensing_axes(linear_part: tuple[Floats, Floats], poses_g: Poses) -> Fit:
     """Return model 9 at these poses, from W in any axes, and V."""
     mat_w, vec_v = linear_part
-    turned = with_linear_part(lower_triangular(mat_w), vec_v).values
-    model = Model({name: turned.get(name, np.zeros(3)) for name in MODELS['9'].effects})
-    return judge(model, poses_g, TIES)
+    return judge(linear_model('9', lower_triangular(mat_w), vec_v), poses_g, TIES)
 
 
 def _fit_rows(poses_g: Poses, name: str, method: Method) -> Fit:
@@ -319,8 +314,7 @@ def _of_the_report(mat_w: Floats, vec_v: Floats, poses_g: Poses) -> tuple[Floats
         rows = length_rows(model, u, {})
         return Point(np.linalg.norm(u, axis=1) - 1.0, model.basis(u, {}).along(rows))
 
-    values = with_linear_part(mat_w, vec_v).values
-    start = np.concatenate([values[name] for name in effects])
+    start = linear_model('10', mat_w, vec_v).vector
     free = np.full(len(start), np.inf)
     found, _ = solve(point_at, start, -free, free)
     return with_vector(effects, found).linear_part
@@ -332,7 +326,9 @@ def _choose(fits: Mapping[str, Fit]) -> tuple[str, str]:
     reasons: list[str] = []
     for name in larger:
         chance = _by_chance(fits[chosen], fits[name])
-        change = f'{_rms_mg(fits[chosen]):.3g} to {_rms_mg(fits[name]):.3g} mg'
+        before, after = (rms_mg(fit.equations.of_poses(fit.residual))
+                         for fit in (fits[chosen], fits[name]))
+        change = f'{before:.3g} to {after:.3g} mg'
         if chance < _LEVEL_OF_MODELS:
             reasons.append(f'model {name} reduces the residual of model {chosen} from {change} '
                            f'(by chance: p = {chance:.1g})')
@@ -343,18 +339,11 @@ def _choose(fits: Mapping[str, Fit]) -> tuple[str, str]:
     return chosen, '; '.join(reasons) or f'the poses determine only model {chosen}'
 
 
-def _rms_mg(fit: Fit) -> float:
-    return float(np.sqrt(np.mean(fit.equations.of_poses(fit.residual) ** 2))) * MG
-
-
 def _by_chance(small: Fit, large: Fit) -> float:
     """Return the probability that noise alone explains the improvement by the larger model."""
-    if large.variance_dof <= 0:
-        return 1.0
     added = small.dof - large.dof
     gained = max(small.chi2 - large.chi2, 0.0) / added
-    ratio = gained / max(large.variance, 1e-300)
-    return float(scipy.special.fdtrc(added, large.variance_dof, ratio))
+    return float(scipy.special.fdtrc(added, large.variance_dof, gained / large.variance))
 
 
 def rejected_by(model: Model, poses_g: Poses) -> tuple[Rejected, ...]:
@@ -477,7 +466,7 @@ def _rotation_onto(directions: Floats, known: Floats) -> Floats:
 
 def _tangential_variance(fit: Fit, covariance: Floats, u: Floats) -> Floats:
     """Return the (n,) variance across the force u from noise and uncertainty of the fit [g²]."""
-    moved = np.linalg.solve(force_slope(fit.model, u, {}), parameter_basis(fit.model, u, {}))
+    moved = np.linalg.solve(fit.model.at({}).slope(u), fit.model.basis(u, {}).full)
     spread = moved @ covariance @ np.swapaxes(moved, 1, 2)
     along = np.einsum('ni,nij,nj->n', unit(u), spread, unit(u))
     own = 2.0 * fit.equations.scale ** 2 * fit.variance

@@ -20,16 +20,16 @@ frame      axes                                   flat reading  third column of 
 `ned` and `win8` are conventions of gravity. Messages are specific force, so that `on_topics` turns
 ΔR into another frame for them.
 
-One flat pose does not determine the heading. The heading is zero by the convention of the angles
-of each frame. For `ros`, `ned` and `android` the sensor is rolled and pitched but not yawed,
+One flat pose determines only the direction of up: an upside-down sensor and a wrong sign have the
+same reading. The heading is zero by the convention of the angles of each frame. For `ros`, `ned`
+and `android` the sensor is rolled and pitched but not yawed,
 
     x column = (√(y²+z²), -xy/√(y²+z²), -xz/√(y²+z²)) / |G|
 
 which is singular if x is vertical (90° pitch). For `win8` the x column is in the x-z plane of the
-sensor, which is singular if y is vertical (90° roll). At these singularities the limit of a level
-y axis, or a level x axis, is used. A second pose, with the nose of the robot tilted straight down,
-determines the heading (TRIAD, Black 1964). One flat pose determines only the direction of up: an
-upside-down sensor and a wrong sign have the same reading.
+sensor, which is singular if y is vertical (90° roll). There the limit of a level y axis, or a
+level x axis, is used. A second pose, with the nose of the robot tilted straight down, determines
+the heading (TRIAD, Black 1964).
 
 **Wiring.** |force| = 1 g does not reveal a wrong sign, swapped axes or a rotated sensor, because
 the sphere of poses is the same. Known orientations reveal them. A least squares fit
@@ -51,14 +51,13 @@ from typing import Any
 import numpy as np
 import scipy
 
-from .calibration import Calibration
-from .context import with_history
+from .calibration import Calibration, with_history
 from .quality import in_g
 from ..effects import AXES, Context, Model, sensor_force
 from ..errors import InputError, RefusedFitError
 from ..estimate import fit_12
 from ..finding import Finding, Level, without
-from ..geometry import quaternion_of, rotation_from_rpy, rpy_of
+from ..geometry import angle_of, quaternion_of, rotation_from_rpy, rpy_of
 from ..table import Floats, Poses
 from ..units import FrameName
 
@@ -66,8 +65,8 @@ _NOSE_DOWN = {'ros': np.array([-1.0, 0.0, 0.0]), 'ned': np.array([1.0, 0.0, 0.0]
               'android': np.array([0.0, -1.0, 0.0]), 'win8': np.array([0.0, 1.0, 0.0])}
 """Reading of a sensor whose nose points straight down, for each frame [g]."""
 
-_ON_ITS_SIDE = 45.0
-"""Angle between a flat pose and the expected axis above which there is a warning [°]."""
+_UPRIGHT = np.cos(np.radians(45.0))
+"""Beyond 45° between a flat pose and the expected axis there is a warning."""
 
 _SAME_TILT = np.cos(np.radians(10.0))
 
@@ -132,9 +131,8 @@ def with_heading(rotation: Floats, nose_down: Floats, frame: str = 'ros') -> Flo
     """
     Return a levelled ΔR with the heading from a pose with the nose of the robot down.
 
-    It matches the flat pose exactly, and the second pose in heading. In that pose the nose (front
-    of the robot, top of a screen) is tilted straight down by 10° to 170°. `nose_down` is its (3,)
-    calibrated reading in the axes of the sensor, of any length.
+    In that pose the nose (front of the robot, top of a screen) is tilted straight down by 10° to
+    170°. `nose_down` is its (3,) calibrated reading in the axes of the sensor, of any length.
 
     """
     flat = flat_direction(frame)
@@ -168,8 +166,7 @@ def in_frame(calibration: Calibration, frame: FrameName) -> Calibration:
     """
     Return a calibration with the same mounting in another frame.
 
-    A heading that is known stays; one that follows from the convention of the frame follows from
-    that of the other frame.
+    A heading that follows from the convention of the frame then follows from that of the other.
 
     """
     before, rotation = calibration.frame, calibration.rotation
@@ -211,8 +208,8 @@ def mounting_figures(rotation: Floats, sensor: str, base: str = '') -> dict[str,
     Return a mounting as numbers and as the lines for the URDF and for TF.
 
     The numbers are ``roll``, ``pitch`` and ``yaw`` [rad] of the sensor in the levelled frame, and
-    ``quaternion`` (x, y, z, w). The lines are ``urdf`` and ``static_transform_publisher``, for the
-    frame_id `sensor` (if empty ``imu_link``) and the frame `base` (if empty ``base_link``).
+    ``quaternion`` (x, y, z, w). The lines are for the frame_id `sensor` (if empty ``imu_link``)
+    and the frame `base` (if empty ``base_link``).
 
     """
     roll, pitch, yaw = (round(angle, _DIGITS) + 0.0 for angle in rpy_of(rotation.T))
@@ -250,16 +247,11 @@ def heading_is_arbitrary(rotation: Floats, frame: str) -> bool:
 def level_by_rows(calibration: Calibration, poses: Poses, frame: FrameName, flat: int | None,
                   nose_down: int | None) -> Calibration:
     """
-    Return a calibration with the mounting from rows of a pose table in its unit.
+    Return a calibration with the mounting from rows of a pose table in its unit, 1-based.
 
-    Row `flat` is a pose with the robot level. Row `nose_down` is a pose with the nose of the robot
-    tilted straight down, and determines the heading. Both are 1-based.
-
-    Raises
-    ------
-    InputError
-        If a row does not exist, `nose_down` is set without `flat`, or the nose is tilted down by
-        less than 10°.
+    In row `flat` the robot is level. In row `nose_down` its nose is tilted straight down, which
+    determines the heading. Raise InputError if a row does not exist, `nose_down` is set without
+    `flat`, or the nose is tilted down by less than 10°.
 
     """
     if flat is None:
@@ -288,16 +280,8 @@ def level(calibration: Calibration, reading: Floats, frame: FrameName,
     """
     Return a calibration with ΔR of one flat pose, and a finding if the wiring may be wrong.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration, with any ΔR. The heading of an existing mounting is kept.
-    reading : (3,) array
-        Mean reading of the flat pose, in the unit of the readings.
-    frame : {'ros', 'ned', 'android', 'win8'}
-        The levelled frame.
-    context : mapping of str to array, optional
-        Columns that the effects need, one row.
+    `reading` (3,) is the mean of the flat pose, in the unit of the readings, and `context` has one
+    row of the columns that the effects need. The heading of an existing mounting is kept.
 
     """
     rotation = mounting(_in_sensor_axes(calibration, reading, context), frame)
@@ -319,17 +303,12 @@ def set_heading(calibration: Calibration, reading: Floats, context: Context | No
     """
     Return a levelled calibration with the heading from one pose with the nose of the robot down.
 
-    Parameters as in `level`.
-
-    Raises
-    ------
-    InputError
-        If the nose is tilted down by less than 10°.
+    Parameters as in `level`. Raise InputError if the nose is tilted down by less than 10°.
 
     """
     nose_down = _in_sensor_axes(calibration, reading, context)
-    rotation = with_heading(calibration.rotation, nose_down, calibration.frame)
-    return with_mounting(calibration, rotation)
+    return with_mounting(calibration, with_heading(calibration.rotation, nose_down,
+                                                   calibration.frame))
 
 
 def with_mounting(calibration: Calibration, rotation: Floats, *known: str) -> Calibration:
@@ -343,8 +322,7 @@ def with_given_mounting(calibration: Calibration, rotation: Floats) -> Calibrati
     """
     Return a calibration with a mounting that is known from elsewhere, such as a URDF.
 
-    A calibration that is levelled to within 10° of the given ΔR keeps its tilt, which a flat pose
-    measured, and takes only the heading.
+    Levelled to within 10° of it, it keeps its tilt, which a flat pose measured.
 
     """
     if calibration.is_levelled and calibration.rotation[:, 2] @ rotation[:, 2] > _SAME_TILT:
@@ -362,8 +340,7 @@ def doubts_about_flat(rotation: Floats, frame: str) -> Iterator[Finding]:
     """Yield a finding if the ΔR of a flat pose indicates a wiring fault."""
     expected = flat_direction(frame)
     force = rotation @ expected
-    off = np.degrees(np.arccos(np.clip(force @ expected, -1.0, 1.0)))
-    if off <= _ON_ITS_SIDE:
+    if force @ expected >= _UPRIGHT:
         return
     face = int(np.argmax(np.abs(force)))
     seen = f'{"-" if force[face] < 0.0 else "+"}{AXES[face]}'
@@ -385,8 +362,7 @@ def wiring(calibration: Calibration) -> Iterator[Finding]:
     if 'reference' not in poses:
         return
     mat_q = axes_of(poses.reading, poses['reference'])
-    found = None if mat_q is None else fault_of(mat_q)
-    if mat_q is None or found is None:
+    if mat_q is None or (found := fault_of(mat_q)) is None:
         return
     level: Level = 'USABLE'
     mirrored = np.linalg.det(mat_q) < 0.0
@@ -406,10 +382,9 @@ def wiring(calibration: Calibration) -> Iterator[Finding]:
 
 def axes_of(reading: Floats, reference: Floats) -> Floats | None:
     """
-    Return the orientation of the axes of the readings relative to those of the known forces.
+    Return the orthogonal (3, 3) matrix from known forces to the axes of the readings.
 
-    It is the orthogonal (3, 3) matrix from the (n, 3) known forces to the axes of the (n, 3)
-    readings, both in any units, with determinant ±1. It is None if the forces do not determine it.
+    Both are (n, 3), in any units. The determinant is ±1. None if the forces do not determine it.
 
     """
     scales = np.linalg.svd(reference - reference.mean(axis=0), compute_uv=False)
@@ -419,16 +394,15 @@ def axes_of(reading: Floats, reference: Floats) -> Floats | None:
         left, _, right = np.linalg.svd(fit_12(reading, reference)[0])
     except RefusedFitError:
         return None
-    mat_q: Floats = left @ right
-    return mat_q
+    return left @ right
 
 
 def fault_of(mat_q: Floats) -> str | None:
     """Return the wiring fault of a matrix as from `axes_of`; None if there is none."""
-    if _angle(mat_q) <= _NEAR:
+    if angle_of(mat_q) <= _NEAR:  # the angle of a mirror image is 90° or more
         return None
     nearest = max(_PERMUTATIONS, key=lambda one: float(np.sum(one * mat_q)))
-    if _angle(mat_q @ nearest.T) <= _NEAR:
+    if angle_of(mat_q @ nearest.T) <= _NEAR:
         return _words(nearest)
     if np.linalg.det(mat_q) > 0.0:
         return f'the sensor is rotated by {_turn(mat_q.T)}'
@@ -440,13 +414,6 @@ _PERMUTATIONS: list[Floats] = [
     np.diag(signs) @ np.eye(3)[list(order)]
     for order in permutations(range(3)) for signs in product((1.0, -1.0), repeat=3)]
 """The 48 signed permutations of the axes, including mirror images."""
-
-
-def _angle(mat_q: Floats) -> float:
-    """Return the angle of a rotation [°]; 180 for a mirror image."""
-    if np.linalg.det(mat_q) < 0.0:
-        return 180.0
-    return float(np.degrees(np.arccos(np.clip((np.trace(mat_q) - 1.0) / 2.0, -1.0, 1.0))))
 
 
 def _words(permutation: Floats) -> str:

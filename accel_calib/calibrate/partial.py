@@ -5,13 +5,10 @@
 Calibrations from few poses, with the typical values of sensors.
 
 A robot with wheels tilts by 10° or 20°. Its poses do not determine offset and gain, and a fit is
-refused. Three results are still possible:
-
-- `mounting_only`: no values at all. The calibration carries the mounting ΔR after `level`.
-- `fit_partial`: the values of model 10 that are most probable for a common sensor with these
-  readings (maximum a posteriori).
-- `fit_with_fleet`: the same, for a sensor of a fleet whose values are known. Poses are left out as
-  knocked only if the poses determine the values without the fleet.
+refused. Still possible are `mounting_only`, without values; `fit_partial`, with the values of
+model 10 that are most probable for a common sensor with these readings (maximum a posteriori); and
+`fit_with_fleet`, for a sensor of a fleet whose values are known. There, poses are left out as
+knocked only if the poses determine the values without the fleet.
 
 **Common sensors.** Before any pose, each value of model 10 is normally distributed about zero with
 the typical size of its effect (`accel_calib.effects`). The poses reduce this uncertainty only in
@@ -169,8 +166,7 @@ class PriorFit:
     The fit with the most probable variance factor to the poses kept.
 
     `kept` are their indices, without copies, and `original` has, for each pose, the index of the
-    first equal one. The logarithm of the evidence includes the probability of the prior.
-    `is_unlike` is for a prior of sensors unlike the fleet.
+    first equal one. The evidence includes the probability of the prior.
 
     """
 
@@ -187,8 +183,8 @@ def most_probable(poses_g: Poses, priors: Sequence[Candidate], noise_g: float, s
     """
     Return the fit with the most probable prior, without knocked poses.
 
-    The noise that is tried is at most `noise_g` [g], and knocked poses are at most a `share` of
-    all. NotConvergedError is raised if the readings contradict every prior.
+    The noise is at most `noise_g` [g], and knocked poses are at most a `share` of all. Raise
+    NotConvergedError if the readings contradict every prior.
 
     """
     found, original = [], originals(poses_g)
@@ -275,17 +271,9 @@ def posterior(values: Floats, covariance: Floats, fleet: FleetPrior
     """
     Return fitted values and their covariance with the typical values of a fleet included.
 
-    The covariance of the fleet or of common sensors is chosen that makes the values most probable.
-    There is a finding if the sensor is unlike the fleet.
-
-    Parameters
-    ----------
-    values : (p,) array
-        Values of a fit; those of model 10 come first [g].
-    covariance : (p, p) array
-        Their covariance, without a prior.
-    fleet : FleetPrior
-        Typical values of sensors of the same model.
+    The values (p,) and their covariance (p, p) are those of a fit without a prior [g], with model
+    10 first. The prior that makes them most probable is used. There is a finding if it is for
+    sensors unlike the fleet.
 
     """
     count = len(fleet.prior.mean)
@@ -311,15 +299,8 @@ def mounting_only(poses: Poses, units: Units, *, sensor: str = '', date: str = '
     """
     Return a calibration named ``ideal``, without effects and with ΔR = I, to be levelled.
 
-    `level` adds the mounting. A warning states the error that is left in a common sensor.
-    Parameters as in `fit_partial`.
-
-    Raises
-    ------
-    InputError
-        If the readings are in native units, or clearly in another unit.
-    RefusedFitError
-        If no row is a plausible reading at rest.
+    `level` adds the mounting. A finding states the error that is left in a common sensor.
+    Parameters and errors as in `fit_partial`.
 
     """
     sound, rejected = usable(poses, units, 'a mounting')
@@ -341,11 +322,10 @@ def fit_partial(poses: Poses, units: Units, *, sensor: str = '', date: str = '')
     """
     Fit model 10 to poses near one direction, with the spread of common sensors as the prior.
 
-    Use this function if a fit is refused and `lies_in_cone` is true for the directions. If the
-    sensor can be turned, a fit with more poses is better. Only |force| = 1 g is used, even if the
-    orientations are known. The calibration has ΔR = I and the method `PRIOR`. Its covariance
-    includes the prior. The reason states what the poses determine, and a finding what they leave
-    open.
+    It is for directions that `lies_in_cone`, for which a fit is refused. Only |force| = 1 g is
+    used, even if the orientations are known. The calibration has ΔR = I and the method `PRIOR`.
+    Its covariance includes the prior. The reason states what the poses determine, and a finding
+    what they leave open.
 
     Parameters
     ----------
@@ -381,17 +361,10 @@ def fit_partial(poses: Poses, units: Units, *, sensor: str = '', date: str = '')
 def fit_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, *, sensor: str = '',
                    date: str = '') -> Calibration:
     """
-    Fit model 10 with the typical values of a fleet as the prior.
+    Fit model 10 with the typical values of a fleet as the prior, and the method `FLEET`.
 
-    Only |force| = 1 g is used, even if the orientations are known. The calibration has ΔR = I and
-    the method `FLEET`. Its covariance includes the prior. Parameters as in `fit_partial`.
-
-    Raises
-    ------
-    InputError
-        If the readings are in native units, or clearly in another unit.
-    RefusedFitError
-        If no row is a plausible reading at rest, or the uncertainty is too large.
+    The rest is as in `fit_partial`. RefusedFitError is also raised if the uncertainty is too
+    large.
 
     """
     sound, rejected = usable(poses, units, 'a fit with a fleet')
@@ -492,9 +465,8 @@ def carried(calibration: Calibration) -> Carried:
     axis = cone.axis[np.newaxis]
     moved = np.linalg.solve(model.linear_part[0], model.basis(axis, {}).full[0])
     deviation = np.sqrt(np.diag(covariance))
-    place = {name: [own.startswith(f'{name}.') for own in calibration.parameters]
-             for name in MODELS[NAME].effects}
-    offset = covariance[np.ix_(place['offset'], place['offset'])]
+    place = dict(zip(model.effects, model.terms.parts, strict=True))
+    offset = covariance[place['offset'], place['offset']]
     return Carried(
         len(up), cone, float(deviations_g(calibration, axis)[0]),
         float(np.max(deviations_g(calibration, up))), uncertainty_g(calibration),

@@ -2,43 +2,87 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Which pose to take next, and when more poses no longer help.
+What the directions of poses determine of a model, which pose to take next, and when to stop.
 
-The next pose is one of the 26 orientations that a person can set by eye: the 6 faces, 12 edges and
-8 corners of the sensor. It is the orientation that increases det M most (D-optimal design, Fedorov
-1972). M is the information of the poses so far (see `accel_calib.estimate.geometry`) plus that of
-one pose spread over the whole sphere, which represents the poses to come. Without this term the
-first poses would be chosen as if they were the last. `benchmarks/next_pose.py` compares this order
-with others.
+**Information.** A pose with force u depends on the values of a model through the rows Φ(u). For a
+pose of unknown orientation this is the one row û · basis(u) (see `accel_calib.estimate.equations`,
+with A near I). For a pose of known orientation these are the three rows basis(u). With s_i the
+noise of a pose relative to that of the median pose, the information of the poses is
+
+    M = Σ Φ_iᵀ Φ_i / s_i²
+
+The standard deviation of the corrected |force| (known orientation: of the force) in a direction d,
+relative to the noise of a pose, is
+
+    √(Φ(d) M⁻¹ Φ(d)ᵀ)
+
+The largest value over the sphere is the dilution. It is about 1 for 12 poses that are spread
+evenly. The singular vectors of the rows are combinations of parameters, ordered by how well the
+poses determine them. The combinations that raise the dilution above the limit for a fit are not
+determined. They are described by as few parameters as possible.
+
+Poses that do not determine a model are refused. The error contains the reason, the undetermined
+parameters, the poses to add, and the largest of the smaller models that the poses determine.
+
+**Next pose.** It is one of the 26 orientations that a person can set by eye: the 6 faces, 12 edges
+and 8 corners of the sensor. It is the orientation that increases the determinant of M plus the
+information of one pose spread over the whole sphere most (D-optimal design, Fedorov 1972). The
+latter represents the poses to come; without it the first poses would be chosen as if they were the
+last. `benchmarks/next_pose.py` compares this order with others.
 
 With n well spread poses, the error of |force| is the noise of a pose times √(p / n), RMS over the
 sphere. Another pose reduces it by the factor 1 / 2n. More poses no longer help if the next pose
 reduces the error by less than `_LEAST_GAIN` and the dilution is below `_GOOD_DILUTION`.
 
-Poses that do not determine a model are refused. The error contains the reason, the undetermined
-parameters, the poses to add, and the largest of the smaller models that the poses determine.
-
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import numpy as np
+import scipy
 
 from .calibration import Calibration, ORIENTED, PRIOR
+from ..effects import EFFECTS, Model, MODELS, parameter_names, with_vector
 from ..errors import RefusedFitError
-from ..estimate import (
-    Combination, dilution, error_left_in, Identifiability, identifiability, information_of,
-    LARGEST_DILUTION, largest_error, left_out, NORM_MODELS, pose_noise, poses_needed, rows_of,
-    WEAK_DILUTION)
+from ..estimate import pose_noise
 from ..finding import Finding
-from ..geometry import ATTITUDES, axes_of_signs, cone_of, distinct, OVER_THE_SPHERE, words_of
-from ..table import Floats
+from ..geometry import ATTITUDES, axes_of_signs, cone_of, distinct, OVER_THE_SPHERE, unit, words_of
+from ..table import Floats, Poses
 from ..text import counted
 from ..units import MG
+
+LARGEST_DILUTION = 25.0
+"""
+Above this dilution a fit is refused.
+
+The dilution is 400 for 12 poses in a 45° cone, 100 for poses in five directions with a spread of
+2°, and 25 for the worst 1 % of 12 poses in random directions. With a noise of 0.3 mg per pose, 25
+corresponds to an error of 8 mg in some direction. All fits that are wrong by 10 mg over the whole
+sphere have a larger dilution; with a limit of 40, some of them would pass
+(`benchmarks/geometry.py`).
+
+"""
+
+WEAK_DILUTION = 10.0
+"""Above this dilution a fit warns: the error of |force| is up to ten times that of a pose."""
+
+NORM_MODELS = tuple(name for name, form in MODELS.items() if form.norm == name and form.gains)
+"""Models for poses of unknown orientation; the smallest model is first."""
+
+_SINGULAR, _NOTHING = 1e-6, 1e-14
+
+_OPEN_PART = 0.1
+"""Part of a parameter in the open combinations above which it is not determined."""
+
+_MAIN_PART = 0.3
+"""Weights above this part of the largest weight are included in the words."""
+
+_SMALL = 1e-3
+"""Weights below this are omitted from a combination."""
 
 _LEAST_GAIN = 0.03
 """Smallest useful reduction of the error by a pose; 17 well spread poses reach it."""
@@ -52,6 +96,219 @@ _SPARE = 3
 _TAKEN = np.cos(np.radians(17.0))
 """An orientation within 17° of a pose counts as taken; its neighbours are 35° away."""
 
+_CONE = 30.0
+"""
+Largest angle between poses and their mean direction of a robot that cannot be turned over [°].
+
+Robots with wheels or tracks tilt by 10° to 25°. No number of poses within 30° determines model 10:
+the dilution is above 300 for 60 poses. Poses further apart, such as those in a ring, in a plane or
+at right angles, come from a sensor that can be turned.
+
+"""
+
+_WIDE = 75.0
+"""Angle above which poses are no longer described as near one direction [°]."""
+
+_MOST_NAMED = 3
+"""Largest number of undetermined combinations in a message."""
+
+
+def effects_of(name: str) -> tuple[str, ...]:
+    """Return the effects of a model; model 9 is model 10 in other axes."""
+    form = MODELS[name]
+    return MODELS[form.norm].effects if form.sensing_axes else form.effects
+
+
+def free_parameters(name: str) -> int:
+    """Return the number of free parameters of a model: 4, 6 (g is known), 9, 9 or 12."""
+    return len(parameter_names(effects_of(name)))
+
+
+def poses_needed(name: str) -> int:
+    """Return the smallest number of poses that can determine a model."""
+    return free_parameters(name) // (3 if MODELS[name].known_orientation else 1)
+
+
+@cache
+def _no_errors(name: str) -> Model:
+    return with_vector(effects_of(name), np.zeros(free_parameters(name)))
+
+
+def rows_of(name: str, directions: Floats) -> Floats:
+    """Return Φ at (n, 3) unit vectors: (n, 1, p), or (n, 3, p) for model 12."""
+    basis = _no_errors(name).basis(directions, {})
+    return basis.full if MODELS[name].known_orientation else basis.along(directions)[:, np.newaxis]
+
+
+@lru_cache(maxsize=8)
+def _over_the_sphere(name: str) -> Floats:
+    """Return the (m, 1 or 3, p) rows Φ at directions spread evenly over the sphere."""
+    return rows_of(name, OVER_THE_SPHERE)
+
+
+def _weighted_rows(name: str, directions: Floats, noise: Floats | None) -> Floats:
+    """Return the (m, p) rows Φ / s of all poses."""
+    rows = rows_of(name, directions)
+    if noise is not None and len(rows):
+        rows = rows * (np.median(noise) / noise)[:, np.newaxis, np.newaxis]
+    return rows.reshape(-1, rows.shape[2])
+
+
+def information_of(name: str, directions: Floats, noise: Floats | None = None) -> Floats:
+    """Return the (p, p) information M; arguments as in `identifiability`."""
+    rows = _weighted_rows(name, directions, noise)
+    return rows.T @ rows
+
+
+def dilution(name: str, directions: Floats, noise: Floats | None = None) -> float:
+    """
+    Return the largest error of |force| over the sphere, relative to that of a pose.
+
+    Infinite if the poses do not determine a parameter. Arguments as in `identifiability`.
+
+    """
+    return _largest_error(name, information_of(name, directions, noise))
+
+
+def _largest_error(name: str, information: Floats) -> float:
+    """Return the dilution for the (p, p) information of poses."""
+    ridge = _NOTHING * np.trace(information) + 1e-300
+    inverse = np.linalg.inv(information + ridge * np.eye(len(information)))
+    found = float(np.sqrt(np.max(inverse.ravel() @ _pairs_over_the_sphere(name))))
+    return found if found < 1.0 / _SINGULAR else np.inf
+
+
+@lru_cache(maxsize=8)
+def _pairs_over_the_sphere(name: str) -> Floats:
+    """Return the (p², m) products of the entries of Φ in each direction."""
+    around = _over_the_sphere(name)
+    pairs = np.einsum('mkp,mkq->mpq', around, around)
+    return np.ascontiguousarray(pairs.reshape(len(pairs), -1).T)
+
+
+@dataclass(frozen=True)
+class Combination:
+    """
+    A combination of parameters that the poses do not determine.
+
+    `weights` has the weight of each parameter, the largest first; the sum of the squares is 1.
+
+    """
+
+    weights: Mapping[str, float]
+
+    @property
+    def words(self) -> str:
+        """Return the combination in words, such as ``0.71 offset.z - 0.70 axis_gain.z``."""
+        least = _MAIN_PART * max(map(abs, self.weights.values()))
+        main = [(name, weight) for name, weight in self.weights.items() if abs(weight) > least]
+        if len(main) == 1:
+            return main[0][0]
+        first, *others = (f'{"-" if weight < 0 else "+"} {abs(weight):.2f} {name}'
+                          for name, weight in main)
+        return ' '.join([first.removeprefix('+ '), *others])
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """
+    What poses determine of a model.
+
+    Parameters
+    ----------
+    deviations : mapping of str to float
+        Standard deviation of each parameter, relative to the noise of a pose; infinite if not
+        determined at all.
+    undetermined : tuple of Combination
+        Combinations that the poses do not determine. They determine the rest of the model.
+    dilution, mean_dilution : float
+        Error of |force| relative to that of a pose: largest and RMS over the sphere.
+
+    """
+
+    model: str
+    deviations: Mapping[str, float]
+    undetermined: tuple[Combination, ...]
+    dilution: float
+    mean_dilution: float
+
+    @property
+    def open_parameters(self) -> tuple[str, ...]:
+        """Names of the parameters that the poses do not determine."""
+        part = {name: sum(open_.weights.get(name, 0.0) ** 2 for open_ in self.undetermined)
+                for name in self.deviations}
+        return tuple(name for name in self.deviations if part[name] > _OPEN_PART ** 2)
+
+
+def identifiability(name: str, directions: Floats, noise: Floats | None = None
+                    ) -> Identifiability:
+    """
+    Return what poses determine of a model; it depends only on directions and noise.
+
+    `name` is 4, 7, 9, 10 or 12. `directions` are (n, 3) unit vectors of force in the sensor axes;
+    n can be 0. `noise` is (n,), of each pose, in any unit; by default it is equal for all poses.
+
+    """
+    names = parameter_names(effects_of(name))
+    triangle = np.linalg.qr(_weighted_rows(name, directions, noise), mode='r')
+    square = np.zeros((len(names), len(names)))
+    square[:len(triangle)] = triangle
+    _, scales, axes = np.linalg.svd(square)  # combinations as rows, the best determined first
+    determined = scales > _SINGULAR * max(scales[0], 1.0)
+    deviations = np.where(determined, 1.0 / np.where(determined, scales, 1.0), np.inf)
+    each = np.sqrt(np.sum(_times(axes.T ** 2, deviations ** 2), axis=1))
+    seen = np.sum((_over_the_sphere(name) @ axes.T) ** 2, axis=1)
+    errors = np.cumsum(_times(seen, deviations ** 2), axis=1)  # from all up to this one
+    open_ = np.sqrt(np.max(errors, axis=0)) > LARGEST_DILUTION
+    return Identifiability(name, dict(zip(names, map(float, each), strict=True)),
+                           _combinations(names, axes[open_]),
+                           float(np.sqrt(np.max(errors[:, -1]))),
+                           float(np.sqrt(np.mean(errors[:, -1]))))
+
+
+def _times(share: Floats, deviations: Floats) -> Floats:
+    """Return the product; 0 times an infinite deviation is 0."""
+    none = np.abs(share) < _NOTHING
+    return np.where(none, 0.0, share) * np.where(none, 0.0, deviations)
+
+
+def _combinations(names: tuple[str, ...], axes: Floats) -> tuple[Combination, ...]:
+    """Return sparse combinations that span these (k, p) combinations."""
+    if not len(axes):
+        return ()
+    pivots = scipy.linalg.qr(axes, mode='r', pivoting=True)[1][:len(axes)]
+    mixed = np.linalg.inv(axes[:, pivots])  # each combination has its own pivot
+    found = []
+    for row in unit(mixed) @ axes:
+        order = [k for k in np.argsort(-np.abs(row), kind='stable') if abs(row[k]) > _SMALL]
+        sign = np.sign(row[order[0]])
+        found.append(Combination({names[k]: float(sign * row[k]) for k in order}))
+    return tuple(sorted(found, key=lambda each: names.index(next(iter(each.weights)))))
+
+
+def error_left_in(smaller: str, larger: str, directions: Floats, noise: Floats | None = None
+                  ) -> float:
+    """
+    Return the typical error of |force| if a model omits effects of a larger model [g].
+
+    The omitted effects have their typical size. The fit partly absorbs them, which changes the
+    correction over the whole sphere; the error is RMS over it. Both models are for poses of
+    unknown orientation; directions and noise as in `identifiability`.
+
+    """
+    effects = [effect for effect in _left_out(smaller, larger) for _ in EFFECTS[effect].values]
+    more = [name.partition('.')[0] in effects for name in parameter_names(effects_of(larger))]
+    added = np.linalg.lstsq(_weighted_rows(smaller, directions, noise),
+                            _weighted_rows(larger, directions, noise)[:, more], rcond=None)[0]
+    wrong = _over_the_sphere(larger)[:, 0, more] - _over_the_sphere(smaller)[:, 0] @ added
+    sizes = np.array([EFFECTS[effect].typical for effect in effects])
+    return float(np.sqrt(np.sum(np.mean(wrong ** 2, axis=0) * sizes ** 2)))
+
+
+def _left_out(smaller: str, larger: str) -> list[str]:
+    """Return the effects that a smaller model omits."""
+    return [effect for effect in effects_of(larger) if effect not in effects_of(smaller)]
+
 
 @dataclass(frozen=True)
 class NextPose:
@@ -60,10 +317,9 @@ class NextPose:
 
     Parameters
     ----------
-    direction : (3,) array or None
-        Direction to point up, a unit vector in the sensor axes; None: more poses no longer help.
-    words : str
-        The same as a sentence.
+    direction, words : (3,) array or None, and str
+        Direction to point up, a unit vector in the sensor axes, and the same as a sentence; None:
+        more poses no longer help.
     error : float
         Expected error of |force| after a fit to the poses so far, RMS over the sphere, relative
         to the noise of a pose; infinite if the poses do not determine a parameter.
@@ -117,15 +373,17 @@ def next_pose(directions: Floats, name: str = '10', noise: Floats | None = None,
 
 def _helps(name: str, up: Floats, information: Floats, count: int) -> bool:
     """Return whether a pose in this direction improves a fit visibly."""
-    now, after = (_error(name, information, count),
-                  _error(name, information + information_of(name, up[np.newaxis]), count + 1))
-    return after <= (1.0 - _LEAST_GAIN) * now or largest_error(name, information) > _GOOD_DILUTION
+    if _largest_error(name, information) > _GOOD_DILUTION:
+        return True
+    after = information + information_of(name, up[np.newaxis])
+    limit = (1.0 - _LEAST_GAIN) * _error(name, information, count)
+    return _error(name, after, count + 1) <= limit
 
 
 def _planned(name: str, directions: Floats, information: Floats, spare: int) -> Iterator[Floats]:
     """Yield the attitudes to add until the poses determine a model well."""
     while (len(directions) < poses_needed(name) + spare
-           or largest_error(name, information) > _GOOD_DILUTION):
+           or _largest_error(name, information) > _GOOD_DILUTION):
         up = _best(name, directions, information)
         if up is None:
             return
@@ -150,8 +408,7 @@ def _best(name: str, directions: Floats, information: Floats) -> Floats | None:
     rows = _attitude_rows(name)
     to_come = np.linalg.inv(information + _mean_information(name))
     gains = np.linalg.slogdet(np.eye(rows.shape[1]) + rows @ to_come @ np.swapaxes(rows, 1, 2))[1]
-    found: Floats = up[np.argmax(np.where(free, np.round(gains, 6), -1.0))]  # the first of equals
-    return found
+    return up[np.argmax(np.where(free, np.round(gains, 6), -1.0))]  # the first of equals
 
 
 def _attitudes(name: str) -> Floats:
@@ -187,7 +444,8 @@ class Outlook:
 
     `identifiability` and `next_pose` are for the requested model; for the largest model if the
     choice was ``auto``. `uncertainty_mg` is the stated one of the corrected |force| (model 12: of
-    the force), RMS over the sphere [mg]; None if it is not known.
+    the force), RMS over the sphere, with effects in the middle of their range [mg]; None for a
+    mounting alone or an offset over temperature alone.
 
     """
 
@@ -196,18 +454,16 @@ class Outlook:
     uncertainty_mg: float | None
 
 
-def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
-    """
-    Return what the poses of a calibration determine, and the next pose for the model asked for.
-
-    Effects are taken in the middle of their range. The uncertainty of a mounting alone, and of an
-    offset over temperature alone, is not known.
-
-    """
-    poses = calibration.used_poses
+def directions_in(poses: Poses, calibration: Calibration) -> Floats:
+    """Return the direction of up in each pose, (n, 3) unit vectors in the sensor axes."""
     mat_w, vec_v = calibration.model.linear_part
-    force = np.linalg.solve(mat_w, (calibration.units.to_g(poses.reading) - vec_v).T).T
-    directions = force / np.linalg.norm(force, axis=1, keepdims=True)
+    return unit(np.linalg.solve(mat_w, (calibration.units.to_g(poses.reading) - vec_v).T).T)
+
+
+def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
+    """Return what the poses of a calibration determine, and the next pose for a model."""
+    poses = calibration.used_poses
+    directions = directions_in(poses, calibration)
     noise = pose_noise(poses.noise, directions)
     alone = calibration.method == PRIOR and not calibration.form.effects
     uncertainty = np.nan if alone or not calibration.model.effects else _uncertainty(calibration)
@@ -234,26 +490,9 @@ def _uncertainty(calibration: Calibration) -> float:
     return float(np.sqrt(np.mean(errors)))
 
 
-CONE = 30.0
-"""
-Largest angle between poses and their mean direction of a robot that cannot be turned over [°].
-
-Robots with wheels or tracks tilt by 10° to 25°. No number of poses within 30° determines model 10:
-the dilution is above 300 for 60 poses. Poses further apart, such as those in a ring, in a plane or
-at right angles, come from a sensor that can be turned.
-
-"""
-
-_WIDE = 75.0
-"""Angle above which poses are no longer described as near one direction [°]."""
-
-_MOST_NAMED = 3
-"""Largest number of undetermined combinations in a message."""
-
-
 def lies_in_cone(directions: Floats) -> bool:
     """Return whether (n, 3) unit vectors are those of a robot that cannot be turned over."""
-    return bool(len(directions) and cone_of(directions).degrees <= CONE)
+    return bool(len(directions) and cone_of(directions).degrees <= _CONE)
 
 
 def determines(name: str, directions: Floats, noise: Floats | None = None) -> bool:
@@ -269,7 +508,8 @@ def refuse_if_unfit(name: str, directions: Floats, noise: Floats | None = None) 
     smaller = [other for other in NORM_MODELS if poses_needed(other) < poses_needed(name)
                and len(directions) >= poses_needed(other)
                and dilution(other, directions, noise) <= WEAK_DILUTION]
-    offer = _offer(name, smaller[-1], directions, noise) if smaller else ''
+    offer = (f', or use model {smaller[-1]}, which these poses determine: '
+             f'{_omitted(smaller[-1], name, directions, noise)}') if smaller else ''
     few = len(directions) < poses_needed(NORM_MODELS[0])
     open_ = () if few else identifiability(name, directions, noise).undetermined
     raise RefusedFitError(
@@ -286,24 +526,17 @@ def unseen(chosen: str, directions: Floats, noise: Floats | None = None) -> Iter
         open_ = identifiability(largest, directions, noise).undetermined
         yield Finding(
             'undetermined', f'the poses do not determine {combination_words(open_)}, so model '
-            f'{chosen} is the largest possible: it omits {enumerated(left_out(chosen, largest))}, '
-            f'{_commonly(chosen, largest, directions, noise)}',
+            f'{chosen} is the largest possible: {_omitted(chosen, largest, directions, noise)}',
             f'to determine them, {turn_words(missing_poses(largest, directions, noise))}')
 
 
-def _offer(name: str, smaller: str, directions: Floats, noise: Floats | None) -> str:
-    """Return a text that offers a smaller model, with the effects that it omits."""
-    offer = (f', or use model {smaller}, which these poses determine: it omits '
-             f'{enumerated(left_out(smaller, name))}')
-    if name == ORIENTED:
-        return offer
-    return f'{offer}, {_commonly(smaller, name, directions, noise)}'
-
-
-def _commonly(smaller: str, larger: str, directions: Floats, noise: Floats | None) -> str:
-    """Return a text about the typical error if the effects are omitted."""
+def _omitted(smaller: str, larger: str, directions: Floats, noise: Floats | None) -> str:
+    """Return a text about the effects that a smaller model omits, and the typical error."""
+    words = f'it omits {enumerated(_left_out(smaller, larger))}'
+    if larger == ORIENTED:
+        return words
     error = error_left_in(smaller, larger, directions, noise) * MG
-    return f'which causes an error of |a| of {error:.0f} mg in a common sensor'
+    return f'{words}, which causes an error of |a| of {error:.0f} mg in a common sensor'
 
 
 def combination_words(open_: Sequence[Combination]) -> str:

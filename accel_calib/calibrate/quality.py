@@ -14,11 +14,9 @@ gain and effects, and a useful uncertainty. The limits are far beyond the values
 sensors; only useless calibrations exceed them.
 
 Each limit is written as `not value <= limit`, so that NaN does not pass it. Absurd values may
-overflow on the way; infinity does not pass either.
-
-A calibration without effects, such as a mounting alone, has no residual of a fit to check. The
-uncertainty of a partial fit (`.partial`) is limited by that of common sensors, and its warning
-states it. It has no other limit.
+overflow on the way; infinity does not pass either. A calibration without effects, such as a
+mounting alone, has no residual to check. The uncertainty of a partial fit (`.partial`) has no
+limit but that of common sensors, and its warning states it.
 
 """
 
@@ -30,12 +28,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .calibration import Calibration, check_sensor, PRIOR, Quality, Rejected
-from .context import with_history
+from .calibration import Calibration, check_sensor, PRIOR, Quality, Rejected, with_history
+from .pose_planning import WEAK_DILUTION
 from .rest_noise import with_rest_noise
 from ..effects import correct, LADDER, length_rows, Model, sensor_force
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
-from ..estimate import believable, Fit, judge, Rival, unseen_mistakes, WEAK_DILUTION
+from ..estimate import believable, Fit, judge, Rival, unseen_mistakes
 from ..finding import Finding, without
 from ..geometry import coverage, OVER_THE_SPHERE, unit
 from ..table import Floats, Poses
@@ -112,7 +110,7 @@ def verify(calibration: Calibration, poses: Poses) -> Verification:
     if believable(poses_g.noise) is not None:
         known = poses_g if vectors else _without_orientation(poses_g)
         scale = judge(Model(model.values), known).equations.scale
-        floor = _rms_mg(scale) * float(np.sqrt(3.0 if vectors else 1.0))
+        floor = rms_mg(scale) * float(np.sqrt(3.0 if vectors else 1.0))
     return Verification(*_residuals(model, poses_g, units, vectors), floor)
 
 
@@ -122,7 +120,7 @@ def _residuals(model: Model, poses_g: Poses, units: Units, vectors: bool
     errors = (errors_before(poses_g, units, vectors=vectors),
               errors_after(model, poses_g, vectors=vectors))
     before, after = (float(np.max(np.abs(each))) * 100.0 for each in errors)
-    return _rms_mg(errors[0]), _rms_mg(errors[1]), before, after
+    return rms_mg(errors[0]), rms_mg(errors[1]), before, after
 
 
 def _without_orientation(poses_g: Poses) -> Poses:
@@ -135,7 +133,7 @@ def quality_of(fit: Fit, units: Units, directions: Floats) -> Quality:
     vectors = 'reference' in fit.poses_g
     held_out = _held_out(fit)
     return Quality(*_residuals(fit.model, fit.poses_g, units, vectors),
-                   None if held_out is None else _rms_mg(held_out),
+                   None if held_out is None else rms_mg(held_out),
                    noise_floor_mg(fit) if fit.noise_known else None,
                    fit.chi2 / fit.dof if fit.noise_known and fit.dof > 0 else None,
                    coverage(directions))
@@ -145,23 +143,12 @@ def record_of(fit: Fit, poses: Poses, units: Units, directions: Floats, name: st
               covariance: Floats | None = None, rejected: tuple[Rejected, ...] = (),
               reason: str = '', noted: tuple[Finding, ...] = ()) -> Calibration:
     """
-    Return a fit as a calibration with ΔR = I, or with the ΔR of its model.
+    Return a fit to the poses that are not rejected as a calibration, with the ΔR of its model.
 
-    The gate has not checked it yet: `finished` does. A fit is also
-    compared with another fit to fewer poses, or of a larger model, which need not be useful.
-
-    Parameters
-    ----------
-    fit : Fit
-        The fit, to the poses that are not rejected.
-    poses : Poses
-        All poses, in the unit of the readings.
-    directions : (n, 3) array
-        Direction of up in each pose of the fit, unit vectors.
-    covariance : (p, p) array, optional
-        Covariance of the values; by default that of the fit.
-    units, name, method, rejected, reason, noted
-        As in `Calibration`; `rejected` in any order.
+    `directions` are (n, 3) unit vectors, up in each pose of the fit. The (p, p) covariance is by
+    default that of the fit. The other arguments are as in `Calibration`; `rejected` in any order.
+    The gate has not checked the calibration yet: `finished` does. A fit is also compared with
+    another fit to fewer poses, or of a larger model, which need not be useful.
 
     """
     return Calibration(
@@ -174,16 +161,11 @@ def noise_floor_mg(fit: Fit) -> float:
     """Return the residual that noise causes after the fit absorbs a part of it [mg]."""
     data, scale = fit.by_pose, fit.equations.scale
     own = np.trace(data.own(data.spread), axis1=1, axis2=2) - (data.columns.shape[1] - data.rows)
-    return _rms_mg(scale * np.sqrt(np.maximum(own, 0.0)))
+    return rms_mg(scale * np.sqrt(np.maximum(own, 0.0)))
 
 
 def errors_before(poses_g: Poses, units: Units, *, vectors: bool) -> Floats:
-    """
-    Return the (n,) errors without a calibration [g].
-
-    Native readings have no known zero; they are measured from the middle of their range.
-
-    """
+    """Return the (n,) errors without a calibration [g]; native: from the middle of the range."""
     reading = poses_g.reading
     if units.is_native:
         reading = reading - (reading.max(axis=0) + reading.min(axis=0)) / 2.0
@@ -202,10 +184,9 @@ def errors_after(model: Model, poses_g: Poses, *, vectors: bool) -> Floats:
 
 def _held_out(fit: Fit) -> Floats | None:
     """
-    Return the (n,) errors of each pose under a fit of the other poses [g].
+    Return the (n,) errors of each pose under a fit of the others, or None if they need it [g].
 
-    With H the hat matrix, this error is (I - H_ii)⁻¹ times the residual of the pose (PRESS, Allen
-    1974). The result is None if a pose alone determines a parameter.
+    With H the hat matrix, they are (I - H_ii)⁻¹ times the residuals (PRESS, Allen 1974).
 
     """
     data = fit.by_pose
@@ -221,7 +202,8 @@ def _held_out(fit: Fit) -> Floats | None:
     return np.linalg.norm(left_out, axis=1) * fit.equations.scale
 
 
-def _rms_mg(errors_g: Floats | float) -> float:
+def rms_mg(errors_g: Floats) -> float:
+    """Return the RMS of errors [mg]."""
     return float(np.sqrt(np.mean(np.square(errors_g)))) * MG
 
 
@@ -277,8 +259,8 @@ def _hardly_checked(fit: Fit) -> Iterator[Finding]:
     largest = float(np.max(unseen))
     size = f'a mistake of {largest * MG:.0f} mg' if largest < _WHOLE_G else 'any mistake'
     yield Finding(
-        'hardly_checked', f'the other poses hardly check {listed("row", rows[:_MOST_NAMED])}'
-        f'{_and_more(rows)}: {size} would move the result and not show',
+        'hardly_checked', f'the other poses hardly check {listed("row", rows, _MOST_NAMED)}: '
+        f'{size} would move the result and not show',
         'take one more pose in about the same orientation', 'USABLE', tuple(rows))
 
 
@@ -291,13 +273,9 @@ def rival_findings(found: tuple[Rival, ...], row: NDArray[np.int64]) -> Iterator
     yield Finding(
         'outlier_not_certain', f'which row is the outlier is not certain: {listed("row", out)} is '
         f'left out, but the poses agree about as well without '
-        f'{"one of " if len(instead) > 1 else ""}{listed("row", instead[:_MOST_NAMED])}'
-        f'{_and_more(instead)} instead; the uncertainty includes both cases',
+        f'{"one of " if len(instead) > 1 else ""}{listed("row", instead, _MOST_NAMED)} instead; '
+        'the uncertainty includes both cases',
         'take these poses again, or take more poses', 'USABLE', (*out, *instead))
-
-
-def _and_more(rows: list[int]) -> str:
-    return f' and {len(rows) - _MOST_NAMED} more' if len(rows) > _MOST_NAMED else ''
 
 
 def finished(calibration: Calibration, poses: Poses, sensor: str, date: str) -> Calibration:
@@ -311,10 +289,7 @@ def gated(calibration: Calibration) -> Calibration:
     """
     Check a calibration, and return it with a finding if its uncertainty is large.
 
-    Raises
-    ------
-    RefusedFitError
-        If the calibration is not plausible.
+    Raise RefusedFitError if it is not plausible.
 
     """
     _check_numbers(calibration)
@@ -350,8 +325,7 @@ def _check_rotation(rotation: Floats) -> None:
 def _check_covariance(covariance: Floats) -> None:
     """Refuse a covariance that is not symmetric and positive semidefinite."""
     root = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    with np.errstate(over='ignore', invalid='ignore'):
-        scaled = covariance / root / root[:, np.newaxis]
+    scaled = covariance / root / root[:, np.newaxis]
     sound = (np.all(np.diag(covariance) >= 0.0) and np.all(np.isfinite(scaled))
              and np.allclose(scaled, scaled.T, atol=_COVARIANCE_TOLERANCE)
              and (not len(root)
@@ -379,28 +353,24 @@ def _check_gain(calibration: Calibration) -> None:
 
 def _check_effects(calibration: Calibration) -> None:
     """Refuse effects whose contribution to a pose of the calibration is not plausible."""
-    used = calibration.used_poses
+    used_g = in_g(calibration.used_poses, calibration.units)
     for name, values in calibration.model.values.items():
         model = Model({name: values})
         effect = model.terms.effects[0]
-        if name in LADDER or effect.output is not None or not len(used):
+        if name in LADDER or effect.output is not None or not len(used_g):
             continue
-        if any(key not in used for key in model.needs if key != 'previous'):
+        if any(key not in used_g for key in model.needs if key != 'previous'):
             continue
-        added = _contribution(model, used, calibration.units)
+        added = _contribution(model, used_g)
         if not added <= effect.plausible_g:
             raise RefusedFitError(f'{name} adds up to {added:.3g} g to a reading, expected less '
                                   f'than {effect.plausible_g:g} g', _CHECK_POSES)
 
 
-def _contribution(model: Model, used: Poses, units: Units) -> float:
+def _contribution(model: Model, poses_g: Poses) -> float:
     """Return the largest contribution of an effect at poses [g]."""
-    context = {**used.columns}
-    if 'std' in used:
-        context['std'] = units.to_g(used['std'])
-    context.setdefault('previous', unit(used.reading))
-    directions = unit(used.reading)
-    added = model.at(context).reading(directions) - directions
+    up = unit(poses_g.reading)
+    added = model.at({'previous': up, **poses_g.columns}).reading(up) - up
     return float(np.max(np.linalg.norm(added, axis=1)))
 
 

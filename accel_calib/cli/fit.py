@@ -18,11 +18,10 @@ from .frame import (
     console, Done, FAILED, given, intake, log_options, prior, rows_between, settings,
     stored_calibration)
 from .output import error_line, progress, short_if_known, table, Verdict, working
-from ..calibrate import Calibration, Curve, GyroBias, outlook
+from ..calibrate import Calibration, Curve, GyroBias, NORM_MODELS, outlook
 from ..disk import STANDARD_OUTPUT
 from ..effects import AXES, effect_named
 from ..errors import InputError, saying, system_error
-from ..estimate import NORM_MODELS
 from ..findings import (
     calibration_json, curve_json, effect_figures, linear_figures, rate_refinement, refinement_json)
 from ..pipeline import (

@@ -51,10 +51,10 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from ..calibrate import Calibration, fit_unknown, in_g, with_history
-from ..effects import Context, effect_named, force_slope, Model, parameter_basis, reading_of
+from ..calibrate import Calibration, fit_unknown, in_g, NORM_MODELS, with_history
+from ..effects import Context, effect_named, Model, reading_of
 from ..errors import InputError, RefusedFitError
-from ..estimate import Fit, judge, NORM_MODELS
+from ..estimate import Fit, judge
 from ..table import Floats, Poses
 from ..text import counted
 from ..units import STANDARD_GRAVITY
@@ -108,8 +108,8 @@ def rotation_free(calibration: Calibration, context: Context, per_g: float) -> R
     model = calibration.model
     origin = np.zeros((1, 3))
     vec_v = reading_of(model, origin, context)[0]
-    mat_w = force_slope(model, origin, context)[0]
-    slope_v = parameter_basis(model, origin, context)[0]
+    mat_w = model.at(context).slope(origin)[0]
+    slope_v = model.basis(origin, context).full[0]
     here = {key: np.repeat(column, 3, 0) for key, column in context.items()}
     slope_w = model.basis(np.zeros((3, 3)), here, np.eye(3)).full  # (column, row, p)
     mat_s, slope_s = _polar(mat_w, np.swapaxes(slope_w, 0, 1))

@@ -4,8 +4,9 @@
 """
 Effects: what each adds to the reading, and its properties.
 
-`form` defines what an effect is, `catalogue` lists those with a known cause, and `curves` makes
-those without one.
+`form` defines what an effect is, `catalogue` lists those with a known cause and makes curves
+without one, `own` adds those of a user, and `model` computes with a list of them. `simulate` makes
+poses and recordings.
 
 An effect is one entry in `EFFECTS`. Simulation, fit, correction, search, report and documentation
 read it from there, so an effect that is added here works in all of them. Its contribution to the
@@ -35,27 +36,25 @@ from .catalogue import (
     unit_of, value_unit, variable_of, variable_words, VARIABLES, WANDER)
 from .form import (
     AFFINE, AXES, by_axis, Context, CUBE, difference, Effect, fitted_places, FORCE, MODES,
-    MONOMIALS, ODD_SQUARE, ONE, OwnEffect, PRODUCT, SIZE, SQUARE, TO_SEPARATE, WAVE)
-from .forward import (
-    correct, force_slope, length_rows, linear_values, model_with, ModelForm, MODELS,
-    parameter_basis, parse_effect, predict, reading_of, sensor_force, simulate_poses,
-    simulate_recording, too_large, turn_between, with_linear_part)
+    MONOMIALS, ODD_SQUARE, ONE, PRODUCT, SIZE, SQUARE, TO_SEPARATE, WAVE)
 from .model import (
-    AtContext, check_context, CONVERGED_G, EachShape, factors_of, know, know_code, know_file,
-    known_code, LARGEST_FORCE_G, LARGEST_ITERATIONS, Model, times, with_vector)
+    AtContext, check_context, CONVERGED_G, correct, EachShape, factors_of, LARGEST_FORCE_G,
+    LARGEST_ITERATIONS, length_rows, linear_model, linear_values, Model, ModelForm, MODELS,
+    predict, reading_of, sensor_force, times, too_large, with_vector)
+from .own import know, know_code, know_file, known_code, OwnEffect
+from .simulate import model_with, parse_effect, simulate_poses, simulate_recording, turn_between
 from .thermal import acting_temperature, rate_at, ThermalStream
 
-__all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CHANGES', 'CONVERGED_G', 'COVARIATES', 'CUBE',
-           'EFFECTS', 'EMPIRICAL', 'FORCE', 'LADDER', 'LARGEST_FORCE_G', 'LARGEST_ITERATIONS',
-           'MODELS', 'MODES', 'MONOMIALS', 'NOMINAL_SUPPLY', 'ODD_SQUARE', 'OFFSET_POWERS',
-           'OF_RAMPS', 'ONE', 'PROCESSES', 'PRODUCT', 'REFERENCE_TEMPERATURE', 'SIZE', 'SQUARE',
-           'TO_SEPARATE', 'VARIABLES', 'WANDER', 'WAVE', 'AtContext', 'Context', 'EachShape',
-           'Effect', 'Model', 'ModelForm', 'OwnEffect', 'ThermalStream', 'acting_temperature',
-           'by_axis', 'check_context', 'correct', 'covariate_names', 'curve_pairs', 'curve_unit',
+__all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CHANGES', 'CONVERGED_G', 'COVARIATES', 'CUBE', 'EFFECTS',
+           'EMPIRICAL', 'FORCE', 'LADDER', 'LARGEST_FORCE_G', 'LARGEST_ITERATIONS', 'MODELS',
+           'MODES', 'MONOMIALS', 'NOMINAL_SUPPLY', 'ODD_SQUARE', 'OFFSET_POWERS', 'OF_RAMPS',
+           'ONE', 'PROCESSES', 'PRODUCT', 'REFERENCE_TEMPERATURE', 'SIZE', 'SQUARE', 'TO_SEPARATE',
+           'VARIABLES', 'WANDER', 'WAVE', 'AtContext', 'Context', 'EachShape', 'Effect', 'Model',
+           'ModelForm', 'OwnEffect', 'ThermalStream', 'acting_temperature', 'by_axis',
+           'check_context', 'correct', 'covariate_names', 'curve_pairs', 'curve_unit',
            'difference', 'effect_named', 'empirical_name', 'empirical_parts', 'factors_of',
-           'fitted_places', 'force_slope', 'included', 'is_effect', 'kind_of', 'know',
-           'know_code', 'know_file', 'known_code', 'length_rows', 'linear_values', 'model_with',
-           'parameter_basis', 'parameter_names', 'parse_effect', 'predict', 'rate_at',
-           'reading_of', 'sensor_force', 'simulate_poses', 'simulate_recording', 'times',
-           'too_large', 'turn_between', 'unit_of', 'value_unit', 'variable_of', 'variable_words',
-           'with_linear_part', 'with_vector']
+           'fitted_places', 'included', 'is_effect', 'kind_of', 'know', 'know_code', 'know_file',
+           'known_code', 'length_rows', 'linear_model', 'linear_values', 'model_with',
+           'parameter_names', 'parse_effect', 'predict', 'rate_at', 'reading_of', 'sensor_force',
+           'simulate_poses', 'simulate_recording', 'times', 'too_large', 'turn_between', 'unit_of',
+           'value_unit', 'variable_of', 'variable_words', 'with_vector']

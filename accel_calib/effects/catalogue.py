@@ -4,16 +4,15 @@
 """
 The catalogue: one entry for each effect with a known cause, and curves without one.
 
-Factors are functions of the context and of the shape of the effect. Shape searches yield the
-shapes that the search tries. Two kinds of effects are made from their names: an empirical curve,
-with which a part of the reading, the carrier, changes smoothly with a variable
-(`empirical_name`), and a covariate, which is any quantity that the catalogue does not know
-(`covariate_names`).
+Two kinds of effects are made from their names: an empirical curve, with which a part of the
+reading, the carrier, changes smoothly with a variable (`empirical_name`), and a covariate, which
+is any quantity that the catalogue does not know (`covariate_names`).
 
 """
 
 from __future__ import annotations
 
+from collections import ChainMap
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import cache, partial
@@ -63,11 +62,10 @@ def _from_start(context: Context) -> Iterator[Floats]:
 
 def _taus(context: Context) -> Iterator[Floats]:
     """Yield start and time constant; the constants are 1/60 to 3/2 of the time span."""
-    time = _times(context)
-    span = time[-1] - time[0] if len(time) else 0.0
-    if span > 0.0:
+    for start in _from_start(context):
+        span = _times(context)[-1] - start[0]
         for tau in np.geomspace(span / 60.0, span * 1.5, _TAUS):
-            yield np.array([time[0], tau])
+            yield np.array([start[0], tau])
 
 
 def _instants(context: Context) -> Iterator[Floats]:
@@ -103,19 +101,15 @@ def _lags(context: Context) -> Iterator[Floats]:
 
 def _forms(context: Context) -> Iterator[Floats]:
     """Yield both forms of the hysteresis."""
-    yield from (np.array([0.0]), np.array([1.0]))
+    yield from np.array([[0.0], [1.0]])
 
 
 def _warming(context: Mapping[str, Any], shape: Floats) -> Any:
     return context['temperature'] - REFERENCE_TEMPERATURE
 
 
-def _warming_squared(context: Mapping[str, Any], shape: Floats) -> Any:
-    return _warming(context, shape) ** 2
-
-
-def _warming_cubed(context: Mapping[str, Any], shape: Floats) -> Any:
-    return _warming(context, shape) ** 3
+def _warming_to(power: int) -> Factor:
+    return lambda context, shape: _warming(context, shape) ** power
 
 
 def _lagged_warming(key: str) -> Factor:
@@ -127,10 +121,6 @@ def _lagged_warming(key: str) -> Factor:
         return acting_temperature(context, key, lag, bool(of_sensor)) - REFERENCE_TEMPERATURE
 
     return factor
-
-
-def _warming_rate(context: Mapping[str, Any], shape: Floats) -> Any:
-    return rate_at(context)
 
 
 def _motion(context: Mapping[str, Any], shape: Floats) -> Floats:
@@ -156,9 +146,8 @@ def _after(context: Mapping[str, Any], shape: Floats) -> Any:
     return np.asarray(context['time'] >= shape[0], float)
 
 
-def _columns_of(key: str, power: int = 1) -> Factor:
-    """Return the factor for a vector of the context, one component per axis."""
-    return lambda context, shape: np.asarray(context[key], float).T ** power
+def _variances(context: Mapping[str, Any], shape: Floats) -> Any:
+    return np.asarray(context['std'], float).T ** 2
 
 
 def _centripetal(context: Mapping[str, Any], shape: Floats) -> Floats:
@@ -213,7 +202,7 @@ EFFECTS: dict[str, Effect] = {
         lagged='temperature_of_offset'),
     'offset_temperature_quadratic': _in_time(
         'offset that changes with the square of temperature', 'second-order TCO', AXES, 'g/°C²',
-        1e-5, terms=by_axis(ONE), factor=_warming_squared, needs=('temperature',)),
+        1e-5, terms=by_axis(ONE), factor=_warming_to(2), needs=('temperature',)),
     'gain_temperature': _in_time(
         'gain that changes with temperature', 'sensitivity temperature coefficient TCS', AXES,
         '1/°C', 0.0003, terms=by_axis(FORCE), factor=_lagged_warming('temperature_of_gain'),
@@ -221,7 +210,7 @@ EFFECTS: dict[str, Effect] = {
         lagged='temperature_of_gain'),
     'temperature_rate': _in_time(
         'offset in proportion to the rate of the temperature', 'thermal gradient sensitivity',
-        AXES, 'g·s/°C', 0.02, terms=by_axis(ONE), factor=_warming_rate,
+        AXES, 'g·s/°C', 0.02, terms=by_axis(ONE), factor=lambda context, shape: rate_at(context),
         needs=('time', 'temperature'), over=('temperature_rate',)),
     'supply_ratio': Effect(
         'offset and gain in proportion to the supply', 'ratiometric output', ('gain', *AXES),
@@ -247,7 +236,7 @@ EFFECTS: dict[str, Effect] = {
         shapes=_instants),
     'vibration_rectification': Effect(
         'offset that grows with vibration', 'vibration rectification coefficient VRC', AXES,
-        'g/g²', 0.002, 0.5, by_axis(ONE), _columns_of('std', 2), ('std',)),
+        'g/g²', 0.002, 0.5, by_axis(ONE), _variances, ('std',)),
     'hysteresis': Effect('offset that depends on the previous pose', 'hysteresis', AXES, 'g',
                          0.001, 0.5, by_axis(ONE), _motion, ('previous',), ('form',), _forms,
                          usual=(0.0,)),
@@ -263,7 +252,7 @@ EFFECTS: dict[str, Effect] = {
 OF_RAMPS: dict[str, Effect] = {
     'offset_temperature_cubic': _in_time(
         'offset that changes with the cube of temperature', 'third-order TCO', AXES, 'g/°C³',
-        1e-7, terms=by_axis(ONE), factor=_warming_cubed, needs=('temperature',))}
+        1e-7, terms=by_axis(ONE), factor=_warming_to(3), needs=('temperature',))}
 """Effects that only the ramp of a still board shows (`accel_calib.calibrate.thermal`). Still poses
 are too few to distinguish them, so that `accel_calib.refine` does not try them."""
 
@@ -277,18 +266,17 @@ PROCESSES: dict[str, Effect] = {
                      'g', 0.001, terms=(), needs=('time',))}
 """Random processes. `accel_calib.refine` names them; a model cannot contain them."""
 
+LADDER = ('offset', 'gain', 'axis_gain', 'cross_axis', 'misalignment')
+"""The effects that make up V and W. Every sensor has them; models 4 to 12 consist of them."""
+
 CHANGES: dict[str, Effect] = {
     f'{name}_change': replace(EFFECTS[name], words=f'change of the {EFFECTS[name].words}',
                               factor=lambda context, shape: context['new'], needs=('new',),
                               includes=tuple(f'{each}_change' for each in EFFECTS[name].includes),
                               base=name)
-    for name in ('offset', 'gain', 'axis_gain', 'cross_axis', 'misalignment')}
+    for name in LADDER}
 """Changes of a sensor since its stored calibration; see `accel_calib.refine`. The column ``new``
 is 1 for poses taken since then and 0 for the poses of the calibration."""
-
-LADDER = ('offset', 'gain', 'axis_gain', 'cross_axis', 'misalignment')
-"""The effects that make up V and W. Every sensor has them; models 4 to 12 consist of them."""
-
 
 EMPIRICAL = 'empirical'
 """Name of a smooth curve without a physical cause; see `empirical_name`."""
@@ -314,11 +302,10 @@ _CARRIED = {'offset': by_axis(ONE), 'gain': by_axis(FORCE), 'cross_axis': CROSS,
 
 def empirical_name(carrier: str, variable: str, modes: Iterable[int]) -> str:
     """
-    Return the name of an empirical curve.
+    Return the name of an empirical curve: Σ_k c_k cos(k π s) over the modes k, 1 to `MODES`.
 
-    The carrier, one of `CARRIERS` or a part of one, changes with one of `VARIABLES` or a quantity
-    by Σ_k c_k cos(k π s) over the modes k, 1 to `MODES`. s runs from 0 to 1 over the range of the
-    variable in the poses. Outside of it, the curve is constant.
+    The carrier, one of `CARRIERS` or a part of one, changes with one of `VARIABLES` or a quantity.
+    s runs from 0 to 1 over its range in the poses; outside of it, the curve is constant.
 
     """
     return '-'.join([EMPIRICAL, carrier, variable, *map(str, modes)])
@@ -362,19 +349,17 @@ def _empirical(name: str) -> Effect:
     each = len(terms) // len(modes)
     names = tuple(f'{own}_{mode}' for mode in modes for own in ((part,) if part else parts))
     words = f'{carrier.replace("_", "-")} as a smooth function of {variable_words(variable)}'
+    curve = partial(Effect, words, 'empirical curve', names, 'g', 0.001, 0.5, tuple(terms))
     if variable == 'force':
-        return Effect(words, 'empirical curve', names, 'g', 0.001, 0.5, tuple(terms),
-                      family='force')
-    return Effect(words, 'empirical curve', names, 'g', 0.001, 0.5, tuple(terms),
-                  partial(_cosines, variable, np.repeat(modes, each)), (variable,),
-                  ('low', 'high'), partial(_ends, variable))
+        return curve(family='force')
+    return curve(factor=partial(_cosines, variable, np.repeat(modes, each)), needs=(variable,),
+                 shape=('low', 'high'), shapes=partial(_ends, variable))
 
 
 def _variable(variable: str, context: Mapping[str, Any]) -> Floats:
     """Return the variable of an empirical curve; for vectors, its RMS over the axes."""
     values = np.asarray(context[variable], float)
-    found: Floats = np.sqrt(np.mean(values ** 2, axis=-1)) if variable == 'std' else values
-    return found
+    return np.sqrt(np.mean(values ** 2, axis=-1)) if variable == 'std' else values
 
 
 def _ends(variable: str, context: Context) -> Iterator[Floats]:
@@ -402,10 +387,10 @@ _CURVED = '2'
 
 def covariate_names(quantities: Iterable[str]) -> Iterator[str]:
     """
-    Yield the names of the covariates of quantities.
+    Yield the names of the covariates of quantities, such as ``offset_covariate-pressure``.
 
-    ``offset_covariate-pressure`` adds k (pressure - zero), by axis, with the mean over the poses
-    as zero. ``offset_covariate-pressure-2`` adds a square, k₂ (pressure - zero)², too.
+    It adds k (pressure - zero), by axis, with the mean over the poses as zero. With ``-2`` at the
+    end it adds a square, k₂ (pressure - zero)², too.
 
     """
     for quantity in quantities:
@@ -473,9 +458,10 @@ def is_effect(name: str) -> bool:
 @cache
 def effect_named(name: str) -> Effect:
     """Return the effect with this name: of the catalogue, own, a covariate, or a curve."""
-    found = (EFFECTS.get(name) or OF_RAMPS.get(name) or PROCESSES.get(name) or CHANGES.get(name)
-             or OWN.get(name))
-    return found or (_covariate(name) if kind_of(name) in COVARIATES else _empirical(name))
+    known = ChainMap(EFFECTS, OF_RAMPS, PROCESSES, CHANGES, OWN)
+    if name in known:
+        return known[name]
+    return _covariate(name) if kind_of(name) in COVARIATES else _empirical(name)
 
 
 @cache
@@ -496,9 +482,11 @@ _WITHOUT_UNIT = ('of_sensor', 'form')
 
 def value_unit(effect_name: str, value_name: str) -> tuple[str, float]:
     """Return the unit of a value of an effect in reports, and the factor from the model's unit."""
-    effect = effect_named(effect_name)
+    if value_name in _WITHOUT_UNIT:
+        return '', 1.0
+    effect, variable = effect_named(effect_name), variable_of(effect_name)
     if value_name not in effect.parameters:
-        return _shape_unit(value_name, variable_of(effect_name)), 1.0
+        return unit_of(variable) if variable else 's', 1.0
     unit = curve_unit(effect_name) if kind_of(effect_name) == EMPIRICAL else effect.unit
     if value_name.endswith('_square'):
         unit = f'{unit}²'
@@ -508,12 +496,6 @@ def value_unit(effect_name: str, value_name: str) -> tuple[str, float]:
 def curve_unit(name: str) -> str:
     """Return the unit of an empirical curve."""
     return 'g' if empirical_parts(name)[0].startswith('offset') else 'g/g'
-
-
-def _shape_unit(name: str, variable: str) -> str:
-    if name in _WITHOUT_UNIT:
-        return ''
-    return unit_of(variable) if variable else 's'
 
 
 def unit_of(column: str) -> str:

@@ -1,27 +1,19 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The form of an effect: terms, each the product of a factor of the context and a monomial.
-
-A term adds parameter · factor · weight · monomial to one axis of the reading. Monomials are
-functions of the components of the force.
-
-"""
+"""The form of an effect: the sum of terms that `accel_calib.effects` describes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property, partial
-import re
+from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from ..table import Floats, is_quantity
+from ..table import Floats
 
 Context = Mapping[str, NDArray[Any]]
 """Context of readings by column: arrays with n rows, or one row without the first axis."""
@@ -48,14 +40,11 @@ class Monomial(NamedTuple):
     gradient: Callable[[Any, Any, Any], tuple[Any, Any, Any]]
 
 
-def _of_axis(axis: int, value: Callable[[Any], Any], slope: Callable[[Any], Any]) -> Monomial:
-    return (Monomial(lambda x, y, z: value(x), lambda x, y, z: (slope(x), 0.0, 0.0)),
+def each_axis(value: Callable[[Any], Any], slope: Callable[[Any], Any]) -> list[Monomial]:
+    """Return the monomials of a function of one component, for x, y and z."""
+    return [Monomial(lambda x, y, z: value(x), lambda x, y, z: (slope(x), 0.0, 0.0)),
             Monomial(lambda x, y, z: value(y), lambda x, y, z: (0.0, slope(y), 0.0)),
-            Monomial(lambda x, y, z: value(z), lambda x, y, z: (0.0, 0.0, slope(z))))[axis]
-
-
-def _each_axis(value: Callable[[Any], Any], slope: Callable[[Any], Any]) -> list[Monomial]:
-    return [_of_axis(axis, value, slope) for axis in range(3)]
+            Monomial(lambda x, y, z: value(z), lambda x, y, z: (0.0, 0.0, slope(z)))]
 
 
 MODES = 24
@@ -71,15 +60,15 @@ def _wave(mode: int) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
 
 MONOMIALS: list[Monomial] = [
     Monomial(lambda x, y, z: 1.0, lambda x, y, z: (0.0, 0.0, 0.0)),
-    *_each_axis(lambda u: u, lambda u: 1.0),
-    *_each_axis(lambda u: u * u, lambda u: 2.0 * u),
-    *_each_axis(lambda u: u * u * u, lambda u: 3.0 * u * u),
-    *_each_axis(lambda u: u * abs(u), lambda u: 2.0 * abs(u)),
-    *_each_axis(abs, np.sign),
+    *each_axis(lambda u: u, lambda u: 1.0),
+    *each_axis(lambda u: u * u, lambda u: 2.0 * u),
+    *each_axis(lambda u: u * u * u, lambda u: 3.0 * u * u),
+    *each_axis(lambda u: u * abs(u), lambda u: 2.0 * abs(u)),
+    *each_axis(abs, np.sign),
     Monomial(lambda x, y, z: x * y, lambda x, y, z: (y, x, 0.0)),
     Monomial(lambda x, y, z: x * z, lambda x, y, z: (z, 0.0, x)),
     Monomial(lambda x, y, z: y * z, lambda x, y, z: (0.0, z, y)),
-    *(monomial for mode in range(1, MODES + 1) for monomial in _each_axis(*_wave(mode))),
+    *(monomial for mode in range(1, MODES + 1) for monomial in each_axis(*_wave(mode))),
 ]
 """1; u_i; u_i²; u_i³; u_i|u_i|; |u_i|; u_x u_y, u_x u_z, u_y u_z; cos(k π (u_i + 1) / 2) for each
 k, constant beyond ±1 g. The first four are affine. Those of a user's own effects follow."""
@@ -131,15 +120,11 @@ class Effect:
     factor : callable or None
         Factor of the terms; None: 1.
     needs, over : tuple of str
-        Keys of the context that the factor uses; columns that it is a function of, if not those in
-        `needs`.
-    shape : tuple of str
-        Names of the s constants in which the effect is not linear.
-    shapes : callable or None
-        Shapes that the search tries; None for an effect without shape.
+        Keys of the context that the factor uses; columns that it is a function of, if not `needs`.
+    shape, shapes : tuple of str, callable or None
+        Names of the s constants in which the effect is not linear; shapes that the search tries.
     usual : tuple of float
-        Shape where a file or a command does not state it, and the first that the search tries;
-        empty: the shape must be stated.
+        Shape if none is stated, and the first that the search tries; empty: it must be stated.
     lagged : str
         Column of the temperature that acts, for the shape ``lag``, ``of_sensor``; else empty.
     family : {'', 'force', 'time'}
@@ -236,9 +221,8 @@ class Effect:
         return (self.lagged,) if self.is_lagged(shape) else self.over or self.needs
 
 
-FITTED_SHAPES = ('tau', 'lag')
-"""Shape constants that a fit changes, unless they have their usual value; the others are found
-once from the data."""
+_FITTED_SHAPES = ('tau', 'lag')
+"""Shape constants that a fit changes; the others are found once from the data."""
 
 _SHAPE_STEP = 1e-4
 """Relative step of the numerical derivative by a shape constant; all others are analytic."""
@@ -248,22 +232,15 @@ def difference(factor: Factor, context: Context, shape: Floats, place: int) -> F
     """Return the numerical derivative of a factor by one shape constant."""
     step = np.zeros(len(shape))
     step[place] = _SHAPE_STEP * max(abs(shape[place]), 1.0)
-    change: Floats = (factor(context, shape + step) - factor(context, shape - step)) / (
-        2.0 * step[place])
-    return change
+    change = factor(context, shape + step) - factor(context, shape - step)
+    return change / (2.0 * step[place])
 
 
 def fitted_places(effect: Effect, shape: Floats) -> list[int]:
-    """
-    Return the indices of the shape constants that a fit changes.
-
-    A constant at its usual value, such as a lag of 0, is not fitted: the effect stays the plain
-    one.
-
-    """
+    """Return the indices of the shape constants that a fit changes: none at its usual value."""
     usual = dict(enumerate(effect.usual))
     return [place for place, name in enumerate(effect.shape)
-            if name in FITTED_SHAPES and usual.get(place) != shape[place]]
+            if name in _FITTED_SHAPES and usual.get(place) != shape[place]]
 
 
 def by_axis(first: int) -> tuple[Term, ...]:
@@ -281,101 +258,3 @@ def matrix_terms(*entries: tuple[int, int, int, float]) -> tuple[Term, ...]:
 CROSS = matrix_terms((0, 0, 1, 1.0), (0, 1, 0, 1.0), (1, 0, 2, 1.0), (1, 2, 0, 1.0),
                      (2, 1, 2, 1.0), (2, 2, 1, 1.0))
 ALL_AXES = tuple(Term(0, axis, FORCE + axis) for axis in range(3))
-
-
-_NAME = re.compile(r'[a-z][a-z0-9_]{0,63}')
-
-_PROBED_G = np.linspace(-1.47, 1.53, 48)
-_PROBE_STEP_G = 1e-6
-_SLOPE_ERROR = 1e-3
-"""Forces at which the slope of a form is compared with differences, and the largest error."""
-
-
-def _same(u: Any) -> Any:
-    return u
-
-
-@dataclass(frozen=True)
-class OwnEffect:
-    """
-    An effect of a user: each axis reads k · form(u) · change(x) more, with one k for each axis.
-
-    Parameters
-    ----------
-    name, words : str
-        Name, of small letters, digits and ``_``, and short description.
-    typical : float
-        Typical size of k, in `unit`.
-    unit : str
-        Unit of k.
-    form, slope : callable, optional
-        Function of the force u along the axis [g], and its derivative by u. Both take and return
-        arrays. Without them, form is 1: an offset.
-    variable : str
-        Column x that the effect is a function of; empty: of the force alone.
-    change : callable
-        Function of this column, from array to array; by default x itself.
-
-    Raises
-    ------
-    InputError
-        If a part is not usable, or the slope is not the derivative of the form.
-
-    """
-
-    name: str
-    words: str
-    typical: float
-    unit: str = 'g'
-    form: Callable[[Any], Any] | None = None
-    slope: Callable[[Any], Any] | None = None
-    variable: str = ''
-    change: Callable[[Any], Any] = _same
-
-    def __post_init__(self) -> None:
-        if not _NAME.fullmatch(self.name):
-            raise self._refused('has no usable name, expected small letters, digits and _')
-        if not 0.0 < self.typical < np.inf:
-            raise self._refused(f'has the typical size {self.typical}, expected a number above 0')
-        if (self.form is None) is not (self.slope is None):
-            raise self._refused('has only one of form and slope, expected both or none')
-        if self.variable and not is_quantity(self.variable) and self.variable not in _ALONE:
-            raise self._refused(f'is a function of {self.variable!r}, expected one of '
-                                f'{", ".join(_ALONE)}, or the name of another column')
-        if self.form is not None and self.slope is not None:
-            self._check_slope(self.form, self.slope)
-
-    def _check_slope(self, form: Callable[[Any], Any], slope: Callable[[Any], Any]) -> None:
-        stated = np.broadcast_to(slope(_PROBED_G), _PROBED_G.shape)
-        real = (form(_PROBED_G + _PROBE_STEP_G) - form(_PROBED_G - _PROBE_STEP_G)) / (
-            2.0 * _PROBE_STEP_G)
-        error = np.abs(stated - real) / np.maximum(np.abs(real), 1.0)
-        worst = int(np.argmax(error))
-        if not error[worst] < _SLOPE_ERROR:
-            raise self._refused(f'has the slope {stated[worst]:.4g} at {_PROBED_G[worst]:.3g} g, '
-                                f'expected {real[worst]:.4g}, the derivative of its form')
-
-    def _refused(self, what: str) -> InputError:
-        return InputError(f'the effect {self.name!r} {what}', 'correct its definition')
-
-    def entry(self, first: int) -> Effect:
-        """Return the effect, with the index of the first of its `monomials`."""
-        factor = partial(_own_factor, self.variable, self.change) if self.variable else None
-        return Effect(
-            self.words, 'own effect', AXES, self.unit, self.typical, 0.5,
-            by_axis(ONE if self.form is None else first), factor,
-            (self.variable,) if self.variable else (), own=True)
-
-    @property
-    def monomials(self) -> list[Monomial]:
-        """Return the form by axis, to be added to `MONOMIALS`; empty for an offset."""
-        return [] if self.form is None or self.slope is None else _each_axis(self.form, self.slope)
-
-
-_ALONE = ('time', 'temperature', 'supply_voltage')
-"""Columns of one number that an own effect can be a function of, besides quantities."""
-
-
-def _own_factor(variable: str, change: Callable[[Any], Any], context: Mapping[str, Any],
-                shape: Floats) -> Any:
-    return change(context[variable])

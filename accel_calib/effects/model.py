@@ -2,14 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-A model is a list of effects with their values.
+A model is a list of effects with their values: `predict` readings, and `correct` them.
 
 With the context fixed, the terms of all effects sum to an offset, a gain and bending terms:
 
     reading = V + W u + bend(u),   u = ΔR force
 
 `Model.at` returns this form. The correction solves it for u by the iteration u <- W⁻¹ (reading - V
-- bend(u)), which converges if the bending terms are small compared with the gain.
+- bend(u)), which converges if the bending terms are small compared with the gain. Forces and
+readings are in g; `accel_calib.units` converts them.
 
 """
 
@@ -19,18 +20,18 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .catalogue import effect_named, EFFECTS, is_effect, OWN, parameter_names, PROCESSES
-from .form import (
-    AFFINE, Context, difference, Effect, fitted_places, FORCE, MONOMIALS, ONE, OwnEffect)
+from .catalogue import effect_named, EFFECTS, is_effect, PROCESSES
+from .form import AFFINE, Context, difference, Effect, fitted_places, FORCE, MONOMIALS, ONE
 from .thermal import Lag
-from ..errors import AccelCalibError, InputError
+from ..errors import InputError
+from ..geometry import unit
 from ..table import column_of, Floats, is_quantity, Record
+from ..units import Indices
 
 LARGEST_ITERATIONS = 100
 CONVERGED_G = 1e-13
@@ -41,17 +42,15 @@ LARGEST_FORCE_G = 1e6
 
 _IDENTITY = np.eye(3)
 
-Indices = NDArray[np.intp]
-
 
 @dataclass(frozen=True)
 class Terms:
     """
     The t terms of a list of effects as arrays, so that a model adds all of them at once.
 
-    `parts` are the values of each effect among all p values. For each term, `place` is the index
-    in `monomials` (those of `MONOMIALS` that are used), `axis` that of the reading, `value` that
-    of its parameter among all values, and `weight` the constant factor.
+    `parts` are the values of each effect among all p values. Each term has its `place` in
+    `monomials` (those of `MONOMIALS` that are used), the `axis` of the reading, the place of its
+    `value` among all values, and its constant factor `weight`.
 
     """
 
@@ -95,17 +94,6 @@ class Terms:
         """Whether all terms are independent of the context."""
         return all(effect.factor is None for effect in self.effects)
 
-    def factors(self, shapes: list[Floats], context: Mapping[str, Any], rows: tuple[int, ...]
-                ) -> Floats:
-        """Return the (t, *rows) factors of the terms; a factor is 0 where its context is NaN."""
-        found = np.ones((len(self.weight), *rows))
-        start = 0
-        for effect, shape in zip(self.effects, shapes, strict=True):
-            if effect.factor is not None:
-                found[start:start + len(effect.terms)] = effect.factor(context, shape)
-            start += len(effect.terms)
-        return np.nan_to_num(found, copy=False)
-
     def monomials_at(self, u: Floats) -> Floats:
         """Return the (m, n) monomials of (n, 3) forces."""
         x, y, z = u.T
@@ -125,7 +113,7 @@ class Terms:
             monomials = self.monomials_at(u)
         else:
             monomials = np.einsum('mjn,nj->mn', self.gradients_at(u), direction)
-        return np.asarray(monomials[self.place] * self.weight[:, np.newaxis])
+        return monomials[self.place] * self.weight[:, np.newaxis]
 
     def gradients_at(self, u: Floats) -> Floats:
         """Return the (m, 3, n) derivatives of the monomials by the force."""
@@ -156,71 +144,9 @@ def terms_of(names: tuple[str, ...]) -> Terms:
                  value.astype(np.intp), weight)
 
 
-def know(effects: Iterable[OwnEffect]) -> tuple[str, ...]:
-    """
-    Make effects of the user known to this process, and return their names.
-
-    An effect replaces an earlier one of the same name. Raise InputError for a name that the
-    catalogue has.
-
-    """
-    names = []
-    for own in effects:
-        if is_effect(own.name) and own.name not in OWN:
-            raise InputError(f'the effect {own.name!r} is in the catalogue', 'choose another name')
-        OWN[own.name] = own.entry(len(MONOMIALS))
-        MONOMIALS.extend(own.monomials)
-        names.append(own.name)
-    effect_named.cache_clear()
-    parameter_names.cache_clear()
-    terms_of.cache_clear()
-    return tuple(names)
-
-
-def know_file(path: Path) -> tuple[str, ...]:
-    """
-    Execute a Python file that defines own effects, make them known, and return their names.
-
-    Raise InputError if it cannot be executed or defines none, and OSError if it cannot be read.
-
-    """
-    return know_code(str(path), path.read_bytes())
-
-
-def know_code(name: str, code: bytes) -> tuple[str, ...]:
-    """Execute the code of a file as `know_file` does, unless this process has executed it."""
-    before, names = _EXECUTED.get(name, (b'', ()))
-    if names and before == code:
-        return names
-    defined: dict[str, Any] = {'__file__': name, '__name__': Path(name).stem}
-    try:
-        exec(compile(code, name, 'exec'), defined)
-    except (AccelCalibError, OSError):
-        raise
-    except Exception as err:
-        raise InputError(f'{name} cannot be executed ({type(err).__name__}: {err}), expected '
-                         'Python with own effects', 'correct it') from err
-    found = {id(each): each for each in defined.values() if isinstance(each, OwnEffect)}
-    if not found:
-        raise InputError(f'{name} defines no effect, expected at least one accel_calib.Effect',
-                         'see docs/effects.md for an example')
-    _EXECUTED[name] = code, know(found.values())
-    return _EXECUTED[name][1]
-
-
-_EXECUTED: dict[str, tuple[bytes, tuple[str, ...]]] = {}
-"""Code and names of effects of the files that this process has executed, by name."""
-
-
-def known_code() -> dict[str, bytes]:
-    """Return the code of the files with own effects, so that another process can know them."""
-    return {name: code for name, (code, _) in _EXECUTED.items()}
-
-
 def _sums(index: Indices, size: int) -> Floats:
     """Return the (size, t) matrix that sums t numbers by their index."""
-    found: Floats = (index == np.arange(size)[:, np.newaxis]).astype(float)
-    return found
+    return (index == np.arange(size)[:, np.newaxis]).astype(float)
 
 
 @dataclass(frozen=True)
@@ -269,8 +195,7 @@ class AtContext:
         """Return the (n, 3) reading that the bending terms add."""
         terms = self.terms
         values = terms.monomials_at(u)[terms.place[terms.bending]] * self.bend
-        found: Floats = (terms.bends_to_axis @ values).T
-        return found
+        return (terms.bends_to_axis @ values).T
 
     def reading(self, u: Floats) -> Floats:
         """Return the (n, 3) reading for the (n, 3) force u in the sensor axes [g]."""
@@ -312,8 +237,7 @@ def times(matrix: Floats, vectors: Floats) -> Floats:
     """Return matrix times vector for (n, 3) vectors and (3, 3) or (n, 3, 3) matrices."""
     if matrix.ndim == 2:
         return vectors @ matrix.T
-    found: Floats = (matrix @ vectors[:, :, np.newaxis])[:, :, 0]
-    return found
+    return (matrix @ vectors[:, :, np.newaxis])[:, :, 0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -405,7 +329,7 @@ class Model(Record):
     @cached_property
     def _by_effect(self) -> list[tuple[Effect, Floats]]:
         """Effects with their shapes."""
-        return [(effect, values[len(effect.parameters):]) for effect, values in zip(
+        return [(effect, effect.split(values)[1]) for effect, values in zip(
             self.terms.effects, self.values.values(), strict=True)]
 
     @cached_property
@@ -425,9 +349,15 @@ class Model(Record):
         return self._without_context if self.terms.fixed else self._at(self._factors(context))
 
     def _factors(self, context: Context) -> Floats:
+        """Return the (t, n) factors of the terms; a factor is 0 where its context is NaN."""
         check_context(self, context)
         rows = len(np.asarray(context[self.needs[0]])) if self.needs else 1
-        return self.terms.factors([shape for _, shape in self._by_effect], context, (rows,))
+        found, start = np.ones((len(self.terms.weight), rows)), 0
+        for effect, shape in self._by_effect:
+            if effect.factor is not None:
+                found[start:start + len(effect.terms)] = effect.factor(context, shape)
+            start += len(effect.terms)
+        return np.nan_to_num(found, copy=False)
 
     def _at(self, factors: Floats) -> AtContext:
         """Sum the affine terms, given the (t, n) factors."""
@@ -511,3 +441,104 @@ def check_context(model: Model, context: Mapping[str, Any]) -> None:
     if missing:
         raise InputError(f'the effects of the model need {" and ".join(missing)}, which the input '
                          'does not have', 'record these columns together with the readings')
+
+
+@dataclass(frozen=True)
+class ModelForm:
+    """
+    One of the models that consist of offset and gains.
+
+    W has `gains` parameters, apart from a rotation. `norm` is the model with the same ellipsoid
+    that |force| = 1 g alone determines. Poses of `known_orientation` determine the axes of W; with
+    `sensing_axes`, they are fixed to the sensing axes.
+
+    """
+
+    effects: tuple[str, ...]
+    gains: int
+    norm: str
+    known_orientation: bool = False
+    sensing_axes: bool = False
+
+    @property
+    def largest(self) -> str:
+        """Name of the largest model for poses of the same kind."""
+        return '12' if self.known_orientation else '10'
+
+
+_WHOLE = ('offset', 'axis_gain', 'cross_axis', 'misalignment')
+
+MODELS: dict[str, ModelForm] = {
+    'ideal': ModelForm((), 0, 'ideal'),
+    '4': ModelForm(('offset', 'gain'), 1, '4'),
+    '7': ModelForm(('offset', 'axis_gain'), 3, '7'),
+    '9': ModelForm(_WHOLE, 6, '10', sensing_axes=True),
+    '10': ModelForm(('offset', 'axis_gain', 'cross_axis'), 6, '10'),
+    '12': ModelForm(_WHOLE, 6, '10', known_orientation=True),
+}
+"""The models by name. Models 9 and 10 differ only in their axes: model 9 fixes the axes to the
+sensing axes (ESGI'95 report), model 10 makes W symmetric (AN5286)."""
+
+
+def linear_model(name: str, mat_w: Floats, vec_v: Floats) -> Model:
+    """Return one of the models with gain W (3, 3), offset V (3,) [g] and ΔR = I."""
+    values = linear_values(mat_w, vec_v)
+    return Model({effect: values[effect] for effect in MODELS[name].effects})
+
+
+def linear_values(mat_w: Floats, vec_v: Floats) -> dict[str, Floats]:
+    """Return the values of the effects of `LADDER` from W (3, 3) and V (3,) [g]."""
+    symmetric, skew = (mat_w + mat_w.T) / 2, (mat_w - mat_w.T) / 2
+    return {'offset': np.array(vec_v, float), 'gain': np.array([np.trace(mat_w) / 3.0 - 1.0]),
+            'axis_gain': np.diag(mat_w) - 1.0, 'cross_axis': symmetric[[0, 0, 1], [1, 2, 2]],
+            'misalignment': skew[[2, 0, 1], [1, 2, 0]]}
+
+
+def predict(model: Model, force: Floats, context: Context) -> Floats:
+    """
+    Return the (n, 3) readings of a sensor [g].
+
+    `force` is the (n, 3) specific force in the levelled frame [g]. `context` has the columns that
+    the effects need, n rows each. Raise `InputError` if a column is missing.
+
+    """
+    return reading_of(model, force @ model.rotation.T, context)
+
+
+def reading_of(model: Model, u: Floats, context: Context) -> Floats:
+    """Return the (n, 3) readings for the (n, 3) force u in the sensor axes [g]."""
+    reading = model.at(context).reading(u)
+    for effect, values in zip(model.terms.effects, model.values.values(), strict=True):
+        if effect.output is not None:
+            reading = effect.output(reading, values)
+    return reading
+
+
+def sensor_force(model: Model, reading: Floats, context: Context) -> Floats:
+    """Return the (n, 3) specific force in the sensor axes [g]; arguments as in `correct`."""
+    u = model.at(context).force(reading)
+    if np.any(np.isnan(u) & ~np.isnan(reading)):
+        raise too_large()
+    return u
+
+
+def too_large() -> InputError:
+    """Return the error for a reading whose force is not unique."""
+    return InputError('the effects of the model are too large to be corrected at this reading',
+                      'calibrate again, with readings in the range in which the sensor is used')
+
+
+def correct(model: Model, reading: Floats, context: Context) -> Floats:
+    """
+    Return the (n, 3) specific force in the levelled frame [g]; the inverse of `predict`.
+
+    `reading` is (n, 3) [g], and `context` as in `predict`. Raise `InputError` if a column is
+    missing, or the effects are so large that the force of a reading is not unique.
+
+    """
+    return sensor_force(model, reading, context) @ model.rotation
+
+
+def length_rows(model: Model, u: Floats, context: Context) -> Floats:
+    """Return the (n, 3) derivative of |u| by the reading: ûᵀA⁻¹, with A the slope."""
+    return times(np.swapaxes(model.at(context).inverse_slope(u), -1, -2), unit(u))

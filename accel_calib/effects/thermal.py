@@ -15,10 +15,9 @@ spline, Wahba 1978) estimates the rate at the poses; a Kalman filter with the sa
 it from the past samples of a stream. The noise is chosen for periods of 400 s and more: the filter
 follows them, and it averages the steps of the temperature sensor.
 
-**Low pass.** The solution of the first equation is exact for the interpolated temperature. Between
-poses that is the cubic with the temperatures and the rates at its ends; between samples it is the
-straight line. Times need not be sorted. A row without time or temperature is NaN, and the other
-rows ignore it.
+**Low pass.** The solution of the first equation is exact for the interpolated temperature: between
+poses a cubic with the temperatures and the rates at its ends, between samples a straight line.
+Times need not be sorted. A row without time or temperature is NaN, and the other rows ignore it.
 
 """
 
@@ -76,8 +75,7 @@ def acting_temperature(context: Mapping[str, Any], key: str, lag: float, of_sens
     """
     Return the (n,) temperature that acts with a lag [°C], or the column `key` if present.
 
-    The temperature sensor lags if `of_sensor`, otherwise the die. The rows of ``time`` and
-    ``temperature`` are the whole history; one row alone has no lag.
+    The rows of ``time`` and ``temperature`` are the whole history; one row alone has no lag.
 
     """
     if key in context:
@@ -130,8 +128,7 @@ def _smoothed_rate(time: Floats, temperature: Floats) -> Floats:
     right = np.zeros((count, 3))
     right[:, 0] = (temperature - middle) / _ERROR ** 2
     found = scipy.linalg.solveh_banded(banded.reshape(6, -1), right.ravel(), lower=True)
-    rate: Floats = found[1::3] * unit[1]
-    return rate
+    return found[1::3] * unit[1]
 
 
 def _motion(step: Floats) -> tuple[Floats, Floats]:
@@ -243,14 +240,12 @@ class _RateFilter:
 
 class ThermalStream:
     """
-    Lag and rate of the temperature of a stream of samples.
+    Lag and rate of the temperature of a stream, from each sample and earlier ones.
 
-    Each sample uses only itself and earlier samples. `add_all` gives the same numbers as `add`,
-    sample by sample, also if a stream is added in several parts.
-
-    `lags` are by column of the temperature that acts (`accel_calib.effects.model.Model.lags`).
-    With `rate`, the column ``temperature_rate`` is computed. `value` has the columns at the last
-    sample with a temperature; it is empty before it.
+    `add_all` gives the same numbers as `add`, also if a stream is added in several parts. `lags`
+    are by column of the temperature that acts (`accel_calib.effects.Model.lags`). With `rate`, the
+    column ``temperature_rate`` is computed. `value` has the columns at the last sample with a
+    temperature; it is empty before it.
 
     """
 
@@ -268,14 +263,18 @@ class ThermalStream:
         self._begin, self._count, self._times, self._sum = time, 0, 0.0, 0.0
         self._line = (0.0, 0.0)
 
+    def _before(self, time: float, temperature: float) -> tuple[float, float]:
+        """Return the sample before this one: itself if the stream starts, or starts again."""
+        if self._last is None or time < self._last[0] - _RESTART:
+            self._restart(time)
+            return time, temperature
+        return self._last
+
     def add(self, time: float, temperature: float) -> None:
         """Add a sample; it is ignored if its time or temperature is NaN."""
         if not math.isfinite(time + temperature):
             return
-        if self._last is None or time < self._last[0] - _RESTART:
-            self._restart(time)
-            self._last = time, temperature
-        before, warm = self._last
+        before, warm = self._before(time, temperature)
         time = max(time, before)
         for key, lag in self._lags.items():
             if not lag.of_sensor:
@@ -283,8 +282,7 @@ class ThermalStream:
                                               temperature - warm, lag.seconds)
         if self._uses_rate:
             self._average(time, temperature)
-        self._last = time, temperature
-        self._set_value(temperature)
+        self._set_value(time, temperature)
 
     def _average(self, time: float, temperature: float) -> None:
         """Add a sample to the present average; a full average goes into the filter."""
@@ -300,8 +298,8 @@ class ThermalStream:
         self._times += time - self._begin
         self._sum += temperature
 
-    def _set_value(self, temperature: float) -> None:
-        time = self._last[0] if self._last is not None else math.nan
+    def _set_value(self, time: float, temperature: float) -> None:
+        self._last = time, temperature
         rate = self._line[0] + self._line[1] * (time - self._begin) if self._uses_rate else 0.0
         self.value = {key: temperature + lag.seconds * rate if lag.of_sensor
                       else temperature - self._behind[key] for key, lag in self._lags.items()}
@@ -312,8 +310,8 @@ class ThermalStream:
         """
         Add samples, in the order of time, and return the columns at each.
 
-        Rows without time [s] or temperature [°C] have the columns NaN. The columns are the
-        temperatures that act [°C] and ``temperature_rate`` [°C/s].
+        These are the temperatures that act [°C] and ``temperature_rate`` [°C/s]; NaN in rows
+        without time or temperature.
 
         """
         keys = (*self._lags, *(('temperature_rate',) if self._gives_rate else ()))
@@ -323,20 +321,17 @@ class ThermalStream:
         if not len(order):
             return found
         moments, warm = time[order], temperature[order]
-        if self._last is None or moments[0] < self._last[0] - _RESTART:
-            self._restart(float(moments[0]))
-            self._last = float(moments[0]), float(warm[0])
-        moments = np.maximum(moments, self._last[0])
-        rate = self._rates(moments, warm) if self._uses_rate else np.zeros(len(warm))
-        for key, values in self._columns(moments, warm, rate).items():
+        before = self._before(float(moments[0]), float(warm[0]))
+        moments = np.maximum(moments, before[0])
+        for key, values in self._columns(before, moments, warm).items():
             found[key][order] = values
-        self._last = float(moments[-1]), float(warm[-1])
-        self._set_value(float(warm[-1]))
+        self._set_value(float(moments[-1]), float(warm[-1]))
         return found
 
-    def _columns(self, time: Floats, temperature: Floats, rate: Floats) -> dict[str, Floats]:
+    def _columns(self, before: tuple[float, float], time: Floats, temperature: Floats
+                 ) -> dict[str, Floats]:
         """Return the columns of sorted samples, and keep the low passes of the last one."""
-        before = self._last if self._last is not None else (time[0], temperature[0])
+        rate = self._rates(time, temperature) if self._uses_rate else np.zeros(len(time))
         times, warm = np.append(before[0], time), np.append(before[1], temperature)
         found = {'temperature_rate': rate} if self._gives_rate else {}
         for key, lag in self._lags.items():

@@ -4,9 +4,9 @@
 """
 Closed forms: the cost functions of AN5286 and the ESGI'95 report, without weights.
 
-Poses of unknown orientation lie on a quadric: for model 4 a sphere, fitted by linear least
-squares; for model 7 with axes parallel to those of the sensor; for model 10 with any axes. Poses
-of known orientation satisfy reading = X force + y, linear in X and y (ESGI'95 report, section 3).
+Poses of unknown orientation lie on a quadric: for model 4 a sphere, for model 7 with axes parallel
+to those of the sensor, for model 10 with any axes. Poses of known orientation satisfy
+reading = X force + y, linear in X and y (ESGI'95 report, section 3).
 
 **Quadric.** Poses of unknown orientation satisfy |W⁻¹ (reading - V)| = 1 (NXP AN5286):
 
@@ -30,9 +30,8 @@ with φ between f1 and f2, ψ between f1 and f3, and θ between f2 and f3. The r
 matrix T̄ᵒʳᵗʰ of the report (its eq. 11 needs the transpose of its eq. 12), and W = diag(b) T̄ᵒʳᵗʰ
 is lower triangular. The angles need not be small.
 
-|force| does not depend on the axes of the force. This model is therefore fitted as model 10 and
-then rotated (`lower_triangular`). `TIES` maps its nine parameters to the twelve values of the
-model.
+|force| does not depend on the axes of the force, so this model is fitted as model 10 and then
+rotated (`lower_triangular`). `TIES` maps its nine parameters to the twelve values of the model.
 
 **Step.** With A = W⁻², b = A V and k = VᵀA V, |W⁻¹ (reading - V)| = 1 of model 10 is
 
@@ -54,7 +53,7 @@ from math import comb
 import numpy as np
 
 from .equations import believable
-from ..effects import linear_values, Model, MODELS, parameter_names, with_linear_part, with_vector
+from ..effects import linear_model, Model, MODELS, parameter_names, with_vector
 from ..errors import RefusedFitError
 from ..table import Poses
 from ..text import counted
@@ -115,8 +114,8 @@ def sphere_of(second: Floats, third: Floats, count: int) -> tuple[Floats, Floats
     """
     Return centre (..., 3) and radius (...) of the sphere through n readings r minus their mean.
 
-    It solves |r|² = 2 V·r + (W² - |V|²), multiplied by r and by 1 and summed over the poses, from
-    the sums `second` of r rᵀ, (..., 3, 3), and `third` of |r|² r, (..., 3).
+    It solves the sums over the poses of |r|² = 2 V·r + (W² - |V|²), times r and 1, from the sums
+    `second` of r rᵀ, (..., 3, 3), and `third` of |r|² r, (..., 3).
 
     """
     trace = second[..., 0, 0] + second[..., 1, 1] + second[..., 2, 2]
@@ -195,7 +194,7 @@ def along_quadrics(values: Floats, step: Floats) -> Floats:
             mat_w, vec_v = _stepped(values, step)
         except np.linalg.LinAlgError:
             return np.full(len(values), np.nan)
-    return with_linear_part((mat_w + mat_w.T) / 2.0, vec_v).vector[:len(values)]
+    return linear_model('10', (mat_w + mat_w.T) / 2.0, vec_v).vector
 
 
 def _stepped(values: Floats, step: Floats) -> tuple[Floats, Floats]:
@@ -230,19 +229,11 @@ _FACE_COSINE = np.cos(np.radians(20.0))
 
 def closed_form(name: str, reading: Floats) -> tuple[Floats, Floats]:
     """
-    Fit a model to poses of unknown orientation.
+    Fit model 4, 7, 9 or 10 to poses of unknown orientation; 9 is 10 in other axes.
 
-    Parameters
-    ----------
-    name : {'4', '7', '9', '10'}
-        The model; model 9 is model 10 in other axes.
-    reading : (..., n, 3) array
-        Readings in any unit, at least as many as free parameters. Leading axes are separate sets.
-
-    Returns
-    -------
-    (..., 3, 3) array, (..., 3) array
-        W, in the unit of the readings per g, and V; NaN for a set that is not on an ellipsoid.
+    `reading` is (..., n, 3), in any unit, with at least as many poses as free parameters. Leading
+    axes are separate sets. Return W (..., 3, 3), in the unit of the readings per g, and
+    V (..., 3); NaN for a set that is not on an ellipsoid.
 
     """
     gains = MODELS[name].gains
@@ -264,8 +255,7 @@ def start_of(name: str, reading: Floats) -> Model:
     mat_w, vec_v = closed_form(name, reading)
     if not np.all(np.isfinite(mat_w)):
         mat_w, vec_v = closed_form('4', reading)
-    values = linear_values(mat_w, vec_v)
-    return Model({effect: values[effect] for effect in MODELS[name].effects})
+    return linear_model(name, mat_w, vec_v)
 
 
 def agreeing(name: str, poses_g: Poses, most: int) -> Indices:
@@ -339,19 +329,15 @@ def faces(reading: Floats) -> Floats | None:
 
 def _ties() -> Floats:
     """Return the (12, 9) matrix from offset and lower triangle of W to the values of the model."""
-    names = parameter_names(MODELS['9'].effects)
-    ties = np.zeros((len(names), 9))
-    for k in range(6):  # offset and axis_gain
-        ties[k, k] = 1.0
-    # An entry (i, j) below the diagonal is half cross-axis, half rotation.
-    for k, (pair, axis, sign) in enumerate((('xy', 'z', 1), ('xz', 'y', -1), ('yz', 'x', 1))):
-        ties[names.index(f'cross_axis.{pair}'), 6 + k] = 0.5
-        ties[names.index(f'misalignment.{axis}'), 6 + k] = 0.5 * sign
-    return ties
+    entries = np.zeros((6, 3, 3))
+    entries[range(6), (0, 1, 2, 1, 2, 2), (0, 1, 2, 0, 0, 1)] = 1.0
+    return np.column_stack([
+        *(linear_model('9', _IDENTITY, vec_v).vector for vec_v in _IDENTITY),
+        *(linear_model('9', _IDENTITY + entry, np.zeros(3)).vector for entry in entries)])
 
 
 TIES = _ties()
-"""(12, 9) matrix from offset and lower triangle of W to the values of model 9."""
+"""The matrix for model 9."""
 
 
 @dataclass(frozen=True)
@@ -359,9 +345,8 @@ class SensingAxes:
     """
     The nine parameters of the ESGI'95 report.
 
-    `shifts` are s (3,) in the unit of the readings, and `scales` b > 0 (3,) in this unit per unit
-    of force. `phi`, `psi` and `theta` are the angles between f1 and f2, f1 and f3, f2 and f3
-    [rad].
+    `shifts` are s (3,) in the unit of the readings, `scales` b > 0 (3,) in this unit per unit of
+    force, and `phi`, `psi` and `theta` the angles [rad].
 
     """
 

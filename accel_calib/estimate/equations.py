@@ -28,10 +28,9 @@ where N is the covariance of the reading, and B'(u)g is the derivative of B alon
 A with u, by bending terms, is neglected: it is of the order of e times these terms.)
 
 **Copies.** Rows of a table that are one measurement, entered several times, count as one pose.
-They agree far better than their noise allows. As separate poses, they would make the noise seem
-smaller than it is, and the other poses would look like outliers. Two rests in the same orientation
-are no copies: by chance, only one pair in 5000 differs by less than `_ALIKE` of the noise on all
-axes.
+As separate poses, they would make the noise seem smaller than it is, and the other poses would
+look like outliers. Two rests in the same orientation are no copies: by chance, only one pair in
+5000 differs by less than `_ALIKE` of the noise on all axes.
 
 **Noise.** The variance of a residual is λ times the variance predicted by the noise of its pose.
 Either the noise is correct and λ = 1, or poses repeat worse or better than their samples predict,
@@ -69,7 +68,7 @@ USUAL_NOISE_G = 5e-4
 _NO_NOISE_G = 1e-9
 """Noise below this counts as no noise [g]."""
 
-LEAST_NOISE = 0.1
+_LEAST_NOISE = 0.1
 """Smallest noise of a pose, relative to the median over the poses."""
 
 _ALIKE = 0.1
@@ -117,16 +116,21 @@ def believable(noise: Floats | None) -> Floats | None:
     if noise is None or not len(noise):
         return None
     median = np.median(noise)
-    return np.maximum(noise, LEAST_NOISE * median) if median > _NO_NOISE_G else None
+    return np.maximum(noise, _LEAST_NOISE * median) if median > _NO_NOISE_G else None
+
+
+def pose_noise(noise: Floats | None, directions: Floats) -> Floats | None:
+    """Return the (n,) noise of |reading| from the (n, 3) noise of means; None if unknown."""
+    believed = believable(noise) if len(directions) else None
+    if believed is None:
+        return None
+    along = np.linalg.norm(directions * believed, axis=1)
+    median = np.median(along)
+    return np.maximum(along, _LEAST_NOISE * median) if median > 0.0 else None
 
 
 def originals(poses_g: Poses) -> Indices:
-    """
-    Return the (n,) index of the first pose that each pose in g is a copy of, or its own.
-
-    Context, such as the temperature, is compared, too.
-
-    """
+    """Return the (n,) index of the first pose that each pose, with its context, is a copy of."""
     reading, noise = poses_g.reading, believable(poses_g.noise)
     found = np.arange(len(reading))
     cell = max(_EQUAL_G, 0.0 if noise is None else _ALIKE * float(np.median(noise)))
@@ -145,10 +149,9 @@ def originals(poses_g: Poses) -> Indices:
 
 def kinds(poses: Poses) -> tuple[Indices, list[Indices], Indices]:
     """
-    Return the indices of poses by kind of orientation.
+    Return the indices of poses by kind of orientation: known, shared, unknown.
 
-    These are the (a,) poses of known orientation, a list of groups of poses with the same
-    orientation, and the (c,) poses of which only |force| = 1 g is known.
+    Those of shared orientation are a list of groups.
 
     """
     everyone, columns = np.arange(len(poses.row)), poses.columns
@@ -240,12 +243,7 @@ class Equations:
         return np.concatenate([part.columns(model) for part in self.parts])
 
     def columns_of(self, name: str, factors: Floats) -> Floats:
-        """
-        Return the (m, s p) derivative by the p parameters of an effect for each of s shapes.
-
-        `factors` (s, t or 1, n) are those of its terms at the poses, or (1, 1, 1).
-
-        """
+        """Return the (m, s p) derivative for s shapes; factors as from `effects.factors_of`."""
         return np.concatenate([part.columns(EachShape(
             name, factors if factors.shape[2] == 1 else factors[:, :, part.which]))
             for part in self.parts])
@@ -392,8 +390,8 @@ def variance_factor(chi2: float, dof: int, noise_known: bool) -> float:
     """
     Return the ratio of the stated variance to the variance predicted by the noise.
 
-    `chi2` is the sum of the squared residuals in units of the noise, or of `USUAL_NOISE_G` if the
-    noise was not measured. `dof` is the number of equations minus that of free values.
+    `chi2` is the sum of the squared residuals in units of the noise, or of `USUAL_NOISE_G` if not
+    `noise_known`, and `dof` the number of equations minus that of free values.
 
     """
     if dof <= 0:

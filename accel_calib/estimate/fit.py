@@ -81,10 +81,10 @@ _SHAPE_ROOM = 5.0
 @dataclass(frozen=True)
 class ByPose:
     """
-    The equations of a fit by pose: k rows each, padded with 0.
+    The equations of a fit by pose: k rows each, padded with 0, in units of the noise.
 
-    `residual` (n, k) and the derivative `columns` (n, k, q) are in units of the noise; `rows` (n,)
-    are the numbers of equations; `prior` (r, q) are the columns of a prior.
+    They are `residual` (n, k), the derivative `columns` (n, k, q), the numbers of equations
+    `rows` (n,), and the columns of a `prior` (r, q).
 
     """
 
@@ -206,10 +206,9 @@ class Fit:
     @cached_property
     def undetermined(self) -> tuple[str, ...]:
         """Names of the values that the poses do not determine."""
-        size = np.linalg.norm(self.columns, axis=0)
-        size[size == 0.0] = 1.0
-        few = len(self.columns) < len(size)  # only then are there axes beyond the singular values
-        _, scales, axes = np.linalg.svd(self.columns / size, full_matrices=few)
+        columns, size = _scaled(self.columns)
+        few = len(columns) < len(size)  # only then are there axes beyond the singular values
+        _, scales, axes = np.linalg.svd(columns, full_matrices=few)
         open_ = axes[np.sum(scales > _SINGULAR * scales[0]):] if len(scales) else axes
         part = np.linalg.norm(self.ties @ (open_ / size).T, axis=1)
         names = parameter_names(self.model.effects)
@@ -222,9 +221,8 @@ class Fit:
         columns = self.columns
         if self.prior is not None:
             columns = np.vstack([columns, self.prior.columns])
-        size = np.linalg.norm(columns, axis=0)
-        size[size == 0.0] = 1.0
-        factor = self.ties @ (np.linalg.pinv(columns / size) / size[:, np.newaxis])
+        columns, size = _scaled(columns)
+        factor = self.ties @ (np.linalg.pinv(columns) / size[:, np.newaxis])
         spread: Floats = factor @ factor.T
         return spread * self.variance_factor
 
@@ -234,6 +232,13 @@ class Fit:
         if self.factor is not None:
             return self.factor
         return variance_factor(self.chi2, self.dof, self.noise_known)
+
+
+def _scaled(columns: Floats) -> tuple[Floats, Floats]:
+    """Return columns of length 1, and the lengths; 1 for a column of zeros."""
+    size = np.sqrt(np.sum(columns ** 2, axis=0))
+    size[size == 0.0] = 1.0
+    return columns / size, size
 
 
 def free_of(model: Model) -> Floats:
@@ -276,12 +281,12 @@ def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upp
           move: Callable[[Floats, Floats], Floats] = np.add, most: float = np.inf
           ) -> tuple[Floats, Point]:
     """
-    Return the (q,) values that minimise the sum of squared residuals, and the point there.
+    Return the (q,) values from `lower` to `upper` of least squares, and the point there.
 
-    The values stay between `lower` and `upper`. `point_at` computes residuals and derivative at
-    values; the step solves residual = columns · step. `move` returns the values after a step to
-    first order, by default their sum. Raise `NotConvergedError` if the fit has not converged after
-    `_MOST_STEPS` steps, or as soon as it cannot lower the cost to `most`.
+    `point_at` computes residuals and derivative at values; the step solves
+    residual = columns · step. `move` returns the values after a step to first order, by default
+    their sum. Raise `NotConvergedError` if the fit has not converged after `_MOST_STEPS` steps, or
+    as soon as it cannot lower the cost to `most`.
 
     """
     values = np.clip(start, lower, upper)
@@ -320,10 +325,7 @@ def _free(values: Floats, now: Point, lower: Floats, upper: Floats) -> NDArray[n
 
 def _step(now: Point, free: NDArray[np.bool_], damping: float) -> tuple[Floats, float]:
     """Return the damped step, 0 along undetermined values, and the predicted fall of the cost."""
-    columns = now.columns * free
-    size = np.sqrt(np.sum(columns ** 2, axis=0))
-    size[size == 0.0] = 1.0
-    columns = columns / size
+    columns, size = _scaled(now.columns * free)
     scales, axes = np.linalg.eigh(columns.T @ columns)
     downhill = axes.T @ (columns.T @ now.residual)
     determined = scales > now.singular * scales[-1]
@@ -360,11 +362,9 @@ def estimate(start: Model, poses_g: Poses, prior: Prior | None = None,
         Effects with their start values, ΔR = I.
     poses_g : Poses
         Poses in g, of known, shared or unknown orientation, with the context of the effects.
-    prior : Prior, optional
-        Distribution of the values of model 10 over sensors; by default none.
-    factor : float, optional
-        Variance factor of the noise, for a fit with a prior. By default it is 1 in the fit, and
-        that of the residuals in the covariance.
+    prior, factor : Prior and float, optional
+        Distribution of the values of model 10 over sensors, and the variance factor of the noise
+        beside it. By default it is 1 in the fit, and that of the residuals in the covariance.
     most : float, optional
         Cost above which the fit is not needed. It then ends early, as one that does not converge.
 

@@ -104,7 +104,9 @@ def outliers_among(data: ByPose, chi2: float, dof: int, total: int, *, noise_kno
     """
     Find the outliers among poses, given their equations at a fit.
 
-    `chi2` and `dof` are as in `variance_factor`; `total` includes the poses left out before.
+    They are at most `LARGEST_SHARE` of all poses, and at most so many that the other equations
+    identify them. `chi2` and `dof` are as in `variance_factor`; `total` includes the poses left
+    out before.
 
     """
     rows = int(data.rows.max())
@@ -130,11 +132,11 @@ def _limit(spare: int, total: int, rows: int) -> int:
 @dataclass(frozen=True)
 class _Removed:
     """
-    Poses removed in turn.
+    Poses removed in turn: the (k,) index `pose` and number of equations `rows` of each.
 
-    `pose` and `rows` (k,) are the index and the number of equations of each; `size` (k,) its
-    squared residual against the others, in units of its variance; `rss` (k + 1,) the sum of
-    squared residuals before each removal, and at the end; `dof` and `count` belong to the start.
+    `size` (k,) is its squared residual against the others, in units of its variance; `rss`
+    (k + 1,) the sum of squared residuals before each removal, and at the end; `dof` and `count`
+    belong to the start.
 
     """
 
@@ -157,8 +159,7 @@ class _Removed:
 
 def beyond(ratio: Floats, rows: Indices, dof: Floats | float) -> Floats:
     """Return the probability of a larger ratio of variances by chance (F distribution)."""
-    chance: Floats = scipy.special.fdtrc(rows, np.maximum(dof, 1.0), ratio)
-    return chance
+    return scipy.special.fdtrc(rows, np.maximum(dof, 1.0), ratio)
 
 
 def _removed_in_turn(data: ByPose, dof: int, most: int) -> _Removed:
@@ -221,8 +222,8 @@ def fit_norm(name: str, poses_g: Poses) -> tuple[Fit, Indices]:
     """
     Fit model 4, 7 or 10 to poses in g of unknown orientation, without the outliers.
 
-    Return the fit and the (k,) indices of the poses used. Raise `NotConvergedError` if the poses
-    are not on an ellipsoid. The poses are at least as many as free parameters.
+    Return the fit and the (k,) indices of the poses used. The poses are at least as many as free
+    parameters. Raise `NotConvergedError` if they are not on an ellipsoid.
 
     """
     everyone = np.arange(len(poses_g))
@@ -243,13 +244,7 @@ def fit_norm(name: str, poses_g: Poses) -> tuple[Fit, Indices]:
 
 
 def outliers(fit: Fit, total: int) -> Outliers:
-    """
-    Return the outliers among the poses of a fit; `total` includes the poses left out before.
-
-    They are at most `LARGEST_SHARE` of all poses, and at most so many that the other equations
-    identify them.
-
-    """
+    """Return the outliers among the poses of a fit; `total` as in `outliers_among`."""
     return outliers_among(fit.by_pose, fit.chi2, fit.dof, total, noise_known=fit.noise_known)
 
 
@@ -322,17 +317,14 @@ def _agrees(fit: Fit, kept: Indices, poses_g: Poses) -> NDArray[np.bool_]:
     spare = np.where(inside, np.maximum(1.0 - leverage, 1e-6), 1.0 + leverage)
     belief = belief_beside(fit.dof, fit.chi2, fit.noise_known)
     size = data.residual[:, 0] ** 2 / spare / ((belief + fit.chi2) / (belief + fit.dof))
-    agrees: NDArray[np.bool_] = beyond(size, data.rows, belief + fit.dof) >= LEVEL / len(poses_g)
-    return agrees
+    return beyond(size, data.rows, belief + fit.dof) >= LEVEL / len(poses_g)
 
 
 class Rival(NamedTuple):
     """
-    A pose that may be wrong instead of a pose that was left out.
+    A pose that may be wrong `instead` of one that was `left_out`; both are indices.
 
-    `left_out` and `instead` are the indices of the pose left out and of its rival, `fit` the fit
-    without the rival, and `odds` the probability that the rival is wrong over that of the other
-    pose.
+    `fit` is without the rival, and `odds` its probability over that of the other hypothesis.
 
     """
 
@@ -365,12 +357,7 @@ def rivals(fit: Fit, kept: Indices, out: Indices, poses_g: Poses,
 
 
 def covariance_with(fit: Fit, found: tuple[Rival, ...]) -> Floats:
-    """
-    Return the (p, p) covariance of a fit with its rivals.
-
-    It includes the square of the difference to the fit of each rival, times the odds, at most 1.
-
-    """
+    """Return the (p, p) covariance of a fit with the difference to each rival, by its odds."""
     spread = fit.covariance
     for rival in found:
         away = rival.fit.model.vector - fit.model.vector
@@ -398,8 +385,8 @@ def _explained(shift: Floats, own: Floats, others: Floats, spread: Floats) -> Fl
     """
     Return the (n,) part of the residuals by a mistake of one pose that each other pose explains.
 
-    The mistake is `shift` (k,) per noise, `own` (k, q) and `others` (n, k, q) are the derivatives
-    at the poses, and `spread` is (JᵀJ)⁻¹ of the others.
+    The mistake is `shift` (k,) per noise; `own` (k, q) and `others` (n, k, q) are derivatives, and
+    `spread` is (JᵀJ)⁻¹ of the others.
 
     """
     onto = spread @ own.T
@@ -408,8 +395,7 @@ def _explained(shift: Floats, own: Floats, others: Floats, spread: Floats) -> Fl
     left = np.eye(len(own)) - others @ spread @ np.swapaxes(others, 1, 2)
     moved = others @ (spread @ (own.T @ shift))
     solved = np.linalg.pinv(left, _ALONE, hermitian=True) @ moved[:, :, np.newaxis]
-    part: Floats = np.sum(moved * solved[:, :, 0], axis=1) / max(shift @ inverse @ shift, 1e-300)
-    return part
+    return np.sum(moved * solved[:, :, 0], axis=1) / max(shift @ inverse @ shift, 1e-300)
 
 
 def _odds(rival: Fit, fit: Fit) -> float:

@@ -12,11 +12,13 @@ import math
 import numpy as np
 import scipy
 
-from ..calibrate import Calibration, deviations_g, in_g, next_pose, NextPose, PRIOR
+from ..calibrate import (
+    Calibration, deviations_g, directions_in, error_left_in, free_parameters, identifiability,
+    next_pose, NextPose, PRIOR)
 from ..effects import effect_named, EMPIRICAL, empirical_parts, LADDER, Model, MODELS, predict
-from ..estimate import error_left_in, free_parameters, identifiability, pose_noise, variance_factor
-from ..geometry import OVER_THE_SPHERE, unit
-from ..table import Floats, Poses
+from ..estimate import pose_noise, variance_factor
+from ..geometry import OVER_THE_SPHERE
+from ..table import Floats
 from ..units import MG
 
 
@@ -274,12 +276,6 @@ def _few(dof: int) -> float:
 def _by_chance(chi2_per_dof: float, dof: int) -> float:
     """Return the probability that noise alone causes residuals at least this large."""
     return float(scipy.special.chdtrc(dof, chi2_per_dof * dof))
-
-
-def directions_in(poses: Poses, calibration: Calibration) -> Floats:
-    """Return the direction of up in each pose, (n, 3) unit vectors in the sensor axes."""
-    mat_w, vec_v = calibration.model.linear_part
-    return unit(np.linalg.solve(mat_w, (in_g(poses, calibration.units).reading - vec_v).T).T)
 
 
 def depends_on(name: str) -> set[str]:

@@ -17,10 +17,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .expected import (
-    BAD_ERROR, BOUND, CHANGED, COVERED, degrees, depends_on, directions_in, Expected, GOOD_ERROR,
-    HIDDEN, LEFT_OUT, MATTERS, mg, NEAR_FLAT, number, PER_OUTLIER, SPAN, TILT, TO_CHECK,
-    WORST_ERROR)
-from ..calibrate import Calibration, flat_direction, Verification
+    BAD_ERROR, BOUND, CHANGED, COVERED, degrees, depends_on, Expected, GOOD_ERROR, HIDDEN,
+    LEFT_OUT, MATTERS, mg, NEAR_FLAT, number, PER_OUTLIER, SPAN, TILT, TO_CHECK, WORST_ERROR)
+from ..calibrate import Calibration, directions_in, flat_direction, Verification
 from ..effects import EMPIRICAL, WANDER
 from ..errors import TAKE_ALL_SIDES
 from ..finding import Finding, NextStep, ranked, rated, Rating, without

@@ -31,12 +31,11 @@ from .state import fitted_state, is_noise, State
 from .steps import advice_for, beside_walk, not_testable, steps_of, untestable, verdict_of
 from ..calibrate import (
     Calibration, check_sensor, fit_findings, fit_poses, fit_with_fleet, FLEET, FleetPrior, gated,
-    in_g, OF_A_FIT, only_norm, posterior, quality_of, record_of, refuse_if_unfit, Rejected,
-    sound_rows, sure_rows, uncertainty_g, with_history, with_rest_noise)
+    in_g, LARGEST_DILUTION, OF_A_FIT, only_norm, posterior, quality_of, record_of, refuse_if_unfit,
+    Rejected, sound_rows, sure_rows, uncertainty_g, with_history, with_rest_noise)
 from ..effects import CHANGES, included, Model, MODELS, parameter_names, PROCESSES, with_vector
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
-from ..estimate import (
-    fit_sphere, judge, LARGEST_DILUTION, NotConvergedError, outliers, variance_factor)
+from ..estimate import fit_sphere, judge, NotConvergedError, outliers, variance_factor
 from ..finding import Finding, without as without_kinds
 from ..geometry import unit
 from ..table import check_units, Floats, Poses

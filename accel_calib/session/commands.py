@@ -32,7 +32,7 @@ from ..capture import Dwell, poses_from
 from ..effects import Model
 from ..errors import AccelCalibError, InputError, RefusedFitError, StoredCalibrationError
 from ..findings import calibration_json, rate, rate_refinement, Rating, refinement_json
-from ..geometry import spread_directions
+from ..geometry import angle_of, spread_directions
 from ..pipeline import calibrated, is_partial, is_refined, Plan
 from ..refine import refine, Refinement, residual_words, shown_name, times_typical, verdict_words
 from ..table import Poses
@@ -494,8 +494,7 @@ def change_words(before: Calibration | None, after: Calibration) -> str:
         return ''
     offset = after.units.to_g(after.offset - before.offset) * MG
     gain = 100.0 * (np.linalg.solve(before.gain, after.gain) - np.eye(3))
-    turn = before.rotation.T @ after.rotation
-    angle = float(np.degrees(np.arccos(np.clip(0.5 * (np.trace(turn) - 1.0), -1.0, 1.0))))
+    angle = angle_of(before.rotation.T @ after.rotation)
     effects = sorted(set(before.model.effects) ^ set(after.model.effects))
     words = [f'offset by ({", ".join(f"{part:+.2f}" for part in offset)}) mg',
              f'gain by up to {np.max(np.abs(gain)):.3f} %', f'mounting by {angle:.2f}°']

@@ -26,7 +26,7 @@ import numpy as np
 from ..calibrate import Calibration, in_g, uncertainty_g, with_history
 from ..effects import (
     AtContext, Context, effect_named, Model, NOMINAL_SUPPLY, REFERENCE_TEMPERATURE)
-from ..geometry import OVER_THE_SPHERE, spread_directions
+from ..geometry import angle_of, OVER_THE_SPHERE, spread_directions
 from ..table import Floats
 from ..units import MG, Units
 
@@ -229,8 +229,7 @@ def losses_of(calibration: Calibration, label: str, make: Callable[[Calibration]
             where = f', from {limits[0]:.0f} to {limits[1]:.0f} degC' if limits else ''
             found.append(Loss('', f'{label} leaves {total:.2g} mg in all{where}', total))
     if calibration.is_levelled and not made.levelled:
-        cosine = (np.trace(calibration.rotation) - 1.0) / 2.0
-        angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+        angle = angle_of(calibration.rotation)
         found.append(Loss('mounting', f'{label} has its own setting for the mounting: this file '
                           f'leaves the rotation of {angle:.2f} deg',
                           2.0 * np.sin(np.radians(angle) / 2.0) * np.sqrt(2.0 / 3.0) * MG))

@@ -12,12 +12,11 @@ from typing import Any
 
 import accel_calib as ac
 from accel_calib.calibrate import (
-    Calibration, fit_poses, FleetPrior, gated, gyro_bias_of, level, lies_in_cone, next_pose,
-    Rejected, set_heading, with_given_mounting)
+    Calibration, dilution, error_left_in, fit_poses, FleetPrior, gated, gyro_bias_of,
+    identifiability, level, lies_in_cone, next_pose, Rejected, set_heading, with_given_mounting)
 from accel_calib.compare import compare
 from accel_calib.effects import CHANGES, effect_named, EFFECTS, MONOMIALS, PROCESSES
-from accel_calib.estimate import (
-    dilution, error_left_in, estimate, identifiability, Prior, variance_factor)
+from accel_calib.estimate import estimate, Prior, variance_factor
 from accel_calib.finding import Finding, LEVELS
 from accel_calib.findings import Expected, LIMITS, rate
 from accel_calib.geometry import coverage
