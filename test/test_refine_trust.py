@@ -11,14 +11,13 @@ import accel_calib as ac
 from accel_calib.calibrate import fit_poses, verify, with_history
 from accel_calib.errors import RefusedFitError
 from accel_calib.logs import read_poses, write_table
-from accel_calib.refine import refine
+from accel_calib.refine import refine, verdict_words
 from accel_calib.stored import write_calibration
 from accel_calib.table import Poses
 from accel_calib.units import units_of
 import generator
 from inside import (
-    advice_for, main, Model, model_with, rotation_from_rpy, search_effects, simulate_poses,
-    verdict_words)
+    advice_for, main, Model, model_with, rotation_from_rpy, search_effects, simulate_poses)
 import numpy as np
 import pandas as pd
 import pytest

@@ -35,9 +35,9 @@ from numpy.typing import NDArray
 
 from .curves import LEAST, Near, probabilities
 from .linear import Set
-from .result import ENOUGH, percent, PlannedPose, PosePlan, shown_name, versus
 from .search import Found
 from .state import fitted_state, with_effect
+from .steps import percent, shown_name
 from ..effects import effect_named, Model, WANDER
 from ..estimate import Fit, judge, kinds
 from ..geometry import attitude_words, ATTITUDES, spread_directions
@@ -72,6 +72,81 @@ _WAITS = (0.5, 1.0, 2.0)
 
 _DRAWS, _SEED = 1000, 1
 """Random readings for the expected probability; the same for each plan."""
+
+ENOUGH = 0.95
+"""Expected probability of the right effect at which a plan ends."""
+
+NOTHING = (f'there is nothing to separate: no named effect has a rival that leaves it a '
+           f'probability below {100.0 * ENOUGH:.0f} %')
+"""The line of an empty plan."""
+
+
+@dataclass(frozen=True)
+class PlannedPose:
+    """
+    One pose of a plan.
+
+    Parameters
+    ----------
+    up : tuple of float
+        Direction to point up, a unit vector in the sensor axes.
+    words : str
+        The same in words.
+    context : mapping of str to float
+        What else to set, by column of `accel_calib.table.COLUMNS`: ``temperature`` [°C],
+        ``supply_voltage`` [V], ``std`` [g], and ``time`` as the wait after the last pose [s].
+    separates : tuple of str
+        The named effect and its rivals.
+    expected : float
+        Expected probability of the right one of them after this pose and those before it.
+
+    """
+
+    up: tuple[float, float, float]
+    words: str
+    context: Mapping[str, float]
+    separates: tuple[str, ...]
+    expected: float
+
+    @property
+    def purpose(self) -> str:
+        """Return what the pose is for."""
+        return f'to separate {versus(self.separates)}'
+
+    @property
+    def conditions(self) -> str:
+        """Return the context in words; empty if the pose can be taken at once."""
+        return condition_words(self.context)
+
+
+@dataclass(frozen=True)
+class PosePlan:
+    """
+    Poses that separate named effects from their rivals soonest.
+
+    Parameters
+    ----------
+    poses : tuple of PlannedPose
+        The poses in the order to take them; empty if there are no rivals, or no pose separates
+        them.
+    lines : tuple of str
+        The plan in words.
+
+    """
+
+    poses: tuple[PlannedPose, ...] = ()
+    lines: tuple[str, ...] = (NOTHING,)
+
+    @property
+    def advice(self) -> tuple[str, ...]:
+        """Return a line about the first pose; empty without poses."""
+        if not self.poses:
+            return ()
+        first, last = self.poses[0], self.poses[-1]
+        where = f', {first.conditions}' if first.conditions else ''
+        return (f'next pose to separate {versus(first.separates)}: {first.words}{where} (1 of '
+                f'{len(self.poses)} poses, with which the expected probability of the right one '
+                f'is {percent(last.expected)})',)
 
 
 def plan_poses(found: Found) -> PosePlan:
@@ -368,3 +443,30 @@ def _counted(texts: list[str]) -> list[str]:
     """Return each text once, with the number of times if there are several."""
     times = {text: texts.count(text) for text in texts}
     return [text if count == 1 else f'{text} ({count} poses)' for text, count in times.items()]
+
+
+def versus(names: Sequence[str]) -> str:
+    """Return the words of an effect and its rivals."""
+    first, *others = (shown_name(name) for name in names)
+    return f'{first} from {", ".join(others)}'
+
+
+def condition_words(context: Mapping[str, float]) -> str:
+    """Return the context of a planned pose in words; empty if the pose can be taken at once."""
+    parts = []
+    if 'temperature' in context:
+        parts.append(f'at {context["temperature"]:.0f} °C')
+    if 'supply_voltage' in context:
+        parts.append(f'at {context["supply_voltage"]:.2f} V')
+    if 'std' in context:
+        parts.append(f'with {1e3 * context["std"]:.2g} mg of vibration')
+    parts += [f'at {key} {value:.4g}' for key, value in context.items() if is_quantity(key)]
+    if context.get('time', 0.0) > 0.0:
+        parts.append(f'{_duration(context["time"])} after the last pose')
+    return ' '.join(parts)
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 120.0:
+        return f'{seconds:.0f} s'
+    return f'{seconds / 60.0:.0f} min' if seconds < 7200.0 else f'{seconds / 3600.0:.1f} h'

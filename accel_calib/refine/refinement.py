@@ -4,8 +4,7 @@
 """
 The refinement of a calibration: from poses and a base to the record of the result.
 
-See `accel_calib.refine.search` for the method, and `.calibrations` for a stored calibration as the
-base.
+See `accel_calib.refine.search` for the method, and `.base` for a stored calibration as the base.
 
 **Typical values of a fleet.** The search for effects is that without a fleet, because a fleet says
 nothing about effects beyond offset, gain and cross-axis. It needs more poses than model 10 has
@@ -20,27 +19,30 @@ are listed as not testable.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from html import escape
 
 import numpy as np
 
 from .base import beside_stored, sampled, with_stored
-from .plan import plan_poses
-from .result import plain_name, PosePlan, Refinement, Stage, Verdict
+from .plan import plan_poses, PosePlan
 from .search import Found, search
 from .state import fitted_state, is_noise, State
-from .steps import advice_for, beside_walk, not_testable, steps_of, untestable, verdict_of
+from .steps import (
+    advice_for, beside_walk, not_testable, plain_name, Stage, Step, steps_of, untestable, Verdict,
+    verdict_of)
 from ..calibrate import (
     Calibration, check_sensor, fit_findings, fit_poses, fit_with_fleet, FLEET, FleetPrior, gated,
     in_g, OF_A_FIT, only_norm, posterior, quality_of, record_of, refuse_if_unfit, Rejected,
     sound_rows, sure_rows, uncertainty_g, with_history, with_rest_noise)
-from ..effects import CHANGES, included, Model, MODELS, parameter_names, PROCESSES, with_vector
+from ..effects import (
+    CHANGES, included, Model, MODELS, parameter_names, PROCESSES, WANDER, with_vector)
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import (
     fit_sphere, judge, LARGEST_DILUTION, NotConvergedError, outliers, variance_factor)
 from ..finding import Finding, without as without_kinds
 from ..geometry import unit
-from ..table import check_units, Floats, Poses
-from ..text import counted
+from ..table import check_units, Floats, Poses, Record
+from ..text import counted, short, table
 from ..units import BASES, MG, Units
 
 _LEAST_POSES = 4
@@ -53,6 +55,131 @@ _NAMED = 4
 """Largest number of undetermined values that are named."""
 
 _BASE = '10'
+
+_VERDICTS = {
+    'no_gap': 'No gap beyond the noise: these poses support no further effect.',
+    'explained': 'The gap is explained: only noise remains beyond the named effects.',
+    'described': 'The gap is described, not explained: only noise remains beyond {}, but its '
+                 'cause is not known.',
+    'unexplained': 'A gap remains that no effect of the catalogue explains.',
+}
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Refinement(Record):
+    """
+    The result of a refinement.
+
+    Parameters
+    ----------
+    verdict : {'no_gap', 'explained', 'described', 'unexplained'}
+        No gap beyond the noise; the effects are named and the rest is noise; the rest is noise
+        only with an empirical curve or a slow change of the offset; or a gap remains, or it is
+        not known what explains it (`undecided`).
+    noise_floor_mg : float or None
+        Expected residual of a correct model [mg]; None if the noise is not known.
+    gap_mg, remaining_gap_mg : float
+        Residual of the base and of the refined model [mg].
+    steps : tuple of Step
+        The added effects, in order.
+    disturbed_poses : tuple of int
+        Rows of the poses left out.
+    not_testable : tuple of (str, str)
+        Effects that these data cannot show, and the data to record for them.
+    advice : tuple of str
+        Advice for the user.
+    calibration : Calibration
+        The refined calibration.
+    refusal : tuple of str
+        Reason why the calibration must not be stored or used, and advice; empty if it is usable.
+    poses_g : Poses
+        The poses kept, in g.
+    force : (n, 3) array
+        Unit force of each pose kept, in the sensor axes.
+    stages : tuple of Stage
+        Residuals of the base and after each step.
+    plan : PosePlan
+        Poses that separate the effects from their rivals soonest.
+    undecided : bool
+        Whether the rest is noise, but the poses do not show which effects explain the gap: one has
+        more than `MOST_RIVALS` rivals, or the poses do not determine the refined calibration.
+
+    """
+
+    verdict: Verdict
+    noise_floor_mg: float | None
+    gap_mg: float
+    remaining_gap_mg: float
+    steps: tuple[Step, ...]
+    disturbed_poses: tuple[int, ...]
+    not_testable: tuple[tuple[str, str], ...]
+    advice: tuple[str, ...]
+    calibration: Calibration
+    refusal: tuple[str, ...]
+    poses_g: Poses
+    force: Floats
+    stages: tuple[Stage, ...]
+    plan: PosePlan
+    undecided: bool = False
+
+    def __repr__(self) -> str:
+        names = ' + '.join([self.calibration.name, *(step.effect for step in self.steps)])
+        return (f'Refinement({self.verdict}: {names}; residual {self.gap_mg:.3g} -> '
+                f'{self.remaining_gap_mg:.3g} mg)')
+
+    def _repr_html_(self) -> str:
+        """Return the steps as a table, for notebooks."""
+        rows = [[step.effect, f'{step.gap_before_mg:.3g} → {step.gap_after_mg:.3g}',
+                 f'{step.held_out_before_mg:.3g} → {step.held_out_after_mg:.3g}',
+                 f'{step.p_value:.1g}', ', '.join(step.likely_rivals), step.where]
+                for step in self.steps]
+        head = ['effect', 'residual [mg]', 'held out [mg]', 'p', 'rivals', 'where']
+        lines = ''.join(f'<p>{escape(line)}</p>\n' for line in (repr(self), *self.advice))
+        return (table(head, rows) if rows else '') + lines
+
+
+def verdict_words(result: Refinement) -> str:
+    """Return the verdict as a sentence."""
+    walks = any(step.effect == WANDER for step in result.steps)
+    words = _VERDICTS[result.verdict].format(
+        'a slow change of the offset' if walks else 'an empirical curve')
+    if result.undecided:
+        words = _undecided(result)
+    elif result.verdict == 'unexplained' and result.steps:
+        words = ('A gap remains beyond the named effects, and no effect of the catalogue explains '
+                 'it.')
+    if result.noise_floor_mg is None:
+        words += (' The noise of the poses is not known (no std and count), so their scatter is '
+                  'taken as the noise.')
+    return words
+
+
+def _undecided(result: Refinement) -> str:
+    """Return why it is not known what explains a gap."""
+    if result.refusal:
+        why = result.refusal[0]
+    else:
+        most = max(result.steps, key=lambda step: len(step.rivals))
+        why = f'{len(most.rivals)} others explain it about as well as {most.effect}'
+    return f'Not enough poses: they cannot tell what explains the gap, because {why}.'
+
+
+def residual_words(result: Refinement) -> str:
+    """Return the residual of the base and of the refined model, and the noise floor."""
+    floor = ('not known' if result.noise_floor_mg is None
+             else f'{short(result.noise_floor_mg)} mg')
+    residual = f'{short(result.gap_mg)} mg'
+    if result.steps:
+        residual = f'{short(result.gap_mg)} -> {short(result.remaining_gap_mg)} mg'
+    poses = result.poses_g
+    count = int(np.sum(poses['new'] > 0.0)) if 'new' in poses else len(poses)
+    return f'residual {residual} over {counted(count, "pose")}, noise floor {floor}'
+
+
+def base_words(result: Refinement) -> str:
+    """Return the name of the base model."""
+    name = result.calibration.name
+    return 'ideal sensor' if name == 'ideal' else f'model {name}'
 
 
 def refine(poses: Poses, units: Units, *, base: str | Calibration = 'auto', sensor: str = '',
