@@ -23,11 +23,7 @@ from numpy.typing import NDArray
 
 from .errors import InputError, needing
 from .text import counted, table
-from .units import Floats, STANDARD_GRAVITY, UnitName, Units
-
-__all__ = ['ABOUT', 'COLUMNS', 'Autopilot', 'Column', 'Firmware', 'Floats', 'Poses', 'Record',
-           'Recording', 'Table', 'check_values', 'column_of', 'columns_from', 'data_frame',
-           'is_quantity', 'numbered', 'present', 'quantity_key']
+from .units import Floats as Floats, STANDARD_GRAVITY, UnitName, Units
 
 ABOUT = ('units', 'sensor', 'autopilot')
 """What a table states beside its columns."""
@@ -287,6 +283,11 @@ class Table(Record):
     def with_columns(self: _Self, **columns: NDArray[Any]) -> _Self:
         """Return the same rows with these columns added or replaced."""
         return replace(self, columns={**self.columns, **columns})
+
+    def without_columns(self: _Self, *keys: str) -> _Self:
+        """Return the same rows without these columns."""
+        return replace(self, columns={key: values for key, values in self.columns.items()
+                                      if key not in keys})
 
 
 class Poses(Table):

@@ -317,8 +317,7 @@ def unclipped(poses_g: Poses, base: Model) -> tuple[State | None, Clipped | None
     if clip is None or len(poses_g) - len(clip.poses) < _LEAST_KEPT:
         return None, None
     # Clipped samples hardly scatter, so their noise is meaningless: all weights are equal here.
-    plain = Poses({key: values for key, values in poses_g.columns.items() if key != 'std'},
-                  poses_g.row)
+    plain = poses_g.without_columns('std')
     kept = without(plain, clip.poses)
     if not any(_fits_better(model, plain, kept) for model in (base, _linear(base))):
         return None, None
@@ -413,10 +412,9 @@ def beside_stored(poses_g: Poses, calibration: Calibration) -> Poses:
         least = float(np.min(poses_g['orientation']))
         columns['orientation'] = np.concatenate([
             poses_g['orientation'], least - 1.0 - np.arange(count[1])])
-    if 'std' not in columns or 'count' not in columns:
-        columns = {key: values for key, values in columns.items() if key not in ('std', 'count')}
     columns['new'] = np.repeat([1.0, 0.0], count)
-    return Poses(columns, _rows(poses_g, stored))
+    joined = Poses(columns, _rows(poses_g, stored))
+    return joined if joined.noise is not None else joined.without_columns('std', 'count')
 
 
 def with_stored(poses: Poses, calibration: Calibration) -> Poses:

@@ -34,7 +34,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .curves import LEAST, Near, probabilities
-from .linear import Set
 from .search import Found
 from .state import fitted_state, with_effect
 from .steps import percent, shown_name
@@ -102,7 +101,7 @@ class PlannedPose:
 
     """
 
-    up: tuple[float, float, float]
+    up: tuple[float, ...]
     words: str
     context: Mapping[str, float]
     separates: tuple[str, ...]
@@ -116,7 +115,17 @@ class PlannedPose:
     @property
     def conditions(self) -> str:
         """Return the context in words; empty if the pose can be taken at once."""
-        return condition_words(self.context)
+        context, parts = self.context, list[str]()
+        if 'temperature' in context:
+            parts.append(f'at {context["temperature"]:.0f} °C')
+        if 'supply_voltage' in context:
+            parts.append(f'at {context["supply_voltage"]:.2f} V')
+        if 'std' in context:
+            parts.append(f'with {1e3 * context["std"]:.2g} mg of vibration')
+        parts += [f'at {key} {value:.4g}' for key, value in context.items() if is_quantity(key)]
+        if context.get('time', 0.0) > 0.0:
+            parts.append(f'{_duration(context["time"])} after the last pose')
+        return ' '.join(parts)
 
 
 @dataclass(frozen=True)
@@ -188,7 +197,7 @@ class _Contest:
         """Return a contest from the probability of each model, and its fit to the poses so far."""
         weights = np.array([weight for weight, _ in fits.values()])
         each = [judge(fit.model, candidates) for _, fit in fits.values()]
-        count, scale = len(candidates), math.sqrt(_variance(near.chosen))
+        count, scale = len(candidates), math.sqrt(max(near.chosen.variance, 1e-12))
         means = np.array([-fit.residual.reshape(count, -1) for fit in each]) / scale
         rows = tuple(fit.columns.reshape(count, -1, fit.columns.shape[1]) for fit in each)
         return cls(tuple(fits), weights, means, rows,
@@ -239,13 +248,6 @@ def _after(left: Floats, rows: Floats, spread: Floats, taken: list[int]
     gain = spread @ own.T @ np.linalg.inv(np.eye(len(own)) + own @ spread @ own.T)
     learned = left[:, taken].reshape(len(left), -1) @ gain.T
     return left - np.einsum('crq,jq->jcr', rows, learned), spread - gain @ own @ spread
-
-
-def _variance(chosen: Set) -> float:
-    """Return the variance of a pose in units of its noise, moderated as in the search."""
-    linear = chosen.linear
-    left = max(linear.worth + linear.dof - chosen.parameters, 1.0)
-    return max((linear.worth + chosen.rss) / left, 1e-12)
 
 
 def _fits(name: str, found: Found) -> dict[str, tuple[float, Fit]]:
@@ -341,7 +343,7 @@ def _columns(poses_g: Poses, force: Floats, shown: Sequence[Mapping[str, float]]
         if key in poses_g:
             usual = np.nanmedian(poses_g[key], axis=0)
             found[key] = np.tile(usual, (count, 1)) if usual.ndim else np.full(count, usual)
-            if shown and key in shown[0]:
+            if key in shown[0]:
                 level = np.array([each[key] for each in shown])
                 found[key] = np.repeat(level[:, np.newaxis], 3, axis=1) if usual.ndim else level
     if 'time' in poses_g:
@@ -384,15 +386,13 @@ def _in_words(contests: Sequence[_Contest], grid: _Candidates,
     ordered = sorted(chosen, key=lambda each: _effort(grid.shown[each[0]]))
     taken = [index for index, _ in ordered]
     poses = tuple(
-        PlannedPose(_triple(grid.up[index]), attitude_words(grid.up[index]), grid.shown[index],
-                    contest.names, contest.expected(taken[:number]))
+        PlannedPose(tuple(grid.up[index].tolist()), attitude_words(grid.up[index]),
+                    grid.shown[index], contest.names, contest.expected(taken[:number]))
         for number, (index, contest) in enumerate(ordered, 1))
-    lines = []
+    lines: list[str] = []
     for contest in contests:
-        expected = contest.expected(taken) if taken else 0.0
-        lines += plan_lines(dict(zip(contest.names, contest.weights.tolist(), strict=True)), [
-            (pose.words, pose.conditions) for pose, (_, why) in zip(poses, ordered, strict=True)
-            if why is contest], expected, enough=expected >= ENOUGH)
+        own = [pose for pose, (_, why) in zip(poses, ordered, strict=True) if why is contest]
+        lines += _lines_about(contest, own, contest.expected(taken))
     return PosePlan(poses, tuple(lines))
 
 
@@ -402,35 +402,23 @@ def _effort(shown: Mapping[str, float]) -> tuple[float, ...]:
             *(value for key, value in sorted(shown.items()) if is_quantity(key)))
 
 
-def _triple(vector: Floats) -> tuple[float, float, float]:
-    x, y, z = vector.tolist()
-    return x, y, z
-
-
-def plan_lines(weights: Mapping[str, float], poses: Sequence[tuple[str, str]], expected: float, *,
-               enough: bool) -> list[str]:
-    """
-    Return the lines about one contest, with the direction and the conditions of each pose.
-
-    `weights` are the probabilities of the named effect and of its rivals. After all poses of the
-    plan, the right one has the probability `expected`; `enough`: more poses are not needed.
-
-    """
-    odds = ', '.join(percent(weight) for weight in weights.values())
-    what = f'to separate {versus(tuple(weights))} ({odds})'
+def _lines_about(contest: _Contest, poses: Sequence[PlannedPose], expected: float) -> list[str]:
+    """Return the lines about a contest, its poses, and the probability after the whole plan."""
+    odds = ', '.join(percent(weight) for weight in contest.weights.tolist())
+    what = f'to separate {versus(contest.names)} ({odds})'
     end = f'the expected probability of the right one is then {percent(expected)}'
     if poses:
         return [f'{what}, take these poses:', *_held(poses), end]
-    if enough:
+    if expected >= ENOUGH:
         return [f'{what}, the same poses are enough: {end}']
     return [f'{what}, poses at 1 g do not help; apply other forces (a centrifuge)']
 
 
-def _held(poses: Sequence[tuple[str, str]]) -> Iterator[str]:
+def _held(poses: Sequence[PlannedPose]) -> Iterator[str]:
     """Yield one line for each condition; conditions with the same directions share a line."""
     directions: dict[str, list[str]] = {}
-    for direction, where in poses:
-        directions.setdefault(where, []).append(direction)
+    for pose in poses:
+        directions.setdefault(pose.conditions, []).append(pose.words)
     shared: dict[tuple[str, ...], list[str]] = {}
     for where, held in directions.items():
         shared.setdefault(tuple(_counted(held)), []).append(where)
@@ -449,21 +437,6 @@ def versus(names: Sequence[str]) -> str:
     """Return the words of an effect and its rivals."""
     first, *others = (shown_name(name) for name in names)
     return f'{first} from {", ".join(others)}'
-
-
-def condition_words(context: Mapping[str, float]) -> str:
-    """Return the context of a planned pose in words; empty if the pose can be taken at once."""
-    parts = []
-    if 'temperature' in context:
-        parts.append(f'at {context["temperature"]:.0f} °C')
-    if 'supply_voltage' in context:
-        parts.append(f'at {context["supply_voltage"]:.2f} V')
-    if 'std' in context:
-        parts.append(f'with {1e3 * context["std"]:.2g} mg of vibration')
-    parts += [f'at {key} {value:.4g}' for key, value in context.items() if is_quantity(key)]
-    if context.get('time', 0.0) > 0.0:
-        parts.append(f'{_duration(context["time"])} after the last pose')
-    return ' '.join(parts)
 
 
 def _duration(seconds: float) -> str:

@@ -55,6 +55,7 @@ _NAMED = 4
 """Largest number of undetermined values that are named."""
 
 _BASE = '10'
+_ORIENTATION = ('reference', 'orientation')
 
 _VERDICTS = {
     'no_gap': 'No gap beyond the noise: these poses support no further effect.',
@@ -338,7 +339,7 @@ def refine_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, *, sensor: 
 def _combined(refined: Calibration, poses_g: Poses, fleet: FleetPrior) -> Calibration:
     values, covariance, findings = posterior(refined.model.vector, refined.covariance, fleet)
     model = with_vector(refined.model.effects, values)
-    fit = judge(model, without_orientation(poses_g))
+    fit = judge(model, poses_g.without_columns(*_ORIENTATION))
     name = f' of model {fleet.model}' if fleet.model else ''
     return with_rest_noise(gated(replace(
         refined, model=Model(model.values, refined.model.rotation), covariance=covariance,
@@ -442,12 +443,6 @@ def _owners(name: str, effects: list[str]) -> list[set[str]]:
     return [set(parameter_names(whole))] * len(parameter_names((own,)))
 
 
-def without_orientation(poses: Poses) -> Poses:
-    """Return the poses as poses of unknown orientation."""
-    return Poses({key: values for key, values in poses.columns.items()
-                  if key not in ('reference', 'orientation')}, poses.row)
-
-
 @dataclass(frozen=True)
 class Given:
     """The input poses, those used [g], whether the base is stored, rejected rows, and notes."""
@@ -531,7 +526,7 @@ def refined_calibration(base: Calibration, final: State, added: tuple[str, ...],
     elif given.joint:
         kept = kept.take(kept['new'] > 0.0)
     at_poses = judge(model, kept if base.form.known_orientation
-                     else without_orientation(kept))
+                     else kept.without_columns(*_ORIENTATION))
     names = ', '.join(plain_name(name) for name in added)
     others = without_kinds(base.noted, *OF_A_FIT)
     findings = [each for each in others if not given.stored or each.kind == 'flat_pose']

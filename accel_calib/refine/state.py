@@ -52,8 +52,7 @@ class Candidate:
     """
     An effect to try with each of its (s,) `shapes`, which count as `tried` independent ones.
 
-    `factors` (shapes, t or 1, n) are those of its terms at the poses. They do not depend on a
-    model.
+    `factors` (shapes, t or 1, n) are those of its terms at the poses, with any model.
 
     """
 
@@ -64,7 +63,6 @@ class Candidate:
 
     @property
     def entry(self) -> Effect:
-        """Return the effect."""
         return effect_named(self.name)
 
     def beside(self, present: Floats | None, context: Context) -> Candidate:
@@ -224,9 +222,8 @@ class State:
         """Return the residual expected of a correct model [mg]; None if the noise is unknown."""
         if not self.fit.noise_known:
             return None
-        rows = self.fit.by_pose.rows[self.fit.equations.pose]
-        share = np.sqrt(self.dof / len(rows)) * np.ones(len(rows))
-        return self.gap_mg(share)
+        count = len(self.residual)
+        return self.gap_mg(np.full(count, np.sqrt(self.dof / count)))
 
 
 def is_noise(rss: float, dof: float) -> bool:
