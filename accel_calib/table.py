@@ -429,13 +429,10 @@ def _median_length(vectors: Floats) -> float:
 def _check_readings(length: float, units: Units, where: str) -> None:
     if _is_likely(length, units.per_g):
         return
-    likely = _likely(length)
-    supported = next((name for name in likely if name in _SUPPORTED), None)
-    if supported:
-        advice = f'set the units of the readings to {supported}'
-    else:
-        look = f'they look like {" or ".join(likely)}: ' if likely else ''
-        advice = f'{look}set the units of the readings to native; the fit estimates their scale'
+    supported = next((name for name in _likely(length) if name in _SUPPORTED), None)
+    advice = (f'set the units of the readings to {supported}' if supported else
+              f'{_look(length)}set the units of the readings to native; the fit estimates their '
+              'scale')
     raise InputError(f'{where}the length of the readings is about {length:.4g}, expected about '
                      f'{units.per_g:.4g} at rest in {units.name}', advice)
 
@@ -446,16 +443,19 @@ def _check_reference(length: float, units: Units) -> None:
                     (units.per_g, f'in {units.name}, the unit of the readings'))
     if _is_likely(length, per_g):
         return
-    likely = _likely(length)
-    look = f'they look like {" or ".join(likely)}: ' if likely else ''
     raise InputError(f'the length of the known forces ref_x,ref_y,ref_z is about {length:.4g}, '
                      f'expected about {per_g:.4g} {words}',
-                     f'{look}multiply them by {per_g / max(length, 1e-12):.4g}'
+                     f'{_look(length)}multiply them by {per_g / max(length, 1e-12):.4g}'
                      if length > 0.0 else 'fill the columns, or remove them')
 
 
 def _is_likely(length: float, per_g: float) -> bool:
     return _LIKELY_G[0] <= length / per_g <= _LIKELY_G[1]
+
+
+def _look(length: float) -> str:
+    likely = _likely(length)
+    return f'they look like {" or ".join(likely)}: ' if likely else ''
 
 
 def _likely(length: float) -> list[str]:
