@@ -3,8 +3,6 @@
 
 """Recordings that are clipped or coarsely quantised: their poses, their noise, and the names."""
 
-from __future__ import annotations
-
 from accel_calib.calibrate import fit_poses, in_g
 from accel_calib.capture import capture
 from accel_calib.logs import read_recording
