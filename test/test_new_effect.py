@@ -92,7 +92,8 @@ def still(rng, count, added=0.0, **columns):
 
 @pytest.mark.parametrize('name', ['offset_covariate', 'gain_covariate'])
 @pytest.mark.parametrize('curved', [False, True])
-def test_any_column_that_varies_is_a_cause(name, curved, tmp_path):
+def test_any_column_that_varies_is_a_cause_without_which_a_log_is_not_corrected_for_it(
+        name, curved, tmp_path, capsys):
     rng = np.random.default_rng([7, len(name), curved])
     current = rng.uniform(0.0, 12.0, 60)
     away = (current - 6.0) / 6.0
@@ -113,6 +114,11 @@ def test_any_column_that_varies_is_a_cause(name, curved, tmp_path):
     assert np.std(sizes) < 5e-4
     with pytest.raises(InputError, match='need motor_current'):
         stored.apply(readings)
+    poses.drop(columns='motor current').to_csv(tmp_path / 'samples.csv', index=False)
+    assert run('apply', tmp_path / 'samples.csv', '-c', tmp_path / 'calibration.yaml', '-o',
+               tmp_path / 'out.csv', '--units', 'g') == 0
+    shown = ' '.join(capsys.readouterr().out.split())
+    assert f'the samples have no motor_current: {name}-motor_current' in shown
 
 
 def test_a_hump_over_any_column_is_a_curve_of_it():
@@ -141,18 +147,6 @@ def test_text_and_columns_with_holes_are_no_cause(tmp_path):
     poses['humidity'] = [*rng.uniform(30.0, 50.0, 29), np.nan]
     poses.to_csv(tmp_path / 'poses.csv', index=False)
     assert ac.read_poses(tmp_path / 'poses.csv').quantities == ('pressure',)
-
-
-def test_a_bag_without_the_column_is_corrected_for_the_rest(tmp_path, capsys):
-    rng = np.random.default_rng(11)
-    current = rng.uniform(0.0, 12.0, 60)
-    poses = still(rng, 60, np.outer(current - 6.0, [0.001, -0.001, 0.001]), current=current)
-    ac.refine(poses, units='g').calibration.save(tmp_path / 'calibration.yaml')
-    poses.drop(columns='current').to_csv(tmp_path / 'samples.csv', index=False)
-    assert run('apply', tmp_path / 'samples.csv', '-c', tmp_path / 'calibration.yaml', '-o',
-               tmp_path / 'out.csv', '--units', 'g') == 0
-    shown = ' '.join(capsys.readouterr().out.split())
-    assert 'the samples have no current: offset_covariate-current is not corrected' in shown
 
 
 def test_an_own_effect_is_simulated_named_stored_and_needed(tmp_path, capsys):
