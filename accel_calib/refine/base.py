@@ -40,11 +40,11 @@ import numpy as np
 from numpy.typing import NDArray
 import scipy
 
-from .state import beginning, State, without
+from .state import beginning, fitted_state, State, without
 from ..calibrate import Calibration, in_g, with_history
 from ..capture import rounding_left
 from ..effects import included, Model, MODELS
-from ..estimate import estimate, judge, NotConvergedError
+from ..estimate import estimate, judge
 from ..finding import has
 from ..geometry import unit
 from ..table import Floats, Poses
@@ -333,26 +333,21 @@ def _linear(base: Model) -> Model:
 
 def _fits_better(model: Model, plain: Poses, kept: Poses) -> bool:
     """Return whether a model fits the poses clearly better without those at the limit."""
-    try:
-        without = beginning(kept, model)
-    except NotConvergedError:
+    fewer = fitted_state(model, with_history(kept, model))
+    if fewer is None or fewer.dof < 1:
         return False
-    if without.dof < 1:
-        return False
-    try:
-        whole = beginning(plain, model)
-    except NotConvergedError:
-        return True
-    return whole.linear.score(without.rss, float(len(plain) - len(kept)), 0.0) > _CLEARLY
+    whole = fitted_state(model, with_history(plain, model))
+    return whole is None or bool(
+        whole.linear.score(fewer.rss, float(len(plain) - len(kept)), 0.0) > _CLEARLY)
 
 
 def _whole(plain: Poses, kept: Poses, base: Model) -> State:
     """Return the base fitted to all poses, or to those kept if that does not converge."""
-    try:
-        return beginning(plain, base)
-    except NotConvergedError:
-        fitted = beginning(kept, base)
-        return State(judge(fitted.model, with_history(plain, fitted.model)))
+    whole = fitted_state(base, with_history(plain, base))
+    if whole is not None:
+        return whole
+    model = beginning(kept, base).model
+    return State(judge(model, with_history(plain, model)))
 
 
 def off_grid(poses_g: Poses, base: Model) -> tuple[Poses, float | None]:

@@ -90,19 +90,14 @@ def best_curve(state: State, poses_g: Poses, out: tuple[int, ...]) -> Curve | No
     if plain.dof < _LEAST_DOF:
         return None
     best, tried = None, 0
-    for carrier, variable in _pairs(poses_g):
+    for carrier, variable in curve_pairs(causes(poses_g)):
+        if variable not in poses_g and variable != 'force':
+            continue
         for problem in _problems(plain, fit, carrier, variable):
             grown, tried = _grown(_kept(problem, out)), tried + 1
             if grown.blocks and (best is None or grown.score > best[0]):
                 best = grown.score, Set.of(problem, grown.blocks, out)
     return None if best is None else _accepted(best[0] - 2.0 * math.log(tried), best[1], tried)
-
-
-def _pairs(poses_g: Poses) -> list[tuple[str, str]]:
-    """Return the carriers and variables that the poses can show."""
-    return [(carrier, variable) for carrier, variable in curve_pairs(causes(poses_g))
-            if all(key in poses_g for key in
-                   effect_named(empirical_name(carrier, variable, _ALL_MODES)).needs)]
 
 
 def _problems(plain: Linear, fit: Fit, carrier: str, variable: str) -> Iterator[Linear]:
