@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .expected import (
+from .figures import (
     BAD_ERROR, BOUND, CHANGED, COVERED, degrees, depends_on, directions_in, Expected, GOOD_ERROR,
     HIDDEN, LEFT_OUT, MATTERS, mg, NEAR_FLAT, number, PER_OUTLIER, SPAN, TILT, TO_CHECK,
     WORST_ERROR)

@@ -165,9 +165,13 @@ def _search(poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
         state, near = _settled(State(judge(state.model, poses_g)), poses_g, fixed, names)
     begun = _fitted_without(begun, poses_g, near.chosen.out)
     state, near, back = _judged(begun, state, near)
-    walks = (WANDER,) if near.walk is not None else ()
-    named = _end(start, state, (*ladder, *near.names, *walks), near, back, poses_g)
-    return _described(named, start, poses_g)
+    out, walks = near.chosen.out, () if near.walk is None else (WANDER,)
+    there = {*state.model.values, *included(state.model.values), WANDER} - _of_a_turn(state)
+    added = tuple(name for name in (*ladder, *near.names, *walks) if name in there)
+    base = _fitted_without(start, poses_g, out) if out else start
+    found = Found(base, state, added, np.array(out, np.intp), near, _walk(state, near),
+                  taken_back=back)
+    return _described(found, start, poses_g)
 
 
 def _described(found: Found, start: State, poses_g: Poses) -> Found:
@@ -428,15 +432,6 @@ def _explains(before: State, after: State) -> bool:
     return not after.fit.noise_known or after.is_noise or share >= _LEAST_SHARE
 
 
-def _end(start: State, state: State, added: tuple[str, ...], near: Near, back: tuple[str, ...],
-         poses_g: Poses) -> Found:
-    there = {*state.model.values, *included(state.model.values), WANDER} - _of_a_turn(state)
-    out = near.chosen.out
-    base = _fitted_without(start, poses_g, out) if out else start
-    return Found(base, state, tuple(name for name in added if name in there),
-                 np.array(out, np.intp), near, _walk(state, near), None, back)
-
-
 def _of_a_turn(state: State) -> set[str]:
     """
     Return the changes of gains that a mount that has turned explains.
@@ -468,9 +463,7 @@ def _of_a_turn(state: State) -> set[str]:
 
 def _walk(state: State, near: Near) -> Walk | None:
     """Return the walk beside a state, at the poses kept."""
-    if near.walk is None:
-        return None
-    process = process_of(state.linear, state.poses_g)
+    process = None if near.walk is None else process_of(state.linear, state.poses_g)
     return None if process is None else walk_beside(Set.of(state.linear), process)
 
 
