@@ -30,7 +30,7 @@ from ..calibrate import (
     Calibration, Curve, deviations_g, in_g, next_pose, NextPose, Outlook, PRIOR, Quality,
     Verification)
 from ..effects import (
-    AXES, effect_named, EMPIRICAL, empirical_parts, LADDER, Model, MODELS, predict, value_unit)
+    AXES, effect_named, LADDER, Model, MODELS, predict, value_unit)
 from ..estimate import (
     error_left_in, free_parameters, identifiability, pose_noise, sensing_axes, variance_factor)
 from ..finding import Rating
@@ -432,10 +432,9 @@ class Expected:
             return 0.0
         if quality.noise_floor_mg is None or quality.chi2_per_dof is None:
             return quality.rms_after_mg * self._per_dof
-        if _by_chance(quality.chi2_per_dof, self.dof) > _LEVEL:
+        if scipy.special.chdtrc(self.dof, quality.chi2_per_dof * self.dof) > _LEVEL:
             return 0.0
-        squared = quality.rms_after_mg ** 2 - quality.noise_floor_mg ** 2
-        return math.sqrt(max(squared, 0.0)) * self._per_dof
+        return without_noise(quality.rms_after_mg, quality.noise_floor_mg) * self._per_dof
 
     @cached_property
     def not_corrected(self) -> tuple[tuple[str, float], ...]:
@@ -478,8 +477,7 @@ class Expected:
         """Return the error without the calibration, without noise [mg]; None if not known."""
         if self.calibration.units.is_native:
             return None
-        before, noise = self.quality.rms_before_mg, self.noise_mg or 0.0
-        return math.sqrt(max(before ** 2 - noise ** 2, 0.0))
+        return without_noise(self.quality.rms_before_mg, self.noise_mg)
 
 
 def _few(dof: int) -> float:
@@ -487,9 +485,9 @@ def _few(dof: int) -> float:
     return math.sqrt(dof / float(scipy.special.chdtri(dof, 1.0 - _UNLUCKY)))
 
 
-def _by_chance(chi2_per_dof: float, dof: int) -> float:
-    """Return the probability that noise alone causes residuals at least this large."""
-    return float(scipy.special.chdtrc(dof, chi2_per_dof * dof))
+def without_noise(residual_mg: float, noise_mg: float | None) -> float:
+    """Return the part of an RMS that is not noise."""
+    return math.sqrt(max(residual_mg ** 2 - (noise_mg or 0.0) ** 2, 0.0))
 
 
 def directions_in(poses: Poses, calibration: Calibration) -> Floats:
@@ -500,8 +498,6 @@ def directions_in(poses: Poses, calibration: Calibration) -> Floats:
 
 def depends_on(name: str) -> set[str]:
     """Return the context that an effect is a function of."""
-    if name.startswith(f'{EMPIRICAL}-'):
-        return {empirical_parts(name)[1]}
     effect = effect_named(name)
     return set(effect.over or effect.needs)
 
@@ -520,7 +516,6 @@ def number(value: float) -> str:
 
 
 def mg(value: float) -> str:
-    """Return an error with its unit."""
     return f'{number(value)} mg'
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from .figures import (
     BAD_ERROR, BOUND, CHANGED, COVERED, degrees, depends_on, directions_in, Expected, GOOD_ERROR,
     HIDDEN, LEFT_OUT, MATTERS, mg, NEAR_FLAT, number, PER_OUTLIER, SPAN, TILT, TO_CHECK,
-    WORST_ERROR)
+    without_noise, WORST_ERROR)
 from ..calibrate import Calibration, flat_direction, Verification
 from ..effects import EMPIRICAL, WANDER
 from ..errors import TAKE_ALL_SIDES
@@ -310,7 +310,7 @@ def rate_verification(verification: Verification, calibration: Calibration,
     """
     expected, floor = Expected(calibration), verification.noise_floor_mg
     own = rate(calibration)
-    error = _without_noise(verification.rms_after_mg, floor)
+    error = without_noise(verification.rms_after_mg, floor)
     found = [*_on_new_poses(verification, expected, own, error)]
     covered = 1.0 if poses is None else coverage(directions_in(poses, calibration))
     if expected.is_partial or covered < COVERED.value / 100.0:
@@ -329,7 +329,7 @@ def _on_new_poses(verification: Verification, expected: Expected, own: Rating, e
     """Yield the findings that a verification shows."""
     floor, again = verification.noise_floor_mg, 'fit again with these poses'
     native = expected.calibration.units.is_native
-    before = _without_noise(verification.rms_before_mg, floor)
+    before = without_noise(verification.rms_before_mg, floor)
     if error > BAD_ERROR.value:
         yield Finding('error', f'the error of these poses is {mg(error)}, expected at most '
                       f'{mg(BAD_ERROR.value)}', again, 'BAD', step='fit')
@@ -468,7 +468,3 @@ def rate_fleet(counts: Mapping[str, int], sensors: int, changed: int, unnamed: i
             'take the names of the sensors from the paths with --sensor-from REGEX', 'USABLE'))
     return rated(found, 'each recording has a usable calibration', figures,
                  NextStep('done', 'use the calibrations'))
-
-
-def _without_noise(residual_mg: float, noise_mg: float | None) -> float:
-    return math.sqrt(max(residual_mg ** 2 - (noise_mg or 0.0) ** 2, 0.0))
