@@ -33,7 +33,7 @@ from .steps import (
 from ..calibrate import (
     Calibration, check_sensor, fit_findings, fit_poses, fit_with_fleet, FLEET, FleetPrior, gated,
     in_g, OF_A_FIT, only_norm, posterior, quality_of, record_of, refuse_if_unfit, Rejected,
-    sound_rows, sure_rows, uncertainty_g, with_history, with_rest_noise)
+    rejected_by, sound_rows, sure_rows, uncertainty_g, with_history, with_rest_noise)
 from ..effects import (
     CHANGES, included, Model, MODELS, parameter_names, PROCESSES, WANDER, with_vector)
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
@@ -43,7 +43,7 @@ from ..finding import Finding, without as without_kinds
 from ..geometry import unit
 from ..table import check_units, Floats, Poses, Record
 from ..text import counted, short, table
-from ..units import BASES, MG, Units
+from ..units import BASES, Units
 
 _LEAST_POSES = 4
 """Smallest number of poses in which an effect can be found."""
@@ -260,7 +260,10 @@ def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Un
 
 def _record(calibration: Calibration, found: Found, given: Given, sensor: str, date: str
             ) -> Refinement:
-    start, final = _as_stored(calibration, found) if given.stored else found.base, found.final
+    start, final = found.base, found.final
+    if given.stored:  # as stored, without a fit
+        kept = calibration.held(start.poses_g)
+        start = State(judge(Model(calibration.model.values), kept))
     steps, stages = steps_of(found, start, calibration.date, joint=given.joint)
     missing, plan = untestable(found, steps), plan_poses(found)
     verdict, _ = verdict_of(found, steps, refused=False)
@@ -269,11 +272,9 @@ def _record(calibration: Calibration, found: Found, given: Given, sensor: str, d
         advice = advice_for(found, steps, missing, len(calibration.rejected))
         return _of_fit(calibration, alone, verdict, missing, (*advice, *plan.advice))
     rejected = _rejected(found, given)
-    clipped = () if found.clipped is None else given.poses_g.row[found.clipped.poses]
-    outliers = tuple(each.row for each in rejected if each.row not in clipped)
+    outliers = tuple(each.row for each in rejected if each.kind != 'clipped')
     refined, refusal = refined_calibration(calibration, final, found.added, given, rejected)
-    if sensor or date:
-        refined = replace(refined, sensor=sensor or refined.sensor, date=date or refined.date)
+    refined = replace(refined, sensor=sensor or refined.sensor, date=date or refined.date)
     verdict, undecided = verdict_of(found, steps, refused=bool(refusal))
     unexplained = verdict == 'unexplained' and not undecided
     advice = (*advice_for(found, steps, missing, len(outliers), unexplained=unexplained),
@@ -284,20 +285,9 @@ def _record(calibration: Calibration, found: Found, given: Given, sensor: str, d
         final.poses_g, final.fit.equations.force, stages, plan, undecided)
 
 
-def _as_stored(calibration: Calibration, found: Found) -> State:
-    """Return the state of a stored calibration at the poses kept, without a fit."""
-    kept = calibration.held(found.base.poses_g)
-    return State(judge(Model(calibration.model.values), kept))
-
-
 def _rejected(found: Found, given: Given) -> tuple[Rejected, ...]:
     """Return the rows of the table that were left out, with the reason."""
-    out = given.poses_g.take(found.outliers)
-    force = found.final.model.at(out.columns).force(out.reading)
-    away = np.linalg.norm(force, axis=1) - 1.0
-    rejected = [Rejected(int(row), f'outlier: |force| differs by {error * MG:+.2f} mg from 1 g in '
-                         'the fit of the others', 'outlier')
-                for row, error in zip(out.row, away, strict=True)]
+    rejected = [*rejected_by(found.final.model, given.poses_g.take(found.outliers))]
     if found.clipped is not None:
         rejected += [Rejected(int(row), 'the reading is clipped at the limit of the sensor',
                               'clipped')
