@@ -155,7 +155,6 @@ class Finding:
 
     @property
     def words(self) -> str:
-        """Return text and advice in one line."""
         return '; '.join(filter(None, (self.text, self.advice)))
 
 

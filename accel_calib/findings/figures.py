@@ -200,7 +200,6 @@ def _own_names(calibration: Calibration) -> dict[str, Any]:
 
 
 def refinement_json(result: Refinement) -> dict[str, Any]:
-    """Return a refinement for JSON."""
     return {
         'verdict': result.verdict, 'undecided': result.undecided, 'base': result.calibration.name,
         'poses_used': len(result.poses_g), 'noise_floor_mg': result.noise_floor_mg,
@@ -336,7 +335,6 @@ class Expected:
 
     @cached_property
     def next_pose(self) -> NextPose:
-        """Return the pose that improves the calibration most."""
         return next_pose(self.directions, self.calibration.form.largest, self.noise)
 
     @cached_property
@@ -381,7 +379,6 @@ class Expected:
 
     @cached_property
     def directions(self) -> Floats:
-        """Return the direction of up in each pose, (n, 3) unit vectors in the sensor axes."""
         return directions_in(self.poses, self.calibration)
 
     @cached_property

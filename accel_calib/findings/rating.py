@@ -64,12 +64,10 @@ def rate(calibration: Calibration, *, refinement: Refinement | None = None) -> R
 
 
 def rate_refinement(result: Refinement) -> Rating:
-    """Rate the calibration of a refinement."""
     return rate(result.calibration, refinement=result)
 
 
 def _figures(expected: Expected) -> str:
-    """Return the figures of a calibration in one line."""
     quality = expected.quality
     parts = [f'{number(quality.rms_before_mg)} -> {mg(quality.rms_after_mg)}']
     if quality.held_out_rms_mg is not None and not expected.is_partial:
@@ -93,7 +91,6 @@ def findings_of(expected: Expected, refinement: Refinement | None) -> tuple[Find
 
 
 def _refused(expected: Expected, refinement: Refinement | None) -> Iterator[Finding]:
-    """Yield the reason why the gate refuses the calibration, if it is the refined one."""
     if refinement is not None and refinement.refusal and _has(expected, refinement):
         message, advice = refinement.refusal
         yield Finding('refused', message, advice, 'BAD')
@@ -116,7 +113,6 @@ def _too_large(expected: Expected, refinement: Refinement | None) -> Iterator[Fi
 
 
 def _limited(expected: Expected) -> Iterator[Finding]:
-    """Yield a finding if the calibration is partial, a mounting, or a curve over temperature."""
     if not expected.calibration.model.effects:
         yield Finding('mounting_alone', 'it is a mounting alone: offset and gain are not '
                       'calibrated', _more_poses(expected), 'USABLE')
@@ -130,7 +126,6 @@ def _limited(expected: Expected) -> Iterator[Finding]:
 
 
 def _checked(expected: Expected) -> Iterator[Finding]:
-    """Yield findings if too few poses check the fit."""
     if expected.is_partial or not expected.calibration.model.effects:
         return
     if expected.dof == 0:
@@ -154,7 +149,6 @@ def _checked(expected: Expected) -> Iterator[Finding]:
 
 
 def _too_few_left(expected: Expected) -> Iterator[Finding]:
-    """Yield a finding if few poses check the fit after outliers were left out."""
     out = [each.row for each in expected.calibration.rejected if each.kind == 'outlier']
     if out and expected.dof < TO_CHECK.value + PER_OUTLIER.value * len(out):
         yield Finding('outliers', f'{counted(len(out), "outlier")} left out, and only '
@@ -229,7 +223,6 @@ def _inexact(expected: Expected, error: float, refinement: Refinement | None
 
 
 def _left_out(expected: Expected) -> Iterator[Finding]:
-    """Yield a finding if many poses were left out."""
     calibration = expected.calibration
     rows = tuple(each.row for each in calibration.rejected)
     if rows and 100.0 * len(rows) > LEFT_OUT.value * len(calibration.poses):
@@ -239,7 +232,6 @@ def _left_out(expected: Expected) -> Iterator[Finding]:
 
 
 def _more_poses(expected: Expected) -> str:
-    """Return which pose to take next."""
     asked = expected.next_pose
     if asked.direction is None:
         return 'take more poses, and hold the sensor longer in each'
@@ -326,7 +318,6 @@ def rate_verification(verification: Verification, calibration: Calibration,
 
 def _on_new_poses(verification: Verification, expected: Expected, own: Rating, error: float
                   ) -> Iterator[Finding]:
-    """Yield the findings that a verification shows."""
     floor, again = verification.noise_floor_mg, 'fit again with these poses'
     native = expected.calibration.units.is_native
     before = without_noise(verification.rms_before_mg, floor)

@@ -425,7 +425,6 @@ def _rows(poses: Poses, stored: Poses) -> NDArray[np.int64]:
 
 
 def _shares(poses_g: Poses, stored: Poses) -> bool:
-    """Return whether a pose is in both tables."""
     new, old = ({tuple(row) for row in poses.reading.round(_DIGITS).tolist()}
                 for poses in (poses_g, stored))
     return not new.isdisjoint(old)

@@ -172,7 +172,6 @@ def _held_out(chosen: Set) -> float:
 
 
 def is_curve(name: str) -> bool:
-    """Return whether an effect is an empirical curve."""
     return name.startswith(f'{EMPIRICAL}-')
 
 
@@ -358,7 +357,6 @@ class Near:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Return the names of the chosen effects."""
         return self.chosen.effects
 
     @property

@@ -134,7 +134,6 @@ class Linear:
 
     @cached_property
     def numbers_of(self) -> dict[str, NDArray[np.intp]]:
-        """Return the blocks of each effect."""
         numbers: dict[str, list[int]] = {}
         for number, block in enumerate(self.blocks):
             numbers.setdefault(block.effect, []).append(number)
@@ -215,7 +214,6 @@ class Set:
 
     @classmethod
     def of(cls, linear: Linear, blocks: Iterable[int] = (), out: Iterable[int] = ()) -> Set:
-        """Return the set of these blocks, with these poses left out."""
         out = tuple(sorted(out))
         if out not in linear.without_poses:
             linear.without_poses[out] = cls._of_poses(linear, out)
@@ -237,7 +235,6 @@ class Set:
         return cls(linear, (), out, units, across, np.eye(len(rows)))
 
     def extended(self, block: int) -> Set:
-        """Return the set with one more block."""
         part = self.linear.blocks[block].columns
         along = self.across[:, part]
         left = self.linear.products[part] - along.T @ self.across
@@ -286,7 +283,6 @@ class Set:
 
     @cached_property
     def rss(self) -> float:
-        """Return the sum of squares that is left."""
         gain = self.across[:, -1] @ self.across[:, -1]
         return max(float(self.linear.products[-1, -1] - gain), 0.0)
 

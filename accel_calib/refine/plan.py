@@ -434,7 +434,6 @@ def _counted(texts: list[str]) -> list[str]:
 
 
 def versus(names: Sequence[str]) -> str:
-    """Return the words of an effect and its rivals."""
     first, *others = (shown_name(name) for name in names)
     return f'{first} from {", ".join(others)}'
 

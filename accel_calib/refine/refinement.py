@@ -140,7 +140,6 @@ class Refinement(Record):
 
 
 def verdict_words(result: Refinement) -> str:
-    """Return the verdict as a sentence."""
     walks = any(step.effect == WANDER for step in result.steps)
     words = _VERDICTS[result.verdict].format(
         'a slow change of the offset' if walks else 'an empirical curve')
@@ -156,7 +155,6 @@ def verdict_words(result: Refinement) -> str:
 
 
 def _undecided(result: Refinement) -> str:
-    """Return why it is not known what explains a gap."""
     if result.refusal:
         why = result.refusal[0]
     else:
@@ -178,7 +176,6 @@ def residual_words(result: Refinement) -> str:
 
 
 def base_words(result: Refinement) -> str:
-    """Return the name of the base model."""
     name = result.calibration.name
     return 'ideal sensor' if name == 'ideal' else f'model {name}'
 
@@ -286,7 +283,6 @@ def _record(calibration: Calibration, found: Found, given: Given, sensor: str, d
 
 
 def _rejected(found: Found, given: Given) -> tuple[Rejected, ...]:
-    """Return the rows of the table that were left out, with the reason."""
     rejected = [*rejected_by(found.final.model, given.poses_g.take(found.outliers))]
     if found.clipped is not None:
         rejected += [Rejected(int(row), 'the reading is clipped at the limit of the sensor',

@@ -273,7 +273,6 @@ class _Trial:
     tried: tuple[Candidate, ...]
 
     def near(self, state: State) -> Linear:
-        """Return the equations near a model."""
         return linearised(judge(state.model, self.poses_g), self.fixed, self.tried)
 
     def fitted(self, chosen: Set, state: State, most: float = np.inf) -> State | None:
@@ -462,7 +461,6 @@ def _of_a_turn(state: State) -> set[str]:
 
 
 def _walk(state: State, near: Near) -> Walk | None:
-    """Return the walk beside a state, at the poses kept."""
     process = None if near.walk is None else process_of(state.linear, state.poses_g)
     return None if process is None else walk_beside(Set.of(state.linear), process)
 

@@ -148,7 +148,6 @@ def _amplitudes(model: Model) -> Floats:
 
 def _blocks(near: Equations, context: Context, present: Model, tried: Sequence[Candidate]
             ) -> tuple[tuple[Block, ...], Floats]:
-    """Return the blocks of the candidates, and their columns."""
     alike = Counter(kind_of(each.name) for each in tried)
     tried = [each.beside(present.values.get(each.name), context) for each in tried]
     widths = [len(each.shapes) * len(each.entry.parameters) for each in tried]
@@ -252,5 +251,4 @@ def with_effect(model: Mapping[str, Floats], name: str, values: Floats) -> dict[
 
 
 def without(poses: Poses, out: Sequence[int] | NDArray[np.intp]) -> Poses:
-    """Return the poses but those at these indices."""
     return poses.take(np.delete(np.arange(len(poses)), out))

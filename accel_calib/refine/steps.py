@@ -277,7 +277,6 @@ def _p_value(name: str, before: State, found: Found) -> float:
 
 
 def _output_steps(found: Found) -> list[Step]:
-    """Return the steps for readings clipped at a limit or on a grid."""
     steps = []
     gap, held_out = found.base.gap_mg(found.base.residual), found.base.gap_mg(found.base.held_out)
     if found.clipped is not None and found.with_clipped is not None:
