@@ -29,8 +29,7 @@ import scipy
 from ..calibrate import (
     Calibration, Curve, deviations_g, in_g, next_pose, NextPose, Outlook, PRIOR, Quality,
     Verification)
-from ..effects import (
-    AXES, effect_named, LADDER, Model, MODELS, predict, value_unit)
+from ..effects import AXES, effect_named, LADDER, Model, MODELS, predict, value_unit
 from ..estimate import (
     error_left_in, free_parameters, identifiability, pose_noise, sensing_axes, variance_factor)
 from ..finding import Rating
@@ -54,16 +53,8 @@ class Figure:
     """
     A figure of a result.
 
-    Parameters
-    ----------
-    key : str
-        Name, which is unique in the result.
-    label : str
-        Name for people.
-    unit : str
-        Unit of the value; may be empty.
-    value, sd : float
-        Value, and its standard deviation; 0 if it has none.
+    `key` is unique in the result, and `label` is for people. `unit` may be empty. `sd` is the
+    standard deviation of `value`; 0 if it has none.
 
     """
 
@@ -313,15 +304,7 @@ have quantities, either."""
 
 
 class Expected:
-    """
-    The expected error of a calibration in new orientations, and its parts.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration.
-
-    """
+    """The expected error of a calibration in new orientations, and its parts."""
 
     def __init__(self, calibration: Calibration) -> None:
         self.calibration = calibration

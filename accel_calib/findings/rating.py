@@ -50,11 +50,6 @@ def rate(calibration: Calibration, *, refinement: Refinement | None = None) -> R
     refinement : Refinement, optional
         A refinement of the same poses; its calibration, or the base, is rated.
 
-    Returns
-    -------
-    Rating
-        The verdict.
-
     """
     expected = Expected(calibration)
     good = (f'corrected readings in new orientations are right to {mg(expected.error_mg)} '
@@ -294,11 +289,6 @@ def rate_verification(verification: Verification, calibration: Calibration,
         These poses. If they cover only a part of the sphere, the rating is not better than that
         of the calibration itself.
 
-    Returns
-    -------
-    Rating
-        The verdict.
-
     """
     expected, floor = Expected(calibration), verification.noise_floor_mg
     own = rate(calibration)
@@ -346,15 +336,7 @@ def rate_comparison(comparison: Comparison) -> Rating:
     """
     Rate the agreement of calibrations of one sensor.
 
-    Parameters
-    ----------
-    comparison : Comparison
-        The comparison.
-
-    Returns
-    -------
-    Rating
-        GOOD if they agree, USABLE if the differences are small, otherwise BAD.
+    GOOD if they agree, USABLE if the differences are small, otherwise BAD.
 
     """
     largest = max(comparison.runs, key=lambda run: run.rms_mg)
@@ -392,11 +374,8 @@ def rate_noise(found: NoiseFigures) -> Rating:
     """
     Rate the figures of a rest.
 
-    Returns
-    -------
-    Rating
-        GOOD if it shows white noise and random walk of every axis, USABLE if one of them is not
-        seen or the noise is larger than that of common parts, BAD without white noise.
+    GOOD if it shows white noise and random walk of every axis, USABLE if one of them is not seen
+    or the noise is larger than that of common parts, BAD without white noise.
 
     """
     from ..noise import duration, shown_unit, TYPICAL, WORDS  # a fit alone does not load it
@@ -426,6 +405,8 @@ def rate_fleet(counts: Mapping[str, int], sensors: int, changed: int, unnamed: i
     """
     Rate the calibrations of a fleet.
 
+    GOOD if every recording has a usable calibration and no sensor changed, BAD if none has.
+
     Parameters
     ----------
     counts : mapping of str to int
@@ -434,11 +415,6 @@ def rate_fleet(counts: Mapping[str, int], sensors: int, changed: int, unnamed: i
         Number of sensors, and of those whose calibrations do not agree.
     unnamed : int
         Number of recordings without a name of their sensor.
-
-    Returns
-    -------
-    Rating
-        GOOD if every recording has a usable calibration and no sensor changed, BAD if none has.
 
     """
     total, usable = sum(counts.values()), counts.get('GOOD', 0) + counts.get('USABLE', 0)

@@ -340,8 +340,8 @@ class Near:
     """
     What was chosen in the equations of all poses near a model.
 
-    `chosen` has the effects and outliers; its equations are whitened if there is a `walk` of the
-    offset, and `plain` are not. `process` has the modes of a walk; None if it is not tried.
+    The equations of `chosen` are whitened if there is a `walk`; those of `plain` are not. If no
+    walk is tried, `process` is None.
 
     """
 

@@ -347,12 +347,7 @@ class Set:
         return onto, self.linear.whitened(self.linear.residual) - onto @ self.across[:, -1]
 
     def gains(self, effect: str = '') -> tuple[Floats, Floats]:
-        """
-        Return the (b,) gain of each block in addition to the set, and its (b,) rank.
-
-        Both are 0 for the blocks of other effects, if one is given.
-
-        """
+        """Return (b,) gains and ranks of the blocks beside the set; 0 for those of other effects."""
         linear, across = self.linear, self.across
         along = linear.products[-1, :-1] - across[:, -1] @ across[:, :-1]
         gain, rank = np.zeros(len(linear.blocks)), np.zeros(len(linear.blocks))
@@ -370,12 +365,7 @@ class Set:
 
     @property
     def scores_beside(self) -> Floats:
-        """
-        Return the (b,) scores with one more block, without the penalty for its size.
-
-        They are -inf for a block that determines nothing.
-
-        """
+        """Return the (b,) scores with one more block, before the penalty for its size, or -inf."""
         gain, rank = self.gains()
         searched, cost = self.linear.costs
         scores = self.linear.score(self.rss - gain, self.parameters + rank + searched,
