@@ -347,7 +347,7 @@ class Set:
         return onto, self.linear.whitened(self.linear.residual) - onto @ self.across[:, -1]
 
     def gains(self, effect: str = '') -> tuple[Floats, Floats]:
-        """Return (b,) gains and ranks of the blocks beside the set; 0 for those of other effects."""
+        """Return (b,) gains and ranks of the blocks beside the set; 0 for other effects."""
         linear, across = self.linear, self.across
         along = linear.products[-1, :-1] - across[:, -1] @ across[:, :-1]
         gain, rank = np.zeros(len(linear.blocks)), np.zeros(len(linear.blocks))
