@@ -415,8 +415,15 @@ def check_units(poses: Table, units: Units, source: str = '') -> None:
     """
     if len(poses) == 0:
         return
-    if not units.is_native:
-        _check_readings(_median_length(poses.reading), units, source and f'{source}: ')
+    length = _median_length(poses.reading)
+    if not units.is_native and not _is_likely(length, units.per_g):
+        supported = next((name for name in _likely(length) if name in _SUPPORTED), None)
+        advice = (f'set the units of the readings to {supported}' if supported else
+                  f'{_look(length)}set the units of the readings to native; the fit estimates '
+                  'their scale')
+        raise InputError(f'{source and f"{source}: "}the length of the readings is about '
+                         f'{length:.4g}, expected about {units.per_g:.4g} at rest in '
+                         f'{units.name}', advice)
     if 'reference' in poses:
         _check_reference(_median_length(poses['reference']), units)
 
@@ -424,17 +431,6 @@ def check_units(poses: Table, units: Units, source: str = '') -> None:
 def _median_length(vectors: Floats) -> float:
     with np.errstate(over='ignore'):
         return float(np.median(np.linalg.norm(vectors, axis=1)))
-
-
-def _check_readings(length: float, units: Units, where: str) -> None:
-    if _is_likely(length, units.per_g):
-        return
-    supported = next((name for name in _likely(length) if name in _SUPPORTED), None)
-    advice = (f'set the units of the readings to {supported}' if supported else
-              f'{_look(length)}set the units of the readings to native; the fit estimates their '
-              'scale')
-    raise InputError(f'{where}the length of the readings is about {length:.4g}, expected about '
-                     f'{units.per_g:.4g} at rest in {units.name}', advice)
 
 
 def _check_reference(length: float, units: Units) -> None:

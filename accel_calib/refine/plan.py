@@ -165,9 +165,8 @@ def plan_poses(found: Found) -> PosePlan:
     A random walk of the offset cannot be predicted, so it is not planned for.
 
     """
-    if found.near.walk is not None:
-        return PosePlan()
-    rivalries = list(filter(None, (_fits(name, found) for name in found.near.names)))
+    names = () if found.near.walk is not None else found.near.names
+    rivalries = [fits for name in names if (fits := _fits(name, found))]
     if not rivalries:
         return PosePlan()
     grid = _Candidates.of(found.final.fit, _varied({name for each in rivalries for name in each}))

@@ -267,7 +267,7 @@ def _record(calibration: Calibration, found: Found, given: Given, sensor: str, d
     if verdict == 'no_gap' and calibration.reason != 'ideal' and not given.stored:
         alone = given.poses_g.take(np.isin(given.poses_g.row, calibration.used_poses.row))
         advice = advice_for(found, steps, missing, len(calibration.rejected))
-        return _of_fit(calibration, alone, verdict, missing, (*advice, *plan.advice))
+        return _of_fit(calibration, alone, missing, (*advice, *plan.advice))
     rejected = _rejected(found, given)
     outliers = tuple(each.row for each in rejected if each.kind != 'clipped')
     refined, refusal = refined_calibration(calibration, final, found.added, given, rejected)
@@ -349,7 +349,7 @@ def _without_search(fitted: Calibration, message: str, advice: str) -> Refinemen
     """Return the fit with the fleet as a refinement, with the reason why nothing was searched."""
     poses_g = in_g(fitted.used_poses, fitted.units)
     found = _of_fit(
-        fitted, with_history(only_norm(poses_g), fitted.model), 'no_gap',
+        fitted, with_history(only_norm(poses_g), fitted.model),
         not_testable(poses_g, {}, fitted.model.effects),
         (f'no effects were searched: {message}; the result is the fit with the fleet', advice))
     fit, ratio = judge(Model(fitted.model.values), found.poses_g), fitted.quality.chi2_per_dof
@@ -358,16 +358,14 @@ def _without_search(fitted: Calibration, message: str, advice: str) -> Refinemen
                    noise_floor_mg=fitted.quality.noise_floor_mg)
 
 
-def _of_fit(fitted: Calibration, poses_g: Poses, verdict: Verdict,
-            missing: tuple[tuple[str, str], ...], advice: tuple[str, ...]) -> Refinement:
+def _of_fit(fitted: Calibration, poses_g: Poses, missing: tuple[tuple[str, str], ...],
+            advice: tuple[str, ...]) -> Refinement:
     """Return a fit as a refinement without steps; `poses_g` are the poses that it used."""
-    state = State(judge(Model(fitted.model.values), poses_g))
-    gap_mg = state.gap_mg(state.fit.residual)
-    return Refinement(
-        verdict, state.floor_mg, gap_mg, gap_mg, (),
-        tuple(each.row for each in fitted.rejected), missing, advice, fitted, (), poses_g,
-        state.fit.equations.force, (Stage('base', state.mg_of_poses(state.fit.residual)),),
-        PosePlan())
+    fit = judge(Model(fitted.model.values), poses_g)
+    state, out = State(fit), tuple(each.row for each in fitted.rejected)
+    gap_mg, base = state.gap_mg(fit.residual), Stage('base', state.mg_of_poses(fit.residual))
+    return Refinement('no_gap', state.floor_mg, gap_mg, gap_mg, (), out, missing, advice, fitted,
+                      (), poses_g, fit.equations.force, (base,), PosePlan())
 
 
 def base_of(poses: Poses, units: Units, name: str, *, sensor: str = '', date: str = ''
