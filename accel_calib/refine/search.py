@@ -164,13 +164,16 @@ def _search(poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
         poses_g = with_previous(poses_g, unit(force))
         state, near = _settled(State(judge(state.model, poses_g)), poses_g, fixed, names)
     begun = _fitted_without(begun, poses_g, near.chosen.out)
-    state, near, back = _judged(begun, state, near)
+    taken_back: tuple[str, ...] = ()
+    if near.names and near.walk is None and not _explains(begun, state):
+        taken_back, state = near.names, begun
+        near = replace(near, chosen=near.chosen.instead(()))
     out, walks = near.chosen.out, () if near.walk is None else (WANDER,)
     there = {*state.model.values, *included(state.model.values), WANDER} - _of_a_turn(state)
     added = tuple(name for name in (*ladder, *near.names, *walks) if name in there)
-    base = _fitted_without(start, poses_g, out) if out else start
-    found = Found(base, state, added, np.array(out, np.intp), near, _walk(state, near),
-                  taken_back=back)
+    first = _fitted_without(start, poses_g, out) if out else start
+    found = Found(first, state, added, np.array(out, np.intp), near, _walk(state, near),
+                  taken_back=taken_back)
     return _described(found, start, poses_g)
 
 
@@ -416,13 +419,6 @@ def _visible(state: State, names: Iterable[str]) -> tuple[str, ...]:
     unknown = not len(kinds(state.poses_g)[0])
     return tuple(name for name in names if name not in present
                  and not (unknown and effect_named(name).known_orientation))
-
-
-def _judged(begun: State, state: State, near: Near) -> tuple[State, Near, tuple[str, ...]]:
-    """Remove all effects if a gap remains and they explain too little of the residual."""
-    if not near.names or near.walk is not None or _explains(begun, state):
-        return state, near, ()
-    return begun, replace(near, chosen=near.chosen.instead(())), near.names
 
 
 def _explains(before: State, after: State) -> bool:

@@ -444,7 +444,12 @@ def advice_for(found: Found, steps: tuple[Step, ...], untestable: tuple[tuple[st
     """
     lines = [*_other_sensor(found), *_unseen_turn(found)]
     lines += [_separating(step) for step in steps if step.rivals]
-    lines += [line for step in steps for line in _remarks(step)]
+    for step in steps:
+        times, effect = times_typical(step), effect_named(step.name)
+        if times > _FAR:
+            lines.append(f'{step.effect} is {times * effect.typical:.2g} {effect.unit}, typical '
+                         f'parts have about {effect.typical:.2g}: check that the sensor causes '
+                         'it, and not the setup')
     if left_out:
         were, them = ('was', 'it') if left_out == 1 else ('were', 'them')
         lines.append(f'{counted(left_out, "pose")} {were} left out; take {them} again')
@@ -508,13 +513,3 @@ def times_typical(step: Step) -> float:
     effect = effect_named(step.name)
     return max((abs(step.parameters.get(name, 0.0)) for name in effect.parameters),
                default=0.0) / effect.typical
-
-
-def _remarks(step: Step) -> list[str]:
-    """Return a remark on values that are far larger than in common parts."""
-    times = times_typical(step)
-    if times <= _FAR:
-        return []
-    effect = effect_named(step.name)
-    return [f'{step.effect} is {times * effect.typical:.2g} {effect.unit}, typical parts have '
-            f'about {effect.typical:.2g}: check that the sensor causes it, and not the setup']
