@@ -189,15 +189,16 @@ def stored():
     return model, fit_poses(poses, G, date='2026-11-02T00:00:00')
 
 
-def test_the_gap_of_a_stored_calibration_is_that_of_the_file(stored):
+def test_the_gap_of_a_stored_calibration_is_that_of_the_file_and_another_sensor_is_told(stored):
     model, base = stored
     rng = np.random.default_rng(22)
-    for truth in (model, with_effects(rng)):
+    for truth in (model, with_effects(rng, offset=np.array([0.08, -0.06, 0.05]))):
         new = at_20(truth, rng, 16)
         found = refine(new, G, base=base)
         assert found.gap_mg == pytest.approx(verify(base, new).rms_after_mg)
         assert len(set(found.poses_g.row.tolist())) == len(found.poses_g)
         assert (found.verdict == 'no_gap') is (truth is model)
+    assert found.advice[0].startswith('this is probably another sensor')
 
 
 def test_hot_poses_beside_a_cold_calibration_name_the_temperature(stored):
@@ -211,14 +212,6 @@ def test_hot_poses_beside_a_cold_calibration_name_the_temperature(stored):
     np.testing.assert_allclose([found.steps[0].parameters[axis] for axis in 'xyz'], WARM,
                                atol=5e-5)
     assert found.gap_mg > 5.0
-
-
-def test_another_sensor_is_named_as_such(stored):
-    _, base = stored
-    rng = np.random.default_rng(25)
-    other = with_effects(rng, offset=np.array([0.08, -0.06, 0.05]))
-    found = refine(at_20(other, rng, 20), G, base=base)
-    assert found.advice[0].startswith('this is probably another sensor')
 
 
 def test_a_stored_calibration_with_an_effect_of_time_is_compared_as_stored():

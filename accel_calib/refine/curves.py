@@ -359,6 +359,14 @@ class Near:
     def names(self) -> tuple[str, ...]:
         return self.chosen.effects
 
+    def block_of(self, name: str) -> int:
+        """Return the index of the block of a chosen effect."""
+        return self.chosen.blocks[self.names.index(name)]
+
+    def without(self, name: str) -> Set:
+        """Return what was chosen, without an effect."""
+        return self.chosen.without(self.block_of(name))
+
     @property
     def key(self) -> tuple[frozenset[str], tuple[int, ...], bool]:
         """Return what was chosen, apart from values and shapes."""
@@ -388,21 +396,17 @@ def probabilities(name: str, near: Near, *, usual: bool = True) -> dict[str, flo
 
 def _scores(name: str, near: Near, least: float, *, usual: bool) -> dict[str, float]:
     """Return the scores of the set with each effect in the place of a named one, above `least`."""
-    def back(chosen: Set) -> float:
-        return 0.0 if usual else chosen.unusual
-
-    if name == WANDER:
-        others = near.beside
-    else:
-        others = near.chosen.without(near.chosen.blocks[near.names.index(name)])
-    scores = {name: near.chosen.score + back(near.chosen)}
-    least += scores[name] - back(others)
+    back = 0.0 if usual else 1.0
+    others = near.beside if name == WANDER else near.without(name)
+    scores = {name: near.chosen.score + back * near.chosen.unusual}
+    least += scores[name] - back * others.unusual
     for number, likely in enumerate(others.scores_beside):
         effect = others.linear.blocks[number].effect
         if (likely > least and effect not in near.names
                 and (effect in LADDER or name not in LADDER)):
             larger = others.extended(number)
-            scores[effect] = max(larger.score + back(larger), scores.get(effect, -np.inf))
+            score = larger.score + back * larger.unusual
+            scores[effect] = max(score, scores.get(effect, -np.inf))
     if name != WANDER and near.walk is None and near.process is not None:
-        scores[WANDER] = walk_beside(others, near.process).score + back(others)
+        scores[WANDER] = walk_beside(others, near.process).score + back * others.unusual
     return scores

@@ -271,12 +271,11 @@ def _fits(name: str, found: Found) -> dict[str, tuple[float, Fit]]:
 
 def _fit_of(rival: str, name: str, found: Found) -> Fit | None:
     """Return the fit with a rival in the place of an effect, or None without a sound fit."""
-    chosen = found.near.chosen
-    others = chosen.without(chosen.blocks[chosen.effects.index(name)])
+    others = found.near.without(name)
     best = others.best_of(rival)
     unchanged = {key: part for key, part in found.final.model.values.items() if key != name}
     values = with_effect(unchanged, rival, np.concatenate(
-        [others.extended(best).values[best], chosen.linear.blocks[best].shape]))
+        [others.extended(best).values[best], others.linear.blocks[best].shape]))
     state = fitted_state(Model(values), found.final.poses_g)
     return None if state is None else state.fit
 

@@ -270,7 +270,7 @@ def _p_value(name: str, before: State, found: Found) -> float:
     if found.curve is not None and name == found.curve.name:
         return found.curve.p_value
     if name in near.names:
-        return near.chosen.probability(near.chosen.blocks[near.names.index(name)])
+        return near.chosen.probability(near.block_of(name))
     linear = linearised(before.fit, before.model.effects, candidates(LADDER, before.poses_g))
     own = [number for number, block in enumerate(linear.blocks) if block.effect == name]
     return Set.of(linear, own).probability(own[0]) if own else 1.0
