@@ -322,38 +322,16 @@ def numbered(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.int64]:
     return np.arange(1, len(columns['reading']) + 1)
 
 
-def columns_from(given: Mapping[str, Any], needed: Sequence[str], source: str
-                 ) -> dict[str, NDArray[Any]]:
-    """
-    Return columns under the keys of `COLUMNS`, from columns under their names in a file.
-
-    `given` has n values for each name. Other columns of finite numbers are quantities, the rest is
-    ignored. Raise InputError if a key of `needed` or a part of a column is missing, or a value is
-    not valid. `source` is for the error.
-
-    """
-    columns: dict[str, NDArray[Any]] = {}
-    for key in present(list(given), needed, source):
-        parts = [np.asarray(given[name]) for name in COLUMNS[key].names]
-        values = np.column_stack(parts) if len(parts) > 1 else parts[0]
-        columns[key] = values.astype(str) if key == 'label' else values.astype(float)
-    check_values(columns, source)
-    return {**columns, **quantities_of(given)}
-
-
-def quantities_of(given: Mapping[str, Any]) -> dict[str, Floats]:
-    """Return the columns of finite numbers that are not in `COLUMNS`, by key."""
-    found: dict[str, Floats] = {}
-    for name, values in given.items():
-        numbers = np.asarray(values)
-        if quantity_key(name) and numbers.dtype.kind in 'iuf' and np.all(
-                np.abs(numbers) < LARGEST):
-            found.setdefault(quantity_key(name), numbers.astype(float))
-    return found
+def columns_from(given: Mapping[str, Floats]) -> dict[str, Floats]:
+    """Return the columns of which all names are given, by key."""
+    parts = {key: [np.asarray(given[name], float) for name in column.names]
+             for key, column in COLUMNS.items() if set(column.names) <= given.keys()}
+    return {key: np.column_stack(each) if len(each) > 1 else each[0]
+            for key, each in parts.items()}
 
 
 def present(header: Sequence[str], needed: Sequence[str], source: str) -> list[str]:
-    """Return the keys of `COLUMNS` in a header; arguments and errors as `columns_from`."""
+    """Return the keys of `COLUMNS` in a header; InputError if one or a part is missing."""
     keys = []
     for key, column in COLUMNS.items():
         if column.made:
