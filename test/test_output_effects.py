@@ -39,21 +39,17 @@ def found(recording, units):
 
 
 @pytest.mark.parametrize('name', [IMU, 'mpu9150_imu1.csv'])
-@pytest.mark.parametrize('limit', [9.0, 9.75])
-def test_a_clipped_recording_has_the_poses_of_the_recording(name, limit):
-    recording = read_recording(data(name))
-    whole = capture(recording, MPS2).poses
-    poses = capture(limited(recording, -limit, limit), MPS2).poses
-    assert len(poses) == len(whole) == 21
-    free = np.all(np.abs(whole.reading) < limit - 0.3, axis=1)
-    np.testing.assert_allclose(poses.reading[free], whole.reading[free], atol=0.02)
-
-
 @pytest.mark.parametrize('limit', [9.0, 9.6])
-def test_saturation_of_a_real_recording_is_detected_with_its_limit(limit):
-    poses = found(limited(read_recording(data(IMU)), -limit, limit), MPS2)
+def test_a_clipped_recording_has_the_poses_of_the_recording_and_its_limit_is_detected(name, limit):
+    recording = read_recording(data(name))
+    whole, poses = (found(each, MPS2)
+                    for each in (recording, limited(recording, -limit, limit)))
+    limit_g = limit / STANDARD_GRAVITY
+    assert len(poses) == len(whole) == 21
+    free = np.all(np.abs(whole.reading) < limit_g - 0.03, axis=1)
+    np.testing.assert_allclose(poses.reading[free], whole.reading[free], atol=0.002)
     clip = clipped(poses)
-    assert clip.limit_g == pytest.approx(limit / STANDARD_GRAVITY, abs=2e-4)
+    assert clip.limit_g == pytest.approx(limit_g, abs=2e-4)
     at_limit = np.any(np.abs(poses.reading) > clip.limit_g - 1e-3, axis=1)
     assert set(np.flatnonzero(at_limit)) <= set(clip.poses)
     assert None not in unclipped(poses, fit_poses(poses, G, model='10').model)
