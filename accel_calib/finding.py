@@ -145,7 +145,6 @@ class Finding:
 
     @property
     def next(self) -> NextStep:  # noqa: A003, the name in JSON
-        """Return what to do about it."""
         return NextStep(self.step or _STEP_OF.get(self.kind, 'poses'), self.advice)
 
     @property
@@ -156,17 +155,14 @@ class Finding:
 
     @property
     def words(self) -> str:
-        """Return text and advice in one line."""
         return '; '.join(filter(None, (self.text, self.advice)))
 
 
 def without(findings: Iterable[Finding], *kinds: str) -> tuple[Finding, ...]:
-    """Return the findings of other kinds."""
     return tuple(each for each in findings if each.kind not in kinds)
 
 
 def has(findings: Iterable[Finding], kind: str) -> bool:
-    """Return whether there is a finding of a kind."""
     return any(each.kind == kind for each in findings)
 
 
@@ -205,11 +201,9 @@ class Rating:
     @property
     def lines(self) -> tuple[str, ...]:
         """Return the rating as lines of text: the figures, the reason unless GOOD, and next."""
-        width = len('reason') if self.name != 'GOOD' else len('next')
-        lines: list[tuple[str, str]] = [(self.name, self.figures)]
-        if self.name != 'GOOD':
-            lines.append(('reason', self.reason))
-        lines.append(('next', self.next.text))
+        reason = [] if self.name == 'GOOD' else [('reason', self.reason)]
+        lines = [(self.name, self.figures), *reason, ('next', self.next.text)]
+        width = max(len(label) for label, _ in lines)
         return tuple(f'{label:<{width}}  {text}' for label, text in lines)
 
 
@@ -219,5 +213,5 @@ def rated(findings: Iterable[Finding], good: str, figures: str, after: NextStep)
     below = [each for each in ranks if each.level != 'GOOD']
     if not below:
         return Rating('GOOD', good, figures, after, ranks)
-    steps = [each.next for each in below if each.advice]
-    return Rating(below[0].level, below[0].text, figures, next(iter(steps), after), ranks)
+    step = next((each.next for each in below if each.advice), after)
+    return Rating(below[0].level, below[0].text, figures, step, ranks)

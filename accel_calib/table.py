@@ -23,11 +23,7 @@ from numpy.typing import NDArray
 
 from .errors import InputError, needing
 from .text import counted, table
-from .units import Floats, STANDARD_GRAVITY, UnitName, Units
-
-__all__ = ['ABOUT', 'COLUMNS', 'Autopilot', 'Column', 'Firmware', 'Floats', 'Poses', 'Record',
-           'Recording', 'Table', 'check_values', 'column_of', 'columns_from', 'data_frame',
-           'is_quantity', 'numbered', 'present', 'quantity_key']
+from .units import Floats as Floats, STANDARD_GRAVITY, UnitName, Units
 
 ABOUT = ('units', 'sensor', 'autopilot')
 """What a table states beside its columns."""
@@ -288,6 +284,11 @@ class Table(Record):
         """Return the same rows with these columns added or replaced."""
         return replace(self, columns={**self.columns, **columns})
 
+    def without_columns(self: _Self, *keys: str) -> _Self:
+        """Return the same rows without these columns."""
+        return replace(self, columns={key: values for key, values in self.columns.items()
+                                      if key not in keys})
+
 
 class Poses(Table):
     """Averages of still stretches, one row per pose."""
@@ -321,38 +322,16 @@ def numbered(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.int64]:
     return np.arange(1, len(columns['reading']) + 1)
 
 
-def columns_from(given: Mapping[str, Any], needed: Sequence[str], source: str
-                 ) -> dict[str, NDArray[Any]]:
-    """
-    Return columns under the keys of `COLUMNS`, from columns under their names in a file.
-
-    `given` has n values for each name. Other columns of finite numbers are quantities, the rest is
-    ignored. Raise InputError if a key of `needed` or a part of a column is missing, or a value is
-    not valid. `source` is for the error.
-
-    """
-    columns: dict[str, NDArray[Any]] = {}
-    for key in present(list(given), needed, source):
-        parts = [np.asarray(given[name]) for name in COLUMNS[key].names]
-        values = np.column_stack(parts) if len(parts) > 1 else parts[0]
-        columns[key] = values.astype(str) if key == 'label' else values.astype(float)
-    check_values(columns, source)
-    return {**columns, **quantities_of(given)}
-
-
-def quantities_of(given: Mapping[str, Any]) -> dict[str, Floats]:
-    """Return the columns of finite numbers that are not in `COLUMNS`, by key."""
-    found: dict[str, Floats] = {}
-    for name, values in given.items():
-        numbers = np.asarray(values)
-        if quantity_key(name) and numbers.dtype.kind in 'iuf' and np.all(
-                np.abs(numbers) < LARGEST):
-            found.setdefault(quantity_key(name), numbers.astype(float))
-    return found
+def columns_from(given: Mapping[str, Floats]) -> dict[str, Floats]:
+    """Return the columns of which all names are given, by key."""
+    parts = {key: [np.asarray(given[name], float) for name in column.names]
+             for key, column in COLUMNS.items() if set(column.names) <= given.keys()}
+    return {key: np.column_stack(each) if len(each) > 1 else each[0]
+            for key, each in parts.items()}
 
 
 def present(header: Sequence[str], needed: Sequence[str], source: str) -> list[str]:
-    """Return the keys of `COLUMNS` in a header; arguments and errors as `columns_from`."""
+    """Return the keys of `COLUMNS` in a header; InputError if one or a part is missing."""
     keys = []
     for key, column in COLUMNS.items():
         if column.made:
@@ -414,8 +393,15 @@ def check_units(poses: Table, units: Units, source: str = '') -> None:
     """
     if len(poses) == 0:
         return
-    if not units.is_native:
-        _check_readings(_median_length(poses.reading), units, source and f'{source}: ')
+    length = _median_length(poses.reading)
+    if not units.is_native and not _is_likely(length, units.per_g):
+        supported = next((name for name in _likely(length) if name in _SUPPORTED), None)
+        advice = (f'set the units of the readings to {supported}' if supported else
+                  f'{_look(length)}set the units of the readings to native; the fit estimates '
+                  'their scale')
+        raise InputError(f'{source and f"{source}: "}the length of the readings is about '
+                         f'{length:.4g}, expected about {units.per_g:.4g} at rest in '
+                         f'{units.name}', advice)
     if 'reference' in poses:
         _check_reference(_median_length(poses['reference']), units)
 
@@ -425,36 +411,25 @@ def _median_length(vectors: Floats) -> float:
         return float(np.median(np.linalg.norm(vectors, axis=1)))
 
 
-def _check_readings(length: float, units: Units, where: str) -> None:
-    if _is_likely(length, units.per_g):
-        return
-    likely = _likely(length)
-    supported = next((name for name in likely if name in _SUPPORTED), None)
-    if supported:
-        advice = f'set the units of the readings to {supported}'
-    else:
-        look = f'they look like {" or ".join(likely)}: ' if likely else ''
-        advice = f'{look}set the units of the readings to native; the fit estimates their scale'
-    raise InputError(f'{where}the length of the readings is about {length:.4g}, expected about '
-                     f'{units.per_g:.4g} at rest in {units.name}', advice)
-
-
 def _check_reference(length: float, units: Units) -> None:
     per_g, words = ((1.0, 'in g, the unit of known forces for native readings')
                     if units.is_native else
                     (units.per_g, f'in {units.name}, the unit of the readings'))
     if _is_likely(length, per_g):
         return
-    likely = _likely(length)
-    look = f'they look like {" or ".join(likely)}: ' if likely else ''
     raise InputError(f'the length of the known forces ref_x,ref_y,ref_z is about {length:.4g}, '
                      f'expected about {per_g:.4g} {words}',
-                     f'{look}multiply them by {per_g / max(length, 1e-12):.4g}'
+                     f'{_look(length)}multiply them by {per_g / max(length, 1e-12):.4g}'
                      if length > 0.0 else 'fill the columns, or remove them')
 
 
 def _is_likely(length: float, per_g: float) -> bool:
     return _LIKELY_G[0] <= length / per_g <= _LIKELY_G[1]
+
+
+def _look(length: float) -> str:
+    likely = _likely(length)
+    return f'they look like {" or ".join(likely)}: ' if likely else ''
 
 
 def _likely(length: float) -> list[str]:

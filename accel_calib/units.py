@@ -84,11 +84,9 @@ class Units:
         return 'm/s²' if self.is_si else self.name
 
     def to_g(self, reading: Floats) -> Floats:
-        """Convert readings from this unit to g."""
         return reading / self.per_g
 
     def from_g(self, reading_g: Floats) -> Floats:
-        """Convert readings from g to this unit."""
         return reading_g * self.per_g
 
 

@@ -45,7 +45,7 @@ from accel_calib.effects.model import terms_of
 from accel_calib.effects.thermal import Lag, low_passed, rate_of
 from accel_calib.estimate import believable, kinds, originals, unseen_mistakes
 from accel_calib.estimate.equations import equations, measured
-from accel_calib.findings.expected import number
+from accel_calib.findings.figures import number
 from accel_calib.fleet.overview import (
     digest, digest_of, estimated, Months, not_agreeing, odd_sensors, overview, priors_of,
     shared_effects, typical_of)
@@ -74,15 +74,14 @@ from accel_calib.pipeline import (
     thermally_calibrated)
 from accel_calib.refine import base as refine_base
 from accel_calib.refine.base import clipped, grid_step, off_grid, sampled, unclipped
-from accel_calib.refine.beam import accepted, explored, simpler
 from accel_calib.refine.curves import (
     _grown as grown_curve, best_curve, Curve, is_curve, Near, probabilities, Process, process_of,
     SIGNIFICANT, Walk, walk_beside)
 from accel_calib.refine.linear import (
     _RARE as RARE, Block, LEVEL as REFINE_LEVEL, Linear, products_of, Set)
-from accel_calib.refine.plan import _levels as levels_of
-from accel_calib.refine.result import NOTHING as NOTHING_TO_PLAN, verdict_words
-from accel_calib.refine.search import _is_better as is_better_than_walk, search as search_effects
+from accel_calib.refine.plan import _levels as levels_of, NOTHING as NOTHING_TO_PLAN
+from accel_calib.refine.search import (
+    _is_better as is_better_than_walk, accepted, explored, search as search_effects, simpler)
 from accel_calib.refine.state import beginning, candidates, fitted_state, linearised, WORTH
 from accel_calib.refine.steps import advice_for
 from accel_calib.report.page import axis_figures, snippets

@@ -5,8 +5,6 @@
 
 from __future__ import annotations
 
-import ast
-from collections.abc import Iterator
 from importlib.metadata import packages_distributions
 from pathlib import Path
 import re
@@ -16,6 +14,7 @@ from xml.etree import ElementTree
 
 import pytest
 import test_packaging
+from test_style import imports_of
 
 requirements = pytest.importorskip('packaging.requirements')
 Requirement = requirements.Requirement
@@ -55,23 +54,14 @@ def all_of(given: dict[str, Any], *extras: str) -> list[Any]:
     return [Requirement(text) for text in texts]
 
 
-def imported() -> Iterator[str]:
-    """Yield the modules that the package imports, without submodules and relative imports."""
-    for path in (*(ROOT / 'accel_calib').rglob('*.py'), *(ROOT / 'launch').glob('*.py')):
-        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
-            if isinstance(node, ast.Import):
-                yield from (each.name.partition('.')[0] for each in node.names)
-            elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-                yield node.module.partition('.')[0]
-
-
 def test_what_is_imported_is_required(
         setup_py: dict[str, Any], package_xml: ElementTree.Element) -> None:
     required = {normal(each.name) for each in for_users(setup_py)}
     of_ros = set(test_packaging.texts(package_xml, 'exec_depend'))
     distributions = packages_distributions()
-    others = ({*imported()} - sys.stdlib_module_names - WITHOUT_DISTRIBUTION - of_ros
-              - {'accel_calib'})
+    paths = (*(ROOT / 'accel_calib').rglob('*.py'), *(ROOT / 'launch').glob('*.py'))
+    imported = {name.partition('.')[0] for path in paths for name in imports_of(path)}
+    others = imported - sys.stdlib_module_names - WITHOUT_DISTRIBUTION - of_ros - {'accel_calib'}
     assert {'numpy', 'lz4'} < others
     assert not [module for module in others if not required & {
         normal(each) for each in distributions.get(module, ())}]

@@ -3,88 +3,91 @@
 
 """Findings, the rating, which says what to do, and the next step, the same on all surfaces."""
 
-from collections.abc import Callable
 from dataclasses import replace
 import json
-from pathlib import Path
 import shlex
-from typing import Any
 
 import accel_calib as ac
-from accel_calib.calibrate import Calibration, fit_partial, fit_poses, level, mounting_only
-from accel_calib.finding import Finding, KINDS, NextStep, ranked, STEPS, without
+from accel_calib.calibrate import fit_partial, fit_poses, level, mounting_only
+from accel_calib.finding import Finding, KINDS, NextStep, ranked, without
 from accel_calib.findings import (
-    Expected, figures_of, GOOD_MG, rate, rate_comparison, rate_refinement, rate_verification,
-    Rating)
+    Expected, figures_of, GOOD_MG, rate, rate_comparison, rate_refinement, rate_verification)
+from accel_calib.logs import write_table
 from accel_calib.refine import refine
-from accel_calib.table import Poses
 from accel_calib.units import units_of
 from inside import format_calibration, main, Model, number, parse_calibration, spread_directions
 import numpy as np
 import pytest
 from shared import random_directions
 
-G = units_of('g')
+G, MS2 = units_of('g'), units_of('m/s2')
+FACES = np.vstack([np.eye(3), -np.eye(3)])
+TIME = 20.0 * np.arange(30)
+WARM = 27.0 + 3.5 * np.sin(TIME / 60.0)
 COMMON = {'offset': [0.03, -0.02, 0.04], 'axis_gain': [0.01, -0.02, 0.015],
           'cross_axis': [0.006, -0.004, 0.005]}
+HIDDEN = {**COMMON, 'quadratic': [0.03, -0.02, 0.02]}
 
 
-def poses_of(count: int = 24, **options: Any) -> Poses:
+def simulated(effects=COMMON, **options):
+    return ac.simulate(effects, **options)
+
+
+def poses_of(count=24, **options):
     up = random_directions(count, np.random.default_rng(4))
-    return ac.simulate(COMMON, directions=up, units='g', **options)
+    return simulated(directions=up, units='g', **options)
 
 
-def with_(poses: Poses, row: int, factor: float) -> Poses:
+def moved(poses, rows, by):
     reading = poses.reading.copy()
-    reading[row] *= factor
+    reading[np.asarray(rows) - 1] += by
     return poses.with_columns(reading=reading)
 
 
-def upside_down() -> Calibration:
+def upside_down():
     made = fit_poses(poses_of(), G)
     return level(made, made.predict(np.array([[0.0, 0.0, -1.0]]))[0], 'ros')
 
 
-def mirrored() -> Calibration:
+def mirrored():
     poses = poses_of(reference=True)
     return fit_poses(poses.with_columns(reading=poses.reading * [1.0, -1.0, 1.0]), G, model='10')
 
 
-def edited() -> Calibration:
+def edited():
     text = format_calibration(fit_poses(poses_of(), G))
     return parse_calibration(text.replace("sensor: ''", 'sensor: other'), 'x.yaml')
 
 
-def refined() -> Calibration:
+def refined():
     stored = replace(edited(), sensor='')
     warm = np.linspace(15.0, 35.0, 24)
     return refine(poses_of(temperature=warm), G, base=stored).calibration
 
 
-RESULTS: dict[str, Callable[[], Calibration]] = {
+RESULTS = {
     'clean': lambda: fit_poses(poses_of(), G),
     'few': lambda: fit_poses(poses_of(10), G, model='10'),
     'one_side': lambda: fit_poses(poses_of(12), G, model='7'),
-    'without_noise': lambda: fit_poses(Poses({'reading': poses_of(12).reading},
-                                             np.arange(1, 13)), G),
-    'a_knock': lambda: fit_poses(with_(poses_of(11), 5, 1.03), G, model='10'),
+    'without_noise': lambda: fit_poses(poses_of(12).without_columns('std', 'count'), G),
+    'a_knock': lambda: fit_poses(moved(poses_of(11), [6], 0.03), G, model='10'),
     'a_large_residual': lambda: fit_poses(
         poses_of().with_columns(std=np.full((24, 3), 1e-6)), G, model='4'),
     'upside_down': upside_down, 'mirrored': mirrored, 'edited': edited, 'refined': refined}
 
 
-def figures(calibration: Calibration) -> tuple[Any, ...]:
-    rating: Rating = rate(calibration)
+def figures(calibration):
+    rating = rate(calibration)
     return (rating.name, [(each.kind, each.level, each.rows) for each in rating.findings],
             [each.kind for each in calibration.noted], calibration.name,
             calibration.model.vector.tolist(), [each.row for each in calibration.rejected])
 
 
 @pytest.mark.parametrize('name', RESULTS)
-def test_no_result_depends_on_a_text(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_result_depends_on_a_text(name, monkeypatch):
     expected, checked = figures(RESULTS[name]()), Finding.__post_init__
 
-    def reword(self: Finding) -> None:
+    def reword(self):
         checked(self)
         object.__setattr__(self, 'text', 'reworded')
         object.__setattr__(self, 'advice', 'reworded')
@@ -96,13 +99,13 @@ def test_no_result_depends_on_a_text(name: str, monkeypatch: pytest.MonkeyPatch)
     assert figures(made) == expected
 
 
-def test_the_verdict_is_the_level_of_the_first_finding() -> None:
+def test_the_verdict_is_the_level_of_the_first_finding():
     found = rate(RESULTS['mirrored']())
     assert found.name == 'BAD'
     assert (found.findings[0].level, found.findings[0].text) == ('BAD', found.reason)
 
 
-def test_findings_are_ranked_by_level_and_then_by_kind() -> None:
+def test_findings_are_ranked_by_level_and_then_by_kind():
     first, other, *_, last = KINDS
     note, usable = Finding(first, 'a'), Finding(last, 'b', level='USABLE')
     better, bad = Finding(other, 'c', level='USABLE'), Finding(last, 'd', level='BAD')
@@ -110,16 +113,20 @@ def test_findings_are_ranked_by_level_and_then_by_kind() -> None:
     assert without([note, bad], first) == (bad,)
 
 
-def test_a_kind_that_is_not_listed_is_refused() -> None:
+def test_findings_and_steps_have_a_listed_kind_and_a_finding_has_the_step_of_its_kind():
+    assert Finding('flat_pose', 'turned', 'turn it').next == NextStep('level', 'turn it')
+    assert Finding('error', 'large', 'look for it', step='refine').next.kind == 'refine'
     with pytest.raises(ValueError, match="'surprise'"):
         Finding('surprise', 'what')
+    with pytest.raises(ValueError, match="'wait'"):
+        NextStep('wait', 'what')
 
 
-def test_the_figures_of_a_calibration_are_those_of_its_fields() -> None:
+def test_the_figures_of_a_calibration_are_those_of_its_fields():
     effects = {**COMMON, 'quadratic': [0.004, -0.003, 0.005]}
-    poses = ac.simulate(effects, directions=random_directions(40, np.random.default_rng(4)),
-                        units='m/s2', noise=1e-4)
-    calibration = refine(poses, units_of('m/s2')).calibration
+    poses = simulated(effects, directions=random_directions(40, np.random.default_rng(4)),
+                      noise=1e-4)
+    calibration = refine(poses, MS2).calibration
     found = {figure.key: figure for figure in figures_of(calibration)}
     assert found['rms_after_mg'].value == calibration.quality.rms_after_mg
     assert found['max_before_mg'].value == 10.0 * calibration.quality.max_before_percent
@@ -132,29 +139,16 @@ def test_the_figures_of_a_calibration_are_those_of_its_fields() -> None:
     assert found['quadratic.z'].unit == 'mg/g²'
 
 
-def test_a_gain_that_is_not_fitted_is_a_figure_without_deviation() -> None:
+def test_figures_that_are_not_known_are_left_out_and_a_gain_not_fitted_has_no_deviation():
     calibration = ac.fit(poses_of().reading, units='g')
+    keys = [figure.key for figure in figures_of(calibration)]
+    assert 'noise_floor_mg' not in keys
+    assert 'rms_after_mg' in keys
     fixed = replace(calibration, model=Model({'offset': calibration.offset}),
                     covariance=calibration.covariance[:3, :3])
     found = {figure.key: figure for figure in figures_of(fixed)}
     assert (found['gain.x'].value, found['gain.x'].sd) == (1.0, 0.0)
     assert 'gain.xy' not in found
-
-
-def test_figures_that_are_not_known_are_left_out() -> None:
-    keys = [figure.key for figure in figures_of(ac.fit(poses_of().reading, units='g'))]
-    assert 'noise_floor_mg' not in keys
-    assert 'rms_after_mg' in keys
-
-
-MS2, NATIVE = units_of('m/s2'), units_of('native')
-FACES = np.vstack([np.eye(3), -np.eye(3)])
-TIME = 20.0 * np.arange(30)
-WARM = 27.0 + 3.5 * np.sin(TIME / 60.0)
-
-
-def simulated(effects=COMMON, **options):
-    return ac.simulate(effects, **options)
 
 
 def true_error_mg(calibration, effects=COMMON, **context):
@@ -164,12 +158,6 @@ def true_error_mg(calibration, effects=COMMON, **context):
     force = calibration.correct(new.reading, new.columns)
     lengths = np.linalg.norm(force, axis=1) / calibration.force_per_g
     return 1e3 * float(np.sqrt(np.mean((lengths - 1.0) ** 2)))
-
-
-def moved(poses, rows, by):
-    reading = poses.reading.copy()
-    reading[np.asarray(rows) - 1] += by
-    return poses.with_columns(reading=reading)
 
 
 @pytest.mark.parametrize('seed', range(4))
@@ -285,11 +273,12 @@ def test_numbers_have_two_digits_and_one_after_the_point_from_10_to_100(value, e
     assert number(value) == expected
 
 
-def test_a_calibration_of_another_sensor_is_bad_on_new_poses():
+@pytest.mark.parametrize(('effects', 'noise', 'expected'), [
+    ({'offset': [-0.01, 0.005, -0.005]}, 0.003, 'BAD'), (COMMON, 0.1, 'USABLE')])
+def test_poses_of_another_sensor_are_bad_and_noisy_ones_do_not_verify(effects, noise, expected):
     calibration = ac.fit(simulated(poses=24))
-    other = simulated({'offset': [-0.01, 0.005, -0.005]}, poses=12, seed=9)
-    rating = rate_verification(ac.verify(other, calibration), calibration)
-    assert rating.name == 'BAD'
+    new = simulated(effects, poses=12, noise=noise, seed=9)
+    assert rate_verification(ac.verify(new, calibration), calibration).name == expected
 
 
 def test_a_verification_of_few_directions_does_not_improve_the_rating():
@@ -298,13 +287,6 @@ def test_a_verification_of_few_directions_does_not_improve_the_rating():
     new = simulated(directions=near / np.linalg.norm(near, axis=1, keepdims=True), seed=9)
     checked = ac.verify(new, calibration)
     assert rate_verification(checked, calibration, new).name == 'USABLE'
-
-
-def test_poses_that_are_too_noisy_do_not_verify():
-    calibration = ac.fit(simulated(poses=24))
-    rating = rate_verification(ac.verify(simulated(poses=12, noise=0.1, seed=9), calibration),
-                               calibration)
-    assert rating.name == 'USABLE'
 
 
 @pytest.mark.parametrize(('offset', 'expected'), [(0.03, 'GOOD'), (0.032, 'USABLE'),
@@ -324,27 +306,19 @@ def test_calibrations_that_are_too_uncertain_to_differ_are_usable():
     assert rate_comparison(comparison).name == 'USABLE'
 
 
-SENSOR = {'offset': [0.03, -0.02, 0.04], 'axis_gain': [0.01, -0.01, 0.005]}
-HIDDEN = {**SENSOR, 'quadratic': [0.03, -0.02, 0.02]}
-
-
-def written(path: Path, effects: dict[str, list[float]], poses: int = 40) -> Path:
-    table = ac.simulate(effects, poses=poses, units='g', seed=5)
-    rows = [','.join(f'{value:.9g}' for value in (*reading, *std, count)) for reading, std, count
-            in zip(table.reading, table['std'], table['count'], strict=True)]
-    path.write_text('\n'.join(['ax,ay,az,std_x,std_y,std_z,count', *rows]) + '\n',
-                    encoding='utf-8')
+def written(path, effects, poses=40):
+    write_table(path, simulated(effects, poses=poses, units='g', seed=5))
     return path
 
 
-def result_of(line: str, folder: Path) -> dict:
+def result_of(line, folder):
     target = folder / 'result.json'
     assert main([*shlex.split(line)[1:], '--json', str(target)]) == 0, line
     return json.loads(target.read_text(encoding='utf-8'))
 
 
 @pytest.mark.parametrize(('effects', 'kinds'), [
-    (SENSOR, ['level', 'done']), (HIDDEN, ['refine', 'level', 'done'])])
+    (COMMON, ['level', 'done']), (HIDDEN, ['refine', 'level', 'done'])])
 @pytest.mark.parametrize('command', ['fit', 'calibrate --no-refine'])
 def test_the_commands_of_the_next_steps_lead_to_the_end(effects, kinds, command, tmp_path):
     poses, stored = written(tmp_path / 'my poses.csv', effects), tmp_path / 'c.yaml'
@@ -361,7 +335,7 @@ def test_the_commands_of_the_next_steps_lead_to_the_end(effects, kinds, command,
     assert set(calibration.model.effects) >= set(effects)
 
 
-@pytest.mark.parametrize(('effects', 'poses'), [(SENSOR, 40), (HIDDEN, 40), (SENSOR, 8)])
+@pytest.mark.parametrize(('effects', 'poses'), [(COMMON, 40), (HIDDEN, 40), (COMMON, 8)])
 def test_the_same_poses_have_the_same_verdict_and_next_step_everywhere(effects, poses, tmp_path):
     table, stored = written(tmp_path / 'poses.csv', effects, poses), tmp_path / 'c.yaml'
     keys = ('rating', 'rating_reason', 'findings')
@@ -380,21 +354,10 @@ def test_the_same_poses_have_the_same_verdict_and_next_step_everywhere(effects, 
 @pytest.mark.parametrize('noise_known', [False, True])
 def test_after_a_search_without_result_nobody_is_sent_to_search_again(noise_known, tmp_path):
     path, rng = tmp_path / 'poses.csv', np.random.default_rng(4)
-    table = ac.simulate(SENSOR, poses=40, units='g', seed=5)
-    scattered = table.reading + 0.012 * rng.normal(size=table.reading.shape)
-    more = ',std_x,std_y,std_z,count' if noise_known else ''
-    path.write_text('\n'.join([f'ax,ay,az{more}', *(
-        ','.join(map(str, row.tolist())) + (',0.001,0.001,0.001,100' if noise_known else '')
-        for row in scattered)]) + '\n', encoding='utf-8')
+    table = simulated(poses=40, units='g', noise=0.001, seed=5)
+    table = table.with_columns(reading=table.reading + 0.012 * rng.normal(size=(40, 3)))
+    write_table(path, table if noise_known else table.without_columns('std', 'count'))
     first = result_of(f'accel-calib fit {path} --units g -o {tmp_path}/c.yaml', tmp_path)
     assert (first['rating'], first['next']['kind']) == ('USABLE', 'refine')
     again = result_of(first['next']['command'], tmp_path)
     assert (again['rating'], again['next']['kind']) == ('USABLE', 'poses')
-
-
-def test_a_finding_names_the_kind_of_its_step() -> None:
-    assert Finding('flat_pose', 'turned', 'turn it').next == NextStep('level', 'turn it')
-    assert Finding('error', 'large', 'look for it', step='refine').next.kind == 'refine'
-    with pytest.raises(ValueError, match="'wait'"):
-        NextStep('wait', 'what')
-    assert 'done' in STEPS

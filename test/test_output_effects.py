@@ -3,12 +3,10 @@
 
 """Recordings that are clipped or coarsely quantised: their poses, their noise, and the names."""
 
-from __future__ import annotations
-
 from accel_calib.calibrate import fit_poses, in_g
 from accel_calib.capture import capture
 from accel_calib.logs import read_recording
-from accel_calib.table import Poses, Recording
+from accel_calib.table import Poses
 from accel_calib.units import STANDARD_GRAVITY, Units, units_of
 from inside import (
     clipped, grid_step, Model, off_grid, simulate_recording, spread_directions, unclipped)
@@ -18,18 +16,15 @@ from shared import data, random_directions, sensor
 
 G, MPS2, NATIVE = units_of('g'), units_of('m/s2'), units_of('native')
 COUNTS_PER_G = 4056.0
+IMU, COUNTS = 'mpu9150_imu0.csv', 'xsens_mti_counts.csv'
 
 
 def limited(recording, low, high):
-    return with_reading(recording, np.clip(recording.reading, low, high))
+    return recording.with_columns(reading=np.clip(recording.reading, low, high))
 
 
 def rounded(recording, step):
-    return with_reading(recording, np.round(recording.reading / step) * step)
-
-
-def with_reading(recording, reading):
-    return Recording({**recording.columns, 'reading': reading}, recording.row)
+    return recording.with_columns(reading=np.round(recording.reading / step) * step)
 
 
 def simulated(seed, noise=1e-3, count=24):
@@ -43,37 +38,28 @@ def found(recording, units):
     return in_g(capture(recording, units).poses, units)
 
 
-@pytest.mark.parametrize('name', ['mpu9150_imu0.csv', 'mpu9150_imu1.csv'])
-@pytest.mark.parametrize('limit', [9.0, 9.75])
-def test_a_clipped_recording_has_the_poses_of_the_recording(name, limit):
-    recording = read_recording(data(name))
-    whole = capture(recording, MPS2).poses
-    poses = capture(limited(recording, -limit, limit), MPS2).poses
-    assert len(poses) == len(whole) == 21
-    free = np.all(np.abs(whole.reading) < limit - 0.3, axis=1)
-    np.testing.assert_allclose(poses.reading[free], whole.reading[free], atol=0.02)
-
-
+@pytest.mark.parametrize('name', [IMU, 'mpu9150_imu1.csv'])
 @pytest.mark.parametrize('limit', [9.0, 9.6])
-def test_saturation_of_a_real_recording_is_detected_with_its_limit(limit):
-    poses = found(limited(read_recording(data('mpu9150_imu0.csv')), -limit, limit), MPS2)
+def test_a_clipped_recording_has_the_poses_of_the_recording_and_its_limit_is_detected(name, limit):
+    recording = read_recording(data(name))
+    whole, poses = (found(each, MPS2)
+                    for each in (recording, limited(recording, -limit, limit)))
+    limit_g = limit / STANDARD_GRAVITY
+    assert len(poses) == len(whole) == 21
+    free = np.all(np.abs(whole.reading) < limit_g - 0.03, axis=1)
+    np.testing.assert_allclose(poses.reading[free], whole.reading[free], atol=0.002)
     clip = clipped(poses)
-    assert clip is not None
-    assert clip.limit_g == pytest.approx(limit / STANDARD_GRAVITY, abs=2e-4)
+    assert clip.limit_g == pytest.approx(limit_g, abs=2e-4)
     at_limit = np.any(np.abs(poses.reading) > clip.limit_g - 1e-3, axis=1)
     assert set(np.flatnonzero(at_limit)) <= set(clip.poses)
-    whole, named = unclipped(poses, fit_poses(poses, G, model='10').model)
-    assert whole is not None
-    assert named is not None
+    assert None not in unclipped(poses, fit_poses(poses, G, model='10').model)
     assert grid_step(poses) is None
 
 
 def test_counts_around_an_offset_are_clipped_at_different_limits():
-    poses = capture(limited(read_recording(data('xsens_mti_counts.csv')), 29400, 36900),
-                    NATIVE).poses
+    poses = capture(limited(read_recording(data(COUNTS)), 29400, 36900), NATIVE).poses
     assert len(poses) == 38
     clip = clipped(in_g(poses, Units('native', COUNTS_PER_G)))
-    assert clip is not None
     at_limit = np.any((poses.reading < 29401) | (poses.reading > 36899), axis=1)
     assert np.sum(at_limit) > 4
     assert set(np.flatnonzero(at_limit)) <= set(clip.poses)
@@ -88,7 +74,7 @@ def test_clipped_poses_are_left_out_although_the_base_misfits_the_others_too():
 @pytest.mark.parametrize('step_mg', [4, 8, 20])
 def test_quantisation_of_a_real_recording_is_detected_with_its_step(step_mg):
     counts = round(step_mg * 1e-3 * COUNTS_PER_G)
-    taken = capture(rounded(read_recording(data('xsens_mti_counts.csv')), counts), NATIVE).poses
+    taken = capture(rounded(read_recording(data(COUNTS)), counts), NATIVE).poses
     base = fit_poses(taken, NATIVE, model='10')
     poses = in_g(taken, base.units)
     assert grid_step(poses) == pytest.approx(counts / base.units.per_g, rel=2e-3)
@@ -113,19 +99,23 @@ def test_the_stated_noise_of_means_on_a_coarse_grid_is_correct(ratio):
         recording = simulate_recording(Model({}), random_directions(40, rng), rng, noise_g=1e-3,
                                        dwell=3.0, turn=0.6)
         poses = capture(rounded(recording, 1e-3 / ratio), G).poses
-        assert poses.noise is not None
         rest = np.array([np.searchsorted(recording['time'], time) for time in poses['time']])
         error = poses.reading - recording['reference'][rest]
         scores.append(np.sum(error**2) / np.sum(poses.noise**2))
     assert 0.6 < np.mean(scores) < 1.4
 
 
-def test_a_grid_is_named_where_the_stated_noise_includes_it():
+def test_a_grid_is_named_where_the_noise_includes_it_and_added_to_a_noise_that_lacks_it():
     poses = found(rounded(simulated(4, 2e-4, 40), 8e-3), G)
     model = fit_poses(poses, G, model='10').model
     same, step = off_grid(poses, model)
     assert same is poses
     assert step == pytest.approx(8e-3, rel=1e-3)
+    lacking = poses.with_columns(std=np.where(poses['std'] < 2.31e-3, 0.0, poses['std']),
+                                 count=np.full(len(poses), 300.0))
+    with_it, step = off_grid(lacking, model)
+    assert step == pytest.approx(8e-3, rel=1e-3)
+    np.testing.assert_allclose(np.median(with_it.noise), np.median(poses.noise), rtol=0.3)
     few = poses.with_columns(std=np.full((40, 3), 5e-4), count=np.ones(40)).take(np.arange(9))
     assert grid_step(few) == pytest.approx(8e-3, rel=1e-3)
     assert off_grid(few, model) == (few, None)  # as many poses as values: no gap to explain
@@ -138,15 +128,3 @@ def test_the_coarsest_grid_that_holds_the_means_is_that_of_a_table_without_noise
     expected = 2e-3 if isinstance(apart, tuple) else 2e-3 * apart
     poses = Poses({'reading': reading}, np.arange(1, 61))
     assert grid_step(poses) == pytest.approx(expected)
-
-
-def test_a_table_whose_noise_lacks_the_grid_gets_it():
-    poses = found(rounded(simulated(4, 2e-4, 40), 8e-3), G)
-    assert poses.noise is not None
-    lacking = Poses({**poses.columns, 'std': np.where(poses['std'] < 2.31e-3, 0.0, poses['std']),
-                     'count': np.full(len(poses), 300.0)}, poses.row)
-    model = fit_poses(poses, G, model='10').model
-    with_it, step = off_grid(lacking, model)
-    assert step == pytest.approx(8e-3, rel=1e-3)
-    assert with_it.noise is not None
-    np.testing.assert_allclose(np.median(with_it.noise), np.median(poses.noise), rtol=0.3)

@@ -3,8 +3,6 @@
 
 """The plan of a fit beside a calibration that is in use."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import accel_calib as ac

@@ -5,7 +5,6 @@
 
 from accel_calib.logs import read_poses
 from accel_calib.refine import refine
-from accel_calib.table import Poses
 from accel_calib.units import units_of
 import generator
 from inside import LARGEST_SAMPLE, model_with, simulate_poses, spread_directions
@@ -26,12 +25,15 @@ ALIKE = {'quartic': {'quadratic', 'gain_asymmetry'}, 'quintic': {'cubic', 'odd_q
 
 @pytest.fixture
 def taken(tmp_path):
-    """Return poses of a simulated sensor that were written to a file and read again."""
+    """Return poses of a simulated sensor, read from a file, which a refinement cannot change."""
     def take(seed, hidden=None, **setup):
         made = generator.simulate(np.random.default_rng(seed), hidden or {},
                                   generator.Setup(**setup))
         generator.write_csv(tmp_path / 'poses.csv', made.columns)
-        return read_poses(tmp_path / 'poses.csv'), made
+        poses = read_poses(tmp_path / 'poses.csv')
+        for values in poses.columns.values():
+            values.flags.writeable = False
+        return poses, made
     return take
 
 
@@ -61,11 +63,10 @@ def test_each_hidden_effect_is_named_with_its_values(effect, taken):
             assert abs(calibration.model.vector[k] - truth[part]) < 4.0 * deviation, name
 
 
-@pytest.mark.parametrize(('poses', 'sets'), [(24, 2), (60, 1)])
-def test_nothing_is_named_where_nothing_is_hidden(poses, sets, taken):
-    for seed in range(sets):  # benchmarks/refine.py counts how often in many sets
-        found = refine(taken(seed, poses=poses)[0], MPS2)
-        assert (found.verdict, names(found)) == ('no_gap', [])
+@pytest.mark.parametrize(('seed', 'poses'), [(0, 24), (1, 24), (0, 60)])
+def test_nothing_is_named_where_nothing_is_hidden(seed, poses, taken):
+    found = refine(taken(seed, poses=poses)[0], MPS2)  # benchmarks/refine.py: in many sets
+    assert (found.verdict, names(found)) == ('no_gap', [])
 
 
 def test_two_hidden_effects_are_both_named(taken):
@@ -186,11 +187,3 @@ def test_a_long_table_is_refined_from_a_sample_and_says_so(monkeypatch):
     assert 'uses 400 of 1000 poses' in found.calibration.warnings[0]
     np.testing.assert_allclose(found.calibration.model.values['quadratic'],
                                truth.values['quadratic'], atol=5e-4)
-
-
-def test_poses_are_left_as_they_were(taken):
-    poses = taken(10, {'cubic': 6.0}, poses=40)[0]
-    before = Poses({key: values.copy() for key, values in poses.columns.items()}, poses.row)
-    refine(poses, MPS2)
-    for key in poses.columns:
-        np.testing.assert_array_equal(poses[key], before[key])

@@ -15,28 +15,12 @@ ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / 'accel_calib'
 
 LAYERS = (
-    ('errors', 'text', 'units'),
-    ('disk', 'finding', 'table'),
-    ('geometry',),
-    ('effects',),
-    ('logs',),
-    ('capture', 'estimate'),
-    ('calibrate',),
-    ('refine',),
-    ('compare', 'noise'),
-    ('findings',),
-    ('stored',),
-    ('pipeline',),
-    ('messages',),
-    ('report',),
-    ('api', 'session'),
-    ('fleet', 'live'),
-    ('ros',),
-    ('cli',),
-)
+    'errors text units < disk finding table < geometry < effects < logs < capture estimate '
+    '< calibrate < refine < compare noise < findings < stored < pipeline < messages < report '
+    '< api session < fleet live < ros < cli')
 """Parts of the package, lowest first. Each part imports only from lower parts and itself."""
 
-RANKS = {part: rank for rank, layer in enumerate(LAYERS) for part in layer}
+RANKS = {part: rank for rank, layer in enumerate(LAYERS.split('<')) for part in layer.split()}
 ROS = re.compile(r'rclpy|ament_\w+|launch(_\w+)?|tf2_\w+|rosidl_\w+|\w+_(msgs|srvs|interfaces)')
 
 MODULES = sorted(PACKAGE.rglob('*.py'))
@@ -64,26 +48,17 @@ def imports_of(path: Path) -> Iterator[str]:
             yield from (f'{module}.{alias.name}' for alias in node.names)
 
 
-def part_of(path: Path) -> str:
-    return path.relative_to(PACKAGE).with_suffix('').parts[0]
-
-
-def test_imports_point_one_way() -> None:
+def test_imports_point_one_way_and_only_the_nodes_import_ros() -> None:
     for path in MODULES:
-        part = part_of(path)
+        part, names = path.relative_to(PACKAGE).with_suffix('').parts[0], [*imports_of(path)]
+        ros = {name for name in names if ROS.fullmatch(name.split('.')[0])}
+        assert part == 'ros' or not ros, path
         if part == '__init__':
             continue  # imports the public names only for types
-        assert part in RANKS, f'add {part} to LAYERS'
-        inside = [name for name in imports_of(path) if name.startswith('accel_calib.')]
-        others = {name.split('.')[1] for name in inside} - {part, '__version__'}
-        wrong = {other for other in others if RANKS.get(other, len(LAYERS)) >= RANKS[part]}
-        assert not wrong, f'{path} imports {wrong}, which is not below it'
-
-
-def test_only_the_nodes_import_ros() -> None:
-    for path in MODULES:
-        ros = {name for name in imports_of(path) if ROS.fullmatch(name.split('.')[0])}
-        assert part_of(path) == 'ros' or not ros, path
+        inside = {name.split('.')[1] for name in names if name.startswith('accel_calib.')}
+        above = {other for other in inside - {part, '__version__'}
+                 if other not in RANKS or RANKS[other] >= RANKS[part]}
+        assert not above, f'{path} imports {above}, which is not below it in LAYERS'
 
 
 def module_of(name: str) -> str:

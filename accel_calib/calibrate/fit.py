@@ -350,7 +350,8 @@ def rejected_by(model: Model, poses_g: Poses) -> tuple[Rejected, ...]:
     """Return outliers with their distance from 1 g under a model."""
     if not len(poses_g):
         return ()
-    away = np.linalg.norm(sensor_force(model, poses_g.reading, {}), axis=1) - 1.0
+    force = model.at(poses_g.columns).force(poses_g.reading)  # NaN far outside of its effects
+    away = np.linalg.norm(force, axis=1) - 1.0
     return tuple(Rejected(int(row), f'outlier: |force| differs by {error * MG:+.2f} mg from 1 g '
                           'in the fit of the others', 'outlier')
                  for row, error in zip(poses_g.row, away, strict=True))

@@ -22,11 +22,10 @@ it must not be used. All limits are in `LIMITS`.
 
 """
 
-from .expected import Expected, GOOD_MG, Limit, LIMITS
 from .figures import (
-    calibration_json, change_in_words, CROSS, curve_json, effect_figures, Figure, figures_of,
-    GAINS, in_words, linear_figures, OFFSETS, rating_json, refinement_json, residual_figures,
-    scale_of)
+    calibration_json, change_in_words, CROSS, curve_json, effect_figures, Expected, Figure,
+    figures_of, GAINS, GOOD_MG, in_words, Limit, LIMITS, linear_figures, OFFSETS, rating_json,
+    refinement_json, residual_figures, scale_of)
 from .rating import (
     rate, rate_comparison, rate_fleet, rate_noise, rate_refinement, rate_verification)
 from ..finding import Rating

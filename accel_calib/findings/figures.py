@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The figures of a result: one table of names, units, values and standard deviations.
+The figures of a result, its expected error in new orientations, and the limits of the rating.
 
 Every surface shows these figures: terminal, pages, live page, JSON and Parquet. `figures_of` has
 all of a calibration: its residuals [mg], V and W in the unit of the readings, and the values of
-the other effects in the units of the catalogue. The functions at the end make the JSON of results,
-for the command line and the topic ``~/result``.
+the other effects in the units of the catalogue. The functions with ``json`` in their names make
+the JSON of results, for the command line and the topic ``~/result``.
 
 The parameters of `accel_calib.compare` do not depend on the axes of the model. `scale_of` states
 how they are shown: offsets in mg, gains minus 1 and cross-axis gains in %. For native units, 1 g
@@ -19,14 +19,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from functools import cached_property
+import math
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
+import scipy
 
-from ..calibrate import Calibration, Curve, Outlook, Quality, Verification
-from ..effects import AXES, effect_named, LADDER, value_unit
-from ..estimate import sensing_axes
+from ..calibrate import (
+    Calibration, Curve, deviations_g, directions_in, error_left_in, free_parameters,
+    identifiability, next_pose, NextPose, Outlook, PRIOR, Quality, Verification)
+from ..effects import AXES, effect_named, LADDER, Model, MODELS, predict, value_unit
+from ..estimate import pose_noise, sensing_axes, variance_factor
 from ..finding import Rating
+from ..geometry import OVER_THE_SPHERE
 from ..table import Floats
 from ..text import signed
 from ..units import MG
@@ -46,16 +52,8 @@ class Figure:
     """
     A figure of a result.
 
-    Parameters
-    ----------
-    key : str
-        Name, which is unique in the result.
-    label : str
-        Name for people.
-    unit : str
-        Unit of the value; may be empty.
-    value, sd : float
-        Value, and its standard deviation; 0 if it has none.
+    `key` is unique in the result, and `label` is for people. `unit` may be empty. `sd` is the
+    standard deviation of `value`; 0 if it has none.
 
     """
 
@@ -192,7 +190,6 @@ def _own_names(calibration: Calibration) -> dict[str, Any]:
 
 
 def refinement_json(result: Refinement) -> dict[str, Any]:
-    """Return a refinement for JSON."""
     return {
         'verdict': result.verdict, 'undecided': result.undecided, 'base': result.calibration.name,
         'poses_used': len(result.poses_g), 'noise_floor_mg': result.noise_floor_mg,
@@ -224,3 +221,277 @@ def rating_json(rating: Rating, kind: str, text: str, command: str) -> dict[str,
     return {'rating': rating.name, 'rating_reason': rating.reason,
             'findings': [each.stated for each in rating.findings],
             'next': {'kind': kind, 'text': text, 'command': command}}
+
+
+# ----------------------------------------------------------------------------- expected error
+
+@dataclass(frozen=True)
+class Limit:
+    """A limit of the rating: its name, value and unit, and what it means."""
+
+    name: str
+    value: float
+    unit: str
+    meaning: str
+
+
+GOOD_ERROR = Limit(
+    'error of a good calibration', 5.0, 'mg', 'largest error in new orientations, RMS over the '
+    'sphere, as a bound; 5 mg is a tilt of 0.3°, and the zero-g offset of common parts is 20 to '
+    '60 mg')
+WORST_ERROR = Limit(
+    'error in the worst direction', 10.0, 'mg', 'largest uncertainty in any direction of a good '
+    'calibration')
+BAD_ERROR = Limit(
+    'error of a bad calibration', 30.0, 'mg', 'above this error the calibration is BAD: a common '
+    'part without calibration has about this error')
+MATTERS = Limit(
+    'error that matters', 1.0, 'mg', 'a residual beyond the noise, or an effect that cannot be '
+    'corrected, is ignored below this; 1 mg is a tilt of 0.06°')
+HIDDEN = Limit(
+    'scatter of the poses', 2.0, 'times the noise', 'if the scatter is larger, and the part '
+    'beyond the noise is above the error that matters, the model lacks an effect or poses moved')
+LEFT_OUT = Limit(
+    'poses left out', 20.0, '%', 'largest share of a good calibration')
+TO_CHECK = Limit(
+    'poses to check the fit', 3.0, 'poses', 'fewest poses beyond the number of values, if the '
+    'noise is not known or outliers were left out')
+PER_OUTLIER = Limit(
+    'more poses to check, per outlier', 2.0, 'poses', 'a few poses can agree by chance after '
+    'outliers were left out')
+CHANGED = Limit(
+    'error of new poses', 2.0, 'times the error that the fit states', 'if a verification shows a '
+    'larger error, and it is above the error that matters, the sensor has changed')
+COVERED = Limit(
+    'covered part of the sphere', 85.0, '%', 'smallest share within 45° of a pose: elsewhere '
+    'nothing checks the model. A verification that covers less is not rated better than the '
+    'calibration itself')
+TILT = Limit(
+    'tilt between level poses', 0.3, '°', 'above this, the mountings of compared calibrations '
+    'differ')
+NEAR_FLAT = Limit(
+    'pose near level', 20.0, '°', 'a pose within this angle of the level pose is suggested as the '
+    'flat pose')
+SPAN = Limit(
+    'range of temperature', 4.0, '°C', 'smallest range for which a calibration is said to be '
+    'valid')
+
+GOOD_MG = GOOD_ERROR.value
+"""Largest expected error of a good calibration [mg]."""
+
+LIMITS = (GOOD_ERROR, WORST_ERROR, BAD_ERROR, MATTERS, HIDDEN, LEFT_OUT, TO_CHECK, PER_OUTLIER,
+          CHANGED, COVERED, TILT, NEAR_FLAT, SPAN)
+"""All limits of the rating."""
+
+
+BOUND = 1.5
+"""Factor from the uncertainty of nine values, RMS over the sphere, to a bound."""
+
+_UNSEEN = 1.6
+"""Ratio of the largest omitted values that the F test of `auto` does not see to their noise: the
+0.97 quantile of chi² with five degrees of freedom is 2.5 times its mean."""
+
+_UNLUCKY = 0.1
+"""Probability that the scatter is larger than the bound that few poses allow."""
+
+_LEVEL = 0.05
+"""Level of the test whether the residual is larger than the noise explains."""
+
+_ONLY_AT_POSES = ('time', 'previous', 'std')
+"""Context that the correction of a later single sample does not have. Messages and logs may not
+have quantities, either."""
+
+
+class Expected:
+    """The expected error of a calibration in new orientations, and its parts."""
+
+    def __init__(self, calibration: Calibration) -> None:
+        self.calibration = calibration
+        self.poses = calibration.used_poses
+        self.quality = calibration.quality
+
+    @cached_property
+    def noise(self) -> Floats | None:
+        """Return the noise of each pose, in the unit of the readings; None if it is not known."""
+        return pose_noise(self.poses.noise, self.directions)
+
+    @cached_property
+    def next_pose(self) -> NextPose:
+        return next_pose(self.directions, self.calibration.form.largest, self.noise)
+
+    @cached_property
+    def dof(self) -> int:
+        """Return the number of equations of distinct poses beyond the number of free values."""
+        calibration = self.calibration
+        rows = 3 if self.is_vector else 1
+        count = len(np.unique(self.poses.reading, axis=0)) * rows
+        free = (free_parameters(calibration.name) if calibration.form.sensing_axes
+                else int(np.count_nonzero(np.diag(calibration.covariance))))
+        return max(count - free, 0)
+
+    @cached_property
+    def is_vector(self) -> bool:
+        """Whether the errors are those of the force as a vector, not of its length."""
+        return self.calibration.form.known_orientation and 'reference' in self.poses
+
+    @cached_property
+    def is_partial(self) -> bool:
+        """Whether the sensor could not be turned over."""
+        return self.calibration.method == PRIOR
+
+    @cached_property
+    def stated_mg(self) -> float:
+        """Return the stated uncertainty, RMS over the sphere [mg]; partial: over the poses."""
+        calibration = self.calibration
+        if not calibration.model.effects:
+            return 0.0
+        if self.is_vector and set(calibration.model.effects) <= set(LADDER):
+            spread = calibration.force_covariance(OVER_THE_SPHERE * calibration.force_per_g)
+            squares = np.trace(spread, axis1=1, axis2=2) / calibration.force_per_g ** 2
+            return float(np.sqrt(np.mean(squares))) * MG
+        up = self.directions if self.is_partial else OVER_THE_SPHERE
+        return _rms(deviations_g(calibration, up)) * MG * math.sqrt(1.0 + 2.0 * self.is_vector)
+
+    @cached_property
+    def worst_mg(self) -> float:
+        """Return the largest stated uncertainty over the sphere [mg]."""
+        if not self.calibration.model.effects:
+            return 0.0
+        return float(np.max(deviations_g(self.calibration, OVER_THE_SPHERE))) * MG
+
+    @cached_property
+    def directions(self) -> Floats:
+        return directions_in(self.poses, self.calibration)
+
+    @cached_property
+    def omits(self) -> str:
+        """Return the name of the smaller model if values that every sensor has are omitted."""
+        effects = [name for name in self.calibration.model.effects if name in LADDER]
+        return next((name for name in ('4', '7') if set(MODELS[name].effects) == set(effects)), '')
+
+    @cached_property
+    def omitted_mg(self) -> float:
+        """Return the error by values that a smaller model omits [mg]; 0 if it omits none."""
+        if not self.omits or self.is_partial:
+            return 0.0
+        typical = error_left_in(self.omits, '10', self.directions, self.noise) * MG
+        own, whole = (identifiability(name, self.directions, self.noise)
+                      for name in (self.omits, '10'))
+        if whole.undetermined:
+            return typical
+        ratio = (whole.mean_dilution / own.mean_dilution) ** 2 - 1.0
+        return min(_UNSEEN * self.stated_mg * math.sqrt(max(ratio, 0.0)), typical)
+
+    @cached_property
+    def noise_mg(self) -> float | None:
+        """Return the noise of a pose [mg], RMS over the poses; None if it is not known."""
+        floor = self.quality.noise_floor_mg
+        return None if floor is None else floor * self._per_dof
+
+    @cached_property
+    def few(self) -> float:
+        """Return the factor on the uncertainty because few poses check the noise."""
+        chi2 = self.quality.chi2_per_dof
+        if chi2 is None or not self.dof:
+            return 1.0
+        stated = variance_factor(chi2 * self.dof, self.dof, True)
+        return max(math.sqrt(chi2 / stated) * _few(self.dof), 1.0)
+
+    @property
+    def _per_dof(self) -> float:
+        """Return the ratio of an error to its residual after a fit."""
+        count = len(self.poses) * (3 if self.is_vector else 1)
+        return math.sqrt(count / self.dof) if self.dof else 1.0
+
+    @cached_property
+    def hidden_mg(self) -> float:
+        """Return the residual beyond the noise [mg]; without known noise, the residual."""
+        quality = self.quality
+        if not self.dof or self.is_partial:
+            return 0.0
+        if quality.noise_floor_mg is None or quality.chi2_per_dof is None:
+            return quality.rms_after_mg * self._per_dof
+        if scipy.special.chdtrc(self.dof, quality.chi2_per_dof * self.dof) > _LEVEL:
+            return 0.0
+        return without_noise(quality.rms_after_mg, quality.noise_floor_mg) * self._per_dof
+
+    @cached_property
+    def not_corrected(self) -> tuple[tuple[str, float], ...]:
+        """Return effects that the correction of a later sample cannot use, with size [mg]."""
+        values = self.calibration.model.values
+        sizes = ((name, self._size_mg(Model({name: values[name]}))) for name in values
+                 if depends_on(name) & {*_ONLY_AT_POSES, *self.calibration.model.neutral})
+        return tuple(sorted(sizes, key=lambda each: -each[1]))
+
+    def _size_mg(self, model: Model) -> float:
+        """Return the contribution of an effect along the force, RMS over the poses [mg]."""
+        calibration, up = self.calibration, self.directions
+        context = {**self.poses.columns, 'previous': up}
+        if any(key not in context for key in model.needs):
+            return 0.0
+        if 'std' in self.poses:
+            context['std'] = calibration.units.to_g(self.poses['std'])
+        along = np.sum((predict(model, up, context) - up) * up, axis=1)
+        return _rms(along) * MG
+
+    @cached_property
+    def error_mg(self) -> float:
+        """Return the expected error, as a bound [mg]."""
+        few = _few(self.dof) if self.noise_mg is not None and self.dof else 1.0
+        return math.hypot(self.inexact_mg, self.hidden_mg * few,
+                          *(size for _, size in self.not_corrected))
+
+    @property
+    def inexact_mg(self) -> float:
+        """Return the part of the expected error that more poses reduce [mg]."""
+        return math.hypot(BOUND * self.stated_mg * self.few, self.omitted_mg)
+
+    @cached_property
+    def own_mg(self) -> float:
+        """Return the expected error by what the poses show, without omitted values [mg]."""
+        return math.hypot(self.stated_mg, self.hidden_mg)
+
+    @cached_property
+    def before_mg(self) -> float | None:
+        """Return the error without the calibration, without noise [mg]; None if not known."""
+        if self.calibration.units.is_native:
+            return None
+        return without_noise(self.quality.rms_before_mg, self.noise_mg)
+
+
+def _few(dof: int) -> float:
+    """Return the ratio of the largest scatter that `dof` squares allow to their RMS."""
+    return math.sqrt(dof / float(scipy.special.chdtri(dof, 1.0 - _UNLUCKY)))
+
+
+def without_noise(residual_mg: float, noise_mg: float | None) -> float:
+    """Return the part of an RMS that is not noise."""
+    return math.sqrt(max(residual_mg ** 2 - (noise_mg or 0.0) ** 2, 0.0))
+
+
+def depends_on(name: str) -> set[str]:
+    """Return the context that an effect is a function of."""
+    effect = effect_named(name)
+    return set(effect.over or effect.needs)
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values ** 2)))
+
+
+def number(value: float) -> str:
+    """Return a number with two significant digits, and one after the point from 10 on."""
+    if value < 0.001:
+        return '0'
+    if value >= 100.0:
+        return f'{value:.0f}'
+    return f'{value:.1f}' if value >= 10.0 else f'{value:.2g}'
+
+
+def mg(value: float) -> str:
+    return f'{number(value)} mg'
+
+
+def degrees(error_mg: float) -> str:
+    """Return the tilt that an error across gravity causes, in degrees."""
+    return f'{math.degrees(math.asin(min(error_mg / MG, 1.0))):.1g}°'

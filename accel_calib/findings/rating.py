@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .expected import (
-    BAD_ERROR, BOUND, CHANGED, COVERED, degrees, depends_on, Expected, GOOD_ERROR, HIDDEN,
-    LEFT_OUT, MATTERS, mg, NEAR_FLAT, number, PER_OUTLIER, SPAN, TILT, TO_CHECK, WORST_ERROR)
+from .figures import (
+    BAD_ERROR, BOUND, CHANGED, COVERED, degrees, depends_on, Expected, GOOD_ERROR,
+    HIDDEN, LEFT_OUT, MATTERS, mg, NEAR_FLAT, number, PER_OUTLIER, SPAN, TILT, TO_CHECK,
+    without_noise, WORST_ERROR)
 from ..calibrate import Calibration, directions_in, flat_direction, Verification
 from ..effects import EMPIRICAL, WANDER
 from ..errors import TAKE_ALL_SIDES
@@ -49,11 +50,6 @@ def rate(calibration: Calibration, *, refinement: Refinement | None = None) -> R
     refinement : Refinement, optional
         A refinement of the same poses; its calibration, or the base, is rated.
 
-    Returns
-    -------
-    Rating
-        The verdict.
-
     """
     expected = Expected(calibration)
     good = (f'corrected readings in new orientations are right to {mg(expected.error_mg)} '
@@ -63,12 +59,10 @@ def rate(calibration: Calibration, *, refinement: Refinement | None = None) -> R
 
 
 def rate_refinement(result: Refinement) -> Rating:
-    """Rate the calibration of a refinement."""
     return rate(result.calibration, refinement=result)
 
 
 def _figures(expected: Expected) -> str:
-    """Return the figures of a calibration in one line."""
     quality = expected.quality
     parts = [f'{number(quality.rms_before_mg)} -> {mg(quality.rms_after_mg)}']
     if quality.held_out_rms_mg is not None and not expected.is_partial:
@@ -92,7 +86,6 @@ def findings_of(expected: Expected, refinement: Refinement | None) -> tuple[Find
 
 
 def _refused(expected: Expected, refinement: Refinement | None) -> Iterator[Finding]:
-    """Yield the reason why the gate refuses the calibration, if it is the refined one."""
     if refinement is not None and refinement.refusal and _has(expected, refinement):
         message, advice = refinement.refusal
         yield Finding('refused', message, advice, 'BAD')
@@ -115,7 +108,6 @@ def _too_large(expected: Expected, refinement: Refinement | None) -> Iterator[Fi
 
 
 def _limited(expected: Expected) -> Iterator[Finding]:
-    """Yield a finding if the calibration is partial, a mounting, or a curve over temperature."""
     if not expected.calibration.model.effects:
         yield Finding('mounting_alone', 'it is a mounting alone: offset and gain are not '
                       'calibrated', _more_poses(expected), 'USABLE')
@@ -129,7 +121,6 @@ def _limited(expected: Expected) -> Iterator[Finding]:
 
 
 def _checked(expected: Expected) -> Iterator[Finding]:
-    """Yield findings if too few poses check the fit."""
     if expected.is_partial or not expected.calibration.model.effects:
         return
     if expected.dof == 0:
@@ -153,7 +144,6 @@ def _checked(expected: Expected) -> Iterator[Finding]:
 
 
 def _too_few_left(expected: Expected) -> Iterator[Finding]:
-    """Yield a finding if few poses check the fit after outliers were left out."""
     out = [each.row for each in expected.calibration.rejected if each.kind == 'outlier']
     if out and expected.dof < TO_CHECK.value + PER_OUTLIER.value * len(out):
         yield Finding('outliers', f'{counted(len(out), "outlier")} left out, and only '
@@ -228,7 +218,6 @@ def _inexact(expected: Expected, error: float, refinement: Refinement | None
 
 
 def _left_out(expected: Expected) -> Iterator[Finding]:
-    """Yield a finding if many poses were left out."""
     calibration = expected.calibration
     rows = tuple(each.row for each in calibration.rejected)
     if rows and 100.0 * len(rows) > LEFT_OUT.value * len(calibration.poses):
@@ -238,7 +227,6 @@ def _left_out(expected: Expected) -> Iterator[Finding]:
 
 
 def _more_poses(expected: Expected) -> str:
-    """Return which pose to take next."""
     asked = expected.next_pose
     if asked.direction is None:
         return 'take more poses, and hold the sensor longer in each'
@@ -301,15 +289,10 @@ def rate_verification(verification: Verification, calibration: Calibration,
         These poses. If they cover only a part of the sphere, the rating is not better than that
         of the calibration itself.
 
-    Returns
-    -------
-    Rating
-        The verdict.
-
     """
     expected, floor = Expected(calibration), verification.noise_floor_mg
     own = rate(calibration)
-    error = _without_noise(verification.rms_after_mg, floor)
+    error = without_noise(verification.rms_after_mg, floor)
     found = [*_on_new_poses(verification, expected, own, error)]
     covered = 1.0 if poses is None else coverage(directions_in(poses, calibration))
     if expected.is_partial or covered < COVERED.value / 100.0:
@@ -325,10 +308,9 @@ def rate_verification(verification: Verification, calibration: Calibration,
 
 def _on_new_poses(verification: Verification, expected: Expected, own: Rating, error: float
                   ) -> Iterator[Finding]:
-    """Yield the findings that a verification shows."""
     floor, again = verification.noise_floor_mg, 'fit again with these poses'
     native = expected.calibration.units.is_native
-    before = _without_noise(verification.rms_before_mg, floor)
+    before = without_noise(verification.rms_before_mg, floor)
     if error > BAD_ERROR.value:
         yield Finding('error', f'the error of these poses is {mg(error)}, expected at most '
                       f'{mg(BAD_ERROR.value)}', again, 'BAD', step='fit')
@@ -354,15 +336,7 @@ def rate_comparison(comparison: Comparison) -> Rating:
     """
     Rate the agreement of calibrations of one sensor.
 
-    Parameters
-    ----------
-    comparison : Comparison
-        The comparison.
-
-    Returns
-    -------
-    Rating
-        GOOD if they agree, USABLE if the differences are small, otherwise BAD.
+    GOOD if they agree, USABLE if the differences are small, otherwise BAD.
 
     """
     largest = max(comparison.runs, key=lambda run: run.rms_mg)
@@ -400,11 +374,8 @@ def rate_noise(found: NoiseFigures) -> Rating:
     """
     Rate the figures of a rest.
 
-    Returns
-    -------
-    Rating
-        GOOD if it shows white noise and random walk of every axis, USABLE if one of them is not
-        seen or the noise is larger than that of common parts, BAD without white noise.
+    GOOD if it shows white noise and random walk of every axis, USABLE if one of them is not seen
+    or the noise is larger than that of common parts, BAD without white noise.
 
     """
     from ..noise import duration, shown_unit, TYPICAL, WORDS  # a fit alone does not load it
@@ -434,6 +405,8 @@ def rate_fleet(counts: Mapping[str, int], sensors: int, changed: int, unnamed: i
     """
     Rate the calibrations of a fleet.
 
+    GOOD if every recording has a usable calibration and no sensor changed, BAD if none has.
+
     Parameters
     ----------
     counts : mapping of str to int
@@ -442,11 +415,6 @@ def rate_fleet(counts: Mapping[str, int], sensors: int, changed: int, unnamed: i
         Number of sensors, and of those whose calibrations do not agree.
     unnamed : int
         Number of recordings without a name of their sensor.
-
-    Returns
-    -------
-    Rating
-        GOOD if every recording has a usable calibration and no sensor changed, BAD if none has.
 
     """
     total, usable = sum(counts.values()), counts.get('GOOD', 0) + counts.get('USABLE', 0)
@@ -467,7 +435,3 @@ def rate_fleet(counts: Mapping[str, int], sensors: int, changed: int, unnamed: i
             'take the names of the sensors from the paths with --sensor-from REGEX', 'USABLE'))
     return rated(found, 'each recording has a usable calibration', figures,
                  NextStep('done', 'use the calibrations'))
-
-
-def _without_noise(residual_mg: float, noise_mg: float | None) -> float:
-    return math.sqrt(max(residual_mg ** 2 - (noise_mg or 0.0) ** 2, 0.0))

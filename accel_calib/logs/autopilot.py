@@ -46,7 +46,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..geometry import rotation_from_rpy
-from ..table import Autopilot, COLUMNS, columns_from, Floats, numbered, Recording
+from ..table import Autopilot, check_values, COLUMNS, columns_from, Floats, numbered, Recording
 from ..text import counted, some
 
 AXES, RATES = COLUMNS['reading'].names, COLUMNS['rate'].names
@@ -366,7 +366,8 @@ class FlightLog:
 
     def recording(self, source: str) -> Recording:
         """Return the samples as a recording; a number that is not finite is an InputError."""
-        columns = columns_from(self.columns, ('time', 'reading'), source)
+        columns = columns_from(self.columns)
+        check_values(columns, source)
         return Recording(columns, numbered(columns), 'm/s2', self.sensor, self.autopilot)
 
 

@@ -40,11 +40,11 @@ import numpy as np
 from numpy.typing import NDArray
 import scipy
 
-from .state import beginning, State, without
+from .state import beginning, fitted_state, State, without
 from ..calibrate import Calibration, in_g, with_history
 from ..capture import rounding_left
 from ..effects import included, Model, MODELS
-from ..estimate import estimate, judge, NotConvergedError
+from ..estimate import estimate, judge
 from ..finding import has
 from ..geometry import unit
 from ..table import Floats, Poses
@@ -317,8 +317,7 @@ def unclipped(poses_g: Poses, base: Model) -> tuple[State | None, Clipped | None
     if clip is None or len(poses_g) - len(clip.poses) < _LEAST_KEPT:
         return None, None
     # Clipped samples hardly scatter, so their noise is meaningless: all weights are equal here.
-    plain = Poses({key: values for key, values in poses_g.columns.items() if key != 'std'},
-                  poses_g.row)
+    plain = poses_g.without_columns('std')
     kept = without(plain, clip.poses)
     if not any(_fits_better(model, plain, kept) for model in (base, _linear(base))):
         return None, None
@@ -334,26 +333,21 @@ def _linear(base: Model) -> Model:
 
 def _fits_better(model: Model, plain: Poses, kept: Poses) -> bool:
     """Return whether a model fits the poses clearly better without those at the limit."""
-    try:
-        without = beginning(kept, model)
-    except NotConvergedError:
+    fewer = fitted_state(model, with_history(kept, model))
+    if fewer is None or fewer.dof < 1:
         return False
-    if without.dof < 1:
-        return False
-    try:
-        whole = beginning(plain, model)
-    except NotConvergedError:
-        return True
-    return whole.linear.score(without.rss, float(len(plain) - len(kept)), 0.0) > _CLEARLY
+    whole = fitted_state(model, with_history(plain, model))
+    return whole is None or bool(
+        whole.linear.score(fewer.rss, float(len(plain) - len(kept)), 0.0) > _CLEARLY)
 
 
 def _whole(plain: Poses, kept: Poses, base: Model) -> State:
     """Return the base fitted to all poses, or to those kept if that does not converge."""
-    try:
-        return beginning(plain, base)
-    except NotConvergedError:
-        fitted = beginning(kept, base)
-        return State(judge(fitted.model, with_history(plain, fitted.model)))
+    whole = fitted_state(base, with_history(plain, base))
+    if whole is not None:
+        return whole
+    model = beginning(kept, base).model
+    return State(judge(model, with_history(plain, model)))
 
 
 def off_grid(poses_g: Poses, base: Model) -> tuple[Poses, float | None]:
@@ -413,10 +407,9 @@ def beside_stored(poses_g: Poses, calibration: Calibration) -> Poses:
         least = float(np.min(poses_g['orientation']))
         columns['orientation'] = np.concatenate([
             poses_g['orientation'], least - 1.0 - np.arange(count[1])])
-    if 'std' not in columns or 'count' not in columns:
-        columns = {key: values for key, values in columns.items() if key not in ('std', 'count')}
     columns['new'] = np.repeat([1.0, 0.0], count)
-    return Poses(columns, _rows(poses_g, stored))
+    joined = Poses(columns, _rows(poses_g, stored))
+    return joined if joined.noise is not None else joined.without_columns('std', 'count')
 
 
 def with_stored(poses: Poses, calibration: Calibration) -> Poses:
@@ -432,7 +425,6 @@ def _rows(poses: Poses, stored: Poses) -> NDArray[np.int64]:
 
 
 def _shares(poses_g: Poses, stored: Poses) -> bool:
-    """Return whether a pose is in both tables."""
     new, old = ({tuple(row) for row in poses.reading.round(_DIGITS).tolist()}
                 for poses in (poses_g, stored))
     return not new.isdisjoint(old)

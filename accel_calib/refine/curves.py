@@ -90,19 +90,14 @@ def best_curve(state: State, poses_g: Poses, out: tuple[int, ...]) -> Curve | No
     if plain.dof < _LEAST_DOF:
         return None
     best, tried = None, 0
-    for carrier, variable in _pairs(poses_g):
+    for carrier, variable in curve_pairs(causes(poses_g)):
+        if variable not in poses_g and variable != 'force':
+            continue
         for problem in _problems(plain, fit, carrier, variable):
             grown, tried = _grown(_kept(problem, out)), tried + 1
             if grown.blocks and (best is None or grown.score > best[0]):
                 best = grown.score, Set.of(problem, grown.blocks, out)
     return None if best is None else _accepted(best[0] - 2.0 * math.log(tried), best[1], tried)
-
-
-def _pairs(poses_g: Poses) -> list[tuple[str, str]]:
-    """Return the carriers and variables that the poses can show."""
-    return [(carrier, variable) for carrier, variable in curve_pairs(causes(poses_g))
-            if all(key in poses_g for key in
-                   effect_named(empirical_name(carrier, variable, _ALL_MODES)).needs)]
 
 
 def _problems(plain: Linear, fit: Fit, carrier: str, variable: str) -> Iterator[Linear]:
@@ -177,7 +172,6 @@ def _held_out(chosen: Set) -> float:
 
 
 def is_curve(name: str) -> bool:
-    """Return whether an effect is an empirical curve."""
     return name.startswith(f'{EMPIRICAL}-')
 
 
@@ -346,8 +340,8 @@ class Near:
     """
     What was chosen in the equations of all poses near a model.
 
-    `chosen` has the effects and outliers; its equations are whitened if there is a `walk` of the
-    offset, and `plain` are not. `process` has the modes of a walk; None if it is not tried.
+    The equations of `chosen` are whitened if there is a `walk`; those of `plain` are not. If no
+    walk is tried, `process` is None.
 
     """
 
@@ -363,8 +357,15 @@ class Near:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Return the names of the chosen effects."""
         return self.chosen.effects
+
+    def block_of(self, name: str) -> int:
+        """Return the index of the block of a chosen effect."""
+        return self.chosen.blocks[self.names.index(name)]
+
+    def without(self, name: str) -> Set:
+        """Return what was chosen, without an effect."""
+        return self.chosen.without(self.block_of(name))
 
     @property
     def key(self) -> tuple[frozenset[str], tuple[int, ...], bool]:
@@ -395,21 +396,17 @@ def probabilities(name: str, near: Near, *, usual: bool = True) -> dict[str, flo
 
 def _scores(name: str, near: Near, least: float, *, usual: bool) -> dict[str, float]:
     """Return the scores of the set with each effect in the place of a named one, above `least`."""
-    def back(chosen: Set) -> float:
-        return 0.0 if usual else chosen.unusual
-
-    if name == WANDER:
-        others = near.beside
-    else:
-        others = near.chosen.without(near.chosen.blocks[near.names.index(name)])
-    scores = {name: near.chosen.score + back(near.chosen)}
-    least += scores[name] - back(others)
+    back = 0.0 if usual else 1.0
+    others = near.beside if name == WANDER else near.without(name)
+    scores = {name: near.chosen.score + back * near.chosen.unusual}
+    least += scores[name] - back * others.unusual
     for number, likely in enumerate(others.scores_beside):
         effect = others.linear.blocks[number].effect
         if (likely > least and effect not in near.names
                 and (effect in LADDER or name not in LADDER)):
             larger = others.extended(number)
-            scores[effect] = max(larger.score + back(larger), scores.get(effect, -np.inf))
+            score = larger.score + back * larger.unusual
+            scores[effect] = max(score, scores.get(effect, -np.inf))
     if name != WANDER and near.walk is None and near.process is not None:
-        scores[WANDER] = walk_beside(others, near.process).score + back(others)
+        scores[WANDER] = walk_beside(others, near.process).score + back * others.unusual
     return scores

@@ -94,31 +94,16 @@ class Linear:
     """
     The equations of all poses near a model, with the base projected out.
 
-    Parameters
-    ----------
-    onto : (m, p) array
-        Orthonormal columns that span the base.
-    residual, pose : (m,) array
-        Residual of the base, in units of the noise, and index of the pose of each equation.
-    columns, sizes : (m, c) array, (c,) array
-        Columns of all blocks outside of the base, and their norms before it was projected out, to
-        which they are relative.
-    products : (c + 1, c + 1) array
-        Products of the columns and, last, of the residual with each other, after whitening.
-    worth : float
-        ν; 0 if the noise is not known.
-    dof : int
-        N, number of independent equations minus number of values of the base.
-    base_rss : float
-        Residual sum of squares of the base, to which scores are relative.
-    offset : (m, 3) array
-        Columns of an offset.
-    choice, penalty : float
-        What the choice of one effect among the candidates, or of a walk, costs; subtracted from
-        all scores.
-    white : (m, r) array, (r,) array, or None
-        Orthonormal directions along which the equations are whitened, and the part of each that
-        is taken away.
+    The orthonormal columns `onto` (m, p) span the base. `residual` (m,) is that of the base, in
+    units of the noise, and `pose` (m,) is the index of the pose of each equation. `columns` (m, c)
+    are those of all blocks outside of the base, relative to their norms `sizes` (c,) before it was
+    projected out. `products` (c + 1, c + 1) are those of the columns and, last, of the residual
+    with each other, after whitening. `worth` is ν, 0 if the noise is not known. `dof` is N, the
+    number of independent equations minus that of values of the base. Scores are relative to
+    `base_rss`, the residual sum of squares of the base. `offset` (m, 3) are the columns of an
+    offset. `choice` is the cost of the choice of one effect among the candidates, and `penalty`
+    that of a walk, which is subtracted from all scores. `white` has (m, r) orthonormal directions
+    along which the equations are whitened, and the (r,) part of each that is taken away.
 
     """
 
@@ -139,7 +124,7 @@ class Linear:
 
     @cached_property
     def poses(self) -> int:
-        """Return the number of poses."""
+        """Number of poses."""
         return int(self.pose.max()) + 1
 
     @cached_property
@@ -149,7 +134,6 @@ class Linear:
 
     @cached_property
     def numbers_of(self) -> dict[str, NDArray[np.intp]]:
-        """Return the blocks of each effect."""
         numbers: dict[str, list[int]] = {}
         for number, block in enumerate(self.blocks):
             numbers.setdefault(block.effect, []).append(number)
@@ -196,8 +180,7 @@ class Linear:
         if self.white is None:
             return columns
         axes, loss = self.white
-        whitened: Floats = columns - axes @ ((axes.T @ columns).T * loss).T
-        return whitened
+        return columns - axes @ ((axes.T @ columns).T * loss).T
 
     @cached_property
     def outliers(self) -> dict[frozenset[int], tuple[int, ...]]:
@@ -231,7 +214,6 @@ class Set:
 
     @classmethod
     def of(cls, linear: Linear, blocks: Iterable[int] = (), out: Iterable[int] = ()) -> Set:
-        """Return the set of these blocks, with these poses left out."""
         out = tuple(sorted(out))
         if out not in linear.without_poses:
             linear.without_poses[out] = cls._of_poses(linear, out)
@@ -253,7 +235,6 @@ class Set:
         return cls(linear, (), out, units, across, np.eye(len(rows)))
 
     def extended(self, block: int) -> Set:
-        """Return the set with one more block."""
         part = self.linear.blocks[block].columns
         along = self.across[:, part]
         left = self.linear.products[part] - along.T @ self.across
@@ -276,7 +257,6 @@ class Set:
         return Set.of(linear, self.blocks, self.out)
 
     def without(self, block: int) -> Set:
-        """Return the set without one of its blocks."""
         return self.instead(other for other in self.blocks if other != block)
 
     @property
@@ -303,7 +283,6 @@ class Set:
 
     @cached_property
     def rss(self) -> float:
-        """Return the sum of squares that is left."""
         gain = self.across[:, -1] @ self.across[:, -1]
         return max(float(self.linear.products[-1, -1] - gain), 0.0)
 
@@ -333,14 +312,12 @@ class Set:
         return float(self.linear.score(self.rss, self.parameters, self.charge))
 
     @cached_property
-    def effects(self) -> tuple[str, ...]:
-        """Return the names of the effects."""
-        return tuple(self.linear.blocks[block].effect for block in self.blocks)
+    def entries(self) -> list[Block]:
+        return [self.linear.blocks[block] for block in self.blocks]
 
     @cached_property
-    def entries(self) -> list[Block]:
-        """Return the blocks."""
-        return [self.linear.blocks[block] for block in self.blocks]
+    def effects(self) -> tuple[str, ...]:
+        return tuple(each.effect for each in self.entries)
 
     @cached_property
     def values(self) -> dict[int, Floats]:
@@ -359,7 +336,6 @@ class Set:
 
     @property
     def _index(self) -> list[int]:
-        """Return the columns of the blocks."""
         return [column for each in self.entries
                 for column in range(each.columns.start, each.columns.stop)]
 
@@ -371,12 +347,7 @@ class Set:
         return onto, self.linear.whitened(self.linear.residual) - onto @ self.across[:, -1]
 
     def gains(self, effect: str = '') -> tuple[Floats, Floats]:
-        """
-        Return the (b,) gain of each block in addition to the set, and its (b,) rank.
-
-        Both are 0 for the blocks of other effects, if one is given.
-
-        """
+        """Return (b,) gains and ranks of the blocks beside the set; 0 for other effects."""
         linear, across = self.linear, self.across
         along = linear.products[-1, :-1] - across[:, -1] @ across[:, :-1]
         gain, rank = np.zeros(len(linear.blocks)), np.zeros(len(linear.blocks))
@@ -394,12 +365,7 @@ class Set:
 
     @property
     def scores_beside(self) -> Floats:
-        """
-        Return the (b,) scores with one more block, without the penalty for its size.
-
-        They are -inf for a block that determines nothing.
-
-        """
+        """Return the (b,) scores with one more block, before the penalty for its size, or -inf."""
         gain, rank = self.gains()
         searched, cost = self.linear.costs
         scores = self.linear.score(self.rss - gain, self.parameters + rank + searched,
@@ -416,14 +382,23 @@ class Set:
         """Return whether each effect of the set is significant beside the others."""
         return all(self.probability(block) < LEVEL for block in self.blocks)
 
+    @property
+    def left(self) -> float:
+        """Return the degrees of freedom of the variance."""
+        return self.linear.worth + self.linear.dof - self.parameters
+
+    @property
+    def variance(self) -> float:
+        """Return the moderated variance of an equation, in units of the noise."""
+        return (self.linear.worth + self.rss + 1e-300) / max(self.left, 1.0)
+
     def chance(self, fewer: Set) -> float:
         """Return the probability that noise alone makes the set this good beside a smaller one."""
-        worth, added = self.linear.worth, self.parameters - fewer.parameters
-        left = worth + self.linear.dof - self.parameters
-        if added < 1 or left < 1:
+        added = self.parameters - fewer.parameters
+        if added < 1 or self.left < 1:
             return 1.0
-        variance = (worth + self.rss + 1e-300) / left
-        return float(scipy.special.fdtrc(added, left, (fewer.rss - self.rss) / added / variance))
+        ratio = (fewer.rss - self.rss) / added / self.variance
+        return float(scipy.special.fdtrc(added, self.left, ratio))
 
 
 def _explained(products: Floats, along: Floats) -> tuple[Floats, Floats]:
@@ -469,8 +444,7 @@ def products_of(columns: Floats, residual: Floats) -> Floats:
 
 def held_out(residual: Floats, own: Floats) -> Floats:
     """Return (m,) residuals without their own equation (PRESS), from (m,) 1 - leverage `own`."""
-    predicted: Floats = residual / np.maximum(own, _LEAST_OWN)
-    return predicted
+    return residual / np.maximum(own, _LEAST_OWN)
 
 
 def orthonormal(columns: Floats) -> Floats:

@@ -34,10 +34,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .curves import LEAST, Near, probabilities
-from .linear import Set
-from .result import ENOUGH, percent, PlannedPose, PosePlan, shown_name, versus
 from .search import Found
 from .state import fitted_state, with_effect
+from .steps import percent, shown_name
 from ..effects import effect_named, Model, WANDER
 from ..estimate import Fit, judge, kinds
 from ..geometry import attitude_words, ATTITUDES, spread_directions
@@ -73,6 +72,91 @@ _WAITS = (0.5, 1.0, 2.0)
 _DRAWS, _SEED = 1000, 1
 """Random readings for the expected probability; the same for each plan."""
 
+ENOUGH = 0.95
+"""Expected probability of the right effect at which a plan ends."""
+
+NOTHING = (f'there is nothing to separate: no named effect has a rival that leaves it a '
+           f'probability below {100.0 * ENOUGH:.0f} %')
+"""The line of an empty plan."""
+
+
+@dataclass(frozen=True)
+class PlannedPose:
+    """
+    One pose of a plan.
+
+    Parameters
+    ----------
+    up : tuple of float
+        Direction to point up, a unit vector in the sensor axes.
+    words : str
+        The same in words.
+    context : mapping of str to float
+        What else to set, by column of `accel_calib.table.COLUMNS`: ``temperature`` [°C],
+        ``supply_voltage`` [V], ``std`` [g], and ``time`` as the wait after the last pose [s].
+    separates : tuple of str
+        The named effect and its rivals.
+    expected : float
+        Expected probability of the right one of them after this pose and those before it.
+
+    """
+
+    up: tuple[float, ...]
+    words: str
+    context: Mapping[str, float]
+    separates: tuple[str, ...]
+    expected: float
+
+    @property
+    def purpose(self) -> str:
+        """Return what the pose is for."""
+        return f'to separate {versus(self.separates)}'
+
+    @property
+    def conditions(self) -> str:
+        """Return the context in words; empty if the pose can be taken at once."""
+        context, parts = self.context, list[str]()
+        if 'temperature' in context:
+            parts.append(f'at {context["temperature"]:.0f} °C')
+        if 'supply_voltage' in context:
+            parts.append(f'at {context["supply_voltage"]:.2f} V')
+        if 'std' in context:
+            parts.append(f'with {1e3 * context["std"]:.2g} mg of vibration')
+        parts += [f'at {key} {value:.4g}' for key, value in context.items() if is_quantity(key)]
+        if context.get('time', 0.0) > 0.0:
+            parts.append(f'{_duration(context["time"])} after the last pose')
+        return ' '.join(parts)
+
+
+@dataclass(frozen=True)
+class PosePlan:
+    """
+    Poses that separate named effects from their rivals soonest.
+
+    Parameters
+    ----------
+    poses : tuple of PlannedPose
+        The poses in the order to take them; empty if there are no rivals, or no pose separates
+        them.
+    lines : tuple of str
+        The plan in words.
+
+    """
+
+    poses: tuple[PlannedPose, ...] = ()
+    lines: tuple[str, ...] = (NOTHING,)
+
+    @property
+    def advice(self) -> tuple[str, ...]:
+        """Return a line about the first pose; empty without poses."""
+        if not self.poses:
+            return ()
+        first, last = self.poses[0], self.poses[-1]
+        where = f', {first.conditions}' if first.conditions else ''
+        return (f'next pose to separate {versus(first.separates)}: {first.words}{where} (1 of '
+                f'{len(self.poses)} poses, with which the expected probability of the right one '
+                f'is {percent(last.expected)})',)
+
 
 def plan_poses(found: Found) -> PosePlan:
     """
@@ -81,9 +165,8 @@ def plan_poses(found: Found) -> PosePlan:
     A random walk of the offset cannot be predicted, so it is not planned for.
 
     """
-    if found.near.walk is not None:
-        return PosePlan()
-    rivalries = list(filter(None, (_fits(name, found) for name in found.near.names)))
+    names = () if found.near.walk is not None else found.near.names
+    rivalries = [fits for name in names if (fits := _fits(name, found))]
     if not rivalries:
         return PosePlan()
     grid = _Candidates.of(found.final.fit, _varied({name for each in rivalries for name in each}))
@@ -113,7 +196,7 @@ class _Contest:
         """Return a contest from the probability of each model, and its fit to the poses so far."""
         weights = np.array([weight for weight, _ in fits.values()])
         each = [judge(fit.model, candidates) for _, fit in fits.values()]
-        count, scale = len(candidates), math.sqrt(_variance(near.chosen))
+        count, scale = len(candidates), math.sqrt(max(near.chosen.variance, 1e-12))
         means = np.array([-fit.residual.reshape(count, -1) for fit in each]) / scale
         rows = tuple(fit.columns.reshape(count, -1, fit.columns.shape[1]) for fit in each)
         return cls(tuple(fits), weights, means, rows,
@@ -166,13 +249,6 @@ def _after(left: Floats, rows: Floats, spread: Floats, taken: list[int]
     return left - np.einsum('crq,jq->jcr', rows, learned), spread - gain @ own @ spread
 
 
-def _variance(chosen: Set) -> float:
-    """Return the variance of a pose in units of its noise, moderated as in the search."""
-    linear = chosen.linear
-    left = max(linear.worth + linear.dof - chosen.parameters, 1.0)
-    return max((linear.worth + chosen.rss) / left, 1e-12)
-
-
 def _fits(name: str, found: Found) -> dict[str, tuple[float, Fit]]:
     """
     Return probability and fit of an effect and its rivals; empty if the data are certain enough.
@@ -195,12 +271,11 @@ def _fits(name: str, found: Found) -> dict[str, tuple[float, Fit]]:
 
 def _fit_of(rival: str, name: str, found: Found) -> Fit | None:
     """Return the fit with a rival in the place of an effect, or None without a sound fit."""
-    chosen = found.near.chosen
-    others = chosen.without(chosen.blocks[chosen.effects.index(name)])
+    others = found.near.without(name)
     best = others.best_of(rival)
     unchanged = {key: part for key, part in found.final.model.values.items() if key != name}
     values = with_effect(unchanged, rival, np.concatenate(
-        [others.extended(best).values[best], chosen.linear.blocks[best].shape]))
+        [others.extended(best).values[best], others.linear.blocks[best].shape]))
     state = fitted_state(Model(values), found.final.poses_g)
     return None if state is None else state.fit
 
@@ -266,7 +341,7 @@ def _columns(poses_g: Poses, force: Floats, shown: Sequence[Mapping[str, float]]
         if key in poses_g:
             usual = np.nanmedian(poses_g[key], axis=0)
             found[key] = np.tile(usual, (count, 1)) if usual.ndim else np.full(count, usual)
-            if shown and key in shown[0]:
+            if key in shown[0]:
                 level = np.array([each[key] for each in shown])
                 found[key] = np.repeat(level[:, np.newaxis], 3, axis=1) if usual.ndim else level
     if 'time' in poses_g:
@@ -309,15 +384,13 @@ def _in_words(contests: Sequence[_Contest], grid: _Candidates,
     ordered = sorted(chosen, key=lambda each: _effort(grid.shown[each[0]]))
     taken = [index for index, _ in ordered]
     poses = tuple(
-        PlannedPose(_triple(grid.up[index]), attitude_words(grid.up[index]), grid.shown[index],
-                    contest.names, contest.expected(taken[:number]))
+        PlannedPose(tuple(grid.up[index].tolist()), attitude_words(grid.up[index]),
+                    grid.shown[index], contest.names, contest.expected(taken[:number]))
         for number, (index, contest) in enumerate(ordered, 1))
-    lines = []
+    lines: list[str] = []
     for contest in contests:
-        expected = contest.expected(taken) if taken else 0.0
-        lines += plan_lines(dict(zip(contest.names, contest.weights.tolist(), strict=True)), [
-            (pose.words, pose.conditions) for pose, (_, why) in zip(poses, ordered, strict=True)
-            if why is contest], expected, enough=expected >= ENOUGH)
+        own = [pose for pose, (_, why) in zip(poses, ordered, strict=True) if why is contest]
+        lines += _lines_about(contest, own, contest.expected(taken))
     return PosePlan(poses, tuple(lines))
 
 
@@ -327,35 +400,23 @@ def _effort(shown: Mapping[str, float]) -> tuple[float, ...]:
             *(value for key, value in sorted(shown.items()) if is_quantity(key)))
 
 
-def _triple(vector: Floats) -> tuple[float, float, float]:
-    x, y, z = vector.tolist()
-    return x, y, z
-
-
-def plan_lines(weights: Mapping[str, float], poses: Sequence[tuple[str, str]], expected: float, *,
-               enough: bool) -> list[str]:
-    """
-    Return the lines about one contest, with the direction and the conditions of each pose.
-
-    `weights` are the probabilities of the named effect and of its rivals. After all poses of the
-    plan, the right one has the probability `expected`; `enough`: more poses are not needed.
-
-    """
-    odds = ', '.join(percent(weight) for weight in weights.values())
-    what = f'to separate {versus(tuple(weights))} ({odds})'
+def _lines_about(contest: _Contest, poses: Sequence[PlannedPose], expected: float) -> list[str]:
+    """Return the lines about a contest, its poses, and the probability after the whole plan."""
+    odds = ', '.join(percent(weight) for weight in contest.weights.tolist())
+    what = f'to separate {versus(contest.names)} ({odds})'
     end = f'the expected probability of the right one is then {percent(expected)}'
     if poses:
         return [f'{what}, take these poses:', *_held(poses), end]
-    if enough:
+    if expected >= ENOUGH:
         return [f'{what}, the same poses are enough: {end}']
     return [f'{what}, poses at 1 g do not help; apply other forces (a centrifuge)']
 
 
-def _held(poses: Sequence[tuple[str, str]]) -> Iterator[str]:
+def _held(poses: Sequence[PlannedPose]) -> Iterator[str]:
     """Yield one line for each condition; conditions with the same directions share a line."""
     directions: dict[str, list[str]] = {}
-    for direction, where in poses:
-        directions.setdefault(where, []).append(direction)
+    for pose in poses:
+        directions.setdefault(pose.conditions, []).append(pose.words)
     shared: dict[tuple[str, ...], list[str]] = {}
     for where, held in directions.items():
         shared.setdefault(tuple(_counted(held)), []).append(where)
@@ -368,3 +429,14 @@ def _counted(texts: list[str]) -> list[str]:
     """Return each text once, with the number of times if there are several."""
     times = {text: texts.count(text) for text in texts}
     return [text if count == 1 else f'{text} ({count} poses)' for text, count in times.items()]
+
+
+def versus(names: Sequence[str]) -> str:
+    first, *others = (shown_name(name) for name in names)
+    return f'{first} from {", ".join(others)}'
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 120.0:
+        return f'{seconds:.0f} s'
+    return f'{seconds / 60.0:.0f} min' if seconds < 7200.0 else f'{seconds / 3600.0:.1f} h'

@@ -4,8 +4,7 @@
 """
 The refinement of a calibration: from poses and a base to the record of the result.
 
-See `accel_calib.refine.search` for the method, and `.calibrations` for a stored calibration as the
-base.
+See `accel_calib.refine.search` for the method, and `.base` for a stored calibration as the base.
 
 **Typical values of a fleet.** The search for effects is that without a fleet, because a fleet says
 nothing about effects beyond offset, gain and cross-axis. It needs more poses than model 10 has
@@ -20,27 +19,30 @@ are listed as not testable.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from html import escape
 
 import numpy as np
 
 from .base import beside_stored, sampled, with_stored
-from .plan import plan_poses
-from .result import plain_name, PosePlan, Refinement, Stage, Verdict
+from .plan import plan_poses, PosePlan
 from .search import Found, search
 from .state import fitted_state, is_noise, State
-from .steps import advice_for, beside_walk, not_testable, steps_of, untestable, verdict_of
+from .steps import (
+    advice_for, beside_walk, not_testable, plain_name, Stage, Step, steps_of, untestable, Verdict,
+    verdict_of)
 from ..calibrate import (
     Calibration, check_sensor, fit_findings, fit_poses, fit_with_fleet, FLEET, FleetPrior, gated,
     in_g, LARGEST_DILUTION, OF_A_FIT, only_norm, posterior, quality_of, record_of, refuse_if_unfit,
-    Rejected, sound_rows, sure_rows, uncertainty_g, with_history, with_rest_noise)
-from ..effects import CHANGES, included, Model, MODELS, parameter_names, PROCESSES, with_vector
+    Rejected, rejected_by, sound_rows, sure_rows, uncertainty_g, with_history, with_rest_noise)
+from ..effects import (
+    CHANGES, included, Model, MODELS, parameter_names, PROCESSES, WANDER, with_vector)
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import fit_sphere, judge, NotConvergedError, outliers, variance_factor
 from ..finding import Finding, without as without_kinds
 from ..geometry import unit
-from ..table import check_units, Floats, Poses
-from ..text import counted
-from ..units import BASES, MG, Units
+from ..table import check_units, Floats, Poses, Record
+from ..text import counted, short, table
+from ..units import BASES, Units
 
 _LEAST_POSES = 4
 """Smallest number of poses in which an effect can be found."""
@@ -52,6 +54,129 @@ _NAMED = 4
 """Largest number of undetermined values that are named."""
 
 _BASE = '10'
+_ORIENTATION = ('reference', 'orientation')
+
+_VERDICTS = {
+    'no_gap': 'No gap beyond the noise: these poses support no further effect.',
+    'explained': 'The gap is explained: only noise remains beyond the named effects.',
+    'described': 'The gap is described, not explained: only noise remains beyond {}, but its '
+                 'cause is not known.',
+    'unexplained': 'A gap remains that no effect of the catalogue explains.',
+}
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Refinement(Record):
+    """
+    The result of a refinement.
+
+    Parameters
+    ----------
+    verdict : {'no_gap', 'explained', 'described', 'unexplained'}
+        No gap beyond the noise; the effects are named and the rest is noise; the rest is noise
+        only with an empirical curve or a slow change of the offset; or a gap remains, or it is
+        not known what explains it (`undecided`).
+    noise_floor_mg : float or None
+        Expected residual of a correct model [mg]; None if the noise is not known.
+    gap_mg, remaining_gap_mg : float
+        Residual of the base and of the refined model [mg].
+    steps : tuple of Step
+        The added effects, in order.
+    disturbed_poses : tuple of int
+        Rows of the poses left out.
+    not_testable : tuple of (str, str)
+        Effects that these data cannot show, and the data to record for them.
+    advice : tuple of str
+        Advice for the user.
+    calibration : Calibration
+        The refined calibration.
+    refusal : tuple of str
+        Reason why the calibration must not be stored or used, and advice; empty if it is usable.
+    poses_g : Poses
+        The poses kept, in g.
+    force : (n, 3) array
+        Unit force of each pose kept, in the sensor axes.
+    stages : tuple of Stage
+        Residuals of the base and after each step.
+    plan : PosePlan
+        Poses that separate the effects from their rivals soonest.
+    undecided : bool
+        Whether the rest is noise, but the poses do not show which effects explain the gap: one has
+        more than `MOST_RIVALS` rivals, or the poses do not determine the refined calibration.
+
+    """
+
+    verdict: Verdict
+    noise_floor_mg: float | None
+    gap_mg: float
+    remaining_gap_mg: float
+    steps: tuple[Step, ...]
+    disturbed_poses: tuple[int, ...]
+    not_testable: tuple[tuple[str, str], ...]
+    advice: tuple[str, ...]
+    calibration: Calibration
+    refusal: tuple[str, ...]
+    poses_g: Poses
+    force: Floats
+    stages: tuple[Stage, ...]
+    plan: PosePlan
+    undecided: bool = False
+
+    def __repr__(self) -> str:
+        names = ' + '.join([self.calibration.name, *(step.effect for step in self.steps)])
+        return (f'Refinement({self.verdict}: {names}; residual {self.gap_mg:.3g} -> '
+                f'{self.remaining_gap_mg:.3g} mg)')
+
+    def _repr_html_(self) -> str:
+        """Return the steps as a table, for notebooks."""
+        rows = [[step.effect, f'{step.gap_before_mg:.3g} → {step.gap_after_mg:.3g}',
+                 f'{step.held_out_before_mg:.3g} → {step.held_out_after_mg:.3g}',
+                 f'{step.p_value:.1g}', ', '.join(step.likely_rivals), step.where]
+                for step in self.steps]
+        head = ['effect', 'residual [mg]', 'held out [mg]', 'p', 'rivals', 'where']
+        lines = ''.join(f'<p>{escape(line)}</p>\n' for line in (repr(self), *self.advice))
+        return (table(head, rows) if rows else '') + lines
+
+
+def verdict_words(result: Refinement) -> str:
+    walks = any(step.effect == WANDER for step in result.steps)
+    words = _VERDICTS[result.verdict].format(
+        'a slow change of the offset' if walks else 'an empirical curve')
+    if result.undecided:
+        words = _undecided(result)
+    elif result.verdict == 'unexplained' and result.steps:
+        words = ('A gap remains beyond the named effects, and no effect of the catalogue explains '
+                 'it.')
+    if result.noise_floor_mg is None:
+        words += (' The noise of the poses is not known (no std and count), so their scatter is '
+                  'taken as the noise.')
+    return words
+
+
+def _undecided(result: Refinement) -> str:
+    if result.refusal:
+        why = result.refusal[0]
+    else:
+        most = max(result.steps, key=lambda step: len(step.rivals))
+        why = f'{len(most.rivals)} others explain it about as well as {most.effect}'
+    return f'Not enough poses: they cannot tell what explains the gap, because {why}.'
+
+
+def residual_words(result: Refinement) -> str:
+    """Return the residual of the base and of the refined model, and the noise floor."""
+    floor = ('not known' if result.noise_floor_mg is None
+             else f'{short(result.noise_floor_mg)} mg')
+    residual = f'{short(result.gap_mg)} mg'
+    if result.steps:
+        residual = f'{short(result.gap_mg)} -> {short(result.remaining_gap_mg)} mg'
+    poses = result.poses_g
+    count = int(np.sum(poses['new'] > 0.0)) if 'new' in poses else len(poses)
+    return f'residual {residual} over {counted(count, "pose")}, noise floor {floor}'
+
+
+def base_words(result: Refinement) -> str:
+    name = result.calibration.name
+    return 'ideal sensor' if name == 'ideal' else f'model {name}'
 
 
 def refine(poses: Poses, units: Units, *, base: str | Calibration = 'auto', sensor: str = '',
@@ -131,20 +256,21 @@ def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Un
 
 def _record(calibration: Calibration, found: Found, given: Given, sensor: str, date: str
             ) -> Refinement:
-    start, final = _as_stored(calibration, found) if given.stored else found.base, found.final
+    start, final = found.base, found.final
+    if given.stored:  # as stored, without a fit
+        kept = calibration.held(start.poses_g)
+        start = State(judge(Model(calibration.model.values), kept))
     steps, stages = steps_of(found, start, calibration.date, joint=given.joint)
     missing, plan = untestable(found, steps), plan_poses(found)
     verdict, _ = verdict_of(found, steps, refused=False)
     if verdict == 'no_gap' and calibration.reason != 'ideal' and not given.stored:
         alone = given.poses_g.take(np.isin(given.poses_g.row, calibration.used_poses.row))
         advice = advice_for(found, steps, missing, len(calibration.rejected))
-        return _of_fit(calibration, alone, verdict, missing, (*advice, *plan.advice))
+        return _of_fit(calibration, alone, missing, (*advice, *plan.advice))
     rejected = _rejected(found, given)
-    clipped = () if found.clipped is None else given.poses_g.row[found.clipped.poses]
-    outliers = tuple(each.row for each in rejected if each.row not in clipped)
+    outliers = tuple(each.row for each in rejected if each.kind != 'clipped')
     refined, refusal = refined_calibration(calibration, final, found.added, given, rejected)
-    if sensor or date:
-        refined = replace(refined, sensor=sensor or refined.sensor, date=date or refined.date)
+    refined = replace(refined, sensor=sensor or refined.sensor, date=date or refined.date)
     verdict, undecided = verdict_of(found, steps, refused=bool(refusal))
     unexplained = verdict == 'unexplained' and not undecided
     advice = (*advice_for(found, steps, missing, len(outliers), unexplained=unexplained),
@@ -155,20 +281,8 @@ def _record(calibration: Calibration, found: Found, given: Given, sensor: str, d
         final.poses_g, final.fit.equations.force, stages, plan, undecided)
 
 
-def _as_stored(calibration: Calibration, found: Found) -> State:
-    """Return the state of a stored calibration at the poses kept, without a fit."""
-    kept = calibration.held(found.base.poses_g)
-    return State(judge(Model(calibration.model.values), kept))
-
-
 def _rejected(found: Found, given: Given) -> tuple[Rejected, ...]:
-    """Return the rows of the table that were left out, with the reason."""
-    out = given.poses_g.take(found.outliers)
-    force = found.final.model.at(out.columns).force(out.reading)
-    away = np.linalg.norm(force, axis=1) - 1.0
-    rejected = [Rejected(int(row), f'outlier: |force| differs by {error * MG:+.2f} mg from 1 g in '
-                         'the fit of the others', 'outlier')
-                for row, error in zip(out.row, away, strict=True)]
+    rejected = [*rejected_by(found.final.model, given.poses_g.take(found.outliers))]
     if found.clipped is not None:
         rejected += [Rejected(int(row), 'the reading is clipped at the limit of the sensor',
                               'clipped')
@@ -210,7 +324,7 @@ def refine_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, *, sensor: 
 def _combined(refined: Calibration, poses_g: Poses, fleet: FleetPrior) -> Calibration:
     values, covariance, findings = posterior(refined.model.vector, refined.covariance, fleet)
     model = with_vector(refined.model.effects, values)
-    fit = judge(model, without_orientation(poses_g))
+    fit = judge(model, poses_g.without_columns(*_ORIENTATION))
     name = f' of model {fleet.model}' if fleet.model else ''
     return with_rest_noise(gated(replace(
         refined, model=Model(model.values, refined.model.rotation), covariance=covariance,
@@ -234,7 +348,7 @@ def _without_search(fitted: Calibration, message: str, advice: str) -> Refinemen
     """Return the fit with the fleet as a refinement, with the reason why nothing was searched."""
     poses_g = in_g(fitted.used_poses, fitted.units)
     found = _of_fit(
-        fitted, with_history(only_norm(poses_g), fitted.model), 'no_gap',
+        fitted, with_history(only_norm(poses_g), fitted.model),
         not_testable(poses_g, {}, fitted.model.effects),
         (f'no effects were searched: {message}; the result is the fit with the fleet', advice))
     fit, ratio = judge(Model(fitted.model.values), found.poses_g), fitted.quality.chi2_per_dof
@@ -243,16 +357,14 @@ def _without_search(fitted: Calibration, message: str, advice: str) -> Refinemen
                    noise_floor_mg=fitted.quality.noise_floor_mg)
 
 
-def _of_fit(fitted: Calibration, poses_g: Poses, verdict: Verdict,
-            missing: tuple[tuple[str, str], ...], advice: tuple[str, ...]) -> Refinement:
+def _of_fit(fitted: Calibration, poses_g: Poses, missing: tuple[tuple[str, str], ...],
+            advice: tuple[str, ...]) -> Refinement:
     """Return a fit as a refinement without steps; `poses_g` are the poses that it used."""
-    state = State(judge(Model(fitted.model.values), poses_g))
-    gap_mg = state.gap_mg(state.fit.residual)
-    return Refinement(
-        verdict, state.floor_mg, gap_mg, gap_mg, (),
-        tuple(each.row for each in fitted.rejected), missing, advice, fitted, (), poses_g,
-        state.fit.equations.force, (Stage('base', state.mg_of_poses(state.fit.residual)),),
-        PosePlan())
+    fit = judge(Model(fitted.model.values), poses_g)
+    state, out = State(fit), tuple(each.row for each in fitted.rejected)
+    gap_mg, base = state.gap_mg(fit.residual), Stage('base', state.mg_of_poses(fit.residual))
+    return Refinement('no_gap', state.floor_mg, gap_mg, gap_mg, (), out, missing, advice, fitted,
+                      (), poses_g, fit.equations.force, (base,), PosePlan())
 
 
 def base_of(poses: Poses, units: Units, name: str, *, sensor: str = '', date: str = ''
@@ -312,12 +424,6 @@ def _owners(name: str, effects: list[str]) -> list[set[str]]:
         return [{value} for value in parameter_names((own,))]
     whole = tuple(effect for effect in effects if own in included((effect,)))
     return [set(parameter_names(whole))] * len(parameter_names((own,)))
-
-
-def without_orientation(poses: Poses) -> Poses:
-    """Return the poses as poses of unknown orientation."""
-    return Poses({key: values for key, values in poses.columns.items()
-                  if key not in ('reference', 'orientation')}, poses.row)
 
 
 @dataclass(frozen=True)
@@ -403,7 +509,7 @@ def refined_calibration(base: Calibration, final: State, added: tuple[str, ...],
     elif given.joint:
         kept = kept.take(kept['new'] > 0.0)
     at_poses = judge(model, kept if base.form.known_orientation
-                     else without_orientation(kept))
+                     else kept.without_columns(*_ORIENTATION))
     names = ', '.join(plain_name(name) for name in added)
     others = without_kinds(base.noted, *OF_A_FIT)
     findings = [each for each in others if not given.stored or each.kind == 'flat_pose']

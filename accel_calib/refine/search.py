@@ -6,7 +6,7 @@ The search for missing effects.
 
 1. The effects of the ladder (offset, gain, gain by axis, cross-axis) that the base lacks are
    added.
-2. `.sets` searches for the set of effects, outliers and a random walk of the offset with the best
+2. A beam search finds the set of effects, outliers and a random walk of the offset with the best
    score, in the equations near the model.
 3. All values are fitted again, without the outliers, and the equations are set up near the new
    model. Steps 2 and 3 are repeated until the set remains the same.
@@ -17,11 +17,18 @@ The search for missing effects.
 
 A set is kept only if its fit converged, the cost decreased and its values are plausible.
 
+**Beam search.** It keeps the best few sets by the score of `.linear`, and extends each by one
+effect at a time. After each extension the shapes are chosen again, and the outliers are found
+again among all poses, with and without the earlier ones. So a pair may be found of which neither
+effect is visible alone, and an effect is not judged by poses that were knocked. A set is accepted
+only if each of its effects is significant beside the others. With a walk of the offset
+(`.curves`), the search is repeated with equations whitened for it, and the score includes it.
+
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,16 +36,15 @@ from numpy.typing import NDArray
 import scipy
 
 from .base import causes, Clipped, off_grid, unclipped
-from .beam import accepted, explored, simpler
 from .curves import best_curve, Curve, Near, Process, process_of, SIGNIFICANT, Walk, walk_beside
-from .linear import LEVEL, Linear, Set
+from .linear import Block, LEVEL, Linear, Set
 from .state import (
     beginning, Candidate, candidates, fitted_state, is_noise, linearised, State, with_effect,
     without)
 from ..calibrate import with_previous
 from ..effects import (
-    CHANGES, covariate_names, effect_named, EFFECTS, empirical_parts, included, LADDER,
-    linear_values, Model, parameter_names, WANDER)
+    CHANGES, covariate_names, effect_named, EFFECTS, empirical_parts, fitted_places, included,
+    LADDER, linear_values, Model, parameter_names, WANDER)
 from ..estimate import judge, kinds
 from ..geometry import unit
 from ..table import Poses
@@ -65,7 +71,6 @@ _EXACT = 0.05
 _LEAST_SHARE = 0.6
 """Part of the residual above the noise that the named effects must explain."""
 
-
 _NOTHING: tuple[frozenset[str], tuple[int, ...], bool] = (frozenset(), (), False)
 """The key of a choice without effects, outliers and a walk."""
 
@@ -75,28 +80,13 @@ class Found:
     """
     The result of a search.
 
-    Parameters
-    ----------
-    base, final : State
-        State before and after the search, with the same poses.
-    added : tuple of str
-        Added effects, in order; `WANDER` is last if the rest is a random walk of the offset.
-    outliers : (d,) array of int
-        Indices of the outliers.
-    near : Near
-        The equations near the final model, with the chosen set.
-    walk : Walk or None
-        The random walk of the offset, beside the final model at the poses kept.
-    curve : Curve or None
-        The empirical curve.
-    taken_back : tuple of str
-        Effects that were removed because they did not explain enough.
-    clipped : Clipped or None
-        Poses at the limit of the sensor, which are left out.
-    grid_g : float or None
-        Step of the grid of the readings [g], if it is relevant.
-    with_clipped : State or None
-        The base fitted to all poses, including the clipped ones.
+    `base` and `final` are the states before and after it, with the same poses. `added` are the
+    added effects, in order, with `WANDER` last if the rest is a random walk of the offset;
+    `outliers` (d,) are the indices of the outliers. `near` has the equations near the final
+    model, and `walk` is beside the final model at the poses kept. `taken_back` are effects that
+    were removed because they did not explain enough. Poses at the limit of the sensor are left
+    out: they are `clipped`, and `with_clipped` is the base fitted to all poses. `grid_g` is the
+    step of the grid of the readings [g], if it is relevant.
 
     """
 
@@ -174,10 +164,17 @@ def _search(poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
         poses_g = with_previous(poses_g, unit(force))
         state, near = _settled(State(judge(state.model, poses_g)), poses_g, fixed, names)
     begun = _fitted_without(begun, poses_g, near.chosen.out)
-    state, near, back = _judged(begun, state, near)
-    walks = (WANDER,) if near.walk is not None else ()
-    named = _end(start, state, (*ladder, *near.names, *walks), near, back, poses_g)
-    return _described(named, start, poses_g)
+    taken_back: tuple[str, ...] = ()
+    if near.names and near.walk is None and not _explains(begun, state):
+        taken_back, state = near.names, begun
+        near = replace(near, chosen=near.chosen.instead(()))
+    out, walks = near.chosen.out, () if near.walk is None else (WANDER,)
+    there = {*state.model.values, *included(state.model.values), WANDER} - _of_a_turn(state)
+    added = tuple(name for name in (*ladder, *near.names, *walks) if name in there)
+    first = _fitted_without(start, poses_g, out) if out else start
+    found = Found(first, state, added, np.array(out, np.intp), near, _walk(state, near),
+                  taken_back=taken_back)
+    return _described(found, start, poses_g)
 
 
 def _described(found: Found, start: State, poses_g: Poses) -> Found:
@@ -185,12 +182,14 @@ def _described(found: Found, start: State, poses_g: Poses) -> Found:
     if found.walk is None and found.final.is_noise:
         return _with_one_curve(found, start, poses_g)
     curve = best_curve(found.final, poses_g, found.near.chosen.out)
-    alone = None if curve is None else _alone(curve, found, poses_g)
+    if curve is None:
+        return found
+    alone = _alone(curve, found, poses_g)
     if alone is not None:
         return _described(alone, start, poses_g)
     walking = _walking(found)
-    if curve is None or (walking is not None and not _is_better(curve, walking.near)):
-        return found if curve is None or walking is None else walking
+    if walking is not None and not _is_better(curve, walking.near):
+        return walking
     return _with_curve(found, curve, start, poses_g) or found
 
 
@@ -252,10 +251,10 @@ def _alone(curve: Curve, found: Found, poses_g: Poses) -> Found | None:
 def _walking(found: Found) -> Found | None:
     """Return what was found, with a walk; None if a walk is not significant."""
     near = found.near
-    if found.walk is not None or near.process is None:
-        return None if found.walk is None else found
-    walk = walk_beside(near.beside, near.process)
-    if walk.likelihood_ratio < SIGNIFICANT:
+    if found.walk is not None:
+        return found
+    walk = None if near.process is None else walk_beside(near.beside, near.process)
+    if walk is None or walk.likelihood_ratio < SIGNIFICANT:
         return None
     near = replace(near, walk=walk, chosen=near.chosen.within(walk.whitened(near.plain)))
     return replace(found, near=near, walk=_walk(found.final, near),
@@ -277,7 +276,6 @@ class _Trial:
     tried: tuple[Candidate, ...]
 
     def near(self, state: State) -> Linear:
-        """Return the equations near a model."""
         return linearised(judge(state.model, self.poses_g), self.fixed, self.tried)
 
     def fitted(self, chosen: Set, state: State, most: float = np.inf) -> State | None:
@@ -363,9 +361,10 @@ def _best_near(linear: Linear, poses_g: Poses, refused: set[frozenset[str]], *, 
 
     process = process_of(linear, poses_g) if walks else None
     best = Near(best_of(linear), linear, None, process)
-    if linear.worth and not any(_in_time(best)) and _is_all_noise(best.chosen):
+    if process is None or (linear.worth and not any(_in_time(best))
+                           and _is_all_noise(best.chosen)):
         return best
-    return best if process is None else _with_walk(best, process, best_of)
+    return _with_walk(best, process, best_of)
 
 
 def _with_walk(best: Near, process: Process, best_of: Callable[[Linear], Set]) -> Near:
@@ -422,28 +421,10 @@ def _visible(state: State, names: Iterable[str]) -> tuple[str, ...]:
                  and not (unknown and effect_named(name).known_orientation))
 
 
-def _judged(begun: State, state: State, near: Near) -> tuple[State, Near, tuple[str, ...]]:
-    """Remove all effects if a gap remains and they explain too little of the residual."""
-    if not near.names or near.walk is not None:
-        return state, near, ()
-    if _explains(begun, state):
-        return state, near, ()
-    return begun, replace(near, chosen=near.chosen.instead(())), near.names
-
-
 def _explains(before: State, after: State) -> bool:
     """Return whether the residual is noise, or far less above it than before."""
     share = 1.0 - (after.rss - after.dof) / max(before.rss - before.dof, 1e-300)
     return not after.fit.noise_known or after.is_noise or share >= _LEAST_SHARE
-
-
-def _end(start: State, state: State, added: tuple[str, ...], near: Near, back: tuple[str, ...],
-         poses_g: Poses) -> Found:
-    there = {*state.model.values, *included(state.model.values), WANDER} - _of_a_turn(state)
-    out = near.chosen.out
-    base = _fitted_without(start, poses_g, out) if out else start
-    return Found(base, state, tuple(name for name in added if name in there),
-                 np.array(out, np.intp), near, _walk(state, near), None, back)
 
 
 def _of_a_turn(state: State) -> set[str]:
@@ -476,8 +457,133 @@ def _of_a_turn(state: State) -> set[str]:
 
 
 def _walk(state: State, near: Near) -> Walk | None:
-    """Return the walk beside a state, at the poses kept."""
-    if near.walk is None:
-        return None
-    process = process_of(state.linear, state.poses_g)
+    process = None if near.walk is None else process_of(state.linear, state.poses_g)
     return None if process is None else walk_beside(Set.of(state.linear), process)
+
+
+# ----------------------------------------------------------------------------- the beam
+
+_LARGEST = 5
+"""Largest number of effects in a set."""
+
+_WIDTH = 6
+"""Number of sets that are extended."""
+
+_BRANCHES = 6
+"""Number of effects by which a set is extended."""
+
+_TESTED = 12
+"""Number of extended sets whose shapes and outliers are found again."""
+
+_AS_GOOD = 2.0
+"""Within this difference from the best score, the set with fewest values wins."""
+
+_NEARLY = 0.3
+"""Smallest share of the score of a set that a simpler set has before its shape is fitted."""
+
+_PATIENCE = 2
+"""The search ends if the best score has not risen for this number of extensions."""
+
+
+def explored(linear: Linear) -> list[Set]:
+    """Return the sets visited, the best score first."""
+    front = _distinct(Set.of(linear).with_outliers)
+    visited = list(front)
+    best, idle = max(chosen.score for chosen in front), 0
+    for _ in range(_LARGEST):
+        larger = _distinct(new for before in front for new in _extended(before))
+        larger = [_with_best_shapes(new) for new in larger[:_TESTED]]
+        front = _distinct(each for new in larger for each in new.with_outliers)[:_WIDTH]
+        if not front:
+            break
+        visited += [*front, *(fewer for new in front[:3] for fewer in new.fewer)]
+        idle = 0 if front[0].score > best else idle + 1
+        best = max(best, front[0].score)
+        if idle == _PATIENCE:
+            break
+    return _distinct(visited)
+
+
+def simpler(chosen: Set) -> list[Set]:
+    """
+    Return sets with one effect less, in which another effect has the best searched shape.
+
+    Between the shapes that are tried, two effects may imitate one: an offset that changes with
+    temperature and with its rate is one that lags.
+
+    """
+    blocks, fitted = chosen.linear.blocks, dict[str, list[int]]()
+    for number, block in enumerate(blocks):
+        if block.searched and fitted_places(block.entry, block.shape):
+            fitted.setdefault(block.effect, []).append(number)
+    sets = []
+    for less in chosen.fewer:
+        for effect, own in fitted.items():
+            others = less.instead(number for number in less.blocks
+                                  if blocks[number].effect != effect)
+            if _is_barred(blocks[own[0]], others.entries):
+                continue
+            gain, _ = others.gains(effect)
+            new = others.extended(max(own, key=lambda number: gain[number]))
+            if new.score > _NEARLY * chosen.score:
+                sets.append(new)
+    return sets
+
+
+def accepted(visited: Iterable[Set]) -> Iterator[Set]:
+    """Yield the sets whose effects are all significant, the preferred one first."""
+    left = sorted(visited, key=lambda chosen: -chosen.score)
+    while left:
+        near: list[Set] = []
+        for chosen in left:
+            if near and chosen.score < near[0].score - _AS_GOOD:
+                break
+            if chosen.is_significant:
+                near.append(chosen)
+        if not near:
+            return
+        best = min(near, key=lambda chosen: (
+            chosen.parameters, any('new' in each.entry.needs for each in chosen.entries),
+            -chosen.score))
+        yield best
+        left = [chosen for chosen in left if chosen is not best]
+
+
+def _extended(before: Set) -> list[Set]:
+    """Return the set with one more effect, for the effects with the best scores."""
+    linear, scores = before.linear, before.scores_beside
+    best: dict[str, tuple[float, int]] = {}
+    for effect, numbers in linear.numbers_of.items():
+        number = int(numbers[np.argmax(scores[numbers])])
+        if scores[number] > -np.inf and not _is_barred(linear.blocks[number], before.entries):
+            best[effect] = float(scores[number]), number
+    return [before.extended(number)
+            for _, number in sorted(best.values(), reverse=True)[:_BRANCHES]]
+
+
+def _is_barred(block: Block, present: Iterable[Block]) -> bool:
+    """Return whether one of the effects present is that of a block, contains it or is in it."""
+    return any(block.effect == other.effect or block.effect in other.entry.includes
+               or other.effect in block.entry.includes for other in present)
+
+
+def _with_best_shapes(chosen: Set) -> Set:
+    """Choose the shape of each effect again, with the others as they are."""
+    for place, number in enumerate(chosen.blocks[:-1]):
+        effect = chosen.effects[place]
+        if len(chosen.linear.numbers_of[effect]) == 1:
+            continue
+        before, after = chosen.blocks[:place], chosen.blocks[place + 1:]
+        best = chosen.instead((*before, *after)).best_of(effect)
+        if best != number:
+            new = chosen.instead((*before, best, *after))
+            chosen = max(chosen, new, key=lambda either: either.score)
+    return chosen
+
+
+def _distinct(sets: Iterable[Set]) -> list[Set]:
+    """Return the best set of each list of names and outliers, the best score first."""
+    best: dict[tuple[frozenset[str], tuple[int, ...]], Set] = {}
+    for chosen in sorted(sets, key=lambda chosen: -chosen.score):
+        best.setdefault((frozenset(chosen.effects), chosen.out), chosen)
+    return list(best.values())

@@ -52,8 +52,7 @@ class Candidate:
     """
     An effect to try with each of its (s,) `shapes`, which count as `tried` independent ones.
 
-    `factors` (shapes, t or 1, n) are those of its terms at the poses. They do not depend on a
-    model.
+    `factors` (shapes, t or 1, n) are those of its terms at the poses, with any model.
 
     """
 
@@ -64,7 +63,6 @@ class Candidate:
 
     @property
     def entry(self) -> Effect:
-        """Return the effect."""
         return effect_named(self.name)
 
     def beside(self, present: Floats | None, context: Context) -> Candidate:
@@ -150,7 +148,6 @@ def _amplitudes(model: Model) -> Floats:
 
 def _blocks(near: Equations, context: Context, present: Model, tried: Sequence[Candidate]
             ) -> tuple[tuple[Block, ...], Floats]:
-    """Return the blocks of the candidates, and their columns."""
     alike = Counter(kind_of(each.name) for each in tried)
     tried = [each.beside(present.values.get(each.name), context) for each in tried]
     widths = [len(each.shapes) * len(each.entry.parameters) for each in tried]
@@ -224,9 +221,8 @@ class State:
         """Return the residual expected of a correct model [mg]; None if the noise is unknown."""
         if not self.fit.noise_known:
             return None
-        rows = self.fit.by_pose.rows[self.fit.equations.pose]
-        share = np.sqrt(self.dof / len(rows)) * np.ones(len(rows))
-        return self.gap_mg(share)
+        count = len(self.residual)
+        return self.gap_mg(np.full(count, np.sqrt(self.dof / count)))
 
 
 def is_noise(rss: float, dof: float) -> bool:
@@ -255,5 +251,4 @@ def with_effect(model: Mapping[str, Floats], name: str, values: Floats) -> dict[
 
 
 def without(poses: Poses, out: Sequence[int] | NDArray[np.intp]) -> Poses:
-    """Return the poses but those at these indices."""
     return poses.take(np.delete(np.arange(len(poses)), out))

@@ -14,19 +14,21 @@ instant, the ends of the range of a column, or directions of the force.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import pairwise
 import math
+from typing import Literal
 
 import numpy as np
 
 from .curves import is_curve, LEAST, nearest_effects, probabilities, steepest
 from .linear import Set
-from .result import plain_name, shown_name, Stage, Step, Verdict
 from .search import Found
 from .state import candidates, fitted_state, is_noise, linearised, State, visible, with_effect
 from ..effects import (
-    CHANGES, effect_named, EFFECTS, EMPIRICAL, empirical_parts, included, is_effect, kind_of,
-    LADDER, Model, parameter_names, PROCESSES, TO_SEPARATE, unit_of, variable_words, WANDER)
+    CHANGES, COVARIATES, effect_named, EFFECTS, EMPIRICAL, empirical_parts, included, is_effect,
+    kind_of, LADDER, Model, parameter_names, PROCESSES, TO_SEPARATE, unit_of, value_unit,
+    variable_of, variable_words, WANDER)
 from ..estimate import judge, kinds
 from ..geometry import ATTITUDES, axes_of_signs
 from ..table import column_of, Floats, Poses
@@ -50,6 +52,133 @@ _FAR = 10.0
 
 _FEW = 10
 """Degrees of freedom below which most effects cannot be detected."""
+
+_APART = 0.05
+"""Difference of two probabilities above which both are stated."""
+
+_LEAST_P = 1e-16
+
+Verdict = Literal['no_gap', 'explained', 'described', 'unexplained']
+
+
+@dataclass(frozen=True)
+class Step:
+    """
+    One added effect.
+
+    Parameters
+    ----------
+    effect : str
+        What the effect is: its name in the catalogue, ``empirical`` or a covariate.
+    rivals : tuple of str
+        Effects that these data cannot distinguish from it.
+    probabilities : dict
+        Probability of the effect and of each effect in its place, by name. An effect that is far
+        larger than in common sensors is less probable.
+    data_probabilities : dict
+        The same by the data alone, whatever is usual.
+    parameters : dict
+        Values by name. For a change of a stored calibration: the changes of the values.
+    parameters_sd : dict
+        Their standard deviations, of those that are fitted.
+    gap_before_mg, gap_after_mg : float
+        Residual without and with the effect [mg].
+    held_out_before_mg, held_out_after_mg : float
+        Held-out residual without and with the effect [mg].
+    p_value : float
+        Probability that noise alone makes one of all candidates this good.
+    where : str
+        Directions, range or poses of the disagreement.
+    name : str
+        Name in the model, by which `accel_calib.effects.effect_named` finds the effect.
+    variable : str
+        Quantity that a covariate or a curve is a function of; empty for other effects.
+
+    """
+
+    effect: str
+    rivals: tuple[str, ...]
+    probabilities: dict[str, float]
+    data_probabilities: dict[str, float]
+    parameters: dict[str, float]
+    parameters_sd: dict[str, float]
+    gap_before_mg: float
+    gap_after_mg: float
+    held_out_before_mg: float
+    held_out_after_mg: float
+    p_value: float
+    where: str
+    name: str
+    variable: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'variable', variable_of(self.name))
+
+    @property
+    def likely_rivals(self) -> tuple[str, ...]:
+        """Return the rivals with their probabilities, such as ``quadratic (11 %)``."""
+        return tuple(f'{name} ({self.odds(name)})' for name in self.rivals)
+
+    def odds(self, rival: str) -> str:
+        """Return the probability of a rival, and that by the data alone if it differs much."""
+        whole, alone = (each.get(rival, 0.0) for each in (
+            self.probabilities, self.data_probabilities))
+        by_data = f', by the data alone {percent(alone)}' if abs(alone - whole) > _APART else ''
+        return f'{percent(whole)}{by_data}'
+
+
+@dataclass(frozen=True)
+class Stage:
+    """
+    The residuals at one stage, for figures.
+
+    Parameters
+    ----------
+    name : str
+        ``base``, or the effect that was added.
+    residual_mg : (n,) array
+        Residual of each pose kept, signed if only |force| is known.
+
+    """
+
+    name: str
+    residual_mg: Floats
+
+
+def chance(p_value: float) -> str:
+    """Return the probability that noise alone explains a step."""
+    return f'p < {_LEAST_P:.0e}' if p_value < _LEAST_P else f'p = {p_value:.1g}'
+
+
+def percent(probability: float) -> str:
+    """Return a probability as text; only certainty is 0 or 100 %."""
+    if 0.0 < probability < 0.005:
+        return '< 1 %'
+    return '> 99 %' if 0.995 <= probability < 1.0 else f'{100.0 * probability:.0f} %'
+
+
+def values_of(step: Step) -> list[tuple[str, str]]:
+    """Return name and text of each value of a step; values in g are given in mg."""
+    effect = effect_named(step.name)
+    values = []
+    for name, value in step.parameters.items():
+        unit_name, scale = value_unit(step.name, name)
+        words = (f'{value * scale:+.3g} {unit_name}'.replace('-', '−')
+                 if name in effect.parameters else f'{value:.5g} {unit_name}'.rstrip())
+        values.append((name, words))
+    return values
+
+
+def plain_name(name: str) -> str:
+    """Return the name of an effect, for a change that of the effect that has changed."""
+    return CHANGES[name].base if name in CHANGES else name
+
+
+def shown_name(name: str) -> str:
+    """Return the name of an effect among rivals; a covariate keeps its quantity."""
+    if kind_of(name) in COVARIATES:
+        return f'{kind_of(name)}-{variable_of(name)}'
+    return plain_name(kind_of(name))
 
 
 def verdict_of(found: Found, steps: Sequence[Step], *, refused: bool) -> tuple[Verdict, bool]:
@@ -141,14 +270,13 @@ def _p_value(name: str, before: State, found: Found) -> float:
     if found.curve is not None and name == found.curve.name:
         return found.curve.p_value
     if name in near.names:
-        return near.chosen.probability(near.chosen.blocks[near.names.index(name)])
+        return near.chosen.probability(near.block_of(name))
     linear = linearised(before.fit, before.model.effects, candidates(LADDER, before.poses_g))
     own = [number for number, block in enumerate(linear.blocks) if block.effect == name]
     return Set.of(linear, own).probability(own[0]) if own else 1.0
 
 
 def _output_steps(found: Found) -> list[Step]:
-    """Return the steps for readings clipped at a limit or on a grid."""
     steps = []
     gap, held_out = found.base.gap_mg(found.base.residual), found.base.gap_mg(found.base.held_out)
     if found.clipped is not None and found.with_clipped is not None:
@@ -316,7 +444,12 @@ def advice_for(found: Found, steps: tuple[Step, ...], untestable: tuple[tuple[st
     """
     lines = [*_other_sensor(found), *_unseen_turn(found)]
     lines += [_separating(step) for step in steps if step.rivals]
-    lines += [line for step in steps for line in _remarks(step)]
+    for step in steps:
+        times, effect = times_typical(step), effect_named(step.name)
+        if times > _FAR:
+            lines.append(f'{step.effect} is {times * effect.typical:.2g} {effect.unit}, typical '
+                         f'parts have about {effect.typical:.2g}: check that the sensor causes '
+                         'it, and not the setup')
     if left_out:
         were, them = ('was', 'it') if left_out == 1 else ('were', 'them')
         lines.append(f'{counted(left_out, "pose")} {were} left out; take {them} again')
@@ -380,13 +513,3 @@ def times_typical(step: Step) -> float:
     effect = effect_named(step.name)
     return max((abs(step.parameters.get(name, 0.0)) for name in effect.parameters),
                default=0.0) / effect.typical
-
-
-def _remarks(step: Step) -> list[str]:
-    """Return a remark on values that are far larger than in common parts."""
-    times = times_typical(step)
-    if times <= _FAR:
-        return []
-    effect = effect_named(step.name)
-    return [f'{step.effect} is {times * effect.typical:.2g} {effect.unit}, typical parts have '
-            f'about {effect.typical:.2g}: check that the sensor causes it, and not the setup']
