@@ -154,7 +154,7 @@ def calibration_page(calibration: Calibration, rating: Rating, source: str, *,
                        more='' if used is None else verdict_words(used))
 
 
-def thermal_page(outcome: ThermalOutcome, source: str, *, stored: str = STORED,
+def thermal_page(outcome: ThermalOutcome, sources: Sequence[str], *, stored: str = STORED,
                  notes: Sequence[str] = ()) -> str:
     """
     Return the page of a calibration of the offset over temperature as HTML.
@@ -163,16 +163,15 @@ def thermal_page(outcome: ThermalOutcome, source: str, *, stored: str = STORED,
     ----------
     outcome : ThermalOutcome
         The calibration with its curve.
-    source : str
-        Names of the logs.
-    stored : str
-        File of the calibration, for the lines that use it.
-    notes : sequence of str
-        How the logs were read.
+    sources : sequence of str
+        Files of the logs.
+    stored, notes
+        As in `calibration_page`.
 
     """
     calibration, curve = outcome.calibration, outcome.curve
-    title = f'Offset over temperature of {calibration.sensor or Path(source).name or source}'
+    names = ', '.join(Path(source).name for source in sources)
+    title = f'Offset over temperature of {calibration.sensor or names}'
     body = [_curve_numbers(curve),
             section('Offset over temperature', figures(
                 _of_axis(curve, axis) for axis in range(3)), HINT),
@@ -186,8 +185,9 @@ def thermal_page(outcome: ThermalOutcome, source: str, *, stored: str = STORED,
             section('Use it', *(block(name, text) for name, text in snippets(
                 calibration, stored))),
             section('How the log was read', listing(notes)), how_to_read(*_HOW_TO_READ_THERMAL)]
-    return rated_sheet(title, [source, f'fitted {calibration.date}' if calibration.date else ''],
-                       outcome.rating, body)
+    return rated_sheet(title, [
+        ', '.join(sources), f'fitted {calibration.date}' if calibration.date else ''],
+        outcome.rating, body)
 
 
 def _curve_numbers(curve: Curve) -> str:
