@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 import functools
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+import io
 import json
 import os
 from pathlib import Path
@@ -173,13 +174,27 @@ def test_a_recording_that_takes_too_long_is_a_row_with_its_error(
     assert '--time-limit' in row['advice']
 
 
+def without_a_value(data: bytes) -> bytes:
+    """Return a Parquet file with a row that does not say what it is about."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    file, rows = io.BytesIO(), pq.read_table(pa.BufferReader(data))
+    about = rows.to_pylist()
+    about[0][next(name for name in ('recording', 'sensor') if name in about[0])] = None
+    pq.write_table(pa.Table.from_pylist(about, rows.schema), file)
+    return file.getvalue()
+
+
 DAMAGE: dict[str, Callable[[bytes], bytes]] = {
     'truncated': lambda data: data[:len(data) // 2], 'empty': lambda data: b'',
-    'foreign': lambda data: b'{"key": 1}'}
+    'foreign': lambda data: b'{"key": 1}', 'without a value': without_a_value,
+    'of another value': lambda data: data[:200] + bytes([data[200] ^ 1]) + data[201:]}
 
 
-@pytest.mark.parametrize('damage', DAMAGE)
-@pytest.mark.parametrize('name', ['data.parquet', 'sensors.parquet', 'pending'])
+@pytest.mark.parametrize(('name', 'damage'), [
+    *(('data.parquet', damage) for damage in DAMAGE), ('sensors.parquet', 'empty'),
+    ('sensors.parquet', 'without a value'), ('pending', 'truncated'), ('pending', 'foreign')])
 def test_a_damaged_file_of_the_results_is_set_aside_and_made_again(
         name: str, damage: str, client: Any, tmp_path: Path) -> None:
     folder, store = write_fleet(tmp_path / 'in', 5, 1), Store(tmp_path / 'out')
