@@ -131,15 +131,7 @@ def status_of(outcome: Outcome | ThermalOutcome) -> int:
 
 
 def plan_of(args: argparse.Namespace, **more: Any) -> Plan:
-    """
-    Return how to calibrate.
-
-    Raises
-    ------
-    InputError
-        If ``--prior`` stands with another model.
-
-    """
+    """Return how to calibrate; raise InputError if ``--prior`` stands with another model."""
     plan = Plan(**{**given(Plan, args), 'fleet': prior(args), 'also': args.own, **more})
     usual = plan.model in ('auto', NORM_MODELS[-1]) and plan.method == 'ml'
     if plan.fleet is not None and not usual:

@@ -243,10 +243,7 @@ def odd_sensors(values: Mapping[str, Floats], deviations: Mapping[str, Floats] |
     """
     Return the sensors of one model that are far from the others, the farthest first.
 
-    Parameters
-    ----------
-    values, deviations : mapping of str to (9,) array
-        Values by sensor, and their standard deviations; by default 0.
+    The (9,) values and standard deviations are by sensor; the latter are 0 by default.
 
     """
     if len(values) < FEWEST:
@@ -329,17 +326,7 @@ def priors_of(sensors: Iterable[Typical]) -> dict[str, FleetPrior]:
 
 
 def estimated(values: Floats, covariances: Floats) -> Prior:
-    """
-    Return mean and covariance for another sensor of the fleet.
-
-    Parameters
-    ----------
-    values : (n, p) array
-        Values of n sensors.
-    covariances : (n, p, p) array
-        Their covariances.
-
-    """
+    """Return mean and covariance for another sensor, from (n, p) values and their covariances."""
     count, size = values.shape
     mean = np.median(values, axis=0)
     spread = np.median(np.abs(values - mean), axis=0) / 0.6745 + _LEAST_SPREAD_G

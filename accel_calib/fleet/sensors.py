@@ -68,15 +68,7 @@ _NEEDED: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Store:
-    """
-    The folder of the results.
-
-    Parameters
-    ----------
-    folder : Path
-        The folder; all workers must see it under this name.
-
-    """
+    """The folder of the results; all workers must see it under this name."""
 
     folder: Path
 
@@ -117,10 +109,7 @@ class Store:
         """
         Add the pending rows of a sensor, by the name of its folder, to its Parquet file.
 
-        Raises
-        ------
-        OSError
-            If a file cannot be written. The next `merge` completes it.
+        If it raises OSError, the next `merge` completes it.
 
         """
         folder = self.pending / name

@@ -313,21 +313,7 @@ _HOW_TO_READ = (
 
 def comparison_page(comparison: Comparison, rating: Rating, sources: Sequence[Path],
                     calibrations: Sequence[Calibration]) -> str:
-    """
-    Return the page of a comparison as HTML.
-
-    Parameters
-    ----------
-    comparison : Comparison
-        The comparison.
-    rating : Rating
-        The verdict.
-    sources : sequence of Path
-        Files of the calibrations.
-    calibrations : sequence of Calibration
-        The calibrations that were compared.
-
-    """
+    """Return the page of a comparison of the calibrations in the files `sources`, as HTML."""
     labels = [f'{k} {source.name}' for k, source in enumerate(sources, 1)]
     title = f'Comparison of {len(calibrations)} calibrations{_of_sensor(calibrations)}'
     body = [section('Calibrations', _runs(comparison, calibrations, labels)),
@@ -374,19 +360,7 @@ def _notes(comparison: Comparison) -> Iterator[str]:
 
 def history_page(history: History, sources: Sequence[Path],
                  calibrations: Sequence[Calibration]) -> str:
-    """
-    Return the page of a history as HTML.
-
-    Parameters
-    ----------
-    history : History
-        The history.
-    sources : sequence of Path
-        Files of the calibrations.
-    calibrations : sequence of Calibration
-        The calibrations, as given to `accel_calib.compare.history_of`.
-
-    """
+    """Return the page of a history of the calibrations in the files `sources`, as HTML."""
     body = [section('Over the dates', figures(of_history(history)), HINT),
             section('Changes', _changes(history)),
             section('Calibrations', _moments(history, sources)),
