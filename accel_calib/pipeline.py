@@ -235,25 +235,6 @@ def ramp_or_poses(source: Path | Piped | Frame, options: LogOptions = LogOptions
     return poses_of(source, options, settings, progress)
 
 
-def _still_ramp(source: Source, options: LogOptions, found: Intake) -> RampIntake | None:
-    """
-    Return the ramp of a log whose poses all lie in one direction; None if it has no ramp.
-
-    A log of one direction does not determine a calibration. If its temperature spans
-    `LEAST_RANGE`, it is that of a still board that warms up.
-
-    """
-    if not found.captured or not _is_one_direction(found.poses):
-        return None
-    with _opened(source, options) as log:
-        if log.units.is_native:
-            return None
-        cells = cells_of(log.blocks, log.units)
-        low, high = cells.range_c
-        return (RampIntake(ramp_of(cells), log.units, log.read_as, log.notes)
-                if high - low >= LEAST_RANGE else None)
-
-
 def _is_slow_recording(poses: Poses) -> bool:
     """Return whether a table has the form of poses, but is of one board that was not turned."""
     return 'time' in poses and 'count' not in poses and _is_one_direction(poses)
@@ -416,16 +397,12 @@ def _mounted_as(before: Calibration, calibration: Calibration) -> Calibration:
 
 @dataclass(frozen=True)
 class ThermalOutcome:
-    """A calibration with the offset over temperature, the curve of this offset, and the logs."""
+    """A calibration with the offset over temperature, its curve, and the logs."""
 
     calibration: Calibration
     curve: Curve
     logs: Sequence[Intake | RampIntake]
-
-    @property
-    def read_as(self) -> str:
-        """Return how the logs were read."""
-        return _read_as(self.logs)
+    read_as: str
 
     @cached_property
     def rating(self) -> Rating:
@@ -436,27 +413,20 @@ class ThermalOutcome:
 def calibrated_log(source: Source, options: LogOptions, found: Intake, plan: Plan = Plan()
                    ) -> Outcome | ThermalOutcome:
     """
-    Calibrate the poses of a log, or the ramp of a still board that warms up, if it is one.
+    Calibrate the poses that `poses_of` found in a log, or its ramp if it is of a still board.
 
-    Parameters
-    ----------
-    source, options
-        As in `poses_of`.
-    found : Intake
-        What `poses_of` returned for them.
-    plan : Plan
-        How to calibrate; a ramp is not refined.
-
-    Raises
-    ------
-    RefusedFitError, InputError
-        As in `calibrated` and `thermally_calibrated`.
+    Poses in one direction do not determine a calibration. If the temperature of their recording
+    spans `LEAST_RANGE`, the board was still while it warmed up.
 
     """
-    ramp = _still_ramp(source, options, found)
-    if ramp is None:
-        return calibrated(found.poses, found.units, plan)
-    return thermally_calibrated([ramp], plan)
+    if found.captured and not found.units.is_native and _is_one_direction(found.poses):
+        with _opened(source, options) as log:
+            cells = cells_of(log.blocks, log.units)
+            low, high = cells.range_c
+            if high - low >= LEAST_RANGE:
+                return thermally_calibrated([
+                    RampIntake(ramp_of(cells), log.units, log.read_as, log.notes)], plan)
+    return calibrated(found.poses, found.units, plan)
 
 
 def thermally_calibrated(logs: Sequence[Intake | RampIntake], plan: Plan = Plan()
@@ -478,7 +448,8 @@ def thermally_calibrated(logs: Sequence[Intake | RampIntake], plan: Plan = Plan(
         As in `calibrated`, or if there is no ramp, or the logs are of several sensors.
 
     """
-    with saying(_read_as(logs)):
+    read_as = ', '.join(dict.fromkeys(each.read_as for each in logs if each.read_as))
+    with saying(read_as):
         ramps = [each for each in logs if isinstance(each, RampIntake)]
         turned = _turned_over(logs)
         _check_one_sensor([*(each.ramp.stretches for each in ramps),
@@ -493,11 +464,7 @@ def thermally_calibrated(logs: Sequence[Intake | RampIntake], plan: Plan = Plan(
                 plan, refined=False, flat=None, nose_down=None)).calibration
             made = with_curve(fitted, curve, rows)
         return ThermalOutcome(level_by_rows(
-            made, rows, plan.frame, _row(rows, plan.flat), plan.nose_down), curve, logs)
-
-
-def _read_as(logs: Sequence[Intake | RampIntake]) -> str:
-    return ', '.join(dict.fromkeys(each.read_as for each in logs if each.read_as))
+            made, rows, plan.frame, _row(rows, plan.flat), plan.nose_down), curve, logs, read_as)
 
 
 def _turned_over(logs: Sequence[Intake | RampIntake]) -> Intake | None:
@@ -611,8 +578,3 @@ class Correction:
         """Return what the samples lack, and what left the range of the calibration, so far."""
         return [*filter(None, [self._context.lacking]),
                 *(each.line for each in self._context.left)]
-
-
-def corrected(samples: _Samples, calibration: Calibration, units: Units) -> _Samples:
-    """Return samples as `Correction` does, at once; `units` is their unit."""
-    return Correction(calibration, units, samples.sensor)(samples)
