@@ -17,17 +17,16 @@ from accel_calib.report import calibration_page, refinement_page
 from accel_calib.text import milli
 from inside import (
     axis_figures, comparison_page, history_page, residuals_of, residuals_of_refinement, sheet,
-    snippets)
+    snippets, with_linear_part)
 from live_bench import chromium, PATIENCE
 import numpy as np
 from page_parser import parsed
 from playwright.sync_api import expect, sync_playwright
 import pytest
+from shared import SENSOR
 
 pytest.importorskip('matplotlib')
 
-SENSOR = {'offset': [0.02, -0.01, 0.03], 'axis_gain': [0.01, -0.02, 0.005],
-          'cross_axis': [0.004, 0.002, -0.003]}
 HOSTILE = '</script><script>alert(1)</script></title><b onload="x">&\''
 
 
@@ -65,30 +64,26 @@ def dated():
     return found
 
 
-def test_every_figure_has_a_text_and_every_pose_can_be_pointed_at(text, poses):
+def rows_in(found, tag):
+    """Return the rows of the poses that tags of a page are about."""
+    return [each['data-row'] for each in found.named(tag) if 'data-row' in each]
+
+
+def test_every_figure_has_a_text_and_every_pose_can_be_pointed_at(text, poses, calibration):
     found = parsed(text)
-    figures = found.named('svg')
-    assert len(figures) == 4
+    figures, live = found.named('svg'), found.named('figure')
+    assert len(live) == len(figures) == 4
     assert all(each['role'] == 'img' and each['aria-label'] for each in figures)
-    live = found.named('figure')
     assert all(each['tabindex'] == '0' and each['aria-label'] for each in live)
-    assert len(live) == len(figures)
-    for row, warm in zip(poses.row, poses['temperature'], strict=True):
+    for row, warm, before, after in zip(
+            poses.row, poses['temperature'], residuals_of(calibration).before_mg,
+            residuals_of(calibration).after_mg, strict=True):
+        one, other = (f'row {row}, {milli(value, signed=True)} mg, {warm:.0f} °C'
+                      for value in (before, after))
         mine = [mark for mark in found.marks if mark.startswith(f'row {row}, ')]
-        # Coverage, before, after, by direction, against temperature and against time.
-        assert len(mine) == 6
-        assert all(re.fullmatch(rf'row {row}, [+−][\d.]+ mg, {warm:.0f} °C', mark)
-                   for mark in mine)
-    rows = {each['data-row'] for each in found.named('tr') if 'data-row' in each}
-    assert rows == {str(row) for row in poses.row}
-    assert rows == {each['data-row'] for each in found.named('use') if 'data-row' in each}
-
-
-def test_marks_state_the_residual_of_their_pose(text, calibration):
-    residuals = residuals_of(calibration)
-    for row, value, warm in zip(residuals.poses_g.row, residuals.after_mg,
-                                residuals.poses_g['temperature'], strict=True):
-        assert f'row {row}, {milli(value, signed=True)} mg, {warm:.0f} °C' in text
+        # Before; coverage, after, by direction, against temperature and against time.
+        assert sorted(mine) == sorted([one, *[other] * 5])
+    assert {*rows_in(found, 'tr')} == {*rows_in(found, 'use')} == {*map(str, poses.row)}
 
 
 def test_hostile_names_are_text(calibration, poses):
@@ -192,22 +187,12 @@ def test_values_and_their_deviations_are_those_of_the_calibration(calibration, t
 
 
 def test_figures_by_axis_are_those_of_the_axes():
-    # Axes of length 1.01, 1 and 0.99; x and y are 89° apart, the others 90°.
+    apart = np.radians(89.0)
     mat = np.diag([1.01, 1.0, 0.99]) @ np.array(
-        [[1.0, np.cos(np.radians(89.0)), 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    mat[0] *= 1.01 / np.linalg.norm(mat[0])
-    vec = np.concatenate([[0.1, 0.2, 0.3], np.diag(mat) - 1.0, [mat[0, 1] / 2.0, 0.0, 0.0],
-                          [0.0, 0.0, -mat[0, 1] / 2.0]])
-    effects = ('offset', 'axis_gain', 'cross_axis', 'misalignment')
-    from inside import with_vector
-    model = with_vector(effects, vec)
-    if not np.allclose(model.linear_part[0], mat):
-        vec[-1] *= -1.0
-    np.testing.assert_allclose(with_vector(effects, vec).linear_part[0], mat, atol=1e-12)
-    angle = np.degrees(np.arccos(mat[0] @ mat[1] / np.linalg.norm(mat[0])))
-    np.testing.assert_allclose(axis_figures(vec, effects),
-                               [0.1, 0.2, 0.3, 1.01, 1.0, 0.99, angle, 90.0, 90.0])
-    assert angle == pytest.approx(89.0, abs=0.02)
+        [[np.sin(apart), np.cos(apart), 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    model = with_linear_part(mat, np.array([0.1, 0.2, 0.3]))
+    np.testing.assert_allclose(axis_figures(model.vector, model.effects),
+                               [0.1, 0.2, 0.3, 1.01, 1.0, 0.99, 89.0, 90.0, 90.0])
 
 
 def test_left_out_poses_are_listed_and_drawn(poses):
@@ -230,8 +215,7 @@ def test_page_of_a_verification_shows_the_other_poses(calibration):
                             verification=(checked, other))
     found = parsed(text)
     assert '<h1>Check of the calibration of imu_link</h1>' in text
-    rows = [each['data-row'] for each in found.named('tr') if 'data-row' in each]
-    assert rows == [str(row) for row in range(1, 10)]
+    assert rows_in(found, 'tr') == [str(row) for row in range(1, 10)]
     residuals = residuals_of(calibration, other)
     assert residuals.rms_mg == pytest.approx(checked.rms_after_mg)
     assert np.sqrt(np.mean(residuals.before_mg ** 2)) == pytest.approx(checked.rms_before_mg)
@@ -267,21 +251,16 @@ def test_residuals_that_the_calibration_cannot_correct_are_shown_apart():
     assert f'Remaining residual: {residuals.rms_mg:.3g} mg RMS' in text
 
 
-def test_lines_of_c_correct_as_apply_does(calibration):
-    lines = dict(snippets(calibration, 'calibration.yaml'))
-    numbers = [float(value) for value in re.findall(r'(-?\d\.\d+e[+-]\d+)f', lines['C'])]
-    vec, mat = np.array(numbers[:3]), np.reshape(numbers[3:], (3, 3))
-    reading = np.array([[1.0, -4.0, 9.0], [-9.0, 3.0, 1.0]])
-    np.testing.assert_allclose((reading - vec) @ mat.T, calibration.apply(reading), rtol=1e-6)
-
-
-def test_lines_of_python_run(calibration, tmp_path):
+def test_lines_of_c_and_of_python_correct_as_apply_does(calibration, tmp_path):
     path = tmp_path / "robot's.yaml"
     calibration.save(path)
-    reading = np.array([[1.0, -4.0, 9.0]])
+    lines, reading = dict(snippets(calibration, str(path))), np.array([[1, -4, 9], [-9, 3, 1.0]])
+    numbers = [float(value) for value in re.findall(r'(-?\d\.\d+e[+-]\d+)f', lines['C'])]
+    vec, mat = np.array(numbers[:3]), np.reshape(numbers[3:], (3, 3))
     known = {'readings': reading}
-    exec(dict(snippets(calibration, str(path)))['Python'], known)
-    np.testing.assert_allclose(known['force'], calibration.apply(reading))
+    exec(lines['Python'], known)
+    for found in ((reading - vec) @ mat.T, known['force']):
+        np.testing.assert_allclose(found, calibration.apply(reading), rtol=1e-6)
 
 
 def test_history_is_in_order_of_date_and_finds_the_change(dated):
@@ -299,24 +278,17 @@ def test_history_is_in_order_of_date_and_finds_the_change(dated):
     np.testing.assert_allclose(offset.values, expected, atol=1e-9)
 
 
-def test_calibrations_of_one_day_are_labelled_with_their_time(dated):
-    morning, evening = (replace(dated[0], date=f'2026-03-12T{hour}:30:00+00:00')
-                        for hour in ('08', '19'))
+def test_labels_of_a_history_are_its_dates_with_the_time_where_a_day_has_several(dated):
+    morning, evening, undated, wrong = (replace(dated[0], date=date) for date in (
+        '2026-03-12T08:30:00+00:00', '2026-03-12T19:30:00+00:00', '', 'Monday'))
     assert history_of([evening, dated[1], morning]).labels == (
         '2026-02-12 10:00', '2026-03-12 08:30', '2026-03-12 19:30')
-
-
-def test_history_without_dates_keeps_the_order(dated):
-    undated = [dated[2], replace(dated[0], date=''), dated[1]]
-    history = history_of(undated)
+    history = history_of([dated[2], undated, dated[1]])
     assert [moment.index for moment in history.moments] == [0, 1, 2]
     assert history.labels == ('2026-03-12', 'no date', '2026-02-12')
     assert 'calibration 2 has no date: the order is that of the input' in history.notes
-
-
-def test_history_refuses_what_it_cannot_compare(dated):
     with pytest.raises(InputError, match="the date of calibration 2 is 'Monday', expected"):
-        history_of([dated[0], replace(dated[1], date='Monday')])
+        history_of([dated[0], wrong])
     with pytest.raises(InputError, match='found 1 calibration, expected at least 2'):
         history_of(dated[:1])
 
