@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, ExitStack
 from dataclasses import dataclass, field, fields, replace
 from importlib import import_module
 import json
@@ -198,10 +198,7 @@ def _in_parallel(function: Any, items: Sequence[Any], jobs: int) -> list[Any]:
 
     from ..session import WorkerProcess
 
-    workers = [WorkerProcess(idle=False) for _ in range(min(jobs, len(items)))]
-    free: SimpleQueue[WorkerProcess] = SimpleQueue()
-    for worker in workers:
-        free.put(worker)
+    count, free = min(jobs, len(items)), SimpleQueue[WorkerProcess]()
 
     def one(item: Any) -> Any:
         worker = free.get()
@@ -210,12 +207,10 @@ def _in_parallel(function: Any, items: Sequence[Any], jobs: int) -> list[Any]:
         finally:
             free.put(worker)
 
-    with ThreadPoolExecutor(len(workers)) as pool:
-        try:
-            return list(pool.map(one, items))
-        finally:
-            for worker in workers:
-                worker.close()
+    with ThreadPoolExecutor(count) as pool, ExitStack() as workers:
+        for _ in range(count):
+            free.put(workers.enter_context(closing(WorkerProcess(idle=False))))
+        return list(pool.map(one, items))
 
 
 def rated(rating: Rating, args: argparse.Namespace) -> dict[str, Any]:

@@ -13,8 +13,9 @@ does not show; `sensors.parquet` and the rows of the recordings have all of them
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from datetime import datetime, timezone
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import datetime
+from functools import partial
 from itertools import islice
 from typing import Any
 from urllib.parse import unquote
@@ -56,6 +57,9 @@ _LASTING = {True: 'for good', False: 'this calibration only', None: 'newest'}
 
 _DRIFTS = 0.05
 """Probability below which a drift is stated."""
+
+_figures = partial(figures, script=False)
+"""The browser shows the text of a marker that is pointed at."""
 
 
 def write_fleet_page(store: Store, known: Overview, sensors: Sequence[Row],
@@ -201,11 +205,6 @@ def _errors(known: Overview) -> str:
                         long=len(rows) > _LONG) + _not_shown(count - len(rows), 'recording')
 
 
-def _figures(drawings: Iterable[Drawing]) -> str:
-    """Return figures; the browser shows the text of a marker that is pointed at."""
-    return figures(drawings, script=False)
-
-
 def _not_shown(count: int, what: str) -> str:
     """Return how many are not shown; nothing if all are."""
     return paragraph(f'{counted(count, what)} not shown.', 'soft') if count > 0 else ''
@@ -330,7 +329,8 @@ def _of_sensor(name: str, sensor: str, rows: Sequence[Row], changes: Sequence[Ma
     values, deviations = table_of(shown)
     cross = np.any(deviations[:, [NAMES.index(name) for name in CROSS]])
     groups = [(key, names) for key, _, names in GROUPS if cross or names is not CROSS]
-    at, dated = places_of([_stamp(row['date']) for row in shown])
+    at, dated = places_of([datetime.fromisoformat(row['date']).timestamp() if row['date'] else None
+                           for row in shown])
     with drawn(0.9 + 1.15 * len(groups), _short_name(sensor), len(groups), sharex=True
                ) as (figure, panels):
         for panel, (key, names) in zip(panels, groups, strict=True):
@@ -375,11 +375,3 @@ def _change_words(change: Mapping[str, Any]) -> str:
     """Return a change with its standard deviation."""
     words = change_in_words(change['parameter'], change['change'], change['sd'])
     return f'{spoken(change["parameter"])} {words}'
-
-
-def _stamp(date: str | None) -> float | None:
-    """Return a date as seconds since 1970; None without a date."""
-    if not date:
-        return None
-    when = datetime.fromisoformat(date.replace('Z', '+00:00'))
-    return when.replace(tzinfo=when.tzinfo or timezone.utc).timestamp()
