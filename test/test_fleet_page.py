@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 import re
 from typing import Any
@@ -175,7 +176,7 @@ def write_store(folder: Path, count: int, dates: int = 6, name: str = 'robot_{}/
 
 
 def made_page(store: Store, sensors: list[dict[str, Any]],
-              priors: dict[str, FleetPrior] = {}) -> str:
+              priors: Mapping[str, FleetPrior] = {}) -> str:
     known = overview(digest_of(name, store) for name in store.sensors())
     write_fleet_page(store, known, sensors, priors)
     return page_of(store.folder)
