@@ -124,6 +124,7 @@ def run(*arguments: object) -> int:
 
 def run_json(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, Any]:
     """Run a command, and return the exit status and the JSON on standard output."""
+    capsys.readouterr()  # what was printed before
     status = run(*arguments, '--json', '-')
     return status, json.loads(capsys.readouterr().out)
 

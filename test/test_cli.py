@@ -38,7 +38,6 @@ def test_fit_reports_the_next_pose_until_more_poses_no_longer_help(model, tmp_pa
     few, many = tmp_path / 'few.csv', tmp_path / 'many.csv'
     run('simulate', '-o', few, '--poses', 12)
     run('simulate', '-o', many, '--poses', 30)
-    capsys.readouterr()
     asked = run_json(capsys, 'fit', few, '--model', model)[1]['next_pose']
     assert asked['words'].startswith('turn the sensor so that the ')
     assert np.linalg.norm(asked['direction']) == pytest.approx(1.0)
@@ -52,29 +51,23 @@ def test_fit_reports_the_next_pose_until_more_poses_no_longer_help(model, tmp_pa
 def test_flat_row_is_levelled_even_when_it_is_not_fitted(tmp_path, capsys):
     path = tmp_path / 'poses.csv'
     run('simulate', '-o', path, *EFFECTS, '--mounting', 20, -30, 0, '--poses', 30)
-    capsys.readouterr()
     status, result = run_json(capsys, 'fit', path, '--rows', '2:30', '--flat', 1)
-    assert status == 0
-    assert result['poses_used'] == 29
+    assert (status, result['poses_used']) == (0, 29)
     expected = rotation_from_rpy(*np.radians((20, -30, 0)))[2]
     np.testing.assert_allclose(np.array(result['rotation'])[:, 2], expected, atol=2e-3)
 
 
 def test_several_tables_return_a_list_in_their_order(tmp_path, capsys):
-    tables = []
-    for seed in range(3):
-        tables.append(tmp_path / f'{seed}.csv')
-        run('simulate', '-o', tables[-1], *EFFECTS, '--seed', seed)
-    bad = tmp_path / 'bad.csv'
-    bad.write_text('ax,ay\n1,2\n')
-    tables.insert(1, bad)
     folder = tmp_path / 'out'
+    tables = [tmp_path / f'{name}.csv' for name in ('0', 'bad', '1', '2')]
+    for seed, table in enumerate(tables):
+        run('simulate', '-o', table, *EFFECTS, '--seed', seed)
+    tables[1].write_text('ax,ay\n1,2\n')
     folder.mkdir()
-    capsys.readouterr()
     status, results = run_json(capsys, 'fit', *tables, '-o', folder)
     assert status == 2
     assert [result['file'] for result in results] == [str(table) for table in tables]
-    assert 'lacks ay' in results[1]['error'] or 'lacks az' in results[1]['error']
+    assert 'lacks az' in results[1]['error']
     assert sorted(path.name for path in folder.iterdir()) == ['0.yaml', '1.yaml', '2.yaml']
     status, results = run_json(capsys, 'verify', *tables[2:], '-c', folder / '0.yaml')
     assert status == 0
@@ -303,7 +296,6 @@ def test_a_refinement_is_printed_stored_and_drawn(tmp_path, capsys):
     assert page.read_text().startswith('<!DOCTYPE html>')
     assert read_calibration(stored).sensor == 'imu_link'
     run('simulate', '-o', poses, *EFFECTS, *hidden, '--seed', 7, '--poses', 40)
-    capsys.readouterr()
     _, result = run_json(capsys, 'verify', poses, '-c', stored)
     assert result['rms_after_mg'] < 1.5 * result['noise_floor_mg']
 
@@ -341,30 +333,26 @@ def shaky(path, quiet=3, shaken=9, std_g=0.012):
         rows += [up + (shaking if k >= quiet else 0.0) * np.ones((rest, 3)),
                  np.linspace(up, following, turn)]
     readings = np.concatenate(rows) + rng.normal(0.0, 5e-4, ((rest + turn) * len(ups), 3))
-    lines = [f'{k / 100:.2f},{x:.5f},{y:.5f},{z:.5f}' for k, (x, y, z) in enumerate(readings)]
-    path.write_text('\n'.join(['# units: "g"', 'time,ax,ay,az', *lines]) + '\n')
+    np.savetxt(path, np.column_stack([np.arange(len(readings)) / 100.0, readings]), fmt='%.5f',
+               delimiter=',', header='# units: "g"\ntime,ax,ay,az', comments='')
     return path
 
 
-@pytest.mark.parametrize('command', ['capture', 'calibrate', 'fit', 'verify', 'refine', 'report',
-                                     'fleet', 'live'])
-def test_every_command_that_captures_has_all_settings_of_the_capture(command):
-    others = {'capture': ['-o', 'p.csv'], 'verify': ['-c', 'c.yaml'], 'report': ['-o', 'r.html'],
-              'fleet': ['-o', 'out']}
+@pytest.mark.parametrize('line', [
+    'capture r.csv -o p.csv', 'calibrate r.csv', 'thermal r.csv', 'fit r.csv', 'refine r.csv',
+    'verify r.csv -c c.yaml', 'report r.csv -o r.html', 'fleet r.csv -o out', 'live r.csv'])
+def test_every_command_that_captures_has_all_settings_of_the_capture(line):
     assert {each.name for each in dataclasses.fields(CaptureSettings)} <= vars(
-        parser([command]).parse_args([command, 'log.csv', *others.get(command, [])])).keys()
+        parser(line.split()).parse_args(line.split())).keys()
 
 
 def test_a_wider_limit_that_finds_many_more_poses_is_stated_and_can_be_used(tmp_path, capsys):
     log = shaky(tmp_path / 'log.csv')
     run('calibrate', log, '-o', tmp_path / 'c.yaml')
-    said = capsys.readouterr()
-    words = ' '.join((said.out + said.err).split())
-    advice = re.search(r'(\d) poses only, (\d+) with still_std_max (\S+)', words)
-    assert advice is not None, said
-    few, many = int(advice[1]), int(advice[2])
-    assert many >= 2 * few
-    run('calibrate', log, '-o', tmp_path / 'c.yaml', '--still-std-max', advice[3])
+    words = ' '.join(''.join(capsys.readouterr()).split())
+    (few, many, limit), = re.findall(r'(\d) poses only, (\d+) with still_std_max (\S+)', words)
+    assert int(many) >= 2 * int(few)
+    run('calibrate', log, '-o', tmp_path / 'c.yaml', '--still-std-max', limit)
     assert f'captured {many} poses' in capsys.readouterr().out
 
 
@@ -374,11 +362,9 @@ def test_without_a_still_stretch_the_quietest_window_the_limit_and_a_wider_one_a
     status, result = run_json(capsys, 'calibrate', log, '-o', tmp_path / 'c.yaml',
                               '--still-std-max', 0.004)
     assert status == 2
-    found = re.search(r'quietest 0.5 s the standard deviation is (\S+) g, the limit is 0.004',
-                      result['error'])
-    assert found is not None, result
-    assert float(found[1]) == pytest.approx(0.012 / np.sqrt(2.0), rel=0.1)
-    advice = re.search(r'(\d+) with still_std_max (\S+)', result['advice'])
-    assert advice is not None, result
-    run('capture', log, '-o', tmp_path / 'p.csv', '--still-std-max', advice[2])
-    assert f'captured {advice[1]} poses from' in capsys.readouterr().out
+    deviation, = re.findall(
+        r'quietest 0.5 s the standard deviation is (\S+) g, the limit is 0.004', result['error'])
+    assert float(deviation) == pytest.approx(0.012 / np.sqrt(2.0), rel=0.1)
+    (count, limit), = re.findall(r'(\d+) with still_std_max (\S+)', result['advice'])
+    run('capture', log, '-o', tmp_path / 'p.csv', '--still-std-max', limit)
+    assert f'captured {count} poses from' in capsys.readouterr().out
