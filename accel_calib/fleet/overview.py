@@ -238,19 +238,17 @@ def table_of(rows: Sequence[Row]) -> tuple[Floats, Floats]:
             np.array([[row.get(f'{name}.sd') or 0.0 for name in NAMES] for row in rows], float))
 
 
-def odd_sensors(values: Mapping[str, Floats], deviations: Mapping[str, Floats] | None = None
-                ) -> list[Odd]:
+def odd_sensors(values: Mapping[str, Floats], deviations: Mapping[str, Floats]) -> list[Odd]:
     """
     Return the sensors of one model that are far from the others, the farthest first.
 
-    The (9,) values and standard deviations are by sensor; the latter are 0 by default.
+    The (9,) values and standard deviations are by sensor.
 
     """
     if len(values) < FEWEST:
         return []
     names, table = list(values), np.array(list(values.values()))
-    own = np.zeros_like(table) if deviations is None else np.array([deviations[name]
-                                                                    for name in names])
+    own = np.array([deviations[name] for name in names])
     away = table - np.median(table, axis=0)
     spread = np.hypot(_MAD * np.median(np.abs(away), axis=0), own)
     far = np.abs(away) / np.maximum(spread, 1e-9)

@@ -29,12 +29,13 @@ from .sensors import alike, Store
 from ..calibrate import FleetPrior
 from ..compare import NAMES
 from ..effects import MODELS, parameter_names
-from ..findings import change_in_words, CROSS, in_words, scale_of
+from ..findings import CROSS, scale_of
 from ..report.sheet import (
     ACCENT, add_band, AFTER, BAND, BEFORE, Drawing, drawn, EDGE, FAINT, figures, has_matplotlib,
     legend_below, listing, Mark, Marks, paragraph, rated_sheet, scroll_table, section, THIRD,
     write_page)
-from ..report.stability import GROUPS, label_dates, places_of, spoken
+from ..report.stability import (
+    change_words, GROUPS, label_dates, named_words, places_of, spoken)
 from ..table import Floats
 from ..text import counted, short, with_minus
 
@@ -163,8 +164,8 @@ def _change_lines(row: Row) -> Iterator[tuple[str, str, str, str]]:
         yield (sensor, f'{date} {path}'.strip(), _change_words(change),
                _LASTING[change['for_good']])
     if drift and drift['p_value'] < _DRIFTS:
-        words = change_in_words(drift['parameter'], drift['per_year'], drift['sd'])
-        yield sensor, '', f'{spoken(drift["parameter"])} {words} per year', 'drift'
+        words = change_words(drift['parameter'], drift['per_year'], drift['sd'])
+        yield sensor, '', f'{words} per year', 'drift'
     elif not row['changes']:
         yield sensor, '', 'no step or drift that is significant alone', ''
 
@@ -285,8 +286,7 @@ def _odd_words(known: OfModel, odd: Odd) -> str:
     """Return an odd sensor with its value."""
     sensor, name, value, far = odd
     sd = float(known.deviations[sensor][NAMES.index(name)])
-    return (f'{sensor}: {spoken(name)} {in_words(name, value, sd)}, {far:.0f} spreads '
-            'from the median')
+    return f'{sensor}: {named_words(name, value, sd)}, {far:.0f} spreads from the median'
 
 
 def _short_name(name: str) -> str:
@@ -373,5 +373,4 @@ def _mark_changes(panel: Any, rows: Sequence[Row], at: Floats,
 
 def _change_words(change: Mapping[str, Any]) -> str:
     """Return a change with its standard deviation."""
-    words = change_in_words(change['parameter'], change['change'], change['sd'])
-    return f'{spoken(change["parameter"])} {words}'
+    return change_words(change['parameter'], change['change'], change['sd'])

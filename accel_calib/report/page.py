@@ -62,8 +62,7 @@ _HOW_TO_READ = (
     'orientation is known or shared. The noise floor is the expected residual of a correct model.',
     'Of new poses (held out): each pose is predicted from a fit of the others.',
     'Maps have equal areas and show each hemisphere from above its pole: the direction of up in '
-    'the sensor axes. A hollow square is a pose that was left out.',
-)
+    'the sensor axes. A hollow square is a pose that was left out.')
 _HOW_TO_READ_THERMAL = (
     'Each marker is the mean of a short stretch of the log, minus that of the board at the '
     'reference temperature. One orientation shows only this change, not the offset itself.',
@@ -77,8 +76,7 @@ _HOW_TO_READ_STEPS = (
     'If the held-out residual decreases together with the residual, the effect is in the sensor '
     'and not an artefact of the fit.',
     'p is the probability that noise alone makes one of all candidates this good.',
-    'Rivals are effects that these poses cannot distinguish from the named effect.',
-)
+    'Rivals are effects that these poses cannot distinguish from the named effect.')
 _STEP = 1e-6
 _SAME = 1e-9
 _PAIRS = ((0, 1), (0, 2), (1, 2))
@@ -243,9 +241,8 @@ def _is_refined(calibration: Calibration, refinement: Refinement | None) -> bool
     """Return whether a calibration is that of a refinement, perhaps levelled since."""
     if refinement is None:
         return False
-    own, refined = calibration.model.values, refinement.calibration.model.values
-    return own.keys() == refined.keys() and all(
-        np.array_equal(own[name], refined[name]) for name in own)
+    own, refined = calibration.model, refinement.calibration.model
+    return own.effects == refined.effects and np.array_equal(own.vector, refined.vector)
 
 
 # ----------------------------------------------------------------------------- the calibration
