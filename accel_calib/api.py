@@ -27,7 +27,7 @@ from .geometry import spread_directions
 from .logs import (
     are_untimed_samples, Frame, LogOptions, read_log, read_recording as read_whole_recording)
 from .pipeline import (
-    calibrated, captured_from, Flat, options_for, Plan, poses_of, still_ramp, thermally_calibrated)
+    calibrated, calibrated_log, captured_from, Flat, options_for, Plan, poses_of)
 from .refine import refine as find_effects, Refinement
 from .stored import read_calibration, write_calibration
 from .table import (
@@ -346,9 +346,7 @@ def calibrate(log: Source | Poses | Recording | Data, *, units: UnitName | None 
                 also=know(also))
     source, options, asked = _asked(log, units, gravity, {'sensor': sensor, **settings})
     found = poses_of(source, options, asked)
-    ramp = still_ramp(source, options, found)
-    return _public((calibrated(found.poses, found.units, plan) if ramp is None
-                    else thermally_calibrated([ramp], plan)).calibration)
+    return _public(calibrated_log(source, options, found, plan).calibration)
 
 
 def fit(poses: Source | Poses | Data, *, units: UnitName | None = None,

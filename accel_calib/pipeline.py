@@ -5,8 +5,8 @@
 The one way of all surfaces: any log to poses, poses to a calibration, samples to corrected ones.
 
 `poses_of` returns the poses of a log, and captures those of a recording. `calibrated` fits,
-refines and levels by a `Plan`, and rates the result. `corrected` applies a stored calibration to
-samples; `Correction` does so block by block.
+refines and levels by a `Plan`; `calibrated_log` also recognises a still board that warms up.
+`Correction` applies a stored calibration to samples, block by block.
 
 """
 
@@ -57,8 +57,8 @@ class Intake:
     """
     Poses of a table or captured from a recording, with the unit of their readings.
 
-    `read_as` is how the log was read, in one line, empty if nothing was assumed. `notes` are what
-    was left out of the log, and `captured` how the poses were captured, if they were.
+    `read_as` is how the log was read, empty if nothing was assumed. `notes` are what was left out
+    of the log, and `captured` how the poses were captured, if they were.
 
     """
 
@@ -152,16 +152,15 @@ def _captured(source: Source, log: OpenLog, options: LogOptions, settings: Mappi
               progress: Progress) -> tuple[Intake, Captured]:
     """Capture the poses of an open log; InputError without a still stretch."""
     found = capture(log.watched(progress), log.units, settings_from(settings, log.units))
-    count, wider = len(found.poses), (0.0, 0)
-    if count < _FEW:
-        wider = _wider(source, found, log.units, options, settings)
-    finds = f'{wider[1]} with still_std_max {wider[0]:.3g}'
+    count = len(found.poses)
+    limit, more = _wider(source, found, log.units, options, settings) if count < _FEW else (0.0, 0)
+    finds = f'{more} with still_std_max {limit:.3g}'
     if not count:
         name = 'the recording' if isinstance(source, Recording) else str(source)
-        raise _nothing_still(name, found, log.units, settings, finds if wider[1] else '')
+        raise _nothing_still(name, found, log.units, settings, finds if more else '')
     lines = [f'captured {counted(count, "pose")} from {counted(found.recorded, "sample")} in '
              f'{found.seconds:.0f} s']
-    if wider[1] >= 2 * count:
+    if more >= 2 * count:
         lines.append(f'{counted(count, "pose")} only, {finds}')
     return Intake(replace(found.poses, units=log.units.name), log.units, log.read_as, log.notes,
                   tuple(lines)), found
@@ -236,25 +235,6 @@ def ramp_or_poses(source: Path | Piped | Frame, options: LogOptions = LogOptions
     return poses_of(source, options, settings, progress)
 
 
-def still_ramp(source: Source, options: LogOptions, found: Intake) -> RampIntake | None:
-    """
-    Return the ramp of a log whose poses all lie in one direction; None if it has no ramp.
-
-    A log of one direction does not determine a calibration. If its temperature spans
-    `LEAST_RANGE`, it is that of a still board that warms up.
-
-    """
-    if not found.captured or not _is_one_direction(found.poses):
-        return None
-    with _opened(source, options) as log:
-        if log.units.is_native:
-            return None
-        cells = cells_of(log.blocks, log.units)
-        low, high = cells.range_c
-        return (RampIntake(ramp_of(cells), log.units, log.read_as, log.notes)
-                if high - low >= LEAST_RANGE else None)
-
-
 def _is_slow_recording(poses: Poses) -> bool:
     """Return whether a table has the form of poses, but is of one board that was not turned."""
     return 'time' in poses and 'count' not in poses and _is_one_direction(poses)
@@ -326,7 +306,7 @@ class Plan:
 @dataclass(frozen=True)
 class Outcome:
     """
-    A fitted or refined calibration with its rating.
+    A fitted or refined calibration.
 
     `refinement` is None if the search for effects was not asked for, or not possible. `line` is
     what was done beyond the fit, and why.
@@ -417,15 +397,36 @@ def _mounted_as(before: Calibration, calibration: Calibration) -> Calibration:
 
 @dataclass(frozen=True)
 class ThermalOutcome:
-    """A calibration with the offset over temperature, and the curve of this offset."""
+    """A calibration with the offset over temperature, its curve, and the logs."""
 
     calibration: Calibration
     curve: Curve
+    logs: Sequence[Intake | RampIntake]
+    read_as: str
 
     @cached_property
     def rating(self) -> Rating:
         """Return whether the calibration is good, and the next step."""
         return rate(self.calibration)
+
+
+def calibrated_log(source: Source, options: LogOptions, found: Intake, plan: Plan = Plan()
+                   ) -> Outcome | ThermalOutcome:
+    """
+    Calibrate the poses that `poses_of` found in a log, or its ramp if it is of a still board.
+
+    Poses in one direction do not determine a calibration. If the temperature of their recording
+    spans `LEAST_RANGE`, the board was still while it warmed up.
+
+    """
+    if found.captured and not found.units.is_native and _is_one_direction(found.poses):
+        with _opened(source, options) as log:
+            cells = cells_of(log.blocks, log.units)
+            low, high = cells.range_c
+            if high - low >= LEAST_RANGE:
+                return thermally_calibrated([
+                    RampIntake(ramp_of(cells), log.units, log.read_as, log.notes)], plan)
+    return calibrated(found.poses, found.units, plan)
 
 
 def thermally_calibrated(logs: Sequence[Intake | RampIntake], plan: Plan = Plan()
@@ -447,21 +448,23 @@ def thermally_calibrated(logs: Sequence[Intake | RampIntake], plan: Plan = Plan(
         As in `calibrated`, or if there is no ramp, or the logs are of several sensors.
 
     """
-    ramps = [each for each in logs if isinstance(each, RampIntake)]
-    turned = _turned_over(logs)
-    _check_one_sensor([*(each.ramp.stretches for each in ramps),
-                       *([] if turned is None else [turned.poses])])
-    curve = curve_of([each.ramp for each in ramps])
-    if turned is None:
-        made = thermal_alone(curve, ramps[0].units, sensor=plan.sensor, date=now())
-        rows = made.poses
-    else:
-        rows, units = turned.poses, turned.units
-        fitted = calibrated(without_curve(curve, rows, units), units, replace(
-            plan, refined=False, flat=None, nose_down=None)).calibration
-        made = with_curve(fitted, curve, rows)
-    return ThermalOutcome(level_by_rows(
-        made, rows, plan.frame, _row(rows, plan.flat), plan.nose_down), curve)
+    read_as = ', '.join(dict.fromkeys(each.read_as for each in logs if each.read_as))
+    with saying(read_as):
+        ramps = [each for each in logs if isinstance(each, RampIntake)]
+        turned = _turned_over(logs)
+        _check_one_sensor([*(each.ramp.stretches for each in ramps),
+                           *([] if turned is None else [turned.poses])])
+        curve = curve_of([each.ramp for each in ramps])
+        if turned is None:
+            made = thermal_alone(curve, ramps[0].units, sensor=plan.sensor, date=now())
+            rows = made.poses
+        else:
+            rows, units = turned.poses, turned.units
+            fitted = calibrated(without_curve(curve, rows, units), units, replace(
+                plan, refined=False, flat=None, nose_down=None)).calibration
+            made = with_curve(fitted, curve, rows)
+        return ThermalOutcome(level_by_rows(
+            made, rows, plan.frame, _row(rows, plan.flat), plan.nose_down), curve, logs, read_as)
 
 
 def _turned_over(logs: Sequence[Intake | RampIntake]) -> Intake | None:
@@ -575,8 +578,3 @@ class Correction:
         """Return what the samples lack, and what left the range of the calibration, so far."""
         return [*filter(None, [self._context.lacking]),
                 *(each.line for each in self._context.left)]
-
-
-def corrected(samples: _Samples, calibration: Calibration, units: Units) -> _Samples:
-    """Return samples as `Correction` does, at once; `units` is their unit."""
-    return Correction(calibration, units, samples.sensor)(samples)

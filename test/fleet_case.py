@@ -45,6 +45,10 @@ def rows_of(results: Path) -> list[dict[str, Any]]:
     return found
 
 
+def page_of(results: Path) -> str:
+    return (results / 'fleet.html').read_text(encoding='utf-8')
+
+
 def found_in(*names: Path | str) -> list[Input]:
     return list(recordings(map(str, names)))
 

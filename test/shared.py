@@ -6,8 +6,10 @@
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 import json
+import os
 from pathlib import Path
 import re
+import shlex
 import subprocess
 import sys
 from typing import Any
@@ -22,6 +24,10 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / 'shared' / 'data'
+
+SENSOR = {'offset': [0.02, -0.01, 0.03], 'axis_gain': [0.01, -0.02, 0.005],
+          'cross_axis': [0.004, 0.002, -0.003]}
+"""Effects of a sensor that several tests simulate."""
 
 
 def data(name: str) -> Path:
@@ -75,6 +81,23 @@ def run_on_small_disk(folder: Path, size_kb: int, *command: object
     return done, copy
 
 
+def python(*arguments: object, folder: Path | None = None, **environment: str
+           ) -> subprocess.CompletedProcess[str]:
+    """Run Python with the package of this tree in a folder, and return what it did."""
+    return subprocess.run(
+        [sys.executable, *map(str, arguments)], cwd=folder, capture_output=True, text=True,
+        check=False, timeout=300, env={**os.environ, 'PYTHONPATH': str(ROOT), **environment})
+
+
+def shell(line: str, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run a line of bash in a folder, with the command ``accel-calib`` of this tree."""
+    program = shlex.join([sys.executable, *COMMAND])
+    return subprocess.run(
+        ['bash', '-euc', f'accel-calib() {{ {program} "$@"; }}; {line}'], cwd=folder,
+        capture_output=True, text=True, check=False,
+        env={**os.environ, 'PYTHONPATH': str(ROOT), **environment})
+
+
 def run_snippets(page: str, printed: Callable[[str], bool] = bool) -> dict[str, Any]:
     """
     Run the Python of a page in this folder, and return its names.
@@ -101,6 +124,7 @@ def run(*arguments: object) -> int:
 
 def run_json(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, Any]:
     """Run a command, and return the exit status and the JSON on standard output."""
+    capsys.readouterr()  # what was printed before
     status = run(*arguments, '--json', '-')
     return status, json.loads(capsys.readouterr().out)
 

@@ -7,7 +7,6 @@ import ast
 from dataclasses import fields
 import importlib
 import inspect
-from pathlib import Path
 import re
 import shlex
 from xml.etree import ElementTree
@@ -15,11 +14,11 @@ from xml.etree import ElementTree
 import accel_calib as ac
 from accel_calib.session import CalibratorSettings
 from faults.sample import FACTOR
-from inside import COMMANDS, parser
+from inside import parser
 import pytest
+from shared import ROOT
 from test_policy import names_of_the_calibrator
 
-ROOT = Path(__file__).resolve().parents[1]
 PAGES = ['README.md', 'CONTRIBUTING.md', 'QUALITY_DECLARATION.md', 'SECURITY.md', *(
     str(path.relative_to(ROOT)) for path in sorted((ROOT / 'docs').rglob('*.md')))]
 OWN_PAGES = [page for page in PAGES if 'figures' not in page]
@@ -42,24 +41,15 @@ def test_tables_are_those_of_the_code(page, tables):
 
 def test_every_table_is_in_a_page(tables):
     pages = ''.join(map(text_of, OWN_PAGES))
-    for name in tables.TABLES:
-        assert f'<!-- {name} -->' in pages
+    assert not [name for name in tables.TABLES if f'<!-- {name} -->' not in pages]
 
 
-def test_api_reference_is_made_from_the_docstrings(tables):
-    made = tables.api_page.page()
-    assert made == text_of('docs/api.md'), 'run: python docs/tables.py'
-
-
-def test_api_reference_has_every_public_name(tables):
-    assert {*tables.api_page.FUNCTIONS, *tables.api_page.RECORDS} == set(ac.__all__)
-    for name in ac.__all__:
-        assert f'\n### ac.{name}\n' in text_of('docs/api.md')
-
-
-def test_every_parameter_of_a_public_function_is_documented(tables):
+def test_api_reference_is_that_of_all_public_names_with_every_parameter(tables):
     api_page = tables.api_page
+    assert api_page.page() == text_of('docs/api.md'), 'run: python docs/tables.py'
+    assert {*api_page.FUNCTIONS, *api_page.RECORDS} == set(ac.__all__)
     for name in api_page.FUNCTIONS:
+        assert f'\n### ac.{name}\n' in text_of('docs/api.md')
         sections = api_page.parsed(getattr(ac, name))[1]
         listed = [each.lstrip('*') for head, _ in sections['Parameters']
                   for each in api_page.names_in(head)]
@@ -67,23 +57,14 @@ def test_every_parameter_of_a_public_function_is_documented(tables):
         assert {'Returns', 'Raises'} <= set(sections), name
 
 
-def commands_in(page):
-    """Return the lines of a page that are commands, without comments."""
-    lines = re.findall(r'^ {4,}accel-calib (.*)', text_of(page), re.MULTILINE)
-    return [shlex.split(line, comments=True) for line in lines]
-
-
 @pytest.mark.parametrize('page', OWN_PAGES)
 def test_commands_and_their_options_exist(page):
-    named = re.findall(r'`accel-calib ([^`]+)`', text_of(page))
-    for words in [*commands_in(page), *map(shlex.split, named)]:
-        if words[0] == 'COMMAND':
-            continue
-        assert words[0] in COMMANDS
-        own = words[:words.index('--ros-args')] if '--ros-args' in words else words
-        options = {word for word in own if word.startswith('-') and word != '-'}
-        known = parser()._subparsers._group_actions[0].choices[words[0]]._option_string_actions
-        assert options <= set(known), words
+    choices = parser()._subparsers._group_actions[0].choices
+    named = re.findall(r'`accel-calib ([^`]+)`|^ {4,}accel-calib (.*)', text_of(page), re.M)
+    for line in map(''.join, named):
+        command, *words = shlex.split(line.partition('--ros-args')[0], comments=True)
+        options = {word for word in words if word.startswith('-') and word != '-'}
+        assert command == 'COMMAND' or options <= {*choices[command]._option_string_actions}, line
 
 
 @pytest.mark.parametrize('page', PAGES)
@@ -103,19 +84,16 @@ def anchors_of(path):
     return {re.sub(r'[^\w\- ]', '', heading.lower()).replace(' ', '-') for heading in headings}
 
 
-def test_services_and_topics_of_the_docs_are_those_of_the_node():
-    table = [line for line in text_of('docs/node.md').splitlines() if line.startswith('| `')]
+def test_services_topics_and_parameters_of_the_docs_are_those_of_the_node():
+    page = text_of('docs/node.md')
     listed = set(re.findall(r'`(~/\w+|imu/\w+|/diagnostics|temperature)`', '\n'.join(
-        line for line in table if '_msgs/' in line or 'std_srvs' in line)))
+        line for line in page.splitlines() if re.match(r'\| `.*(_msgs/|std_srvs)', line))))
     of_every_node = re.compile(r'/parameter_events|/rosout|~/(.*_parameters.*|get_.*)')
     assert listed == {name for name in names_of_the_calibrator()
                       if not of_every_node.fullmatch(name)}
-
-
-def test_parameters_of_the_docs_are_those_of_the_node():
-    table = text_of('docs/node.md').partition('| parameters | |\n')[2].partition('\n\n')[0]
-    listed = re.findall(r'`(\w+)`', table)
-    assert sorted(listed) == sorted(field.name for field in fields(CalibratorSettings))
+    parameters = page.partition('| parameters | |\n')[2].partition('\n\n')[0]
+    assert sorted(re.findall(r'`(\w+)`', parameters)) == sorted(
+        field.name for field in fields(CalibratorSettings))
 
 
 def test_the_site_has_every_page():
@@ -126,12 +104,8 @@ def test_the_site_has_every_page():
             assert f'\n   {name}\n' in index, name
 
 
-PAGE = (ROOT / 'docs' / 'troubleshooting.md').read_text(encoding='utf-8')
 FOREIGN = {'externally-managed-environment'}
 """Messages of other programs."""
-
-QUOTED = [quote for quote in re.findall(r'^- \*\*`([^`]+)`\*\*', PAGE, re.MULTILINE)
-          if quote not in FOREIGN]
 
 
 def template(node):
@@ -156,16 +130,12 @@ def templates():
     return texts
 
 
-def is_in(quote, text):
-    """Return whether the parts of a quote between … are in a text, in their order."""
-    parts = [re.escape(part.strip()) for part in quote.split('…') if part.strip()]
-    return re.search('.*'.join(parts), text) is not None
-
-
 def test_each_quoted_message_is_in_the_code(templates):
-    assert len(QUOTED) >= 35
-    for quote in QUOTED:
-        assert any(is_in(quote, text) for text in templates), quote
+    quoted = {*re.findall(r'^- \*\*`([^`]+)`\*\*', text_of('docs/troubleshooting.md'), re.M)}
+    assert len(quoted) >= 35
+    for quote in quoted - FOREIGN:
+        pattern = re.compile('.*'.join(re.escape(part.strip()) for part in quote.split('…')))
+        assert any(map(pattern.search, templates)), quote
 
 
 FOLDER = ROOT / 'docs' / 'pictures'

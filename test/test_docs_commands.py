@@ -13,20 +13,17 @@ run, in the order of the page and in one temporary folder. A file that a command
 A snippet whose first line is ``# NAME.py`` is written to this file first.
 ``<!-- status: 1 -->`` above a block states the exit status of its last command. The commands
 `OF_ROS` need ROS 2 or do not end by themselves; test_ros_*.py, test_terminal.py and
-test_live_command.py run them.
+test_live_sources.py run them.
 
 """
 
 from dataclasses import dataclass
 import itertools
 import json
-import os
 from pathlib import Path
 import re
 import shlex
 import shutil
-import subprocess
-import sys
 from tempfile import TemporaryDirectory
 
 import accel_calib as ac
@@ -37,15 +34,14 @@ from inside import COMMANDS, main, model_with, simulate_recording, spread_direct
 import numpy as np
 import pytest
 import ramps
-from shared import run_snippets
+import shared
+from shared import python, ROOT, run_snippets
 
-ROOT = Path(__file__).resolve().parents[1]
 LOGS = ROOT / 'test' / 'data' / 'logs'
 PAGES = sorted(str(path.relative_to(ROOT)) for path in (
     ROOT / 'README.md', *(ROOT / 'docs').rglob('*.md')))
 OF_ROS = {'node', 'simulator', 'watch', 'demo', 'live'}
-SENSOR = {'offset': [0.03, -0.02, 0.04], 'axis_gain': [0.01, -0.02, 0.005],
-          'cross_axis': [0.004, 0.002, -0.003]}
+SENSOR = {**shared.SENSOR, 'offset': [0.03, -0.02, 0.04]}
 LIBRARIES = {'.ulg': 'pyulog', '.bin': 'pymavlink'}
 
 
@@ -181,9 +177,6 @@ def test_every_command_without_ros_is_run_by_a_page():
     assert set(COMMANDS) - OF_ROS <= run_
 
 
-EXAMPLES = sorted(path.name for path in (ROOT / 'examples').iterdir() if path.is_file())
-
-
 def code_of(name):
     """Return the code of an example: of a notebook, that of all its cells."""
     text = (ROOT / 'examples' / name).read_text(encoding='utf-8')
@@ -193,69 +186,59 @@ def code_of(name):
                      if cell['cell_type'] == 'code')
 
 
-def output_of(name, folder, *written):
-    """Run an example in an empty folder, and return its output; it may write these files."""
-    environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
-    done = subprocess.run([sys.executable, '-', *written], cwd=folder, input=code_of(name),
-                          text=True, env=environment, capture_output=True, timeout=120,
-                          check=False)
-    assert done.returncode == 0, done.stderr
-    assert sorted(folder.iterdir()) == sorted(written)
-    return done.stdout
-
-
-def test_hidden_effect_is_found(tmp_path):
-    output = output_of('find_hidden_effect.py', tmp_path)
+def hidden_effect(output):
     assert re.findall(r'Missing effect: (\w+)', output) == ['offset_temperature']
     assert output.endswith('Verdict: explained.\n')
 
 
-def test_recording_is_calibrated_from_end_to_end(tmp_path):
-    output = output_of('calibrate_recording.py', tmp_path)
+def whole_recording(output):
     assert 'Calibration(model 10; 18 of 18 poses' in output
-    before, after = map(float, re.search(r'residual (\S+) -> (\S+) mg', output).groups())
-    assert before > 20.0
-    assert after < 0.5
+    a_small_residual(output)
     assert output.endswith('Corrected force in the flat pose [g]: [0. 0. 1.]\n')
 
 
-def test_error_falls_from_model_to_model_and_is_drawn(tmp_path):
-    pytest.importorskip('matplotlib')
-    paths = [tmp_path / name for name in ('surfaces.svg', 'surfaces.png')]
-    output = output_of('error_surfaces.py', tmp_path, *paths)
-    largest = [float(value) for value in re.findall(r'largest error (\S+) mg', output)]
-    # Figures 1 to 4 of AN5286: about 50, 10, 5 and 2.5 mg.
-    np.testing.assert_allclose(largest, [50.0, 10.0, 5.0, 2.5], rtol=0.1)
-    assert '<svg' in paths[0].read_text(encoding='utf-8')
-    assert paths[1].read_bytes().startswith(b'\x89PNG')
-
-
-def test_the_notebook_runs_from_top_to_bottom(tmp_path):
-    pytest.importorskip('matplotlib')
-    pytest.importorskip('pandas')
-    output = output_of('calibrate.ipynb', tmp_path)
-    assert 'offset_temperature' in code_of('calibrate.ipynb')
+def a_small_residual(output):
     before, after = map(float, re.search(r'residual (\S+) -> (\S+) mg', output).groups())
     assert before > 20.0
     assert after < 0.5
+
+
+def error_of_each_model(output):
+    largest = [float(value) for value in re.findall(r'largest error (\S+) mg', output)]
+    # Figures 1 to 4 of AN5286: about 50, 10, 5 and 2.5 mg.
+    np.testing.assert_allclose(largest, [50.0, 10.0, 5.0, 2.5], rtol=0.1)
+    assert '<svg' in Path('surfaces.svg').read_text(encoding='utf-8')
+    assert Path('surfaces.png').read_bytes().startswith(b'\x89PNG')
+
+
+EXAMPLES = {'find_hidden_effect.py': hidden_effect, 'calibrate_recording.py': whole_recording,
+            'error_surfaces.py': error_of_each_model, 'calibrate.ipynb': a_small_residual}
+"""What the output of each example shows."""
+
+
+def test_every_example_is_run():
+    assert {*EXAMPLES} == {path.name for path in (ROOT / 'examples').iterdir() if path.is_file()}
+
+
+@pytest.mark.parametrize('name', EXAMPLES)
+def test_examples_use_nothing_but_the_public_face_and_run(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for library in {'error_surfaces.py': ['matplotlib'],
+                    'calibrate.ipynb': ['matplotlib', 'pandas']}.get(name, ()):
+        pytest.importorskip(library)
+    imports = re.findall(r'^(?:from|import) .*', code_of(name), re.MULTILINE)
+    own = [line for line in imports if 'accel_calib' in line]
+    assert own == ['import accel_calib as ac']
+    written = ['surfaces.png', 'surfaces.svg'] if name == 'error_surfaces.py' else []
+    done = python('-c', code_of(name), *written[::-1], folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == written
+    EXAMPLES[name](done.stdout)
 
 
 def test_the_notebook_holds_no_output():
     notebook = json.loads((ROOT / 'examples' / 'calibrate.ipynb').read_text(encoding='utf-8'))
     code = [cell for cell in notebook['cells'] if cell['cell_type'] == 'code']
-    assert code
+    assert any('offset_temperature' in ''.join(cell['source']) for cell in code)
     assert not [cell for cell in code if cell['outputs'] or cell['execution_count']]
     assert notebook['nbformat'] == 4
-
-
-@pytest.mark.parametrize('name', EXAMPLES)
-def test_examples_use_nothing_but_the_public_face(name):
-    text = code_of(name)
-    imports = re.findall(r'^(?:from|import) .*', text, re.MULTILINE)
-    own = [line for line in imports if 'accel_calib' in line]
-    assert own == ['import accel_calib as ac']
-
-
-@pytest.mark.parametrize('name', EXAMPLES)
-def test_every_example_is_run(name):
-    assert f"output_of('{name}'" in Path(__file__).read_text(encoding='utf-8')

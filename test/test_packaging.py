@@ -5,8 +5,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 import importlib
 import os
 from pathlib import Path
@@ -20,8 +18,7 @@ from xml.etree import ElementTree
 
 import accel_calib
 import pytest
-
-ROOT = Path(__file__).parent.parent
+from shared import ROOT
 
 EXECUTABLES = ('accel-calib', 'calibrator', 'calibrator_lifecycle', 'simulator')
 
@@ -43,23 +40,14 @@ ROSDEP_KEYS = {
 }
 
 
-@contextmanager
-def working_folder(path: Path) -> Iterator[None]:
-    before = Path.cwd()
-    os.chdir(path)
-    try:
-        yield
-    finally:
-        os.chdir(before)
-
-
 @pytest.fixture
 def setup_py(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """Return the arguments of setup.py for setuptools."""
     setuptools = pytest.importorskip('setuptools')
     given: dict[str, Any] = {}
     monkeypatch.setattr(setuptools, 'setup', lambda **keywords: given.update(keywords))
-    with working_folder(ROOT):
+    with monkeypatch.context() as changed:
+        changed.chdir(ROOT)
         runpy.run_path('setup.py')
     return given
 
@@ -77,14 +65,10 @@ def distributions(requirements: list[str]) -> set[str]:
     return {re.split(r'[^\w.-]', requirement)[0] for requirement in requirements}
 
 
-@pytest.mark.parametrize('tag', ['name', 'version', 'description', 'license', 'maintainer'])
 def test_package_xml_and_setup_py_agree(
-        tag: str, setup_py: dict[str, Any], package_xml: ElementTree.Element) -> None:
-    assert texts(package_xml, tag) == [setup_py[tag]]
-
-
-def test_version_email_and_addresses_agree(
         setup_py: dict[str, Any], package_xml: ElementTree.Element) -> None:
+    for tag in ('name', 'version', 'description', 'license', 'maintainer'):
+        assert texts(package_xml, tag) == [setup_py[tag]]
     assert setup_py['version'] == accel_calib.__version__
     assert package_xml.find('maintainer').get('email') == setup_py['maintainer_email']
     urls = {element.get('type'): element.text for element in package_xml.findall('url')}
@@ -103,12 +87,10 @@ def test_the_version_stands_in_one_place(package_xml: ElementTree.Element) -> No
                 if re.search(rf'\b{re.escape(version)}\b', path.read_text(encoding='utf-8'))]
 
 
-def test_the_page_about_installation_lists_every_part(setup_py: dict[str, Any]) -> None:
+def test_the_page_about_installation_lists_every_part_and_the_readme_those_that_it_uses(
+        setup_py: dict[str, Any]) -> None:
     page = (ROOT / 'docs' / 'install.md').read_text(encoding='utf-8')
     assert {*setup_py['extras_require']} <= {*re.findall(r'`([\w-]+)`', page)}
-
-
-def test_the_readme_installs_what_it_uses(setup_py: dict[str, Any]) -> None:
     text = (ROOT / 'README.md').read_text(encoding='utf-8')
     parts = re.findall(r"pip install './accel_calib\[([\w,]+)\]'", text)[0].split(',')
     used = {'live': 'accel-calib live', 'logs': '.ulg', 'report': 'pictures/page.png',
@@ -127,21 +109,16 @@ def test_messages_name_packages_of_the_index(setup_py: dict[str, Any]) -> None:
     assert not [each for each in sources if re.search(r'pip install .{0,4}accel_calib', each)]
 
 
-def test_each_requirement_has_its_rosdep_key(
+def test_package_xml_lists_each_requirement_and_all_imports_of_the_nodes(
         setup_py: dict[str, Any], package_xml: ElementTree.Element) -> None:
-    extras = setup_py['extras_require']
+    extras, listed = setup_py['extras_require'], {*texts(package_xml, 'exec_depend')}
     required = setup_py['install_requires'] + extras['report'] + extras['live']
     wanted = {ROSDEP_KEYS[name] for name in distributions(required)} - {''}
-    listed = {key for key in texts(package_xml, 'exec_depend') if key.startswith('python3-')}
-    assert wanted == listed
-
-
-def test_package_xml_lists_all_imports_of_the_nodes(package_xml: ElementTree.Element) -> None:
+    assert wanted == {key for key in listed if key.startswith('python3-')}
     sources = [path.read_text(encoding='utf-8')
                for path in (ROOT / 'accel_calib' / 'ros').rglob('*.py')]
     pattern = re.compile(r'^\s*(?:from|import) (rclpy|\w+_(?:msgs|srvs|interfaces))\b', re.M)
-    imported = {name for source in sources for name in pattern.findall(source)}
-    assert imported <= set(texts(package_xml, 'exec_depend'))
+    assert {name for source in sources for name in pattern.findall(source)} <= listed
 
 
 def test_all_shipped_files_exist(setup_py: dict[str, Any]) -> None:
@@ -167,32 +144,22 @@ def test_every_folder_with_code_is_a_package(setup_py: dict[str, Any]) -> None:
         setup_py['packages'])
 
 
-@pytest.fixture
-def entry_points(setup_py: dict[str, Any]) -> dict[str, str]:
-    """Return module:function by name of the executable."""
+def test_every_entry_point_is_an_executable_of_the_package(setup_py: dict[str, Any]) -> None:
     scripts = setup_py['entry_points']['console_scripts']
-    return dict(re.split(r'\s*=\s*', script) for script in scripts)
-
-
-def test_every_entry_point_is_an_executable_of_the_package(entry_points: dict[str, str]) -> None:
-    assert set(entry_points) == set(EXECUTABLES)
+    assert [script.partition('=')[0].strip() for script in scripts] == [*EXECUTABLES]
 
 
 @pytest.mark.parametrize('name', EXECUTABLES)
-def test_entry_points_are_importable(name: str, entry_points: dict[str, str]) -> None:
-    module, function = entry_points[name].split(':')
-    if '.ros.' in module:
-        pytest.importorskip('rclpy')
-    assert callable(getattr(importlib.import_module(module), function))
-
-
-@pytest.mark.parametrize('name', EXECUTABLES)
-def test_scripts_run_the_function_of_the_entry_point(
-        name: str, entry_points: dict[str, str]) -> None:
+def test_scripts_run_the_function_of_the_entry_point(name: str, setup_py: dict[str, Any]) -> None:
+    script, = (script for script in setup_py['entry_points']['console_scripts']
+               if script.split()[0] == name)
     path = ROOT / 'scripts' / name
     assert os.access(path, os.X_OK)
     module, function = re.search(r'^from (\S+) import (\S+)$', path.read_text(), re.M).groups()
-    assert f'{module}:{function}' == entry_points[name]
+    assert script.endswith(f'= {module}:{function}')
+    if '.ros.' in module:
+        pytest.importorskip('rclpy')
+    assert callable(getattr(importlib.import_module(module), function))
 
 
 def test_command_in_the_path_is_that_of_ros2_run(

@@ -1,9 +1,10 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The pages of fits, verifications, comparisons and histories."""
+"""The pages of results: complete, self-contained, readable."""
 
 from dataclasses import replace
+from html.parser import HTMLParser
 from pathlib import Path
 import re
 
@@ -13,22 +14,60 @@ from accel_calib.compare import compare, history_of
 from accel_calib.errors import InputError
 from accel_calib.finding import Finding, NextStep
 from accel_calib.findings import rate, rate_verification, Rating
+from accel_calib.refine import refine
 from accel_calib.report import calibration_page, refinement_page
 from accel_calib.text import milli
+from accel_calib.units import Units
 from inside import (
-    axis_figures, comparison_page, history_page, residuals_of, residuals_of_refinement, sheet,
-    snippets)
+    all_drawings, axis_figures, comparison_page, curve_parts, history_page, model_with,
+    residuals_of, residuals_of_refinement, sheet, simulate_poses, snippets, with_linear_part)
 from live_bench import chromium, PATIENCE
 import numpy as np
-from page_parser import parsed
 from playwright.sync_api import expect, sync_playwright
 import pytest
+from shared import random_directions, SENSOR
 
 pytest.importorskip('matplotlib')
 
-SENSOR = {'offset': [0.02, -0.01, 0.03], 'axis_gain': [0.01, -0.02, 0.005],
-          'cross_axis': [0.004, 0.002, -0.003]}
 HOSTILE = '</script><script>alert(1)</script></title><b onload="x">&\''
+
+
+VOID = {'meta', 'br', 'link', 'img', 'hr', 'input'}
+
+
+class Parsed(HTMLParser):
+    """The tags of a page, with a check that every tag that opens is closed."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.ids, self.tags, self.texts, self.marks = [], [], [], [], []
+
+    def handle_starttag(self, tag, attrs):
+        self.handle_startendtag(tag, attrs)
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        attrs = dict(attrs)
+        self.tags.append((tag, attrs, tuple(self.open)))
+        self.ids += [attrs['id']] if 'id' in attrs else []
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.texts.append(data)
+        if self.open[-2:] == ['use', 'title']:
+            self.marks.append(data)
+
+    def named(self, wanted):
+        return [attrs for tag, attrs, _ in self.tags if tag == wanted]
+
+
+def parsed(text):
+    found = Parsed()
+    found.feed(text)
+    return found
 
 
 def simulated(seed=0, poses=24, units='m/s2', **options):
@@ -65,30 +104,26 @@ def dated():
     return found
 
 
-def test_every_figure_has_a_text_and_every_pose_can_be_pointed_at(text, poses):
+def rows_in(found, tag):
+    """Return the rows of the poses that tags of a page are about."""
+    return [each['data-row'] for each in found.named(tag) if 'data-row' in each]
+
+
+def test_every_figure_has_a_text_and_every_pose_can_be_pointed_at(text, poses, calibration):
     found = parsed(text)
-    figures = found.named('svg')
-    assert len(figures) == 4
+    figures, live = found.named('svg'), found.named('figure')
+    assert len(live) == len(figures) == 4
     assert all(each['role'] == 'img' and each['aria-label'] for each in figures)
-    live = found.named('figure')
     assert all(each['tabindex'] == '0' and each['aria-label'] for each in live)
-    assert len(live) == len(figures)
-    for row, warm in zip(poses.row, poses['temperature'], strict=True):
+    for row, warm, before, after in zip(
+            poses.row, poses['temperature'], residuals_of(calibration).before_mg,
+            residuals_of(calibration).after_mg, strict=True):
+        one, other = (f'row {row}, {milli(value, signed=True)} mg, {warm:.0f} °C'
+                      for value in (before, after))
         mine = [mark for mark in found.marks if mark.startswith(f'row {row}, ')]
-        # Coverage, before, after, by direction, against temperature and against time.
-        assert len(mine) == 6
-        assert all(re.fullmatch(rf'row {row}, [+−][\d.]+ mg, {warm:.0f} °C', mark)
-                   for mark in mine)
-    rows = {each['data-row'] for each in found.named('tr') if 'data-row' in each}
-    assert rows == {str(row) for row in poses.row}
-    assert rows == {each['data-row'] for each in found.named('use') if 'data-row' in each}
-
-
-def test_marks_state_the_residual_of_their_pose(text, calibration):
-    residuals = residuals_of(calibration)
-    for row, value, warm in zip(residuals.poses_g.row, residuals.after_mg,
-                                residuals.poses_g['temperature'], strict=True):
-        assert f'row {row}, {milli(value, signed=True)} mg, {warm:.0f} °C' in text
+        # Before; coverage, after, by direction, against temperature and against time.
+        assert sorted(mine) == sorted([one, *[other] * 5])
+    assert {*rows_in(found, 'tr')} == {*rows_in(found, 'use')} == {*map(str, poses.row)}
 
 
 def test_hostile_names_are_text(calibration, poses):
@@ -192,22 +227,12 @@ def test_values_and_their_deviations_are_those_of_the_calibration(calibration, t
 
 
 def test_figures_by_axis_are_those_of_the_axes():
-    # Axes of length 1.01, 1 and 0.99; x and y are 89° apart, the others 90°.
+    apart = np.radians(89.0)
     mat = np.diag([1.01, 1.0, 0.99]) @ np.array(
-        [[1.0, np.cos(np.radians(89.0)), 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    mat[0] *= 1.01 / np.linalg.norm(mat[0])
-    vec = np.concatenate([[0.1, 0.2, 0.3], np.diag(mat) - 1.0, [mat[0, 1] / 2.0, 0.0, 0.0],
-                          [0.0, 0.0, -mat[0, 1] / 2.0]])
-    effects = ('offset', 'axis_gain', 'cross_axis', 'misalignment')
-    from inside import with_vector
-    model = with_vector(effects, vec)
-    if not np.allclose(model.linear_part[0], mat):
-        vec[-1] *= -1.0
-    np.testing.assert_allclose(with_vector(effects, vec).linear_part[0], mat, atol=1e-12)
-    angle = np.degrees(np.arccos(mat[0] @ mat[1] / np.linalg.norm(mat[0])))
-    np.testing.assert_allclose(axis_figures(vec, effects),
-                               [0.1, 0.2, 0.3, 1.01, 1.0, 0.99, angle, 90.0, 90.0])
-    assert angle == pytest.approx(89.0, abs=0.02)
+        [[np.sin(apart), np.cos(apart), 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    model = with_linear_part(mat, np.array([0.1, 0.2, 0.3]))
+    np.testing.assert_allclose(axis_figures(model.vector, model.effects),
+                               [0.1, 0.2, 0.3, 1.01, 1.0, 0.99, 89.0, 90.0, 90.0])
 
 
 def test_left_out_poses_are_listed_and_drawn(poses):
@@ -230,8 +255,7 @@ def test_page_of_a_verification_shows_the_other_poses(calibration):
                             verification=(checked, other))
     found = parsed(text)
     assert '<h1>Check of the calibration of imu_link</h1>' in text
-    rows = [each['data-row'] for each in found.named('tr') if 'data-row' in each]
-    assert rows == [str(row) for row in range(1, 10)]
+    assert rows_in(found, 'tr') == [str(row) for row in range(1, 10)]
     residuals = residuals_of(calibration, other)
     assert residuals.rms_mg == pytest.approx(checked.rms_after_mg)
     assert np.sqrt(np.mean(residuals.before_mg ** 2)) == pytest.approx(checked.rms_before_mg)
@@ -267,21 +291,16 @@ def test_residuals_that_the_calibration_cannot_correct_are_shown_apart():
     assert f'Remaining residual: {residuals.rms_mg:.3g} mg RMS' in text
 
 
-def test_lines_of_c_correct_as_apply_does(calibration):
-    lines = dict(snippets(calibration, 'calibration.yaml'))
-    numbers = [float(value) for value in re.findall(r'(-?\d\.\d+e[+-]\d+)f', lines['C'])]
-    vec, mat = np.array(numbers[:3]), np.reshape(numbers[3:], (3, 3))
-    reading = np.array([[1.0, -4.0, 9.0], [-9.0, 3.0, 1.0]])
-    np.testing.assert_allclose((reading - vec) @ mat.T, calibration.apply(reading), rtol=1e-6)
-
-
-def test_lines_of_python_run(calibration, tmp_path):
+def test_lines_of_c_and_of_python_correct_as_apply_does(calibration, tmp_path):
     path = tmp_path / "robot's.yaml"
     calibration.save(path)
-    reading = np.array([[1.0, -4.0, 9.0]])
+    lines, reading = dict(snippets(calibration, str(path))), np.array([[1, -4, 9], [-9, 3, 1.0]])
+    numbers = [float(value) for value in re.findall(r'(-?\d\.\d+e[+-]\d+)f', lines['C'])]
+    vec, mat = np.array(numbers[:3]), np.reshape(numbers[3:], (3, 3))
     known = {'readings': reading}
-    exec(dict(snippets(calibration, str(path)))['Python'], known)
-    np.testing.assert_allclose(known['force'], calibration.apply(reading))
+    exec(lines['Python'], known)
+    for found in ((reading - vec) @ mat.T, known['force']):
+        np.testing.assert_allclose(found, calibration.apply(reading), rtol=1e-6)
 
 
 def test_history_is_in_order_of_date_and_finds_the_change(dated):
@@ -299,24 +318,17 @@ def test_history_is_in_order_of_date_and_finds_the_change(dated):
     np.testing.assert_allclose(offset.values, expected, atol=1e-9)
 
 
-def test_calibrations_of_one_day_are_labelled_with_their_time(dated):
-    morning, evening = (replace(dated[0], date=f'2026-03-12T{hour}:30:00+00:00')
-                        for hour in ('08', '19'))
+def test_labels_of_a_history_are_its_dates_with_the_time_where_a_day_has_several(dated):
+    morning, evening, undated, wrong = (replace(dated[0], date=date) for date in (
+        '2026-03-12T08:30:00+00:00', '2026-03-12T19:30:00+00:00', '', 'Monday'))
     assert history_of([evening, dated[1], morning]).labels == (
         '2026-02-12 10:00', '2026-03-12 08:30', '2026-03-12 19:30')
-
-
-def test_history_without_dates_keeps_the_order(dated):
-    undated = [dated[2], replace(dated[0], date=''), dated[1]]
-    history = history_of(undated)
+    history = history_of([dated[2], undated, dated[1]])
     assert [moment.index for moment in history.moments] == [0, 1, 2]
     assert history.labels == ('2026-03-12', 'no date', '2026-02-12')
     assert 'calibration 2 has no date: the order is that of the input' in history.notes
-
-
-def test_history_refuses_what_it_cannot_compare(dated):
     with pytest.raises(InputError, match="the date of calibration 2 is 'Monday', expected"):
-        history_of([dated[0], replace(dated[1], date='Monday')])
+        history_of([dated[0], wrong])
     with pytest.raises(InputError, match='found 1 calibration, expected at least 2'):
         history_of(dated[:1])
 
@@ -331,3 +343,86 @@ def test_history_has_a_page(dated):
                for mark in found.marks)
     assert text.count('<td>differ, ') == 1
     assert 'temperature [°C]' in text
+
+
+# ----------------------------------------------------------------------------- refinements
+
+@pytest.fixture(scope='module')
+def warm():
+    """Return a refinement of poses with an effect of the temperature, one of them knocked."""
+    rng, time = np.random.default_rng(5), np.arange(60) * 20.0
+    model = model_with({'offset': np.array([0.02, -0.01, 0.03]),
+                        'axis_gain': np.array([0.01, -0.02, 0.005]),
+                        'offset_temperature': np.array([2e-4, -1e-4, 1.5e-4])})
+    table = simulate_poses(model, random_directions(60, rng), rng, noise_g=0.002, context={
+        'time': time, 'temperature': 30.0 + 10.0 * np.sin(time / 190.0)})
+    reading = table.reading.copy()
+    reading[8] *= 1.05
+    return refine(table.with_columns(reading=reading), Units('g', 1.0), base='10')
+
+
+def test_page_is_complete_and_self_contained(warm):
+    text = refinement_page(warm, '<b onload="x">&.csv')
+    found = parsed(text)
+    assert not found.open
+    assert len(found.ids) == len(set(found.ids))
+    referred = set(re.findall(r'(?:href="|url\()#([^")]+)', text))
+    assert referred <= set(found.ids)
+    assert not re.search(r'https?:|//[a-z]|<link|<img|@import|src=|fetch|XMLHttp|WebSocket', text)
+    assert '<html lang="en">' in text
+    assert 'name="viewport"' in text
+    assert '<b onload' not in text
+    assert '&lt;b onload=&quot;x&quot;&gt;&amp;.csv' in text
+
+
+def test_before_and_after_have_one_scale(warm):
+    figures = {drawing.name: drawing.figure for drawing in all_drawings(warm)}
+    ladder = {text.get_text() for text in figures['ladder'].axes[0].texts}
+    assert '+ offset_temperature' in ladder
+    before, after = (figures[f'step1_offset_temperature_variable_{when}'].axes[0]
+                     for when in ('before', 'after'))
+    assert before.get_ylim() == after.get_ylim()
+    assert before.get_ylim()[0] == -before.get_ylim()[1]
+    maps = [figures[f'step1_offset_temperature_sphere_{when}'].axes[0].collections[-1]
+            for when in ('before', 'after')]
+    assert maps[0].get_clim() == maps[1].get_clim()
+
+
+@pytest.fixture(scope='module')
+def bumpy():
+    """Return a refinement of an offset of z that is larger near 35 °C, and that bump."""
+    rng = np.random.default_rng(5)
+    warm = rng.uniform(10.0, 50.0, 100)
+    poses = simulate_poses(
+        model_with({'offset': np.array([0.02, -0.01, 0.03])}), random_directions(100, rng), rng,
+        noise_g=0.001, context={'time': np.arange(100) * 20.0, 'temperature': warm})
+    shift = np.zeros((100, 3))
+    shift[:, 2] = bump(warm)
+    return refine(poses.with_columns(reading=poses.reading + shift), Units('g', 1.0), base='10')
+
+
+def bump(warm):
+    return 0.004 * np.exp(-((warm - 35.0) / 5.0) ** 2)
+
+
+def test_figure_of_a_curve_shows_the_truth_within_its_band(bumpy):
+    step = bumpy.steps[-1]
+    assert bumpy.verdict == 'described'
+    assert step.effect == 'empirical'
+    parts = {part.name: part for part in curve_parts(bumpy, step.name)}
+    for name, part in parts.items():
+        truth = bump(part.at) - np.mean(bump(part.poses)) if name == 'z' else 0.0
+        np.testing.assert_array_less(np.abs(part.change - truth), 6.0 * part.deviation + 2e-4)
+        np.testing.assert_allclose(part.poses, bumpy.poses_g['temperature'])
+    assert np.ptp(parts['z'].change) == pytest.approx(0.004, rel=0.15)
+
+    figures = {drawing.name: drawing.figure for drawing in all_drawings(bumpy)}
+    panel = figures[f'step{len(bumpy.steps)}_curve'].axes[0]
+    assert panel.get_xlabel() == 'temperature [°C]'
+    assert panel.get_ylabel() == 'change from the mean [mg]'
+    assert len(panel.collections) == len(parts)
+    ticks = [line for line in panel.lines if line.get_marker() == '|']
+    np.testing.assert_allclose(ticks[0].get_xdata(), bumpy.poses_g['temperature'])
+    band = panel.collections[0].get_paths()[0].vertices[:, 1]
+    first = next(iter(parts.values()))
+    assert np.max(band) == pytest.approx(1e3 * np.max(first.change + 1.96 * first.deviation))

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 import io
 import json
@@ -13,30 +12,28 @@ import math
 import os
 from pathlib import Path
 import pty
-import shlex
 import subprocess
 import sys
 from typing import Any
 
 import accel_calib as ac
-from accel_calib.calibrate import next_pose
 from accel_calib.errors import InputError
 from accel_calib.session import Progress
 from inside import (
-    changes, COMMAND, Guide, in_one_line, main, Output, Plan, screen, shown, state, unit, words_of)
+    changes, COMMAND, in_one_line, main, Output, screen, shown, state, unit, words_of)
 import numpy as np
 import pytest
 from rich.console import Console
+from shared import python, ROOT, run, run_json, shell
 
 RUN = [sys.executable, *COMMAND]
-ROOT = str(Path(__file__).parent.parent)
 
 
 @pytest.fixture
 def poses(tmp_path, capsys):
     path = tmp_path / 'poses.csv'
-    assert main(['simulate', '-o', str(path), '--effect', 'offset=0.02,-0.01,0.03', '--effect',
-                 'axis_gain=0.01,-0.02,0.005', '--temperature', '20', '30']) == 0
+    assert run('simulate', '-o', path, '--effect', 'offset=0.02,-0.01,0.03', '--effect',
+               'axis_gain=0.01,-0.02,0.005', '--temperature', 20, 30) == 0
     capsys.readouterr()
     return path
 
@@ -44,12 +41,12 @@ def poses(tmp_path, capsys):
 @pytest.fixture
 def printed(monkeypatch, capsys):
     """Return a function that runs a command on a terminal of this width, and returns its text."""
-    def run(*arguments, columns=80):
+    def on_width(*arguments, columns=80):
         monkeypatch.setenv('COLUMNS', str(columns))
-        assert main([str(argument) for argument in arguments]) == 0
+        assert run(*arguments) == 0
         return capsys.readouterr().out
 
-    return run
+    return on_width
 
 
 @pytest.mark.parametrize('columns', [80, 60])
@@ -94,30 +91,25 @@ def test_control_characters_are_escaped():
     assert shown('a ± \udc80', 'ascii') == 'a +- \\udc80'
 
 
-def test_a_wrong_value_of_a_known_option_gets_no_suggestion(capsys):
+@pytest.mark.parametrize(('line', 'said'), [
+    ('calibrte x', '(did you mean calibrate?); see accel-calib --help\n'),
+    ('fit x.csv --modle 4', '(did you mean --model?)'),
+    ('refine x.csv --bsae 4', '(did you mean --base?)'),
+    ('fit x --units m/s', '(did you mean m/s2?)'),
+    ('fit x.csv --gravity -3', 'expected a positive number; see accel-calib fit --help')])
+def test_a_misspelt_name_gets_a_suggestion_in_one_line_and_a_wrong_value_none(line, said, capsys):
     with pytest.raises(SystemExit, match='2'):
-        main(['fit', 'x.csv', '--gravity', '-3'])
+        main(line.split())
     error = capsys.readouterr().err
-    assert 'expected a positive number; see accel-calib fit --help' in error
-
-
-@pytest.mark.parametrize(('arguments', 'meant'), [
-    (['calibrte', 'x'], 'calibrate'), (['fit', 'x.csv', '--modle', '4'], '--model'),
-    (['refine', 'x.csv', '--bsae', '4'], '--base'), (['fit', 'x', '--units', 'm/s'], 'm/s2')])
-def test_a_misspelt_name_gets_a_suggestion_in_one_line(arguments, meant, capsys):
-    with pytest.raises(SystemExit, match='2'):
-        main(arguments)
-    error = capsys.readouterr().err
-    assert f'(did you mean {meant}?)' in error
+    assert said in error
     assert error.count('\n') == 1
 
 
 def test_progress_shows_on_a_terminal_from_the_start(tmp_path):
-    rng = np.random.default_rng(3)
     path, count = tmp_path / 'rest.csv', 50_000
-    values = np.column_stack([np.arange(count) / 100.0, rng.normal((0.1, 0.2, 9.8), 0.02,
-                                                                   (count, 3))])
-    np.savetxt(path, values, fmt='%.4f', delimiter=',', header='time,ax,ay,az', comments='')
+    reading = np.random.default_rng(3).normal((0.1, 0.2, 9.8), 0.02, (count, 3))
+    np.savetxt(path, np.column_stack([np.arange(count) / 100.0, reading]), fmt='%.4f',
+               delimiter=',', header='time,ax,ay,az', comments='')
     status, shown_text = on_a_terminal(['capture', path, '-o', tmp_path / 'p.csv'])
     assert status == 0
     assert 'samples' in shown_text
@@ -148,8 +140,8 @@ def _read(terminal):
 def worse(poses, tmp_path):
     """Return a stored calibration, and poses of another sensor."""
     stored, other = tmp_path / 'c.yaml', tmp_path / 'other.csv'
-    assert main(['fit', str(poses), '-o', str(stored)]) == 0
-    assert main(['simulate', '-o', str(other), '--effect', 'offset=0.09,-0.01,0.03']) == 0
+    assert run('fit', poses, '-o', stored) == 0
+    assert run('simulate', '-o', other, '--effect', 'offset=0.09,-0.01,0.03') == 0
     return stored, other
 
 
@@ -163,36 +155,29 @@ def test_the_verdict_has_a_colour_on_a_terminal_only(poses, worse):
         _, plain = on_a_terminal(arguments, NO_COLOR='1')
         assert verdict in plain
         assert f'{colour}m' not in plain
-        piped = subprocess.run([*RUN, *map(str, arguments)], capture_output=True, text=True,
-                               check=False)
-        assert verdict in piped.stdout
-        assert '\x1b' not in piped.stdout + piped.stderr
+        no_terminal = python(*COMMAND, *arguments)
+        assert verdict in no_terminal.stdout
+        assert '\x1b' not in no_terminal.stdout + no_terminal.stderr
 
 
-def test_verify_says_why_it_ends_with_1(poses, worse, capsys, monkeypatch, tmp_path):
+def test_verify_says_why_it_ends_with_1(poses, worse, capsys, monkeypatch):
     stored, other = worse
     capsys.readouterr()
     monkeypatch.setenv('COLUMNS', '300')
-    result = tmp_path / 'result.json'
-    assert main(['verify', str(other), '-c', str(stored), '--max', '5', '--json', str(result)]
-                ) == 1
-    why = 'mg is above --max 5 mg: exit status 1'
-    assert why in capsys.readouterr().out
-    found = json.loads(result.read_text(encoding='utf-8'))
-    assert (found['max_mg'], found['above_max']) == (5.0, True)
-    assert main(['verify', str(poses), '-c', str(stored), '--max', '5']) == 0
+    limited = '-c', stored, '--max', 5
+    status, found = run_json(capsys, 'verify', other, *limited)
+    assert (status, found['max_mg'], found['above_max']) == (1, 5.0, True)
+    assert run('verify', poses, *limited) == 0
     assert 'above' not in capsys.readouterr().out
-    assert main(['verify', str(poses), str(other), '-c', str(stored), '--max', '5']) == 1
+    assert run('verify', poses, other, *limited) == 1
+    why = 'mg is above --max 5 mg: exit status 1'
     lines = [line for line in capsys.readouterr().out.splitlines() if why in line]
     assert [line.split(':')[0] for line in lines] == [str(other)]
 
 
 def piped(line, folder):
     """Return what a line of the shell prints; each command ends with status 0."""
-    done = subprocess.run(['bash', '-euc',
-                           f'accel-calib() {{ {shlex.join(RUN)} "$@"; }}; {line}'],
-                          cwd=folder, capture_output=True, text=True, check=False,
-                          env={**os.environ, 'PYTHONPATH': ROOT, 'COLUMNS': '200'})
+    done = shell(line, folder, COLUMNS='200')
     assert done.returncode == 0, done.stderr
     return done
 
@@ -223,17 +208,14 @@ def test_a_reader_that_leaves_early_gets_no_error(tmp_path):
     assert 'Broken' not in done.stderr
 
 
-@pytest.mark.parametrize(('arguments', 'message'), [
-    (['simulate', '-o', '-', '--json', '-'], 'unrecognized arguments: --json'),
-    (['capture', 'r.csv', '-o', '-', '--json', '-'], '-o and --json are both -'),
-    (['fit', 'r.csv', 'r.csv', '-o', '-'], '-o is -, expected a folder'),
-    (['fit', '-'], 'standard input is empty'),
-    (['fleet', 'r.csv', '-o', '-'], '-o is -, expected a folder')])
-def test_what_cannot_go_through_a_pipe_is_refused(arguments, message, tmp_path):
+@pytest.mark.parametrize(('line', 'message'), [
+    ('simulate -o - --json -', 'unrecognized arguments: --json'),
+    ('capture r.csv -o - --json -', '-o and --json are both -'),
+    ('fit r.csv r.csv -o -', '-o is -, expected a folder'),
+    ('fit -', 'standard input is empty'), ('fleet r.csv -o -', '-o is -, expected a folder')])
+def test_what_cannot_go_through_a_pipe_is_refused(line, message, tmp_path):
     (tmp_path / 'r.csv').write_text('time,ax,ay,az\n0,0,0,9.8\n', encoding='utf-8')
-    done = subprocess.run([*RUN, *arguments], cwd=tmp_path, stdin=subprocess.DEVNULL,
-                          capture_output=True, text=True, check=False,
-                          env={**os.environ, 'PYTHONPATH': ROOT})
+    done = shell(f'accel-calib {line} </dev/null', tmp_path)
     assert done.returncode == 2
     assert message in done.stderr
     assert done.stderr.count('\n') == 1
@@ -250,39 +232,22 @@ def test_the_shell_completes_options(tmp_path):
     pytest.importorskip('argcomplete')
     out = tmp_path / 'completions'
     line = 'accel-calib fit --mod'
-    subprocess.run(RUN, env={**os.environ, '_ARGCOMPLETE': '1', 'COMP_LINE': line,
-                             'COMP_POINT': str(len(line)), '_ARGCOMPLETE_IFS': '\n',
-                             '_ARGCOMPLETE_STDOUT_FILENAME': str(out)},
-                   check=False)
+    python(*COMMAND, _ARGCOMPLETE='1', COMP_LINE=line, COMP_POINT=str(len(line)),
+           _ARGCOMPLETE_IFS='\n', _ARGCOMPLETE_STDOUT_FILENAME=str(out))
     assert '--model' in out.read_text(encoding='utf-8')
 
 
 NODE = '/left/calibrator'
-NOISE_G = 0.0004
-
-
-def guided() -> Iterator[Progress]:
-    """Yield the progress of a person who follows the guidance, until more poses do not help."""
-    directions = np.zeros((0, 3))
-    while True:
-        asked = next_pose(directions, noise_g=NOISE_G)
-        up = () if asked.direction is None else tuple(asked.direction.tolist())
-        guide = Guide()
-        guide.plan = Plan(asked, len(directions), directions, NOISE_G, len(directions) / 20)
-        action = guide.action
-        assert action is not None
-        yield Progress(
-            still=True, stillness=0.5, dwell=0.6, min_dwell=1.0, poses=len(directions),
-            total=asked.total, coverage=len(directions) / 20, accuracy=asked.error * NOISE_G,
-            step=action.kind, advice=action.words, command=action.command, direction=up)
-        if asked.direction is None:
-            return
-        directions = np.vstack([directions, asked.direction])
-
-
-STEPS = list(guided())
-START, MIDDLE, ENOUGH = STEPS[0], STEPS[7], STEPS[-1]
+START = Progress(
+    still=True, stillness=0.5, dwell=0.6, min_dwell=1.0, poses=0, total=12, coverage=0.0,
+    accuracy=math.inf, step='poses', advice='turn the sensor so that the top side points up',
+    command='', direction=(0.0, 0.0, 1.0))
+MIDDLE = replace(START, poses=7, coverage=0.35, direction=(0.58, 0.58, -0.58),
+                 advice='turn the sensor so that the front left bottom corner points up')
+ENOUGH = replace(START, poses=20, coverage=1.0, accuracy=0.0003, step='fit', command='fit',
+                 advice='more poses no longer help: call ~/fit', direction=())
 FITTED = replace(MIDDLE, step='done', advice='use the calibration', command='', direction=())
+SEEN = replace(MIDDLE, up=(0.6, 0.0, 0.8), length=1.0213, corrected=1.0002, temperature=-3.5)
 
 
 def drawn(view: Any, width: int = 80, height: int = 24, encoding: str = 'utf-8') -> str:
@@ -298,22 +263,14 @@ def row(shown: str, label: str) -> str:
     return next(line for line in shown.splitlines() if label in line)
 
 
-@pytest.mark.parametrize('progress', [*STEPS, FITTED, replace(
-    START, still=False, stillness=math.nan, accuracy=math.nan, step='', advice=''), replace(
-    START, up=(0.6, 0.0, 0.8), length=1.0213, corrected=1.0002, temperature=-3.5)])
+@pytest.mark.parametrize('progress', [START, ENOUGH, FITTED, replace(
+    START, still=False, stillness=math.nan, accuracy=math.nan, step='', advice='')])
 def test_figures_are_read_as_they_are_written(progress: Progress) -> None:
     figures = dict(progress.figures())
     found = Progress.from_figures({**figures, 'a figure of a later version': '1'})
     assert dict(found.figures()) == figures
-    assert found.direction == pytest.approx(progress.direction, abs=1e-4)
-    assert found.up == pytest.approx(progress.up, abs=1e-4)
-    assert found.accuracy == pytest.approx(progress.accuracy, rel=0.01, nan_ok=True)
-    assert (found.length, found.corrected, found.temperature) == pytest.approx(
-        (progress.length, progress.corrected, progress.temperature), nan_ok=True)
-    assert (found.still, found.poses, found.total) == (
-        progress.still, progress.poses, progress.total)
-    assert (found.step, found.advice, found.command) == (
-        progress.step, progress.advice, progress.command)
+    seen = replace(SEEN, accuracy=0.0012, still=progress.still, step=progress.step)
+    assert Progress.from_figures(dict(seen.figures())) == seen
 
 
 @pytest.mark.parametrize(('name', 'text', 'words'), [
@@ -338,29 +295,34 @@ def test_screen_shows_all_figures() -> None:
     assert f'{ENOUGH.accuracy * 1e3:.2g} mg expected' in drawn(screen(NODE, ENOUGH))
 
 
-@pytest.mark.parametrize('signs', [
-    np.array(signs, float) for signs in ((0, 0, 1), (1, -1, 0), (-1, 1, -1))], ids=str)
-def test_every_next_pose_is_shown_in_large_words(signs: Any) -> None:
-    words = words_of(signs)
-    progress = replace(START, direction=tuple(unit(signs[np.newaxis])[0].tolist()),
-                       advice=f'turn the sensor so that {words} points up')
-    sides = words.removeprefix('the ').rsplit(' ', 1)[0].upper()
+def pose_step(*signs: float) -> Progress:
+    words = words_of(np.array(signs))
+    return replace(START, direction=tuple(unit(np.array([signs]))[0].tolist()),
+                   advice=f'turn the sensor so that {words} points up')
+
+
+@pytest.mark.parametrize(('progress', 'words'), [
+    (pose_step(0.0, 0.0, 1.0), 'TOP'), (pose_step(1.0, -1.0, 0.0), 'FRONT RIGHT'),
+    (pose_step(-1.0, 1.0, -1.0), 'BACK LEFT BOTTOM'), *(
+        (replace(FITTED, step=step), words) for step, words in (
+            ('refine', 'CALL REFINE'), ('level', 'SET LEVEL'), ('accept', 'ACCEPT'),
+            ('done', 'DONE')))])
+def test_every_step_is_shown_in_the_largest_words_that_fit(progress: Progress, words: str
+                                                           ) -> None:
     large = drawn(screen(NODE, progress))
-    assert sides not in large
+    assert words not in large
     below = large[large.index('accuracy'):]
     assert '██' in below or '▀' in below
-    assert all(len(line) == 80 for line in large.splitlines())
-    assert f'│ {sides} ' in drawn(screen(NODE, progress), height=14)
-    narrow = drawn(screen(NODE, progress), width=40)
-    assert all(len(line) == 40 for line in narrow.splitlines())
+    assert f'│ {words} ' in drawn(screen(NODE, progress), height=14)
+    for width in (80, 40):
+        lines = drawn(screen(NODE, progress), width=width).splitlines()
+        assert {len(line) for line in lines} == {width}
 
 
 def test_lengths_and_temperature_are_shown_if_they_are_known() -> None:
-    before = drawn(screen(NODE, START))
+    before, fitted = (drawn(screen(NODE, progress)) for progress in (START, SEEN))
     assert 'not known' in row(before, '|a|')
     assert 'temperature' not in before
-    fitted = drawn(screen(NODE, replace(START, length=1.0213, corrected=1.0002,
-                                        temperature=-3.5)))
     assert '1.0213 g, corrected 1.0002 g' in row(fitted, '|a|')
     assert '-3.5 °C' in row(fitted, 'temperature')
 
@@ -376,29 +338,17 @@ def test_end_of_the_poses_is_clear() -> None:
     assert 'more poses no longer help' in shown
     assert f'ros2 service call {NODE}/fit std_srvs/srv/Trigger' in shown
     assert '██████  ██  ██████' in shown  # FIT
-    line, = changes(NODE, STEPS[-2], ENOUGH)
+    line, = changes(NODE, MIDDLE, ENOUGH)
     assert 'more poses no longer help' in line
     assert line.endswith(f'~/fit: ros2 service call {NODE}/fit std_srvs/srv/Trigger')
     assert list(state(NODE, ENOUGH))[-1] == f'ros2 service call {NODE}/fit std_srvs/srv/Trigger'
 
 
-@pytest.mark.parametrize(('step', 'words'), [
-    ('refine', 'CALL REFINE'), ('level', 'SET LEVEL'), ('accept', 'ACCEPT'), ('done', 'DONE')])
-def test_every_step_that_is_no_pose_is_shown_in_large_words(step: str, words: str) -> None:
-    shown = drawn(screen(NODE, replace(FITTED, step=step)), height=14)
-    assert f'│ {words} ' in shown
-    large = drawn(screen(NODE, replace(FITTED, step=step)))
-    assert words not in large
-    assert '██' in large or '▀' in large
-
-
 def test_missing_ros_is_one_line(tmp_path: Path) -> None:
     for name in ('diagnostic_msgs', 'rclpy'):
         (tmp_path / f'{name}.py').write_text(f"raise ImportError('no {name}')\n")
-    paths = [str(tmp_path), ROOT]
-    done = subprocess.run(
-        [sys.executable, *COMMAND, 'watch', '--once'], capture_output=True, text=True, timeout=60,
-        check=False, cwd=tmp_path, env={**os.environ, 'PYTHONPATH': os.pathsep.join(paths)})
+    done = python(*COMMAND, 'watch', '--once', folder=tmp_path,
+                  PYTHONPATH=f'{tmp_path}{os.pathsep}{ROOT}')
     assert done.returncode == 2
     line, = done.stderr.splitlines()
     assert 'ROS 2 is not installed' in line

@@ -29,20 +29,9 @@ class Command(NamedTuple):
     """
     A command.
 
-    Parameters
-    ----------
-    summary : str
-        What it does.
-    module : str
-        Module in this folder with the function ``run_NAME``.
-    example : str
-        End of the help; its first line is an example.
-    options : function
-        Adds its options to a parser.
-    writes : str
-        Kind of the file that ``-o`` names; empty for any.
-    about : str
-        Argument that an error in JSON is about; empty for none.
+    `module` of this folder has the function ``run_NAME``. `example` is the end of the help; its
+    first line is an example. `options` adds the options to a parser. `writes` is the kind of the
+    file that ``-o`` names, empty for any, and `about` the argument that an error in JSON is about.
 
     """
 
@@ -151,31 +140,30 @@ def _fit(made: options.Parser) -> None:
 
 
 def _calibrate(made: options.Parser) -> None:
-    add = made.add_argument
-    add('log', type=options.log_path, metavar='LOG', help='recording or pose table: CSV in any '
+    made.add_argument(
+        'log', type=options.log_path, metavar='LOG', help='recording or pose table: CSV in any '
         'dialect, rosbag2, .mcap, .db3, ROS 1 .bag, PX4 .ulg, ArduPilot .bin; - for standard '
         'input')
-    add('-o', '--output', type=Path, default=Path('calibration.yaml'), metavar='FILE',
-        help='calibration to write (default: %(default)s); the page has the same name with .html')
-    add('--flat', type=_flat, metavar='ROW', help='pose with the robot level: its row, 1-based, '
-        'or first or last; it determines the mounting')
-    options.add_mounting(made)
-    options.share(made, '--keep-bad', '--prior', '--sensor-model', '--no-refine', '--json')
-    options.add_log(made)
-    options.add_capture(made)
+    _calibration_of_logs(made, '--prior', '--sensor-model', '--no-refine')
 
 
 def _thermal(made: options.Parser) -> None:
-    add = made.add_argument
-    add('logs', nargs='+', type=options.log_path, metavar='LOG', help='log of a still board whose '
+    made.add_argument(
+        'logs', nargs='+', type=options.log_path, metavar='LOG', help='log of a still board whose '
         'temperature changes; several are fitted together, and one of them may be of poses in '
         'many directions; - for standard input')
+    _calibration_of_logs(made)
+
+
+def _calibration_of_logs(made: options.Parser, *shared: str) -> None:
+    """Add the options of a command from logs to a calibration and a page beside it."""
+    add = made.add_argument
     add('-o', '--output', type=Path, default=Path('calibration.yaml'), metavar='FILE',
         help='calibration to write (default: %(default)s); the page has the same name with .html')
     add('--flat', type=_flat, metavar='ROW', help='pose with the robot level: its row, 1-based, '
         'or first or last; it determines the mounting')
     options.add_mounting(made)
-    options.share(made, '--keep-bad', '--json')
+    options.share(made, '--keep-bad', *shared, '--json')
     options.add_log(made)
     options.add_capture(made)
 

@@ -21,11 +21,11 @@ from .output import error_line, progress, short_if_known, table, Verdict, workin
 from ..calibrate import Calibration, Curve, GyroBias, NORM_MODELS, outlook
 from ..disk import STANDARD_OUTPUT
 from ..effects import AXES, effect_named
-from ..errors import InputError, saying, system_error
+from ..errors import InputError, system_error
 from ..findings import (
     calibration_json, curve_json, effect_figures, linear_figures, rate_refinement, refinement_json)
 from ..pipeline import (
-    calibrated, Intake, Outcome, Plan, ramp_or_poses, RampIntake, still_ramp, thermally_calibrated,
+    calibrated, calibrated_log, Intake, Outcome, Plan, ramp_or_poses, thermally_calibrated,
     ThermalOutcome)
 from ..stored import write_calibration
 from ..text import counted, listed, now, short, with_sd
@@ -56,11 +56,10 @@ def run_fit(args: argparse.Namespace) -> Done:
 def run_calibrate(args: argparse.Namespace) -> Done:
     """Calibrate, store, and write the page."""
     with intake(args, args.log) as found, working('fitting'):
-        ramp = still_ramp(args.log, log_options(args), found)
-        if ramp is not None:
-            return _thermal_done(args, [args.log], [ramp],
-                                 'its temperature changes: fitted as by accel-calib thermal')
-        outcome = calibrated(found.poses, found.units, plan_of(args))
+        outcome = calibrated_log(args.log, log_options(args), found, plan_of(args))
+    if isinstance(outcome, ThermalOutcome):
+        return _thermal_done(args, [args.log], outcome,
+                             'its temperature changes: fitted as by accel-calib thermal')
     calibration, refinement = outcome.calibration, outcome.refinement
     lines, stored = store(args, outcome)
     return Done(
@@ -78,28 +77,26 @@ def run_thermal(args: argparse.Namespace) -> Done:
     for path in args.logs:
         with progress('samples') as moved:
             found.append(ramp_or_poses(path, log_options(args), settings(args), moved))
-    return _thermal_done(args, args.logs, found)
+    with working('fitting'):
+        outcome = thermally_calibrated(found, Plan(**given(Plan, args)))
+    return _thermal_done(args, args.logs, outcome)
 
 
-def _thermal_done(args: argparse.Namespace, logs: Sequence[Path],
-                  found: Sequence[Intake | RampIntake], *notes: str) -> Done:
-    """Fit, store, write the page, and return what is done, with further notes on the logs."""
-    lines = [*(line for each in found for line in each.lines), *notes]
-    read_as = ', '.join(dict.fromkeys(each.read_as for each in found if each.read_as))
-    plan = Plan(**{**given(Plan, args), 'rows': None, 'fleet': None, 'refined': False})
-    with saying(read_as), working('fitting'):
-        outcome = thermally_calibrated(found, plan)
-    calibration, is_whole = outcome.calibration, any(isinstance(each, Intake) for each in found)
-    (left_out, stored), names = store(args, outcome), ', '.join(map(str, logs))
+def _thermal_done(args: argparse.Namespace, logs: Sequence[Path], outcome: ThermalOutcome,
+                  *notes: str) -> Done:
+    """Store, write the page, and return what is done, with further notes on the logs."""
+    calibration, (left_out, stored) = outcome.calibration, store(args, outcome)
+    lines = [*(line for each in outcome.logs for line in each.lines), *notes]
+    is_whole = any(isinstance(each, Intake) for each in outcome.logs)
 
     def page() -> str:
         from ..report import thermal_page
 
-        return thermal_page(outcome, names, stored=str(args.output), notes=lines)
+        return thermal_page(outcome, list(map(str, logs)), stored=str(args.output), notes=lines)
 
     return Done(
         {'file': list(logs), **calibration_json(calibration, outlook(calibration, 'auto')),
-         'read_as': read_as, 'read_lines': lines, 'thermal': curve_json(outcome.curve)},
+         'read_as': outcome.read_as, 'read_lines': lines, 'thermal': curve_json(outcome.curve)},
         [*lines, *_curve_lines(outcome.curve),
          *(calibration_lines(calibration) if is_whole else _notes(calibration)), *left_out,
          *page_beside(args, page)],
@@ -133,15 +130,7 @@ def status_of(outcome: Outcome | ThermalOutcome) -> int:
 
 
 def plan_of(args: argparse.Namespace, **more: Any) -> Plan:
-    """
-    Return how to calibrate.
-
-    Raises
-    ------
-    InputError
-        If ``--prior`` stands with another model.
-
-    """
+    """Return how to calibrate; raise InputError if ``--prior`` stands with another model."""
     plan = Plan(**{**given(Plan, args), 'fleet': prior(args), 'also': args.own, **more})
     usual = plan.model in ('auto', NORM_MODELS[-1]) and plan.method == 'ml'
     if plan.fleet is not None and not usual:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, ExitStack
 from dataclasses import dataclass, field, fields, replace
 from importlib import import_module
 import json
@@ -68,22 +68,9 @@ class Done:
     """
     What a command has done for one input.
 
-    Parameters
-    ----------
-    result : mapping
-        The result for JSON, besides the rating.
-    shown : iterable
-        Texts and tables for the terminal; they are made when they are printed.
-    rating : Rating, optional
-        The rating, which follows them.
-    status : int
-        Exit status.
-    stored : sequence of Path
-        The files written.
-    page : function, optional
-        Returns the page, if one is asked for.
-    refusal : tuple of str
-        Why the file of ``-o`` is not written, and what to do; empty if it is written.
+    `result` is the JSON, and `shown` are texts and tables for the terminal, which are made when
+    they are printed; the rating follows both. `stored` are the files written. `page` returns the
+    page, if one is asked for. `refusal` is why the file of ``-o`` is not written, and what to do.
 
     """
 
@@ -112,29 +99,15 @@ class Target(NamedTuple):
 
 def run(args: argparse.Namespace) -> int:
     """
-    Run a command.
+    Run a command, and return the exit status.
 
-    Parameters
-    ----------
-    args : Namespace
-        The arguments, and the name of the command.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    Raises
-    ------
-    AccelCalibError
-        If the input is not valid; ``--json`` then has the error, too.
-    OSError
-        If a file cannot be read or written.
+    AccelCalibError is raised if the input is not valid, and OSError if a file cannot be read or
+    written; ``--json`` then has the error, too.
 
     """
     each = _for_each(args)
     _check_targets(args, each)
-    if getattr(args, 'report', None) or COMMANDS[args.command].writes == 'page':
+    if _page_of(args) is not None:
         from ..report import check_matplotlib
 
         check_matplotlib()
@@ -147,13 +120,18 @@ def _function(kind: str, command: str) -> Callable[[Any], Any]:
     return function
 
 
+def _page_of(args: argparse.Namespace) -> Path | None:
+    """Return the page that is asked for."""
+    name = 'output' if COMMANDS[args.command].writes == 'page' else 'report'
+    page: Path | None = getattr(args, name, None)
+    return page
+
+
 def _done(args: argparse.Namespace) -> Done:
     """Run the command for one input, with the own effects of the user, and draw its page."""
-    path = getattr(args, 'also', None)
+    path, page = getattr(args, 'also', None), _page_of(args)
     args.own = () if path is None else know_file(path)
     done: Done = _function('run', args.command)(args)
-    is_page = COMMANDS[args.command].writes == 'page'
-    page = args.output if is_page else getattr(args, 'report', None)
     if page is not None and done.page is not None:
         from ..report import write_page
 
@@ -220,10 +198,7 @@ def _in_parallel(function: Any, items: Sequence[Any], jobs: int) -> list[Any]:
 
     from ..session import WorkerProcess
 
-    workers = [WorkerProcess(idle=False) for _ in range(min(jobs, len(items)))]
-    free: SimpleQueue[WorkerProcess] = SimpleQueue()
-    for worker in workers:
-        free.put(worker)
+    count, free = min(jobs, len(items)), SimpleQueue[WorkerProcess]()
 
     def one(item: Any) -> Any:
         worker = free.get()
@@ -232,12 +207,10 @@ def _in_parallel(function: Any, items: Sequence[Any], jobs: int) -> list[Any]:
         finally:
             free.put(worker)
 
-    with ThreadPoolExecutor(len(workers)) as pool:
-        try:
-            return list(pool.map(one, items))
-        finally:
-            for worker in workers:
-                worker.close()
+    with ThreadPoolExecutor(count) as pool, ExitStack() as workers:
+        for _ in range(count):
+            free.put(workers.enter_context(closing(WorkerProcess(idle=False))))
+        return list(pool.map(one, items))
 
 
 def rated(rating: Rating, args: argparse.Namespace) -> dict[str, Any]:
@@ -320,7 +293,9 @@ def _check_piped(args: argparse.Namespace, each: Sequence[argparse.Namespace]) -
 
 def _check_targets(args: argparse.Namespace, each: Sequence[argparse.Namespace]) -> None:
     _check_piped(args, each)
-    inputs = [path for name in _INPUTS for path in _paths(getattr(args, name, None))]
+    read = [getattr(args, name, None) for name in _INPUTS]
+    inputs = [path for value in read for path in (value if isinstance(value, list) else [value])
+              if isinstance(path, Path)]
     seen: dict[Path, str] = {}
     for target in _targets(args, each):
         if not target.kind and not target.path.exists():
@@ -335,21 +310,10 @@ def _check_targets(args: argparse.Namespace, each: Sequence[argparse.Namespace])
 
 def check_target(target: Target, inputs: Iterable[Path], *, force: bool) -> None:
     """
-    Check a file that is to be written.
+    Check a file that is to be written; with `force` it may replace one of another kind.
 
-    Parameters
-    ----------
-    target : Target
-        The file.
-    inputs : iterable of Path
-        Files that are read.
-    force : bool
-        Whether a file of another kind may be replaced.
-
-    Raises
-    ------
-    InputError
-        If its folder is missing, or it is an input, cannot be replaced or holds something else.
+    InputError is raised if its folder is missing, or it is one of the files that are read, cannot
+    be replaced, or holds something else.
 
     """
     option, path = target.option, target.path
@@ -369,11 +333,6 @@ def check_target(target: Target, inputs: Iterable[Path], *, force: bool) -> None
     if head.strip() and not re.match(_KINDS[target.kind], head):
         raise InputError(f'{option} {path} exists and is no {target.kind} of accel_calib, '
                          'expected a new file', 'choose another name, or replace it with --force')
-
-
-def _paths(value: object) -> list[Path]:
-    values = value if isinstance(value, list) else [value]
-    return [each for each in values if isinstance(each, Path)]
 
 
 # ----------------------------------------------------------------------------- inputs
@@ -420,15 +379,7 @@ def prior(args: argparse.Namespace) -> FleetPrior | None:
 
 
 def rows_between(poses: Poses, text: str | None) -> slice:
-    """
-    Return the rows ``A:B`` of a table, 1-based, inclusive; A and B are optional.
-
-    Raises
-    ------
-    InputError
-        If the text is not of this form, or the rows are not in the table.
-
-    """
+    """Return the rows ``A:B`` of a table, 1-based, inclusive; A and B are optional."""
     first, colon, last = (text or ':').partition(':')
     try:
         start, stop = int(first or 1), int((last if colon else first) or len(poses))

@@ -27,13 +27,10 @@ NOT_READ = 141
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """
-    Run a command.
+    Run a command, and return the exit status.
 
-    Returns
-    -------
-    int
-        Exit status: 0; 1 if a requested check fails; 2 for invalid input or an internal error,
-        with one line on standard error.
+    It is 0; 1 if a result is BAD or a requested check fails; 2 for invalid input or an internal
+    error, with one line on standard error.
 
     """
     with _leaving():

@@ -256,15 +256,7 @@ class _Lines:
 
 
 class _Screen:
-    """
-    A screen that is drawn again, with a bell for each captured pose.
-
-    Attributes
-    ----------
-    view : rich renderable or None
-        What it shows.
-
-    """
+    """A screen that is drawn again, with a bell for each captured pose; it shows `view`."""
 
     def __init__(self, live: Live, bell: bool) -> None:
         self._live, self._bell = live, bell
@@ -282,16 +274,9 @@ class _Screen:
 
 def screen(node: str, progress: Progress | None, problem: str = '') -> RenderableType:
     """
-    Return the screen.
+    Return the screen of a calibrator by its full name; `progress` is None before any message.
 
-    Parameters
-    ----------
-    node : str
-        Full name of the calibrator.
-    progress : Progress or None
-        Its progress; None before the first message.
-    problem : str, optional
-        Why no messages arrive, and what to do.
+    `problem` is why no messages arrive, and what to do.
 
     """
     parts: list[RenderableType] = [Text(problem, style=f'bold {BAD}')] if problem else []

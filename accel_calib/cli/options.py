@@ -65,7 +65,8 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print one line, and exit with status 2."""
-        known = self._known()
+        known = [str(name) for action in self._actions
+                 for name in (*action.option_strings, *(action.choices or ()))]
         given = message.partition(' (choose')[0]
         wrong = re.findall(r"'([^']+)'", given) or [
             word.rstrip(':') for word in given.split() if word.startswith('-')]
@@ -85,11 +86,6 @@ class Parser(argparse.ArgumentParser):
                         if isinstance(action.choices, dict) and command in action.choices), self)
             own.error(f'unrecognized arguments: {" ".join(unknown)}')
         return args
-
-    def _known(self) -> list[str]:
-        """Return the options and the choices of this parser."""
-        return [str(name) for action in self._actions
-                for name in (*action.option_strings, *(action.choices or ()))]
 
 
 def positive(text: str) -> float:

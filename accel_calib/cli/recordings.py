@@ -24,7 +24,7 @@ from ..effects import parse_effect
 from ..errors import InputError
 from ..findings import rate_noise
 from ..logs import is_bag, open_log, OpenLog, Progress, write_blocks, write_table
-from ..pipeline import captured_from, corrected, Correction
+from ..pipeline import captured_from, Correction
 from ..table import Recording
 from ..text import counted
 from ..units import units_of
@@ -134,7 +134,7 @@ def _noise(args: argparse.Namespace) -> tuple[NoiseFigures, list[str]]:
             recording = _samples(log, args.recording, moved)
         lines, units = _read_lines(log), log.units
     if calibration:
-        recording = corrected(recording, calibration, units)
+        recording = Correction(calibration, units, recording.sensor)(recording)
         units = units_of('g') if units.is_native else units
     with progress('axes') as moved:
         return noise_of(recording, units, args.gravity, moved), lines

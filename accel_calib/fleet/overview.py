@@ -238,22 +238,17 @@ def table_of(rows: Sequence[Row]) -> tuple[Floats, Floats]:
             np.array([[row.get(f'{name}.sd') or 0.0 for name in NAMES] for row in rows], float))
 
 
-def odd_sensors(values: Mapping[str, Floats], deviations: Mapping[str, Floats] | None = None
-                ) -> list[Odd]:
+def odd_sensors(values: Mapping[str, Floats], deviations: Mapping[str, Floats]) -> list[Odd]:
     """
     Return the sensors of one model that are far from the others, the farthest first.
 
-    Parameters
-    ----------
-    values, deviations : mapping of str to (9,) array
-        Values by sensor, and their standard deviations; by default 0.
+    The (9,) values and standard deviations are by sensor.
 
     """
     if len(values) < FEWEST:
         return []
     names, table = list(values), np.array(list(values.values()))
-    own = np.zeros_like(table) if deviations is None else np.array([deviations[name]
-                                                                    for name in names])
+    own = np.array([deviations[name] for name in names])
     away = table - np.median(table, axis=0)
     spread = np.hypot(_MAD * np.median(np.abs(away), axis=0), own)
     far = np.abs(away) / np.maximum(spread, 1e-9)
@@ -329,17 +324,7 @@ def priors_of(sensors: Iterable[Typical]) -> dict[str, FleetPrior]:
 
 
 def estimated(values: Floats, covariances: Floats) -> Prior:
-    """
-    Return mean and covariance for another sensor of the fleet.
-
-    Parameters
-    ----------
-    values : (n, p) array
-        Values of n sensors.
-    covariances : (n, p, p) array
-        Their covariances.
-
-    """
+    """Return mean and covariance for another sensor, from (n, p) values and their covariances."""
     count, size = values.shape
     mean = np.median(values, axis=0)
     spread = np.median(np.abs(values - mean), axis=0) / 0.6745 + _LEAST_SPREAD_G

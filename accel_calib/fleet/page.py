@@ -13,8 +13,9 @@ does not show; `sensors.parquet` and the rows of the recordings have all of them
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from datetime import datetime, timezone
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import datetime
+from functools import partial
 from itertools import islice
 from typing import Any
 from urllib.parse import unquote
@@ -28,12 +29,13 @@ from .sensors import alike, Store
 from ..calibrate import FleetPrior
 from ..compare import NAMES
 from ..effects import MODELS, parameter_names
-from ..findings import change_in_words, CROSS, in_words, scale_of
+from ..findings import CROSS, scale_of
 from ..report.sheet import (
     ACCENT, add_band, AFTER, BAND, BEFORE, Drawing, drawn, EDGE, FAINT, figures, has_matplotlib,
     legend_below, listing, Mark, Marks, paragraph, rated_sheet, scroll_table, section, THIRD,
     write_page)
-from ..report.stability import GROUPS, label_dates, places_of, spoken
+from ..report.stability import (
+    change_words, GROUPS, label_dates, named_words, places_of, spoken)
 from ..table import Floats
 from ..text import counted, short, with_minus
 
@@ -56,6 +58,9 @@ _LASTING = {True: 'for good', False: 'this calibration only', None: 'newest'}
 
 _DRIFTS = 0.05
 """Probability below which a drift is stated."""
+
+_figures = partial(figures, script=False)
+"""The browser shows the text of a marker that is pointed at."""
 
 
 def write_fleet_page(store: Store, known: Overview, sensors: Sequence[Row],
@@ -159,8 +164,8 @@ def _change_lines(row: Row) -> Iterator[tuple[str, str, str, str]]:
         yield (sensor, f'{date} {path}'.strip(), _change_words(change),
                _LASTING[change['for_good']])
     if drift and drift['p_value'] < _DRIFTS:
-        words = change_in_words(drift['parameter'], drift['per_year'], drift['sd'])
-        yield sensor, '', f'{spoken(drift["parameter"])} {words} per year', 'drift'
+        words = change_words(drift['parameter'], drift['per_year'], drift['sd'])
+        yield sensor, '', f'{words} per year', 'drift'
     elif not row['changes']:
         yield sensor, '', 'no step or drift that is significant alone', ''
 
@@ -199,11 +204,6 @@ def _errors(known: Overview) -> str:
     count = sum(known.counts[status] for status in ('error', 'unread'))
     return scroll_table('Errors', ('recording', 'error', 'what to do'), rows, '',
                         long=len(rows) > _LONG) + _not_shown(count - len(rows), 'recording')
-
-
-def _figures(drawings: Iterable[Drawing]) -> str:
-    """Return figures; the browser shows the text of a marker that is pointed at."""
-    return figures(drawings, script=False)
 
 
 def _not_shown(count: int, what: str) -> str:
@@ -286,8 +286,7 @@ def _odd_words(known: OfModel, odd: Odd) -> str:
     """Return an odd sensor with its value."""
     sensor, name, value, far = odd
     sd = float(known.deviations[sensor][NAMES.index(name)])
-    return (f'{sensor}: {spoken(name)} {in_words(name, value, sd)}, {far:.0f} spreads '
-            'from the median')
+    return f'{sensor}: {named_words(name, value, sd)}, {far:.0f} spreads from the median'
 
 
 def _short_name(name: str) -> str:
@@ -330,7 +329,8 @@ def _of_sensor(name: str, sensor: str, rows: Sequence[Row], changes: Sequence[Ma
     values, deviations = table_of(shown)
     cross = np.any(deviations[:, [NAMES.index(name) for name in CROSS]])
     groups = [(key, names) for key, _, names in GROUPS if cross or names is not CROSS]
-    at, dated = places_of([_stamp(row['date']) for row in shown])
+    at, dated = places_of([datetime.fromisoformat(row['date']).timestamp() if row['date'] else None
+                           for row in shown])
     with drawn(0.9 + 1.15 * len(groups), _short_name(sensor), len(groups), sharex=True
                ) as (figure, panels):
         for panel, (key, names) in zip(panels, groups, strict=True):
@@ -373,13 +373,4 @@ def _mark_changes(panel: Any, rows: Sequence[Row], at: Floats,
 
 def _change_words(change: Mapping[str, Any]) -> str:
     """Return a change with its standard deviation."""
-    words = change_in_words(change['parameter'], change['change'], change['sd'])
-    return f'{spoken(change["parameter"])} {words}'
-
-
-def _stamp(date: str | None) -> float | None:
-    """Return a date as seconds since 1970; None without a date."""
-    if not date:
-        return None
-    when = datetime.fromisoformat(date.replace('Z', '+00:00'))
-    return when.replace(tzinfo=when.tzinfo or timezone.utc).timestamp()
+    return change_words(change['parameter'], change['change'], change['sd'])

@@ -51,14 +51,9 @@ _BLOCK = 1 << 20
 @dataclass(frozen=True)
 class Input:
     """
-    A recording that was found.
+    A recording that was found: its absolute path, or an address such as ``s3://bucket/a.mcap``.
 
-    Parameters
-    ----------
-    path : str
-        Absolute path, or address such as ``s3://bucket/a.mcap``.
-    inside : str
-        Its path below the folder or glob that was passed, with ``/``.
+    `inside` is its path below the folder or glob that was passed, with ``/``.
 
     """
 
@@ -70,17 +65,8 @@ def recordings(given: Iterable[str]) -> Iterator[Input]:
     """
     Yield the recordings of files, folders, globs, lists (``@list.txt``) and addresses.
 
-    Parameters
-    ----------
-    given : iterable of str
-        What the user passed.
-
-    Raises
-    ------
-    InputError
-        If one of them does not exist, or holds no recording.
-    OSError
-        If a list or a folder cannot be read.
+    InputError is raised if one of them does not exist or holds no recording, and OSError if a list
+    or a folder cannot be read.
 
     """
     for text in given:

@@ -85,18 +85,9 @@ class Summary:
     """
     What a run did.
 
-    Parameters
-    ----------
-    counts : mapping of str to int
-        Number of recordings by status: ok, error, unread, skipped.
-    sensors : tuple of dict
-        The rows of all sensors.
-    priors : mapping of str to FleetPrior
-        Typical values by model of sensor.
-    damaged : tuple of str
-        Damaged files of the results, under their new names; their content was made again.
-    rating : Rating
-        The verdict about the whole fleet.
+    `counts` are the recordings by status (`STATUS`), `sensors` the rows of all sensors, and
+    `priors` the typical values by model of sensor. `damaged` are damaged files of the results,
+    under their new names; their content was made again.
 
     """
 
@@ -356,12 +347,8 @@ def calibrate_recording(found: Input, options: Options, store: Store, limit_s: f
     """
     Calibrate one recording, add the result to the store, and return what happened to it.
 
-    Raises
-    ------
-    UnreadError
-        If it cannot be read, or takes longer than `limit_s` [s].
-    OSError
-        If the result cannot be written.
+    UnreadError is raised if it cannot be read or takes longer than `limit_s` [s], and OSError if
+    the result cannot be written.
 
     """
     begin = time.perf_counter()

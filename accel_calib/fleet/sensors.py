@@ -61,19 +61,14 @@ UNREAD = '~unread'
 
 _DATA = 'data.parquet'
 _SENSORS = 'sensors.parquet'
+_NEEDED: dict[str, tuple[str, ...]] = {
+    _SENSORS: ('sensor',), _DATA: ('key', 'content', 'recording', 'date', 'status')}
+"""Columns without which a row is damaged, by the name of the file."""
 
 
 @dataclass(frozen=True)
 class Store:
-    """
-    The folder of the results.
-
-    Parameters
-    ----------
-    folder : Path
-        The folder; all workers must see it under this name.
-
-    """
+    """The folder of the results; all workers must see it under this name."""
 
     folder: Path
 
@@ -114,10 +109,7 @@ class Store:
         """
         Add the pending rows of a sensor, by the name of its folder, to its Parquet file.
 
-        Raises
-        ------
-        OSError
-            If a file cannot be written. The next `merge` completes it.
+        If it raises OSError, the next `merge` completes it.
 
         """
         folder = self.pending / name
@@ -201,32 +193,38 @@ def write_parquet(path: Path, rows: list[Row], columns: pa.Schema) -> None:
 
     path.parent.mkdir(parents=True, exist_ok=True)
     table = pa.Table.from_pylist(rows, columns)
-    write_atomically(path, lambda file: pq.write_table(table, file.buffer))
+    write_atomically(path, lambda file: pq.write_table(table, file.buffer,
+                                                       write_page_checksum=True))
 
 
 def read_parquet(path: Path, columns: Sequence[str] | None = None) -> list[Row]:
     """Return the rows of a Parquet file, with all columns or these; none without a file."""
     import pyarrow.parquet as pq
 
-    return pq.ParquetFile(path).read(columns).to_pylist() if path.exists() else []
+    if not path.exists():
+        return []
+    return pq.ParquetFile(path, page_checksum_verification=True).read(columns).to_pylist()
 
 
 def is_damaged(path: Path) -> bool:
-    """Return whether a file of `Store.files` cannot be read; raise OSError of the disk."""
+    """Return whether a file of `Store.files`, or a row of it, is damaged; OSError is raised."""
     import pyarrow as pa
 
+    needed = _NEEDED.get(path.name, (*_NEEDED[_DATA], 'sensor'))
+    if path.parent.name == f'sensor={UNREAD}':
+        needed = ('recording', 'status')
     try:
-        if path.suffix != '.json':
-            read_parquet(path)
-            return False
-        row = json.loads(path.read_text(encoding='utf-8'))
-        pa.Table.from_pylist([row], schema())
-        return not row.keys() >= {'sensor', 'key', 'content', 'date', 'recording'}
+        if path.suffix == '.json':
+            rows = [json.loads(path.read_text(encoding='utf-8'))]
+            pa.Table.from_pylist(rows, schema())
+        else:
+            rows = read_parquet(path)
+        return any(row[name] is None for row in rows for name in needed)
     except OSError as err:
         if err.errno is not None:
             raise
         return True
-    except (ValueError, TypeError, AttributeError, pa.ArrowException):
+    except (ValueError, TypeError, AttributeError, LookupError, pa.ArrowException):
         return True
 
 

@@ -62,8 +62,7 @@ _HOW_TO_READ = (
     'orientation is known or shared. The noise floor is the expected residual of a correct model.',
     'Of new poses (held out): each pose is predicted from a fit of the others.',
     'Maps have equal areas and show each hemisphere from above its pole: the direction of up in '
-    'the sensor axes. A hollow square is a pose that was left out.',
-)
+    'the sensor axes. A hollow square is a pose that was left out.')
 _HOW_TO_READ_THERMAL = (
     'Each marker is the mean of a short stretch of the log, minus that of the board at the '
     'reference temperature. One orientation shows only this change, not the offset itself.',
@@ -77,8 +76,7 @@ _HOW_TO_READ_STEPS = (
     'If the held-out residual decreases together with the residual, the effect is in the sensor '
     'and not an artefact of the fit.',
     'p is the probability that noise alone makes one of all candidates this good.',
-    'Rivals are effects that these poses cannot distinguish from the named effect.',
-)
+    'Rivals are effects that these poses cannot distinguish from the named effect.')
 _STEP = 1e-6
 _SAME = 1e-9
 _PAIRS = ((0, 1), (0, 2), (1, 2))
@@ -154,7 +152,7 @@ def calibration_page(calibration: Calibration, rating: Rating, source: str, *,
                        more='' if used is None else verdict_words(used))
 
 
-def thermal_page(outcome: ThermalOutcome, source: str, *, stored: str = STORED,
+def thermal_page(outcome: ThermalOutcome, sources: Sequence[str], *, stored: str = STORED,
                  notes: Sequence[str] = ()) -> str:
     """
     Return the page of a calibration of the offset over temperature as HTML.
@@ -163,16 +161,15 @@ def thermal_page(outcome: ThermalOutcome, source: str, *, stored: str = STORED,
     ----------
     outcome : ThermalOutcome
         The calibration with its curve.
-    source : str
-        Names of the logs.
-    stored : str
-        File of the calibration, for the lines that use it.
-    notes : sequence of str
-        How the logs were read.
+    sources : sequence of str
+        Files of the logs.
+    stored, notes
+        As in `calibration_page`.
 
     """
     calibration, curve = outcome.calibration, outcome.curve
-    title = f'Offset over temperature of {calibration.sensor or Path(source).name or source}'
+    names = ', '.join(Path(source).name for source in sources)
+    title = f'Offset over temperature of {calibration.sensor or names}'
     body = [_curve_numbers(curve),
             section('Offset over temperature', figures(
                 _of_axis(curve, axis) for axis in range(3)), HINT),
@@ -186,8 +183,9 @@ def thermal_page(outcome: ThermalOutcome, source: str, *, stored: str = STORED,
             section('Use it', *(block(name, text) for name, text in snippets(
                 calibration, stored))),
             section('How the log was read', listing(notes)), how_to_read(*_HOW_TO_READ_THERMAL)]
-    return rated_sheet(title, [source, f'fitted {calibration.date}' if calibration.date else ''],
-                       outcome.rating, body)
+    return rated_sheet(title, [
+        ', '.join(sources), f'fitted {calibration.date}' if calibration.date else ''],
+        outcome.rating, body)
 
 
 def _curve_numbers(curve: Curve) -> str:
@@ -243,9 +241,8 @@ def _is_refined(calibration: Calibration, refinement: Refinement | None) -> bool
     """Return whether a calibration is that of a refinement, perhaps levelled since."""
     if refinement is None:
         return False
-    own, refined = calibration.model.values, refinement.calibration.model.values
-    return own.keys() == refined.keys() and all(
-        np.array_equal(own[name], refined[name]) for name in own)
+    own, refined = calibration.model, refinement.calibration.model
+    return own.effects == refined.effects and np.array_equal(own.vector, refined.vector)
 
 
 # ----------------------------------------------------------------------------- the calibration

@@ -125,15 +125,7 @@ def all_drawings(result: Refinement) -> Iterator[Drawing]:
 
 
 def write_figures(folder: Path, result: Refinement) -> list[Path]:
-    """
-    Write all figures as SVG and PNG, and return the paths.
-
-    Raises
-    ------
-    OSError
-        If the folder cannot be written.
-
-    """
+    """Write all figures as SVG and PNG, and return the paths; raise OSError if it fails."""
     folder.mkdir(exist_ok=True)
     paths = []
     for drawing in all_drawings(result):
@@ -176,16 +168,9 @@ class CurvePart:
     """
     One part of an empirical curve: an axis, a pair of axes, or all.
 
-    Parameters
-    ----------
-    name : str
-        Name of the part.
-    at : (g,) array
-        Values of the variable.
-    change, deviation : (g,) array
-        Change of the reading from the mean over the poses, and its standard deviation [g, g/g].
-    poses : (n,) array
-        Value of the variable at each pose.
+    `at` are (g,) values of the variable. `change` and `deviation` are the (g,) change of the
+    reading from the mean over the poses, and its standard deviation [g, g/g]. `poses` is the (n,)
+    variable at each pose.
 
     """
 

@@ -49,16 +49,9 @@ _SPANS = (('h', 3600.0), ('min', 60.0), ('s', 1.0))
 @dataclass(frozen=True)
 class Variable:
     """
-    A variable for the horizontal axis.
+    A variable for the horizontal axis, with its (n,) values, one per pose.
 
-    Parameters
-    ----------
-    label : str
-        Name and unit.
-    values : (n,) array
-        One value per pose.
-    unit_range : bool
-        Whether the range is -1 to 1 by definition.
+    `unit_range` is whether the range is -1 to 1 by definition.
 
     """
 
@@ -72,16 +65,8 @@ def variables_of(effect: str, poses_g: Poses, force: Floats, shape: Floats | Non
     """
     Return the variables that an effect depends on: one variable, or one per axis.
 
-    Parameters
-    ----------
-    effect : str
-        Name of the effect in the model.
-    poses_g : Poses
-        The poses, in g.
-    force : (n, 3) array
-        Force of each pose [g].
-    shape : (s,) array, optional
-        Shape of the effect, such as a lag; by default zeros.
+    `force` is the (n, 3) force of the poses [g], and `shape` the (s,) shape of the effect, such as
+    a lag; by default zeros.
 
     """
     found = effect_named(effect)
@@ -147,7 +132,7 @@ class Residuals:
     reasons : mapping of int to str
         Reason by row for the poses left out.
     signed : bool
-        Whether `after_mg` is signed, because only |force| is known.
+        Whether `after_mg` is signed.
 
     """
 
@@ -171,17 +156,7 @@ class Residuals:
 
 
 def residuals_of(calibration: Calibration, poses: Poses | None = None) -> Residuals:
-    """
-    Return the residuals of a calibration.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        The calibration.
-    poses : Poses, optional
-        The poses, in the unit of the calibration; by default the poses of the calibration.
-
-    """
+    """Return the residuals of a calibration on poses in its unit, by default on its own."""
     own = calibration.poses if poses is None else poses
     model, units = calibration.model, calibration.units
     poses_g = calibration.held(with_history(in_g(own, units), model))

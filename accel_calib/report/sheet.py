@@ -146,18 +146,8 @@ def scroll_table(name: str, head: Iterable[str], rows: Sequence[Iterable[str]],
     """
     Return a table that scrolls inside of the page; nothing without rows.
 
-    Parameters
-    ----------
-    name : str
-        Name for those who do not see the table.
-    head, rows : iterable of str, sequence of iterable of str
-        Names of the columns, and the cells.
-    kind : str
-        CSS class of the table.
-    long : bool
-        Whether it also scrolls up and down.
-    poses : sequence of int
-        Row of the pose of each line, which a marker highlights.
+    `name` is for those who do not see the table, and `kind` its CSS class. A `long` one also
+    scrolls up and down. `poses` is the row of the pose of each line, which a marker highlights.
 
     """
     return (f'<div class="scroll{" long" if long else ""}" tabindex="0" role="region" '
@@ -250,17 +240,9 @@ class Drawing:
     """
     A figure of a page.
 
-    Parameters
-    ----------
-    name : str
-        Name of the file, without suffix; unique on the page.
-    title : str
-        Description for those who do not see the figure.
-    figure : Figure
-        The figure.
-    hover : mapping of str to tuple of Mark
-        For each named group of markers, one text per marker, in the order in which they are
-        drawn.
+    `name` is that of the file, without suffix, and unique on the page. `title` is for those who do
+    not see the figure. `hover` has one text per marker for each named group of markers, in the
+    order in which they are drawn.
 
     """
 
@@ -296,18 +278,8 @@ def drawn(height_inches: float, title: str = '', rows: int = 1, columns: int = 1
     """
     Yield a new figure and its panels, to be drawn in the style of all figures.
 
-    Parameters
-    ----------
-    height_inches, width_inches : float
-        Size.
-    title : str
-        Title, in which $ is no mathematics.
-    rows, columns : int
-        Number of panels.
-    grid : {'both', 'x', 'y', ''}
-        Axes with a grid.
-    **shared
-        Axes that the panels share, as in ``Figure.subplots``.
+    In the title, $ is no mathematics. `grid` are the axes with a grid. `shared` are those that the
+    panels share, as in ``Figure.subplots``.
 
     """
     from matplotlib.figure import Figure

@@ -54,8 +54,7 @@ _HOW_TO_READ_NOISE = (
     'and is K/√3 on that line at τ = 1 s (IEEE Std 952 and 1293).',
     'Data sheets state the noise density for positive frequencies alone, which is √2 N. Kalibr '
     'and VINS use N.',
-    'Bands are 95 % intervals. At long τ few averages remain, and the bands are wide.',
-)
+    'Bands are 95 % intervals. At long τ few averages remain, and the bands are wide.')
 
 
 def noise_page(found: NoiseFigures, source: str) -> str:
@@ -178,9 +177,14 @@ def spoken(name: str) -> str:
     return name.replace('.', ' ')
 
 
-def _named_words(name: str, value: float, sd: float) -> str:
+def named_words(name: str, value: float, sd: float) -> str:
     """Return a parameter with its name, such as ``offset x +20.3 ± 0.1 mg``."""
     return f'{spoken(name)} {in_words(name, value, sd)}'
+
+
+def change_words(name: str, change: float, sd: float) -> str:
+    """Return the change of a parameter with its name."""
+    return f'{spoken(name)} {change_in_words(name, change, sd)}'
 
 
 def of_parameters(comparison: Comparison, labels: Sequence[str]) -> Iterator[Drawing]:
@@ -210,7 +214,7 @@ def _draw_parameters(panel: Any, found: Sequence[Parameter], labels: Sequence[st
         colour = _COLOURS[run % len(_COLOURS)]
         panel.vlines(at, (change - band) * factor, (change + band) * factor, color=colour)
         panel.plot(at, change * factor, 'o', color=colour, gid=f'run{run}', label=label, **EDGE)
-        hover[f'run{run}'] = tuple(Mark(f'{label}, ' + _named_words(
+        hover[f'run{run}'] = tuple(Mark(f'{label}, ' + named_words(
             each.name, each.values[run], each.stated_sd[run])) for each in found)
     panel.set_xticks(range(len(found)), [each.name.partition('.')[2] for each in found])
     panel.set_ylabel(scale_of(found[0].name)[2])
@@ -280,7 +284,7 @@ def _draw_line(panel: Any, each: Parameter, at: Floats, warm: Floats | None) -> 
 def _marks(history: History, each: Parameter) -> Marks:
     """Return date, value and temperature of each calibration."""
     return tuple(Mark(
-        f'{label}, {_named_words(each.name, value, sd)}'
+        f'{label}, {named_words(each.name, value, sd)}'
         + ('' if moment.temperature is None else f', {moment.temperature:.0f} °C'))
         for label, moment, value, sd in zip(history.labels, history.moments, each.values,
                                             each.stated_sd, strict=True))
@@ -307,27 +311,12 @@ _HOW_TO_READ = (
     'The test uses all parameters at once and each one alone. p is the probability of differences '
     'at least this large, if the sensor has not changed.',
     'RMS and largest: difference of |force| from the mean of the other calibrations, over all '
-    'directions.',
-)
+    'directions.')
 
 
 def comparison_page(comparison: Comparison, rating: Rating, sources: Sequence[Path],
                     calibrations: Sequence[Calibration]) -> str:
-    """
-    Return the page of a comparison as HTML.
-
-    Parameters
-    ----------
-    comparison : Comparison
-        The comparison.
-    rating : Rating
-        The verdict.
-    sources : sequence of Path
-        Files of the calibrations.
-    calibrations : sequence of Calibration
-        The calibrations that were compared.
-
-    """
+    """Return the page of a comparison of the calibrations in the files `sources`, as HTML."""
     labels = [f'{k} {source.name}' for k, source in enumerate(sources, 1)]
     title = f'Comparison of {len(calibrations)} calibrations{_of_sensor(calibrations)}'
     body = [section('Calibrations', _runs(comparison, calibrations, labels)),
@@ -374,19 +363,7 @@ def _notes(comparison: Comparison) -> Iterator[str]:
 
 def history_page(history: History, sources: Sequence[Path],
                  calibrations: Sequence[Calibration]) -> str:
-    """
-    Return the page of a history as HTML.
-
-    Parameters
-    ----------
-    history : History
-        The history.
-    sources : sequence of Path
-        Files of the calibrations.
-    calibrations : sequence of Calibration
-        The calibrations, as given to `accel_calib.compare.history_of`.
-
-    """
+    """Return the page of a history of the calibrations in the files `sources`, as HTML."""
     body = [section('Over the dates', figures(of_history(history)), HINT),
             section('Changes', _changes(history)),
             section('Calibrations', _moments(history, sources)),
@@ -401,8 +378,7 @@ def _changes(history: History) -> str:
     head = ('from', 'to', 'verdict', 'p', 'largest change', 'RMS [mg]')
     rows = [(first, second, f'{"agree" if change.comparison.agree else "differ"}, '
              f'{rate_comparison(change.comparison).name}', f'{change.comparison.p_value:.2g}',
-             f'{spoken(change.parameter)} ' + change_in_words(
-                 change.parameter, change.change, change.sd),
+             change_words(change.parameter, change.change, change.sd),
              short(change.comparison.runs[1].rms_mg))
             for first, second, change in zip(history.labels, history.labels[1:], history.changes,
                                              strict=False)]

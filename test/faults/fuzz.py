@@ -61,7 +61,6 @@ LONGEST_LINE = 700
 """Longest error message about a calibration [characters]."""
 
 _LIMIT_S = 60
-_SHOWN_EVERY = 10_000
 _SHOWN = 500
 _MEMORY = Path('/dev/shm')
 _NOT_SHOWN = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)
@@ -300,35 +299,20 @@ def main() -> int:
     parser.add_argument('--count', type=int, default=1000)
     parser.add_argument('--seed', type=int, default=1)
     args = parser.parse_args()
-    found: Counter[str] = Counter()
+    found: set[str] = set()
     for kind in KINDS if 'all' in args.kinds else args.kinds:
-        _show(kind, args.count, args.seed, found)
-    return int(bool(set(found) - {'read', 'refused'}))
-
-
-def _show(kind: str, count: int, seed: int, found: Counter[str]) -> None:
-    """Run the cases of a kind, print the outcomes, and add them to those found."""
-    counts: Counter[str] = Counter()
-    start = last = time.monotonic()
-    slowest = (0.0, 0)
-    for case, outcome in outcomes(kind, count, seed):
-        now = time.monotonic()
-        slowest, last = max(slowest, (now - last, case)), now
-        sound = outcome in ('read', 'refused')
-        key = outcome if sound else re.sub(r'[\dxa-f]+', '0', outcome)[:80]
-        if not sound and not found[key]:
-            _say(f'{kind}, case {case}: {outcome[:_SHOWN]}')
-        found[key] += 1
-        counts[outcome if sound else 'finding'] += 1
-        if not (case + 1) % _SHOWN_EVERY:
-            _say(f'{kind}: {case + 1} {dict(counts)}')
-    _say(f'{kind}: {dict(counts)}, {count / (time.monotonic() - start):.0f} per second, the '
-         f'slowest is case {slowest[1]} with {slowest[0]:.2f} s')
-
-
-def _say(line: str) -> None:
-    sys.stdout.write(f'{line}\n')
-    sys.stdout.flush()
+        counts, start = Counter[str](), time.monotonic()
+        for case, outcome in outcomes(kind, args.count, args.seed):
+            if outcome not in ('read', 'refused'):
+                finding = re.sub(r'[\dxa-f]+', '0', outcome)[:80]
+                if finding not in found:
+                    sys.stdout.write(f'{kind}, case {case}: {outcome[:_SHOWN]}\n')
+                found.add(finding)
+                outcome = 'finding'
+            counts[outcome] += 1
+        sys.stdout.write(f'{kind}: {dict(counts)} in {time.monotonic() - start:.0f} s\n')
+        sys.stdout.flush()
+    return int(bool(found))
 
 
 if __name__ == '__main__':

@@ -5,12 +5,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from importlib.util import find_spec
-import os
 from pathlib import Path
 import struct
-import warnings
 
 from accel_calib.errors import InputError
 from accel_calib.logs import read_log
@@ -32,16 +29,6 @@ def test_a_damaged_file_ends_in_a_result_or_in_one_line(kind: str) -> None:
     found = dict(outcomes(kind, CASES, seed=5))
     assert not {case: each for case, each in found.items() if each not in ('read', 'refused')}
     assert {*found.values()} == {'read', 'refused'}
-
-
-@pytest.mark.parametrize(('read', 'finding'), [
-    (lambda path, rng: os.write(2, b'by C'), 'prints by C'),
-    (lambda path, rng: warnings.warn('too large', stacklevel=1), 'prints UserWarning: too'),
-    (lambda path, rng: 1 // 0, 'ZeroDivisionError')])
-def test_the_trials_notice_what_a_reader_prints_and_raises(
-        read: Callable[..., object], finding: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(KINDS, 'bad', (lambda: inputs.random_table, read))
-    assert all(outcome.startswith(finding) for _, outcome in outcomes('bad', 3, seed=1))
 
 
 def test_a_damaged_flight_log_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]
