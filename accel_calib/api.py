@@ -26,8 +26,7 @@ from .findings import figures_of, rate, Rating
 from .geometry import spread_directions
 from .logs import (
     are_untimed_samples, Frame, LogOptions, read_log, read_recording as read_whole_recording)
-from .pipeline import (
-    calibrated, calibrated_log, captured_from, Flat, options_for, Plan, poses_of)
+from .pipeline import calibrated, calibrated_log, captured_from, Flat, options_for, Plan, poses_of
 from .refine import refine as find_effects, Refinement
 from .stored import read_calibration, write_calibration
 from .table import (

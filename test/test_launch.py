@@ -352,4 +352,3 @@ def test_parameters_of_other_packages_have_their_names(started: Any) -> None:
 def test_launch_finds_the_arguments_of_each_file(name: str, more: set[str]) -> None:
     pytest.importorskip('launch_ros', reason='not on PyPI')
     assert {each.name for each in described(name).get_launch_arguments()} == ARGUMENTS | more
-

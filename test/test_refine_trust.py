@@ -15,8 +15,7 @@ from accel_calib.refine import refine, verdict_words
 from accel_calib.stored import write_calibration
 from accel_calib.units import units_of
 import generator
-from inside import (
-    advice_for, Model, model_with, rotation_from_rpy, search_effects, simulate_poses)
+from inside import advice_for, Model, model_with, rotation_from_rpy, search_effects, simulate_poses
 import numpy as np
 import pandas as pd
 import pytest

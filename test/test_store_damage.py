@@ -17,8 +17,7 @@ from typing import Any
 from accel_calib.errors import InputError, StoredCalibrationError
 from accel_calib.session import Level
 from accel_calib.stored import read_calibration
-from inside import (
-    aside, Identity, Lock, MOST_BYTES, SensorStore, spread_directions, store_of)
+from inside import aside, Identity, Lock, MOST_BYTES, SensorStore, spread_directions, store_of
 import numpy as np
 import pytest
 from test_session import Driver

@@ -22,6 +22,7 @@ from inside import model_with, simulate_recording, spread_directions
 import numpy as np
 import pytest
 from shared import run
+
 SENSOR = {'offset': (0.05, -0.03, 0.08), 'axis_gain': (0.02, -0.03, 0.01),
           'cross_axis': (0.004, -0.003, 0.002)}
 METRIC = ('g', 'm/s2')

@@ -16,7 +16,8 @@ from .calibration import (
     Calibration, check_sensor, converted, FLEET, of_samples, Outside, outside, PRIOR, Quality,
     Rejected, RejectedKind, SampleContext, STORED_METHODS, thermal_stream, USES_LIMIT,
     with_history, with_previous)
-from .fit import directions_of, fit_poses, fit_unknown, only_norm, rejected_by, sound_rows, sure_rows
+from .fit import (
+    directions_of, fit_poses, fit_unknown, only_norm, rejected_by, sound_rows, sure_rows)
 from .mounting import (
     angle_words, flat_direction, in_frame, level, level_by_rows, mounting_figures, mounting_of,
     mounting_words, on_topics, set_heading, with_given_mounting)
@@ -42,6 +43,7 @@ __all__ = ['FLEET', 'LARGEST_DILUTION', 'LARGEST_OFFSET_G', 'NORM_MODELS', 'OF_A
            'level', 'level_by_rows', 'lies_in_cone', 'mounting_figures', 'mounting_of',
            'mounting_only', 'mounting_words', 'next_pose', 'of_samples', 'on_topics', 'only_norm',
            'outlook', 'outside', 'posterior', 'quality_of', 'record_of', 'refuse_if_unfit',
-           'rejected_by',           'sample_noise_of', 'set_heading', 'sound_rows', 'sure_rows', 'thermal_alone',
-           'thermal_stream', 'uncertainty_g', 'verify', 'with_curve', 'with_given_mounting',
-           'with_history', 'with_previous', 'with_rest_noise', 'without_curve']
+           'rejected_by', 'sample_noise_of', 'set_heading', 'sound_rows', 'sure_rows',
+           'thermal_alone', 'thermal_stream', 'uncertainty_g', 'verify', 'with_curve',
+           'with_given_mounting', 'with_history', 'with_previous', 'with_rest_noise',
+           'without_curve']

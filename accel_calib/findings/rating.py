@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .figures import (
-    BAD_ERROR, BOUND, CHANGED, COVERED, degrees, depends_on, Expected, GOOD_ERROR,
-    HIDDEN, LEFT_OUT, MATTERS, mg, NEAR_FLAT, number, PER_OUTLIER, SPAN, TILT, TO_CHECK,
-    without_noise, WORST_ERROR)
+    BAD_ERROR, BOUND, CHANGED, COVERED, degrees, depends_on, Expected, GOOD_ERROR, HIDDEN,
+    LEFT_OUT, MATTERS, mg, NEAR_FLAT, number, PER_OUTLIER, SPAN, TILT, TO_CHECK, without_noise,
+    WORST_ERROR)
 from ..calibrate import Calibration, directions_in, flat_direction, Verification
 from ..effects import EMPIRICAL, WANDER
 from ..errors import TAKE_ALL_SIDES

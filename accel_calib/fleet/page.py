@@ -34,8 +34,7 @@ from ..report.sheet import (
     ACCENT, add_band, AFTER, BAND, BEFORE, Drawing, drawn, EDGE, FAINT, figures, has_matplotlib,
     legend_below, listing, Mark, Marks, paragraph, rated_sheet, scroll_table, section, THIRD,
     write_page)
-from ..report.stability import (
-    change_words, GROUPS, label_dates, named_words, places_of, spoken)
+from ..report.stability import change_words, GROUPS, label_dates, named_words, places_of, spoken
 from ..table import Floats
 from ..text import counted, short, with_minus
 

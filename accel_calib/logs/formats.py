@@ -33,6 +33,7 @@ FLIGHT_LOG = re.compile(rb'\A(?:' + re.escape(ULOG) + b'|' + re.escape(DATAFLASH
 
 _STANDARD_ERROR = 2
 
+
 @contextmanager
 def sound_log(path: Path, expected: str, advice: str = 'copy it from the vehicle again'
               ) -> Iterator[None]:

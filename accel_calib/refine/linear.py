@@ -124,7 +124,7 @@ class Linear:
 
     @cached_property
     def poses(self) -> int:
-        """Number of poses."""
+        """Return the number of poses."""
         return int(self.pose.max()) + 1
 
     @cached_property

@@ -27,7 +27,7 @@ import io
 import json
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, TextIO, TYPE_CHECKING
+from typing import Any, TextIO, TYPE_CHECKING, TypeGuard
 
 import numpy as np
 
@@ -242,11 +242,11 @@ def _noise_figures(noise: Noise | None, label: str) -> tuple[dict[str, float], t
                              f'{label} needs a positive number', 'record a longer rest and run '
                              'accel-calib noise again, or write the figure of the data sheet into '
                              'the file')
-        figures[key] = float(value)
+        figures[key] = value
     return figures, tuple(notes)
 
 
-def _is_positive(value: object) -> bool:
+def _is_positive(value: object) -> TypeGuard[float]:
     return (isinstance(value, int | float) and not isinstance(value, bool)
             and 0.0 < value < np.inf)
 
