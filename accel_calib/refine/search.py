@@ -532,7 +532,7 @@ def simpler(chosen: Set) -> list[Set]:
 
 def accepted(visited: Iterable[Set]) -> Iterator[Set]:
     """Yield the sets whose effects are all significant, the preferred one first."""
-    left = sorted(visited, key=lambda chosen: -chosen.score)
+    left = sorted(visited, key=lambda chosen: _falling(chosen.score))
     while left:
         near: list[Set] = []
         for chosen in left:
@@ -558,7 +558,7 @@ def _extended(before: Set) -> list[Set]:
         if scores[number] > -np.inf and not _is_barred(linear.blocks[number], before.entries):
             best[effect] = float(scores[number]), number
     return [before.extended(number)
-            for _, number in sorted(best.values(), reverse=True)[:_BRANCHES]]
+            for _, number in sorted(best.values(), key=lambda each: _falling(each[0]))[:_BRANCHES]]
 
 
 def _is_barred(block: Block, present: Iterable[Block]) -> bool:
@@ -581,9 +581,19 @@ def _with_best_shapes(chosen: Set) -> Set:
     return chosen
 
 
+def _falling(score: float) -> float:
+    """
+    Return the key that sorts by score, the best first.
+
+    Equal scores keep their order: without rounding, the last bit of a processor would decide.
+
+    """
+    return -round(score, 6)
+
+
 def _distinct(sets: Iterable[Set]) -> list[Set]:
     """Return the best set of each list of names and outliers, the best score first."""
     best: dict[tuple[frozenset[str], tuple[int, ...]], Set] = {}
-    for chosen in sorted(sets, key=lambda chosen: -chosen.score):
+    for chosen in sorted(sets, key=lambda chosen: _falling(chosen.score)):
         best.setdefault((frozenset(chosen.effects), chosen.out), chosen)
     return list(best.values())

@@ -480,13 +480,15 @@ def _unexplained(found: Found, untestable: tuple[tuple[str, str], ...]) -> list[
 
 def _other_sensor(found: Found) -> list[str]:
     """Return a line if the changes are too large for one sensor."""
-    for name, values in found.final.model.values.items():
-        if name in CHANGES and np.max(np.abs(values)) > CHANGES[name].repeatable_g:
-            return ['this is probably another sensor: its '
-                    f'{CHANGES[name].base} differs from the stored one by '
-                    f'{np.max(np.abs(values)):.2g} {CHANGES[name].unit}, which is too much for '
-                    'one sensor; fit a new calibration from its own poses']
-    return []
+    changes = {name: float(np.max(np.abs(values)))
+               for name, values in found.final.model.values.items() if name in CHANGES}
+    by_limit = {name: change / CHANGES[name].repeatable_g for name, change in changes.items()}
+    name = max(by_limit, key=by_limit.__getitem__, default='')
+    if not name or by_limit[name] <= 1.0:
+        return []
+    return [f'this is probably another sensor: its {CHANGES[name].base} differs from the stored '
+            f'one by {changes[name]:.2g} {CHANGES[name].unit}, which is too much for one sensor; '
+            'fit a new calibration from its own poses']
 
 
 def _unseen_turn(found: Found) -> list[str]:
