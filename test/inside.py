@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 from accel_calib.calibrate import (
     Calibration, determines, mounting_figures, posterior, refuse_if_unfit, sound_rows)
@@ -40,7 +39,7 @@ from accel_calib.compare.drift import change, is_over, MEMORY as DRIFT_MEMORY
 from accel_calib.disk import check_regular, previous
 from accel_calib.effects import (
     acting_temperature, correct, linear_model, Model, model_with, MODELS, parse_effect, predict,
-    reading_of, sensor_force, simulate_poses, simulate_recording, ThermalStream, with_vector)
+    sensor_force, simulate_poses, simulate_recording, ThermalStream, with_vector)
 from accel_calib.effects.model import terms_of
 from accel_calib.effects.thermal import Lag, low_passed, rate_of
 from accel_calib.estimate import believable, kinds, originals, unseen_mistakes

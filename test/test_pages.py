@@ -19,8 +19,8 @@ from accel_calib.report import calibration_page, refinement_page
 from accel_calib.text import milli
 from accel_calib.units import Units
 from inside import (
-    all_drawings, axis_figures, comparison_page, curve_parts, history_page, model_with,
-    residuals_of, residuals_of_refinement, sheet, simulate_poses, snippets, with_linear_part)
+    all_drawings, axis_figures, comparison_page, curve_parts, history_page, linear_model, model_with,
+    residuals_of, residuals_of_refinement, sheet, simulate_poses, snippets)
 from live_bench import chromium, PATIENCE
 import numpy as np
 from playwright.sync_api import expect, sync_playwright
@@ -230,7 +230,7 @@ def test_figures_by_axis_are_those_of_the_axes():
     apart = np.radians(89.0)
     mat = np.diag([1.01, 1.0, 0.99]) @ np.array(
         [[np.sin(apart), np.cos(apart), 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    model = with_linear_part(mat, np.array([0.1, 0.2, 0.3]))
+    model = linear_model('12', mat, np.array([0.1, 0.2, 0.3]))
     np.testing.assert_allclose(axis_figures(model.vector, model.effects),
                                [0.1, 0.2, 0.3, 1.01, 1.0, 0.99, 89.0, 90.0, 90.0])
 

@@ -161,9 +161,9 @@ class Bag:
             raise InputError(f'{self.path} has {some(others) or "no topics"}, expected a topic of '
                              f'type {IMU}', 'record the Imu topic')
         if topic not in topics and (topic or len(topics) > 1):
-            found = (f'the Imu topics {some(topics)}, expected {topic}' if topic else
-                     f'{len(topics)} Imu topics, expected one: {some(topics)}')
-            raise InputError(f'{self.path} has {found}', 'choose one of them with --topic')
+            found = (f'has the Imu topics {some(topics)}, expected {topic}' if topic else
+                     f'has {len(topics)} Imu topics, expected one: {some(topics)}')
+            raise InputError(f'{self.path} {found}', 'choose one of them with --topic')
         return topic or topics[0]
 
     def first_frame_id(self, topic: str) -> str:
