@@ -19,8 +19,8 @@ from accel_calib.report import calibration_page, refinement_page
 from accel_calib.text import milli
 from accel_calib.units import Units
 from inside import (
-    all_drawings, axis_figures, comparison_page, curve_parts, history_page, linear_model, model_with,
-    residuals_of, residuals_of_refinement, sheet, simulate_poses, snippets)
+    all_drawings, axis_figures, comparison_page, curve_parts, history_page, linear_model,
+    model_with, residuals_of, residuals_of_refinement, sheet, simulate_poses, snippets)
 from live_bench import chromium, PATIENCE
 import numpy as np
 from playwright.sync_api import expect, sync_playwright
