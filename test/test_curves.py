@@ -4,8 +4,9 @@
 """Empirical curves: their names, their form, the search for them, and their storage."""
 
 
+from accel_calib.calibrate import fit_poses
 from accel_calib.effects import (
-    CARRIERS, effect_named, empirical_name, empirical_parts, is_effect, MODES, VARIABLES)
+    CARRIERS, effect_named, empirical_name, empirical_parts, is_effect, MODES, modes_of, VARIABLES)
 from accel_calib.refine import refine
 from accel_calib.units import units_of
 from inside import (
@@ -20,7 +21,8 @@ G = units_of('g')
 CURVES = {
     'empirical-offset.x-temperature-2-3': [4e-3, -2e-3, 15.0, 35.0],
     'empirical-gain-time-1-4': [*np.linspace(-4e-3, 5e-3, 6), 100.0, 3000.0],
-    'empirical-force-std-1': [5e-3, 1e-3, 5e-3]}
+    'empirical-force-std-1': [5e-3, 1e-3, 5e-3],
+    'empirical-force-direction-3-5': np.linspace(-3e-3, 2e-3, 18)}
 
 
 def with_curve(added_g, seed=1):
@@ -46,17 +48,18 @@ def base_of(poses):
 @pytest.mark.parametrize('variable', VARIABLES)
 @pytest.mark.parametrize('carrier', [*CARRIERS, 'gain.z', 'cross_axis.yz'])
 def test_the_name_of_a_curve_is_read_back(carrier, variable):
-    name = empirical_name(carrier, variable, (1, 5, MODES))
-    if variable == 'force' and carrier != 'offset':
+    modes = tuple(modes_of(variable)[k] for k in (0, 2, -1))
+    name = empirical_name(carrier, variable, modes)
+    if carrier != {'force': 'offset', 'direction': 'force'}.get(variable, carrier):
         assert not is_effect(name)
         return
     assert is_curve(name)
-    assert empirical_parts(name) == (carrier, variable, (1, 5, MODES))
+    assert empirical_parts(name) == (carrier, variable, modes)
     effect = effect_named(name)
     parts = 1 if '.' in carrier else len(CARRIERS[carrier])
-    assert len(effect.parameters) == 3 * parts
+    assert len(effect.parameters) == (7 + 11 + 13 if variable == 'direction' else 3 * parts)
     assert len(set(effect.parameters)) == len(effect.parameters)
-    assert effect.needs == (() if variable == 'force' else (variable,))
+    assert effect.needs == (() if variable in ('force', 'direction') else (variable,))
 
 
 @pytest.mark.parametrize('name', [
@@ -65,14 +68,16 @@ def test_the_name_of_a_curve_is_read_back(carrier, variable):
         '', '0', f'{MODES + 1}', 'one', '-1', '1.5', '\u00b2', '1-1', '2-1')),
     *(f'empirical-{parts}-1' for parts in (
         'offset-count', 'offset-ax', 'mood-time', 'offset.q-time', 'offset.-time',
-        'offset.x.y-time', 'gain-force')), 'curve-offset-time-1', 'offset-time-1'])
+        'offset.x.y-time', 'gain-force', 'gain-direction')),
+    *(f'empirical-force-direction-{degree}' for degree in (2, 7)), 'curve-offset-time-1',
+    'offset-time-1'])
 def test_a_name_that_is_no_curve_is_refused(name):
     assert not is_effect(name)
     with pytest.raises(ValueError, match='expected one of'):
         Model({name: np.zeros(3)})
 
 
-@pytest.mark.parametrize('name', CURVES)
+@pytest.mark.parametrize('name', [name for name in CURVES if effect_named(name).needs])
 def test_a_curve_is_constant_outside_of_its_range(name):
     variable, (low, high) = empirical_parts(name)[1], CURVES[name][-2:]
     at = np.maximum([low - 1.0, low, high, 1e3 * high], 0.0)
@@ -87,6 +92,42 @@ def test_a_curve_over_the_force_is_constant_beyond_1_g():
     model = Model({'empirical-offset-force-1-3': np.linspace(-3e-3, 4e-3, 6)})
     added = predict(model, force, {}) - force
     np.testing.assert_allclose(added[1], added[0], atol=1e-15)
+
+
+def test_a_gain_that_depends_on_the_direction_has_the_forms_of_its_degrees():
+    rng = np.random.default_rng(3)
+    up, oblique = random_directions(200, rng), random_directions(1, rng)[0]
+    for degree, factor in ((3, 2.5), (4, 35.0 / 8.0), (5, 63.0 / 8.0), (6, 231.0 / 16.0)):
+        model = Model({f'empirical-force-direction-{degree}': np.zeros(2 * degree + 1)})
+        basis = model.basis(2.0 * up, {}).full
+        gains = np.einsum('ni,nip->np', up, basis) / 2.0
+        np.testing.assert_allclose(2.0 * up[:, :, np.newaxis] * gains[:, np.newaxis], basis,
+                                   atol=1e-12)
+        # Legendre's polynomial about any direction is a sum of them, and its highest power.
+        lower = np.column_stack([gains, *(np.polynomial.legendre.legvander(
+            up @ oblique, degree - 1).T)])
+        power = factor * (up @ oblique) ** degree
+        left = power - lower @ np.linalg.lstsq(lower, power, rcond=None)[0]
+        assert np.max(np.abs(left)) < 1e-10
+        assert np.linalg.cond(gains) < 6.0
+
+
+@pytest.mark.parametrize(('oblique', 'form'), [
+    ([0.6, 0.64, 0.48], lambda u: u ** 3), ([0.36, -0.48, 0.8], np.abs)])
+def test_a_nonlinearity_along_an_oblique_axis_is_described(oblique, form):
+    rng = np.random.default_rng(8)
+    model, up = sensor(rng), random_directions(160, rng)
+    bend = 8e-3 * np.outer(form(up @ oblique), [0.48, -0.6, 0.64])
+    poses = simulate_poses(model, up, rng, noise_g=2e-4, context={})
+    poses = poses.with_columns(reading=poses.reading + bend)
+    shown, kept = poses.take(np.arange(80)), poses.take(np.arange(80, 160))
+    found = refine(shown, G, base='10')
+    step = found.steps[-1]
+    assert (step.effect, step.variable) == ('empirical', 'direction')
+    assert 'direction of the force' in step.where
+    errors = [np.sqrt(np.mean((np.linalg.norm(each.correct(kept.reading), axis=1) - 1.0) ** 2))
+              for each in (fit_poses(shown, G, model='10'), found.calibration)]
+    assert errors[1] < 0.5 * errors[0]
 
 
 def test_the_values_of_a_curve_are_the_cosines_of_its_definition():

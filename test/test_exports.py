@@ -31,7 +31,8 @@ BENDING = {'quadratic': [0.003, -0.002, 0.001], 'cubic': [0.002, 0.001, -0.003],
            'odd_quadratic': [0.001, 0.002, 0.001], 'gain_asymmetry': [0.002, 0.001, -0.002],
            'cross_coupling': [0.001, -0.002, 0.001, 0.0005, 0.001, 0.002]}
 CURVES = {'empirical-offset-force-1-2': [0.001, 0.002, -0.001, 0.0005, 0.001, -0.002],
-          'empirical-gain.z-temperature-1-2': [0.004, -0.002, 12.0, 38.0]}
+          'empirical-gain.z-temperature-1-2': [0.004, -0.002, 12.0, 38.0],
+          'empirical-force-direction-3-4': np.linspace(-0.002, 0.003, 16)}
 TILTED = rotation_from_rpy(0.1, -0.2, 0.05)
 RANGE = (12.0, 38.0)
 HOSTILE = ['*/ int x; /*', 'a??/', 'b\\', 'c\n#error', '\u00fcber\u2028\x00', '/**/', '"%s', '']

@@ -6,7 +6,7 @@
 
 import accel_calib as ac
 from accel_calib.calibrate import Calibration, fit_poses, outlook
-from accel_calib.effects import effect_named, EFFECTS, empirical_name, VARIABLES
+from accel_calib.effects import effect_named, EFFECTS, empirical_name, modes_of, VARIABLES
 from accel_calib.errors import InputError, RefusedFitError
 from accel_calib.finding import has
 from accel_calib.findings import rate
@@ -27,8 +27,8 @@ G = units_of('g')
 
 OUTPUT = [name for name, effect in EFFECTS.items() if effect.output]
 ADDED = [name for name in EFFECTS if name not in OUTPUT]
-CURVES = [empirical_name('offset' if variable == 'force' else 'gain', variable, (1, 3))
-          for variable in VARIABLES]
+CURVES = [empirical_name({'force': 'offset', 'direction': 'force'}.get(variable, 'gain'), variable,
+                         modes_of(variable)[::2][:2]) for variable in VARIABLES]
 
 SHAPES = {'start': 1000.0, 'tau': 900.0, 'instant': 4000.0, 'lag': 200.0, 'of_sensor': 0.0,
           'form': 1.0, 'low': 10.0, 'high': 3000.0}
@@ -41,7 +41,7 @@ FEW = (10, 14)
 """Range of numbers of poses that may show that one of them is wrong, but not which."""
 
 THREE = st.tuples(*[st.floats(-1.0, 1.0)] * 3)
-PARTS = st.lists(st.floats(-1.0, 1.0), min_size=9, max_size=9)
+PARTS = st.lists(st.floats(-1.0, 1.0), min_size=18, max_size=18)
 ANGLES = st.tuples(*[st.floats(-3.0, 3.0)] * 3)
 
 ERRORS = st.builds(

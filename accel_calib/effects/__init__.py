@@ -31,12 +31,12 @@ are those of IEEE 1293 (model equation of a linear accelerometer) and of data sh
 
 from .catalogue import (
     CARRIERS, CHANGES, covariate_names, COVARIATES, curve_pairs, curve_unit, effect_named, EFFECTS,
-    EMPIRICAL, empirical_name, empirical_parts, included, is_effect, kind_of, LADDER,
+    EMPIRICAL, empirical_name, empirical_parts, included, is_effect, kind_of, LADDER, modes_of,
     NOMINAL_SUPPLY, OF_RAMPS, OFFSET_POWERS, parameter_names, PROCESSES, REFERENCE_TEMPERATURE,
     unit_of, value_unit, variable_of, variable_words, VARIABLES, WANDER)
 from .form import (
     AFFINE, AXES, by_axis, Context, CUBE, difference, Effect, fitted_places, FORCE, MODES,
-    MONOMIALS, ODD_SQUARE, ONE, PRODUCT, SIZE, SQUARE, TO_SEPARATE, WAVE)
+    MONOMIALS, ODD_SQUARE, ONE, PRODUCT, SIZE, SQUARE, TO_SEPARATE, WAVE, ZONAL, ZONES)
 from .model import (
     AtContext, check_context, CONVERGED_G, correct, EachShape, factors_of, LARGEST_FORCE_G,
     LARGEST_ITERATIONS, length_rows, linear_model, linear_values, Model, ModelForm, MODELS,
@@ -49,12 +49,12 @@ __all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CHANGES', 'CONVERGED_G', 'COVARIATES',
            'EMPIRICAL', 'FORCE', 'LADDER', 'LARGEST_FORCE_G', 'LARGEST_ITERATIONS', 'MODELS',
            'MODES', 'MONOMIALS', 'NOMINAL_SUPPLY', 'ODD_SQUARE', 'OFFSET_POWERS', 'OF_RAMPS',
            'ONE', 'PROCESSES', 'PRODUCT', 'REFERENCE_TEMPERATURE', 'SIZE', 'SQUARE', 'TO_SEPARATE',
-           'VARIABLES', 'WANDER', 'WAVE', 'AtContext', 'Context', 'EachShape', 'Effect', 'Model',
-           'ModelForm', 'OwnEffect', 'ThermalStream', 'acting_temperature', 'by_axis',
-           'check_context', 'correct', 'covariate_names', 'curve_pairs', 'curve_unit',
+           'VARIABLES', 'WANDER', 'WAVE', 'ZONAL', 'ZONES', 'AtContext', 'Context', 'EachShape',
+           'Effect', 'Model', 'ModelForm', 'OwnEffect', 'ThermalStream', 'acting_temperature',
+           'by_axis', 'check_context', 'correct', 'covariate_names', 'curve_pairs', 'curve_unit',
            'difference', 'effect_named', 'empirical_name', 'empirical_parts', 'factors_of',
            'fitted_places', 'included', 'is_effect', 'kind_of', 'know', 'know_code', 'know_file',
-           'known_code', 'length_rows', 'linear_model', 'linear_values', 'model_with',
+           'known_code', 'length_rows', 'linear_model', 'linear_values', 'model_with', 'modes_of',
            'parameter_names', 'parse_effect', 'predict', 'rate_at', 'reading_of', 'sensor_force',
            'simulate_poses', 'simulate_recording', 'times', 'too_large', 'turn_between', 'unit_of',
            'value_unit', 'variable_of', 'variable_words', 'with_vector']

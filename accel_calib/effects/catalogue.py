@@ -13,7 +13,7 @@ is any quantity that the catalogue does not know (`covariate_names`).
 from __future__ import annotations
 
 from collections import ChainMap
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from typing import Any
@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .form import (
-    ALL_AXES, AXES, by_axis, Context, CROSS, CUBE, Effect, Factor, FORCE, matrix_terms, MODES,
-    ODD_SQUARE, ONE, PRODUCTS, SIZE, SQUARE, Term, WAVE)
+    ALL_AXES, AXES, by_axis, Context, CROSS, CUBE, DEGREES, Effect, Factor, FORCE, matrix_terms,
+    MODES, ODD_SQUARE, ONE, PRODUCTS, SIZE, SQUARE, Term, WAVE, ZONAL, ZONES)
 from .thermal import acting_temperature, rate_at
 from ..table import column_of, Floats, is_quantity
 from ..units import MG, STANDARD_GRAVITY
@@ -288,7 +288,8 @@ too, such as ``gain.z``. The carrier ``force`` is the common gain of all axes.""
 
 VARIABLES: dict[str, str] = {
     'time': 'time', 'temperature': 'temperature', 'temperature_rate': 'rate of temperature',
-    'supply_voltage': 'supply voltage', 'std': 'vibration', 'force': 'force along the axis'}
+    'supply_voltage': 'supply voltage', 'std': 'vibration', 'force': 'force along the axis',
+    'direction': 'direction of the force'}
 """Quantities that an empirical curve can be a function of, by column, with their words."""
 
 
@@ -305,18 +306,27 @@ def empirical_name(carrier: str, variable: str, modes: Iterable[int]) -> str:
     Return the name of an empirical curve: Σ_k c_k cos(k π s) over the modes k, 1 to `MODES`.
 
     The carrier, one of `CARRIERS` or a part of one, changes with one of `VARIABLES` or a quantity.
-    s runs from 0 to 1 over its range in the poses; outside of it, the curve is constant.
+    s runs from 0 to 1 over its range in the poses; outside of it, the curve is constant. The
+    modes of the variable ``direction`` are degrees of spherical harmonics.
 
     """
     return '-'.join([EMPIRICAL, carrier, variable, *map(str, modes)])
+
+
+_ONLY_CARRIER = {'force': 'offset', 'direction': 'force'}
 
 
 def curve_pairs(quantities: Iterable[str] = ()) -> Iterator[tuple[str, str]]:
     """Yield the carriers and variables of empirical curves; the quantities are variables, too."""
     for variable in (*VARIABLES, *quantities):
         for carrier in CARRIERS:
-            if variable != 'force' or carrier == 'offset':
+            if carrier == _ONLY_CARRIER.get(variable, carrier):
                 yield carrier, variable
+
+
+def modes_of(variable: str) -> Sequence[int]:
+    """Return the modes that an empirical curve over a variable can have."""
+    return DEGREES if variable == 'direction' else range(1, MODES + 1)
 
 
 def empirical_parts(name: str) -> tuple[str, str, tuple[int, ...]]:
@@ -328,13 +338,15 @@ def empirical_parts(name: str) -> tuple[str, str, tuple[int, ...]]:
     whole, dot, part = rest[0].partition('.')
     pairs = curve_pairs(filter(is_quantity, rest[1:2]))
     if ((whole, rest[1]) not in pairs or (dot and part not in CARRIERS[whole])
-            or list(modes) != sorted(set(modes)) or not 1 <= modes[0] <= modes[-1] <= MODES):
+            or list(modes) != sorted(set(modes)) or not set(modes) <= set(modes_of(rest[1]))):
         raise KeyError(name)
     return rest[0], rest[1], modes
 
 
 def _empirical(name: str) -> Effect:
     carrier, variable, modes = empirical_parts(name)
+    if variable == 'direction':
+        return _harmonic(modes)
     whole, _, part = carrier.partition('.')
     parts = CARRIERS[whole]
     terms = []
@@ -354,6 +366,16 @@ def _empirical(name: str) -> Effect:
         return curve(family='force')
     return curve(factor=partial(_cosines, variable, np.repeat(modes, each)), needs=(variable,),
                  shape=('low', 'high'), shapes=partial(_ends, variable))
+
+
+def _harmonic(degrees: tuple[int, ...]) -> Effect:
+    """Return the gain of all axes as a sum of spherical harmonics of the direction."""
+    zones = [number for number, zone in enumerate(ZONES) if zone.degree in degrees]
+    terms = tuple(Term(k, axis, ZONAL + 3 * number + axis)
+                  for k, number in enumerate(zones) for axis in range(3))
+    names = tuple(f'{degree}_{k}' for degree in degrees for k in range(1, 2 * degree + 2))
+    return Effect(f'gain as a smooth function of {VARIABLES["direction"]}', 'empirical curve',
+                  names, 'g/g', 0.001, 0.5, terms, family='force')
 
 
 def _variable(variable: str, context: Mapping[str, Any]) -> Floats:

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from numpy.polynomial.legendre import leg2poly
 from numpy.typing import NDArray
 
 from ..table import Floats
@@ -58,6 +59,68 @@ def _wave(mode: int) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
             lambda u: -turn * np.sin(turn * (np.clip(u, -1.0, 1.0) + 1.0)) * (abs(u) < 1.0))
 
 
+DEGREES = (3, 4, 5, 6)
+"""Degrees of the spherical harmonics of which a gain that depends on the direction consists. Those
+of lower degree are offsets, gains and cross-axis gains."""
+
+_CONE = np.radians(80.0)
+"""Angle from z of the directions of the harmonics: at 80° their Gram matrices have condition
+numbers of 4 to 11."""
+
+
+def _directions(degree: int) -> list[list[float]]:
+    """Return 2 n + 1 unit vectors; the Legendre polynomials P_n about them span degree n."""
+    turn = 2.0 * np.pi * np.arange(2 * degree + 1) / (2 * degree + 1)
+    around = np.sin(_CONE) * np.column_stack([np.cos(turn), np.sin(turn)])
+    found: list[list[float]] = np.insert(around, 2, np.cos(_CONE), axis=1).tolist()
+    return found
+
+
+def _horner(polynomial: list[float], x: Any) -> Any:
+    total = polynomial[-1]
+    for value in polynomial[-2::-1]:
+        total = total * x + value
+    return total
+
+
+class Zone(NamedTuple):
+    """
+    P(c), the Legendre polynomial of the cosine c between the force and a direction.
+
+    `polynomial` has its coefficients by power of c.
+
+    """
+
+    degree: int
+    towards: list[float]
+    polynomial: list[float]
+
+    def monomials(self) -> list[Monomial]:
+        """Return u_i P(c) for each axis i."""
+        (a, b, d), slope = self.towards, [k * value for k, value in enumerate(self.polynomial)][1:]
+
+        def cosine(x: Any, y: Any, z: Any) -> tuple[Any, Any]:
+            size = (x * x + y * y + z * z + 1e-300) ** 0.5
+            return (a * x + b * y + d * z) / size, size
+
+        def value(axis: int, *u: Any) -> Any:
+            return u[axis] * _horner(self.polynomial, cosine(*u)[0])
+
+        def gradient(axis: int, *u: Any) -> tuple[Any, Any, Any]:
+            c, size = cosine(*u)
+            steep = u[axis] / size * _horner(slope, c)
+            x, y, z = (steep * (towards - c * part / size)
+                       + (_horner(self.polynomial, c) if k == axis else 0.0)
+                       for k, (towards, part) in enumerate(zip(self.towards, u)))
+            return x, y, z
+
+        return [Monomial(partial(value, axis), partial(gradient, axis)) for axis in range(3)]
+
+
+ZONES = [Zone(degree, towards, leg2poly([0.0] * degree + [1.0]).tolist())
+         for degree in DEGREES for towards in _directions(degree)]
+"""Harmonics of all `DEGREES`, in their order."""
+
 MONOMIALS: list[Monomial] = [
     Monomial(lambda x, y, z: 1.0, lambda x, y, z: (0.0, 0.0, 0.0)),
     *each_axis(lambda u: u, lambda u: 1.0),
@@ -69,11 +132,14 @@ MONOMIALS: list[Monomial] = [
     Monomial(lambda x, y, z: x * z, lambda x, y, z: (z, 0.0, x)),
     Monomial(lambda x, y, z: y * z, lambda x, y, z: (0.0, z, y)),
     *(monomial for mode in range(1, MODES + 1) for monomial in each_axis(*_wave(mode))),
+    *(monomial for zone in ZONES for monomial in zone.monomials()),
 ]
 """1; u_i; u_i²; u_i³; u_i|u_i|; |u_i|; u_x u_y, u_x u_z, u_y u_z; cos(k π (u_i + 1) / 2) for each
-k, constant beyond ±1 g. The first four are affine. Those of a user's own effects follow."""
+k, constant beyond ±1 g; u_i P(c) for each of `ZONES`. The first four are affine. Those of a user's
+own effects follow."""
 
 ONE, FORCE, SQUARE, CUBE, ODD_SQUARE, SIZE, PRODUCT, WAVE = 0, 1, 4, 7, 10, 13, 16, 19
+ZONAL = WAVE + 3 * MODES
 """First index of each kind in `MONOMIALS`; a kind by axis has three entries."""
 
 AFFINE = 4

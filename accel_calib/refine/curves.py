@@ -7,10 +7,12 @@ Gaps without a known form: empirical curves, and an offset that wanders.
 **Curves.** They show where the gap lies, if no known effect has its form. A curve changes a
 carrier (offset, gain, cross-axis, |force|, or one axis of them) with a variable (time,
 temperature, its rate, supply, vibration, the force along the axis, or any quantity). It is a sum
-of a few cosines over the range of the variable (`accel_calib.effects.empirical_name`). For each
-carrier and variable, the cosines are added in the order of their gain while the score of `.linear`
-rises; each costs its values and 2 log k for the choice of the k-th. The best curve is accepted if
-it is significant, and if poses held out agree.
+of a few cosines over the range of the variable (`accel_calib.effects.empirical_name`), or of
+spherical harmonics of a few degrees over the direction of the force, which are the forms of
+nonlinearities along oblique axes. For each carrier and variable, the cosines or degrees are added
+in the order of their gain while the score of `.linear` rises; each costs its values and 2 log k
+for the choice of the k-th. The best curve is accepted if it is significant, and if poses held out
+agree.
 
 **Wander.** The effect `offset_wander` is an offset that changes slowly. It is a random process,
 expanded in its Karhunen-Loève modes
@@ -44,7 +46,7 @@ from .linear import Block, held_out, LEVEL, Linear, outside_of, products_of, Set
 from .state import candidates, linearised, State
 from ..effects import (
     CARRIERS, curve_pairs, effect_named, EFFECTS, EMPIRICAL, empirical_name, empirical_parts,
-    LADDER, Model, MODES, WANDER)
+    LADDER, Model, modes_of, WANDER)
 from ..estimate import Fit, judge
 from ..table import Floats, Poses
 
@@ -54,8 +56,6 @@ _LARGEST_SHARE = 0.35
 
 _LEAST_DOF = 30
 """Degrees of freedom below which no curve is looked for; a few poses fit many curves."""
-
-_ALL_MODES = range(1, MODES + 1)
 
 _PATIENCE = 2
 """Cosines without a better score after which no more are added; a wave needs several."""
@@ -91,8 +91,6 @@ def best_curve(state: State, poses_g: Poses, out: tuple[int, ...]) -> Curve | No
         return None
     best, tried = None, 0
     for carrier, variable in curve_pairs(causes(poses_g)):
-        if variable not in poses_g and variable != 'force':
-            continue
         for problem in _problems(plain, fit, carrier, variable):
             grown, tried = _grown(_kept(problem, out)), tried + 1
             if grown.blocks and (best is None or grown.score > best[0]):
@@ -101,9 +99,12 @@ def best_curve(state: State, poses_g: Poses, out: tuple[int, ...]) -> Curve | No
 
 
 def _problems(plain: Linear, fit: Fit, carrier: str, variable: str) -> Iterator[Linear]:
-    """Yield the problem with the cosines of a carrier as candidates, and of each of its parts."""
-    name = empirical_name(carrier, variable, _ALL_MODES)
+    """Yield the problem with the modes of a carrier as candidates, and of each of its parts."""
+    modes = modes_of(variable)
+    name = empirical_name(carrier, variable, modes)
     effect = effect_named(name)
+    if not set(effect.needs) <= set(fit.poses_g.columns):
+        return
     shapes = [np.zeros(0)] if effect.shapes is None else list(effect.shapes(fit.poses_g.columns))
     if not shapes:
         return
@@ -111,13 +112,14 @@ def _problems(plain: Linear, fit: Fit, carrier: str, variable: str) -> Iterator[
     model = Model({name: np.concatenate([np.zeros(count), shapes[0]])})
     columns, sizes = outside_of(plain.onto, fit.equations.columns(model)[:, :count])
     products = products_of(columns, plain.residual)
-    whole = [(carrier, slice(None), len(parts))]
-    alone = [(f'{carrier}.{part}', slice(k, None, len(parts)), 1) for k, part in enumerate(parts)]
-    for own, which, width in whole + alone if len(parts) > 1 else whole:
+    whole = [(carrier, slice(None))]
+    alone = [(f'{carrier}.{part}', slice(k, None, len(parts))) for k, part in enumerate(parts)]
+    for own, which in whole + alone if len(parts) > 1 else whole:
         index = [*np.arange(len(sizes))[which], -1]
-        blocks = tuple(Block(empirical_name(own, variable, (mode,)), shapes[0],
-                             slice(width * (mode - 1), width * mode), effect, 0, float(mode))
-                       for mode in _ALL_MODES)
+        names = [empirical_name(own, variable, (mode,)) for mode in modes]
+        ends = np.cumsum([0, *(len(effect_named(each).parameters) for each in names)]).tolist()
+        blocks = tuple(Block(each, shapes[0], slice(*ends[k:k + 2]), effect, 0, k + 1.0)
+                       for k, each in enumerate(names))
         yield replace(plain, columns=columns[:, which], sizes=sizes[which], choice=0.0,
                       products=products[np.ix_(index, index)], blocks=blocks)
 
@@ -130,7 +132,7 @@ def _kept(problem: Linear, out: tuple[int, ...]) -> Linear:
 
 
 def _grown(problem: Linear) -> Set:
-    """Return the cosines with the best score."""
+    """Return the modes with the best score."""
     best = now = Set.of(problem)
     for _ in range(_MOST_MODES):
         scores = now.scores_beside
@@ -158,7 +160,8 @@ def _accepted(score: float, chosen: Set, tried: int) -> Curve | None:
         return None
     blocks, first = sorted(chosen.blocks), chosen.entries[0]
     carrier, variable, _ = empirical_parts(first.effect)
-    name = empirical_name(carrier, variable, [block + 1 for block in blocks])
+    modes = [empirical_parts(chosen.linear.blocks[block].effect)[2][0] for block in blocks]
+    name = empirical_name(carrier, variable, modes)
     values = np.concatenate([*(chosen.values[block] for block in blocks), first.shape])
     return Curve(name, values, score, chosen.out, p_value)
 
@@ -195,7 +198,7 @@ def nearest_effects(before: State) -> dict[str, float]:
 
 def steepest(variable: str, poses_g: Poses, share_mg: Floats) -> tuple[float, float] | None:
     """Return the values of a variable of one number between which a curve changes most."""
-    if variable in ('force', 'std'):
+    if variable in ('force', 'direction', 'std'):
         return None
     values = poses_g[variable]
     parts = np.array_split(np.argsort(values, kind='stable'), 5)

@@ -75,10 +75,15 @@ def _step(result: Refinement, number: int, step: Step) -> str:
     shown = values_of(step)
     table = scroll_table(f'Values of step {number}', [name for name, _ in shown],
                          [[value for _, value in shown]] if shown else [])
-    curve = figures([of_curve(result, number - 1)], 'wide') if step.effect == EMPIRICAL else ''
+    curve = figures([of_curve(result, number - 1)], 'wide') if _is_drawn(step) else ''
     title = f'{number}. {effect_named(step.name).words.capitalize()}'
     return section(title, f'<p>{_story(step)}</p>\n', table,
                    figures(of_step(result, number - 1)), curve)
+
+
+def _is_drawn(step: Step) -> bool:
+    """Return whether a step is a curve over one variable; one over directions is on the sphere."""
+    return step.effect == EMPIRICAL and step.variable != 'direction'
 
 
 def _overview(result: Refinement) -> str:
@@ -119,7 +124,7 @@ def all_drawings(result: Refinement) -> Iterator[Drawing]:
     yield ladder(result)
     for step in range(len(result.steps)):
         yield from of_step(result, step)
-        if result.steps[step].effect == EMPIRICAL:
+        if _is_drawn(result.steps[step]):
             yield of_curve(result, step)
     yield from of_remainder(residuals_of_refinement(result))
 

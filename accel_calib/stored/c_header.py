@@ -32,7 +32,7 @@ from .made import (
     temperature_range, TITLE)
 from ..calibrate import Calibration
 from ..effects import (
-    CUBE, MONOMIALS, ODD_SQUARE, PRODUCT, REFERENCE_TEMPERATURE, SIZE, SQUARE, WAVE)
+    CUBE, MONOMIALS, ODD_SQUARE, PRODUCT, REFERENCE_TEMPERATURE, SIZE, SQUARE, WAVE, ZONAL, ZONES)
 from ..errors import InputError
 from ..table import Floats
 
@@ -242,16 +242,20 @@ def _affine(header: Header, name: str) -> list[str]:
 
 def _general(header: Header, name: str) -> list[str]:
     temperature = 'float temperature, ' if header.of_temperature else ''
-    return [f'static inline void {name}_apply(const float raw[3], {temperature}float force[3])',
+    degrees = sorted({ZONES[(index - ZONAL) // 3].degree
+                      for index in header.monomial.tolist() if index >= ZONAL})
+    return [*(line for degree in degrees for line in _legendre(degree, name)),
+            f'static inline void {name}_apply(const float raw[3], {temperature}float force[3])',
             '{', _array('N', header.inverse), _array('R', header.turn),
             *_scaled_temperature(header),
             f'    const float per_unit = {_literal(1.0 / header.per_g)};',
-            '    float d[3], e[3], u[3];', '    int i, step;', '',
+            f'    float d[3], e[3], u[3]{", v[3]" if degrees else ""};', '    int i, step;', '',
             *(f'    d[{axis}] = (raw[{axis}] - {_horner(header.vec_v[:, axis])}) * per_unit;'
               for axis in range(3)),
             *_product('u', 'N', 'd', '    '),
             f'    for (step = 0; step < {header.steps}; ++step) {{',
-            *(f'        e[{axis}] = d[{axis}]{_added(header, axis)};' for axis in range(3)),
+            *(_DIRECTION if degrees else ()),
+            *(f'        e[{axis}] = d[{axis}]{_added(header, axis, name)};' for axis in range(3)),
             *_product('u', 'N', 'e', '        '), '    }', *_product('force', 'R', 'u', '    '),
             '}']
 
@@ -279,6 +283,18 @@ def _signed(value: float) -> str:
     return f'({_literal(value)})' if value < 0 else _literal(value)
 
 
+_DIRECTION = ('        for (i = 0; i < 3; ++i) {',
+              '            v[i] = u[i] / sqrtf(u[0] * u[0] + u[1] * u[1] + u[2] * u[2] + 1e-30f);',
+              '        }')
+
+
+def _legendre(degree: int, name: str) -> list[str]:
+    """Return the lines of a Legendre polynomial."""
+    polynomial = next(np.array(zone.polynomial) for zone in ZONES if zone.degree == degree)
+    return [f'static inline float {name}_p{degree}(float s)', '{',
+            f'    return {_horner(polynomial)};', '}', '']
+
+
 def _horner(polynomial: Floats) -> str:
     """Return the C expression of a polynomial in s, in brackets if it has more than one part."""
     kept = np.trim_zeros(polynomial, 'b')
@@ -288,7 +304,7 @@ def _horner(polynomial: Floats) -> str:
     return text
 
 
-def _added(header: Header, axis: int) -> str:
+def _added(header: Header, axis: int, name: str) -> str:
     """Return the C terms that are taken from d of an axis."""
     parts = []
     for column in range(3):
@@ -297,12 +313,18 @@ def _added(header: Header, axis: int) -> str:
             parts.append(f'{_horner(change)} * u[{column}]')
     for k in np.flatnonzero(header.axis == axis):
         if np.any(header.bend[:, k]):
-            parts.append(f'{_horner(header.bend[:, k])} * {_monomial(int(header.monomial[k]))}')
+            parts.append(f'{_horner(header.bend[:, k])} * '
+                         f'{_monomial(int(header.monomial[k]), name)}')
     return ''.join(f'\n            - {part}' for part in parts)
 
 
-def _monomial(index: int) -> str:
+def _monomial(index: int, name: str) -> str:
     x, size = (f'u[{(index - SQUARE) % 3}]', '({0} < 0.0f ? -{0} : {0})')
+    if index >= ZONAL:
+        number, axis = divmod(index - ZONAL, 3)
+        cosine = ' + '.join(f'{_signed(towards)} * v[{k}]'
+                            for k, towards in enumerate(ZONES[number].towards))
+        return f'u[{axis}] * {name}_p{ZONES[number].degree}({cosine})'
     if index >= WAVE:
         mode, axis = divmod(index - WAVE, 3)
         x = f'u[{axis}]'
