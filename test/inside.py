@@ -44,6 +44,7 @@ from accel_calib.effects.model import terms_of
 from accel_calib.effects.thermal import Lag, low_passed, rate_of
 from accel_calib.estimate import believable, kinds, originals, unseen_mistakes
 from accel_calib.estimate.equations import equations, measured
+from accel_calib.estimate.outliers import _look_alikes as look_alikes
 from accel_calib.findings.figures import number
 from accel_calib.fleet.overview import (
     digest, digest_of, estimated, Months, not_agreeing, odd_sensors, overview, priors_of,

@@ -20,7 +20,7 @@ from inside import (
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionMode, Reader, StoragePlugin
 from scipy.spatial.transform import Rotation
 from shared import sensor
 import yaml
@@ -259,6 +259,17 @@ def test_a_corrected_bag_keeps_all_other_content(make, turned, tmp_path):
     assert calls[-1] == (COUNT, COUNT) or make == 'split'  # whose metadata count the first file
     check_copy(path, tmp_path / 'out', '/imu/a', calibration)
     assert sorted(item.name for item in tmp_path.iterdir()) == sorted([path.name, 'out'])
+
+
+@pytest.mark.parametrize('mode', [CompressionMode.FILE, CompressionMode.MESSAGE])
+def test_a_copy_is_compressed_like_its_bag_unless_it_is_one_file(mode, tmp_path):
+    path = rosbag2(StoragePlugin.MCAP, mode)(tmp_path, TOPICS, messages(4))
+    for name, found in (('out', mode.name.lower()), ('out.mcap', None), ('out.db3', None)):
+        correct_bag(path, a_calibration(), tmp_path / name, '/imu/a')
+        assert len(deserialized(tmp_path / name)) == COUNT
+        if found:
+            with Reader(tmp_path / name) as copy:
+                assert copy.compression_mode == found
 
 
 @pytest.mark.parametrize('plugin', StoragePlugin)

@@ -11,13 +11,15 @@ import accel_calib as ac
 from accel_calib.calibrate import fit_poses, in_g, outlook, verify
 from accel_calib.errors import RefusedFitError
 from accel_calib.estimate import (
-    lower_triangular, NotConvergedError, Point, sensing_axes, solve, variance_factor)
+    estimate, lower_triangular, NotConvergedError, Point, sensing_axes, solve, start_of,
+    variance_factor)
 from accel_calib.finding import has
 from accel_calib.geometry import ATTITUDES
 from accel_calib.table import numbered, Poses
 from accel_calib.units import units_of
 from inside import (
-    Model, MODELS, predict, rotation_from_rpy, simulate_poses, spread_directions, unit)
+    look_alikes, Model, MODELS, predict, rotation_from_rpy, simulate_poses, spread_directions,
+    unit)
 import numpy as np
 import pytest
 from shared import random_directions, sensor
@@ -293,6 +295,19 @@ def test_all_knocked_poses_are_left_out_but_at_most_a_quarter(count):
     poses = knocked(7, count, count // 5)
     assert left_out(poses) == set(poses.row[:count // 5].tolist())
     assert len(left_out(knocked(8, count, 2 * count // 5))) <= count // 4
+
+
+@pytest.mark.parametrize(('seed', 'wrong'), [(25, 4), (253, 11)])
+def test_a_pose_that_explains_a_third_of_the_mistake_of_another_is_found(seed, wrong):
+    rng = np.random.default_rng(seed)
+    around, beside = int(rng.integers(11, 20)), int(rng.integers(0, 25))
+    up = random_directions(around, rng)
+    close = unit(up[[3]] + 0.15 * rng.normal(size=(beside, 3)))
+    poses = simulate_poses(sensor(rng), np.vstack([up, close]), rng)
+    poses.reading[wrong] *= 1.03
+    kept = np.delete(np.arange(len(poses)), wrong)
+    fit = estimate(start_of('10', poses.take(kept).reading), poses.take(kept))
+    assert list(look_alikes(fit, kept, np.array([wrong]), poses))
 
 
 def with_copies(poses, rows):

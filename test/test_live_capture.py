@@ -263,6 +263,7 @@ def test_poses_of_a_noisier_time_are_marked_and_kept() -> None:
     np.testing.assert_array_equal(again.book.poses()['doubtful'], poses['doubtful'])
     calibration = fit_poses(poses, UNITS, model='10')
     assert [each.row for each in calibration.rejected] == list(range(1, 13))
+    assert list(calibration.used_poses.row) == list(range(13, 25))
     assert 'doubtful' in calibration.rejected[0].reason
     needed = fit_poses(poses.take(slice(0, 13)), UNITS, model='10')
     assert not needed.rejected

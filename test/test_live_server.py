@@ -136,8 +136,7 @@ def test_a_calibration_is_offered_to_all_viewers_and_stored_when_it_is_accepted(
     wait(lambda: all(map(viewer.answer, numbers)))
     assert sorted(viewer.answer(each)['success'] for each in numbers) == [False, True]
     assert any('still running' in viewer.answer(each)['words'] for each in numbers)
-    wait(lambda: 'fit' in [state['busy'] for state in viewer.of('state')]
-         and viewer.state['busy'] == '')
+    wait(lambda: viewer.state['busy'] == '')
     assert viewer.ask('undo')['success']
     wait(lambda: not viewer.state['preview'])
     assert not turned.path.exists()

@@ -50,6 +50,12 @@ def test_basis_and_slope_are_the_derivatives_by_the_values_and_by_the_force(name
                                np.stack(numeric, axis=2), atol=1e-7)
 
 
+def test_a_covariate_changes_the_offset_from_its_zero_on():
+    model = Model({'offset_covariate-current-2': np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3, 4.0])})
+    added = predict(model, np.zeros((2, 3)), {'current': np.array([4.0, 6.0])})
+    np.testing.assert_allclose(added, [[0.0, 0.0, 0.0], [2.4, 4.8, 7.2]])
+
+
 def test_effects_of_the_output_act_on_the_whole_reading():
     force = np.array([[0.5, -0.96, 0.123]])
     offset = parse_effect('offset=0.01,-0.01,0.002')

@@ -218,6 +218,7 @@ def test_the_result_is_described_and_calibrate_recognises_a_still_board(tmp_path
     assert {axis: len(values) for axis, values in thermal['coefficients'].items()} == {
         'x': 2, 'y': 2, 'z': 2}
     assert thermal['coefficients']['x'][0] == pytest.approx(0.5, abs=0.05)
+    assert 1e-5 < thermal['coefficients_sd']['x'][0] < 0.05
     assert {'offset', 'gain', 'rating_reason', 'findings', 'next', 'read_as'} <= set(result)
     assert result['file'] == [str(path)]
     run('thermal', path, '-o', tmp_path / 'c.yaml')

@@ -222,8 +222,7 @@ def _writer(bag: Bag, target: Path, suffix: str) -> Any:
     writer = Writer2(target, version=9, storage_plugin=StoragePlugin.MCAP if mcap
                      else StoragePlugin.SQLITE3)
     mode = bag.reader.compression_mode if isinstance(bag.reader, Reader) else None
-    # A compressed file has another suffix.
-    if mode and (mode == 'message' or suffix not in ('.mcap', '.db3')):
+    if mode and suffix not in ('.mcap', '.db3'):  # a lone file has no metadata to tell it
         writer.set_compression(CompressionMode[mode.upper()], CompressionFormat.ZSTD)
     return writer
 
