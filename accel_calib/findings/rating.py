@@ -21,7 +21,7 @@ from .figures import (
     LEFT_OUT, MATTERS, mg, NEAR_FLAT, number, PER_OUTLIER, SPAN, TILT, TO_CHECK, without_noise,
     WORST_ERROR)
 from ..calibrate import Calibration, directions_in, flat_direction, Verification
-from ..effects import EMPIRICAL, WANDER
+from ..effects import EMPIRICAL, kind_of, WANDER
 from ..errors import TAKE_ALL_SIDES
 from ..finding import Finding, NextStep, ranked, rated, Rating, without
 from ..geometry import coverage
@@ -184,7 +184,7 @@ def _not_corrected(expected: Expected) -> Iterator[Finding]:
     """Yield the effects of the model that a later sample is not corrected for."""
     for name, size in expected.not_corrected:
         if size > MATTERS.value:
-            short = 'a curve' if name.startswith(EMPIRICAL) else name
+            short = 'a curve' if kind_of(name) == EMPIRICAL else name
             if 'time' in depends_on(name):
                 yield Finding('settling', f'the readings changed with time by {mg(size)} '
                               f'({short}), and may change again', 'let the sensor settle, and '

@@ -531,8 +531,8 @@ def simpler(chosen: Set) -> list[Set]:
 
 
 def accepted(visited: Iterable[Set]) -> Iterator[Set]:
-    """Yield the sets whose effects are all significant, the preferred one first."""
-    left = sorted(visited, key=lambda chosen: _falling(chosen.score))
+    """Yield the sets whose effects are all significant, the preferred one first, from `explored`."""
+    left = list(visited)
     while left:
         near: list[Set] = []
         for chosen in left:

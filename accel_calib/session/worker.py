@@ -61,8 +61,11 @@ _PATIENCE = 10.0
 _IDLE = 'idle'
 """Command line argument for a process that runs only while the processor is idle."""
 
-_ONE_THREAD = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
-"""Limits of the number of threads: arrays are small, so more threads would only wait."""
+_ENVIRONMENT = {
+    **dict.fromkeys(('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'), '1'),
+    'MALLOC_TRIM_THRESHOLD_': '131072'}
+"""Arrays are small, so more threads would only wait. A set threshold is not adapted by glibc, so
+that freed arrays do not stay in the process."""
 
 _IMPORTED = ('accel_calib.refine', 'scipy.linalg', 'scipy.optimize', 'scipy.special')
 """Modules imported at the start, so that the first fit is as fast as later ones."""
@@ -91,7 +94,7 @@ class WorkerProcess:
             return
         command = [sys.executable, '-c', _START, *([_IDLE] if self._idle else [])]
         path = os.pathsep.join(filter(None, sys.path))
-        environment = {**os.environ, 'PYTHONPATH': path, **dict.fromkeys(_ONE_THREAD, '1')}
+        environment = {**os.environ, 'PYTHONPATH': path, **_ENVIRONMENT}
         try:
             # In its own session it does not receive the Ctrl-C of a terminal.
             self._process = subprocess.Popen(
