@@ -18,8 +18,8 @@ from accel_calib.geometry import ATTITUDES
 from accel_calib.table import numbered, Poses
 from accel_calib.units import units_of
 from inside import (
-    look_alikes, Model, MODELS, predict, rotation_from_rpy, simulate_poses, spread_directions,
-    unit)
+    agreeing, look_alikes, Model, MODELS, predict, rotation_from_rpy, simulate_poses,
+    spread_directions, unit)
 import numpy as np
 import pytest
 from shared import random_directions, sensor
@@ -295,6 +295,13 @@ def test_all_knocked_poses_are_left_out_but_at_most_a_quarter(count):
     poses = knocked(7, count, count // 5)
     assert left_out(poses) == set(poses.row[:count // 5].tolist())
     assert len(left_out(knocked(8, count, 2 * count // 5))) <= count // 4
+
+
+@pytest.mark.parametrize('name', ['4', '7', '10'])
+def test_the_poses_that_agree_best_are_those_that_are_not_knocked(name):
+    poses = simulated(19, 24, *MODELS[name].effects)[1]
+    poses.reading[:4] *= np.array([[0.9], [0.95], [1.05], [1.1]])
+    assert list(agreeing(name, poses, 4)) == list(range(4, 24))
 
 
 @pytest.mark.parametrize(('seed', 'wrong'), [(25, 4), (253, 11)])

@@ -225,6 +225,8 @@ def test_a_fleet_is_rated_by_its_recordings(
         counts: dict[str, int], changed: int, unnamed: int, name: str, kinds: list[str]) -> None:
     rating = rate_fleet(counts, 2, changed, unnamed)
     assert (rating.name, [each.kind for each in rating.findings]) == (name, kinds)
+    if 'error' in counts:
+        assert '1 of 4 recordings' in rating.findings[0].text
 
 
 def test_fleets_of_any_size_and_with_any_names_have_a_page(page: str, tmp_path: Path) -> None:

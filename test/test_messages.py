@@ -402,6 +402,8 @@ def test_context_of_one_reading_is_limited_to_the_ranges():
     poses = calibration.poses.with_columns(temperature=np.linspace(20.0, 30.0, 20))
     calibration = replace(calibration, poses=poses)
     reader = OneReading(calibration)
+    unknown = reader.at({'temperature': np.nan}).correct(1.0, 2.0, 9.0)
+    assert np.linalg.norm(unknown) == pytest.approx(np.linalg.norm([1.0, 2.0, 9.0]), rel=0.1)
     for temperature, edge in ((80.0, 30.0), (-40.0, 20.0)):
         beyond, at_edge = (reader.at({'temperature': each}).correct(1.0, 2.0, 9.0)
                            for each in (temperature, edge))
