@@ -47,7 +47,7 @@ CARRIERS = (('cross_axis', r'\bcross-axis'), ('gain', r'\bgain\b'), ('offset', r
             ('force', r'\bsize of the force\b|\|force\||\|a\|'))
 VARIABLES = (('temperature_rate', r'\brate\b'), ('temperature', r'\btemperature\b'),
              ('supply', r'\bsupply\b'), ('vibration', r'\bvibration\b'), ('time', r'\btime\b'),
-             ('force', r'\bforce along\b'))
+             ('force', r'\bforce along\b'), ('direction', r'\bdirection\b'))
 """Words of carriers and variables, more specific ones first."""
 
 LAG_WITHIN = 0.1

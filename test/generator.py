@@ -298,7 +298,8 @@ def _traits(rng: np.random.Generator, setup: Setup, around: Around) -> Traits:
                   rng.uniform(0.1, 0.3) * span, rng.uniform(0.2, 0.6, 3),
                   rng.uniform(0.0, 2.0 * np.pi, 3), walk, rng.normal(size=(n, 3)),
                   setup.hysteresis, more.uniform(0.1, 0.3, 3), float(knee),
-                  _instant(more, elapsed), more.uniform(0.1, 0.3) * span, _flicker(more, elapsed))
+                  _instant(more, elapsed), more.uniform(0.1, 0.3) * span, _flicker(more, elapsed),
+                  unit(more.normal(size=3)))
 
 
 def _instant(rng: np.random.Generator, elapsed: Floats) -> float:

@@ -38,7 +38,8 @@ STEEP = 1.5
 
 OUTSIDE = ('ripple', 'periodic_offset', 'repeatability', 'quartic', 'quintic', 'dead_zone',
            'gain_temperature_quadratic', 'gain_temperature_steep', 'cross_axis_temperature',
-           'gain_periodic', 'offset_temperature_knee', 'offset_supply_quadratic', 'wander_1f')
+           'gain_periodic', 'offset_temperature_knee', 'offset_supply_quadratic', 'wander_1f',
+           'oblique_cubic', 'oblique_hinge')
 """Effects that can be hidden but are not in the catalogue."""
 
 Carried = tuple[tuple[str, str], ...]
@@ -52,6 +53,7 @@ CARRIER: dict[str, Carried] = {
     **_all(('quadratic', 'cubic', 'odd_quadratic', 'gain_asymmetry', 'ripple', 'quartic',
             'quintic', 'dead_zone'), ('offset', 'force'), ('gain', 'force'), ('force', 'force')),
     **_all(('cross_coupling',), ('cross_axis', 'force')),
+    **_all(('oblique_cubic', 'oblique_hinge'), ('force', 'direction')),
     **_all(('offset_temperature', 'offset_temperature_quadratic', 'offset_temperature_knee'),
            ('offset', 'temperature')),
     **_all(('temperature_rate',), ('offset', 'temperature_rate')),
@@ -70,10 +72,10 @@ CARRIER: dict[str, Carried] = {
 What each effect changes, and with what: pairs of carrier and variable.
 
 The carriers are offset, gain, cross_axis and force, the size of the force. The variables are time,
-temperature, temperature_rate, force (along an axis), supply and vibration. Any one of the pairs is
-right. A function of the force along an axis has three: on the unit sphere, the same change of |a|
-is that of an offset, of a gain or of the size of the force. Effects without a pair have no such
-form.
+temperature, temperature_rate, force (along an axis), direction (of the force), supply and
+vibration. Any one of the pairs is right. A function of the force along an axis has three: on the
+unit sphere, the same change of |a| is that of an offset, of a gain or of the size of the force.
+Effects without a pair have no such form.
 """
 
 
@@ -136,6 +138,8 @@ class Traits:
         Instant of the step and period of the periodic part of the gain [s].
     flicker : (n, 3) array
         1/f noise in time.
+    oblique : (3,) array
+        Unit vector along which the oblique effects are a function of the force.
 
     """
 
@@ -154,6 +158,7 @@ class Traits:
     gain_instant: float
     gain_beat: float
     flicker: Floats
+    oblique: Floats
 
 
 def unit(vectors: Floats) -> Floats:
@@ -258,6 +263,8 @@ EFFECTS: dict[str, Callable[[Around, Traits], Floats] | None] = {
     'offset_temperature_knee': _same(lambda a, t: np.tanh((a.temperature - t.knee) / STEEP)),
     'offset_supply_quadratic': _same(lambda a, t: (a.supply / NOMINAL_SUPPLY - 1.0) ** 2),
     'wander_1f': _by_axis(lambda a, t: t.flicker),
+    'oblique_cubic': _same(lambda a, t: (a.force @ t.oblique) ** 3),
+    'oblique_hinge': _same(lambda a, t: np.maximum(a.force @ t.oblique, 0.0)),
 }
 """The (n, 3, p) basis of each effect with p values; None for effects on the output."""
 
