@@ -121,11 +121,11 @@ class Session:
                          else _LARGEST_G * self.units.per_g)
         self._events: list[Event] = []
         known = settings.sensor or settings.calibration_file
-        store = self._take_files(settings.sensor) if known else None
+        store = _take_files(self, settings.sensor) if known else None
         if store is None:
             self.show_poses(store=False)
         else:
-            answered(self._load(store, self.sensor))
+            answered(_load(self, store, self.sensor))
 
     @property
     def name(self) -> str:
@@ -164,7 +164,7 @@ class Session:
         """Check the stream, and try to lock the files; to be called about once per second."""
         store = self.files.try_again()
         if store is not None:
-            self.report(self._load(store, self.sensor))
+            self.report(_load(self, store, self.sensor))
         self._report_still()
         self.reports.tick()
         self._events += self.commands.due()
@@ -286,50 +286,9 @@ class Session:
     def _begin_again(self) -> None:
         """Discard poses and calibration of another sensor, and load those of this sensor."""
         self.sensor = Sensor(self.settings, self.units)
-        store = self._take_files(self.name)
+        store = _take_files(self, self.name)
         if store is not None:
-            self.report(self._load(store, self.sensor))
-
-    def _take_files(self, sensor: str) -> Store | None:
-        """Lock the files of a sensor and return the store; None if another node uses them."""
-        store = self.files.take(sensor)
-        if self.files.problem:
-            self.problem = self.files.problem
-            self.log('error', self.problem)
-        return store
-
-    def _load(self, store: Store, sensor: Sensor) -> Task:
-        """Read the files of a sensor, and use them unless another one has replaced it."""
-        calibration: Calibration | None = None
-        poses: Poses | None = None
-        problem = ''
-        notes: list[str] = yield Files(tidied, store)
-        try:
-            calibration = yield Parse(store.load_calibration)
-        except Exception as error:  # the node starts in any case
-            problem = yield Files(unusable, store.calibration, error)
-        if calibration is not None and calibration.stream not in ('', store.identity.topic):
-            notes.append(f'{store.calibration} was made for {calibration.stream}, but it is used '
-                         f'for {store.identity.topic}')
-        try:
-            poses = yield Files(store.load_poses)
-        except Exception as error:
-            notes.append((yield Files(unusable, store.poses, error, True)))
-        if self.sensor is not sensor:
-            return ''
-        sensor.owners = {each.sensor for each in (calibration, poses)
-                         if each is not None and each.sensor}
-        if poses is not None:
-            sensor.live.book.add_stored(poses)
-            self.log('info', f'read {counted(len(poses), "pose")} from the store')
-        if calibration is not None:
-            self.adopt(calibration)
-            sensor.fitted_poses = len(calibration.poses)
-        self.problem = problem
-        for line in filter(None, (problem, *notes)):
-            self.log('error', line)
-        self.show_poses(store=False)
-        return ''
+            self.report(_load(self, store, self.sensor))
 
     # The calibration
 
@@ -373,26 +332,7 @@ class Session:
         if rating is not None or sensor.present is None:
             sensor.rating = rating
         if sensor.present is not None:
-            self.report(self._report_rating(sensor, sensor.present, rating))
-
-    def _report_rating(self, sensor: Sensor, calibration: Calibration, rating: Rating | None
-                       ) -> Task:
-        """Rate a calibration, and report it, unless another one has replaced it."""
-        rating, found = yield Compute(rated, calibration, sensor.refinement, rating,
-                                      self.settings.model)
-        if sensor.present is not calibration:
-            return ''
-        sensor.rating = rating
-        action = next_action(self)
-        if action is not NOT_KNOWN:
-            found['in_use'] = sensor.offered is not calibration
-            if calibration.is_levelled:
-                found['mounting'] = mounting_figures(
-                    calibration.rotation, self.frame_id or '', self.settings.base_frame)
-            command = action.command and f'~/{action.command}'
-            self.report(Result(json.dumps({
-                **found, **rating_json(rating, action.kind, action.words, command)})))
-        return ''
+            self.report(_report_rating(self, sensor, sensor.present, rating))
 
     def set_mounting(self, rotation: Floats) -> None:
         """Use a mounting ΔR that is known from elsewhere, (3, 3)."""
@@ -428,29 +368,93 @@ class Session:
         sensor = self.sensor
         poses = sensor.live.book.poses()
         added = sensor.guide.added(len(poses), self.statistics.stamp)
-        self.report(self._draw_poses(sensor, poses, added, new_rest,
-                                     self.files.store if store else None))
+        self.report(_draw_poses(self, sensor, poses, added, new_rest,
+                                self.files.store if store else None))
 
-    def _draw_poses(self, sensor: Sensor, poses: Poses, added: int, new_rest: bool,
-                    store: Store | None) -> Task:
-        """Store and draw poses, this number more than before; return the line of a new rest."""
-        guide, given = sensor.guide, (poses, self.units, self.settings.model)
-        due = added != 0 or guide.plan is None
-        try:
-            yield Files() if store is None else Files(store.save_poses, poses)
-        except OSError as error:
-            self.log('error', f'the poses could not be stored: {error}; {writing_advice(error)}',
-                     'not_stored', AGAIN)
-        # Computed even where only an average has changed, so that the lines keep their order.
-        plan = yield Compute(plan_for, *given) if due and len(poses) else Compute()
-        if due and not len(poses):  # without the start of the worker process
-            plan = plan_for(*given)
-        if plan is not None and sensor is self.sensor:
-            guide.plan = plan
-            self.report(ShowPoses(plan.up, plan.asked, self.frame_id or ''))
-        if not new_rest or sensor is not self.sensor:
-            return ''
-        return guide.line(poses, self.units, next_action(self), added=added > 0)
+
+def _take_files(session: Session, sensor: str) -> Store | None:
+    """Lock the files of a sensor and return the store; None if another node uses them."""
+    store = session.files.take(sensor)
+    if session.files.problem:
+        session.problem = session.files.problem
+        session.log('error', session.problem)
+    return store
+
+
+def _load(session: Session, store: Store, sensor: Sensor) -> Task:
+    """Read the files of a sensor, and use them unless another one has replaced it."""
+    calibration: Calibration | None = None
+    poses: Poses | None = None
+    problem = ''
+    notes: list[str] = yield Files(tidied, store)
+    try:
+        calibration = yield Parse(store.load_calibration)
+    except Exception as error:  # the node starts in any case
+        problem = yield Files(unusable, store.calibration, error)
+    if calibration is not None and calibration.stream not in ('', store.identity.topic):
+        notes.append(f'{store.calibration} was made for {calibration.stream}, but it is used '
+                     f'for {store.identity.topic}')
+    try:
+        poses = yield Files(store.load_poses)
+    except Exception as error:
+        notes.append((yield Files(unusable, store.poses, error, True)))
+    if session.sensor is not sensor:
+        return ''
+    sensor.owners = {each.sensor for each in (calibration, poses)
+                     if each is not None and each.sensor}
+    if poses is not None:
+        sensor.live.book.add_stored(poses)
+        session.log('info', f'read {counted(len(poses), "pose")} from the store')
+    if calibration is not None:
+        session.adopt(calibration)
+        sensor.fitted_poses = len(calibration.poses)
+    session.problem = problem
+    for line in filter(None, (problem, *notes)):
+        session.log('error', line)
+    session.show_poses(store=False)
+    return ''
+
+
+def _report_rating(session: Session, sensor: Sensor, calibration: Calibration,
+                   rating: Rating | None) -> Task:
+    """Rate a calibration, and report it, unless another one has replaced it."""
+    rating, found = yield Compute(rated, calibration, sensor.refinement, rating,
+                                  session.settings.model)
+    if sensor.present is not calibration:
+        return ''
+    sensor.rating = rating
+    action = next_action(session)
+    if action is not NOT_KNOWN:
+        found['in_use'] = sensor.offered is not calibration
+        if calibration.is_levelled:
+            found['mounting'] = mounting_figures(
+                calibration.rotation, session.frame_id or '', session.settings.base_frame)
+        command = action.command and f'~/{action.command}'
+        session.report(Result(json.dumps({
+            **found, **rating_json(rating, action.kind, action.words, command)})))
+    return ''
+
+
+def _draw_poses(session: Session, sensor: Sensor, poses: Poses, added: int, new_rest: bool,
+                store: Store | None) -> Task:
+    """Store and draw poses, this number more than before; return the line of a new rest."""
+    guide, given = sensor.guide, (poses, session.units, session.settings.model)
+    due = added != 0 or guide.plan is None
+    try:
+        yield Files() if store is None else Files(store.save_poses, poses)
+    except OSError as error:
+        session.log('error', f'the poses could not be stored: {error}; {writing_advice(error)}',
+                    'not_stored', AGAIN)
+    # Computed even where only an average has changed, so that the lines keep their order.
+    plan = yield Compute(plan_for, *given) if due and len(poses) else Compute()
+    if due and not len(poses):  # without the start of the worker process
+        plan = plan_for(*given)
+    if plan is not None and sensor is session.sensor:
+        guide.plan = plan
+        session.report(ShowPoses(plan.up, plan.asked, session.frame_id or ''))
+    if not new_rest or sensor is not session.sensor:
+        return ''
+    return guide.line(poses, session.units, next_action(session), added=added > 0)
 
 
 def _check_frames(settings: CalibratorSettings) -> None:
