@@ -522,9 +522,10 @@ def _closest(fitting: Sequence[LogFormat], header: Sequence[str]) -> LogFormat:
     return found if there else replace(found, instance='')
 
 
-def check_sensor(layout: LogFormat, path: Path) -> None:
+def check_sensor(header: Sequence[str], path: Path) -> None:
     """Check the name of a file, if its maker gives the files of all sensors the same columns."""
-    if _is_named(path, layout.other_sensors):
+    layout = recognise(header)  # also where the user names another format
+    if layout and _is_named(path, layout.other_sensors):
         raise InputError(f'{path} is the log of another sensor ({path.stem}), expected readings '
                          'of an accelerometer', layout.record)
 
