@@ -296,11 +296,11 @@ class LogFormat:
     does not determine it. `instance` is the column with the number of the sensor, if rows of
     several alternate.
 
-    Names of `columns` and `marks` together determine the layout if it is `plain`; otherwise it is
-    used only where the user names it. `without_gravity` are the maker's columns of acceleration
-    without gravity, and its files of it (``.csv``); `other_sensors` are its files of other sensors
-    with the same columns. `record` is what to use instead of these files, and `note` what else a
-    user should know.
+    The names of time, readings, `divisors` and `marks` together determine the layout if it is
+    `plain`; otherwise it is used only where the user names it. `without_gravity` are the maker's
+    columns of acceleration without gravity, and its files of it (``.csv``); `other_sensors` are
+    its files of other sensors with the same columns. `record` is what to use instead of these
+    files, and `note` what else a user should know.
 
     """
 
