@@ -322,14 +322,6 @@ def numbered(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.int64]:
     return np.arange(1, len(columns['reading']) + 1)
 
 
-def columns_from(given: Mapping[str, Floats]) -> dict[str, Floats]:
-    """Return the columns of which all names are given, by key."""
-    parts = {key: [np.asarray(given[name], float) for name in column.names]
-             for key, column in COLUMNS.items() if set(column.names) <= given.keys()}
-    return {key: np.column_stack(each) if len(each) > 1 else each[0]
-            for key, each in parts.items()}
-
-
 def present(header: Sequence[str], needed: Sequence[str], source: str) -> list[str]:
     """Return the keys of `COLUMNS` in a header; InputError if one or a part is missing."""
     keys = []

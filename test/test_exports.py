@@ -356,6 +356,7 @@ def test_vins_gets_the_noise_of_one_sample():
     ({**NOISE, 'update_rate': 0.0}, 'has update_rate 0.0'),
     ({**NOISE, 'update_rate': True}, 'has update_rate True'),
     ({**NOISE, 'update_rate': float('nan')}, 'has update_rate nan'),
+    ({**NOISE, 'update_rate': 10**400}, 'has update_rate 1000'),
     ({**NOISE, 'update_rate': '200'}, "has update_rate '200'")])
 def test_noise_that_is_missing_is_refused(to, noise, message):
     with pytest.raises(InputError, match=re.escape(message)):

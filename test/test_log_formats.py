@@ -85,10 +85,11 @@ def test_a_log_without_gravity_is_refused_and_the_maker_s_other_log_is_named(
     assert 'native' not in str(caught.value)
 
 
+@pytest.mark.parametrize('stated', ['', 'sensor-logger', 'matlab', 'esp32'])
 @pytest.mark.parametrize('name', make.OTHER_SENSORS)
-def test_a_log_of_another_sensor_with_the_same_columns_is_refused(name: str) -> None:
+def test_a_log_of_another_sensor_with_the_same_columns_is_refused(name: str, stated: str) -> None:
     with pytest.raises(InputError, match='another sensor'):
-        read_log(LOGS / name)
+        read_log(LOGS / name, LogOptions(format=stated))
 
 
 def test_another_and_an_unknown_format_are_refused_with_what_is_lacking_or_meant() -> None:

@@ -46,7 +46,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..geometry import rotation_from_rpy
-from ..table import Autopilot, check_values, COLUMNS, columns_from, Floats, numbered, Recording
+from ..table import Autopilot, check_values, COLUMNS, Floats, numbered, Recording
 from ..text import counted, some
 
 AXES, RATES = COLUMNS['reading'].names, COLUMNS['rate'].names
@@ -366,7 +366,10 @@ class FlightLog:
 
     def recording(self, source: str) -> Recording:
         """Return the samples as a recording; a number that is not finite is an InputError."""
-        columns = columns_from(self.columns)
+        parts = {key: [np.asarray(self.columns[name], float) for name in column.names]
+                 for key, column in COLUMNS.items() if set(column.names) <= self.columns.keys()}
+        columns = {key: np.column_stack(each) if len(each) > 1 else each[0]
+                   for key, each in parts.items()}
         check_values(columns, source)
         return Recording(columns, numbered(columns), 'm/s2', self.sensor, self.autopilot)
 

@@ -167,7 +167,7 @@ def chosen(layout: Layout, options: LogOptions) -> Chosen:
     given = dict(options.columns)
     if maker is None or set(READING) & given.keys():
         return with_indices(layout, _counted(layout, options, sources(layout, given)))
-    check_sensor(maker, layout.path)
+    check_sensor(header[:MOST], layout.path)
     found = sources(layout, {**maker.present(header), **given})
     for ours, theirs in maker.divisors.items():
         found[f'{ours}/'] = column(layout, theirs)

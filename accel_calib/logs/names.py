@@ -296,11 +296,11 @@ class LogFormat:
     does not determine it. `instance` is the column with the number of the sensor, if rows of
     several alternate.
 
-    Names of `columns` and `marks` together determine the layout if it is `plain`; otherwise it is
-    used only where the user names it. `without_gravity` are the maker's columns of acceleration
-    without gravity, and its files of it (``.csv``); `other_sensors` are its files of other sensors
-    with the same columns. `record` is what to use instead of these files, and `note` what else a
-    user should know.
+    The names of time, readings, `divisors` and `marks` together determine the layout if it is
+    `plain`; otherwise it is used only where the user names it. `without_gravity` are the maker's
+    columns of acceleration without gravity, and its files of it (``.csv``); `other_sensors` are
+    its files of other sensors with the same columns. `record` is what to use instead of these
+    files, and `note` what else a user should know.
 
     """
 
@@ -522,9 +522,10 @@ def _closest(fitting: Sequence[LogFormat], header: Sequence[str]) -> LogFormat:
     return found if there else replace(found, instance='')
 
 
-def check_sensor(layout: LogFormat, path: Path) -> None:
+def check_sensor(header: Sequence[str], path: Path) -> None:
     """Check the name of a file, if its maker gives the files of all sensors the same columns."""
-    if _is_named(path, layout.other_sensors):
+    layout = recognise(header)  # also where the user names another format
+    if layout and _is_named(path, layout.other_sensors):
         raise InputError(f'{path} is the log of another sensor ({path.stem}), expected readings '
                          'of an accelerometer', layout.record)
 

@@ -81,8 +81,9 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
     ------
     InputError
         If the bag is damaged, has no Imu messages or those of several sensors, or lacks a topic
-        that the calibration needs; if the readings are clearly in another unit; if the mounting is
-        in the frame win8; or if `out` exists.
+        that the calibration needs; if the readings are clearly in another unit; if only one of
+        calibration and messages is in native units; if the mounting is in the frame win8; or if
+        `out` exists.
     StoredCalibrationError
         If the calibration belongs to another sensor.
     OSError

@@ -64,7 +64,7 @@ def output_scale(calibration: Calibration, gravity: float) -> float:
 def corrected(calibration: Calibration, doubles: Floats, context: Context | None = None,
               stream: ThermalStream | None = None, scale: float = 1.0) -> Floats:
     """
-    Return the corrected doubles of Imu messages.
+    Return the corrected doubles of Imu messages, (n, 37).
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ class Rewriter:
     scale, gravity : float
         m/s² per unit of the corrected force, and local gravity [m/s²].
     frame_id : str
-        frame_id of the corrected messages, whose layout is the attribute `layout`.
+        frame_id of the corrected messages.
     noise : SampleNoise, optional
         Noise of the samples, stated in messages whose covariance is unknown.
     thermal : ThermalStream, optional
@@ -180,6 +180,8 @@ class Rewriter:
 
     Attributes
     ----------
+    layout : Layout
+        Layout of the corrected messages.
     bias : (float, float, float)
         Bias that is subtracted from the angular velocity [rad/s].
 

@@ -57,7 +57,8 @@ class OneReading:
         self.turn = _flat(model.rotation.T * self._unit)
         self.back = _flat(model.rotation / self._unit)
         self.per_g = calibration.units.per_g
-        self._fixed, self._bends = [0.0] * 12, list[_Bend]()
+        self._fixed = [0.0] * 12
+        self._bends: list[_Bend] = []
         self._varying: list[tuple[Effect, list[float], list[_Term]]] = []
         for effect, values in zip(model.terms.effects, model.values.values(), strict=True):
             size, shape = effect.split(values)

@@ -41,7 +41,7 @@ from .. import __version__
 from ..calibrate import Calibration
 from ..disk import check_regular, write_atomically
 from ..errors import InputError
-from ..table import Floats
+from ..table import Floats, LARGEST
 from ..units import STANDARD_GRAVITY
 
 if TYPE_CHECKING:
@@ -248,7 +248,7 @@ def _noise_figures(noise: Noise | None, label: str) -> tuple[dict[str, float], t
 
 def _is_positive(value: object) -> TypeGuard[float]:
     return (isinstance(value, int | float) and not isinstance(value, bool)
-            and 0.0 < value < np.inf)
+            and 0.0 < value < LARGEST)
 
 
 def read_noise(path: Path) -> Noise:
