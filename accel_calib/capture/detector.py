@@ -261,7 +261,12 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
 
 def samples_of(recording: Recording, start: int, stop: int, context: Sequence[str] = CONTEXT
                ) -> Floats:
-    """Return samples start to stop as (k, n) rows for `StillDetector.add`; InputError if bad."""
+    """
+    Return samples start to stop for `StillDetector.add`: (k, n), a row for each of its columns.
+
+    InputError if a time or a reading is not finite.
+
+    """
     which = slice(start, stop)
     time = recording['time'][which]
     width = MOTION if 'rate' in recording else 4

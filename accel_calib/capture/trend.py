@@ -72,7 +72,7 @@ class Line(NamedTuple):
     Least squares lines through windows, in units of one step.
 
     `slope` is (..., n). `square` and `neighbours` are the sums of the squared residuals, and of
-    the products of neighbouring residuals. `time_square` is Σ t².
+    the products of neighbouring residuals. `time_square` is Σ t², `length` that of the windows.
 
     """
 
