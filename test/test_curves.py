@@ -130,6 +130,15 @@ def test_a_nonlinearity_along_an_oblique_axis_is_described(oblique, form):
     assert errors[1] < 0.5 * errors[0]
 
 
+def test_a_gain_of_all_degrees_has_each_of_them_once():
+    rng = np.random.default_rng(0)
+    name = empirical_name('force', 'direction', modes_of('direction'))
+    values = rng.normal(size=len(effect_named(name).parameters)) * 2e-3
+    model = Model({'offset': np.array([0.01, 0.02, 0.0]), name: values})
+    poses = simulate_poses(model, random_directions(200, rng), rng, noise_g=3e-4, context={})
+    assert best_curve(base_of(poses), poses, ()).name == name
+
+
 def test_the_values_of_a_curve_are_the_cosines_of_its_definition():
     name = 'empirical-offset.x-temperature-2-3'
     temperature = np.linspace(15.0, 35.0, 9)

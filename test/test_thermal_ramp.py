@@ -21,6 +21,7 @@ from accel_calib.calibrate import Curve, curve_of
 from accel_calib.capture import capture, cells_of, Ramp, ramp_of
 from accel_calib.errors import InputError
 from accel_calib.logs import write_table
+from accel_calib.report import thermal_page
 from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import Recording
 from accel_calib.units import MG, units_of
@@ -301,6 +302,11 @@ def test_logs_of_several_sensors_in_counts_or_with_poses_without_temperature_are
     poses = capture(without_temperature(twelve_poses(1)), UNITS).poses
     with pytest.raises(InputError, match='the poses have no temperature'):
         thermal(ramp(8), Intake(poses, UNITS))
+
+
+def test_the_title_of_the_page_names_each_log():
+    page = thermal_page(thermal(ramp(8)), ['logs/cold.csv', '.'])
+    assert '<h1>Offset over temperature of cold.csv, .</h1>' in page
 
 
 def test_the_sense_hat_has_the_curve_that_others_found(tmp_path, capsys):

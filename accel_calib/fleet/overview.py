@@ -324,7 +324,7 @@ def priors_of(sensors: Iterable[Typical]) -> dict[str, FleetPrior]:
 
 
 def estimated(values: Floats, covariances: Floats) -> Prior:
-    """Return mean and covariance for another sensor, from (n, p) values and their covariances."""
+    """Return mean and covariance for another sensor, from (n, p) values, (n, p, p) covariances."""
     count, size = values.shape
     mean = np.median(values, axis=0)
     spread = np.median(np.abs(values - mean), axis=0) / 0.6745 + _LEAST_SPREAD_G

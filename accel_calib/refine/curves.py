@@ -134,7 +134,7 @@ def _kept(problem: Linear, out: tuple[int, ...]) -> Linear:
 def _grown(problem: Linear) -> Set:
     """Return the modes with the best score."""
     best = now = Set.of(problem)
-    for _ in range(_MOST_MODES):
+    for _ in range(min(_MOST_MODES, len(problem.blocks))):
         scores = now.scores_beside
         scores[list(now.blocks)] = -np.inf
         now = now.extended(int(np.argmax(scores)))

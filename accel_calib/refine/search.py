@@ -531,7 +531,7 @@ def simpler(chosen: Set) -> list[Set]:
 
 
 def accepted(visited: Iterable[Set]) -> Iterator[Set]:
-    """Yield the sets whose effects are all significant, the preferred one first."""
+    """Yield the sets of `explored` whose effects are significant, the preferred one first."""
     left = list(visited)
     while left:
         near: list[Set] = []

@@ -168,7 +168,7 @@ def thermal_page(outcome: ThermalOutcome, sources: Sequence[str], *, stored: str
 
     """
     calibration, curve = outcome.calibration, outcome.curve
-    names = ', '.join(Path(source).name for source in sources)
+    names = ', '.join(Path(source).name or source for source in sources)
     title = f'Offset over temperature of {calibration.sensor or names}'
     body = [_curve_numbers(curve),
             section('Offset over temperature', figures(
