@@ -47,6 +47,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 import copy
 from dataclasses import dataclass, field
+from functools import cache
 import math
 from typing import Any
 
@@ -299,6 +300,7 @@ def _dwell(context: Sequence[str], found: Any, std: Floats, count: float, rate_s
 CELLS = 256
 
 
+@cache
 def dwell_type(sums: np.dtype[Any]) -> np.dtype[Any]:
     """Return the type of the sums of a chunk in a dwell, from that of its sums alone."""
     return np.dtype([*sums.descr,
@@ -452,9 +454,8 @@ class Tracker:
         before = self._held
         if self._pause or self._dwell is None:
             before = _without_windows(self._lead)
-            first = chained(before, chunks[:1])['sums']
-            if (self._dwell is None or not self._dwell.chunks
-                    or not self._dwell.continued_by(first, self._rule.scale)):
+            if (self._dwell is None or not self._dwell.chunks or not self._dwell.continued_by(
+                    chained(before, chunks[:1])['sums'], self._rule.scale)):
                 done = self._end()
                 self._dwell = OngoingDwell(self._chunks, self.number)
             self._pause = 0
