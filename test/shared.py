@@ -132,3 +132,9 @@ def run_json(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[in
 def result(step: Step) -> Any:
     """Return the result of a step, computed in this process."""
     return step.run(lambda function, *given: function(*given))
+
+
+def children(pid: int) -> list[int]:
+    """Return the ids of the processes that a process started."""
+    tasks = Path(f'/proc/{pid}/task').glob('*/children')
+    return [int(child) for task in tasks for child in task.read_text().split()]

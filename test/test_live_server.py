@@ -6,11 +6,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
+from contextlib import contextmanager, ExitStack, suppress
 from functools import partial
 import json
+import os
 from pathlib import Path
 import re
+import signal
 import socket
 import sys
 from threading import Event
@@ -26,6 +28,7 @@ from inside import (
     PERIOD_OF_A_COMPLAINT, qr_code, reachable, simulate_recording, spread_directions, STUCK)
 import numpy as np
 import pytest
+from shared import children
 from viewer import fetch, hosted, Viewer, wait
 
 GRAVITY = 9.80665
@@ -129,10 +132,26 @@ def test_a_new_viewer_gets_all_kinds_of_messages(bench: Bench) -> None:
     wait(lambda: 'bench.csv has ended' in viewer.state['problem'])
 
 
+@contextmanager
+def stopped_children() -> Iterator[None]:
+    """Stop the worker processes, so that what they compute does not end."""
+    wait(lambda: children(os.getpid()))
+    workers = children(os.getpid())
+    for pid in workers:
+        os.kill(pid, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        for pid in workers:
+            os.kill(pid, signal.SIGCONT)
+
+
 def test_a_calibration_is_offered_to_all_viewers_and_stored_when_it_is_accepted(
         turned: Bench) -> None:
     viewer, other = turned.viewer(), turned.viewer()
-    numbers = [viewer.begin('fit') for _ in range(2)]
+    with stopped_children():
+        numbers = [viewer.begin('fit') for _ in range(2)]
+        wait(lambda: viewer.answer(numbers[1]) and other.state['busy'] == 'fit')
     wait(lambda: all(map(viewer.answer, numbers)))
     assert sorted(viewer.answer(each)['success'] for each in numbers) == [False, True]
     assert any('still running' in viewer.answer(each)['words'] for each in numbers)

@@ -27,6 +27,7 @@ import pytest
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.task import Future
+from shared import children
 
 TICKS = 20
 """Number of ticks of a timer for which the work of a service waits."""
@@ -186,12 +187,6 @@ def test_a_node_that_ends_does_not_wait_for_a_computation(process: WorkerProcess
         process.call(time.sleep, 3600.0)
     closing.join()
     assert not Path(f'/proc/{worker}').exists()
-
-
-def children(pid: int) -> list[int]:
-    """Return the ids of the processes that a process started."""
-    tasks = Path(f'/proc/{pid}/task').glob('*/children')
-    return [int(child) for task in tasks for child in task.read_text().split()]
 
 
 @pytest.mark.parametrize('number', sample([signal.SIGKILL, signal.SIGTERM, signal.SIGINT], 2))
