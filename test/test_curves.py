@@ -3,15 +3,19 @@
 
 """Empirical curves: their names, their form, the search for them, and their storage."""
 
+import re
 
 from accel_calib.calibrate import fit_poses
 from accel_calib.effects import (
-    CARRIERS, effect_named, empirical_name, empirical_parts, is_effect, MODES, modes_of, VARIABLES)
+    CARRIERS, effect_named, EMPIRICAL, empirical_name, empirical_parts, is_effect, kind_of, MODES,
+    modes_of, VARIABLES)
+from accel_calib.findings import rate
 from accel_calib.refine import refine
+from accel_calib.report import calibration_page
 from accel_calib.units import units_of
 from inside import (
-    beginning, best_curve, fitted_state, format_calibration, is_curve, Model, parse_calibration,
-    predict, simulate_poses)
+    beginning, best_curve, fitted_state, format_calibration, Model, parse_calibration, predict,
+    simulate_poses)
 import numpy as np
 import pytest
 from shared import random_directions, sensor
@@ -53,7 +57,7 @@ def test_the_name_of_a_curve_is_read_back(carrier, variable):
     if carrier != {'force': 'offset', 'direction': 'force'}.get(variable, carrier):
         assert not is_effect(name)
         return
-    assert is_curve(name)
+    assert kind_of(name) == EMPIRICAL
     assert empirical_parts(name) == (carrier, variable, modes)
     effect = effect_named(name)
     parts = 1 if '.' in carrier else len(CARRIERS[carrier])
@@ -128,6 +132,9 @@ def test_a_nonlinearity_along_an_oblique_axis_is_described(oblique, form):
     errors = [np.sqrt(np.mean((np.linalg.norm(each.correct(kept.reading), axis=1) - 1.0) ** 2))
               for each in (fit_poses(shown, G, model='10'), found.calibration)]
     assert errors[1] < 0.5 * errors[0]
+    page = calibration_page(found.calibration, rate(found.calibration), '')
+    assert re.search(r'curve of force over direction of the force\s+\d degree',
+                     re.sub(r'<[^>]+>', ' ', page))
 
 
 def test_a_gain_of_all_degrees_has_each_of_them_once():
@@ -211,7 +218,7 @@ def test_a_curve_that_leaves_most_of_the_gap_is_not_added():
 
 def test_a_calibration_with_a_curve_is_stored_and_read_with_all_digits(described):
     calibration = described.calibration
-    name = next(name for name in calibration.model.values if is_curve(name))
+    name = next(name for name in calibration.model.values if kind_of(name) == EMPIRICAL)
     text = format_calibration(calibration)
     found = parse_calibration(text, 'calibration.yaml')
     assert f'  {name}: ' in text

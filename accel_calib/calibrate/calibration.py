@@ -25,8 +25,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from .rest_noise import GyroBias, SampleNoise
 from ..effects import (
-    acting_temperature, AXES, Context, correct, EMPIRICAL, empirical_parts, Model, ModelForm,
-    MODELS, parameter_names, predict, rate_at, ThermalStream, variable_of)
+    acting_temperature, AXES, Context, correct, Model, ModelForm, MODELS, parameter_names, predict,
+    rate_at, ThermalStream, variable_of)
 from ..errors import InputError, StoredCalibrationError
 from ..finding import Finding
 from ..geometry import unit
@@ -613,7 +613,7 @@ def _size(values: Floats) -> Floats:
 def _vibration_range(calibration: Calibration) -> dict[str, tuple[float, float]]:
     """Return the range of the empirical curves over the vibration, if there are any."""
     ends = [values[-2:] for name, values in calibration.model.values.items()
-            if name.startswith(f'{EMPIRICAL}-') and empirical_parts(name)[1] == 'std']
+            if variable_of(name) == 'std']
     if not ends:
         return {}
     return {'std': (float(np.max([low for low, _ in ends])),

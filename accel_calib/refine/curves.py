@@ -45,8 +45,8 @@ from .base import causes
 from .linear import Block, held_out, LEVEL, Linear, outside_of, products_of, Set
 from .state import candidates, linearised, State
 from ..effects import (
-    CARRIERS, curve_pairs, effect_named, EFFECTS, EMPIRICAL, empirical_name, empirical_parts,
-    LADDER, Model, modes_of, WANDER)
+    CARRIERS, curve_pairs, effect_named, EFFECTS, empirical_name, empirical_parts, LADDER, Model,
+    modes_of, WANDER)
 from ..estimate import Fit, judge
 from ..table import Floats, Poses
 
@@ -172,10 +172,6 @@ def _held_out(chosen: Set) -> float:
     own = 1.0 - np.sum(chosen.linear.onto ** 2, axis=1) - np.sum(onto ** 2, axis=1)
     kept = own > 1e-6  # not the outliers
     return float(np.sum(held_out(residual[kept], own[kept]) ** 2))
-
-
-def is_curve(name: str) -> bool:
-    return name.startswith(f'{EMPIRICAL}-')
 
 
 _NEAREST = 2

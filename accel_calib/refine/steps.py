@@ -21,7 +21,7 @@ from typing import Literal
 
 import numpy as np
 
-from .curves import is_curve, LEAST, nearest_effects, probabilities, steepest
+from .curves import LEAST, nearest_effects, probabilities, steepest
 from .linear import Set
 from .search import Found
 from .state import candidates, fitted_state, is_noise, linearised, State, visible, with_effect
@@ -333,7 +333,7 @@ def _deviations(name: str, state: State) -> dict[str, float]:
 def _where(name: str, before: State, after: Floats) -> str:
     """Return where an effect explains the disagreement, given the residuals with it."""
     share_mg = before.mg_of_poses(before.fit.residual - after)
-    if is_curve(name):
+    if kind_of(name) == EMPIRICAL:
         return _curve(name, before, share_mg)
     if name == 'offset_step':
         return _instant(before.poses_g, share_mg)

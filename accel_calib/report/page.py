@@ -35,7 +35,7 @@ from .sheet import (
     scroll_table, section)
 from ..calibrate import Calibration, Curve, mounting_figures, outlook
 from ..effects import (
-    AXES, effect_named, EMPIRICAL, empirical_parts, REFERENCE_TEMPERATURE, value_unit,
+    AXES, effect_named, EMPIRICAL, empirical_parts, kind_of, REFERENCE_TEMPERATURE, value_unit,
     variable_words, with_vector)
 from ..findings import effect_figures, Figure, rate_refinement, residual_figures
 from ..geometry import coverage
@@ -345,13 +345,14 @@ def _linear_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
 def _effect_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
     """Yield the values of the other effects; a curve, which has many, is one row."""
     for name in calibration.model.effects:
-        if name.startswith(f'{EMPIRICAL}-'):
+        if kind_of(name) == EMPIRICAL:
             carrier, variable, modes = empirical_parts(name)
-            words = variable_words(variable)
-            yield f'curve of {carrier} over {words}', counted(len(modes), 'wave'), ''
+            mode = 'degree' if variable == 'direction' else 'wave'
+            yield (f'curve of {carrier} over {variable_words(variable)}',
+                   counted(len(modes), mode), '')
     for figure in effect_figures(calibration):
         name, _, part = figure.key.rpartition('.')
-        if name.startswith(f'{EMPIRICAL}-') or not (figure.value or figure.sd):
+        if kind_of(name) == EMPIRICAL or not (figure.value or figure.sd):
             continue
         label = f'{name.replace("_", " ")} {part}'
         if part in effect_named(name).parameters:
