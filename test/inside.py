@@ -60,12 +60,13 @@ from accel_calib.geometry import (
     unit, words_of)
 from accel_calib.live import sources
 from accel_calib.live.sources import is_port, open_source
-from accel_calib.logs import are_samples, bag_samples, bounded_bags, layout_with, open_bag, text
+from accel_calib.logs import bag_samples, bounded_bags, layout_with, open_bag, text
 from accel_calib.logs.bag_samples import together
 from accel_calib.logs.bounded_bags import decompressed, largest
 from accel_calib.logs.flight import read_dataflash, read_ulg
 from accel_calib.logs.formats import ULOG as ULG_MAGIC
 from accel_calib.logs.names import format_named, meaning, unit_of
+from accel_calib.logs.quantities import are_samples
 from accel_calib.logs.serialized import frame_ids, stamps_of
 from accel_calib.messages.one_reading import OneReading
 from accel_calib.noise.components import COMPONENTS as ALLAN_COMPONENTS, fit_components
@@ -76,7 +77,7 @@ from accel_calib.pipeline import (
 from accel_calib.refine import base as refine_base
 from accel_calib.refine.base import clipped, grid_step, off_grid, sampled, unclipped
 from accel_calib.refine.curves import (
-    _grown as grown_curve, best_curve, Curve, is_curve, Near, probabilities, Process, process_of,
+    _grown as grown_curve, best_curve, Curve, Near, probabilities, Process, process_of,
     SIGNIFICANT, Walk, walk_beside)
 from accel_calib.refine.linear import (
     _RARE as RARE, Block, LEVEL as REFINE_LEVEL, Linear, products_of, Set)
@@ -92,7 +93,7 @@ from accel_calib.report.sheet import sheet
 from accel_calib.report.stability import comparison_page, history_page
 from accel_calib.ros.run import own_domain
 from accel_calib.session import store as session_store, worker
-from accel_calib.session.commands import fitted as fit_in_node
+from accel_calib.session.commands import fit as fit_in_node
 from accel_calib.session.guidance import Guide, next_action, Plan, plan_for
 from accel_calib.session.live_capture import LiveCapture, PoseBook, with_temperature
 from accel_calib.session.sensor import rest_after, Sensor, TemperatureHistory

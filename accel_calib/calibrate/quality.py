@@ -108,7 +108,7 @@ def verify(calibration: Calibration, poses: Poses) -> Verification:
     vectors = calibration.form.known_orientation and 'reference' in poses
     floor = None
     if believable(poses_g.noise) is not None:
-        known = poses_g if vectors else _without_orientation(poses_g)
+        known = poses_g if vectors else poses_g.without_columns('reference', 'orientation')
         scale = judge(Model(model.values), known).equations.scale
         floor = rms_mg(scale) * float(np.sqrt(3.0 if vectors else 1.0))
     return Verification(*_residuals(model, poses_g, units, vectors), floor)
@@ -121,11 +121,6 @@ def _residuals(model: Model, poses_g: Poses, units: Units, vectors: bool
               errors_after(model, poses_g, vectors=vectors))
     before, after = (float(np.max(np.abs(each))) * 100.0 for each in errors)
     return rms_mg(errors[0]), rms_mg(errors[1]), before, after
-
-
-def _without_orientation(poses_g: Poses) -> Poses:
-    return Poses({key: values for key, values in poses_g.columns.items()
-                  if key not in ('reference', 'orientation')}, poses_g.row)
 
 
 def quality_of(fit: Fit, units: Units, directions: Floats) -> Quality:

@@ -16,7 +16,7 @@ from .bag_samples import context_of, ContextTopics
 from .columns import LogOptions
 from .containers import Frame, Piped
 from .names import NAMES
-from .quantities import are_samples, are_untimed_samples
+from .quantities import are_untimed_samples
 from .read import (
     is_bag, LineReader, Log, open_log, OpenLog, Progress, read_log, read_poses, read_recording,
     write_blocks, write_table)
@@ -31,7 +31,7 @@ __all__ = ['ACCELERATION', 'ACCELERATION_COVARIANCE', 'ANGULAR_VELOCITY',
            'LITTLE_ENDIAN', 'NAMES', 'NAME_AT', 'NINE', 'ORIENTATION', 'ORIENTATION_COVARIANCE',
            'PER_MILLION', 'STAMP', 'STAMP_AT', 'THREE', 'Bag', 'ByAxis', 'ContextTopics', 'Frame',
            'Layout', 'LineReader', 'Log', 'LogOptions', 'Messages', 'OpenLog', 'Piped',
-           'Progress', 'are_samples', 'are_untimed_samples', 'context_of',
+           'Progress', 'are_untimed_samples', 'context_of',
            'damage_as_input_error', 'doubles_at', 'is_bag', 'joined', 'layout_of', 'layout_with',
            'open_bag', 'open_log', 'put_doubles', 'read_log', 'read_poses', 'read_recording',
            'renamed', 'samples_of', 'write_blocks', 'write_table']

@@ -256,7 +256,7 @@ class Commands:
 
 def _fit(session: Session) -> Part[Fitted]:
     """Return a fit to the poses; the values of a refined calibration are fitted anew."""
-    return (yield from _sound(session, 'fit', fitted, session.units, session.settings,
+    return (yield from _sound(session, 'fit', fit, session.units, session.settings,
                               session.name, session.sensor.present))
 
 
@@ -406,8 +406,8 @@ def _refusal(rating: Rating) -> tuple[str, ...]:
     return (rating.reason, rating.next.text) if rating.name == 'BAD' else ()
 
 
-def fitted(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str,
-           before: Calibration | None) -> Fitted:
+def fit(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str,
+        before: Calibration | None) -> Fitted:
     """
     Return a fit of all poses with its rating, in the levelled frame of the calibration before.
 

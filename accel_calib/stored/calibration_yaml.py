@@ -4,9 +4,9 @@
 """
 Stored calibrations, and typical values of a fleet: readable, versioned YAML.
 
-The reader bounds size and nesting (`.plain_yaml`) and checks every value, and the calibration then
-passes the same gate as a fit (`accel_calib.calibrate.gate`). The last line of a file is a checksum
-of the text before it; it reveals a file that was edited by hand.
+The reader bounds size and nesting (`.plain_yaml`) and checks every value. The calibration then
+passes the same gate as a fit (`accel_calib.calibrate.gated`). The last line of a file is a
+checksum of the text before it; it reveals a file that was edited by hand.
 
 """
 
