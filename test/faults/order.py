@@ -8,7 +8,8 @@ A call takes effect at one moment between its start and its end. `explained` loo
 moments: an order of all calls in which each response follows from the state that the calls before
 it left.
 The state is small: the stored calibration, the one in use, the steps of ~/undo, and the number of
-poses. Of a calibration it holds which call made it, and whether it is levelled and a full fit.
+poses. Of a calibration it holds which call made it, the angles of its mounting, and the time of
+its fit.
 
 """
 
@@ -16,11 +17,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+import math
 import re
 
 from inside import MOST_STEPS
 
 _NUMBER_OF_POSES = re.compile(r'(\d+) poses?\b')
+_ANGLES = re.compile(r'roll (\S+)°, pitch (\S+)°, yaw (\S+)°')
 _FEWEST = 4
 _OFF = 'correction switched off'  # this state hides that of the calibration
 _DATE_S = 1.0  # resolution of the date of a calibration
@@ -39,13 +42,21 @@ class Call:
 
 @dataclass(frozen=True)
 class Made:
-    """A calibration: number, end and words of the call that made it, and what it made of it."""
+    """A calibration: number of the call that made it, mounting [°], end of its last fit."""
 
     number: int
-    ended: float
-    levelled: bool
-    full: bool
-    words: str
+    angles: tuple[float, ...]
+    fitted: float
+
+    @property
+    def levelled(self) -> bool:
+        """Whether the mounting is levelled."""
+        return bool(self.angles)
+
+    @property
+    def full(self) -> bool:
+        """Whether it is a fit of poses."""
+        return math.isfinite(self.fitted)
 
 
 @dataclass(frozen=True)
@@ -62,6 +73,12 @@ def _number_of_poses(call: Call) -> int:
     found = _NUMBER_OF_POSES.search(call.words)
     assert found is not None, call
     return int(found[1])
+
+
+def _angles(call: Call) -> tuple[float, ...]:
+    found = _ANGLES.search(call.words)
+    assert found is not None, call
+    return tuple(map(float, found.groups()))
 
 
 def _with_step(state: State, made: Made | None) -> State:
@@ -88,15 +105,14 @@ def _new(state: State, call: Call, number: int) -> Iterator[State]:
     if not call.good:
         yield state
         return
-    before, fits = state.used, call.name in ('fit', 'refine')
-    kept = before is not None and before.levelled
-    if (fits and state.poses < _FEWEST) or (call.name == 'set_heading' and not kept):
+    before, fits = state.used or Made(-1, (), -math.inf), call.name in ('fit', 'refine')
+    if (fits and state.poses < _FEWEST) or (call.name == 'set_heading' and not before.levelled):
         return
-    full, words = fits or (before is not None and before.full), call.words.partition('; next: ')[0]
-    yield _with_step(state, Made(number, call.ended, kept or not fits, full, words))
-    if state.used == state.stored is not None and state.stored.words == words and not (
-            fits and call.begun - state.stored.ended > _DATE_S):
-        yield state  # the same rest or poses again: an equal file is not a step
+    angles = before.angles if fits else _angles(call)
+    yield _with_step(state, Made(number, angles, call.ended if fits else before.fitted))
+    if state.used == state.stored is not None and angles == before.angles and not (
+            fits and call.begun - before.fitted > _DATE_S):
+        yield state  # the same rest or poses again may give an equal file, which is not a step
 
 
 def _save(state: State, call: Call, number: int) -> Iterator[State]:

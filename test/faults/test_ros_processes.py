@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from itertools import compress, product
 import json
 import os
 from pathlib import Path
@@ -73,14 +72,12 @@ class Stored:
 
 def after_kill(states: Iterable[State], name: str) -> list[State]:
     """Return the states that a call without a response may leave, if it was killed or done."""
-    parts = ('mounting of the sensor ', 'changes offset ', 'no calibration any more ')
-    found = []
+    unknown, found = 'roll nan°, pitch nan°, yaw nan°', []
     for state in states:
         found.append(state)
         for count in {max(state.poses - 1, 0), state.poses, state.poses + 1}:
-            for said in product((True, False), repeat=len(parts)):
-                text = f'{"".join(compress(parts, said))}{count} poses'
-                call = Call(name, 0.0, 0.0, text, good=True)
+            for undone in ('', 'no calibration any more'):
+                call = Call(name, 0.0, 0.0, f'{count} poses; {unknown}; {undone}', good=True)
                 found += AFTER[name](state, call, -1)
     return found
 
