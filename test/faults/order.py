@@ -42,7 +42,7 @@ class Call:
 
 @dataclass(frozen=True)
 class Made:
-    """A calibration: number of the call that made it, mounting [°], end of its last fit."""
+    """A calibration: its number, mounting [whole degrees], and end of its last fit."""
 
     number: int
     angles: tuple[float, ...]
@@ -78,7 +78,7 @@ def _number_of_poses(call: Call) -> int:
 def _angles(call: Call) -> tuple[float, ...]:
     found = _ANGLES.search(call.words)
     assert found is not None, call
-    return tuple(map(float, found.groups()))
+    return tuple(float(f'{float(each):.0f}') for each in found.groups())
 
 
 def _with_step(state: State, made: Made | None) -> State:
@@ -159,6 +159,14 @@ AFTER: dict[str, Callable[[State, Call, int], Iterator[State]]] = {
 """The states in which a call with its response can leave a calibrator; none: it cannot be."""
 
 
+def _renumbered(state: State) -> State:
+    """Return a state with the numbers of its calibrations in order: only their equality counts."""
+    made = [state.stored, state.used, *state.steps]
+    numbers = {each.number: -k for k, each in enumerate(made, 1) if each is not None}
+    stored, used, *steps = (each and replace(each, number=numbers[each.number]) for each in made)
+    return replace(state, stored=stored, used=used, steps=tuple(steps))
+
+
 def explained(clients: Sequence[Sequence[Call]], start: State,
               fits: Callable[[State], bool]) -> tuple[State | None, list[Call]]:
     """
@@ -196,8 +204,7 @@ def explained(clients: Sequence[Sequence[Call]], start: State,
             if call.begun > first_end:
                 continue  # another call ended before this one began
             after = (*at[:c], at[c] + 1, *at[c + 1:])
-            number = 100_000 * c + at[c]
-            for found in AFTER[call.name](state, call, number):
+            for found in map(_renumbered, AFTER[call.name](state, call, 1)):
                 if (after, found) not in seen:
                     seen.add((after, found))
                     waiting.append((after, found))

@@ -26,7 +26,7 @@ pytest.importorskip('rclpy')
 
 CALLER = Path(__file__).with_name('caller.py')
 CLIENTS = 4
-CALLS = 50
+CALLS = 25
 """Calls of a client; of many more, the search for their order takes too long."""
 
 ENABLES, AT_ONCE = 10_000 if FACTOR > 1 else 200, 100
