@@ -7,9 +7,11 @@ Whether the responses of a calibrator agree with some order of the calls.
 A call takes effect at one moment between its start and its end. `explained` looks for such
 moments: an order of all calls in which each response follows from the state that the calls before
 it left.
-The state is small: the stored calibration, the one in use, the steps of ~/undo, and the number of
-poses. Of a calibration it holds which call made it, the angles of its mounting, and the time of
-its fit.
+The state is small: the number of poses, the stored calibration, which is the one in use, and the
+steps of ~/undo. Of a calibration it holds the angles of its mounting and the time of its fit.
+A command that writes an equal file leaves no step. The responses do not show whether a file was
+equal. A calibration that may be equal therefore leaves a step that is not sure; ~/undo and the
+files at the end decide.
 
 """
 
@@ -26,7 +28,7 @@ _NUMBER_OF_POSES = re.compile(r'(\d+) poses?\b')
 _ANGLES = re.compile(r'roll (\S+)°, pitch (\S+)°, yaw (\S+)°')
 _FEWEST = 4
 _OFF = 'correction switched off'  # this state hides that of the calibration
-_DATE_S = 1.0  # resolution of the date of a calibration
+_SAME_FIT_S = 1.5  # resolution of the date of a calibration, and of `Made.fitted`
 
 
 @dataclass(frozen=True)
@@ -42,10 +44,9 @@ class Call:
 
 @dataclass(frozen=True)
 class Made:
-    """A calibration: its number, mounting [whole degrees], and end of its last fit."""
+    """A calibration: its mounting [whole degrees], and the end of its fit [whole seconds]."""
 
-    number: int
-    angles: tuple[float, ...]
+    angles: tuple[int, ...]
     fitted: float
 
     @property
@@ -60,13 +61,24 @@ class Made:
 
 
 @dataclass(frozen=True)
+class Step:
+    """A step of ~/undo: the calibration before, and whether there surely is such a step."""
+
+    made: Made | None
+    sure: bool
+
+
+@dataclass(frozen=True)
 class State:
-    """What a calibrator knows and has stored."""
+    """What a calibrator has stored; the calibration in use is the stored one."""
 
     poses: int
     stored: Made | None = None
-    used: Made | None = None
-    steps: tuple[Made | None, ...] = ()
+    steps: tuple[Step, ...] = ()
+
+    def has(self, count: int) -> bool:
+        """Return whether there can be this number of steps."""
+        return sum(step.sure for step in self.steps) <= count <= min(len(self.steps), MOST_STEPS)
 
 
 def _number_of_poses(call: Call) -> int:
@@ -75,96 +87,87 @@ def _number_of_poses(call: Call) -> int:
     return int(found[1])
 
 
-def _angles(call: Call) -> tuple[float, ...]:
+def _angles(call: Call) -> tuple[int, ...]:
     found = _ANGLES.search(call.words)
     assert found is not None, call
-    return tuple(float(f'{float(each):.0f}') for each in found.groups())
+    return tuple(round(float(angle)) for angle in found.groups())
 
 
-def _with_step(state: State, made: Made | None) -> State:
-    return replace(state, stored=made, used=made,
-                   steps=(*state.steps, state.stored)[-MOST_STEPS:])
+def _with_step(state: State, made: Made | None, *, sure: bool = True) -> State:
+    steps = (*state.steps, Step(state.stored, sure))
+    oldest = len(steps) - MOST_STEPS
+    return replace(state, stored=made, steps=tuple(
+        replace(step, sure=step.sure and k >= oldest) for k, step in enumerate(steps)))
 
 
-def _capture_pose(state: State, call: Call, number: int) -> Iterator[State]:
+def _capture_pose(state: State, call: Call) -> Iterator[State]:
     if not call.good:
         yield state
     elif _number_of_poses(call) - state.poses in (0, 1):
         yield replace(state, poses=_number_of_poses(call))
 
 
-def _undo_pose(state: State, call: Call, number: int) -> Iterator[State]:
+def _undo_pose(state: State, call: Call) -> Iterator[State]:
     if call.good and state.poses - _number_of_poses(call) in (0, 1):
         yield replace(state, poses=_number_of_poses(call))  # poses of one direction are merged
     elif not call.good and not state.poses:
         yield state
 
 
-def _new(state: State, call: Call, number: int) -> Iterator[State]:
+def _new(state: State, call: Call) -> Iterator[State]:
     """Yield the states that a new calibration can leave."""
     if not call.good:
         yield state
         return
-    before, fits = state.used or Made(-1, (), -math.inf), call.name in ('fit', 'refine')
+    before, fits = state.stored or Made((), -math.inf), call.name in ('fit', 'refine')
     if (fits and state.poses < _FEWEST) or (call.name == 'set_heading' and not before.levelled):
         return
-    angles = before.angles if fits else _angles(call)
-    yield _with_step(state, Made(number, angles, call.ended if fits else before.fitted))
-    if state.used == state.stored is not None and angles == before.angles and not (
-            fits and call.begun - before.fitted > _DATE_S):
-        yield state  # the same rest or poses again may give an equal file, which is not a step
+    made = (Made(before.angles, float(round(call.ended))) if fits else
+            Made(_angles(call), before.fitted))
+    may_equal = state.stored is not None and made.angles == before.angles and not (
+        fits and call.begun - before.fitted > _SAME_FIT_S)  # the same rest, or the same poses
+    yield _with_step(state, made, sure=not may_equal)
 
 
-def _save(state: State, call: Call, number: int) -> Iterator[State]:
-    if call.good is (state.used is not None):
-        yield state if state.used in (None, state.stored) else _with_step(state, state.used)
-
-
-def _load(state: State, call: Call, number: int) -> Iterator[State]:
+def _needs_calibration(state: State, call: Call) -> Iterator[State]:
     if call.good is (state.stored is not None):
-        yield replace(state, used=state.stored) if call.good else state
+        yield state
 
 
-def _undo(state: State, call: Call, number: int) -> Iterator[State]:
-    steps = state.steps
-    while steps and steps[-1] == state.stored:
-        steps = steps[:-1]
-    if not call.good and not steps:
-        yield replace(state, steps=steps)
-    elif call.good and steps and ('no calibration any more' in call.words) is (steps[-1] is None):
-        yield replace(state, stored=steps[-1], used=steps[-1], steps=steps[:-1])
+def _undo(state: State, call: Call) -> Iterator[State]:
+    if not call.good:
+        if state.has(0):
+            yield replace(state, steps=())
+        return
+    for k, step in reversed(list(enumerate(state.steps))):
+        if ('no calibration any more' in call.words) is (step.made is None):
+            yield replace(state, stored=step.made, steps=state.steps[:k])
+        if step.sure:
+            return
 
 
-def _reset(state: State, call: Call, number: int) -> Iterator[State]:
+def _reset(state: State, call: Call) -> Iterator[State]:
     if call.good:
-        after = state if state.stored is None else _with_step(state, None)
-        yield replace(after, used=None, poses=0)
+        yield replace(state if state.stored is None else _with_step(state, None), poses=0)
 
 
-def _self_test(state: State, call: Call, number: int) -> Iterator[State]:
+def _self_test(state: State, call: Call) -> Iterator[State]:
     levelled = ', levelled' in call.words
-    if _OFF in call.words or levelled is (state.used is not None and state.used.levelled):
+    if _OFF in call.words or levelled is (state.stored is not None and state.stored.levelled):
         yield state
 
 
-def _same(state: State, call: Call, number: int) -> Iterator[State]:
+def _same(state: State, call: Call) -> Iterator[State]:
     if call.good:
         yield state
 
 
-AFTER: dict[str, Callable[[State, Call, int], Iterator[State]]] = {
+AFTER: dict[str, Callable[[State, Call], Iterator[State]]] = {
     'capture_pose': _capture_pose, 'undo_pose': _undo_pose, 'fit': _new, 'refine': _new,
-    'set_level': _new, 'set_heading': _new, 'calibrate_at_rest': _new, 'save': _save,
-    'load': _load, 'undo': _undo, 'reset': _reset, 'enable': _same, 'self_test': _self_test}
+    'set_level': _new, 'set_heading': _new, 'calibrate_at_rest': _new,
+    'save': _needs_calibration, 'load': _needs_calibration, 'undo': _undo, 'reset': _reset,
+    'enable': _same, 'self_test': _self_test}
 """The states in which a call with its response can leave a calibrator; none: it cannot be."""
-
-
-def _renumbered(state: State) -> State:
-    """Return a state with the numbers of its calibrations in order: only their equality counts."""
-    made = [state.stored, state.used, *state.steps]
-    numbers = {each.number: -k for k, each in enumerate(made, 1) if each is not None}
-    stored, used, *steps = (each and replace(each, number=numbers[each.number]) for each in made)
-    return replace(state, stored=stored, used=used, steps=tuple(steps))
 
 
 def explained(clients: Sequence[Sequence[Call]], start: State,
@@ -204,7 +207,7 @@ def explained(clients: Sequence[Sequence[Call]], start: State,
             if call.begun > first_end:
                 continue  # another call ended before this one began
             after = (*at[:c], at[c] + 1, *at[c + 1:])
-            for found in map(_renumbered, AFTER[call.name](state, call, 1)):
+            for found in AFTER[call.name](state, call):
                 if (after, found) not in seen:
                     seen.add((after, found))
                     waiting.append((after, found))
