@@ -76,6 +76,13 @@ def test_two_hidden_effects_are_both_named(taken):
         assert sorted(names(found)) == sorted(pair)
 
 
+@pytest.mark.parametrize(('effect', 'poses'), [('quintic', 60), ('oblique_hinge', 200)])
+def test_a_form_outside_of_the_catalogue_is_not_named_after_its_nearest_effect(
+        effect, poses, taken):
+    found = refine(taken(3, {effect: 8.0}, poses=poses)[0], MPS2, base='10')
+    assert names(found) == ['empirical']
+
+
 @pytest.mark.parametrize('effect', ['repeatability', 'quartic', 'quintic', 'dead_zone',
                                     'gain_temperature_steep', 'offset_temperature_knee',
                                     'wander_1f'])

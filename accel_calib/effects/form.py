@@ -244,9 +244,11 @@ class Effect:
         return self.factor is None and self.output is None and not self.bends
 
     @cached_property
-    def is_slow_offset(self) -> bool:
-        """Whether the effect is an offset that changes with time, or with what changes slowly."""
-        return self.family == 'time' and all(term.monomial == ONE for term in self.terms)
+    def changes(self) -> str:
+        """What the effect changes: ``offset``, ``gain``, or ``force`` if it bends."""
+        if self.bends:
+            return 'force'
+        return 'offset' if all(term.monomial == ONE for term in self.terms) else 'gain'
 
     @cached_property
     def is_offset(self) -> bool:

@@ -45,8 +45,8 @@ from .base import causes
 from .linear import Block, held_out, LEVEL, Linear, outside_of, products_of, Set
 from .state import candidates, linearised, State
 from ..effects import (
-    CARRIERS, curve_pairs, effect_named, EFFECTS, empirical_name, empirical_parts, LADDER, Model,
-    modes_of, WANDER)
+    CARRIERS, curve_pairs, Effect, effect_named, EFFECTS, empirical_name, empirical_parts, LADDER,
+    Model, modes_of, WANDER)
 from ..estimate import Fit, judge
 from ..table import Floats, Poses
 
@@ -83,42 +83,71 @@ class Curve(NamedTuple):
     p_value: float
 
 
-def best_curve(state: State, poses_g: Poses, out: tuple[int, ...]) -> Curve | None:
-    """Return the best curve beside a model, or None; `out`: indices of the outliers."""
+class _Family(NamedTuple):
+    """The curves of a carrier and its parts over a variable, with all modes in one effect."""
+
+    carrier: str
+    variable: str
+    effect: Effect
+    shape: Floats
+
+    @property
+    def parts(self) -> list[tuple[str, slice]]:
+        """Return the carrier and each of its parts, with the places of their values."""
+        parts = CARRIERS[self.carrier]
+        alone = [(f'{self.carrier}.{part}', slice(k, None, len(parts)))
+                 for k, part in enumerate(parts)]
+        return [(self.carrier, slice(None)), *(alone if len(parts) > 1 else ())]
+
+
+def best_curve(state: State, poses_g: Poses, out: tuple[int, ...], *, of_force: bool = False
+               ) -> Curve | None:
+    """
+    Return the best curve beside a model, or None.
+
+    `out` are the indices of the outliers; `of_force`: only curves over the force or its
+    direction. The choice among all curves is paid for in either case.
+
+    """
     fit = judge(state.model, poses_g)
     plain = linearised(fit, state.model.effects)
     if plain.dof < _LEAST_DOF:
         return None
-    best, tried = None, 0
-    for carrier, variable in curve_pairs(causes(poses_g)):
-        for problem in _problems(plain, fit, carrier, variable):
-            grown, tried = _grown(_kept(problem, out)), tried + 1
+    families = list(_families(poses_g))
+    tried, best = sum(len(family.parts) for family in families), None
+    for family in families:
+        if of_force and not family.effect.bends:
+            continue
+        for problem in _problems(plain, fit, family):
+            grown = _grown(_kept(problem, out))
             if grown.blocks and (best is None or grown.score > best[0]):
                 best = grown.score, Set.of(problem, grown.blocks, out)
     return None if best is None else _accepted(best[0] - 2.0 * math.log(tried), best[1], tried)
 
 
-def _problems(plain: Linear, fit: Fit, carrier: str, variable: str) -> Iterator[Linear]:
+def _families(poses_g: Poses) -> Iterator[_Family]:
+    """Yield the curves that the columns of poses allow."""
+    for carrier, variable in curve_pairs(causes(poses_g)):
+        effect = effect_named(empirical_name(carrier, variable, modes_of(variable)))
+        if set(effect.needs) <= set(poses_g.columns):
+            shapes = iter([np.zeros(0)]) if effect.shapes is None else effect.shapes(
+                poses_g.columns)
+            yield from (_Family(carrier, variable, effect, shape) for shape in shapes)
+
+
+def _problems(plain: Linear, fit: Fit, family: _Family) -> Iterator[Linear]:
     """Yield the problem with the modes of a carrier as candidates, and of each of its parts."""
-    modes = modes_of(variable)
-    name = empirical_name(carrier, variable, modes)
-    effect = effect_named(name)
-    if not set(effect.needs) <= set(fit.poses_g.columns):
-        return
-    shapes = [np.zeros(0)] if effect.shapes is None else list(effect.shapes(fit.poses_g.columns))
-    if not shapes:
-        return
-    count, parts = len(effect.parameters), CARRIERS[carrier]
-    model = Model({name: np.concatenate([np.zeros(count), shapes[0]])})
+    _, variable, effect, shape = family
+    count, modes = len(effect.parameters), modes_of(variable)
+    model = Model({empirical_name(family.carrier, variable, modes):
+                   np.concatenate([np.zeros(count), shape])})
     columns, sizes = outside_of(plain.onto, fit.equations.columns(model)[:, :count])
     products = products_of(columns, plain.residual)
-    whole = [(carrier, slice(None))]
-    alone = [(f'{carrier}.{part}', slice(k, None, len(parts))) for k, part in enumerate(parts)]
-    for own, which in whole + alone if len(parts) > 1 else whole:
+    for own, which in family.parts:
         index = [*np.arange(len(sizes))[which], -1]
         names = [empirical_name(own, variable, (mode,)) for mode in modes]
         ends = np.cumsum([0, *(len(effect_named(each).parameters) for each in names)]).tolist()
-        blocks = tuple(Block(each, shapes[0], slice(*ends[k:k + 2]), effect, 0, k + 1.0)
+        blocks = tuple(Block(each, shape, slice(*ends[k:k + 2]), effect, 0, k + 1.0)
                        for k, each in enumerate(names))
         yield replace(plain, columns=columns[:, which], sizes=sizes[which], choice=0.0,
                       products=products[np.ix_(index, index)], blocks=blocks)

@@ -61,9 +61,13 @@ _TREND = 15.0
 _TIMED = 30.0
 """A curve over time must have a score better than a walk by this."""
 
+_INSTEAD = {'force': 2.0, 'offset': 10.0, 'gain': 10.0}
+"""A curve in place of one effect must have a score better by this (Kass and Raftery 1995: positive,
+very strong). A curve over what changes slowly begins with half a wave, which is almost a line."""
+
 _SEVERAL = 10.0
-"""Each further slow offset must raise the score by this: one unknown cause is more likely than
-several that act at once (Kass and Raftery 1995: very strong)."""
+"""Each further effect of the same kind must raise the score by this: one unknown cause is more
+likely than several that act at once (Kass and Raftery 1995: very strong)."""
 
 _EXACT = 0.05
 """Largest error of a predicted sum of squares, in variances, after which a search ends."""
@@ -179,8 +183,10 @@ def _search(poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
 
 def _described(found: Found, start: State, poses_g: Poses) -> Found:
     """Add an empirical curve if the names leave a gap, or if it is better than they or a walk."""
-    if found.walk is None and found.final.is_noise:
-        return _with_one_curve(found, start, poses_g)
+    if found.walk is None:
+        instead = _with_one_curve(found, start, poses_g)
+        if instead is not None or found.final.is_noise:
+            return instead or found
     curve = best_curve(found.final, poses_g, found.near.chosen.out)
     if curve is None:
         return found
@@ -193,23 +199,29 @@ def _described(found: Found, start: State, poses_g: Poses) -> Found:
     return _with_curve(found, curve, start, poses_g) or found
 
 
-def _with_one_curve(found: Found, start: State, poses_g: Poses) -> Found:
+def _with_one_curve(found: Found, start: State, poses_g: Poses) -> Found | None:
     """
-    Replace several offsets that change slowly by one curve, if its score is better.
+    Replace the effects that change the same by one curve, if its score is better.
 
-    A smooth change whose cause is not recorded is imitated by a sum of such effects.
+    A form outside of the catalogue is imitated by the effects nearest to it, and a smooth change
+    whose cause is not recorded by those that change slowly. None if the names are better.
 
     """
-    slow = [name for name in found.near.names if effect_named(name).is_slow_offset]
-    beside = _less(found, slow) if len(slow) > 1 else None
-    curve = None if beside is None else best_curve(beside.final, poses_g, beside.near.chosen.out)
-    if beside is None or curve is None:
-        return found
-    gained = found.near.beside.score - beside.near.beside.score
-    if curve.score < gained - _SEVERAL * (len(slow) - 1):
-        return found
-    described = _with_curve(beside, curve, start, poses_g)
-    return found if described is None or not described.final.is_noise else described
+    for what, better in _INSTEAD.items():
+        names = [name for name in found.near.names
+                 if (entry := effect_named(name)).family and entry.changes == what]
+        beside = _less(found, names)
+        curve = None if beside is None else best_curve(
+            beside.final, poses_g, beside.near.chosen.out, of_force=what == 'force')
+        if beside is None or curve is None:
+            continue
+        gained = found.near.beside.score - beside.near.beside.score
+        if curve.score < gained + better - _SEVERAL * (len(names) - 1):
+            continue
+        described = _with_curve(beside, curve, start, poses_g)
+        if described is not None and (described.final.is_noise or not found.final.is_noise):
+            return described
+    return None
 
 
 def _with_curve(found: Found, curve: Curve, start: State, poses_g: Poses) -> Found | None:
