@@ -309,8 +309,9 @@ class _Alone:
         self._at, self._along = u, g
 
     def columns(self, model: Model | EachShape) -> Floats:
-        return (model.basis(self._at, self._context).along(self._rows)
-                - model.basis(self._at, self._context, self._along).along(self._rows_along))
+        plain = model.terms.along(self._rows, self._at)
+        plain -= model.terms.along(self._rows_along, self._at, self._along)
+        return model.basis_of(plain, self._context).summed
 
 
 class _Known:
@@ -324,7 +325,7 @@ class _Known:
         self.residual = (poses.reading - reading).ravel() / self._sigma
 
     def columns(self, model: Model | EachShape) -> Floats:
-        basis = model.basis(self.force, self._context).full
+        basis = model.basis_of(model.terms.plain(self.force), self._context).full
         return basis.reshape(len(self._sigma), basis.shape[2]) / self._sigma[:, np.newaxis]
 
 
@@ -377,7 +378,7 @@ class _Shared:
         return rows - self._turn @ onto[self._group]
 
     def columns(self, model: Model | EachShape) -> Floats:
-        basis = model.basis(self.force, self._context).full
+        basis = model.basis_of(model.terms.plain(self.force), self._context).full
         rows = self._projected(basis / self._sigma[:, :, np.newaxis])
         return rows.reshape(len(self.pose), basis.shape[2])
 
