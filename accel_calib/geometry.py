@@ -102,7 +102,7 @@ vectors, whose signs are those of the axes."""
 
 _NEAR = np.cos(np.radians(45.0))
 _COVERAGE_DIRECTIONS = 500
-_BLOCK = 10000
+_BLOCK = 1000
 _SAME = np.cos(np.radians(5.0))
 _NAMED = np.cos(np.radians(8.0))
 """A direction within 8° of a face, edge or corner has its name."""
@@ -112,10 +112,10 @@ _SIDES = (('front', 'back'), ('left', 'right'), ('top', 'bottom'))
 
 def uncovered(directions: Floats) -> Floats:
     """Return the directions of an even grid that are not within 45° of a pose, (m, 3)."""
-    grid = spread_directions(_COVERAGE_DIRECTIONS)
-    nearest = [np.max(grid @ directions[start:start + _BLOCK].T, axis=1)
-               for start in range(0, len(directions), _BLOCK)]
-    return grid[np.max(nearest, axis=0) < _NEAR]
+    left = spread_directions(_COVERAGE_DIRECTIONS)
+    for start in range(0, len(directions), _BLOCK):
+        left = left[np.max(left @ directions[start:start + _BLOCK].T, axis=1) < _NEAR]
+    return left
 
 
 def coverage(directions: Floats) -> float:

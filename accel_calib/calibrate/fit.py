@@ -214,7 +214,7 @@ def _by_norm(poses: Poses, units: Units, model: str, method: Method) -> tuple[Ca
     poses_g, directions = only_norm(in_g(poses, units)), directions_of(poses, units)
     dilutions = _dilutions(model, directions, pose_noise(poses_g.noise, directions))
     original = originals(poses_g) if method == 'ml' else np.arange(len(poses_g))
-    kept = np.unique(original)
+    first = kept = np.flatnonzero(np.bincount(original))
     fits: dict[str, Fit] = {}
     if method == 'ml':
         largest = list(dilutions)[-1]
@@ -226,11 +226,13 @@ def _by_norm(poses: Poses, units: Units, model: str, method: Method) -> tuple[Ca
         dilutions = _dilutions(model, used, noise)
     fits = {name: fits.get(name) or _fit_rows(left, name, method) for name in dilutions}
     name, reason = (model, f'model {model} was requested') if model != 'auto' else _choose(fits)
-    fit, out = fits[name], np.setdiff1d(np.unique(original), kept)
+    inside = np.zeros(len(poses_g), bool)
+    inside[kept] = True
+    fit, out = fits[name], first[~inside[first]]
     unlike = rivals(fit, kept, out, poses_g, lambda others: _estimated(name, others))
     return record_of(
         fit, poses, units, used, name, method, covariance=covariance_with(fit, unlike),
-        rejected=rejected_by(fit.model, poses_g.take(~np.isin(original, kept))), reason=reason,
+        rejected=rejected_by(fit.model, poses_g.take(~inside[original])), reason=reason,
         noted=(*copies(original, poses_g), *rival_findings(unlike, poses_g.row),
                *fit_findings(fit, dilutions[name]),
                *(unseen(list(dilutions)[-1], used, noise) if model == 'auto' else ()))), fit
@@ -238,8 +240,8 @@ def _by_norm(poses: Poses, units: Units, model: str, method: Method) -> tuple[Ca
 
 def copies(original: Indices, poses: Poses) -> Iterator[Finding]:
     """Yield a finding about the rows that count as one pose, from the result of `originals`."""
-    first, count = np.unique(original, return_counts=True)
-    groups = [poses.row[original == each].tolist() for each in first[count > 1]]
+    groups = [poses.row[original == each].tolist()
+              for each in np.flatnonzero(np.bincount(original) > 1)]
     if groups:
         shown = '; '.join(listed('row', rows) for rows in groups[:_MOST_NAMED])
         more = len(groups) - _MOST_NAMED

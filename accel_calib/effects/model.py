@@ -17,7 +17,7 @@ readings are in g; `accel_calib.units` converts them.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 import math
 from typing import Any
@@ -109,11 +109,18 @@ class Terms:
         With a `direction`, (n, 3), return their derivative along this direction of the force.
 
         """
-        if direction is None:
-            monomials = self.monomials_at(u)
-        else:
-            monomials = np.einsum('mjn,nj->mn', self.gradients_at(u), direction)
+        monomials = self.monomials_at(u)
+        if direction is not None:
+            for k, index in enumerate(self.monomials):
+                monomials[k] = sum(part * along for part, along in zip(
+                    MONOMIALS[index].gradient(*u.T), direction.T) if np.ndim(part) or part)
         return monomials[self.place] * self.weight[:, np.newaxis]
+
+    def along(self, rows: Floats, u: Floats, direction: Floats | None = None) -> Floats:
+        """Return the (t, n) products of `plain` with an (n, 3) row per pose."""
+        found = self.plain(u, direction)
+        found *= rows.T[self.axis]
+        return found
 
     def gradients_at(self, u: Floats) -> Floats:
         """Return the (m, 3, n) derivatives of the monomials by the force."""
@@ -172,8 +179,13 @@ class Basis:
 
     def along(self, rows: Floats) -> Floats:
         """Return the (n, p) product of the derivative with an (n, 3) row per pose."""
-        found = np.moveaxis(self.to_value @ (self.terms * rows.T[self.axis]), -1, 0)
-        return found.reshape(len(rows), math.prod(found.shape[1:]))
+        return replace(self, terms=self.terms * rows.T[self.axis]).summed
+
+    @property
+    def summed(self) -> Floats:
+        """(n, p) array, the sums over the axes."""
+        found = self.to_value @ self.terms
+        return found.reshape(math.prod(found.shape[:-1]), found.shape[-1]).T
 
 
 @dataclass(frozen=True)
@@ -379,8 +391,11 @@ class Model(Record):
         along this direction of the force.
 
         """
+        return self.basis_of(self.terms.plain(u, direction), context)
+
+    def basis_of(self, plain: Floats, context: Context) -> Basis:
+        """Return the same from the (t, n) terms for values and factors of 1."""
         terms = self.terms
-        plain = terms.plain(u, direction)
         if terms.fixed:
             return Basis(plain, terms.axis, terms.to_value)
         found: list[Floats] = [plain * self._factors(context)]
@@ -413,12 +428,14 @@ class EachShape:
     name: str
     factors: Floats
 
-    def basis(self, u: Floats, context: Context, direction: Floats | None = None) -> Basis:
-        """Return the derivative of the reading by the parameters; see `Model.basis`."""
-        terms = terms_of((self.name,))
-        parameters = len(terms.effects[0].parameters)
-        return Basis(terms.plain(u, direction) * self.factors, terms.axis,
-                     terms.to_value[:parameters])
+    @property
+    def terms(self) -> Terms:
+        return terms_of((self.name,))
+
+    def basis_of(self, plain: Floats, context: Context) -> Basis:
+        """Return the derivative of the reading by the parameters; see `Model.basis_of`."""
+        parameters = len(self.terms.effects[0].parameters)
+        return Basis(plain * self.factors, self.terms.axis, self.terms.to_value[:parameters])
 
 
 def factors_of(name: str, shapes: Iterable[Floats], context: Context) -> Floats:

@@ -48,9 +48,6 @@ _BIN = 1.0
 _RESTART = 1.0
 """If the time of a stream jumps back by more than this, the stream starts again [s]."""
 
-_LONGEST = 30.0
-"""Longest part of a low pass that is computed at once, in lags; e³⁰ keeps all digits."""
-
 _SHORTEST = 0.1
 """Shortest interval for the smoother [s]; earlier rows count as simultaneous."""
 
@@ -199,19 +196,18 @@ def _moment(steps: Floats, polynomial: tuple[float, float, float]) -> Floats:
 
 
 def _decayed(time: Floats, behind: Floats, lag: float, start: float) -> Floats:
-    """Return T - A at n increasing times: `start`, then its decay plus the n - 1 steps behind."""
-    found = np.empty(len(time))
-    found[0], first = start, 0
-    while first < len(time) - 1:
-        last = max(int(np.searchsorted(time, time[first] + _LONGEST * lag)), first + 2)
-        ages = (time[first + 1:last] - time[first]) / lag
-        if last == first + 2:  # one step, of any length
-            found[first + 1] = found[first] * np.exp(-ages[0]) + behind[first]
-        else:
-            growth = np.exp(ages)
-            total = found[first] + np.cumsum(behind[first:last - 1] * growth)
-            found[first + 1:last] = total / growth
-        first = last - 1
+    """
+    Return T - A at n increasing times: `start`, then its decay plus the n - 1 steps behind.
+
+    After pass k each sum has its last 2^k steps, and `kept` what remains of what is older.
+
+    """
+    found, kept = np.append(start, behind), np.exp(-np.diff(time, prepend=-np.inf) / lag)
+    reach = 1
+    while reach < len(found) and np.any(kept):
+        found[reach:] += kept[reach:] * found[:-reach]
+        kept[reach:] *= kept[:-reach]
+        reach *= 2
     return found
 
 

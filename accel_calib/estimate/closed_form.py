@@ -49,6 +49,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
 from math import comb
+from operator import itemgetter
 
 import numpy as np
 
@@ -61,6 +62,9 @@ from ..units import Floats, Indices
 
 _RIDGE = 1e-12
 """Keeps the solution finite for poses in a plane; the centre is then in the plane."""
+
+_DISTANCES = 2 ** 16
+"""Largest number of distances of poses from subsets that are held at once."""
 
 _BLOCK = 8192
 """Number of poses per block; their monomials fit in the cache."""
@@ -265,11 +269,15 @@ def agreeing(name: str, poses_g: Poses, most: int) -> Indices:
     noise = believable(poses_g.noise)
     noise = np.ones_like(reading) if noise is None else noise
     nearest = _subsets(count, most, len(parameter_names(MODELS[name].effects)))
+    at_once = max(_DISTANCES // count, 1)
     for _ in range(_CONCENTRATIONS):
-        squared = _squared_distances(name, reading, nearest, noise)
-        nearest = np.argsort(squared, axis=1)[:, :count - most]
-        trimmed = np.take_along_axis(squared, nearest, axis=1).sum(axis=1)
-        nearest = nearest[np.argsort(trimmed)[:10]]
+        best: list[tuple[float, Indices]] = []
+        for first in range(0, len(nearest), at_once):
+            squared = _squared_distances(name, reading, nearest[first:first + at_once], noise)
+            inside = np.argpartition(squared, count - most - 1, axis=1)[:, :count - most]
+            trimmed = np.take_along_axis(squared, inside, axis=1).sum(axis=1)
+            best = sorted([*best, *zip(trimmed.tolist(), inside)], key=itemgetter(0))[:10]
+        nearest = np.array([inside for _, inside in best])
     return np.sort(nearest[0])
 
 
@@ -282,7 +290,8 @@ def _subsets(count: int, most: int, free: int) -> Indices:
         return np.nonzero(inside)[1].reshape(len(out), -1)
     size = min(free + _SPARE, count - most)
     rng = np.random.default_rng(count)
-    return np.argsort(rng.random((_MOST_SUBSETS, count)), axis=1)[:, :size]
+    return np.array([np.argpartition(rng.random(count), size - 1)[:size].copy()
+                     for _ in range(_MOST_SUBSETS)])
 
 
 def _squared_distances(name: str, reading: Floats, subsets: Indices, noise: Floats

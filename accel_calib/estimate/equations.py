@@ -62,6 +62,9 @@ from ..geometry import unit
 from ..table import Poses
 from ..units import Floats, Indices
 
+_BLOCK = 8192
+"""Number of poses per block; their equations fit in the cache."""
+
 USUAL_NOISE_G = 5e-4
 """Noise of a pose mean of a common MEMS sensor, assumed if it was not measured [g]."""
 
@@ -147,12 +150,21 @@ def originals(poses_g: Poses) -> Indices:
 
 
 def _first_equal(rows: Floats) -> Indices:
-    """Return the (n,) index of the first row equal to each; a hash is sorted faster than rows."""
+    """
+    Return the (n,) index of the first row equal to each.
+
+    A hash is sorted faster than rows, and few rows are not the only ones with their hash.
+
+    """
     bits = (rows + 0.0).view(np.uint64)  # -0.0 becomes 0.0
     factors = np.random.default_rng(1).integers(2 ** 63, size=rows.shape[1], dtype=np.uint64)
-    _, first, which = np.unique(bits @ (2 * factors + 1), return_index=True, return_inverse=True)
-    first = first[which]
-    return np.where(np.all(rows[first] == rows, axis=1), first, np.arange(len(rows)))
+    mixed, found = bits @ (2 * factors + 1), np.arange(len(rows))
+    ordered = np.sort(mixed)
+    again = np.flatnonzero(np.isin(mixed, ordered[1:][ordered[1:] == ordered[:-1]]))
+    _, first, which = np.unique(mixed[again], return_index=True, return_inverse=True)
+    first = again[first[which]]
+    found[again] = np.where(np.all(rows[first] == rows[again], axis=1), first, again)
+    return found
 
 
 def kinds(poses: Poses) -> tuple[Indices, list[Indices], Indices]:
@@ -186,11 +198,11 @@ class _Kind(NamedTuple):
 
 @dataclass(frozen=True)
 class Measured:
-    """Poses in g by kind of orientation, and their noise; see `measured`."""
+    """Poses in g by kind of orientation, those alone in blocks, and their noise; see `measured`."""
 
     known: _Kind
     shared: _Kind
-    alone: _Kind
+    alone: tuple[_Kind, ...]
     count: int
     noise_known: bool
 
@@ -211,7 +223,11 @@ def measured(poses_g: Poses) -> Measured:
         context = {key: values[which] for key, values in poses_g.columns.items()}
         return _Kind(which, group, context, reading[which], s[which])
 
-    return Measured(kind([known]), kind(shared), kind([alone]), len(s), noise is not None)
+    # The context of a pose can be that of the others, too: a low pass has a history.
+    size = _BLOCK if {*poses_g.columns} <= {*_OF_READING} else max(len(alone), 1)
+    return Measured(kind([known]), kind(shared), tuple(
+        kind([alone[first:first + size]]) for first in range(0, len(alone), size)),
+        len(s), noise is not None)
 
 
 @dataclass(frozen=True)
@@ -270,7 +286,8 @@ def equations(model: Model, poses: Measured) -> Equations:
     """Set up the equations near a model with ΔR = I; NaN where a reading's force is not unique."""
     parts: list[_Known | _Shared | _Alone] = []
     force, scale = np.empty((poses.count, 3)), np.empty(poses.count)
-    for make, kind in ((_Known, poses.known), (_Shared, poses.shared), (_Alone, poses.alone)):
+    for make, kind in ((_Known, poses.known), (_Shared, poses.shared),
+                       *((_Alone, block) for block in poses.alone)):
         if len(kind.which):
             part = make(model, kind)
             parts.append(part)
@@ -309,8 +326,9 @@ class _Alone:
         self._at, self._along = u, g
 
     def columns(self, model: Model | EachShape) -> Floats:
-        return (model.basis(self._at, self._context).along(self._rows)
-                - model.basis(self._at, self._context, self._along).along(self._rows_along))
+        plain = model.terms.along(self._rows, self._at)
+        plain -= model.terms.along(self._rows_along, self._at, self._along)
+        return model.basis_of(plain, self._context).summed
 
 
 class _Known:
@@ -324,7 +342,7 @@ class _Known:
         self.residual = (poses.reading - reading).ravel() / self._sigma
 
     def columns(self, model: Model | EachShape) -> Floats:
-        basis = model.basis(self.force, self._context).full
+        basis = model.basis_of(model.terms.plain(self.force), self._context).full
         return basis.reshape(len(self._sigma), basis.shape[2]) / self._sigma[:, np.newaxis]
 
 
@@ -377,7 +395,7 @@ class _Shared:
         return rows - self._turn @ onto[self._group]
 
     def columns(self, model: Model | EachShape) -> Floats:
-        basis = model.basis(self.force, self._context).full
+        basis = model.basis_of(model.terms.plain(self.force), self._context).full
         rows = self._projected(basis / self._sigma[:, :, np.newaxis])
         return rows.reshape(len(self.pose), basis.shape[2])
 

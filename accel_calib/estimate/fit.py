@@ -62,6 +62,9 @@ _SINGULAR_STEP = 1e-6
 _SINGULAR_WITH_PRIOR = 1e-12
 """As `Point.singular`; a prior determines all combinations."""
 
+_BLOCK = 8192
+"""Number of equations that are reduced to a triangle at once."""
+
 _SINGULAR = 1e-3
 """Relative singular value below which a combination of values is not determined."""
 
@@ -114,8 +117,8 @@ class ByPose:
 
     def own(self, spread: Floats) -> Floats:
         """Return the (n, k, k) matrices I - leverage of each pose."""
-        return (np.eye(self.columns.shape[1])
-                - self.columns @ spread @ np.swapaxes(self.columns, 1, 2))
+        onto = (self.flat @ spread).reshape(self.columns.shape)
+        return np.eye(onto.shape[1]) - np.einsum('nkq,nlq->nkl', onto, self.columns)
 
 
 def by_pose(residual: Floats, columns: Floats, pose: Indices,
@@ -124,7 +127,7 @@ def by_pose(residual: Floats, columns: Floats, pose: Indices,
     rows = np.bincount(pose)
     count = len(rows)
     if len(pose) == count:
-        order = np.argsort(pose)
+        order = slice(None) if np.all(pose[:-1] < pose[1:]) else np.argsort(pose)
         return ByPose(residual[order][:, np.newaxis], columns[order][:, np.newaxis], rows, prior)
     order = np.argsort(pose, kind='stable')
     slot = np.arange(len(pose)) - np.repeat(np.cumsum(rows) - rows, rows)
@@ -204,9 +207,18 @@ class Fit:
         return by_pose(self.residual, self.columns, self.equations.pose, prior)
 
     @cached_property
+    def _triangle(self) -> tuple[Floats, Floats]:
+        """(m, q) R of the QR decomposition of the scaled columns, block by block; the scales."""
+        columns, size = _scaled(self.columns)
+        found = columns[:0]
+        for first in range(0, len(columns), _BLOCK):
+            found = np.linalg.qr(np.vstack([found, columns[first:first + _BLOCK]]), mode='r')
+        return found, size
+
+    @cached_property
     def undetermined(self) -> tuple[str, ...]:
         """Names of the values that the poses do not determine."""
-        columns, size = _scaled(self.columns)
+        columns, size = self._triangle
         few = len(columns) < len(size)  # only then are there axes beyond the singular values
         _, scales, axes = np.linalg.svd(columns, full_matrices=few)
         open_ = axes[np.sum(scales > _SINGULAR * scales[0]):] if len(scales) else axes
@@ -218,10 +230,9 @@ class Fit:
     @cached_property
     def covariance(self) -> Floats:
         """(p, p) array, covariance of ``model.vector`` [g²]; 0 for values that are not fitted."""
-        columns = self.columns
+        columns, size = self._triangle
         if self.prior is not None:
-            columns = np.vstack([columns, self.prior.columns])
-        columns, size = _scaled(columns)
+            columns, size = _scaled(np.vstack([columns * size, self.prior.columns]))
         factor = self.ties @ (np.linalg.pinv(columns) / size[:, np.newaxis])
         spread: Floats = factor @ factor.T
         return spread * self.variance_factor
@@ -271,6 +282,16 @@ class Point:
     singular: float = _SINGULAR_STEP
 
     @cached_property
+    def normal(self) -> Floats:
+        """(q, q) array, JᵀJ."""
+        return self.columns.T @ self.columns
+
+    @cached_property
+    def downhill(self) -> Floats:
+        """(q,) array, Jᵀ times the residuals."""
+        return self.columns.T @ self.residual
+
+    @cached_property
     def cost(self) -> float:
         """Sum of the squared residuals; infinite if a residual or derivative is not finite."""
         cost = float(self.residual @ self.residual)
@@ -318,19 +339,20 @@ def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upp
 
 def _free(values: Floats, now: Point, lower: Floats, upper: Floats) -> NDArray[np.bool_]:
     """Return which values are free: not at a bound beyond which the cost would decrease."""
-    downhill = now.columns.T @ now.residual
-    held = ((values <= lower) & (downhill < 0.0)) | ((values >= upper) & (downhill > 0.0))
+    held = (((values <= lower) & (now.downhill < 0.0))
+            | ((values >= upper) & (now.downhill > 0.0)))
     return ~held
 
 
 def _step(now: Point, free: NDArray[np.bool_], damping: float) -> tuple[Floats, float]:
     """Return the damped step, 0 along undetermined values, and the predicted fall of the cost."""
-    columns, size = _scaled(now.columns * free)
-    scales, axes = np.linalg.eigh(columns.T @ columns)
-    downhill = axes.T @ (columns.T @ now.residual)
+    size = np.sqrt(np.diag(now.normal))
+    weight = free / np.where(size == 0.0, 1.0, size)
+    scales, axes = np.linalg.eigh(now.normal * weight * weight[:, np.newaxis])
+    downhill = axes.T @ (now.downhill * weight)
     determined = scales > now.singular * scales[-1]
     along = np.where(determined, downhill, 0.0) / (np.where(determined, scales, 1.0) + damping)
-    return axes @ along / size, float(along @ downhill)
+    return axes @ along * weight, float(along @ downhill)
 
 
 @dataclass(frozen=True)

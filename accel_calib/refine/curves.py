@@ -274,7 +274,7 @@ class Walk:
         axes = self.process.axes
         across = np.column_stack([axes.T @ linear.columns, axes.T @ linear.residual])
         taken = (1.0 - 1.0 / spread)[:, np.newaxis]
-        return replace(linear, white=(axes, 1.0 - 1.0 / np.sqrt(spread)),
+        return replace(linear, white=(axes, 1.0 - 1.0 / np.sqrt(spread), across),
                        products=linear.products - across.T @ (taken * across),
                        penalty=float(np.sum(np.log(spread))) + _charge(linear))
 
@@ -304,8 +304,8 @@ def process_of(linear: Linear, poses: Poses) -> Process | None:
     number = np.pi * (np.arange(min(int(np.sum(known)), _MODES)) + 0.5)
     waves = np.sin(number * tau[:, np.newaxis])
     shapes = (waves / number)[linear.pose]
-    modes = np.hstack([linear.offset[:, [axis]] * shapes for axis in range(3)])
-    modes = modes - linear.onto @ (linear.onto.T @ modes)
+    modes = (linear.offset[:, :, np.newaxis] * shapes[:, np.newaxis]).reshape(len(shapes), -1)
+    modes -= linear.onto @ (linear.onto.T @ modes)
     values, vectors = np.linalg.eigh(modes.T @ modes)
     kept = values > 1e-10 * values[-1]
     if not np.any(kept):

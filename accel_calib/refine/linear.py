@@ -74,6 +74,9 @@ _RARE = 5.0
 _LARGEST_LOG = 100.0
 """Largest logarithm of a ratio, against overflow."""
 
+_ALONE = 1e-12
+"""Smallest part of the equations of a pose outside of the base, against division by zero."""
+
 _LEAST_OWN = 0.02
 """Smallest 1 - leverage; below it, an equation alone determines a value."""
 
@@ -103,7 +106,8 @@ class Linear:
     `base_rss`, the residual sum of squares of the base. `offset` (m, 3) are the columns of an
     offset. `choice` is the cost of the choice of one effect among the candidates, and `penalty`
     that of a walk, which is subtracted from all scores. `white` has (m, r) orthonormal directions
-    along which the equations are whitened, and the (r,) part of each that is taken away.
+    along which the equations are whitened, the (r,) part of each that is taken away, and their
+    (r, c + 1) products with the columns and the residual.
 
     """
 
@@ -120,7 +124,7 @@ class Linear:
     offset: Floats
     choice: float
     penalty: float = 0.0
-    white: tuple[Floats, Floats] | None = None
+    white: tuple[Floats, Floats, Floats] | None = None
 
     @cached_property
     def poses(self) -> int:
@@ -179,8 +183,12 @@ class Linear:
         """Return (m,) or (m, q) columns outside of the base, whitened as the equations are."""
         if self.white is None:
             return columns
-        axes, loss = self.white
+        axes, loss, _ = self.white
         return columns - axes @ ((axes.T @ columns).T * loss).T
+
+    def rows_of(self, poses: tuple[int, ...]) -> NDArray[np.intp]:
+        """Return the indices of the equations of poses."""
+        return np.flatnonzero(np.isin(self.pose, poses)) if poses else np.zeros(0, np.intp)
 
     @cached_property
     def outliers(self) -> dict[frozenset[int], tuple[int, ...]]:
@@ -188,8 +196,8 @@ class Linear:
         return {}
 
     @cached_property
-    def without_poses(self) -> dict[tuple[int, ...], Any]:
-        """Return the sets without effects that were made so far, by the poses left out."""
+    def without_poses(self) -> dict[tuple[int, ...], tuple[Floats, Floats]]:
+        """Return `root` and `across` of the sets without effects, by the poses left out."""
         return {}
 
 
@@ -199,16 +207,17 @@ class Set:
     Effects that are added to the base, and poses that are left out.
 
     `blocks` are the indices of the blocks of the effects in the problem `linear`, and `out` those
-    of the poses. The columns `units` (m, k) span the poses. With those of the blocks, they are k'
-    columns; times `mix` (k', q) they are an orthonormal basis. `across` (q, c + 1) are the
-    products of the basis with the columns of the problem and, last, with its residual.
+    of the poses. The columns of the k equations of these poses are orthonormal times `root`
+    (k, k). With those of the blocks, they are k' columns; times `mix` (k', q) they are an
+    orthonormal basis. `across` (q, c + 1) are the products of the basis with the columns of the
+    problem and, last, with its residual.
 
     """
 
     linear: Linear = field(repr=False)
     blocks: tuple[int, ...]
     out: tuple[int, ...]
-    units: Floats = field(repr=False)
+    root: Floats = field(repr=False)
     across: Floats = field(repr=False)
     mix: Floats = field(repr=False)
 
@@ -217,22 +226,26 @@ class Set:
         out = tuple(sorted(out))
         if out not in linear.without_poses:
             linear.without_poses[out] = cls._of_poses(linear, out)
-        found: Set = linear.without_poses[out]
+        root, across = linear.without_poses[out]
+        found = cls(linear, (), out, root, across, np.eye(len(across)))
         for block in blocks:
             found = found.extended(block)
         return found
 
-    @classmethod
-    def _of_poses(cls, linear: Linear, out: tuple[int, ...]) -> Set:
-        rows = np.flatnonzero(np.isin(linear.pose, out)) if out else np.zeros(0, np.intp)
-        units: Floats = np.zeros((len(linear.pose), len(rows)))
-        units[rows, np.arange(len(rows))] = 1.0
-        if out:
-            outside = units - linear.onto @ linear.onto[rows].T
-            units = np.linalg.qr(linear.whitened(outside))[0]
-        white = linear.whitened(units)
-        across = np.column_stack([white.T @ linear.columns, white.T @ linear.residual])
-        return cls(linear, (), out, units, across, np.eye(len(rows)))
+    @staticmethod
+    def _of_poses(linear: Linear, out: tuple[int, ...]) -> tuple[Floats, Floats]:
+        rows = linear.rows_of(out)
+        own, across = linear.onto[rows], np.column_stack([linear.columns[rows],
+                                                          linear.residual[rows]])
+        left = np.eye(len(rows)) - own @ own.T
+        if linear.white is not None:
+            axes, loss, along = linear.white
+            taken = axes[rows] * (loss * (2.0 - loss))
+            left -= taken @ axes[rows].T
+            across -= taken @ along
+        size, turn = np.linalg.eigh(left)
+        root = turn / np.sqrt(np.maximum(size, _ALONE))
+        return root, root.T @ across
 
     def extended(self, block: int) -> Set:
         part = self.linear.blocks[block].columns
@@ -327,7 +340,7 @@ class Set:
         index, linear = self._index, self.linear
         left, right = linear.products[index][:, index], linear.products[-1, index]
         if self.out:
-            across = self.across[:self.units.shape[1]]
+            across = self.across[:len(self.root)]
             left = left - across[:, index].T @ across[:, index]
             right = right - across[:, index].T @ across[:, -1]
         values = np.linalg.lstsq(left, right, rcond=_DETERMINED)[0] / linear.sizes[index]
@@ -342,9 +355,14 @@ class Set:
     @property
     def spanned(self) -> tuple[Floats, Floats]:
         """Return (m, q) orthonormal columns that span the set, and the (m,) residual beside it."""
-        columns = self.linear.whitened(self.linear.columns[:, self._index])
-        onto = np.hstack([self.units, columns]) @ self.mix
-        return onto, self.linear.whitened(self.linear.residual) - onto @ self.across[:, -1]
+        linear, count = self.linear, len(self.root)
+        onto = linear.whitened(linear.columns[:, self._index]) @ self.mix[count:]
+        if self.out:
+            rows = linear.rows_of(self.out)
+            units = -linear.onto @ linear.onto[rows].T
+            units[rows, np.arange(count)] += 1.0
+            onto += linear.whitened(units) @ (self.root @ self.mix[:count])
+        return onto, linear.whitened(linear.residual) - onto @ self.across[:, -1]
 
     def gains(self, effect: str = '') -> tuple[Floats, Floats]:
         """Return (b,) gains and ranks of the blocks beside the set; 0 for other effects."""

@@ -304,8 +304,8 @@ def _settled(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterab
              walks: bool = True) -> tuple[State, Near]:
     """Search and fit in turn until the set remains; return the state, and the set near it."""
     trial = _Trial(poses_g, fixed,
-                   candidates((name for name in names if name not in fixed), poses_g))
-    settled: Near | None = None
+                   tuple(candidates((name for name in names if name not in fixed), poses_g)))
+    settled: tuple[tuple[str, ...], tuple[int, ...], Process | None] | None = None
     begun = set(state.model.effects) <= set(fixed) and len(state.poses_g) == len(poses_g)
     seen = [_NOTHING] if begun else []
     refused: set[frozenset[str]] = set()
@@ -318,13 +318,16 @@ def _settled(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterab
         if after is None:
             refused.add(frozenset(near.names))
             continue
-        state, settled, linear = after, near, trial.near(after)
         seen.append(near.key)
-        if _is_predicted(near, after):
+        process = near.walk and near.walk.process
+        settled, predicted = (near.names, near.chosen.out, process), _is_predicted(near, after)
+        del near, linear  # before the next columns are made
+        state, linear = after, trial.near(after)
+        if predicted:
             break
     if settled is None and len(state.poses_g) < len(poses_g):  # the set has all poses
         state = _fitted_without(state, poses_g, ())
-    near = _at(linear, settled or Near(Set.of(linear), linear, None, None), poses_g)
+    near = _at(linear, *(settled or ((), (), None)), poses_g)
     return _significant(state, near, trial)
 
 
@@ -341,11 +344,12 @@ def _significant(state: State, near: Near, trial: _Trial) -> tuple[State, Near]:
                 if near.chosen.probability(block) > LEVEL]
         if not weak:
             break
-        fewer = replace(near, chosen=max(weak, key=lambda fewer: fewer.score))
-        after = trial.fitted(fewer.chosen, state)
+        fewer, process = max(weak, key=lambda fewer: fewer.score), near.walk and near.walk.process
+        after = trial.fitted(fewer, state)
         if after is None:
             break
-        state, near = after, _at(trial.near(after), fewer, trial.poses_g)
+        state, near = after, _at(trial.near(after), fewer.effects, fewer.out, process,
+                                 trial.poses_g)
     return state, near
 
 
@@ -409,11 +413,12 @@ def _is_all_noise(chosen: Set) -> bool:
     return is_noise(chosen.rss, chosen.linear.dof - chosen.parameters)
 
 
-def _at(linear: Linear, near: Near, poses_g: Poses) -> Near:
+def _at(linear: Linear, names: tuple[str, ...], out: tuple[int, ...], process: Process | None,
+        poses_g: Poses) -> Near:
     """Return a set near its fit; its effects are in the order of their contribution."""
-    blocks = [int(linear.numbers_of[name][-1]) for name in near.names]
-    plain = Set.of(linear, blocks, near.chosen.out)
-    walk = None if near.walk is None else walk_beside(plain, near.walk.process)
+    blocks = [int(linear.numbers_of[name][-1]) for name in names]
+    plain = Set.of(linear, blocks, out)
+    walk = None if process is None else walk_beside(plain, process)
     whole = plain if walk is None else plain.within(walk.whitened(linear))
     blocks.sort(key=lambda block: -whole.without(block).rss)
     return Near(whole.instead(blocks), linear, walk, process_of(linear, poses_g))

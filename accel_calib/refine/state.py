@@ -83,16 +83,15 @@ class Candidate:
             start += count
 
 
-def candidates(names: Iterable[str], poses_g: Poses) -> tuple[Candidate, ...]:
-    """Return the effects of these names that the context of the poses allows."""
-    found, context = [], poses_g.columns
+def candidates(names: Iterable[str], poses_g: Poses) -> Iterator[Candidate]:
+    """Yield the effects of these names that the context of the poses allows."""
+    context = poses_g.columns
     for name in names:
         effect = effect_named(name)
         if effect.output is None and all(key in context for key in effect.needs):
             shapes, tried = _shapes(effect, context, len(poses_g))
             if shapes:
-                found.append(Candidate(name, shapes, tried, factors_of(name, shapes, context)))
-    return tuple(found)
+                yield Candidate(name, shapes, tried, factors_of(name, shapes, context))
 
 
 def _shapes(effect: Effect, context: Context, poses: int) -> tuple[tuple[Floats, ...], float]:
@@ -105,7 +104,7 @@ def _shapes(effect: Effect, context: Context, poses: int) -> tuple[tuple[Floats,
     return shapes, max(len(shapes) / _SHAPES_ALIKE, 1.0)
 
 
-def linearised(fit: Fit, base: tuple[str, ...], tried: Sequence[Candidate] = ()) -> Linear:
+def linearised(fit: Fit, base: tuple[str, ...], tried: Iterable[Candidate] = ()) -> Linear:
     """Return the linear problem at a fit, given the names of the base, and the candidates."""
     near, model = fit.equations, fit.model
     held = Model({name: values for name, values in model.values.items() if name in base})
@@ -115,8 +114,7 @@ def linearised(fit: Fit, base: tuple[str, ...], tried: Sequence[Candidate] = ())
         residual = residual + near.columns(further) @ _amplitudes(further)
     onto = orthonormal(near.columns(held)[:, held.fitted])
     residual = residual - onto @ (onto.T @ residual)
-    blocks, raw = _blocks(near, fit.poses_g.columns, further, tried)
-    columns, sizes = outside_of(onto, raw)
+    blocks, columns, sizes = _blocks(near, onto, fit.poses_g.columns, further, tuple(tried))
     kinds = len({kind_of(block.effect) for block in blocks})
     return Linear(onto, residual, near.pose, blocks, columns, sizes,
                   products_of(columns, residual), WORTH if near.noise_known else 0.0,
@@ -124,7 +122,7 @@ def linearised(fit: Fit, base: tuple[str, ...], tried: Sequence[Candidate] = ())
                   2.0 * math.log(1.0 + kinds))
 
 
-def visible(fit: Fit, tried: Sequence[Candidate]) -> dict[str, float]:
+def visible(fit: Fit, tried: Iterable[Candidate]) -> dict[str, float]:
     """Return the effect on the residuals of candidates of typical size beside a fit, per noise."""
     near, found = fit.equations, {}
     onto = orthonormal(fit.columns)
@@ -146,17 +144,18 @@ def _amplitudes(model: Model) -> Floats:
     return np.concatenate(parts)
 
 
-def _blocks(near: Equations, context: Context, present: Model, tried: Sequence[Candidate]
-            ) -> tuple[tuple[Block, ...], Floats]:
+def _blocks(near: Equations, onto: Floats, context: Context, present: Model,
+            tried: Sequence[Candidate]) -> tuple[tuple[Block, ...], Floats, Floats]:
     alike = Counter(kind_of(each.name) for each in tried)
     tried = [each.beside(present.values.get(each.name), context) for each in tried]
     widths = [len(each.shapes) * len(each.entry.parameters) for each in tried]
-    columns = np.empty((len(near.pose), sum(widths)), order='F')
+    columns, sizes = np.empty((len(near.pose), sum(widths)), order='F'), np.empty(sum(widths))
     blocks: list[Block] = []
     for each, start, width in zip(tried, np.cumsum([0, *widths]).tolist(), widths):
-        columns[:, start:start + width] = near.columns_of(each.name, each.factors)
+        own = slice(start, start + width)
+        columns[:, own], sizes[own] = outside_of(onto, near.columns_of(each.name, each.factors))
         blocks += each.blocks(start, alike[kind_of(each.name)])
-    return tuple(blocks), columns
+    return tuple(blocks), columns, sizes
 
 
 @dataclass(frozen=True)
