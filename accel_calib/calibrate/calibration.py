@@ -21,7 +21,7 @@ from html import escape
 from typing import Literal, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from .rest_noise import GyroBias, SampleNoise
 from ..effects import (
@@ -282,22 +282,6 @@ class Calibration(Record):
         return replace(self, units=Units(name, before.per_g * factor), noise=noise,
                        poses=converted(self.poses, before.name, name))
 
-    def in_units_of(self, table: Table) -> Calibration:
-        """
-        Return the same calibration for the readings of a table.
-
-        If the table states no unit, the median length of the readings decides between g and m/s².
-
-        """
-        own = self.units
-        if table.units or own.is_native or not len(table):
-            return self.in_units(table.units or own.name)
-        other = self.in_units('g' if own.is_si else 'm/s2')
-        with np.errstate(over='ignore'):
-            length = float(np.median(np.linalg.norm(table.reading, axis=1)))
-        border = float(np.sqrt(own.per_g * other.units.per_g))
-        return other if (length > border) is (other.units.per_g > border) else self
-
     @property
     def offset_sd(self) -> Floats:
         """Return the standard deviation of V, (3,), in the unit of the readings."""
@@ -312,19 +296,15 @@ class Calibration(Record):
         return np.column_stack(columns) * (self.units.per_g / self.force_per_g)
 
     @cached_property
-    def _is_used(self) -> NDArray[np.bool_]:
-        """(n,) mask of the poses that the fit uses."""
-        return ~np.isin(self.poses.row, [pose.row for pose in self.rejected])
-
-    @cached_property
     def used_poses(self) -> Poses:
         """Return the poses that the calibration was fitted to, in the unit of the readings."""
-        return self.poses.take(self._is_used)
+        return self.poses.take(~np.isin(self.poses.row, [pose.row for pose in self.rejected]))
 
     @cached_property
     def ranges(self) -> Mapping[str, tuple[float, float]]:
         """Range over the poses of what the effects depend on; of a lag, the acting temperature."""
-        known, used = _with_acting(self.model, self.poses.columns), self._is_used
+        known = _with_acting(self.model, self.poses.columns)
+        used = np.isin(self.poses.row, self.used_poses.row)
         wanted = {*self.model.over, *({'temperature'} & {*self.model.needs})}
         return {key: (float(np.min(known[key][used])), float(np.max(known[key][used])))
                 for key in (*_HELD, *self.poses.quantities)
