@@ -29,7 +29,7 @@ from ..effects import (
     rate_at, ThermalStream, variable_of)
 from ..errors import InputError, StoredCalibrationError
 from ..finding import Finding
-from ..geometry import unit
+from ..geometry import over_axes, unit
 from ..table import column_of, Floats, Poses, Record, Table
 from ..text import counted, table, with_sd
 from ..units import FrameName, METHODS, MG, UnitName, Units, units_of
@@ -576,18 +576,13 @@ def outside(calibration: Calibration, known: Context) -> dict[str, Outside]:
     """Return the comparison of each column that has a range; ``count`` is 0 if all are inside."""
     found = {}
     for key, (low, high) in {**calibration.ranges, **_vibration_range(calibration)}.items():
-        values = _size(known[key]) if key in known else np.zeros(0)
+        values = over_axes(known[key]) if key in known else np.zeros(0)
         values = values[np.isfinite(values)]
         if len(values):
             count = int(np.sum((values < low) | (values > high)))
             found[key] = Outside(key, count, len(values), low, high, float(np.min(values)),
                                  float(np.max(values)))
     return found
-
-
-def _size(values: Floats) -> Floats:
-    """Return the values of a quantity; for vectors, the RMS over the axes."""
-    return np.sqrt(np.mean(values ** 2, axis=1)) if values.ndim > 1 else values
 
 
 def _vibration_range(calibration: Calibration) -> dict[str, tuple[float, float]]:

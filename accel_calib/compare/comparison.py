@@ -25,7 +25,7 @@ from .agreement import (
 from ..calibrate import Calibration
 from ..effects import Context, length_rows, sensor_force
 from ..errors import InputError
-from ..geometry import OVER_THE_SPHERE
+from ..geometry import OVER_THE_SPHERE, rms
 from ..table import Floats
 from ..text import counted, listed
 from ..units import MG
@@ -276,7 +276,7 @@ def _into(names: tuple[str, ...], run: RotationFree, rows: Floats) -> Floats:
 
 
 def _parameter(name: str, values: Floats, stated: Floats) -> Parameter:
-    spread, typical = float(np.std(values, ddof=1)), _rms(stated)
+    spread, typical = float(np.std(values, ddof=1)), rms(stated)
     return Parameter(name, values, stated, spread, spread / typical if typical > 0.0 else None)
 
 
@@ -293,14 +293,10 @@ def _each(prepared: Sequence[_Prepared], chances: Floats) -> tuple[Run, ...]:
         away = length[k] - others @ np.delete(length, k, 0)
         expected = variance[k] + others ** 2 @ np.delete(variance, k, 0)
         largest = int(np.argmax(np.abs(away)))
-        runs.append(Run(_rms(away) * MG, _rms(np.sqrt(expected)) * MG,
+        runs.append(Run(rms(away) * MG, rms(np.sqrt(expected)) * MG,
                         float(np.abs(away[largest])) * MG, OVER_THE_SPHERE[largest],
                         float(chance)))
     return tuple(runs)
-
-
-def _rms(values: Floats) -> float:
-    return float(np.sqrt(np.mean(values ** 2)))
 
 
 def _tilt_deg(prepared: Sequence[_Prepared]) -> float | None:

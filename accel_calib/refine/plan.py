@@ -39,7 +39,7 @@ from .state import fitted_state, with_effect
 from .steps import percent, shown_name
 from ..effects import effect_named, Model, WANDER
 from ..estimate import Fit, judge, kinds
-from ..geometry import attitude_words, ATTITUDES, spread_directions
+from ..geometry import attitude_words, ATTITUDES, over_axes, spread_directions
 from ..table import Floats, is_quantity, Poses
 
 VARIED = ('temperature', 'supply_voltage', 'time', 'std')
@@ -329,7 +329,7 @@ def _levels(key: str, poses_g: Poses) -> list[float]:
 
 def _sizes(values: NDArray[Any]) -> Floats:
     """Return the finite (n,) values of a column, of a vector its RMS over the axes."""
-    sizes = np.sqrt(np.mean(values ** 2, axis=1)) if values.ndim > 1 else values
+    sizes = over_axes(values)
     return np.asarray(sizes[np.isfinite(sizes)], float)
 
 

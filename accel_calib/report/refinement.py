@@ -29,8 +29,9 @@ from .sheet import (
 from ..effects import (
     AXES, CARRIERS, curve_unit, effect_named, EMPIRICAL, empirical_parts, parameter_names,
     variable_words)
+from ..geometry import over_axes
 from ..refine import base_words, chance, values_of, verdict_words
-from ..table import Floats, Poses
+from ..table import Floats
 from ..text import short
 from ..units import MG
 
@@ -201,7 +202,7 @@ def curve_parts(result: Refinement, name: str) -> list[CurvePart]:
     parts = []
     for k, own in enumerate(names):
         poses = (result.force[:, AXES.index(own)] if variable == 'force'
-                 else _at_poses(variable, result.poses_g))
+                 else over_axes(with_thermal(result.poses_g, '', np.zeros(0))[variable]))
         waves = _waves(modes, at, low, high)
         waves = waves - np.mean(_waves(modes, poses, low, high), axis=1, keepdims=True)
         rows = first + k + len(names) * np.arange(len(modes))
@@ -210,12 +211,6 @@ def curve_parts(result: Refinement, name: str) -> list[CurvePart]:
         parts.append(CurvePart(own, at, values[k:count:len(names)] @ waves,
                                np.sqrt(np.maximum(variance, 0.0)), poses))
     return parts
-
-
-def _at_poses(variable: str, poses_g: Poses) -> Floats:
-    """Return the variable of a curve at each pose; for vectors, its RMS over the axes."""
-    values = with_thermal(poses_g, '', np.zeros(0))[variable]
-    return np.sqrt(np.mean(values ** 2, axis=1)) if values.ndim > 1 else values
 
 
 def _waves(modes: Sequence[int], values: Floats, low: float, high: float) -> Floats:

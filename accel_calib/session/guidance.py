@@ -26,7 +26,6 @@ from ..calibrate import directions_of, next_pose, NextPose
 from ..compare import status
 from ..errors import RefusedFitError
 from ..estimate import fit_sphere, pose_noise
-from ..finding import NextStep
 from ..geometry import coverage
 from ..pipeline import FEWEST_IN_CONE, is_partial
 from ..refine import PlannedPose
@@ -292,7 +291,10 @@ def _with_sensor(sensor: Sensor) -> Action:
     if sensor.calibration is not None and rating is None:
         return NOT_KNOWN
     if rating is not None and rating.name == 'GOOD':
-        return _after_good(sensor, rating.next)
+        if sensor.calibration is not None and not sensor.calibration.is_levelled:
+            return _level_step()
+        return Action('done', rating.next.text if rating.next.kind == 'done' else
+                      'use the calibration')
     if rating is not None and rating.findings and rating.findings[0].kind == 'flat_pose':
         return Action('level', f'{rating.reason}; if it is mounted so, place it level again and '
                       'call ~/set_level once more', 'set_level')
@@ -306,9 +308,3 @@ def _with_sensor(sensor: Sensor) -> Action:
 def _level_step() -> Action:
     return Action('level', 'place the robot level, hold it still and call ~/set_level; a sensor '
                   'alone is done', 'set_level')
-
-
-def _after_good(sensor: Sensor, after: NextStep) -> Action:
-    if sensor.calibration is not None and not sensor.calibration.is_levelled:
-        return _level_step()
-    return Action('done', after.text if after.kind == 'done' else 'use the calibration')

@@ -235,9 +235,11 @@ class Sensor:
         return context if known else None
 
     def context_of(self, rest: Dwell, calibration: Calibration) -> Context:
-        """Return the context of a rest as one row, for this calibration."""
+        """Return the context of a rest as one row, without a previous pose."""
         neutral = {key: np.array([value]) for key, value in calibration.model.neutral.items()}
-        return {**neutral, **context_of_rest(rest, calibration.units),
+        known = {key: np.array([value]) for key, value in rest.context.items()}
+        return {**neutral, 'previous': _NONE, 'rate': _NONE, **known,
+                'time': np.array([rest.time]), 'std': calibration.units.to_g(rest.std)[np.newaxis],
                 **self.temperatures.during(calibration.model, rest.start, rest.end)}
 
     def limits_left(self, known: Mapping[str, float]) -> dict[str, Outside]:
@@ -293,13 +295,6 @@ def gyro_bias_of_rest(rest: Dwell) -> GyroBias | None:
     known = () if math.isnan(temperature) else (temperature, temperature)
     return GyroBias(np.asarray(rate, float), rest.rate_std / math.sqrt(rest.count), 1,
                     temperature, np.zeros(3), known)
-
-
-def context_of_rest(rest: Dwell, units: Units) -> Context:
-    """Return the context of a rest as one row, without a previous pose."""
-    known = {key: np.array([value]) for key, value in rest.context.items()}
-    return {'previous': _NONE, 'rate': _NONE, **known, 'time': np.array([rest.time]),
-            'std': units.to_g(rest.std)[np.newaxis]}
 
 
 def rest_after(part: Dwell, whole: Dwell) -> Dwell:
