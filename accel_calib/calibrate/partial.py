@@ -304,18 +304,15 @@ def mounting_only(poses: Poses, units: Units, *, sensor: str = '', date: str = '
 
     """
     sound, rejected = usable(poses, units, 'a mounting')
-    fit = judge(Model({}), only_norm(in_g(sound, units)))
+    fit, offset = judge(Model({}), only_norm(in_g(sound, units))), EFFECTS['offset'].typical
     return finished(record_of(
         fit, poses, units, unit(sound.reading), 'ideal', PRIOR, rejected=rejected,
         reason='mounting alone: offset and gain are not calibrated',
-        noted=(Finding('open', _not_calibrated()),)), poses, sensor, date)
-
-
-def _not_calibrated() -> str:
-    offset = EFFECTS['offset'].typical
-    return ('offset and gain are not calibrated: a common sensor has an offset of '
+        noted=(Finding(
+            'open', 'offset and gain are not calibrated: a common sensor has an offset of '
             f'{offset * MG:.0f} mg on each axis, so |a| is off by about as much, and away from '
-            f'the level pose the tilt by about {np.degrees(np.arcsin(offset)):.0f}°')
+            f'the level pose the tilt by about {np.degrees(np.arcsin(offset)):.0f}°'),)),
+        poses, sensor, date)
 
 
 def fit_partial(poses: Poses, units: Units, *, sensor: str = '', date: str = '') -> Calibration:

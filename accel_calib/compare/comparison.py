@@ -195,6 +195,13 @@ class Comparison:
     tilt_deg: float | None
     notes: tuple[str, ...]
 
+    @property
+    def tilt_words(self) -> str:
+        """Return `tilt_deg` as one line; empty if it is not known."""
+        return '' if self.tilt_deg is None else (
+            'the directions of up of levelled calibrations differ by up to '
+            f'{self.tilt_deg:.3g}°; the test does not use them')
+
 
 @dataclass(frozen=True)
 class _Prepared:
@@ -219,8 +226,7 @@ class _Prepared:
     def spread(self, names: tuple[str, ...], covariance: Floats) -> Floats:
         """Return the (t, t) covariance of the common parameters."""
         slope = _into(names, self.free, self.slope)
-        carried: Floats = slope @ covariance @ slope.T
-        return carried
+        return np.asarray(slope @ covariance @ slope.T)
 
 
 def compare(calibrations: Sequence[Calibration]) -> Comparison:

@@ -25,7 +25,6 @@ import shlex
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .refinement import refusal_lines, search_sections
 from .residuals import of_before_after, of_coverage, of_remainder, Residuals, residuals_of
@@ -211,19 +210,17 @@ def _of_axis(curve: Curve, axis: int) -> Drawing:
         for label, which, colour in (('warming', curve.warming, ACCENT),
                                      ('cooling', ~curve.warming, AFTER)):
             if np.any(which):
-                hover[label] = tuple(_marks(curve, axis, which))
-                panel.plot(curve.stretches['temperature'][which], curve.change[which, axis] * MG,
-                           'o', color=colour, markersize=3.0, label=label, gid=label, **EDGE)
+                warm = curve.stretches['temperature'][which]
+                change_mg = curve.change[which, axis] * MG
+                hover[label] = tuple(Mark(f'{at:.2f} °C: {change:+.2f} mg')
+                                     for at, change in zip(warm, change_mg))
+                panel.plot(warm, change_mg, 'o', color=colour, markersize=3.0, label=label,
+                           gid=label, **EDGE)
         panel.plot(grid, line, color=INK, linewidth=1.2, label='curve', zorder=3.0)
         legend_below(figure, 3)
     ends = f'{short(float(line[0]))} to {short(float(line[-1]))} mg'
     return Drawing(f'thermal_{AXES[axis]}', f'Change of the offset {AXES[axis]} over the '
                    f'temperature: {ends}', figure, hover)
-
-
-def _marks(curve: Curve, axis: int, which: NDArray[np.bool_]) -> Iterator[Mark]:
-    for warm, change in zip(curve.stretches['temperature'][which], curve.change[which, axis]):
-        yield Mark(f'{warm:.2f} °C: {change * MG:+.2f} mg', 0)
 
 
 def _coefficients(curve: Curve) -> str:
