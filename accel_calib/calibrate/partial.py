@@ -208,7 +208,9 @@ def without_knocked(poses_g: Poses, kept: Indices, prior: Prior, noise_g: float,
     total = len(kept)
     now = best = _likely(poses_g, kept, 0, prior, noise_g)
     for knocked in range(1, int(share * total) + 1):
-        away = _away(now.fit) / now.factor
+        data = now.fit.by_pose
+        own = np.maximum(data.own(data.spread)[:, 0, 0], _LEAST_OWN)
+        away = data.residual[:, 0] ** 2 / own / now.factor  # from the fit of the others
         farthest = np.argsort(-away, kind='stable')[:_TRIED]
         if now.factor == 1.0 and away[farthest[0]] < _SUSPICIOUS:
             break
@@ -221,12 +223,6 @@ def without_knocked(poses_g: Poses, kept: Indices, prior: Prior, noise_g: float,
         factor = max(factor, best.factor)
     fit = estimate(fit.model, fit.poses_g, prior, max(factor, _LEAST_FACTOR))
     return replace(best, fit=fit)
-
-
-def _away(fit: Fit) -> Floats:
-    """Return the (n,) squared distances of poses from the fit of the others, per variance."""
-    own = fit.by_pose.own(fit.by_pose.spread)[:, 0, 0]
-    return fit.by_pose.residual[:, 0] ** 2 / np.maximum(own, _LEAST_OWN)
 
 
 def _likely(poses_g: Poses, kept: Indices, knocked: int, prior: Prior,

@@ -162,19 +162,14 @@ def _history_lines(history: History) -> Iterator[Any]:
     yield _dates_table(history)
     for first, second, change in zip(history.labels, history.labels[1:], history.changes,
                                      strict=False):
-        yield _step_line(first, second, change)
+        comparison = change.comparison
+        verdict = 'agree' if comparison.agree else 'differ'
+        most = change_in_words(change.parameter, change.change, change.sd).replace('−', '-')
+        yield (f'{first} to {second}: {verdict} (p = {comparison.p_value:.2g}), '
+               f'{rate_comparison(comparison).name}; largest change: '
+               f'{change.parameter.replace(".", " ")} {most}')
     for note in history.notes:
         yield f'note: {note}'
-
-
-def _step_line(first: str, second: str, change: Any) -> str:
-    """Return one step as a line of text."""
-    comparison = change.comparison
-    verdict = 'agree' if comparison.agree else 'differ'
-    most = change_in_words(change.parameter, change.change, change.sd).replace('−', '-')
-    return (f'{first} to {second}: {verdict} (p = {comparison.p_value:.2g}), '
-            f'{rate_comparison(comparison).name}; largest change: '
-            f'{change.parameter.replace(".", " ")} {most}')
 
 
 def _dates_table(history: History) -> Table:

@@ -37,22 +37,20 @@ _WARMER = 5.0
 """Difference of temperature between runs that causes a note [°C]."""
 
 
-def _contexts_of(calibrations: Sequence[Calibration]) -> tuple[Context, ...]:
-    """Return the context for the comparison of each run, one row each."""
+def _contexts_of(calibrations: Sequence[Calibration]) -> list[Context]:
+    """Return the context for the comparison of each run, one row each: medians, and no motion."""
     common = {key: np.array([np.mean([np.median(run.poses[key]) for run in calibrations
                                       if key in run.poses])])
               for key in _COMMON if any(key in run.poses for run in calibrations)}
-    return tuple({**_own_context(run), **common} for run in calibrations)
-
-
-def _own_context(run: Calibration) -> Context:
-    """Return the median context of a run, with zero rate and without a previous pose."""
-    context: dict[str, Floats] = {'rate': np.zeros((1, 3)), 'previous': np.zeros((1, 3))}
-    if 'time' in run.poses:
-        context['time'] = np.array([np.median(run.poses['time'])])
-    if 'std' in run.poses:
-        context['std'] = run.units.to_g(np.median(run.poses['std'], axis=0))[np.newaxis]
-    return context
+    contexts: list[Context] = []
+    for run in calibrations:
+        own: dict[str, Floats] = {'rate': np.zeros((1, 3)), 'previous': np.zeros((1, 3))}
+        if 'time' in run.poses:
+            own['time'] = np.array([np.median(run.poses['time'])])
+        if 'std' in run.poses:
+            own['std'] = run.units.to_g(np.median(run.poses['std'], axis=0))[np.newaxis]
+        contexts.append({**own, **common})
+    return contexts
 
 
 def _notes_of(given: Sequence[Comparable], names: tuple[str, ...], deviation: Floats,

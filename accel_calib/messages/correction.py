@@ -231,7 +231,9 @@ class Rewriter:
         largest = self._largest
         a, b, c = force
         if not (-largest < a < largest and -largest < b < largest and -largest < c < largest):
-            raise _implausible(force)
+            words = ', '.join(f'{part:.3g}' for part in force)
+            raise InputError(f'the corrected acceleration is ({words}) m/s², expected less than '
+                             f'{LARGEST_G:.0f} g', 'check the calibration and the driver')
         covariance, seen = data[self._force_spread:], self._seen_force
         if covariance != seen.given:
             seen = self._seen_force = _seen(self._inverse, covariance, self._fill_force)
@@ -287,12 +289,6 @@ class Rewriter:
             known.update(self._thermal.value)
         self._at = self._calibration.at(known)
         return self._at
-
-
-def _implausible(force: Triple) -> InputError:
-    words = ', '.join(f'{part:.3g}' for part in force)
-    return InputError(f'the corrected acceleration is ({words}) m/s², expected less than '
-                      f'{LARGEST_G:.0f} g', 'check the calibration and the driver')
 
 
 def _diagonal(deviation: Floats) -> bytes:

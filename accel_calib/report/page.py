@@ -402,24 +402,17 @@ def _axis_cells(reading: Floats) -> list[list[str]]:
 
 def snippets(calibration: Calibration, stored: str) -> tuple[tuple[str, str], ...]:
     """Return titles and lines of code that use the calibration in the file `stored`."""
-    return (('ROS 2', _ros(calibration, stored)),
-            ('ROS 2 launch file', _launch(calibration, stored)),
+    path = shlex.quote(stored) if Path(stored).is_absolute() else f'"$PWD"/{shlex.quote(stored)}'
+    ros = ('ros2 launch accel_calib calibrator.launch.py imu:=imu/data_raw \\\n'
+           f'  units:={calibration.units.name} calibration_file:={path}')
+    launch = ("Node(package='accel_calib', executable='calibrator',\n"
+              f"     parameters=[{{'calibration_file': {stored!r},\n"
+              f"                  'units': {calibration.units.name!r}}}],\n"
+              "     remappings=[('imu/data_raw', 'imu/data_raw')])")
+    return (('ROS 2', ros), ('ROS 2 launch file', launch),
             ('Python', _python(calibration, stored)), ('C', _c(calibration)),
             ('C header, Arduino, PX4, ArduPilot and others',
              f'accel-calib export {shlex.quote(stored)} --to c -o calibration.h'))
-
-
-def _ros(calibration: Calibration, stored: str) -> str:
-    path = shlex.quote(stored) if Path(stored).is_absolute() else f'"$PWD"/{shlex.quote(stored)}'
-    return ('ros2 launch accel_calib calibrator.launch.py imu:=imu/data_raw \\\n'
-            f'  units:={calibration.units.name} calibration_file:={path}')
-
-
-def _launch(calibration: Calibration, stored: str) -> str:
-    return ("Node(package='accel_calib', executable='calibrator',\n"
-            f"     parameters=[{{'calibration_file': {stored!r},\n"
-            f"                  'units': {calibration.units.name!r}}}],\n"
-            "     remappings=[('imu/data_raw', 'imu/data_raw')])")
 
 
 def _python(calibration: Calibration, stored: str) -> str:

@@ -223,7 +223,9 @@ def of_curve(result: Refinement, step: int) -> Drawing:
     """Draw the empirical curve of a step with its 95 % band, and ticks at the poses."""
     name = result.steps[step].name
     carrier, variable, _ = empirical_parts(name)
-    words = _carrier_words(carrier)
+    whole, _, axis = carrier.partition('.')
+    words = 'gain of all axes' if whole == 'force' else whole.replace('_', '-')
+    words += f' of {axis}' if axis else ''
     title = f'{words[0].upper()}{words[1:]} over {variable_words(variable)}, with 95 % band'
     parts = curve_parts(result, name)
     with drawn(HEIGHT_INCHES, title) as (figure, (panel,)):
@@ -239,12 +241,6 @@ def of_curve(result: Refinement, step: int) -> Drawing:
         panel.set_ylabel(f'change from the mean [m{curve_unit(name)}]')
         panel.legend(ncols=len(parts))
     return Drawing(f'step{step + 1}_curve', title, figure)
-
-
-def _carrier_words(carrier: str) -> str:
-    whole, _, part = carrier.partition('.')
-    words = 'gain of all axes' if whole == 'force' else whole.replace('_', '-')
-    return f'{words} of {part}' if part else words
 
 
 # ----------------------------------------------------------------------------- the ladder
