@@ -453,7 +453,8 @@ class Tracker:
         done: list[OngoingDwell] = []
         before = self._held
         if self._pause or self._dwell is None:
-            before = _without_windows(self._lead)
+            before = self._lead.copy()  # without its windows, which are not still
+            before['sums']['level'] = before['sums']['windows'] = 0.0
             if (self._dwell is None or not self._dwell.chunks or not self._dwell.continued_by(
                     chained(before, chunks[:1])['sums'], self._rule.scale)):
                 done = self._end()
@@ -504,12 +505,6 @@ def _records(judged: Judged) -> Records:
     found['begin'], found['end'] = chunks.begin, chunks.end
     found['limit'], found['still'] = judged.limit.T, judged.still
     found['trending'] = judged.trending
-    return found
-
-
-def _without_windows(chunks: Records) -> Records:
-    found = chunks.copy()
-    found['sums']['level'] = found['sums']['windows'] = 0.0
     return found
 
 

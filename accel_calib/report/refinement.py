@@ -22,7 +22,7 @@ import numpy as np
 
 from .residuals import (
     against, are_spread, limit_mg, of_remainder, Residuals, residuals_of_refinement, sphere_map,
-    Variable, variable_of, variables_of, with_thermal)
+    variable_of, variables_of, with_thermal)
 from .sheet import (
     ACCENT, add_band, AFTER, AXIS_COLOURS, BAND, BEFORE, code, Drawing, drawn, FAINT, figures,
     HEIGHT_INCHES, INK, PAPER, paragraph, save, scroll_table, section)
@@ -151,20 +151,15 @@ def of_step(result: Refinement, step: int) -> Iterator[Drawing]:
     limit = limit_mg(*(residuals for _, _, residuals, _ in stages))
     titles = [f'{when.capitalize()}: {words}, {short(residuals.rms_mg)} mg RMS'
               for when, words, residuals, _ in stages]
-    name, variables = f'step{step + 1}_{after.name}', _variables_of_step(result, step)
+    name, effect = f'step{step + 1}_{after.name}', result.steps[step].name
+    values = result.calibration.model.values.get(effect)
+    shape = None if values is None else effect_named(effect).split(values)[1]
+    variables = variables_of(effect, result.poses_g, result.force, shape)
     if are_spread(result.force):
         for title, (when, _, residuals, _) in zip(titles, stages, strict=True):
             yield sphere_map(residuals, f'{name}_sphere_{when}', title, limit)
     for title, (when, _, residuals, colour) in zip(titles, stages, strict=True):
         yield against(residuals, variables, f'{name}_variable_{when}', title, limit, colour)
-
-
-def _variables_of_step(result: Refinement, step: int) -> list[Variable]:
-    """Return the variables of the effect of a step, with the shape of the refined model."""
-    name = result.steps[step].name
-    values = result.calibration.model.values.get(name)
-    shape = None if values is None else effect_named(name).split(values)[1]
-    return variables_of(name, result.poses_g, result.force, shape)
 
 
 # ----------------------------------------------------------------------------- curves

@@ -118,7 +118,11 @@ class Guide:
         """Return the next pose, or that of a followed refinement; None before the first choice."""
         if self._plan is None or not self._planned:
             return self._plan
-        return replace(self._plan, asked=_as_asked(self._planned, self._plan))
+        first, plan = self._planned[0], self._plan
+        where = f' {first.conditions}' if first.conditions else ''
+        return replace(plan, asked=NextPose(
+            np.array(first.up), f'hold {first.words}{where}, {first.purpose}', plan.asked.error,
+            plan.poses + len(self._planned), fits=False))
 
     @plan.setter
     def plan(self, plan: Plan | None) -> None:
@@ -199,13 +203,6 @@ class Guide:
             noise = f', {float(np.mean(units.to_g(latest))) * MG:.2f} mg'
         then = '' if action.kind == 'done' else f', next: {action.words}'
         return f'pose {count}{noise}{then}'
-
-
-def _as_asked(planned: Sequence[PlannedPose], plan: Plan) -> NextPose:
-    first = planned[0]
-    where = f' {first.conditions}' if first.conditions else ''
-    return NextPose(np.array(first.up), f'hold {first.words}{where}, {first.purpose}',
-                    plan.asked.error, plan.poses + len(planned), fits=False)
 
 
 @dataclass(frozen=True)
