@@ -374,8 +374,7 @@ def fit_known(poses: Poses, units: Units, method: Method) -> Calibration:
         noted=(*rival_findings(unlike, poses.row), *fit_findings(fit, 0.0), *_placement(fit)))
 
 
-def _without_outliers(poses_g: Poses, method: Method
-                      ) -> tuple[Fit, tuple[Rejected, ...]]:
+def _without_outliers(poses_g: Poses, method: Method) -> tuple[Fit, tuple[Rejected, ...]]:
     """Fit model 12, without outliers if the other poses determine the model."""
     kept = ('reading', 'reference') if method == 'algebraic' else tuple(poses_g.columns)
     poses_g = Poses({key: poses_g[key] for key in kept if key in poses_g}, poses_g.row)

@@ -225,8 +225,7 @@ def without_knocked(poses_g: Poses, kept: Indices, prior: Prior, noise_g: float,
     return replace(best, fit=fit)
 
 
-def _likely(poses_g: Poses, kept: Indices, knocked: int, prior: Prior,
-            noise_g: float) -> PriorFit:
+def _likely(poses_g: Poses, kept: Indices, knocked: int, prior: Prior, noise_g: float) -> PriorFit:
     """Return the fit with the most probable variance factor; the other poses were knocked."""
     used = poses_g.take(kept)
     model, factors = with_vector(_EFFECTS, prior.mean), _factors(used, noise_g)
@@ -290,8 +289,7 @@ def posterior(values: Floats, covariance: Floats, fleet: FleetPrior
     return values + gain @ away, (left + left.T) / 2.0, (UNLIKE_FLEET,) * is_unlike
 
 
-def mounting_only(poses: Poses, units: Units, *, sensor: str = '', date: str = ''
-                  ) -> Calibration:
+def mounting_only(poses: Poses, units: Units, *, sensor: str = '', date: str = '') -> Calibration:
     """
     Return a calibration named ``ideal``, without effects and with ΔR = I, to be levelled.
 
@@ -343,8 +341,7 @@ def fit_partial(poses: Poses, units: Units, *, sensor: str = '', date: str = '')
     if determines(NAME, unit(sound.reading)):
         raise ValueError(f'the {len(sound)} poses determine model {NAME}, expected poses near '
                          'one direction: use fit_poses')
-    found = most_probable(only_norm(in_g(sound, units)), priors_of(), FIRST_NOISE_G,
-                          LARGEST_SHARE)
+    found = most_probable(only_norm(in_g(sound, units)), priors_of(), FIRST_NOISE_G, LARGEST_SHARE)
     calibration = _recorded(found, poses, sound, units, PRIOR, rejected)
     about = carried(calibration)
     return finished(replace(calibration, reason=_known_words(about), noted=(

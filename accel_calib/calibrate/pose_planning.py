@@ -240,8 +240,7 @@ class Identifiability:
         return tuple(name for name in self.deviations if part[name] > _OPEN_PART ** 2)
 
 
-def identifiability(name: str, directions: Floats, noise: Floats | None = None
-                    ) -> Identifiability:
+def identifiability(name: str, directions: Floats, noise: Floats | None = None) -> Identifiability:
     """
     Return what poses determine of a model; it depends only on directions and noise.
 

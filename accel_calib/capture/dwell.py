@@ -394,8 +394,7 @@ _NONE = np.empty(0, _judged_type(sums_type(0)))
 class Tracker:
     """Join still chunks to dwells, in one segment."""
 
-    def __init__(self, settings: CaptureSettings, rule: Rule, judged: Judged, number: int
-                 ) -> None:
+    def __init__(self, settings: CaptureSettings, rule: Rule, judged: Judged, number: int) -> None:
         chunks = judged.chunks
         self._rule = rule
         self._chunks = chunks

@@ -251,8 +251,7 @@ MATTERS = Limit(
 HIDDEN = Limit(
     'scatter of the poses', 2.0, 'times the noise', 'if the scatter is larger, and the part '
     'beyond the noise is above the error that matters, the model lacks an effect or poses moved')
-LEFT_OUT = Limit(
-    'poses left out', 20.0, '%', 'largest share of a good calibration')
+LEFT_OUT = Limit('poses left out', 20.0, '%', 'largest share of a good calibration')
 TO_CHECK = Limit(
     'poses to check the fit', 3.0, 'poses', 'fewest poses beyond the number of values, if the '
     'noise is not known or outliers were left out')

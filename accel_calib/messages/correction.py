@@ -89,8 +89,7 @@ def corrected(calibration: Calibration, doubles: Floats, context: Context | None
         result[:, ANGULAR_VELOCITY] = doubles[:, ANGULAR_VELOCITY] @ rotation
         present = doubles[:, ORIENTATION_COVARIANCE.start] != -1.0
         x, y, z, w = doubles[present, ORIENTATION].T
-        result[present, ORIENTATION] = np.array(
-            _product(x, y, z, w, *quaternion_of(rotation))).T
+        result[present, ORIENTATION] = np.array(_product(x, y, z, w, *quaternion_of(rotation))).T
     turn = rotation.T if calibration.is_levelled else np.eye(3)
     for part in (ANGULAR_VELOCITY_COVARIANCE, ORIENTATION_COVARIANCE):
         _transform(result, part, turn)
@@ -139,8 +138,7 @@ LARGEST_G = 100.0
 """Larger corrected forces are not published [g]. The range of common accelerometers is 16 to 40 g;
 shock sensors cannot be calibrated by gravity."""
 
-_FORCE, _FRONT, _WHOLE = (struct.Struct(each) for each in (
-    '<12d', '<4d72s3d72s', '<4d72s3d72s3d'))
+_FORCE, _FRONT, _WHOLE = (struct.Struct(each) for each in ('<12d', '<4d72s3d72s', '<4d72s3d72s3d'))
 _ABSENT = struct.pack('<d', -1.0)
 _UNKNOWN = bytes(72)
 _NONE: Triple = (0.0, 0.0, 0.0)

@@ -140,8 +140,7 @@ class OneReading:
                     change = difference(effect.factor, known, shape, place)
                     factors += np.broadcast_to(change, count).tolist()
         which, rows = self._spread_rows
-        basis: Floats = (which * factors) @ rows
-        return basis
+        return np.asarray((which * factors) @ rows)
 
 
 def _factor(effect: Effect, known: Known, shape: Any) -> Any:

@@ -240,8 +240,7 @@ class _Contest:
         return float(np.mean(parts[right] / np.sum(parts, axis=0)))
 
 
-def _after(left: Floats, rows: Floats, spread: Floats, taken: list[int]
-           ) -> tuple[Floats, Floats]:
+def _after(left: Floats, rows: Floats, spread: Floats, taken: list[int]) -> tuple[Floats, Floats]:
     """Return what a model leaves of means, and its covariance, after a fit to candidates."""
     own = rows[taken].reshape(-1, rows.shape[2])
     gain = spread @ own.T @ np.linalg.inv(np.eye(len(own)) + own @ spread @ own.T)

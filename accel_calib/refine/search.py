@@ -257,8 +257,7 @@ def _walking(found: Found) -> Found | None:
     if walk is None or walk.likelihood_ratio < SIGNIFICANT:
         return None
     near = replace(near, walk=walk, chosen=near.chosen.within(walk.whitened(near.plain)))
-    return replace(found, near=near, walk=_walk(found.final, near),
-                   added=(*found.added, WANDER))
+    return replace(found, near=near, walk=_walk(found.final, near), added=(*found.added, WANDER))
 
 
 def _is_better(curve: Curve, near: Near) -> bool:

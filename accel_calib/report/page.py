@@ -97,8 +97,7 @@ _LONG_TABLE = 25
 
 def refinement_page(result: Refinement, source: str) -> str:
     """Return the page of a refinement of the poses in the file `source`, as HTML."""
-    return calibration_page(result.calibration, rate_refinement(result), source,
-                            refinement=result)
+    return calibration_page(result.calibration, rate_refinement(result), source, refinement=result)
 
 
 def calibration_page(calibration: Calibration, rating: Rating, source: str, *,

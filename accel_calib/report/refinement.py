@@ -63,10 +63,8 @@ def search_sections(result: Refinement, residuals: Residuals, *, used: bool) -> 
         yield _step(result, number, step)
     left = residuals_of_refinement(result)
     if not np.isclose(left.rms_mg, residuals.rms_mg, rtol=_SAME_RESIDUAL):
-        yield section('What remains after the refinement',
-                      figures(of_remainder(left, 'refined')))
-    rows = [(f'{effect_named(name).words} ({name})', needs)
-            for name, needs in result.not_testable]
+        yield section('What remains after the refinement', figures(of_remainder(left, 'refined')))
+    rows = [(f'{effect_named(name).words} ({name})', needs) for name, needs in result.not_testable]
     yield section('What these data cannot show', scroll_table(
         'Effects that cannot be tested', ('effect', 'to see it, record'), rows, ''))
 

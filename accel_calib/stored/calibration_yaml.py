@@ -288,8 +288,7 @@ def _check_keys(content: Mapping[str, Any], calibration: Calibration) -> None:
                                  f'{", ".join(known or ())}')
 
 
-def _other_correction(content: Mapping[str, Any], calibration: Calibration
-                      ) -> tuple[Finding, ...]:
+def _other_correction(content: Mapping[str, Any], calibration: Calibration) -> tuple[Finding, ...]:
     """Return a finding if a file states a correction that is not that of its effects."""
     if content.get('correction') is None:
         return ()
