@@ -30,7 +30,8 @@ from .pipeline import calibrated, calibrated_log, captured_from, Flat, options_f
 from .refine import refine as find_effects, Refinement
 from .stored import read_calibration, write_calibration
 from .table import (
-    check_units, check_values, data_frame, Floats, LARGEST, numbered, Poses, Recording, Table)
+    check_units, check_values, data_frame, Floats, LARGEST, median_length, numbered, Poses,
+    Recording, Table)
 from .text import counted, now
 from .units import FrameName, is_native, Method, STANDARD_GRAVITY, UnitName, units_of
 
@@ -646,7 +647,23 @@ def _beside(calibration: _Calibration, given: Source | Poses | Data, units: Unit
     """Return a calibration in the unit of poses, and these poses."""
     source, options, settings = _asked(given, units)
     poses = poses_of(source, options_for(calibration, options), settings).poses
-    return calibration.in_units_of(replace(poses, units=units or poses.units)), poses
+    return in_units_of(calibration, replace(poses, units=units or poses.units)), poses
+
+
+def in_units_of(calibration: _Calibration, table: Table) -> _Calibration:
+    """
+    Return the same calibration for the readings of a table.
+
+    If the table states no unit, the median length of the readings decides between g and m/s².
+
+    """
+    own = calibration.units
+    if table.units or own.is_native or not len(table):
+        return calibration.in_units(table.units or own.name)
+    other = calibration.in_units('g' if own.is_si else 'm/s2')
+    length = median_length(table.reading)
+    border = math.sqrt(own.per_g * other.units.per_g)
+    return other if (length > border) is (other.units.per_g > border) else calibration
 
 
 def _array(given: Data) -> Poses:

@@ -93,8 +93,7 @@ def copy_atomically(path: Path, target: Path) -> None:
 def _replacing(target: Path) -> Iterator[BinaryIO]:
     """Yield a new file that replaces the target at the end; it is removed after an error."""
     old = replaceable(target)
-    temporary = target.with_name(
-        f'.{target.name[:_LONGEST_NAME]}.{secrets.token_hex(8)}{_SUFFIX}')
+    temporary = target.with_name(f'.{target.name[:_LONGEST_NAME]}.{secrets.token_hex(8)}{_SUFFIX}')
     handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666)
     try:
         with open(handle, 'wb') as file:

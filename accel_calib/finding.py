@@ -168,8 +168,7 @@ def has(findings: Iterable[Finding], kind: str) -> bool:
 
 def ranked(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Return findings of the worst level first, and within a level in the order of `KINDS`."""
-    return tuple(sorted(findings, key=lambda each: (-LEVELS.index(each.level),
-                                                    _RANKS[each.kind])))
+    return tuple(sorted(findings, key=lambda each: (-LEVELS.index(each.level), _RANKS[each.kind])))
 
 
 @dataclass(frozen=True)

@@ -90,6 +90,16 @@ OVER_THE_SPHERE = spread_directions(300)
 """Directions over which figures are averaged, (300, 3); not to be changed in place."""
 
 
+def rms(values: Floats) -> float:
+    """Return the root of the mean square of numbers."""
+    return float(np.sqrt(np.mean(values ** 2)))
+
+
+def over_axes(values: Floats) -> Floats:
+    """Return the (n,) values of a quantity; of (n, 3) vectors, the RMS over the axes."""
+    return np.sqrt(np.mean(values ** 2, axis=1)) if values.ndim > 1 else values
+
+
 def unit(vectors: Floats) -> Floats:
     """Return (n, 3) vectors scaled to length 1; zero vectors stay zero."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)

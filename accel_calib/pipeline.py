@@ -225,7 +225,9 @@ def ramp_or_poses(source: Path | Piped | Frame, options: LogOptions = LogOptions
     """
     with open_log(source, options) as log, saying(log.read_as):
         table = log.poses
-        if table is not None and not _is_slow_recording(table):
+        # A recording of slow samples has the form of a pose table.
+        if table is not None and not ('time' in table and 'count' not in table
+                                      and _is_one_direction(table)):
             return Intake(table, log.units, log.read_as, log.notes)
         samples = log.watched(progress) if table is None else (Recording(
             table.columns, table.row, table.units, table.sensor, table.autopilot),)
@@ -235,12 +237,8 @@ def ramp_or_poses(source: Path | Piped | Frame, options: LogOptions = LogOptions
     return poses_of(source, options, settings, progress)
 
 
-def _is_slow_recording(poses: Poses) -> bool:
-    """Return whether a table has the form of poses, but is of one board that was not turned."""
-    return 'time' in poses and 'count' not in poses and _is_one_direction(poses)
-
-
 def _is_one_direction(poses: Poses) -> bool:
+    """Return whether poses are of one board that was not turned."""
     up = unit(poses.reading)
     return bool(np.all(up @ up[0] > _ONE_DIRECTION))
 

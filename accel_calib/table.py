@@ -385,7 +385,7 @@ def check_units(poses: Table, units: Units, source: str = '') -> None:
     """
     if len(poses) == 0:
         return
-    length = _median_length(poses.reading)
+    length = median_length(poses.reading)
     if not units.is_native and not _is_likely(length, units.per_g):
         supported = next((name for name in _likely(length) if name in _SUPPORTED), None)
         advice = (f'set the units of the readings to {supported}' if supported else
@@ -395,10 +395,11 @@ def check_units(poses: Table, units: Units, source: str = '') -> None:
                          f'{length:.4g}, expected about {units.per_g:.4g} at rest in '
                          f'{units.name}', advice)
     if 'reference' in poses:
-        _check_reference(_median_length(poses['reference']), units)
+        _check_reference(median_length(poses['reference']), units)
 
 
-def _median_length(vectors: Floats) -> float:
+def median_length(vectors: Floats) -> float:
+    """Return the median length of (n, 3) vectors."""
     with np.errstate(over='ignore'):
         return float(np.median(np.linalg.norm(vectors, axis=1)))
 

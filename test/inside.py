@@ -16,6 +16,7 @@ from __future__ import annotations
 from importlib.util import find_spec
 from pathlib import Path
 
+from accel_calib.api import in_units_of
 from accel_calib.calibrate import (
     Calibration, determines, mounting_figures, posterior, refuse_if_unfit, sound_rows)
 from accel_calib.calibrate.mounting import (

@@ -18,7 +18,7 @@ from accel_calib.stored import write_calibration
 from accel_calib.table import Poses, Table
 from accel_calib.units import STANDARD_GRAVITY as GRAVITY, Units, units_of
 from bag_files import write_bag
-from inside import model_with, simulate_recording, spread_directions
+from inside import in_units_of, model_with, simulate_recording, spread_directions
 import numpy as np
 import pytest
 from shared import run
@@ -87,7 +87,7 @@ def test_native_units_stay_native(before: str, after: str) -> None:
                        f'{before}, or fit a calibration to poses in {after}'):
         calibration.in_units(after)
     assert calibration.in_units(before) is calibration
-    assert calibration.in_units_of(unstated(poses(before))) is calibration
+    assert in_units_of(calibration, unstated(poses(before))) is calibration
     with pytest.raises(InputError, match='scale of native units is not known'):
         ac.verify(poses(after), calibration)
 
@@ -95,12 +95,12 @@ def test_native_units_stay_native(before: str, after: str) -> None:
 @pytest.mark.parametrize('units', METRIC)
 def test_an_unstated_unit_is_that_of_the_length_of_the_readings(units: str) -> None:
     calibration = ac.fit(poses(units))
-    assert calibration.in_units_of(unstated(poses(units))) is calibration
-    found = calibration.in_units_of(unstated(poses(other(units))))
+    assert in_units_of(calibration, unstated(poses(units))) is calibration
+    found = in_units_of(calibration, unstated(poses(other(units))))
     assert found.units.name == other(units)
     # A stated unit wins over the length.
     lying = replace(poses(other(units)), units=units)
-    assert calibration.in_units_of(lying) is calibration
+    assert in_units_of(calibration, lying) is calibration
 
 
 def test_verify_takes_the_unit_that_the_caller_states() -> None:

@@ -21,7 +21,7 @@ from html import escape
 from typing import Literal, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from .rest_noise import GyroBias, SampleNoise
 from ..effects import (
@@ -29,7 +29,7 @@ from ..effects import (
     rate_at, ThermalStream, variable_of)
 from ..errors import InputError, StoredCalibrationError
 from ..finding import Finding
-from ..geometry import unit
+from ..geometry import over_axes, unit
 from ..table import column_of, Floats, Poses, Record, Table
 from ..text import counted, table, with_sd
 from ..units import FrameName, METHODS, MG, UnitName, Units, units_of
@@ -282,22 +282,6 @@ class Calibration(Record):
         return replace(self, units=Units(name, before.per_g * factor), noise=noise,
                        poses=converted(self.poses, before.name, name))
 
-    def in_units_of(self, table: Table) -> Calibration:
-        """
-        Return the same calibration for the readings of a table.
-
-        If the table states no unit, the median length of the readings decides between g and m/s².
-
-        """
-        own = self.units
-        if table.units or own.is_native or not len(table):
-            return self.in_units(table.units or own.name)
-        other = self.in_units('g' if own.is_si else 'm/s2')
-        with np.errstate(over='ignore'):
-            length = float(np.median(np.linalg.norm(table.reading, axis=1)))
-        border = float(np.sqrt(own.per_g * other.units.per_g))
-        return other if (length > border) is (other.units.per_g > border) else self
-
     @property
     def offset_sd(self) -> Floats:
         """Return the standard deviation of V, (3,), in the unit of the readings."""
@@ -312,19 +296,15 @@ class Calibration(Record):
         return np.column_stack(columns) * (self.units.per_g / self.force_per_g)
 
     @cached_property
-    def _is_used(self) -> NDArray[np.bool_]:
-        """(n,) mask of the poses that the fit uses."""
-        return ~np.isin(self.poses.row, [pose.row for pose in self.rejected])
-
-    @cached_property
     def used_poses(self) -> Poses:
         """Return the poses that the calibration was fitted to, in the unit of the readings."""
-        return self.poses.take(self._is_used)
+        return self.poses.take(~np.isin(self.poses.row, [pose.row for pose in self.rejected]))
 
     @cached_property
     def ranges(self) -> Mapping[str, tuple[float, float]]:
         """Range over the poses of what the effects depend on; of a lag, the acting temperature."""
-        known, used = _with_acting(self.model, self.poses.columns), self._is_used
+        known = _with_acting(self.model, self.poses.columns)
+        used = np.isin(self.poses.row, self.used_poses.row)
         wanted = {*self.model.over, *({'temperature'} & {*self.model.needs})}
         return {key: (float(np.min(known[key][used])), float(np.max(known[key][used])))
                 for key in (*_HELD, *self.poses.quantities)
@@ -596,18 +576,13 @@ def outside(calibration: Calibration, known: Context) -> dict[str, Outside]:
     """Return the comparison of each column that has a range; ``count`` is 0 if all are inside."""
     found = {}
     for key, (low, high) in {**calibration.ranges, **_vibration_range(calibration)}.items():
-        values = _size(known[key]) if key in known else np.zeros(0)
+        values = over_axes(known[key]) if key in known else np.zeros(0)
         values = values[np.isfinite(values)]
         if len(values):
             count = int(np.sum((values < low) | (values > high)))
             found[key] = Outside(key, count, len(values), low, high, float(np.min(values)),
                                  float(np.max(values)))
     return found
-
-
-def _size(values: Floats) -> Floats:
-    """Return the values of a quantity; for vectors, the RMS over the axes."""
-    return np.sqrt(np.mean(values ** 2, axis=1)) if values.ndim > 1 else values
 
 
 def _vibration_range(calibration: Calibration) -> dict[str, tuple[float, float]]:

@@ -327,9 +327,11 @@ def _choose(fits: Mapping[str, Fit]) -> tuple[str, str]:
     chosen, *larger = fits
     reasons: list[str] = []
     for name in larger:
-        chance = _by_chance(fits[chosen], fits[name])
-        before, after = (rms_mg(fit.equations.of_poses(fit.residual))
-                         for fit in (fits[chosen], fits[name]))
+        small, large = fits[chosen], fits[name]
+        added = small.dof - large.dof
+        gained = max(small.chi2 - large.chi2, 0.0) / added
+        chance = float(scipy.special.fdtrc(added, large.variance_dof, gained / large.variance))
+        before, after = (rms_mg(fit.equations.of_poses(fit.residual)) for fit in (small, large))
         change = f'{before:.3g} to {after:.3g} mg'
         if chance < _LEVEL_OF_MODELS:
             reasons.append(f'model {name} reduces the residual of model {chosen} from {change} '
@@ -339,13 +341,6 @@ def _choose(fits: Mapping[str, Fit]) -> tuple[str, str]:
             reasons.append(f'model {name} would change it from {change}, which noise explains '
                            f'(p = {chance:.2g})')
     return chosen, '; '.join(reasons) or f'the poses determine only model {chosen}'
-
-
-def _by_chance(small: Fit, large: Fit) -> float:
-    """Return the probability that noise alone explains the improvement by the larger model."""
-    added = small.dof - large.dof
-    gained = max(small.chi2 - large.chi2, 0.0) / added
-    return float(scipy.special.fdtrc(added, large.variance_dof, gained / large.variance))
 
 
 def rejected_by(model: Model, poses_g: Poses) -> tuple[Rejected, ...]:
@@ -381,8 +376,7 @@ def fit_known(poses: Poses, units: Units, method: Method) -> Calibration:
         noted=(*rival_findings(unlike, poses.row), *fit_findings(fit, 0.0), *_placement(fit)))
 
 
-def _without_outliers(poses_g: Poses, method: Method
-                      ) -> tuple[Fit, tuple[Rejected, ...]]:
+def _without_outliers(poses_g: Poses, method: Method) -> tuple[Fit, tuple[Rejected, ...]]:
     """Fit model 12, without outliers if the other poses determine the model."""
     kept = ('reading', 'reference') if method == 'algebraic' else tuple(poses_g.columns)
     poses_g = Poses({key: poses_g[key] for key in kept if key in poses_g}, poses_g.row)

@@ -225,10 +225,9 @@ def mounting_figures(rotation: Floats, sensor: str, base: str = '') -> dict[str,
 def mounting_words(rotation: Floats, sensor: str, base: str = '') -> str:
     """Return `mounting_figures` as one line."""
     found = mounting_figures(rotation, sensor, base)
-    angles = angle_words(rotation)
     quaternion = ', '.join(f'{part:.6f}' for part in found['quaternion'])
-    return (f'mounting of the sensor: {angles}; quaternion ({quaternion}); URDF {found["urdf"]}; '
-            f'or {found["static_transform_publisher"]}')
+    return (f'mounting of the sensor: {angle_words(rotation)}; quaternion ({quaternion}); URDF '
+            f'{found["urdf"]}; or {found["static_transform_publisher"]}')
 
 
 def angle_words(rotation: Floats) -> str:

@@ -208,7 +208,9 @@ def without_knocked(poses_g: Poses, kept: Indices, prior: Prior, noise_g: float,
     total = len(kept)
     now = best = _likely(poses_g, kept, 0, prior, noise_g)
     for knocked in range(1, int(share * total) + 1):
-        away = _away(now.fit) / now.factor
+        data = now.fit.by_pose
+        own = np.maximum(data.own(data.spread)[:, 0, 0], _LEAST_OWN)
+        away = data.residual[:, 0] ** 2 / own / now.factor  # from the fit of the others
         farthest = np.argsort(-away, kind='stable')[:_TRIED]
         if now.factor == 1.0 and away[farthest[0]] < _SUSPICIOUS:
             break
@@ -223,14 +225,7 @@ def without_knocked(poses_g: Poses, kept: Indices, prior: Prior, noise_g: float,
     return replace(best, fit=fit)
 
 
-def _away(fit: Fit) -> Floats:
-    """Return the (n,) squared distances of poses from the fit of the others, per variance."""
-    own = fit.by_pose.own(fit.by_pose.spread)[:, 0, 0]
-    return fit.by_pose.residual[:, 0] ** 2 / np.maximum(own, _LEAST_OWN)
-
-
-def _likely(poses_g: Poses, kept: Indices, knocked: int, prior: Prior,
-            noise_g: float) -> PriorFit:
+def _likely(poses_g: Poses, kept: Indices, knocked: int, prior: Prior, noise_g: float) -> PriorFit:
     """Return the fit with the most probable variance factor; the other poses were knocked."""
     used = poses_g.take(kept)
     model, factors = with_vector(_EFFECTS, prior.mean), _factors(used, noise_g)
@@ -294,8 +289,7 @@ def posterior(values: Floats, covariance: Floats, fleet: FleetPrior
     return values + gain @ away, (left + left.T) / 2.0, (UNLIKE_FLEET,) * is_unlike
 
 
-def mounting_only(poses: Poses, units: Units, *, sensor: str = '', date: str = ''
-                  ) -> Calibration:
+def mounting_only(poses: Poses, units: Units, *, sensor: str = '', date: str = '') -> Calibration:
     """
     Return a calibration named ``ideal``, without effects and with ΔR = I, to be levelled.
 
@@ -304,18 +298,15 @@ def mounting_only(poses: Poses, units: Units, *, sensor: str = '', date: str = '
 
     """
     sound, rejected = usable(poses, units, 'a mounting')
-    fit = judge(Model({}), only_norm(in_g(sound, units)))
+    fit, offset = judge(Model({}), only_norm(in_g(sound, units))), EFFECTS['offset'].typical
     return finished(record_of(
         fit, poses, units, unit(sound.reading), 'ideal', PRIOR, rejected=rejected,
         reason='mounting alone: offset and gain are not calibrated',
-        noted=(Finding('open', _not_calibrated()),)), poses, sensor, date)
-
-
-def _not_calibrated() -> str:
-    offset = EFFECTS['offset'].typical
-    return ('offset and gain are not calibrated: a common sensor has an offset of '
+        noted=(Finding(
+            'open', 'offset and gain are not calibrated: a common sensor has an offset of '
             f'{offset * MG:.0f} mg on each axis, so |a| is off by about as much, and away from '
-            f'the level pose the tilt by about {np.degrees(np.arcsin(offset)):.0f}°')
+            f'the level pose the tilt by about {np.degrees(np.arcsin(offset)):.0f}°'),)),
+        poses, sensor, date)
 
 
 def fit_partial(poses: Poses, units: Units, *, sensor: str = '', date: str = '') -> Calibration:
@@ -350,8 +341,7 @@ def fit_partial(poses: Poses, units: Units, *, sensor: str = '', date: str = '')
     if determines(NAME, unit(sound.reading)):
         raise ValueError(f'the {len(sound)} poses determine model {NAME}, expected poses near '
                          'one direction: use fit_poses')
-    found = most_probable(only_norm(in_g(sound, units)), priors_of(), FIRST_NOISE_G,
-                          LARGEST_SHARE)
+    found = most_probable(only_norm(in_g(sound, units)), priors_of(), FIRST_NOISE_G, LARGEST_SHARE)
     calibration = _recorded(found, poses, sound, units, PRIOR, rejected)
     about = carried(calibration)
     return finished(replace(calibration, reason=_known_words(about), noted=(

@@ -240,8 +240,7 @@ class Identifiability:
         return tuple(name for name in self.deviations if part[name] > _OPEN_PART ** 2)
 
 
-def identifiability(name: str, directions: Floats, noise: Floats | None = None
-                    ) -> Identifiability:
+def identifiability(name: str, directions: Floats, noise: Floats | None = None) -> Identifiability:
     """
     Return what poses determine of a model; it depends only on directions and noise.
 
@@ -365,7 +364,10 @@ def next_pose(directions: Floats, name: str = '10', noise: Floats | None = None,
     error, fits = _error(name, information, count), determines(name, directions, noise)
     up = _best(name, directions, information)
     if up is None or not _helps(name, up, information, count):
-        return NextPose(None, _enough(count, error, noise_g), error, count, fits)
+        certain = (f'{error * noise_g * MG:.2g} mg' if noise_g is not None
+                   else f'{error:.2g} times the noise of a pose')
+        words = f'more poses no longer help: {count} poses determine |a| to within {certain}'
+        return NextPose(None, words, error, count, fits)
     total = count + len(list(_planned(name, directions, information, _SPARE)))
     words = f'turn the sensor so that {words_of(up)} points up ({axes_of_signs(up)})'
     return NextPose(up, words, error, total, fits)
@@ -428,13 +430,6 @@ def _error(name: str, information: Floats, count: int) -> float:
             np.linalg.matrix_rank(information, hermitian=True) < len(information)):
         return np.inf
     return float(np.sqrt(np.trace(np.linalg.solve(information, _mean_information(name)))))
-
-
-def _enough(count: int, error: float, noise_g: float | None) -> str:
-    """Return the sentence for the case that more poses no longer help."""
-    certain = (f'{error * noise_g * MG:.2g} mg' if noise_g is not None
-               else f'{error:.2g} times the noise of a pose')
-    return f'more poses no longer help: {count} poses determine |a| to within {certain}'
 
 
 @dataclass(frozen=True)

@@ -356,17 +356,12 @@ def _check_effects(calibration: Calibration) -> None:
             continue
         if any(key not in used_g for key in model.needs if key != 'previous'):
             continue
-        added = _contribution(model, used_g)
+        up = unit(used_g.reading)
+        along = model.at({'previous': up, **used_g.columns}).reading(up)
+        added = float(np.max(np.linalg.norm(along - up, axis=1)))
         if not added <= effect.plausible_g:
             raise RefusedFitError(f'{name} adds up to {added:.3g} g to a reading, expected less '
                                   f'than {effect.plausible_g:g} g', _CHECK_POSES)
-
-
-def _contribution(model: Model, poses_g: Poses) -> float:
-    """Return the largest contribution of an effect at poses [g]."""
-    up = unit(poses_g.reading)
-    added = model.at({'previous': up, **poses_g.columns}).reading(up) - up
-    return float(np.max(np.linalg.norm(added, axis=1)))
 
 
 def uncertainty_g(calibration: Calibration) -> float:

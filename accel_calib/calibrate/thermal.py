@@ -259,9 +259,8 @@ def _covariance(stretches: Poses, group: NDArray[np.intp], design: Floats) -> Fl
     sizes = (share / np.sum(share))[:, np.newaxis] * variance
     onto = np.linalg.pinv(design)
     white, walk = (onto @ each @ onto.T for each in (white, walk))
-    covariance: Floats = (np.multiply.outer(np.sum(sizes, axis=0), white)
-                          + np.multiply.outer(walks @ sizes, walk))
-    return covariance
+    return np.asarray(np.multiply.outer(np.sum(sizes, axis=0), white)
+                      + np.multiply.outer(walks @ sizes, walk))
 
 
 def _lowest(errors: Sequence[Floats], fits: Sequence[tuple[Floats, Floats]]) -> int:
@@ -351,8 +350,7 @@ def ramp_rows(curve: Curve, units: Units) -> Poses:
     return Poses(columns, numbered(columns), units.name, stretches.sensor, stretches.autopilot)
 
 
-def thermal_alone(curve: Curve, units: Units, *, sensor: str = '', date: str = ''
-                  ) -> Calibration:
+def thermal_alone(curve: Curve, units: Units, *, sensor: str = '', date: str = '') -> Calibration:
     """
     Return a calibration with the offset over the temperature alone, zero at the reference.
 

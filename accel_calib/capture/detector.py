@@ -338,7 +338,10 @@ def select(dwells: Sequence[Dwell], settings: CaptureSettings, units: Units) -> 
 
 def merged(first: Dwell, second: Dwell, units: Units) -> Dwell:
     """Return the mean of two dwells in nearly one direction, with the orientation of the first."""
-    weight = _weight(first, second)
+    samples = first.samples + second.samples
+    share = first.samples / samples
+    one, two = (float(np.sum(each.std**2)) / each.count for each in (first, second))
+    weight = two / (one + two) if one + two > 0.0 else share
     mean = weight * first.mean + (1.0 - weight) * second.mean
     if not units.is_native:
         chord = float(np.linalg.norm(first.mean - second.mean)) / units.per_g
@@ -346,21 +349,12 @@ def merged(first: Dwell, second: Dwell, units: Units) -> Dwell:
     noise = np.sqrt(weight**2 * first.std**2 / first.count
                     + (1.0 - weight)**2 * second.std**2 / second.count)
     count = first.count + second.count
-    samples = first.samples + second.samples
-    share = first.samples / samples
     rate_std = np.sqrt(share * first.rate_std**2 + (1.0 - share) * second.rate_std**2)
     context = {name: share * first.context[name] + (1.0 - share) * second.context[name]
                for name in first.context if name in second.context}
     return replace(first, end=second.end, mean=mean, std=noise * np.sqrt(count), count=count,
                    time=share * first.time + (1.0 - share) * second.time,
                    samples=samples, context=context, rate_std=rate_std)
-
-
-def _weight(first: Dwell, second: Dwell) -> float:
-    one = float(np.sum(first.std**2)) / first.count
-    two = float(np.sum(second.std**2)) / second.count
-    return two / (one + two) if one + two > 0.0 else first.samples / (
-        first.samples + second.samples)
 
 
 def _radius(means: Sequence[Floats], units: Units) -> float:

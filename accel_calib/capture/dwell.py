@@ -394,8 +394,7 @@ _NONE = np.empty(0, _judged_type(sums_type(0)))
 class Tracker:
     """Join still chunks to dwells, in one segment."""
 
-    def __init__(self, settings: CaptureSettings, rule: Rule, judged: Judged, number: int
-                 ) -> None:
+    def __init__(self, settings: CaptureSettings, rule: Rule, judged: Judged, number: int) -> None:
         chunks = judged.chunks
         self._rule = rule
         self._chunks = chunks
@@ -453,7 +452,8 @@ class Tracker:
         done: list[OngoingDwell] = []
         before = self._held
         if self._pause or self._dwell is None:
-            before = _without_windows(self._lead)
+            before = self._lead.copy()  # without its windows, which are not still
+            before['sums']['level'] = before['sums']['windows'] = 0.0
             if (self._dwell is None or not self._dwell.chunks or not self._dwell.continued_by(
                     chained(before, chunks[:1])['sums'], self._rule.scale)):
                 done = self._end()
@@ -504,12 +504,6 @@ def _records(judged: Judged) -> Records:
     found['begin'], found['end'] = chunks.begin, chunks.end
     found['limit'], found['still'] = judged.limit.T, judged.still
     found['trending'] = judged.trending
-    return found
-
-
-def _without_windows(chunks: Records) -> Records:
-    found = chunks.copy()
-    found['sums']['level'] = found['sums']['windows'] = 0.0
     return found
 
 

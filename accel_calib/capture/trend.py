@@ -253,8 +253,7 @@ def _autocovariance(centred: Floats, sizes: Floats, axes: Floats) -> Floats:
     power = np.sum(np.abs(np.fft.rfft(centred, padded, axis=2))**2, axis=0)
     lags = np.arange(max(length // 2, 2))
     terms = np.maximum(sizes[:, np.newaxis] - lags, 1.0)
-    return np.asarray(np.fft.irfft(power, padded, axis=1)[:, lags]
-                      / (terms * axes[:, np.newaxis]))
+    return np.asarray(np.fft.irfft(power, padded, axis=1)[:, lags] / (terms * axes[:, np.newaxis]))
 
 
 def _long_run(covariance: Floats, sizes: Floats) -> Floats:

@@ -83,18 +83,12 @@ def run_compare(args: argparse.Namespace) -> Done:
         return comparison_page(comparison, rating, paths, calibrations)
 
     models = [calibration.name for calibration in calibrations]
-    return Done(_comparison_result(paths, models, comparison),
-                _comparison_lines(paths, models, comparison), rating,
-                status=0 if comparison.agree else FAILED, page=page)
-
-
-def _comparison_result(paths: list[Path], models: list[str], comparison: Comparison
-                       ) -> dict[str, Any]:
-    """Return the result for JSON."""
     outlier = comparison.outlier
-    return {**asdict(comparison), 'outlier': None if outlier is None else outlier + 1,
-            'runs': [{'file': path, 'model': model, **asdict(run)} for path, model, run in
-                     zip(paths, models, comparison.runs, strict=True)]}
+    result = {**asdict(comparison), 'outlier': None if outlier is None else outlier + 1,
+              'runs': [{'file': path, 'model': model, **asdict(run)} for path, model, run in
+                       zip(paths, models, comparison.runs, strict=True)]}
+    return Done(result, _comparison_lines(paths, models, comparison), rating,
+                status=0 if comparison.agree else FAILED, page=page)
 
 
 def _comparison_lines(paths: list[Path], models: list[str], comparison: Comparison
@@ -114,9 +108,8 @@ def _comparison_lines(paths: list[Path], models: list[str], comparison: Comparis
          for one in comparison.parameters if np.any(one.stated_sd)))
     for note in comparison.notes:
         yield f'note: {note}'
-    if comparison.tilt_deg is not None:
-        yield ('the directions of up of levelled calibrations differ by up to '
-               f'{comparison.tilt_deg:.3g}°; the test does not use them')
+    if comparison.tilt_words:
+        yield comparison.tilt_words
     yield _answer(comparison)
 
 
@@ -169,19 +162,14 @@ def _history_lines(history: History) -> Iterator[Any]:
     yield _dates_table(history)
     for first, second, change in zip(history.labels, history.labels[1:], history.changes,
                                      strict=False):
-        yield _step_line(first, second, change)
+        comparison = change.comparison
+        verdict = 'agree' if comparison.agree else 'differ'
+        most = change_in_words(change.parameter, change.change, change.sd).replace('−', '-')
+        yield (f'{first} to {second}: {verdict} (p = {comparison.p_value:.2g}), '
+               f'{rate_comparison(comparison).name}; largest change: '
+               f'{change.parameter.replace(".", " ")} {most}')
     for note in history.notes:
         yield f'note: {note}'
-
-
-def _step_line(first: str, second: str, change: Any) -> str:
-    """Return one step as a line of text."""
-    comparison = change.comparison
-    verdict = 'agree' if comparison.agree else 'differ'
-    most = change_in_words(change.parameter, change.change, change.sd).replace('−', '-')
-    return (f'{first} to {second}: {verdict} (p = {comparison.p_value:.2g}), '
-            f'{rate_comparison(comparison).name}; largest change: '
-            f'{change.parameter.replace(".", " ")} {most}')
 
 
 def _dates_table(history: History) -> Table:

@@ -306,13 +306,12 @@ def _shown(args: argparse.Namespace, result: Refinement) -> Iterator[Any]:
 def several_refine(results: Sequence[dict[str, Any]]) -> Iterator[str]:
     """Yield a line for each of several results."""
     for result in results:
-        yield f'{result["file"]}: {error_line(result) or _in_a_line(result)}'
-
-
-def _in_a_line(result: dict[str, Any]) -> str:
-    names = ' + '.join([result['base'], *(step['effect'] for step in result['steps'])])
-    return (f'{result["verdict"]}: {names}, {short(result["gap_mg"])} -> '
-            f'{short(result["remaining_gap_mg"])} mg')
+        line = error_line(result)
+        if not line:
+            names = ' + '.join([result['base'], *(step['effect'] for step in result['steps'])])
+            line = (f'{result["verdict"]}: {names}, {short(result["gap_mg"])} -> '
+                    f'{short(result["remaining_gap_mg"])} mg')
+        yield f'{result["file"]}: {line}'
 
 
 def _steps_table(result: Refinement) -> Table:

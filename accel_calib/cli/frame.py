@@ -116,15 +116,13 @@ def run(args: argparse.Namespace) -> int:
 
 def _function(kind: str, command: str) -> Callable[[Any], Any]:
     module = import_module(f'.{COMMANDS[command].module}', __package__)
-    function: Callable[[Any], Any] = getattr(module, f'{kind}_{command}')
-    return function
+    return getattr(module, f'{kind}_{command}')
 
 
 def _page_of(args: argparse.Namespace) -> Path | None:
     """Return the page that is asked for."""
     name = 'output' if COMMANDS[args.command].writes == 'page' else 'report'
-    page: Path | None = getattr(args, name, None)
-    return page
+    return getattr(args, name, None)
 
 
 def _done(args: argparse.Namespace) -> Done:

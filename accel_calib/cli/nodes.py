@@ -174,6 +174,8 @@ _LETTERS = {
 }
 """Rows of pixels of each letter, from the top."""
 
+_BLOCKS = {'..': ' ', '#.': '▀', '.#': '▄', '##': '█'}
+"""Character for two pixels, the upper one first, each of half a row."""
 
 _CALLS = {'fit': 'CALL FIT', 'refine': 'CALL REFINE', 'level': 'SET LEVEL', 'accept': 'ACCEPT',
           'save': 'SAVE', 'done': 'DONE'}
@@ -437,28 +439,13 @@ class _Large:
     style: str
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        rows = _pixels(self.words)
-        wide, half = _two_columns(rows), _half_rows(rows)
+        letters = [_LETTERS[letter].split() for letter in self.words]
+        rows = ['.'.join(parts) for parts in zip(*letters)]
+        wide = [''.join('██' if pixel == '#' else '  ' for pixel in row) for row in rows]
+        padded = [*rows, '.' * len(rows[0])]
+        half = [''.join(_BLOCKS[upper + lower] for upper, lower in zip(above, below))
+                for above, below in zip(padded[::2], padded[1::2])]
         fitting = [lines for lines in (wide, half) if len(lines[0]) <= options.max_width
                    and len(lines) <= console.height - _OTHER_ROWS]
         lines = fitting[0] if fitting and not options.ascii_only else [self.words]
         yield Text('\n'.join(lines), style=self.style)
-
-
-def _pixels(words: str) -> list[str]:
-    """Return the rows of pixels of words."""
-    letters = [_LETTERS[letter].split() for letter in words]
-    return ['.'.join(parts) for parts in zip(*letters)]
-
-
-def _two_columns(rows: list[str]) -> list[str]:
-    """Return lines with two columns for a pixel."""
-    return [''.join('██' if pixel == '#' else '  ' for pixel in row) for row in rows]
-
-
-def _half_rows(rows: list[str]) -> list[str]:
-    """Return lines with half a row for a pixel."""
-    blocks = {'..': ' ', '#.': '▀', '.#': '▄', '##': '█'}
-    padded = [*rows, '.' * len(rows[0])]
-    return [''.join(blocks[upper + lower] for upper, lower in zip(above, below))
-            for above, below in zip(padded[::2], padded[1::2])]

@@ -55,7 +55,7 @@ from ..calibrate import Calibration, fit_unknown, in_g, NORM_MODELS, with_histor
 from ..effects import Context, effect_named, Model, reading_of
 from ..errors import InputError, RefusedFitError
 from ..estimate import Fit, judge
-from ..table import Floats, Poses
+from ..table import Floats
 from ..text import counted
 from ..units import STANDARD_GRAVITY
 
@@ -239,8 +239,7 @@ def _fit_of(calibration: Calibration) -> Fit:
     poses_g = with_history(in_g(calibration.poses, calibration.units), model)
     poses_g = poses_g.take(np.isin(poses_g.row, calibration.used_poses.row))
     if not calibration.form.known_orientation:
-        poses_g = Poses({key: values for key, values in poses_g.columns.items()
-                         if key != 'reference'}, poses_g.row)
+        poses_g = poses_g.without_columns('reference')
     return judge(model, poses_g, np.eye(len(model.vector)))
 
 

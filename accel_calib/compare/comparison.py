@@ -25,7 +25,7 @@ from .agreement import (
 from ..calibrate import Calibration
 from ..effects import Context, length_rows, sensor_force
 from ..errors import InputError
-from ..geometry import OVER_THE_SPHERE
+from ..geometry import OVER_THE_SPHERE, rms
 from ..table import Floats
 from ..text import counted, listed
 from ..units import MG
@@ -37,22 +37,20 @@ _WARMER = 5.0
 """Difference of temperature between runs that causes a note [°C]."""
 
 
-def _contexts_of(calibrations: Sequence[Calibration]) -> tuple[Context, ...]:
-    """Return the context for the comparison of each run, one row each."""
+def _contexts_of(calibrations: Sequence[Calibration]) -> list[Context]:
+    """Return the context for the comparison of each run, one row each: medians, and no motion."""
     common = {key: np.array([np.mean([np.median(run.poses[key]) for run in calibrations
                                       if key in run.poses])])
               for key in _COMMON if any(key in run.poses for run in calibrations)}
-    return tuple({**_own_context(run), **common} for run in calibrations)
-
-
-def _own_context(run: Calibration) -> Context:
-    """Return the median context of a run, with zero rate and without a previous pose."""
-    context: dict[str, Floats] = {'rate': np.zeros((1, 3)), 'previous': np.zeros((1, 3))}
-    if 'time' in run.poses:
-        context['time'] = np.array([np.median(run.poses['time'])])
-    if 'std' in run.poses:
-        context['std'] = run.units.to_g(np.median(run.poses['std'], axis=0))[np.newaxis]
-    return context
+    contexts: list[Context] = []
+    for run in calibrations:
+        own: dict[str, Floats] = {'rate': np.zeros((1, 3)), 'previous': np.zeros((1, 3))}
+        if 'time' in run.poses:
+            own['time'] = np.array([np.median(run.poses['time'])])
+        if 'std' in run.poses:
+            own['std'] = run.units.to_g(np.median(run.poses['std'], axis=0))[np.newaxis]
+        contexts.append({**own, **common})
+    return contexts
 
 
 def _notes_of(given: Sequence[Comparable], names: tuple[str, ...], deviation: Floats,
@@ -195,6 +193,13 @@ class Comparison:
     tilt_deg: float | None
     notes: tuple[str, ...]
 
+    @property
+    def tilt_words(self) -> str:
+        """Return `tilt_deg` as one line; empty if it is not known."""
+        return '' if self.tilt_deg is None else (
+            'the directions of up of levelled calibrations differ by up to '
+            f'{self.tilt_deg:.3g}°; the test does not use them')
+
 
 @dataclass(frozen=True)
 class _Prepared:
@@ -219,8 +224,7 @@ class _Prepared:
     def spread(self, names: tuple[str, ...], covariance: Floats) -> Floats:
         """Return the (t, t) covariance of the common parameters."""
         slope = _into(names, self.free, self.slope)
-        carried: Floats = slope @ covariance @ slope.T
-        return carried
+        return np.asarray(slope @ covariance @ slope.T)
 
 
 def compare(calibrations: Sequence[Calibration]) -> Comparison:
@@ -276,7 +280,7 @@ def _into(names: tuple[str, ...], run: RotationFree, rows: Floats) -> Floats:
 
 
 def _parameter(name: str, values: Floats, stated: Floats) -> Parameter:
-    spread, typical = float(np.std(values, ddof=1)), _rms(stated)
+    spread, typical = float(np.std(values, ddof=1)), rms(stated)
     return Parameter(name, values, stated, spread, spread / typical if typical > 0.0 else None)
 
 
@@ -293,14 +297,10 @@ def _each(prepared: Sequence[_Prepared], chances: Floats) -> tuple[Run, ...]:
         away = length[k] - others @ np.delete(length, k, 0)
         expected = variance[k] + others ** 2 @ np.delete(variance, k, 0)
         largest = int(np.argmax(np.abs(away)))
-        runs.append(Run(_rms(away) * MG, _rms(np.sqrt(expected)) * MG,
+        runs.append(Run(rms(away) * MG, rms(np.sqrt(expected)) * MG,
                         float(np.abs(away[largest])) * MG, OVER_THE_SPHERE[largest],
                         float(chance)))
     return tuple(runs)
-
-
-def _rms(values: Floats) -> float:
-    return float(np.sqrt(np.mean(values ** 2)))
 
 
 def _tilt_deg(prepared: Sequence[_Prepared]) -> float | None:

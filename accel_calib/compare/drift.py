@@ -296,8 +296,7 @@ def _covariance(state: Drift, rests: tuple[RestError, ...]) -> Floats:
     """Return the (n, n) covariance of the errors of these rests without a change [g²]."""
     slope = np.array([rest.slope for rest in rests])
     noise = np.array([rest.variance + state.repeats for rest in rests])
-    covariance: Floats = slope @ state.covariance @ slope.T + np.diag(state.scatter ** 2 * noise)
-    return covariance
+    return np.asarray(slope @ state.covariance @ slope.T + np.diag(state.scatter ** 2 * noise))
 
 
 def _scatter(state: Drift, rests: tuple[RestError, ...]) -> float:

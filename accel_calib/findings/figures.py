@@ -32,7 +32,7 @@ from ..calibrate import (
 from ..effects import AXES, effect_named, LADDER, Model, MODELS, predict, value_unit
 from ..estimate import pose_noise, sensing_axes, variance_factor
 from ..finding import Rating
-from ..geometry import OVER_THE_SPHERE
+from ..geometry import OVER_THE_SPHERE, rms
 from ..table import Floats
 from ..text import signed
 from ..units import MG
@@ -251,8 +251,7 @@ MATTERS = Limit(
 HIDDEN = Limit(
     'scatter of the poses', 2.0, 'times the noise', 'if the scatter is larger, and the part '
     'beyond the noise is above the error that matters, the model lacks an effect or poses moved')
-LEFT_OUT = Limit(
-    'poses left out', 20.0, '%', 'largest share of a good calibration')
+LEFT_OUT = Limit('poses left out', 20.0, '%', 'largest share of a good calibration')
 TO_CHECK = Limit(
     'poses to check the fit', 3.0, 'poses', 'fewest poses beyond the number of values, if the '
     'noise is not known or outliers were left out')
@@ -350,7 +349,7 @@ class Expected:
             squares = np.trace(spread, axis1=1, axis2=2) / calibration.force_per_g ** 2
             return float(np.sqrt(np.mean(squares))) * MG
         up = self.directions if self.is_partial else OVER_THE_SPHERE
-        return _rms(deviations_g(calibration, up)) * MG * math.sqrt(1.0 + 2.0 * self.is_vector)
+        return rms(deviations_g(calibration, up)) * MG * math.sqrt(1.0 + 2.0 * self.is_vector)
 
     @cached_property
     def worst_mg(self) -> float:
@@ -432,7 +431,7 @@ class Expected:
         if 'std' in self.poses:
             context['std'] = calibration.units.to_g(self.poses['std'])
         along = np.sum((predict(model, up, context) - up) * up, axis=1)
-        return _rms(along) * MG
+        return rms(along) * MG
 
     @cached_property
     def error_mg(self) -> float:
@@ -473,10 +472,6 @@ def depends_on(name: str) -> set[str]:
     """Return the context that an effect is a function of."""
     effect = effect_named(name)
     return set(effect.over or effect.needs)
-
-
-def _rms(values: Floats) -> float:
-    return float(np.sqrt(np.mean(values ** 2)))
 
 
 def number(value: float) -> str:

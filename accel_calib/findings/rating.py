@@ -196,8 +196,7 @@ def _not_corrected(expected: Expected) -> Iterator[Finding]:
                               f'{where}', level='USABLE')
 
 
-def _inexact(expected: Expected, error: float, refinement: Refinement | None
-             ) -> Iterator[Finding]:
+def _inexact(expected: Expected, error: float, refinement: Refinement | None) -> Iterator[Finding]:
     """Yield a finding if an error that has no name yet is too large [mg]."""
     if expected.is_partial or not expected.calibration.model.effects:
         return

@@ -303,20 +303,15 @@ def _of_months(prefix: str, known: OfModel) -> Iterator[Drawing]:
         with drawn(3.9, f'{words} minus its median [{scale_of(names[0])[2]}]', 3, sharex=True
                    ) as (figure, panels):
             for panel, name in zip(panels, names, strict=True):
-                _draw_months(panel, name, days, found[:, :, NAMES.index(name)])
+                lines = found[:, :, NAMES.index(name)].T * scale_of(name)[1]
+                panel.axhline(0.0, color=FAINT, linewidth=1.2)
+                add_band(panel, days, lines[0], lines[4], AFTER, 0.18)
+                add_band(panel, days, lines[1], lines[3], AFTER, 0.35)
+                panel.plot(days, lines[2], color=AFTER)
+                panel.set_ylabel(name.partition('.')[2])
             label_dates(panels[-1], days, 'month of the recording', dated=True)
         yield Drawing(f'{prefix}_{key}', f'{words}: difference from the median of the sensor, by '
                       'month, with bands of 50 % and 90 % of the calibrations', figure)
-
-
-def _draw_months(panel: Any, name: str, days: Floats, quantiles: Floats) -> None:
-    """Draw the (months, `_PARTS`) quantiles of a value."""
-    lines = quantiles.T * scale_of(name)[1]
-    panel.axhline(0.0, color=FAINT, linewidth=1.2)
-    add_band(panel, days, lines[0], lines[4], AFTER, 0.18)
-    add_band(panel, days, lines[1], lines[3], AFTER, 0.35)
-    panel.plot(days, lines[2], color=AFTER)
-    panel.set_ylabel(name.partition('.')[2])
 
 
 def _of_sensor(name: str, sensor: str, rows: Sequence[Row], changes: Sequence[Mapping[str, Any]]

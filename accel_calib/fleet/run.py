@@ -23,7 +23,7 @@ import threading
 import time
 from typing import Any, TYPE_CHECKING, TypeVar
 
-from .overview import digest_of, Overview, overview, priors_of, rating_of
+from .overview import digest_of, overview, priors_of, rating_of
 from .page import write_fleet_page
 from .recording import (
     as_folder, as_text, content_hash, Input, key_of, on_disk, Options, Row, row_of, unread_row)
@@ -182,19 +182,13 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
         store.replace_unread(unread)
         sensors = tuple(_merge(client, store))
         known = overview(_by_sensor(client, digest_of, [*store.sensors(), UNREAD], store))
-        priors = _stored_priors(store, known)
+        priors, path = priors_of(known.typical), store.folder / PRIOR_FILE
+        if priors:
+            write_priors(path, priors)
+        else:
+            path.unlink(missing_ok=True)
         write_fleet_page(store, known, sensors, priors)
         return Summary(counts, sensors, priors, damaged, rating_of(known, sensors))
-
-
-def _stored_priors(store: Store, known: Overview) -> dict[str, FleetPrior]:
-    """Write the typical values by model of sensor, and return them."""
-    priors, path = priors_of(known.typical), store.folder / PRIOR_FILE
-    if priors:
-        write_priors(path, priors)
-    else:
-        path.unlink(missing_ok=True)
-    return priors
 
 
 def _set_aside(client: Client, store: Store) -> Iterator[str]:

@@ -386,14 +386,11 @@ class Host:
         if self._waiting:
             samples, self._waiting = np.concatenate(self._waiting), []
             if self.session.accepts(self._source.sensor):
-                self._set_temperature(samples[:, 7])
+                known = samples[np.isfinite(samples[:, 7]), 7]
+                if len(known):
+                    self.session.around.take('temperature', float(known[-1]))
                 self.session.push(samples, monotonic())
         self._handle_events()
-
-    def _set_temperature(self, temperatures: Floats) -> None:
-        known = temperatures[np.isfinite(temperatures)]
-        if len(known):
-            self.session.around.take('temperature', float(known[-1]))
 
     def _handle_events(self) -> None:
         for event in self.session.events():

@@ -423,8 +423,7 @@ class PageServer:
 
     def ask(self, command: str, answer: Callable[[bool, str], object]) -> None:
         """Ask the desk, and call `answer` in this thread."""
-        self._desk.ask(command, lambda success, words: self._call(
-            lambda: answer(success, words)))
+        self._desk.ask(command, lambda success, words: self._call(lambda: answer(success, words)))
 
 
 def _suffix_of(file: Traversable) -> str:

@@ -131,17 +131,12 @@ def _played(blocks: Iterator[Recording], speed: float) -> Iterator[Floats]:
             if due[done] - last > _LONGEST_GAP_S / speed:
                 shift = due[done] - now
             ready = int(np.searchsorted(due, now + shift, side='right'))
-            ready = _before_gap(due, done, ready, speed)
+            gaps = np.flatnonzero(np.diff(due[done:ready]) > _LONGEST_GAP_S / speed)
+            ready = max(done, done + int(gaps[0]) + 1 if len(gaps) else ready)
             yield rows[done:ready]
             if ready > done:
                 last, done = due[ready - 1], ready
             time.sleep(_WAIT_S)
-
-
-def _before_gap(due: Floats, done: int, ready: int, speed: float) -> int:
-    """Return the end of the samples that are ready, at the latest at the next long gap."""
-    gaps = np.flatnonzero(np.diff(due[done:ready]) > _LONGEST_GAP_S / speed)
-    return max(done, done + int(gaps[0]) + 1 if len(gaps) else ready)
 
 
 def _rows(recording: Recording) -> Floats:

@@ -89,8 +89,7 @@ def corrected(calibration: Calibration, doubles: Floats, context: Context | None
         result[:, ANGULAR_VELOCITY] = doubles[:, ANGULAR_VELOCITY] @ rotation
         present = doubles[:, ORIENTATION_COVARIANCE.start] != -1.0
         x, y, z, w = doubles[present, ORIENTATION].T
-        result[present, ORIENTATION] = np.array(
-            _product(x, y, z, w, *quaternion_of(rotation))).T
+        result[present, ORIENTATION] = np.array(_product(x, y, z, w, *quaternion_of(rotation))).T
     turn = rotation.T if calibration.is_levelled else np.eye(3)
     for part in (ANGULAR_VELOCITY_COVARIANCE, ORIENTATION_COVARIANCE):
         _transform(result, part, turn)
@@ -139,8 +138,7 @@ LARGEST_G = 100.0
 """Larger corrected forces are not published [g]. The range of common accelerometers is 16 to 40 g;
 shock sensors cannot be calibrated by gravity."""
 
-_FORCE, _FRONT, _WHOLE = (struct.Struct(each) for each in (
-    '<12d', '<4d72s3d72s', '<4d72s3d72s3d'))
+_FORCE, _FRONT, _WHOLE = (struct.Struct(each) for each in ('<12d', '<4d72s3d72s', '<4d72s3d72s3d'))
 _ABSENT = struct.pack('<d', -1.0)
 _UNKNOWN = bytes(72)
 _NONE: Triple = (0.0, 0.0, 0.0)
@@ -231,7 +229,9 @@ class Rewriter:
         largest = self._largest
         a, b, c = force
         if not (-largest < a < largest and -largest < b < largest and -largest < c < largest):
-            raise _implausible(force)
+            words = ', '.join(f'{part:.3g}' for part in force)
+            raise InputError(f'the corrected acceleration is ({words}) m/s², expected less than '
+                             f'{LARGEST_G:.0f} g', 'check the calibration and the driver')
         covariance, seen = data[self._force_spread:], self._seen_force
         if covariance != seen.given:
             seen = self._seen_force = _seen(self._inverse, covariance, self._fill_force)
@@ -287,12 +287,6 @@ class Rewriter:
             known.update(self._thermal.value)
         self._at = self._calibration.at(known)
         return self._at
-
-
-def _implausible(force: Triple) -> InputError:
-    words = ', '.join(f'{part:.3g}' for part in force)
-    return InputError(f'the corrected acceleration is ({words}) m/s², expected less than '
-                      f'{LARGEST_G:.0f} g', 'check the calibration and the driver')
 
 
 def _diagonal(deviation: Floats) -> bytes:

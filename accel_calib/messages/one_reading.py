@@ -140,8 +140,7 @@ class OneReading:
                     change = difference(effect.factor, known, shape, place)
                     factors += np.broadcast_to(change, count).tolist()
         which, rows = self._spread_rows
-        basis: Floats = (which * factors) @ rows
-        return basis
+        return np.asarray((which * factors) @ rows)
 
 
 def _factor(effect: Effect, known: Known, shape: Any) -> Any:
@@ -246,7 +245,11 @@ class AtReading:
 
         """
         if self._bends:
-            added = self._bent_spread(_times(self._owner.back, *force))
+            u = _times(self._owner.back, *force)
+            monomials = [MONOMIALS[index].value(*u) for index in self._owner.monomials]
+            to_force = np.reshape(_product(self._owner.turn, _inverse(self._slope_at(u))), (3, 3))
+            moved = to_force @ np.dot(monomials, self._basis).reshape(3, -1)
+            added = (moved @ moved.T).ravel().tolist()
         else:
             xx, xy, xz, yy, yz, zz = [form(*force) for form in self._forms]
             added = [xx, xy, xz, xy, yy, yz, xz, yz, zz]
@@ -263,13 +266,6 @@ class AtReading:
         form = np.array([both[m, n] / (2.0 if m == n else 1.0)
                          for m, n in zip(*np.triu_indices(AFFINE), strict=True)])
         return [_quadratic(*form[:, entry].tolist()) for entry in (0, 1, 2, 4, 5, 8)]
-
-    def _bent_spread(self, u: Triple) -> list[float]:
-        monomials = [MONOMIALS[index].value(*u) for index in self._owner.monomials]
-        to_force = np.reshape(_product(self._owner.turn, _inverse(self._slope_at(u))), (3, 3))
-        moved = to_force @ np.dot(monomials, self._basis).reshape(3, -1)
-        added: list[float] = (moved @ moved.T).ravel().tolist()
-        return added
 
     @cached_property
     def _basis(self) -> Floats:

@@ -158,8 +158,9 @@ class Spread:
         matrix[self.pairs[:, 0], self.pairs[:, 1]] = found
         matrix[self.pairs[:, 1], self.pairs[:, 0]] = found
         if sizes[_RANDOM] > 0.0:
-            matrix += 2.0 * sizes[_RANDOM] * _definite(
-                np.einsum('c,cij->ij', sizes[:_RANDOM], self.of_mean))
+            # Without the negative eigenvalues of rounded sums.
+            values, vectors = np.linalg.eigh(np.einsum('c,cij->ij', sizes[:_RANDOM], self.of_mean))
+            matrix += 2.0 * sizes[_RANDOM] * (vectors * np.maximum(values, 0.0) @ vectors.T)
         return matrix
 
 
@@ -177,12 +178,6 @@ def spread_of(lengths: Counts, samples: int) -> Spread:
         lengths[first] * lengths[second])
     of_mean[:, second, first] = of_mean[:, first, second]
     return Spread(len(lengths), np.column_stack([first, second]), gamma, weight, of_mean)
-
-
-def _definite(matrix: Floats) -> Floats:
-    """Return a symmetric matrix without the negative eigenvalues of rounded sums."""
-    values, vectors = np.linalg.eigh(matrix)
-    return np.asarray(vectors * np.maximum(values, 0.0) @ vectors.T)
 
 
 def _lags(one: int, two: int, samples: int) -> Counts:

@@ -282,17 +282,14 @@ class Set:
         """Return the set as it is, and with the outliers that it leaves, if they differ."""
         found, key = self.linear.outliers, frozenset(self.blocks)
         if key not in found:
-            found[key] = (Set.of(self.linear, self.blocks) if self.out else self)._outliers
+            whole = Set.of(self.linear, self.blocks) if self.out else self
+            linear, (onto, residual) = self.linear, whole.spanned
+            found[key] = tuple(outliers_among(
+                by_pose(residual, np.hstack([linear.onto, onto]), linear.pose), whole.rss,
+                linear.dof - int(whole.parameters), linear.poses, noise_known=linear.worth > 0.0
+            ).poses.tolist())
         out = found[key]
         return [self] if out == self.out else [self, Set.of(self.linear, self.blocks, out)]
-
-    @property
-    def _outliers(self) -> tuple[int, ...]:
-        linear, (onto, residual) = self.linear, self.spanned
-        return tuple(outliers_among(
-            by_pose(residual, np.hstack([linear.onto, onto]), linear.pose), self.rss,
-            linear.dof - int(self.parameters), linear.poses, noise_known=linear.worth > 0.0
-        ).poses.tolist())
 
     @cached_property
     def rss(self) -> float:
@@ -394,11 +391,6 @@ class Set:
         """Return the probability that noise alone makes a block this good beside the others."""
         chance = self.chance(self.without(block))
         return min(1.0, chance * self.linear.kinds * self.linear.blocks[block].tried)
-
-    @property
-    def is_significant(self) -> bool:
-        """Return whether each effect of the set is significant beside the others."""
-        return all(self.probability(block) < LEVEL for block in self.blocks)
 
     @property
     def left(self) -> float:

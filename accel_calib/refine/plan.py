@@ -39,7 +39,7 @@ from .state import fitted_state, with_effect
 from .steps import percent, shown_name
 from ..effects import effect_named, Model, WANDER
 from ..estimate import Fit, judge, kinds
-from ..geometry import attitude_words, ATTITUDES, spread_directions
+from ..geometry import attitude_words, ATTITUDES, over_axes, spread_directions
 from ..table import Floats, is_quantity, Poses
 
 VARIED = ('temperature', 'supply_voltage', 'time', 'std')
@@ -240,8 +240,7 @@ class _Contest:
         return float(np.mean(parts[right] / np.sum(parts, axis=0)))
 
 
-def _after(left: Floats, rows: Floats, spread: Floats, taken: list[int]
-           ) -> tuple[Floats, Floats]:
+def _after(left: Floats, rows: Floats, spread: Floats, taken: list[int]) -> tuple[Floats, Floats]:
     """Return what a model leaves of means, and its covariance, after a fit to candidates."""
     own = rows[taken].reshape(-1, rows.shape[2])
     gain = spread @ own.T @ np.linalg.inv(np.eye(len(own)) + own @ spread @ own.T)
@@ -329,7 +328,7 @@ def _levels(key: str, poses_g: Poses) -> list[float]:
 
 def _sizes(values: NDArray[Any]) -> Floats:
     """Return the finite (n,) values of a column, of a vector its RMS over the axes."""
-    sizes = np.sqrt(np.mean(values ** 2, axis=1)) if values.ndim > 1 else values
+    sizes = over_axes(values)
     return np.asarray(sizes[np.isfinite(sizes)], float)
 
 

@@ -143,7 +143,10 @@ def verdict_words(result: Refinement) -> str:
     words = _VERDICTS[result.verdict].format(
         'a slow change of the offset' if walks else 'an empirical curve')
     if result.undecided:
-        words = _undecided(result)
+        most = max(result.steps, key=lambda step: len(step.rivals))
+        why = result.refusal[0] if result.refusal else (
+            f'{len(most.rivals)} others explain it about as well as {most.effect}')
+        words = f'Not enough poses: they cannot tell what explains the gap, because {why}.'
     elif result.verdict == 'unexplained' and result.steps:
         words = ('A gap remains beyond the named effects, and no effect of the catalogue explains '
                  'it.')
@@ -151,15 +154,6 @@ def verdict_words(result: Refinement) -> str:
         words += (' The noise of the poses is not known (no std and count), so their scatter is '
                   'taken as the noise.')
     return words
-
-
-def _undecided(result: Refinement) -> str:
-    if result.refusal:
-        why = result.refusal[0]
-    else:
-        most = max(result.steps, key=lambda step: len(step.rivals))
-        why = f'{len(most.rivals)} others explain it about as well as {most.effect}'
-    return f'Not enough poses: they cannot tell what explains the gap, because {why}.'
 
 
 def residual_words(result: Refinement) -> str:

@@ -269,8 +269,7 @@ def _walking(found: Found) -> Found | None:
     if walk is None or walk.likelihood_ratio < SIGNIFICANT:
         return None
     near = replace(near, walk=walk, chosen=near.chosen.within(walk.whitened(near.plain)))
-    return replace(found, near=near, walk=_walk(found.final, near),
-                   added=(*found.added, WANDER))
+    return replace(found, near=near, walk=_walk(found.final, near), added=(*found.added, WANDER))
 
 
 def _is_better(curve: Curve, near: Near) -> bool:
@@ -498,6 +497,10 @@ _AS_GOOD = 2.0
 _NEARLY = 0.3
 """Smallest share of the score of a set that a simpler set has before its shape is fitted."""
 
+_DECIMALS = 6
+"""Decimals of the scores that sets are sorted by: not the last bit of a processor decides, and
+equal scores keep their order."""
+
 _PATIENCE = 2
 """The search ends if the best score has not risen for this number of extensions."""
 
@@ -555,7 +558,7 @@ def accepted(visited: Iterable[Set]) -> Iterator[Set]:
         for chosen in left:
             if near and chosen.score < near[0].score - _AS_GOOD:
                 break
-            if chosen.is_significant:
+            if all(chosen.probability(block) < LEVEL for block in chosen.blocks):
                 near.append(chosen)
         if not near:
             return
@@ -573,9 +576,9 @@ def _extended(before: Set) -> list[Set]:
     for effect, numbers in linear.numbers_of.items():
         number = int(numbers[np.argmax(scores[numbers])])
         if scores[number] > -np.inf and not _is_barred(linear.blocks[number], before.entries):
-            best[effect] = float(scores[number]), number
-    return [before.extended(number)
-            for _, number in sorted(best.values(), key=lambda each: _falling(each[0]))[:_BRANCHES]]
+            best[effect] = round(float(scores[number]), _DECIMALS), number
+    first = sorted(best.values(), key=lambda each: -each[0])[:_BRANCHES]
+    return [before.extended(number) for _, number in first]
 
 
 def _is_barred(block: Block, present: Iterable[Block]) -> bool:
@@ -598,19 +601,9 @@ def _with_best_shapes(chosen: Set) -> Set:
     return chosen
 
 
-def _falling(score: float) -> float:
-    """
-    Return the key that sorts by score, the best first.
-
-    Equal scores keep their order: without rounding, the last bit of a processor would decide.
-
-    """
-    return -round(score, 6)
-
-
 def _distinct(sets: Iterable[Set]) -> list[Set]:
     """Return the best set of each list of names and outliers, the best score first."""
     best: dict[tuple[frozenset[str], tuple[int, ...]], Set] = {}
-    for chosen in sorted(sets, key=lambda chosen: _falling(chosen.score)):
+    for chosen in sorted(sets, key=lambda chosen: -round(chosen.score, _DECIMALS)):
         best.setdefault((frozenset(chosen.effects), chosen.out), chosen)
     return list(best.values())

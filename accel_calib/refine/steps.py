@@ -501,8 +501,7 @@ def _unseen_turn(found: Found) -> list[str]:
 
 
 def _separating(step: Step) -> str:
-    families = {effect_named(name).family for name in (step.name, *step.rivals)
-                if is_effect(name)}
+    families = {effect_named(name).family for name in (step.name, *step.rivals) if is_effect(name)}
     family = families.pop() if len(families) == 1 else ''
     return (f'{step.effect} cannot be distinguished from {", ".join(step.rivals)} here: '
             f'{TO_SEPARATE[family]}')

@@ -25,7 +25,6 @@ import shlex
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .refinement import refusal_lines, search_sections
 from .residuals import of_before_after, of_coverage, of_remainder, Residuals, residuals_of
@@ -98,8 +97,7 @@ _LONG_TABLE = 25
 
 def refinement_page(result: Refinement, source: str) -> str:
     """Return the page of a refinement of the poses in the file `source`, as HTML."""
-    return calibration_page(result.calibration, rate_refinement(result), source,
-                            refinement=result)
+    return calibration_page(result.calibration, rate_refinement(result), source, refinement=result)
 
 
 def calibration_page(calibration: Calibration, rating: Rating, source: str, *,
@@ -211,19 +209,17 @@ def _of_axis(curve: Curve, axis: int) -> Drawing:
         for label, which, colour in (('warming', curve.warming, ACCENT),
                                      ('cooling', ~curve.warming, AFTER)):
             if np.any(which):
-                hover[label] = tuple(_marks(curve, axis, which))
-                panel.plot(curve.stretches['temperature'][which], curve.change[which, axis] * MG,
-                           'o', color=colour, markersize=3.0, label=label, gid=label, **EDGE)
+                warm = curve.stretches['temperature'][which]
+                change_mg = curve.change[which, axis] * MG
+                hover[label] = tuple(Mark(f'{at:.2f} °C: {change:+.2f} mg')
+                                     for at, change in zip(warm, change_mg))
+                panel.plot(warm, change_mg, 'o', color=colour, markersize=3.0, label=label,
+                           gid=label, **EDGE)
         panel.plot(grid, line, color=INK, linewidth=1.2, label='curve', zorder=3.0)
         legend_below(figure, 3)
     ends = f'{short(float(line[0]))} to {short(float(line[-1]))} mg'
     return Drawing(f'thermal_{AXES[axis]}', f'Change of the offset {AXES[axis]} over the '
                    f'temperature: {ends}', figure, hover)
-
-
-def _marks(curve: Curve, axis: int, which: NDArray[np.bool_]) -> Iterator[Mark]:
-    for warm, change in zip(curve.stretches['temperature'][which], curve.change[which, axis]):
-        yield Mark(f'{warm:.2f} °C: {change * MG:+.2f} mg', 0)
 
 
 def _coefficients(curve: Curve) -> str:
@@ -405,24 +401,17 @@ def _axis_cells(reading: Floats) -> list[list[str]]:
 
 def snippets(calibration: Calibration, stored: str) -> tuple[tuple[str, str], ...]:
     """Return titles and lines of code that use the calibration in the file `stored`."""
-    return (('ROS 2', _ros(calibration, stored)),
-            ('ROS 2 launch file', _launch(calibration, stored)),
+    path = shlex.quote(stored) if Path(stored).is_absolute() else f'"$PWD"/{shlex.quote(stored)}'
+    ros = ('ros2 launch accel_calib calibrator.launch.py imu:=imu/data_raw \\\n'
+           f'  units:={calibration.units.name} calibration_file:={path}')
+    launch = ("Node(package='accel_calib', executable='calibrator',\n"
+              f"     parameters=[{{'calibration_file': {stored!r},\n"
+              f"                  'units': {calibration.units.name!r}}}],\n"
+              "     remappings=[('imu/data_raw', 'imu/data_raw')])")
+    return (('ROS 2', ros), ('ROS 2 launch file', launch),
             ('Python', _python(calibration, stored)), ('C', _c(calibration)),
             ('C header, Arduino, PX4, ArduPilot and others',
              f'accel-calib export {shlex.quote(stored)} --to c -o calibration.h'))
-
-
-def _ros(calibration: Calibration, stored: str) -> str:
-    path = shlex.quote(stored) if Path(stored).is_absolute() else f'"$PWD"/{shlex.quote(stored)}'
-    return ('ros2 launch accel_calib calibrator.launch.py imu:=imu/data_raw \\\n'
-            f'  units:={calibration.units.name} calibration_file:={path}')
-
-
-def _launch(calibration: Calibration, stored: str) -> str:
-    return ("Node(package='accel_calib', executable='calibrator',\n"
-            f"     parameters=[{{'calibration_file': {stored!r},\n"
-            f"                  'units': {calibration.units.name!r}}}],\n"
-            "     remappings=[('imu/data_raw', 'imu/data_raw')])")
 
 
 def _python(calibration: Calibration, stored: str) -> str:

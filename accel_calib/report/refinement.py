@@ -22,15 +22,16 @@ import numpy as np
 
 from .residuals import (
     against, are_spread, limit_mg, of_remainder, Residuals, residuals_of_refinement, sphere_map,
-    Variable, variable_of, variables_of, with_thermal)
+    variable_of, variables_of, with_thermal)
 from .sheet import (
     ACCENT, add_band, AFTER, AXIS_COLOURS, BAND, BEFORE, code, Drawing, drawn, FAINT, figures,
     HEIGHT_INCHES, INK, PAPER, paragraph, save, scroll_table, section)
 from ..effects import (
     AXES, CARRIERS, curve_unit, effect_named, EMPIRICAL, empirical_parts, parameter_names,
     variable_words)
+from ..geometry import over_axes
 from ..refine import base_words, chance, values_of, verdict_words
-from ..table import Floats, Poses
+from ..table import Floats
 from ..text import short
 from ..units import MG
 
@@ -62,10 +63,8 @@ def search_sections(result: Refinement, residuals: Residuals, *, used: bool) -> 
         yield _step(result, number, step)
     left = residuals_of_refinement(result)
     if not np.isclose(left.rms_mg, residuals.rms_mg, rtol=_SAME_RESIDUAL):
-        yield section('What remains after the refinement',
-                      figures(of_remainder(left, 'refined')))
-    rows = [(f'{effect_named(name).words} ({name})', needs)
-            for name, needs in result.not_testable]
+        yield section('What remains after the refinement', figures(of_remainder(left, 'refined')))
+    rows = [(f'{effect_named(name).words} ({name})', needs) for name, needs in result.not_testable]
     yield section('What these data cannot show', scroll_table(
         'Effects that cannot be tested', ('effect', 'to see it, record'), rows, ''))
 
@@ -150,20 +149,15 @@ def of_step(result: Refinement, step: int) -> Iterator[Drawing]:
     limit = limit_mg(*(residuals for _, _, residuals, _ in stages))
     titles = [f'{when.capitalize()}: {words}, {short(residuals.rms_mg)} mg RMS'
               for when, words, residuals, _ in stages]
-    name, variables = f'step{step + 1}_{after.name}', _variables_of_step(result, step)
+    name, effect = f'step{step + 1}_{after.name}', result.steps[step].name
+    values = result.calibration.model.values.get(effect)
+    shape = None if values is None else effect_named(effect).split(values)[1]
+    variables = variables_of(effect, result.poses_g, result.force, shape)
     if are_spread(result.force):
         for title, (when, _, residuals, _) in zip(titles, stages, strict=True):
             yield sphere_map(residuals, f'{name}_sphere_{when}', title, limit)
     for title, (when, _, residuals, colour) in zip(titles, stages, strict=True):
         yield against(residuals, variables, f'{name}_variable_{when}', title, limit, colour)
-
-
-def _variables_of_step(result: Refinement, step: int) -> list[Variable]:
-    """Return the variables of the effect of a step, with the shape of the refined model."""
-    name = result.steps[step].name
-    values = result.calibration.model.values.get(name)
-    shape = None if values is None else effect_named(name).split(values)[1]
-    return variables_of(name, result.poses_g, result.force, shape)
 
 
 # ----------------------------------------------------------------------------- curves
@@ -201,7 +195,7 @@ def curve_parts(result: Refinement, name: str) -> list[CurvePart]:
     parts = []
     for k, own in enumerate(names):
         poses = (result.force[:, AXES.index(own)] if variable == 'force'
-                 else _at_poses(variable, result.poses_g))
+                 else over_axes(with_thermal(result.poses_g, '', np.zeros(0))[variable]))
         waves = _waves(modes, at, low, high)
         waves = waves - np.mean(_waves(modes, poses, low, high), axis=1, keepdims=True)
         rows = first + k + len(names) * np.arange(len(modes))
@@ -210,12 +204,6 @@ def curve_parts(result: Refinement, name: str) -> list[CurvePart]:
         parts.append(CurvePart(own, at, values[k:count:len(names)] @ waves,
                                np.sqrt(np.maximum(variance, 0.0)), poses))
     return parts
-
-
-def _at_poses(variable: str, poses_g: Poses) -> Floats:
-    """Return the variable of a curve at each pose; for vectors, its RMS over the axes."""
-    values = with_thermal(poses_g, '', np.zeros(0))[variable]
-    return np.sqrt(np.mean(values ** 2, axis=1)) if values.ndim > 1 else values
 
 
 def _waves(modes: Sequence[int], values: Floats, low: float, high: float) -> Floats:
@@ -228,7 +216,9 @@ def of_curve(result: Refinement, step: int) -> Drawing:
     """Draw the empirical curve of a step with its 95 % band, and ticks at the poses."""
     name = result.steps[step].name
     carrier, variable, _ = empirical_parts(name)
-    words = _carrier_words(carrier)
+    whole, _, axis = carrier.partition('.')
+    words = 'gain of all axes' if whole == 'force' else whole.replace('_', '-')
+    words += f' of {axis}' if axis else ''
     title = f'{words[0].upper()}{words[1:]} over {variable_words(variable)}, with 95 % band'
     parts = curve_parts(result, name)
     with drawn(HEIGHT_INCHES, title) as (figure, (panel,)):
@@ -244,12 +234,6 @@ def of_curve(result: Refinement, step: int) -> Drawing:
         panel.set_ylabel(f'change from the mean [m{curve_unit(name)}]')
         panel.legend(ncols=len(parts))
     return Drawing(f'step{step + 1}_curve', title, figure)
-
-
-def _carrier_words(carrier: str) -> str:
-    whole, _, part = carrier.partition('.')
-    words = 'gain of all axes' if whole == 'force' else whole.replace('_', '-')
-    return f'{words} of {part}' if part else words
 
 
 # ----------------------------------------------------------------------------- the ladder

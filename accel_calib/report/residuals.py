@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 from .sheet import (
     ACCENT, add_bar, AFTER, BEFORE, check_matplotlib, DISC, DIVERGING, Drawing, drawn, EDGE, FAINT,
     HEIGHT_INCHES, INK, legend_below, Mark, Marks, PAPER, RIM, SEQUENTIAL)
-from ..calibrate import Calibration, errors_after, errors_before, in_g, with_history
+from ..calibrate import (
+    Calibration, directions_in, errors_after, errors_before, in_g, with_history)
 from ..effects import acting_temperature, AXES, effect_named, rate_at, sensor_force
-from ..geometry import uncovered, unit
+from ..geometry import rms, uncovered, unit
 from ..table import column_of, Floats, Poses
 from ..text import milli, percentage, short, with_minus
 from ..units import MG
@@ -148,7 +149,7 @@ class Residuals:
     @property
     def rms_mg(self) -> float:
         """RMS of the residuals with the calibration [mg]."""
-        return float(np.sqrt(np.mean(self.after_mg ** 2)))
+        return rms(self.after_mg)
 
     def at(self, stage: Stage) -> Residuals:
         """Return the residuals at a stage of the refinement of these poses."""
@@ -176,14 +177,13 @@ def residuals_of_refinement(result: Refinement) -> Residuals:
     calibration = result.calibration
     own = calibration.poses
     out = own.take(np.isin(own.row, result.disturbed_poses))
-    mat_w, vec_v = calibration.model.linear_part
-    force = np.linalg.solve(mat_w, (calibration.units.to_g(out.reading) - vec_v).T).T
     reasons = {each.row: each.reason for each in calibration.rejected}
     signed = any(bool(np.any(stage.residual_mg < 0.0)) for stage in result.stages)
     before = errors_before(result.poses_g, calibration.units,
                            vectors=not signed and 'reference' in result.poses_g)
     return Residuals(
-        result.poses_g, result.force, before * MG, result.stages[-1].residual_mg, out, unit(force),
+        result.poses_g, result.force, before * MG, result.stages[-1].residual_mg, out,
+        directions_in(out, calibration),
         {int(row): reasons.get(int(row), 'disagrees with the other poses') for row in out.row},
         signed)
 
@@ -344,7 +344,7 @@ def of_before_after(residuals: Residuals, floor_mg: float | None) -> Drawing:
 
 
 def _before_after_title(residuals: Residuals) -> str:
-    before = float(np.sqrt(np.mean(residuals.before_mg ** 2)))
+    before = rms(residuals.before_mg)
     return f'Each pose before and after: {short(before)} and {short(residuals.rms_mg)} mg RMS'
 
 

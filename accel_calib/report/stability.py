@@ -322,7 +322,8 @@ def comparison_page(comparison: Comparison, rating: Rating, sources: Sequence[Pa
     body = [section('Calibrations', _runs(comparison, calibrations, labels)),
             section('Parameters', figures(of_parameters(comparison, labels)), HINT,
                     _parameters(comparison)),
-            section('Notes', listing(_notes(comparison))), how_to_read(*_HOW_TO_READ)]
+            section('Notes', listing(filter(None, (*comparison.notes, comparison.tilt_words)))),
+            how_to_read(*_HOW_TO_READ)]
     return rated_sheet(title, map(str, sources), rating, body)
 
 
@@ -352,13 +353,6 @@ def _parameters(comparison: Comparison) -> str:
                      short(each.spread * factor), short(stated * factor),
                      '' if each.ratio is None else f'{each.ratio:.2f}'))
     return scroll_table('Parameters', ('', 'mean', 'spread', 'stated', 'ratio'), rows)
-
-
-def _notes(comparison: Comparison) -> Iterator[str]:
-    yield from comparison.notes
-    if comparison.tilt_deg is not None:
-        yield ('the directions of up of levelled calibrations differ by up to '
-               f'{comparison.tilt_deg:.3g}°; the test does not use them')
 
 
 def history_page(history: History, sources: Sequence[Path],

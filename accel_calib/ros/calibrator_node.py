@@ -78,8 +78,7 @@ def pose_markers(directions: Floats, asked: NextPose, frame_id: str) -> MarkerAr
     The (n, 3) directions of up are unit vectors in the sensor axes.
 
     """
-    markers = [Marker(action=Marker.DELETEALL),
-               _marker('sphere', 0, Marker.SPHERE, _SPHERE, 2.0)]
+    markers = [Marker(action=Marker.DELETEALL), _marker('sphere', 0, Marker.SPHERE, _SPHERE, 2.0)]
     for k, direction in enumerate(directions):
         markers += [_marker('poses', k, Marker.SPHERE, _CAPTURED, _DOT, direction),
                     _text('numbers', k, str(k + 1), direction * _NUMBER_AT)]

@@ -43,6 +43,7 @@ from .declare import LATCHED, SENSOR
 from .run import own_domain
 from ..effects import parse_effect
 from ..errors import AccelCalibError
+from ..geometry import rms
 from ..stored import read_calibration
 from ..table import Floats
 from ..text import counted
@@ -323,13 +324,9 @@ def _errors(rests: Sequence[Rest], name: str) -> Errors:
     sizes = np.linalg.norm(values, axis=1)
     errors = (sizes - 1.0) * MG
     cosines = np.sum(values * truth, axis=1) / sizes / np.linalg.norm(truth, axis=1)
-    return Errors(_rms(np.linalg.norm(values - truth, axis=1)) * MG, _rms(errors),
+    return Errors(rms(np.linalg.norm(values - truth, axis=1)) * MG, rms(errors),
                   float(np.max(np.abs(errors))),
-                  _rms(np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))))
-
-
-def _rms(values: Floats) -> float:
-    return float(np.sqrt(np.mean(values ** 2)))
+                  rms(np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))))
 
 
 def demonstrate_page(port: int, report: Callable[[str], None],

@@ -258,18 +258,12 @@ class SimulatorNode(Node):
 
 
 def _directions(settings: SimulatorSettings) -> Floats:
-    spread = spread_directions(settings.poses)
-    return np.vstack([*[_FLAT] * settings.flat_first,
-                      _mixed(spread) if settings.mixed else spread,
-                      *[_FLAT] * settings.flat_last])
-
-
-def _mixed(directions: Floats) -> Floats:
-    """Return directions in an order of which every part is spread over the sphere."""
-    count = len(directions)
-    stride = next(step for step in range(round(_GOLDEN * count), 2 * count + 1)
-                  if math.gcd(step, count) == 1)
-    return directions[np.arange(count) * stride % count]
+    count, spread = settings.poses, spread_directions(settings.poses)
+    if settings.mixed:  # in an order of which every part is spread over the sphere
+        stride = next(step for step in range(round(_GOLDEN * count), 2 * count + 1)
+                      if math.gcd(step, count) == 1)
+        spread = spread[np.arange(count) * stride % count]
+    return np.vstack([*[_FLAT] * settings.flat_first, spread, *[_FLAT] * settings.flat_last])
 
 
 def _empty_message(settings: SimulatorSettings) -> Imu:

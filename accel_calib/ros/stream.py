@@ -283,9 +283,9 @@ class Stream:
             rows = np.column_stack([found['time'], found['reading'], found['rate'],
                                     self._around(changes, len(waiting))])
             self._session.push(rows, self._arrived)
+            self._on_events()
         self._session.around.expire()
         self._note_context()
-        self._on_events()
 
     def _around(self, changes: list[tuple[int, Mapping[str, float]]], count: int) -> Floats:
         """Return the context of each message, (n, k), from its changes."""

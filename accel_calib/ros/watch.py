@@ -54,8 +54,7 @@ class _Receiver:
         self.messages = 0
         topic = f'{name.rstrip("/")}{_SUFFIX}'
         try:
-            found = node.create_subscription(DiagnosticStatus, topic, self._on_message,
-                                             LATCHED)
+            found = node.create_subscription(DiagnosticStatus, topic, self._on_message, LATCHED)
         except InvalidTopicNameException as err:
             raise InputError(f'--node is {name!r}, expected the name of a node',
                              'set it to a name such as calibrator or left/calibrator') from err

@@ -320,8 +320,7 @@ def _use(session: Session, fitted: Fitted, *, offered: bool = False) -> Part[str
         return (f'{words}; published on ~/preview only: call ~/save to use and store it, or '
                 '~/undo to discard it')
     try:
-        yield from _alone(session, Files(
-            store.write, after=Parse(store.prepared, calibration)))
+        yield from _alone(session, Files(store.write, after=Parse(store.prepared, calibration)))
     except OSError as error:
         session.adopt(calibration, fitted.refinement, fitted.rating)
         session.sensor.unsaved = True

@@ -26,7 +26,6 @@ from ..calibrate import directions_of, next_pose, NextPose
 from ..compare import status
 from ..errors import RefusedFitError
 from ..estimate import fit_sphere, pose_noise
-from ..finding import NextStep
 from ..geometry import coverage
 from ..pipeline import FEWEST_IN_CONE, is_partial
 from ..refine import PlannedPose
@@ -119,7 +118,11 @@ class Guide:
         """Return the next pose, or that of a followed refinement; None before the first choice."""
         if self._plan is None or not self._planned:
             return self._plan
-        return replace(self._plan, asked=_as_asked(self._planned, self._plan))
+        first, plan = self._planned[0], self._plan
+        where = f' {first.conditions}' if first.conditions else ''
+        return replace(plan, asked=NextPose(
+            np.array(first.up), f'hold {first.words}{where}, {first.purpose}', plan.asked.error,
+            plan.poses + len(self._planned), fits=False))
 
     @plan.setter
     def plan(self, plan: Plan | None) -> None:
@@ -200,13 +203,6 @@ class Guide:
             noise = f', {float(np.mean(units.to_g(latest))) * MG:.2f} mg'
         then = '' if action.kind == 'done' else f', next: {action.words}'
         return f'pose {count}{noise}{then}'
-
-
-def _as_asked(planned: Sequence[PlannedPose], plan: Plan) -> NextPose:
-    first = planned[0]
-    where = f' {first.conditions}' if first.conditions else ''
-    return NextPose(np.array(first.up), f'hold {first.words}{where}, {first.purpose}',
-                    plan.asked.error, plan.poses + len(planned), fits=False)
 
 
 @dataclass(frozen=True)
@@ -292,7 +288,10 @@ def _with_sensor(sensor: Sensor) -> Action:
     if sensor.calibration is not None and rating is None:
         return NOT_KNOWN
     if rating is not None and rating.name == 'GOOD':
-        return _after_good(sensor, rating.next)
+        if sensor.calibration is not None and not sensor.calibration.is_levelled:
+            return _level_step()
+        return Action('done', rating.next.text if rating.next.kind == 'done' else
+                      'use the calibration')
     if rating is not None and rating.findings and rating.findings[0].kind == 'flat_pose':
         return Action('level', f'{rating.reason}; if it is mounted so, place it level again and '
                       'call ~/set_level once more', 'set_level')
@@ -306,9 +305,3 @@ def _with_sensor(sensor: Sensor) -> Action:
 def _level_step() -> Action:
     return Action('level', 'place the robot level, hold it still and call ~/set_level; a sensor '
                   'alone is done', 'set_level')
-
-
-def _after_good(sensor: Sensor, after: NextStep) -> Action:
-    if sensor.calibration is not None and not sensor.calibration.is_levelled:
-        return _level_step()
-    return Action('done', after.text if after.kind == 'done' else 'use the calibration')

@@ -81,8 +81,6 @@ class Sensor:
         Sensors that the stored files name.
     drift : Drift or None
         State of the drift monitor; None without a calibration.
-    gravity : (3,) array or None
-        Corrected force of the last `rest` [m/s²].
 
     """
 
@@ -100,12 +98,12 @@ class Sensor:
         self.owners: set[str] = set()
         self.drift: Drift | None = None
         self.rest: Dwell | None = None
-        self.gravity: Floats | None = None
         self._g, self._rotates, self._frame = settings.gravity, settings.rotate, settings.frame
         self._past: Drift | None = None
         self._counted: Dwell | None = None
         self._stillness = math.nan, math.nan
         self._prepared: tuple[Calibration, OneReading] | None = None
+        self._held: tuple[Dwell | None, Calibration | None, Floats | None] = None, None, None
 
     @property
     def present(self) -> Calibration | None:
@@ -148,7 +146,6 @@ class Sensor:
         if self.calibration is not None:
             self.applied = (on_topics(self.calibration, self._frame) if rotates
                             else self.calibration.in_sensor_frame)
-        self._hold()
 
     @property
     def gyro(self) -> GyroBias | None:
@@ -183,7 +180,6 @@ class Sensor:
     def update(self, rest: Dwell, least: float) -> None:
         """Compare an ongoing rest with 1 g; `least` is the smallest change to report [g]."""
         self.rest = rest
-        self._hold()
         part = self._uncounted(rest)
         if part is not None and part.end - part.start >= LONG_REST:
             self._past, self._counted = self._with(rest, least), _as_noisy_as(part, rest)
@@ -218,13 +214,18 @@ class Sensor:
         found = rest_errors(self.calibration, part.mean[np.newaxis], noise, context)
         return compared(self._past, found[0], least)
 
-    def _hold(self) -> None:
-        """Set the gravity: the corrected force of the last rest, if that can be corrected."""
-        context = None if self.rest is None else self._context(self.rest)
-        self.gravity = None
-        if self.rest is not None and self.applied is not None and context is not None:
-            force = self.applied.correct(self.rest.mean[np.newaxis], context)[0]
-            self.gravity = force * output_scale(self.applied, self._g)
+    @property
+    def gravity(self) -> Floats | None:
+        """Corrected force of the last rest, (3,) [m/s²]; None if it cannot be corrected."""
+        rest, applied, gravity = self._held
+        if rest is not self.rest or applied is not self.applied:
+            rest, applied, gravity = self.rest, self.applied, None
+            context = None if rest is None else self._context(rest)
+            if rest is not None and applied is not None and context is not None:
+                force = applied.correct(rest.mean[np.newaxis], context)[0]
+                gravity = force * output_scale(applied, self._g)
+            self._held = rest, applied, gravity
+        return gravity
 
     def _context(self, rest: Dwell) -> Context | None:
         """Return the context of a rest, or None if the calibration needs more context."""
@@ -235,9 +236,11 @@ class Sensor:
         return context if known else None
 
     def context_of(self, rest: Dwell, calibration: Calibration) -> Context:
-        """Return the context of a rest as one row, for this calibration."""
+        """Return the context of a rest as one row, without a previous pose."""
         neutral = {key: np.array([value]) for key, value in calibration.model.neutral.items()}
-        return {**neutral, **context_of_rest(rest, calibration.units),
+        known = {key: np.array([value]) for key, value in rest.context.items()}
+        return {**neutral, 'previous': _NONE, 'rate': _NONE, **known,
+                'time': np.array([rest.time]), 'std': calibration.units.to_g(rest.std)[np.newaxis],
                 **self.temperatures.during(calibration.model, rest.start, rest.end)}
 
     def limits_left(self, known: Mapping[str, float]) -> dict[str, Outside]:
@@ -278,9 +281,8 @@ class Sensor:
     @property
     def residual(self) -> float:
         """Return |a| - 1 g at the last rest [g]; NaN if not known."""
-        if self.gravity is None:
-            return math.nan
-        return float(np.linalg.norm(self.gravity)) / self._g - 1.0
+        gravity = self.gravity
+        return math.nan if gravity is None else float(np.linalg.norm(gravity)) / self._g - 1.0
 
 
 def gyro_bias_of_rest(rest: Dwell) -> GyroBias | None:
@@ -293,13 +295,6 @@ def gyro_bias_of_rest(rest: Dwell) -> GyroBias | None:
     known = () if math.isnan(temperature) else (temperature, temperature)
     return GyroBias(np.asarray(rate, float), rest.rate_std / math.sqrt(rest.count), 1,
                     temperature, np.zeros(3), known)
-
-
-def context_of_rest(rest: Dwell, units: Units) -> Context:
-    """Return the context of a rest as one row, without a previous pose."""
-    known = {key: np.array([value]) for key, value in rest.context.items()}
-    return {'previous': _NONE, 'rate': _NONE, **known, 'time': np.array([rest.time]),
-            'std': units.to_g(rest.std)[np.newaxis]}
 
 
 def rest_after(part: Dwell, whole: Dwell) -> Dwell:

@@ -191,8 +191,7 @@ class CalibratorSettings:
     also: str = parameter(
         '', 'Python file with own effects (accel_calib.Effect), which ~/refine tries beside the '
         'catalogue, and which a calibration that has them needs. It is executed. Empty: none')
-    auto_capture: bool = parameter(
-        True, 'Capture a pose at each rest of the sensor', live=True)
+    auto_capture: bool = parameter(True, 'Capture a pose at each rest of the sensor', live=True)
     auto_fit: bool = parameter(
         False, 'Fit automatically after auto_fit_poses poses, at most once per minute, and use '
         'the result if it differs from the calibration by more than its uncertainty', live=True)

@@ -174,8 +174,7 @@ class WorkerProcess:
             return self._ask(function, given)
         if not select([process.stdout], [], [], limit_s)[0]:
             raise TimeoutError
-        answer: tuple[bool, Any] = pickle.load(process.stdout)
-        return answer
+        return pickle.load(process.stdout)
 
     def close(self) -> None:
         """End the process; a waiting call raises InputError."""

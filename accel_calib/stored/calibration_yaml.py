@@ -36,6 +36,7 @@ from ..errors import (
     AccelCalibError, DamagedCalibrationError, InputError, RefusedFitError, StoredCalibrationError)
 from ..estimate import Prior
 from ..finding import Finding, KINDS, LEVELS, without
+from ..geometry import rms
 from ..table import (
     Autopilot, check_values, column_of, COLUMNS, Floats, is_quantity, LARGEST, Poses)
 from ..units import FRAMES, MODEL_NAMES, UNIT_NAMES, Units
@@ -163,7 +164,7 @@ def _own_rms(name: str, poses: Poses, units: Units) -> float:
     """Return the RMS over the poses of what the values of an own effect are multiplied by."""
     poses_g, values = in_g(poses, units), np.zeros(len(effect_named(name).values))
     basis = Model({name: values}).basis(poses_g.reading, poses_g.columns)
-    return float(np.sqrt(np.mean(basis.terms ** 2)))
+    return rms(basis.terms)
 
 
 def _rest_noise(gyro: GyroBias | None, noise: SampleNoise | None) -> dict[str, Any]:
@@ -287,8 +288,7 @@ def _check_keys(content: Mapping[str, Any], calibration: Calibration) -> None:
                                  f'{", ".join(known or ())}')
 
 
-def _other_correction(content: Mapping[str, Any], calibration: Calibration
-                      ) -> tuple[Finding, ...]:
+def _other_correction(content: Mapping[str, Any], calibration: Calibration) -> tuple[Finding, ...]:
     """Return a finding if a file states a correction that is not that of its effects."""
     if content.get('correction') is None:
         return ()
