@@ -153,6 +153,7 @@ MISSING_FILES = [
         '--recording --dwell 1e300', '--gravity 1e308',
         '--temperature 1e308 1e308 --effect offset_temperature=1')),
     *(('fit', 'poses.csv', option, 'circle') for option in ('-o', '--json', '--report')),
+    ('fit', 'poses.csv', '-o', 'new.yaml', '--json', '.'), ('calibrate', 'poses.csv', '-o', ''),
     ('capture', 'poses.csv', '-o', 'circle'), ('calibrate', 'poses.csv', '-o', 'circle'),
     ('apply', 'poses.csv', '-c', 'calibration.yaml', '-o', 'circle'), ('fit', 'circle'),
     ('simulate', '-o', 'no_folder/x.csv'),

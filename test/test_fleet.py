@@ -182,16 +182,16 @@ DAMAGE: dict[str, Callable[[bytes], bytes]] = {
 
 @pytest.mark.parametrize(('name', 'damage'), [
     *(('data.parquet', damage) for damage in DAMAGE), ('sensors.parquet', 'empty'),
-    ('sensors.parquet', 'without a value'), ('pending', 'truncated'), ('pending', 'foreign')])
+    ('sensors.parquet', 'without a value'), ('pending', 'truncated'), ('pending', 'foreign'),
+    ('pending', 'of another value')])
 def test_a_damaged_file_of_the_results_is_set_aside_and_made_again(
         name: str, damage: str, client: Any, tmp_path: Path) -> None:
     folder, store = write_fleet(tmp_path / 'in', 5, 1), Store(tmp_path / 'out')
     run(client, found_in(folder), QUICK, store)
     before = state_of(store.folder)
     if name == 'pending':
-        file = store.pending / 'robot_0%2Fimu_link' / '0123.json'
-        file.parent.mkdir(parents=True)
-        file.write_bytes(json.dumps({'key': '0123', 'content': '', 'sensor': ''}).encode())
+        store.add({**rows_of(store.folder)[0], 'key': '0123'})
+        file, = store.pending.rglob('0123.json')
     else:
         file = next(store.folder.rglob(name))
     file.write_bytes(broken := DAMAGE[damage](file.read_bytes()))
@@ -202,6 +202,16 @@ def test_a_damaged_file_of_the_results_is_set_aside_and_made_again(
     assert not file.exists() or file.read_bytes() != broken
     assert state_of(store.folder) == before
     assert run(client, found_in(folder), QUICK, store).damaged == ()
+
+
+def test_results_whose_file_or_mark_is_lost_are_made_again(client: Any, tmp_path: Path) -> None:
+    folder, store = write_fleet(tmp_path / 'in', 5, 1), Store(tmp_path / 'out')
+    run(client, found_in(folder), QUICK, store)
+    before = state_of(store.folder)
+    next(store.folder.rglob('data.parquet')).unlink()
+    next(store.folder.glob('done/*/*')).write_bytes(b'\xff' * 300)
+    run(client, found_in(folder), QUICK, store)
+    assert state_of(store.folder) == before
 
 
 def test_a_second_run_calibrates_what_is_new_and_all_with_other_options(
@@ -349,6 +359,16 @@ def test_lists_globs_and_folders_find_recordings(tmp_path: Path) -> None:
         found_in(tmp_path / 'robot_9')
     with pytest.raises(InputError, match='holds no recording'):
         found_in(tmp_path / 'nothing_*')
+
+
+@pytest.mark.parametrize(('content', 'words'), [
+    (b'@list.txt\n', '@list.txt does not exist'), (b'\xff.csv\n', '.csv does not exist')])
+def test_a_list_that_names_no_recordings_is_refused(
+        content: bytes, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path('list.txt').write_bytes(content)
+    with pytest.raises(InputError, match=words):
+        found_in('@list.txt')
 
 
 def test_an_address_of_the_web_may_have_a_query(tmp_path: Path) -> None:

@@ -171,6 +171,7 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
     """
     with store.locked():
         damaged = tuple(_set_aside(client, store))
+        store.forget_lost()
         _merge(client, store)  # what an interrupted run left
         counts, unread = Counter[str](), list[Row]()
         for item, status in mapped(client, calibrate_recording, found, options, store, limit_s):
