@@ -228,6 +228,18 @@ def test_ctrl_c_while_modules_load_ends_without_words_unless_it_is_ignored(name,
     assert ('Residual' in done.stdout) if is_ignored else not done.stdout
 
 
+def test_ctrl_c_while_python_ends_changes_nothing(poses):
+    """The last handler of atexit is called first, before Python has ended anything."""
+    done = python('-c', f"""
+import atexit, runpy, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+atexit.register(signal.raise_signal, signal.SIGINT)
+sys.argv = ['accel-calib', 'fit', {str(poses)!r}]
+runpy.run_module({COMMAND[1]!r}, run_name='__main__')
+""")
+    assert (done.returncode, done.stderr) == (0, '')
+
+
 @pytest.mark.parametrize('command', COMMANDS)
 def test_every_command_has_help_with_an_example(command, capsys):
     with pytest.raises(SystemExit, match='0'):

@@ -588,6 +588,23 @@ def test_the_run_after_a_disturbed_one_loses_and_doubles_nothing(
     assert state_of(site.results) == undisturbed
 
 
+@pytest.mark.parametrize('moment', ['starts', 'works'])
+def test_ctrl_c_ends_the_program_and_its_workers_without_words(
+        moment: str, recorded: Path, tmp_path: Path) -> None:
+    (temporary := tmp_path / 'tmp').mkdir()
+    results = tmp_path / 'out'
+    program = subprocess.Popen(
+        [sys.executable, *COMMAND, 'fleet', str(recorded), '-o', str(results), '--workers', '2'],
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        env={**os.environ, 'TMPDIR': str(temporary)})
+    seen = temporary.glob if moment == 'starts' else results.glob
+    wait(lambda: [*seen('*')] or program.poll() is not None)
+    os.killpg(program.pid, signal.SIGINT)  # as a terminal does
+    assert program.communicate(timeout=WAIT_S)[1] == ''
+    assert program.returncode == 130
+    assert not [*temporary.iterdir()]
+
+
 def deadly(name: str) -> str:
     """Kill the worker at one of the items."""
     if name == 'deadly':
