@@ -128,7 +128,7 @@ def test_files_keep_the_typical_values_and_what_was_fitted_with_them(
     ('mean:', 'mean_of:', "'mean'"),
     ('models:', 'other:', "'models'"),
     ('sensors: 40', 'sensors: -5', 'sensors is -5, expected 1 to'),
-    ('sensors: 40', f'sensors: {10**400}', 'sensors is 1000.*…, expected 1 to'),
+    ('sensors: 40', f'sensors: {10**12}', 'sensors is 1000.*, expected 1 to'),
     ('offset.x', 9000 * 'x', f'names are {100 * "x"}…, offset.y'),
     ('sensors: 40', 'sensors: .inf', 'sensors is inf, expected a whole number'),
     ('mean:\n  - ', 'mean:\n  - 1e308  # ', 'mean contains a number of more than 1 in magnitude'),
