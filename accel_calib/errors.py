@@ -22,7 +22,6 @@ import traceback
 
 from . import __version__
 
-
 _LONGEST = 2000
 """Longest message [characters]."""
 

@@ -90,7 +90,7 @@ def some(items: Iterable[object], most: int = 12) -> str:
 
 
 def reason(error: Exception) -> str:
-    """Return why a library refuses damaged bytes, in one line; it may quote names of any length."""
+    """Return why a library refuses damaged bytes, in one line of limited length."""
     said = ' '.join(str(error)[:_LONGEST_REASON].split())
     return said if ' ' in said else f'{type(error).__name__} {said}'.strip()
 

@@ -256,9 +256,9 @@ def damage_as_input_error(path: Path) -> Iterator[None]:
         if isinstance(err, OSError) and err.errno is not None and err.errno not in _BY_VALUE:
             raise
         inside = ' or the .mcap or .db3 file inside it' if path.is_dir() else ''
-        raise InputError(f'{path} is damaged or not a bag ({reason(err)}), expected a rosbag2 folder, '
-                         '.mcap, .db3 or .bag', f'use another file{inside}; ros2 bag reindex may '
-                         'repair this one') from err
+        raise InputError(f'{path} is damaged or not a bag ({reason(err)}), expected a rosbag2 '
+                         'folder, .mcap, .db3 or .bag', f'use another file{inside}; ros2 bag '
+                         'reindex may repair this one') from err
 
 
 def _check(reader: Any) -> None:
