@@ -22,6 +22,9 @@ import traceback
 
 from . import __version__
 
+_LONGEST = 2000
+"""Longest message [characters]."""
+
 
 class AccelCalibError(Exception):
     """The input is not valid."""
@@ -29,6 +32,8 @@ class AccelCalibError(Exception):
     read_as = ''
 
     def __init__(self, message: str, advice: str) -> None:
+        if len(message) > _LONGEST:  # it quotes a name of a damaged file
+            message = f'{message[:_LONGEST // 2]} … {message[-_LONGEST // 2:]}'
         super().__init__(message, advice)
         self.message = message
         self.advice = advice

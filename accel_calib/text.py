@@ -16,8 +16,8 @@ from typing import Any
 _ZERO = 1e-12
 """Values below are zero but for rounding."""
 
-_LONGEST_ITEM = 100
-"""Characters of one item of a list that a message shows."""
+_LONGEST_ITEM, _LONGEST_REASON = 100, 400
+"""Characters that a message shows of one item of a list, and of the reason of a library."""
 
 
 def short(value: float) -> str:
@@ -87,6 +87,12 @@ def some(items: Iterable[object], most: int = 12) -> str:
              for word in map(str, items)]
     more = f' and {len(words) - most} more' if len(words) > most else ''
     return ', '.join(words[:most]) + more
+
+
+def reason(error: Exception) -> str:
+    """Return why a library refuses damaged bytes, in one line of limited length."""
+    said = ' '.join(str(error)[:_LONGEST_REASON].split())
+    return said if ' ' in said else f'{type(error).__name__} {said}'.strip()
 
 
 def listed(noun: str, items: Sequence[object], most: int = 50) -> str:

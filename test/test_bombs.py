@@ -311,7 +311,8 @@ COMMANDS = [('fit', '{}'), ('fit', '{}', '--rows', '1:9'), ('verify', '{}', '-c'
             ('apply', '{}', '-c', '{yaml}', '-o', '{out}'),
             ('report', '{}', '-o', '{out}'), ('compare', '{}', '{}'), ('history', '{}'),
             ('export', '{}', '--to', 'c'),
-            ('export', '{yaml}', '--to', 'kalibr', '--noise', '{}')]
+            ('export', '{yaml}', '--to', 'kalibr', '--noise', '{}'),
+            ('verify', '{yaml}', '-c', '{yaml}', '--also', '{}'), ('fleet', '@{}', '-o', '{out}')]
 
 
 @pytest.mark.parametrize(('command', 'suffix'), [

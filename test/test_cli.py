@@ -153,6 +153,7 @@ MISSING_FILES = [
         '--recording --dwell 1e300', '--gravity 1e308',
         '--temperature 1e308 1e308 --effect offset_temperature=1')),
     *(('fit', 'poses.csv', option, 'circle') for option in ('-o', '--json', '--report')),
+    ('fit', 'poses.csv', '-o', 'new.yaml', '--json', '.'), ('calibrate', 'poses.csv', '-o', ''),
     ('capture', 'poses.csv', '-o', 'circle'), ('calibrate', 'poses.csv', '-o', 'circle'),
     ('apply', 'poses.csv', '-c', 'calibration.yaml', '-o', 'circle'), ('fit', 'circle'),
     ('simulate', '-o', 'no_folder/x.csv'),
@@ -225,6 +226,18 @@ def test_ctrl_c_while_modules_load_ends_without_words_unless_it_is_ignored(name,
     is_ignored = handler == 'SIG_IGN'
     assert (done.returncode, done.stderr) == (0 if is_ignored else 130, '')
     assert ('Residual' in done.stdout) if is_ignored else not done.stdout
+
+
+def test_ctrl_c_while_python_ends_changes_nothing(poses):
+    """The last handler of atexit is called first, before Python has ended anything."""
+    done = python('-c', f"""
+import atexit, runpy, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+atexit.register(signal.raise_signal, signal.SIGINT)
+sys.argv = ['accel-calib', 'fit', {str(poses)!r}]
+runpy.run_module({COMMAND[1]!r}, run_name='__main__')
+""")
+    assert (done.returncode, done.stderr) == (0, '')
 
 
 @pytest.mark.parametrize('command', COMMANDS)

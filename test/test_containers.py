@@ -139,9 +139,14 @@ def old_excel(path: Path, tables: Mapping[str, list[list[Any]]]) -> Path:
     return path
 
 
+PACKED = {'zip': zipfile.ZIP_DEFLATED, 'bz2 zip': zipfile.ZIP_BZIP2, 'lzma zip': zipfile.ZIP_LZMA}
+
+
 def written(kind: str, folder: Path, tables: Tables) -> Path:
-    if 'zip' in kind:
-        return zipped(folder, tables) if kind == 'zip' else stored(folder, tables)
+    if kind in PACKED:
+        return zipped(folder, tables, method=PACKED[kind])
+    if kind == 'stored zip':
+        return stored(folder, tables)
     sheets = {name.replace('/', ' '): rows_in(text) for name, text in tables.items()
               if name not in ('meta/device', 'Metadata')}
     return (excel(folder / 'log.xlsx', sheets) if kind == 'xlsx' else
@@ -290,7 +295,15 @@ def test_a_small_container_takes_little_memory(kind: str, tmp_path: Path) -> Non
         tracemalloc.stop()
 
 
-@pytest.mark.parametrize('kind', ['zip', 'xlsx', 'xls', 'mat'])
+def test_a_long_name_in_a_damaged_archive_is_not_shown_whole(tmp_path: Path) -> None:
+    path = zipped(tmp_path, {60_000 * 'a': '1,2,3\n'})
+    path.write_bytes(path.read_bytes().replace(b'aaa', b'bbb', 1))
+    with pytest.raises(InputError, match='cannot be unpacked') as caught:
+        read_log(path)
+    assert len(str(caught.value)) < 1000
+
+
+@pytest.mark.parametrize('kind', [*PACKED, 'xlsx', 'xls', 'mat'])
 def test_a_damaged_container_ends_in_a_result_or_a_refusal(kind: str, tmp_path: Path) -> None:
     tables, reading = tables_of('phyphox')
     path = (matlab(tmp_path, {'acc': reading[:300], 'gyr': reading[:300]}) if kind == 'mat' else

@@ -182,16 +182,16 @@ DAMAGE: dict[str, Callable[[bytes], bytes]] = {
 
 @pytest.mark.parametrize(('name', 'damage'), [
     *(('data.parquet', damage) for damage in DAMAGE), ('sensors.parquet', 'empty'),
-    ('sensors.parquet', 'without a value'), ('pending', 'truncated'), ('pending', 'foreign')])
+    ('sensors.parquet', 'without a value'), ('pending', 'truncated'), ('pending', 'foreign'),
+    ('pending', 'of another value')])
 def test_a_damaged_file_of_the_results_is_set_aside_and_made_again(
         name: str, damage: str, client: Any, tmp_path: Path) -> None:
     folder, store = write_fleet(tmp_path / 'in', 5, 1), Store(tmp_path / 'out')
     run(client, found_in(folder), QUICK, store)
     before = state_of(store.folder)
     if name == 'pending':
-        file = store.pending / 'robot_0%2Fimu_link' / '0123.json'
-        file.parent.mkdir(parents=True)
-        file.write_bytes(json.dumps({'key': '0123', 'content': '', 'sensor': ''}).encode())
+        store.add({**rows_of(store.folder)[0], 'key': '0123'})
+        file, = store.pending.rglob('0123.json')
     else:
         file = next(store.folder.rglob(name))
     file.write_bytes(broken := DAMAGE[damage](file.read_bytes()))
@@ -202,6 +202,16 @@ def test_a_damaged_file_of_the_results_is_set_aside_and_made_again(
     assert not file.exists() or file.read_bytes() != broken
     assert state_of(store.folder) == before
     assert run(client, found_in(folder), QUICK, store).damaged == ()
+
+
+def test_results_whose_file_or_mark_is_lost_are_made_again(client: Any, tmp_path: Path) -> None:
+    folder, store = write_fleet(tmp_path / 'in', 5, 1), Store(tmp_path / 'out')
+    run(client, found_in(folder), QUICK, store)
+    before = state_of(store.folder)
+    next(store.folder.rglob('data.parquet')).unlink()
+    next(store.folder.glob('done/*/*')).write_bytes(b'\xff' * 300)
+    run(client, found_in(folder), QUICK, store)
+    assert state_of(store.folder) == before
 
 
 def test_a_second_run_calibrates_what_is_new_and_all_with_other_options(
@@ -349,6 +359,16 @@ def test_lists_globs_and_folders_find_recordings(tmp_path: Path) -> None:
         found_in(tmp_path / 'robot_9')
     with pytest.raises(InputError, match='holds no recording'):
         found_in(tmp_path / 'nothing_*')
+
+
+@pytest.mark.parametrize(('content', 'words'), [
+    (b'@list.txt\n', '@list.txt does not exist'), (b'\xff.csv\n', '.csv does not exist')])
+def test_a_list_that_names_no_recordings_is_refused(
+        content: bytes, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path('list.txt').write_bytes(content)
+    with pytest.raises(InputError, match=words):
+        found_in('@list.txt')
 
 
 def test_an_address_of_the_web_may_have_a_query(tmp_path: Path) -> None:
@@ -566,6 +586,23 @@ def test_the_run_after_a_disturbed_one_loses_and_doubles_nothing(
     assert sum(found[name] for name in ('ok', 'error', 'skipped')) == COUNT
     assert found['unread'] == 0
     assert state_of(site.results) == undisturbed
+
+
+@pytest.mark.parametrize('moment', ['starts', 'works'])
+def test_ctrl_c_ends_the_program_and_its_workers_without_words(
+        moment: str, recorded: Path, tmp_path: Path) -> None:
+    (temporary := tmp_path / 'tmp').mkdir()
+    results = tmp_path / 'out'
+    program = subprocess.Popen(
+        [sys.executable, *COMMAND, 'fleet', str(recorded), '-o', str(results), '--workers', '2'],
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        env={**os.environ, 'TMPDIR': str(temporary)})
+    seen = temporary.glob if moment == 'starts' else results.glob
+    wait(lambda: [*seen('*')] or program.poll() is not None)
+    os.killpg(program.pid, signal.SIGINT)  # as a terminal does
+    assert program.communicate(timeout=WAIT_S)[1] == ''
+    assert program.returncode == 130
+    assert not [*temporary.iterdir()]
 
 
 def deadly(name: str) -> str:

@@ -448,7 +448,7 @@ def test_requests_that_are_not_http_are_counted_in_one_line(
 
 @pytest.mark.parametrize('headers', [
     '', UPGRADE, f'{UPGRADE}Sec-WebSocket-Version: 7\r\n',
-    f'{UPGRADE}{VERSION}Sec-WebSocket-Key: x\r\n'])
+    *(f'{UPGRADE}{VERSION}Sec-WebSocket-Key: {key}\r\n' for key in 'xä')])
 def test_a_stream_that_is_no_websocket_is_refused(shared: Bench, headers: str) -> None:
     found = shared.sent(request(shared, 'GET', '/stream', headers))
     head, _, body = found.partition(b'\r\n\r\n')

@@ -399,7 +399,8 @@ def test_few_samples_or_stamps_that_stop_make_no_pose(count, step, interruptions
 @pytest.mark.parametrize('settings', [
     {'still_window': 0.0}, {'min_dwell': -1.0}, {'max_dwell': 0.5}, {'still_std_max': -1.0},
     {'still_gyro_max': float('nan')}, {'still_norm_tolerance': 0.0}, {'min_pose_angle': 4.0},
-    {'repeated': 'forget'}])
+    {'repeated': 'forget'}, {'still_std_max': 1e308}, {'still_gyro_max': 1e308},
+    {'min_dwell': 1e308, 'max_dwell': np.inf}])
 def test_settings_out_of_range_are_refused_by_name(settings):
-    with pytest.raises(ValueError, match=next(iter(settings))):
+    with pytest.raises(ValueError, match=f'{next(iter(settings))} is'):
         CaptureSettings(**settings)

@@ -38,6 +38,10 @@ Repeated = Literal['keep', 'merge', 'refuse']
 REPEATED: tuple[str, ...] = get_args(Repeated)
 
 
+_LARGEST = 1e12
+"""Limit of the settings: more than any recording [s] and any count."""
+
+
 @dataclass(frozen=True)
 class CaptureSettings:
     """
@@ -81,15 +85,15 @@ class CaptureSettings:
     repeated: Repeated = 'keep'
 
     def __post_init__(self) -> None:
-        self._check('still_window', 0.0 < self.still_window < math.inf, 'a positive number [s]')
-        self._check('min_dwell', 0.0 < self.min_dwell < math.inf, 'a positive number [s]')
+        for name in ('still_window', 'min_dwell'):
+            self._check(name, 0.0 < getattr(self, name) < _LARGEST, f'0 to {_LARGEST:g} [s]')
         self._check('max_dwell', self.max_dwell >= 2.0 * self.min_dwell,
                     'at least twice min_dwell [s]')
         self._check('min_pose_angle', 0.0 <= self.min_pose_angle <= math.pi, '0 to π [rad]')
         self._check('repeated', self.repeated in REPEATED, f'one of {REPEATED}')
         self._check('still_norm_tolerance', self.still_norm_tolerance > 0.0, 'positive [g]')
         for name in ('still_std_max', 'still_gyro_max'):
-            self._check(name, 0.0 <= getattr(self, name) < math.inf, 'zero or positive')
+            self._check(name, 0.0 <= getattr(self, name) < _LARGEST, f'0 to {_LARGEST:g}')
 
     def _check(self, name: str, good: bool, expected: str) -> None:
         if not good:

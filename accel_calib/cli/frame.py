@@ -266,7 +266,7 @@ def _targets(args: argparse.Namespace, each: Sequence[argparse.Namespace]) -> It
         if target.is_piped:
             continue
         if len(each) == 1 or target.kind not in _SUFFIXES:
-            yield target._replace(kind='' if target.path.is_dir() else target.kind)
+            yield target
         elif target.path.is_dir():
             for one in each:
                 yield target._replace(path=getattr(one, target.name),

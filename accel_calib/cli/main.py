@@ -62,6 +62,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return INTERRUPTED
     except Exception as err:  # a defect of this program, which no user should see as a traceback
         line = crash_words(err)
+    finally:
+        if arguments is None:  # Python's own end would print that it was interrupted
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
     return _refuse(args.command, line)
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from .catalogue import effect_named, is_effect, OWN, parameter_names
 from .form import AXES, by_axis, each_axis, Effect, Monomial, MONOMIALS, ONE
 from .model import terms_of
+from ..disk import check_regular
 from ..errors import AccelCalibError, InputError
 from ..table import Floats, is_quantity
 
@@ -140,6 +141,7 @@ def know(effects: Iterable[OwnEffect]) -> tuple[str, ...]:
 
 def know_file(path: Path) -> tuple[str, ...]:
     """Execute a Python file as `know_code` does; raise OSError if it cannot be read."""
+    check_regular(path)
     return know_code(str(path), path.read_bytes())
 
 

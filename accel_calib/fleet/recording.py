@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime, timezone
 import hashlib
+from itertools import chain
 import json
 import os
 from pathlib import Path, PurePosixPath
@@ -31,6 +32,7 @@ import numpy as np
 from .. import __version__
 from ..calibrate import Calibration, determines, directions_of, fit_poses
 from ..compare import NAMES, rotation_free
+from ..disk import check_regular
 from ..effects import known_code, MODELS
 from ..errors import AccelCalibError, crash_words, InputError, RefusedFitError
 from ..findings import residual_figures
@@ -69,10 +71,7 @@ def recordings(given: Iterable[str]) -> Iterator[Input]:
     or a folder cannot be read.
 
     """
-    for text in given:
-        if text.startswith('@'):
-            yield from recordings(_lines(Path(text[1:])))
-            continue
+    for text in chain.from_iterable(map(_stated, given)):
         found = None
         for found in _addresses(text) if '://' in text else _local(text):
             yield found
@@ -82,9 +81,14 @@ def recordings(given: Iterable[str]) -> Iterator[Input]:
                              'correct the name, or put a glob in quotes')
 
 
-def _lines(path: Path) -> Iterator[str]:
-    """Yield the lines of a list; relative names are relative to the list."""
-    with path.open(encoding='utf-8') as file:
+def _stated(text: str) -> Iterator[str]:
+    """Yield a name, or those of a list, whose relative names are relative to it."""
+    if not text.startswith('@'):
+        yield text
+        return
+    path = Path(text[1:])
+    check_regular(path)
+    with path.open(encoding='utf-8', errors='surrogateescape') as file:
         for line in filter(None, map(str.strip, file)):
             if not line.startswith('#'):
                 yield line if '://' in line else str(path.parent / line)

@@ -15,10 +15,13 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass
 from itertools import islice
+from multiprocessing import resource_tracker
 from pathlib import Path
+import signal
+from tempfile import TemporaryDirectory
 import threading
 import time
 from typing import Any, TYPE_CHECKING, TypeVar
@@ -120,20 +123,62 @@ def cluster(address: str = '', workers: int | None = None) -> Iterator[Client]:
         import dask
         from distributed import Client, LocalCluster
         import pyarrow  # noqa: F401
-    if address:
+    with ExitStack() as stack:
+        ctrl_c = stack.enter_context(_CtrlC())
         try:
-            client = Client(address, timeout=_CONNECT_S, set_as_default=False)
+            if not address:
+                scratch = stack.enter_context(TemporaryDirectory(prefix='accel_calib-'))
+                stack.enter_context(dask.config.set(
+                    {**_CONFIG, 'temporary-directory': scratch}))
+                started: Any = stack.enter_context(LocalCluster(
+                    n_workers=workers, threads_per_worker=1, host=_HERE,
+                    dashboard_address=f'{_HERE}:0', silence_logs='ERROR'))
+            client = stack.enter_context(Client(
+                address or started, timeout=_CONNECT_S, set_as_default=False))
         except (OSError, ValueError) as err:
+            if not address:
+                raise
             raise InputError(f'no scheduler answers at {address}: {err}', 'start dask scheduler, '
                              'or correct --scheduler') from err
-        with client:
+        with ctrl_c.passing():
             yield client
-        return
-    with dask.config.set(_CONFIG), \
-            LocalCluster(n_workers=workers, threads_per_worker=1, host=_HERE,
-                         dashboard_address=f'{_HERE}:0', silence_logs='ERROR') as local, \
-            Client(local, set_as_default=False) as client:
-        yield client
+
+
+class _CtrlC:
+    """Ctrl-C, which waits while the cluster starts and ends, and never reaches its processes."""
+
+    def __enter__(self) -> _CtrlC:
+        self._came, self._waits = False, True
+        self._before = signal.getsignal(signal.SIGINT)
+        if self._before != signal.SIG_IGN:
+            signal.signal(signal.SIGINT, self._take)
+        # Threads and processes inherit the mask; the tracker would lift it when it starts.
+        resource_tracker.ensure_running()
+        self._mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        signal.pthread_sigmask(signal.SIG_SETMASK, self._mask)
+        signal.signal(signal.SIGINT, self._before)
+        if self._came:  # whatever else the interruption has caused
+            raise KeyboardInterrupt
+
+    def _take(self, number: int, frame: object) -> None:
+        self._came = True
+        if not self._waits:
+            raise KeyboardInterrupt
+
+    @contextmanager
+    def passing(self) -> Iterator[None]:
+        """Let Ctrl-C interrupt the block."""
+        signal.pthread_sigmask(signal.SIG_SETMASK, self._mask)
+        if self._came:
+            raise KeyboardInterrupt
+        self._waits = False
+        try:
+            yield
+        finally:
+            self._waits = True
 
 
 def run(client: Client, found: Sequence[Input], options: Options, store: Store,
@@ -171,6 +216,7 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
     """
     with store.locked():
         damaged = tuple(_set_aside(client, store))
+        store.forget_lost()
         _merge(client, store)  # what an interrupted run left
         counts, unread = Counter[str](), list[Row]()
         for item, status in mapped(client, calibrate_recording, found, options, store, limit_s):

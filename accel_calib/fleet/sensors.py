@@ -35,7 +35,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 import errno
 import fcntl
+from hashlib import blake2b
 import json
+import os
 from pathlib import Path
 import time
 from typing import Any, TYPE_CHECKING
@@ -99,7 +101,9 @@ class Store:
         """Write a row, to be merged into the data set; raise OSError if it fails."""
         folder = self.pending / as_folder(row['sensor'])
         folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(folder / f'{row["key"]}.json', lambda file: json.dump(row, file))
+        text = json.dumps(row)
+        write_atomically(folder / f'{row["key"]}.json',
+                         lambda file: file.write(f'{text}\n{_digest(text)}\n'))
 
     def waiting(self) -> list[str]:
         """Return the folders of sensors with pending rows, in order."""
@@ -114,7 +118,7 @@ class Store:
         """
         folder = self.pending / name
         paths = sorted(folder.glob('*.json'), key=lambda path: path.stat().st_mtime)
-        new = [json.loads(path.read_text(encoding='utf-8')) for path in paths]
+        new = [_pending_row(path) for path in paths]
         old = self.of_sensor(name)
         rows, replaced = _merged(old, new)
         if new:
@@ -146,13 +150,14 @@ class Store:
         """Move a file with rows away, so that they are made again; return its new path."""
         moved = self.folder / 'damaged' / str(time.time_ns()) / path.relative_to(self.folder)
         moved.parent.mkdir(parents=True)
-        if path.name == _DATA:
-            sensor = path.parent.name.partition('=')[2]
-            for mark in self.folder.glob('done/*/*'):
-                if mark.read_text(encoding='utf-8') in ('', sensor):  # '': of older versions
-                    mark.unlink()
         path.rename(moved)
         return moved
+
+    def forget_lost(self) -> None:
+        """Remove the marks of results whose Parquet file is gone, so that they are made again."""
+        for mark in self.folder.glob('done/*/*'):
+            if not os.path.exists(self.data(os.fsdecode(mark.read_bytes()))):
+                mark.unlink()
 
     def replace_unread(self, rows: list[Row]) -> None:
         """Replace the rows of the recordings that could not be read."""
@@ -210,22 +215,33 @@ def is_damaged(path: Path) -> bool:
     """Return whether a file of `Store.files`, or a row of it, is damaged; OSError is raised."""
     import pyarrow as pa
 
-    needed = _NEEDED.get(path.name, (*_NEEDED[_DATA], 'sensor'))
+    needed = _NEEDED.get(path.name, ())
     if path.parent.name == f'sensor={UNREAD}':
         needed = ('recording', 'status')
     try:
         if path.suffix == '.json':
-            rows = [json.loads(path.read_text(encoding='utf-8'))]
-            pa.Table.from_pylist(rows, schema())
-        else:
-            rows = read_parquet(path)
-        return any(row[name] is None for row in rows for name in needed)
+            _pending_row(path)
+            return False
+        return any(row[name] is None for row in read_parquet(path) for name in needed)
     except OSError as err:
         if err.errno is not None:
             raise
         return True
-    except (ValueError, TypeError, AttributeError, LookupError, pa.ArrowException):
+    except (ValueError, LookupError, pa.ArrowException):
         return True
+
+
+def _pending_row(path: Path) -> Row:
+    """Return a row that `Store.add` wrote; ValueError if the file is damaged."""
+    text, digest, end = path.read_text(encoding='utf-8').split('\n')
+    if end or digest != _digest(text):
+        raise ValueError('the row and its digest differ')
+    row: Row = json.loads(text)
+    return row
+
+
+def _digest(text: str) -> str:
+    return blake2b(text.encode(), digest_size=8).hexdigest()
 
 
 def _merged(old: list[Row], new: list[Row]) -> tuple[list[Row], list[str]]:

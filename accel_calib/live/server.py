@@ -379,7 +379,11 @@ class PageServer:
         """Serve a viewer until it ends."""
         socket_ = secured(web.WebSocketResponse(
             heartbeat=STUCK_S / 1.5, max_msg_size=LARGEST, compress=False))
-        if not socket_.can_prepare(request).ok:
+        try:
+            is_one = socket_.can_prepare(request).ok
+        except ValueError:  # a key that is not ASCII
+            is_one = False
+        if not is_one:
             return secured(web.Response(status=400, text='expected a WebSocket; open /\n'))
         await socket_.prepare(request)
         connection.stage = 2

@@ -28,7 +28,7 @@ from .serialized import frame_ids, IMU_DOUBLES, joined, Messages, samples_of
 from ..disk import check_regular
 from ..errors import InputError
 from ..table import Floats
-from ..text import some
+from ..text import reason, some
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -46,9 +46,6 @@ LARGEST = 1e6
 _BLOCK_BYTES = 1 << 24
 _AT_ONCE = 64
 """Number of bytes above which a block ends, and of messages after which they are counted."""
-
-_LONGEST_REASON = 400
-"""Longest reason that is shown [characters]; damaged files have names of any length."""
 
 _BY_VALUE = (errno.EINVAL, errno.EOVERFLOW, errno.EISDIR, errno.EFBIG,
              errno.ENAMETOOLONG, errno.ENOTDIR)
@@ -258,12 +255,10 @@ def damage_as_input_error(path: Path) -> Iterator[None]:
     except Exception as err:  # damaged bytes cause many kinds of errors
         if isinstance(err, OSError) and err.errno is not None and err.errno not in _BY_VALUE:
             raise
-        reason = ' '.join(str(err)[:_LONGEST_REASON].split())
-        what = reason if ' ' in reason else f'{type(err).__name__} {reason}'.strip()
         inside = ' or the .mcap or .db3 file inside it' if path.is_dir() else ''
-        raise InputError(f'{path} is damaged or not a bag ({what}), expected a rosbag2 folder, '
-                         '.mcap, .db3 or .bag', f'use another file{inside}; ros2 bag reindex may '
-                         'repair this one') from err
+        raise InputError(f'{path} is damaged or not a bag ({reason(err)}), expected a rosbag2 '
+                         'folder, .mcap, .db3 or .bag', f'use another file{inside}; ros2 bag '
+                         'reindex may repair this one') from err
 
 
 def _check(reader: Any) -> None:

@@ -22,6 +22,7 @@ from functools import partial
 import io
 from itertools import chain, islice
 import json
+import lzma
 from pathlib import Path
 from typing import Any
 import zipfile
@@ -37,6 +38,7 @@ from .names import meaning, READING, record_instead
 from .text import open_text, TextTable
 from ..errors import InputError, needing
 from ..table import ABOUT
+from ..text import reason
 
 _WORKBOOK = 'xl/workbook.xml'
 
@@ -141,10 +143,12 @@ def _members_of(path: Path, head: bytes) -> Iterator[Sequence[Member]]:
 def _member_of(path: Path, members: Sequence[Member], options: LogOptions) -> Member:
     names = [member.name for member in members]
     wanted = [member for member in members if options.topic in ('', member.name)]
+    if not names:
+        raise InputError(f'{path} has no tables, expected one',
+                         'check that this is the intended file')
     if not wanted:
         raise InputError(f'{path} has no table {options.topic}, expected one of {shown(names)}',
-                         f'name one of these with --topic "{names[0]}"' if names else
-                         'check that this is the intended file')
+                         f'name one of these with --topic "{names[0]}"')
     tables, refused = _tables(path, wanted, options)
     if not tables:
         if len(wanted) == 1:
@@ -192,8 +196,11 @@ def _is_named(member: Member, columns: Chosen) -> bool:
 def _sound_archive(path: Path) -> Iterator[None]:
     try:
         yield
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError) as err:
-        raise InputError(f'{path} cannot be unpacked ({err}), expected a ZIP archive',
+    except (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, NotImplementedError,
+            OSError) as err:
+        if isinstance(err, OSError) and err.errno is not None:
+            raise  # only damaged bytes of bz2 have no number
+        raise InputError(f'{path} cannot be unpacked ({reason(err)}), expected a ZIP archive',
                          _UNPACK) from err
 
 

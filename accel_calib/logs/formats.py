@@ -14,6 +14,7 @@ from pathlib import Path
 import re
 
 from ..errors import InputError
+from ..text import reason
 
 HEAD = 8192
 """Number of first bytes by which a file is recognised."""
@@ -50,8 +51,7 @@ def sound_log(path: Path, expected: str, advice: str = 'copy it from the vehicle
         # Of a library, or a seek to before the start of a file, by a damaged length.
         if isinstance(err, OSError) and err.errno not in (None, errno.EINVAL):
             raise
-        why = ' '.join(str(err).split()) or type(err).__name__
-        raise InputError(f'{path} is damaged ({why}), expected {expected}',
+        raise InputError(f'{path} is damaged ({reason(err)}), expected {expected}',
                          advice) from err
 
 

@@ -39,6 +39,7 @@ from ..finding import Finding, KINDS, LEVELS, without
 from ..geometry import rms
 from ..table import (
     Autopilot, check_values, column_of, COLUMNS, Floats, is_quantity, LARGEST, Poses)
+from ..text import some
 from ..units import FRAMES, MODEL_NAMES, UNIT_NAMES, Units
 
 try:  # eight times as fast, but not in every build of PyYAML
@@ -460,6 +461,7 @@ _PRIORS = 1
 """Format of a file of typical values."""
 
 _PRIOR_NAMES = parameter_names(MODELS['10'].effects)
+_MOST_SENSORS = 10**9
 
 
 def write_priors(path: Path, priors: Mapping[str, FleetPrior]) -> None:
@@ -507,7 +509,7 @@ def read_prior(path: Path, model: str = '') -> FleetPrior:
                          'use fleet.yaml of accel-calib fleet') from err
     chosen = [each for each in found if each.model == model or (not model and len(found) == 1)]
     if not chosen:
-        names = ', '.join(each.model or "''" for each in found) or 'no model'
+        names = some(each.model or "''" for each in found) or 'no model'
         raise InputError(f'{path} has {names}, expected the model {model!r}',
                          'set --sensor-model to a model in the file')
     return chosen[0]
@@ -515,13 +517,13 @@ def read_prior(path: Path, model: str = '') -> FleetPrior:
 
 def _fleet_of(content: Mapping[str, Any]) -> FleetPrior:
     size = len(_PRIOR_NAMES)
-    if tuple(content['names']) != _PRIOR_NAMES:
-        raise ValueError(f'names are {content["names"]}, expected {list(_PRIOR_NAMES)}')
+    if tuple(names := values_at(content, 'names', str)) != _PRIOR_NAMES:
+        raise ValueError(f'names are {some(names)}, expected {some(_PRIOR_NAMES)}')
     covariance = array_at(content, 'covariance', (size, size), most=LARGEST_OFFSET_G)
     if not np.allclose(covariance, covariance.T):
         raise ValueError('covariance is not symmetric')
     prior = Prior(array_at(content, 'mean', (size,), most=LARGEST_OFFSET_G), covariance)
     _ = prior.whitening  # raises LinAlgError unless it is positive definite
-    if (sensors := value_at(content, 'sensors', int)) < 1:
-        raise ValueError(f'sensors is {sensors}, expected 1 or more')
+    if not 1 <= (sensors := value_at(content, 'sensors', int)) <= _MOST_SENSORS:
+        raise ValueError(f'sensors is {shown(sensors)}, expected 1 to {_MOST_SENSORS}')
     return FleetPrior(str(content['model']), sensors, prior)
