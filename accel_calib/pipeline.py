@@ -223,7 +223,8 @@ def ramp_or_poses(source: Path | Piped | Frame, options: LogOptions = LogOptions
     (`accel_calib.capture.ramp`).
 
     """
-    with open_log(source, options) as log, saying(log.read_as):
+    with open_log(source, options) as log, saying(
+            ', '.join(filter(None, (log.read_as, *log.notes)))):
         table = log.poses
         if table is not None and not _is_slow_recording(table):
             return Intake(table, log.units, log.read_as, log.notes)
@@ -463,8 +464,9 @@ def thermally_calibrated(logs: Sequence[Intake | RampIntake], plan: Plan = Plan(
             fitted = calibrated(without_curve(curve, rows, units), units, replace(
                 plan, refined=False, flat=None, nose_down=None)).calibration
             made = with_curve(fitted, curve, rows)
-        return ThermalOutcome(level_by_rows(
-            made, rows, plan.frame, _row(rows, plan.flat), plan.nose_down), curve, logs, read_as)
+        levelled = level_by_rows(made, made.poses, plan.frame, _row(rows, plan.flat),
+                                 plan.nose_down)
+        return ThermalOutcome(levelled, curve, logs, read_as)
 
 
 def _turned_over(logs: Sequence[Intake | RampIntake]) -> Intake | None:
