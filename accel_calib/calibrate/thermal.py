@@ -163,7 +163,7 @@ class Curve:
     def effects(self) -> tuple[dict[str, Floats], Floats]:
         """Return the effects with their values, and the covariance of these [g²]."""
         shift = REFERENCE_TEMPERATURE - self.reference_c
-        degree = max(self.degree, 1)  # degree 0 is a slope of zero, so that it is seen and exported
+        degree = max(self.degree, 1)  # degree 0 is stored as a slope of zero
         values, covariance = np.zeros((degree, 3)), np.zeros((3, degree, degree))
         values[:self.degree], covariance[:, :self.degree, :self.degree] = (
             self.values, self.covariance)
