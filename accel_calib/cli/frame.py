@@ -155,7 +155,8 @@ def _run_one(args: argparse.Namespace) -> int:
             output.print(f'read as: {error["read_as"]}')
         raise
     write_json(target, done.result)
-    for each in (*done.shown, *(f'stored in {path}' for path in done.stored),
+    for each in (*done.shown, *(f'stored in {path}' for path in done.stored
+                                if str(path) != STANDARD_OUTPUT),
                  *(rating_lines(done.rating, args) if done.rating else ())):
         output.print(each)
     if done.refusal:
