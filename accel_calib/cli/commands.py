@@ -235,7 +235,8 @@ def _export(made: options.Parser) -> None:
 
     made.epilog = '\n'.join([f'{made.epilog}\nformats:', *(
         f'  {name:<11}{each.what}' for name, each in FORMATS.items())])
-    made.add_argument('calibration', type=Path, metavar='CALIBRATION', help='stored calibration')
+    made.add_argument('calibration', type=Path, metavar='CALIBRATION',
+                      help='stored calibration; - for standard input')
     made.add_argument('--to', required=True, choices=tuple(FORMATS), metavar='FORMAT',
                       help='format, see below')
     made.add_argument('-o', '--output', metavar='FILE', help='file to write; - for standard '
