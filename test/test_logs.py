@@ -494,7 +494,9 @@ def counted(made: dict[str, Any], start: int = 65_000, bits: int = 16) -> np.nda
 @pytest.mark.parametrize('comment', ['// Sample rate: 100.0Hz', '// Update Rate: 100.0Hz',
                                      '# Config: data_rate = 100.0 Hz, filter = 48 Hz',
                                      'Acquisition frequency: 100 Hz',
-                                     '--- Data File Created at 100 Hz ---', 'OutputRate:,0.1kHz'])
+                                     '--- Data File Created at 100 Hz ---', 'OutputRate:,0.1kHz',
+                                     '# fs = 100 Hz', 'Sampling Frequency (Hz): 100',
+                                     'Sample rate,100,Hz'])
 @pytest.mark.parametrize('name', ['Counter', 'PacketCounter', 'Packet number', ''])
 def test_samples_without_times_have_the_rate_that_the_file_states(comment: str, name: str,
                                                                   reads: Reads) -> None:
