@@ -183,9 +183,10 @@ def _wider(source: Source, found: Captured, units: Units, options: LogOptions,
 def _nothing_still(source: str, found: Captured, units: Units, settings: Mapping[str, Any],
                    finds: str) -> InputError:
     """Return the error for a recording without a still stretch."""
-    window = settings_from(settings, units).still_window
-    numbers = (f': in its quietest {window:g} s the standard deviation is {found.quietest:.2g} '
-               f'{units.name}, the limit is {found.threshold:.2g}'
+    asked = settings_from(settings, units)
+    numbers = (f': in its quietest {asked.still_window:g} s the standard deviation is '
+               f'{found.quietest:.2g} {units.name}, the limit is {found.threshold:.2g} for at '
+               f'least {asked.min_dwell:g} s'
                if math.isfinite(found.quietest) else '')
     tried = (f'; {finds} (wide limits make poses inaccurate)' if finds else
              '; a wider limit (still_std_max) finds none either')
