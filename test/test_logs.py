@@ -9,6 +9,7 @@ from collections.abc import Callable
 from datetime import datetime, timezone
 from pathlib import Path
 import re
+import sys
 import tracemalloc
 from typing import Any
 
@@ -385,6 +386,8 @@ def test_columns_unit_and_rate_are_said_also_where_gravity_is_lacking(
     with pytest.raises(InputError, match='gravity removed') as caught:
         reads(names, time, 0.01 * np.random.default_rng(1).normal(size=reading.shape))
     assert said.removesuffix(' in m/s2') in caught.value.read_as
+    if sys.version_info >= (3, 11):
+        assert caught.value.__notes__ == [f'read as: {caught.value.read_as}']
 
 
 def test_a_bad_date_is_an_error_with_its_line_or_is_skipped(reads: Reads) -> None:
