@@ -48,7 +48,10 @@ def saying(read_as: str) -> Iterator[None]:
     try:
         yield
     except AccelCalibError as error:
-        error.read_as = error.read_as or read_as
+        if read_as and not error.read_as:
+            error.read_as = read_as
+            if sys.version_info >= (3, 11):  # a traceback, as in a notebook, shows it
+                error.add_note(f'read as: {read_as}')
         raise
 
 

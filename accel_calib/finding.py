@@ -58,8 +58,8 @@ KINDS: Mapping[str, str] = MappingProxyType({
     'undetermined': 'the poses do not determine the largest model',
     'copies': 'equal rows count as one pose',
     'unlike_fleet': 'the sensor is unlike the fleet',
-    'not_calibrated': 'recordings of a fleet have no usable calibration',
     'unnamed': 'recordings of a fleet do not say of which sensor they are',
+    'not_calibrated': 'recordings of a fleet have no usable calibration',
     'noisy': 'the white noise at rest is larger than that of common parts',
     'not_seen': 'a rest does not show all figures of the noise',
     'open': 'what poses near one direction leave open',
@@ -196,6 +196,9 @@ class Rating:
     figures: str
     next: NextStep  # noqa: A003, the name in JSON
     findings: tuple[Finding, ...] = ()
+
+    def __str__(self) -> str:
+        return '\n'.join(self.lines)
 
     @property
     def lines(self) -> tuple[str, ...]:

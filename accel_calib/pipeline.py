@@ -183,9 +183,10 @@ def _wider(source: Source, found: Captured, units: Units, options: LogOptions,
 def _nothing_still(source: str, found: Captured, units: Units, settings: Mapping[str, Any],
                    finds: str) -> InputError:
     """Return the error for a recording without a still stretch."""
-    window = settings_from(settings, units).still_window
-    numbers = (f': in its quietest {window:g} s the standard deviation is {found.quietest:.2g} '
-               f'{units.name}, the limit is {found.threshold:.2g}'
+    asked = settings_from(settings, units)
+    numbers = (f': in its quietest {asked.still_window:g} s the standard deviation is '
+               f'{found.quietest:.2g} {units.name}, the limit is {found.threshold:.2g} for at '
+               f'least {asked.min_dwell:g} s'
                if math.isfinite(found.quietest) else '')
     tried = (f'; {finds} (wide limits make poses inaccurate)' if finds else
              '; a wider limit (still_std_max) finds none either')
@@ -223,7 +224,8 @@ def ramp_or_poses(source: Path | Piped | Frame, options: LogOptions = LogOptions
     (`accel_calib.capture.ramp`).
 
     """
-    with open_log(source, options) as log, saying(log.read_as):
+    with open_log(source, options) as log, saying(
+            ', '.join(filter(None, (log.read_as, *log.notes)))):
         table = log.poses
         # A recording of slow samples has the form of a pose table.
         if table is not None and not ('time' in table and 'count' not in table
@@ -461,8 +463,9 @@ def thermally_calibrated(logs: Sequence[Intake | RampIntake], plan: Plan = Plan(
             fitted = calibrated(without_curve(curve, rows, units), units, replace(
                 plan, refined=False, flat=None, nose_down=None)).calibration
             made = with_curve(fitted, curve, rows)
-        return ThermalOutcome(level_by_rows(
-            made, rows, plan.frame, _row(rows, plan.flat), plan.nose_down), curve, logs, read_as)
+        levelled = level_by_rows(made, made.poses, plan.frame, _row(rows, plan.flat),
+                                 plan.nose_down)
+        return ThermalOutcome(levelled, curve, logs, read_as)
 
 
 def _turned_over(logs: Sequence[Intake | RampIntake]) -> Intake | None:

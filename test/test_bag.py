@@ -5,6 +5,7 @@
 
 from dataclasses import replace
 from functools import cache
+import re
 
 from accel_calib.calibrate import fit_poses, level
 from accel_calib.capture import capture
@@ -318,6 +319,7 @@ def test_poses_do_not_depend_on_the_size_of_blocks(recording, tmp_path, monkeypa
     monkeypatch.setattr(*BLOCK_OF_A_BAG, 20)
     with open_log(path, LogOptions()) as stream:
         assert stream.samples == len(recording)
+        assert re.match(r'Imu messages of /\S+ at \d+ Hz in m/s2$', stream.read_as)
         found = capture(stream.blocks, UNITS)
     assert len(whole.poses) == 12
     assert (found.recorded, found.seconds) == (len(recording), whole.seconds)

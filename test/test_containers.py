@@ -268,7 +268,7 @@ def test_an_export_without_gravity_is_refused_with_what_to_record(tmp_path: Path
 
 @pytest.mark.parametrize('kind', ['zip', 'xlsx', 'far', 'mat'])
 def test_a_small_container_takes_little_memory(kind: str, tmp_path: Path) -> None:
-    path = tmp_path / 'bomb.mat'
+    path = tmp_path / ('bomb.mat' if kind == 'mat' else 'bomb.xls')
     if kind == 'zip':
         with zipfile.ZipFile(path, 'w', zipfile.ZIP_DEFLATED) as archive, archive.open(
                 'acc.csv', 'w') as file:
@@ -280,14 +280,18 @@ def test_a_small_container_takes_little_memory(kind: str, tmp_path: Path) -> Non
         path.write_bytes(data)
     elif kind == 'far':
         book = openpyxl.Workbook()
-        book.active.cell(1, 1, 1.0)
-        book.active.cell(1 << 20, 1 << 14, 1.0)
-        book.save(path)
+        book.active.append(['ax', 'ay', 'az', *[None] * 16, 'note'])
+        book.active.append([0.0, 0.0, 9.8])
+        book.active.cell(1 << 20, 1, 1.0)
+        book.save(path.with_suffix('.xlsx'))
+        path.with_suffix('.xlsx').rename(path)
     else:
         matlab(tmp_path, {'acc': np.zeros((4_000_000, 3))}).rename(path)
     tracemalloc.start()
     try:
-        with pytest.raises(InputError):
+        with pytest.raises(InputError, match={
+                'zip': 'more than|lines', 'xlsx': 'unpacks to', 'far': 'more than 2000000 cells',
+                'mat': 'at most'}[kind]):
             read_log(path)
         # scipy unpacks 128 KiB at once, to at most 1030 times as much.
         assert tracemalloc.get_traced_memory()[1] < (250e6 if kind == 'mat' else 150e6)
@@ -301,6 +305,18 @@ def test_a_long_name_in_a_damaged_archive_is_not_shown_whole(tmp_path: Path) -> 
     with pytest.raises(InputError, match='cannot be unpacked') as caught:
         read_log(path)
     assert len(str(caught.value)) < 1000
+
+
+def test_the_damage_of_a_sheet_is_stated_although_there_are_others(tmp_path: Path) -> None:
+    tables, _ = tables_of('phyphox')
+    path = written('xlsx', tmp_path, {**tables, 'Metadata Time': 'a,b\n1,2'})
+    with zipfile.ZipFile(path) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, 'w') as archive:
+        for name, data in parts.items():
+            archive.writestr(name, data.replace(b'<row r="9"', b'<row<'))
+    with pytest.raises(InputError, match='is damaged.* expected an Excel file'):
+        read_log(path)
 
 
 @pytest.mark.parametrize('kind', [*PACKED, 'xlsx', 'xls', 'mat'])

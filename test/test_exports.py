@@ -305,6 +305,8 @@ def test_betaflight_gets_its_offsets_in_counts(options, unit, per_g, scale):
     made = sensor_with(BY_AXIS, unit=unit, per_g=per_g)
     assert betaflight(text_of(made, 'betaflight', **options)) == [
         round(each * scale) for each in BY_AXIS['offset']]
+    losses = export(made, 'betaflight', options=ExportOptions(**options)).losses
+    assert all(' the zero-g offset to counts: ' in each for each in losses if 'rounds' in each)
 
 
 @pytest.mark.parametrize('name', ['affine', 'in_g', 'counts', 'levelled'])

@@ -213,6 +213,7 @@ def test_a_residual_far_above_the_noise_is_ignored_below_a_milli_g():
     assert calibration.quality.chi2_per_dof > 400.0
     assert Expected(calibration).hidden_mg < 1.0
     assert rate(calibration).name == 'GOOD'
+    assert any('run refine' in warning for warning in calibration.warnings)
 
 
 def test_a_fit_beside_a_refused_refinement_is_not_bad():
@@ -279,6 +280,16 @@ def test_poses_of_another_sensor_are_bad_and_noisy_ones_do_not_verify(effects, n
     calibration = ac.fit(simulated(poses=24))
     new = simulated(effects, poses=12, noise=noise, seed=9)
     assert rate_verification(ac.verify(new, calibration), calibration).name == expected
+
+
+def test_a_verification_never_advises_to_replace_what_it_verified(tmp_path):
+    other, stored = written(tmp_path / 'other.csv', HIDDEN), tmp_path / 'c.yaml'
+    ac.fit(simulated(poses=24, units='g')).save(stored)
+    target = tmp_path / 'result.json'
+    main(['verify', str(other), '-c', str(stored), '--json', str(target)])
+    step = json.loads(target.read_text(encoding='utf-8'))['next']
+    assert (step['kind'], step['command']) == (
+        'fit', f'accel-calib fit {other} -o {tmp_path / "c_new.yaml"}')
 
 
 def test_a_verification_of_few_directions_does_not_improve_the_rating():

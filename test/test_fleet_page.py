@@ -219,6 +219,7 @@ def test_the_page_begins_with_a_verdict_and_needs_no_script_and_no_other_file(pa
 @pytest.mark.parametrize(('counts', 'changed', 'unnamed', 'name', 'kinds'), [
     ({'GOOD': 3, 'USABLE': 1}, 0, 0, 'GOOD', []),
     ({'GOOD': 3, 'error': 1}, 0, 1, 'USABLE', ['not_calibrated']),
+    ({'GOOD': 3, 'error': 1}, 0, 4, 'USABLE', ['unnamed', 'not_calibrated']),
     ({'BAD': 1, 'unread': 1}, 0, 0, 'BAD', ['not_calibrated']),
     ({'GOOD': 4}, 0, 4, 'USABLE', ['unnamed']), ({'GOOD': 4}, 1, 0, 'USABLE', ['changed'])])
 def test_a_fleet_is_rated_by_its_recordings(
@@ -226,7 +227,7 @@ def test_a_fleet_is_rated_by_its_recordings(
     rating = rate_fleet(counts, 2, changed, unnamed)
     assert (rating.name, [each.kind for each in rating.findings]) == (name, kinds)
     if 'error' in counts:
-        assert '1 of 4 recordings' in rating.findings[0].text
+        assert '1 of 4 recordings' in rating.findings[-1].text
 
 
 def test_fleets_of_any_size_and_with_any_names_have_a_page(page: str, tmp_path: Path) -> None:

@@ -248,7 +248,11 @@ def test_a_board_on_a_serial_port_is_calibrated(tmp_path: Path) -> None:
         assert viewer.ask('save')['success']
         viewer.close()
         run.send_signal(signal.SIGINT)
-        assert run.wait(PATIENCE) == 0
+        printed = ' '.join(run.communicate(timeout=PATIENCE)[0].split())
+        assert run.returncode == 0
+    assert 'press Fit' in printed
+    assert 'press Accept to use and store it, or Take back to discard it' in printed
+    assert '~/' not in printed
     assert any(line.startswith("read as: ';'") for line in lines)
     assert any(words.startswith('samples arrive from ') for words in said)
     assert not any('Imu messages' in words or 'frame_id' in words for words in said)

@@ -182,6 +182,14 @@ def test_the_lowest_sensor_of_an_ardupilot_log_is_read_and_the_others_are_named(
     np.testing.assert_allclose(other.columns['ay'], samples.reading[:, 1] * make.G, rtol=1e-6)
 
 
+@pytest.mark.parametrize('name', ['two_imus.bin', 'two_imus.csv'])
+def test_the_number_of_a_sensor_may_be_written_as_a_program_does(name: str) -> None:
+    pytest.importorskip('pymavlink')
+    one, same = (read_log(LOGS / 'ardupilot' / name, LogOptions(sensor=text)).table
+                 for text in ('1', '1.0'))
+    assert same == one
+
+
 def test_the_csv_of_two_sensors_gives_the_lowest_or_the_one_that_is_named() -> None:
     path = LOGS / 'ardupilot/two_imus.csv'
     assert len(read_log(path).table) == len(make.recording(50))

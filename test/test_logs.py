@@ -9,6 +9,7 @@ from collections.abc import Callable
 from datetime import datetime, timezone
 from pathlib import Path
 import re
+import sys
 import tracemalloc
 from typing import Any
 
@@ -137,8 +138,8 @@ def test_one_line_says_how_the_log_of_a_microcontroller_is_read(tmp_path: Path) 
     made = samples(per_g=16512.0)
     rows = rows_of(made['time'] * 1e3, made['reading'], digits='.0f')
     log = read_log(write(tmp_path, text_of(rows, 'timestamp_ms;accX;accY;accZ', ';')))
-    assert re.fullmatch(r"';', timestamp_ms -> s, accX/Y/Z, 16 \d{3} counts = 1 g \(native\)",
-                        log.read_as)
+    assert re.fullmatch(r"';', timestamp_ms in ms \(100 Hz\) -> s, accX/Y/Z, "
+                        r'16 \d{3} counts = 1 g \(native\)', log.read_as)
     assert log.units.name == 'native'
     np.testing.assert_allclose(log.table['time'], made['time'], atol=1e-9)
     poses = capture(log.table, log.units).poses  # type: ignore[arg-type]
@@ -359,7 +360,8 @@ def test_times_in_any_unit_become_seconds(name: str, unit: float, start: float, 
 
 @pytest.mark.parametrize('form', ['%Y-%m-%dT%H:%M:%S.%fZ', '%Y-%m-%d %H:%M:%S.%f',
                                   '%Y/%m/%d %H:%M:%S.%f', '%d-%b-%Y %H:%M:%S.%f',
-                                  '%Y-%m-%dT%H:%M:%S.%f+00:00', '%H:%M:%S.%f'])
+                                  '%Y-%m-%dT%H:%M:%S.%f+00:00', '%H:%M:%S.%f',
+                                  '%H:%M:%S:%f'])
 def test_dates_become_seconds(form: str, reads: Reads) -> None:
     made = samples()
     start = datetime(2026, 1, 31, 23, 59, 45, tzinfo=timezone.utc).timestamp()
@@ -369,6 +371,23 @@ def test_dates_become_seconds(form: str, reads: Reads) -> None:
     check(log, time=made['time'], within_s=2e-6)
     if '%d' in form:
         assert log.table['time'][0] == pytest.approx(start, abs=1e-5)
+
+
+@pytest.mark.parametrize(('names', 'said'), [
+    ('time,ax,ay,az', 'time in s (73 Hz), ax/y/z in m/s2'),
+    ('t_ms,acc_x,acc_y,acc_z', 't_ms in ms (73 Hz) -> s, acc_x/y/z in m/s2'),
+    ('Time (s),Acceleration x (m/s^2),Acceleration y (m/s^2),Acceleration z (m/s^2)',
+     'phyphox format, Time (s) in s (73 Hz), Acceleration x/y/z (m/s^2) in m/s2')])
+def test_columns_unit_and_rate_are_said_also_where_gravity_is_lacking(
+        names: str, said: str, reads: Reads) -> None:
+    reading, in_ms = samples()['reading'], names.startswith('t_ms')
+    time = np.round(np.arange(len(reading)) / 73.0, 3) * (1000.0 if in_ms else 1.0)
+    assert reads(names, time, reading).read_as == said
+    with pytest.raises(InputError, match='gravity removed') as caught:
+        reads(names, time, 0.01 * np.random.default_rng(1).normal(size=reading.shape))
+    assert said.removesuffix(' in m/s2') in caught.value.read_as
+    if sys.version_info >= (3, 11):
+        assert caught.value.__notes__ == [f'read as: {caught.value.read_as}']
 
 
 def test_a_bad_date_is_an_error_with_its_line_or_is_skipped(reads: Reads) -> None:
@@ -478,7 +497,9 @@ def counted(made: dict[str, Any], start: int = 65_000, bits: int = 16) -> np.nda
 @pytest.mark.parametrize('comment', ['// Sample rate: 100.0Hz', '// Update Rate: 100.0Hz',
                                      '# Config: data_rate = 100.0 Hz, filter = 48 Hz',
                                      'Acquisition frequency: 100 Hz',
-                                     '--- Data File Created at 100 Hz ---', 'OutputRate:,0.1kHz'])
+                                     '--- Data File Created at 100 Hz ---', 'OutputRate:,0.1kHz',
+                                     '# fs = 100 Hz', 'Sampling Frequency (Hz): 100',
+                                     'Sample rate,100,Hz'])
 @pytest.mark.parametrize('name', ['Counter', 'PacketCounter', 'Packet number', ''])
 def test_samples_without_times_have_the_rate_that_the_file_states(comment: str, name: str,
                                                                   reads: Reads) -> None:

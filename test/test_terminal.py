@@ -198,6 +198,10 @@ def test_logs_and_tables_go_through_pipes(tmp_path):
     table = piped('accel-calib apply - -c stored.yaml -o - <r.csv', tmp_path)
     assert table.stdout.startswith('# units: "m/s2"\n')
     assert 'corrected' in table.stderr
+    for line in ('export FILE --to imucal -o -', 'verify p.csv -c FILE'):
+        texts = {piped(f'accel-calib {line.replace("FILE", name)} <stored.yaml', tmp_path).stdout
+                 for name in ('-', 'stored.yaml')}
+        assert len(texts) == 1
     line = 'accel-calib fit - --json - <p.csv'
     assert json.loads(piped(line, tmp_path).stdout)['file'] == 'standard input'
 

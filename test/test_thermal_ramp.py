@@ -187,6 +187,11 @@ def test_a_ramp_and_a_log_of_poses_become_one_calibration(tmp_path, capsys):
     assert (status, result['rating'], result['model']) == (0, 'GOOD', '10')
     stored = read_calibration(out)
     assert stored.is_levelled
+    _, open_ = run_json(capsys, 'thermal', *paths, '-o', out)
+    command = open_['next']['command']
+    assert command.startswith(f'accel-calib thermal {paths[0]} {paths[1]} -o {out} --flat ')
+    assert run(*command.split()[1:]) == 0
+    assert read_calibration(out).is_levelled
     sd = np.array(result['offset_sd'])
     np.testing.assert_array_less(np.abs(np.array(result['offset']) / G - make.OFFSET_G) * G,
                                  4.0 * sd + 1e-9)
@@ -197,6 +202,30 @@ def test_a_ramp_and_a_log_of_poses_become_one_calibration(tmp_path, capsys):
     assert out.with_suffix('.html').read_text(encoding='utf-8').count('<svg') == 3
     assert {each['kind'] for each in result['findings']} >= {'open'}
     assert result['thermal']['degree'] == 2
+
+
+@pytest.mark.parametrize('low', [-10.0, -35.0])
+def test_an_offset_that_does_not_change_is_a_calibration_too(low, tmp_path, capsys):
+    paths = written(tmp_path, ramp=ramp(8, (), low=low, high=low + 40.0), poses=twelve_poses(11))
+    out = tmp_path / 'c.yaml'
+    assert run('thermal', paths[0], '-o', out) == 0
+    printed = ' '.join(capsys.readouterr().out.split())
+    assert 'the offset does not change with the temperature degree 0' in printed
+    assert 'it is the offset over temperature alone' in printed
+    status, result = run_json(capsys, 'thermal', *paths, '-o', out)
+    assert (status, result['thermal']['degree']) == (0, 0)
+    assert not np.any(read_calibration(out).model.values['offset_temperature'])
+
+
+def test_a_log_with_several_temperatures_is_refused_with_their_names(tmp_path, capsys):
+    path, = written(tmp_path, ramp=ramp(8))
+    text = path.read_text().splitlines()
+    head = next(k for k, line in enumerate(text) if 'ax' in line)
+    rows = [f'{line},{20 + k}' for k, line in enumerate(text[head + 1:])]
+    names = text[head].replace('temperature', 'temp1') + ',temp2'
+    path.write_text('\n'.join([*text[:head], names, *rows]))
+    assert run('thermal', path, '-o', tmp_path / 'c.yaml') == 2
+    assert 'temp1, temp2; choose one' in ' '.join(capsys.readouterr().out.split())
 
 
 def test_a_boards_log_of_another_sensor_does_not_fit_to_the_poses(tmp_path, capsys):

@@ -239,7 +239,7 @@ def fit_findings(fit: Fit, dilution: float) -> tuple[Finding, ...]:
         found.append(Finding(
             'beyond_noise', f'the residuals are {np.sqrt(fit.chi2 / fit.dof):.1f} times the noise '
             'of the pose means: poses repeat worse than the noise of their samples predicts, or '
-            'the model lacks an effect'))
+            'the model lacks an effect', 'run refine to find the missing effect', step='refine'))
     return (*found, *_hardly_checked(fit))
 
 

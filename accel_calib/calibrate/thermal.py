@@ -163,15 +163,19 @@ class Curve:
     def effects(self) -> tuple[dict[str, Floats], Floats]:
         """Return the effects with their values, and the covariance of these [g²]."""
         shift = REFERENCE_TEMPERATURE - self.reference_c
+        degree = max(self.degree, 1)  # degree 0 is stored as a slope of zero
+        values, covariance = np.zeros((degree, 3)), np.zeros((3, degree, degree))
+        values[:self.degree], covariance[:, :self.degree, :self.degree] = (
+            self.values, self.covariance)
         to = np.array([[comb(j, k) * shift ** (j - k) if j >= k else 0.0
-                        for j in range(1, self.degree + 1)] for k in range(self.degree + 1)])
+                        for j in range(1, degree + 1)] for k in range(degree + 1)])
         first = 0 if shift else 1  # without a shift, the constant is zero
-        names = OFFSET_POWERS[first:self.degree + 1]
-        values = dict(zip(names, (to @ self.values)[first:]))
-        spread = np.einsum('kp,apq,lq->kla', to, self.covariance, to)[first:, first:]
+        names = OFFSET_POWERS[first:degree + 1]
+        found = dict(zip(names, (to @ values)[first:]))
+        spread = np.einsum('kp,apq,lq->kla', to, covariance, to)[first:, first:]
         full = np.zeros((len(names), 3, len(names), 3))
         full[:, range(3), :, range(3)] = np.moveaxis(spread, 2, 0)
-        model = {name: effect_named(name).filled(each) for name, each in values.items()}
+        model = {name: effect_named(name).filled(each) for name, each in found.items()}
         return model, full.reshape(3 * len(names), -1)
 
 

@@ -74,26 +74,30 @@ def command_line(name: str, args: argparse.Namespace, **changed: object) -> str:
 
 def _words(value: object) -> list[str]:
     """Return the value of an option as words of a command line."""
-    if isinstance(value, list):  # --columns
-        return [','.join('='.join(pair) for each in value for pair in each.items())]
     from ..logs import Piped
 
-    return [options.STANDARD_INPUT if isinstance(value, Piped) else str(value)]
+    if not isinstance(value, list):
+        return [options.STANDARD_INPUT if isinstance(value, Piped) else str(value)]
+    columns = [f'{ours}={theirs}' for each in value if isinstance(each, dict)
+               for ours, theirs in each.items()]
+    return [','.join(columns)] if columns else [word for each in value for word in _words(each)]
 
 
 def next_command(step: NextStep, args: argparse.Namespace) -> str:
     """Return the command of the next step after a command; empty if hands are needed."""
     log = getattr(args, 'log', None) or getattr(args, 'poses', None)
-    stored = getattr(args, 'output', None) or getattr(args, 'calibration', None)
-    files = {'poses': log, 'log': log, 'output': stored or Path('calibration.yaml')}
+    written, base = getattr(args, 'output', None), getattr(args, 'calibration', None)
+    # A calibration that was only read is not replaced.
+    beside = Path('calibration.yaml') if base is None else base.with_stem(f'{base.stem}_new')
+    files = {'poses': log, 'log': log, 'output': written or beside}
     match step.kind:
         case 'fit' | 'refine' if log:
             return command_line(step.kind, args, **files)
-        case 'level' if args.command in ('fit', 'calibrate', 'refine'):
+        case 'level' if args.command in ('fit', 'calibrate', 'refine', 'thermal'):
             name = 'calibrate' if args.command == 'refine' else args.command
             return command_line(name, args, **files, flat=next(iter(step.rows), 'ROW'))
-        case 'verify' if stored:
-            return command_line('verify', args, poses='NEW_POSES', calibration=stored)
+        case 'verify' if written or base:
+            return command_line('verify', args, poses='NEW_POSES', calibration=written or base)
     return ''
 
 
@@ -231,7 +235,8 @@ def _export(made: options.Parser) -> None:
 
     made.epilog = '\n'.join([f'{made.epilog}\nformats:', *(
         f'  {name:<11}{each.what}' for name, each in FORMATS.items())])
-    made.add_argument('calibration', type=Path, metavar='CALIBRATION', help='stored calibration')
+    made.add_argument('calibration', type=Path, metavar='CALIBRATION',
+                      help='stored calibration; - for standard input')
     made.add_argument('--to', required=True, choices=tuple(FORMATS), metavar='FORMAT',
                       help='format, see below')
     made.add_argument('-o', '--output', metavar='FILE', help='file to write; - for standard '

@@ -106,10 +106,13 @@ def _thermal_done(args: argparse.Namespace, logs: Sequence[Path], outcome: Therm
 def _curve_lines(curve: Curve) -> Iterator[Any]:
     """Yield the curve as a table and lines."""
     low, high = curve.range_c
-    yield table(f'Offset over T - {curve.reference_c:.1f} °C', ('', *AXES), (
-        (f'mg/°C{"" if k == 1 else "²³"[k - 2]}',
-         *(with_sd(value * MG, sd * MG) for value, sd in zip(values, deviations)))
-        for k, (values, deviations) in enumerate(zip(curve.values, curve.deviations), 1)))
+    if curve.degree:
+        yield table(f'Offset over T - {curve.reference_c:.1f} °C', ('', *AXES), (
+            (f'mg/°C{"" if k == 1 else "²³"[k - 2]}',
+             *(with_sd(value * MG, sd * MG) for value, sd in zip(values, deviations)))
+            for k, (values, deviations) in enumerate(zip(curve.values, curve.deviations), 1)))
+    else:
+        yield 'the offset does not change with the temperature'
     yield (f'degree {curve.degree} from {low:.1f} to {high:.1f} °C: {short(curve.change_mg)} -> '
            f'{short(curve.residual_mg)} mg, uncertainty up to {short(curve.band_mg)} mg')
     if curve.hysteresis_mg is None:

@@ -25,10 +25,11 @@ import json
 import os
 from pathlib import Path
 import re
+import sys
 from typing import Any, NamedTuple, TYPE_CHECKING
 
 from .commands import COMMANDS, next_command
-from .options import BAD_INPUT
+from .options import BAD_INPUT, STANDARD_INPUT
 from .output import Output, progress, Verdict, working
 from ..calibrate import Calibration, FleetPrior
 from ..capture import CaptureSettings
@@ -37,7 +38,7 @@ from ..effects import know_file
 from ..errors import AccelCalibError, InputError, RefusedFitError, saying, system_error
 from ..logs import LogOptions
 from ..pipeline import Intake, options_for, poses_of
-from ..stored import OF_FILE, read_calibration, read_prior
+from ..stored import calibration_from, OF_FILE, read_calibration, read_prior
 from ..table import Poses
 from ..text import counted, plain
 
@@ -153,7 +154,8 @@ def _run_one(args: argparse.Namespace) -> int:
             output.print(f'read as: {error["read_as"]}')
         raise
     write_json(target, done.result)
-    for each in (*done.shown, *(f'stored in {path}' for path in done.stored),
+    for each in (*done.shown, *(f'stored in {path}' for path in done.stored
+                                if str(path) != STANDARD_OUTPUT),
                  *(rating_lines(done.rating, args) if done.rating else ())):
         output.print(each)
     if done.refusal:
@@ -363,8 +365,10 @@ def intake(args: argparse.Namespace, path: Path, calibration: Calibration | None
 
 
 def stored_calibration(path: Path) -> Calibration:
-    """Read a stored calibration; report on standard error if it was edited by hand."""
-    calibration = read_calibration(path)
+    """Read a stored calibration or standard input; report if it was edited by hand."""
+    piped = str(path) == STANDARD_INPUT
+    calibration = (calibration_from(sys.stdin.buffer.read(), 'standard input') if piped else
+                   read_calibration(path))
     for found in calibration.noted:
         if found.kind in OF_FILE:
             Output(stderr=True).print(f'note: {path}: {found.words}')

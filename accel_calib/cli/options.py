@@ -252,7 +252,8 @@ def add_page(made: Parser, about: str = 'page to write (HTML)') -> None:
 
 def add_stored(made: Any, about: str = 'stored calibration', **needed: bool) -> None:
     """Add ``--calibration`` to a parser or a group."""
-    made.add_argument('-c', '--calibration', type=Path, metavar='FILE', help=about, **needed)
+    made.add_argument('-c', '--calibration', type=Path, metavar='FILE',
+                      help=f'{about}; - for standard input', **needed)
 
 
 def add_mounting(made: Parser) -> None:

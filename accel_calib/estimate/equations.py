@@ -198,7 +198,7 @@ class _Kind(NamedTuple):
 
 @dataclass(frozen=True)
 class Measured:
-    """Poses in g by kind of orientation, those alone in blocks, and their noise; see `measured`."""
+    """Poses in g by kind of orientation, those alone in blocks, and noise; see `measured`."""
 
     known: _Kind
     shared: _Kind

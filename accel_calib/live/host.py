@@ -18,8 +18,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator
 from contextlib import suppress
+from dataclasses import replace
+from functools import cache
+from importlib.resources import files
 import math
 from queue import Empty, SimpleQueue
+import re
 from time import monotonic, time
 from typing import Any, TYPE_CHECKING
 
@@ -272,6 +276,20 @@ def _rounded(values: Any) -> Any:
     return [_rounded(each) for each in array]
 
 
+@cache
+def _buttons() -> dict[str, str]:
+    """Return what stands for the services where no ROS runs: the labels of the buttons."""
+    page = (files(__package__) / 'page' / 'index.html').read_text(encoding='utf-8')
+    labels = re.findall(r'data-command="(\w+)"[^>]*>([^<]+)<', page)
+    return {'preview': 'the preview', **dict(reversed(labels))}
+
+
+def _with_buttons(words: str) -> str:
+    """Return words for a person at the page, as the page shows them."""
+    return re.sub(r'(call )?~/(\w+)', lambda found: (
+        f'{"press " if found[1] else ""}{_buttons().get(found[2], found[0])}'), words)
+
+
 _TICK = 1.0
 """Interval between two checks of the stream [s]."""
 
@@ -407,5 +425,5 @@ class Host:
 
     def _log(self, line: Log) -> None:
         if self._filter.passes(line):
-            self._print(line)
+            self._print(replace(line, words=_with_buttons(line.words)))
             self.exchange.show_line(line)

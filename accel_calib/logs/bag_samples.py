@@ -320,6 +320,13 @@ def _unit(topic: ContextTopic, typical: float) -> tuple[str, float, float]:
                      'name another topic')
 
 
+def rate_words(bag: Bag, imu: str) -> str:
+    """Return the rate of an Imu, by the receipt of its first messages; empty if not known."""
+    received = _received(bag.first(imu, size=_PEEKED))
+    seconds = float(np.ptp(received)) if len(received) else 0.0
+    return f' at {(len(received) - 1) / seconds:.3g} Hz' if seconds > 0.0 else ''
+
+
 def _late(bag: Bag, imu: str) -> float:
     """Return the median stamp of the first messages of an Imu after their receipt [s]."""
     block = bag.first(imu, size=_PEEKED)

@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
+import re
 from typing import Literal
 
 import numpy as np
@@ -83,6 +84,11 @@ class LogOptions:
     sensor: str = ''
     temperature_topic: str = ''
     supply_topic: str = ''
+
+    @property
+    def instance(self) -> str:
+        """Return `sensor`, of a flight log: ``1.0``, as programs write a number, is 1."""
+        return re.sub(r'^0*(\d+)(\.0*)?$', r'\1', self.sensor.strip())
 
 
 @dataclass(frozen=True)

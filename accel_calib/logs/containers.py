@@ -33,7 +33,8 @@ import scipy
 
 from .columns import Chosen, chosen, is_log_header, LogOptions
 from .dialect import shown
-from .formats import BLACKBOX, FLIGHT_LOG, HEAD, MATLAB, MATLAB_HDF5, OLE, sound_log
+from .formats import (
+    BLACKBOX, DamagedLogError, FLIGHT_LOG, HEAD, MATLAB, MATLAB_HDF5, OLE, sound_log)
 from .names import meaning, READING, record_instead
 from .text import open_text, TextTable
 from ..errors import InputError, needing
@@ -48,8 +49,8 @@ _MOST_BYTES = 1 << 29
 """Largest size of the parts of an Excel file [bytes]."""
 
 _MOST_CELLS = 50_000_000
-_SMALL, _LARGEST_RATIO = 2_000_000, 100
-"""Numbers that any file may hold, and largest ratio of unpacked to packed data."""
+_SMALL, _LARGEST_RATIO, _NUMBER_BYTES = 2_000_000, 100, 8
+"""Numbers that any file may hold, largest ratio of unpacked to packed data, size of a number."""
 
 _ROWS = 500
 """Number of rows of a sheet that are read at once."""
@@ -151,8 +152,9 @@ def _member_of(path: Path, members: Sequence[Member], options: LogOptions) -> Me
                          f'name one of these with --topic "{names[0]}"')
     tables, refused = _tables(path, wanted, options)
     if not tables:
-        if len(wanted) == 1:
-            raise refused[0]
+        damaged = [err for err in refused if isinstance(err, DamagedLogError)]
+        if damaged or len(wanted) == 1:
+            raise (damaged or refused)[0]
         raise InputError(f'{path} has the tables {shown(names)}, expected one of an accelerometer',
                          'export the table of the accelerometer, with gravity, or name one with '
                          f'--topic "{names[0]}" to see why it is not read')
@@ -190,6 +192,11 @@ def _is_named(member: Member, columns: Chosen) -> bool:
                for name in names)
 
 
+def _most_numbers(path: Path) -> int:
+    """Return the largest number of numbers that a file of this size holds."""
+    return max(_SMALL, _LARGEST_RATIO * path.stat().st_size // _NUMBER_BYTES)
+
+
 # ----------------------------------------------------------------------------- ZIP archives
 
 @contextmanager
@@ -201,7 +208,7 @@ def _sound_archive(path: Path) -> Iterator[None]:
         if isinstance(err, OSError) and err.errno is not None:
             raise  # only damaged bytes of bz2 have no number
         raise InputError(f'{path} cannot be unpacked ({reason(err)}), expected a ZIP archive',
-                         _UNPACK) from err
+                         f'copy it again, or {_UNPACK}') from err
 
 
 def _files(path: Path, archive: zipfile.ZipFile) -> list[Member]:
@@ -236,15 +243,13 @@ def _sheets(path: Path, archive: zipfile.ZipFile) -> Iterator[Sequence[Member]]:
                          'Excel file', _AGAIN)
     with needing('openpyxl', 'an Excel file (.xlsx)'):
         import openpyxl
-    with sound_log(path, 'an Excel file (.xlsx)', _AGAIN):
-        book = openpyxl.load_workbook(path, read_only=True, data_only=True)
-        for sheet in book.worksheets:
-            sheet.reset_dimensions()  # those that the file states can be wrong
-    try:
+    with path.open('rb') as file:  # of a path, the suffix would have to be right
+        with sound_log(path, 'an Excel file (.xlsx)', _AGAIN):
+            book = openpyxl.load_workbook(file, read_only=True, data_only=True)
+            for sheet in book.worksheets:
+                sheet.reset_dimensions()  # those that the file states can be wrong
         yield [Member(sheet.title, size, partial(
             _rows, path, partial(sheet.iter_rows, values_only=True))) for sheet in book.worksheets]
-    finally:
-        book.close()
 
 
 def _old_sheets(path: Path) -> list[Member]:
@@ -276,6 +281,7 @@ def _csv(rows: Iterator[Sequence[Any]]) -> Iterator[bytes]:
 def _padded(path: Path, rows: Iterator[Sequence[Any]]) -> Iterator[list[str]]:
     """Yield the rows of a sheet as text; all rows have the same number of cells."""
     width = cells = 0
+    most = min(_MOST_CELLS, _most_numbers(path))
     while True:
         with sound_log(path, 'an Excel file', _AGAIN):
             block = [[_cell(value) for value in row] for row in islice(rows, _ROWS)]
@@ -283,9 +289,9 @@ def _padded(path: Path, rows: Iterator[Sequence[Any]]) -> Iterator[list[str]]:
             return
         width = max(width, *map(len, block))
         cells += (width + 1) * len(block)
-        if cells > _MOST_CELLS:
-            raise InputError(f'{path} has more than {_MOST_CELLS} cells, expected a smaller Excel '
-                             'file', _AGAIN)
+        if cells > most:
+            raise InputError(f'{path} has more than {most} cells, expected a smaller Excel file',
+                             _AGAIN)
         yield from ([*row, *[''] * (width - len(row))] for row in block)
 
 
@@ -307,7 +313,7 @@ def _arrays(path: Path) -> list[Member]:
         plain = [name for name, shape, kind in held
                  if kind in _NUMBERS and len(shape) == 2 and max(shape) > 1]
         size = sum(int(np.prod(shape)) for name, shape, _ in held if name in plain)
-        most = max(_SMALL, _LARGEST_RATIO * path.stat().st_size // 8)
+        most = _most_numbers(path)
         found = scipy.io.loadmat(path, variable_names=plain) if 0 < size <= most else {}
     if not found:
         kinds = shown([f'{kind} {name}' for name, _, kind in held])

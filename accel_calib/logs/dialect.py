@@ -46,9 +46,10 @@ _TRIED_LINES = 200
 _SAMPLE_ROWS = 200
 """Number of first rows in `Layout.sample`."""
 
-_RATE = re.compile(r'(?:rate|frequency|\bodr|\bat)\b[^\w\n]{0,12}(\d+(?:\.\d+)?) ?(k?)Hz\b',
-                   re.ASCII | re.IGNORECASE)
-"""Rate of the samples in the lines before a table: ``Sample rate: 50.0Hz``, ``at 100 Hz``."""
+_RATE = re.compile(
+    r'(?:rate|frequency|\bodr|\bfs|\bat)\b(?:[^\w\n]{0,12}(\d+(?:\.\d+)?)[ ,;\t]?(k?)Hz\b|'
+    r'\W{1,2}(k?)Hz\W{1,6}(\d+(?:\.\d+)?)\b)', re.ASCII | re.IGNORECASE)
+"""Rate of the samples in the lines before a table: ``Sample rate: 50.0Hz``, ``fs (Hz): 100``."""
 
 _MONITOR = re.compile(r'^(\d{1,2}:\d{2}:\d{2}(?:\.\d+)?) -> ')
 """Time that the serial monitor of the Arduino IDE puts before a line."""
@@ -72,7 +73,7 @@ EPOCH_S = (1e9, 4e9)
 
 _CLOCK = re.compile(
     r'(?:(\d{4}[-/]\d{1,2}[-/]\d{1,2}|\d{1,2}-[A-Za-z]{3}-\d{4}|\d{1,2}\.\d{1,2}\.\d{4})[T ])?'
-    r'(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d+))?)? ?(Z|UTC|[-+]\d{2}(?::?\d{2})?)?', re.ASCII)
+    r'(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,:](\d+))?)? ?(Z|UTC|[-+]\d{2}(?::?\d{2})?)?', re.ASCII)
 _DAYS = ('%Y-%m-%d', '%d-%b-%Y', '%d.%m.%Y')
 
 IsHeader = Callable[[Sequence[str]], bool]
@@ -429,8 +430,8 @@ def _passed_over(lines: Sequence[str]) -> tuple[str, ...]:
 
 def _stated_rate(lines: Sequence[str]) -> float | None:
     """Return the rate of the samples that lines state [Hz]; None if they state none or several."""
-    found = {float(value) * (1000.0 if kilo else 1.0)
-             for line in lines for value, kilo in _RATE.findall(line[:1000])}
+    found = {float(before or after) * (1000.0 if any(kilo) else 1.0)
+             for line in lines for before, *kilo, after in _RATE.findall(line[:1000])}
     return found.pop() if len(found) == 1 and min(found) > 0.0 else None
 
 

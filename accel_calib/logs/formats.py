@@ -35,11 +35,15 @@ FLIGHT_LOG = re.compile(rb'\A(?:' + re.escape(ULOG) + b'|' + re.escape(DATAFLASH
 _STANDARD_ERROR = 2
 
 
+class DamagedLogError(InputError):
+    """A library cannot read a log."""
+
+
 @contextmanager
 def sound_log(path: Path, expected: str, advice: str = 'copy it from the vehicle again'
               ) -> Iterator[None]:
     """
-    Turn what a library raises for a damaged log into one InputError, and drop what it prints.
+    Turn what a library raises for a damaged log into one DamagedLogError, and drop what it prints.
 
     Libraries of logs raise errors of any class, and print. Errors of the system pass.
 
@@ -51,8 +55,8 @@ def sound_log(path: Path, expected: str, advice: str = 'copy it from the vehicle
         # Of a library, or a seek to before the start of a file, by a damaged length.
         if isinstance(err, OSError) and err.errno not in (None, errno.EINVAL):
             raise
-        raise InputError(f'{path} is damaged ({reason(err)}), expected {expected}',
-                         advice) from err
+        raise DamagedLogError(f'{path} is damaged ({reason(err)}), expected {expected}',
+                              advice) from err
 
 
 @contextmanager

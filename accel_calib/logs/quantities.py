@@ -29,7 +29,7 @@ from .columns import Chosen, LogOptions, unused
 from .names import DEGREE, meaning, RATE, READING, record_instead, unit_of, ZEROS
 from .text import Cells
 from .times import Clock, clock_of
-from ..errors import InputError
+from ..errors import InputError, saying
 from ..table import COLUMNS, Floats
 from ..units import STANDARD_GRAVITY, UnitName, Units, units_of
 
@@ -178,9 +178,11 @@ def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
         first = _of_instance(columns, first, made.instance)
     if 'time' in columns.sources:
         made.clock = clock_of(columns, first, options)
-        made.said += filter(None, [made.clock.words])
         made.notes += made.clock.doubts
-    _decide_reading(made, first, options)
+    samples = _decide_samples(made, first, options)
+    if 'time' in columns.sources and (samples or columns.sources['time'].name != 'time'):
+        made.said.append(made.clock.words)
+    _decide_reading(made, first, options, samples=samples)
     _decide_rate(made, first)
     _decide_temperature(made, first)
     if 'supply_voltage' in columns.sources:
@@ -193,10 +195,10 @@ def _instance(columns: Chosen, first: Cells, options: LogOptions, notes: list[st
     there = np.unique(columns.numbers(first, 'instance')).tolist()
     names = [f'{each:g}' for each in there]
     if options.sensor:
-        if options.sensor not in names:
+        if options.instance not in names:
             raise InputError(f'{columns.layout.path} has the sensors {", ".join(names)}, expected '
                              f'{options.sensor}', 'choose one of them with --sensor')
-        return float(options.sensor)
+        return float(options.instance)
     if len(there) > 1:
         notes.append(f'the log has the sensors {", ".join(names)}; sensor {names[0]} is read: '
                      'choose another with --sensor')
@@ -205,22 +207,22 @@ def _instance(columns: Chosen, first: Cells, options: LogOptions, notes: list[st
 
 # ---------------------------------------------------------------------------------- reading
 
-def _decide_reading(made: Quantities, first: Cells, options: LogOptions) -> None:
+def _decide_reading(made: Quantities, first: Cells, options: LogOptions, *, samples: bool
+                    ) -> None:
     """Decide the unit of the readings; raise InputError if what states it is contradicted."""
     columns = made.chosen
-    raw = columns.three(first, READING)
-    samples = _decide_samples(made, first, raw, options)
     named, factor = _named(columns)
     stated = _stated(columns, options) or (not named and options.default_units) or ''
     if stated and stated != named:
         factor = 1.0
-    rests = rests_of(raw * factor, samples=samples)
-    name = stated or named
-    _check_gravity(columns, rests, units_of(name, options.gravity) if name else None)
+    rests = rests_of(columns.three(first, READING) * factor, samples=samples)
+    name, words = stated or named, compact(columns.names(READING))
+    with saying(', '.join([*made.said, f'{words} in {name}' if name else words])):
+        _check_gravity(columns, rests, units_of(name, options.gravity) if name else None)
+        if name and not stated:
+            _check_named(columns, rests, units_of(name))
     if not name:
         name, factor = _at_rest(columns, rests)
-    elif not stated:
-        _check_named(columns, rests, units_of(name))
     made.units = units_of(name, options.gravity)
     made.scale(READING, factor)
     is_ours = columns.names(READING) == list(READING) and (stated or made.units.is_si)
@@ -232,8 +234,9 @@ def _decide_reading(made: Quantities, first: Cells, options: LogOptions) -> None
                           'alike')
 
 
-def _decide_samples(made: Quantities, first: Cells, raw: Floats, options: LogOptions) -> bool:
+def _decide_samples(made: Quantities, first: Cells, options: LogOptions) -> bool:
     """Return whether rows are samples, rather than poses; set their rate if they lack times."""
+    raw = made.chosen.three(first, READING)
     there = {key: raw for key, column in COLUMNS.items() if column.names[0] in made.chosen.sources}
     if 'time' in made.chosen.sources:
         return are_samples({**there, 'time': made.clock.seconds(first)})

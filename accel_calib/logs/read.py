@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from .autopilot import FlightLog
 from .bag import Bag, open_bag
-from .bag_samples import context_of, imu_samples, together
+from .bag_samples import context_of, imu_samples, rate_words, together
 from .columns import check_once, chosen, is_log_header, LogOptions, Source, with_indices
 from .containers import Frame, open_table, Piped
 from .dialect import layout_of
@@ -171,7 +171,7 @@ def _opened(path: Path | Piped | Frame, options: LogOptions) -> Iterator[OpenLog
             yield replace(log, read_as=', '.join(filter(None, (member, log.read_as))))
     elif FLIGHT_LOG.search(head):
         read_flight = read_ulg if head.startswith(ULOG) else read_dataflash
-        yield _flight(path, read_flight(path, options.topic, options.sensor), options)
+        yield _flight(path, read_flight(path, options.topic, options.instance), options)
     else:
         with open_text(path, lambda cells: is_log_header(cells, options)) as text:
             yield _text(path, text, options)
@@ -192,7 +192,8 @@ def _bag(bag: Bag, options: LogOptions) -> OpenLog:
     # Drivers exist that publish g, although Imu messages are in m/s².
     units = units_of(options.units or options.default_units or 'm/s2', options.gravity)
     return OpenLog(_checked(bag.path, blocks, units), bag.count(topic), units, sensor,
-                   f'Imu messages of {topic} in {units.name}', noted=lambda: notes)
+                   f'Imu messages of {topic}{rate_words(bag, topic)} in {units.name}',
+                   noted=lambda: notes)
 
 
 def _flight(path: Path, log: FlightLog, options: LogOptions) -> OpenLog:

@@ -46,6 +46,9 @@ _MOST_BACK = 0.1
 
 _USUAL_HZ = 100.0
 
+_GAP = 3.0
+"""Steps above this ratio to the median are interruptions."""
+
 _MANY_ROWS = 500
 _WINDOW = 8
 _AT_REST = 0.3
@@ -111,18 +114,21 @@ def clock_of(columns: Chosen, first: Cells, options: LogOptions) -> Clock:
         raise InputError(f'{layout.path} has times, but --rate is {options.rate:g}',
                          'remove --rate, or leave the times out with --columns time=')
     if columns.dates:
-        if has_date(columns.texts(first, 'time')[0]):
-            return Clock(columns, words=f'{source.name}: dates -> s')
-        return Clock(columns, periods=(_DAY_S,), words=f'{source.name}: times of the day -> s')
+        dated = has_date(columns.texts(first, 'time')[0])
+        rate = _rate_words(_step_of(Clock(columns).seconds(first)))
+        return Clock(columns, periods=() if dated else (_DAY_S,), words=(
+            f'{source.name}: {"dates" if dated else "times of the day"}{rate} -> s'))
     stamps = columns.numbers(first, 'time')
     back = np.count_nonzero(np.diff(stamps) < 0.0)
     if not layout.header and back > _MOST_BACK * (len(stamps) - 1):
         raise InputError(f'{layout.path} has no header line, and column '
                          f'{source.name} does not increase, expected times',
                          'add a header line, or name the columns with --columns ax=1,ay=2,az=3')
-    unit, words = _unit_of_time(columns, first, stamps)
+    unit = _unit_of_time(columns, first, stamps)
     scale = {**_UNITS, _TICK: 1e-4}[unit]
     step = scale * _step_of(stamps)
+    named = f'column {source.name}' if source.name.isdecimal() else source.name
+    words = f'{named} in {unit}{_rate_words(step)}{"" if unit == "s" else " -> s"}'
     agrees = not layout.rate_hz or not step > 0.0 or any(
         _agree(1.0 / step, rate) for rate in rates_beside(layout, source))
     doubts = () if agrees else (f'{source.name} has {1.0 / step:.4g} samples per second, but the '
@@ -130,26 +136,23 @@ def clock_of(columns: Chosen, first: Cells, options: LogOptions) -> Clock:
     return Clock(columns, scale, _PERIODS_S.get(unit, ()), words, doubts)
 
 
-def _unit_of_time(columns: Chosen, first: Cells, stamps: Floats) -> tuple[str, str]:
-    """Return the unit of stamps, and what is assumed about it."""
+def _rate_words(step: float) -> str:
+    return f' ({1.0 / step:.3g} Hz)' if step > 0.0 else ''
+
+
+def _unit_of_time(columns: Chosen, first: Cells, stamps: Floats) -> str:
     source, layout = columns.sources['time'], columns.layout
     of_maker = columns.maker and columns.maker.scales.get('time')
     if of_maker:
-        unit = next(name for name, factor in _UNITS.items() if factor == of_maker)
-        return unit, f'{source.name} in {unit}' if unit != 's' else ''
+        return next(name for name, factor in _UNITS.items() if factor == of_maker)
     stated = unit_of('time', source.unit)
     if stated:
-        return stated[0], f'{source.name} -> s' if stated[0] != 's' else source.name
+        return stated[0]
     if layout.header and source.name == 'time' and (layout.about or 'count' in columns.sources
                                                     or not _by_rate(columns, first, stamps)):
-        return 's', ''
+        return 's'
     units = TICKS.get(bare_name(source.name), _UNITS)
-    found = _unit_by_rate(stamps, rates_beside(layout, source), units)
-    named = f'column {source.name}' if source.name.isdecimal() else source.name
-    if found is None:
-        return 's', f'{named} in s'
-    return found[0], f'{named} in {found[0]} ({found[1]:.3g} Hz)' + (
-        ' -> s' if found[0] != 's' else '')
+    return _unit_by_rate(stamps, rates_beside(layout, source), units)
 
 
 def _by_rate(columns: Chosen, first: Cells, stamps: Floats) -> bool:
@@ -159,11 +162,11 @@ def _by_rate(columns: Chosen, first: Cells, stamps: Floats) -> bool:
 
 
 def _unit_by_rate(stamps: Floats, beside: Sequence[float], units: Mapping[str, float]
-                  ) -> tuple[str, float] | None:
-    """Return the unit with a plausible rate, best one that the file states, and the rate [Hz]."""
+                  ) -> str:
+    """Return the unit with a plausible rate, best one that the file states; else s."""
     step = _step_of(stamps)
     if not step > 0.0:
-        return None
+        return 's'
     rates = {name: 1.0 / (step * unit) for name, unit in units.items()}
     plausible = [name for name, rate in rates.items() if RATES_HZ[0] * 0.9 <= rate
                  <= RATES_HZ[1] * 1.1]
@@ -172,9 +175,8 @@ def _unit_by_rate(stamps: Floats, beside: Sequence[float], units: Mapping[str, f
                   if EPOCH_S[0] <= float(np.median(stamps)) * units[name] <= EPOCH_S[1]]
     if not np.all(stamps == np.round(stamps)) and 's' in plausible:
         plausible = ['s']
-    best = min(stated or since_1970 or plausible, default=None,
+    return min(stated or since_1970 or plausible, default='s',
                key=lambda name: abs(math.log(rates[name] / _USUAL_HZ)))
-    return None if best is None else (best, rates[best])
 
 
 def _agree(one: float, two: float) -> bool:
@@ -187,10 +189,9 @@ def _step_of(stamps: Floats) -> float:
     if not len(steps):
         return 0.0
     middle = float(np.median(steps))
-    forward = steps[steps > 0.0]
-    if middle > 0.0 or not len(forward):
-        return middle
-    return float(forward.sum()) / len(steps)
+    if middle > 0.0:  # the mean, because stamps can be rounded, but without interruptions
+        return float(np.mean(steps[(steps >= 0.0) & (steps <= _GAP * middle)]))
+    return float(np.maximum(steps, 0.0).sum()) / len(steps)
 
 
 def _is_dense(stamps: Floats, reading: Floats) -> bool:

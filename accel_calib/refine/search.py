@@ -62,8 +62,8 @@ _TIMED = 30.0
 """A curve over time must have a score better than a walk by this."""
 
 _INSTEAD = {'force': 2.0, 'offset': 10.0, 'gain': 10.0}
-"""A curve in place of one effect must have a score better by this (Kass and Raftery 1995: positive,
-very strong). A curve over what changes slowly begins with half a wave, which is almost a line."""
+"""A curve in place of one effect must have a score better by this (Kass and Raftery 1995:
+positive, very strong). One over what changes slowly begins with half a wave, almost a line."""
 
 _SEVERAL = 10.0
 """Each further effect of the same kind must raise the score by this: one unknown cause is more

@@ -9,7 +9,8 @@ Files of this package: calibrations and what a fleet of sensors has in common.
 """
 
 from .calibration_yaml import (
-    calibration_bytes, OF_FILE, read_calibration, read_prior, write_calibration, write_priors)
+    calibration_bytes, calibration_from, OF_FILE, read_calibration, read_prior, write_calibration,
+    write_priors)
 
-__all__ = ['OF_FILE', 'calibration_bytes', 'read_calibration', 'read_prior', 'write_calibration',
-           'write_priors']
+__all__ = ['OF_FILE', 'calibration_bytes', 'calibration_from', 'read_calibration', 'read_prior',
+           'write_calibration', 'write_priors']

@@ -257,8 +257,6 @@ def _lacking(name: str, values: Floats, made: Made, left: Callable[[dict[str, Fl
              ) -> str:
     """Return what a format does with an effect that it does not hold."""
     effect = effect_named(name)
-    if effect.is_offset and made.rounded:
-        return f'rounds the zero-g offset to {made.rounded}'
     parameters, shape = effect.split(values)
     words = effect.words.partition(',')[0]
     if name in made.rounded:
