@@ -30,15 +30,15 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from .server import PageServer, PERIOD
-from .viewer import Message, OFFERED
+from .viewer import Message
 from ..calibrate import Calibration
 from ..errors import AccelCalibError, InputError, system_error
 from ..findings import rate, residual_figures
 from ..messages.one_reading import Triple
 from ..report import calibration_page, STORED
 from ..session import (
-    Answer, BATCH, CalibratorSettings, CallSoon, checks, Compute, Level, Log, LogFilter, Progress,
-    Session, Severity, ShowPoses, state, Task, title, words_of_state, Worker)
+    Answer, BATCH, CalibratorSettings, CallSoon, checks, Commands, Compute, Level, Log, LogFilter,
+    Progress, Session, Severity, ShowPoses, state, Task, title, words_of_state, Worker)
 from ..stored.exports import export, Exported
 from ..table import Floats
 from ..units import MG
@@ -73,6 +73,7 @@ class Exchange:
     def __init__(self, session: Session, worker: Worker, call_soon: CallSoon,
                  log: Callable[[Log], None]) -> None:
         self._session, self._worker = session, worker
+        self._commands = Commands(session, offers=True)
         self._call_soon, self._log = call_soon, log
         self.show: Show = lambda message: None
         self.problem = ''
@@ -141,11 +142,9 @@ class Exchange:
             self.show_state()
 
     def _command(self, name: str) -> Task:
-        commands = self._session.commands
         if name in ('enable', 'disable'):
-            return commands.enable(name == 'enable')
-        command = getattr(commands, name)
-        return (yield from command(offered=True) if name in OFFERED else command())
+            return self._commands.enable(name == 'enable')
+        return (yield from getattr(self._commands, name)())
 
     def _draw(self, answer: Answer) -> None:
         """Draw the calibration page, unless it is drawn already."""

@@ -38,7 +38,7 @@ from typing import Any, TYPE_CHECKING, TypeVar
 from aiohttp import web, WSCloseCode, WSMsgType
 
 from ..errors import InputError
-from ..session import ros_home
+from ..session import COMMANDS as COMMANDS_OF_A_SESSION, ros_home
 
 if TYPE_CHECKING:
     from .server import PageServer
@@ -65,11 +65,7 @@ _HEADERS = {'Server': 'accel_calib', 'X-Content-Type-Options': 'nosniff',
 
 Message = Mapping[str, Any]
 
-OFFERED = ('fit', 'refine', 'set_level', 'set_heading', 'calibrate_at_rest')
-"""Commands whose result is offered as a preview."""
-
-COMMANDS = ('capture_pose', 'undo_pose', *OFFERED, 'save', 'undo', 'load', 'reset', 'enable',
-            'disable')
+COMMANDS = (*COMMANDS_OF_A_SESSION, 'enable', 'disable')
 """Commands of the page."""
 
 LARGEST = 4096

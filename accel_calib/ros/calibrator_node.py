@@ -43,8 +43,8 @@ from ..errors import AccelCalibError
 from ..live import check_installed
 from ..messages.correction import output_frame
 from ..session import (
-    CalibratorSettings, Check, checks, context_topics, Event, figures, Level, Log, LogFilter,
-    Mounting, Result, Session, ShowPoses, state, Still, Worker, worst)
+    CalibratorSettings, Check, checks, COMMANDS, context_topics, Event, figures, Level, Log,
+    LogFilter, Mounting, Result, Session, ShowPoses, state, Still, Worker, worst)
 from ..table import Floats
 
 if TYPE_CHECKING:
@@ -52,10 +52,6 @@ if TYPE_CHECKING:
 
     from ..live.host import Exchange
     from ..live.server import PageServer
-
-_TRIGGERS = ('capture_pose', 'undo_pose', 'fit', 'refine', 'set_level', 'set_heading',
-             'calibrate_at_rest', 'save', 'load', 'undo', 'reset')
-"""Services that are commands of the session."""
 
 _PROGRESS_EVERY = 0.25
 """Shortest time between two messages of ~/progress without a new pose [s]."""
@@ -162,7 +158,7 @@ class Calibrator:
                                            qos_overriding_options=self._overrides)
 
     def _serve(self) -> None:
-        for name in _TRIGGERS:
+        for name in COMMANDS:
             command = getattr(self.session.commands, name)
             serve(self._node, name, command, self._worker, self._log)
         self._node.create_service(SetBool, '~/enable', self._on_enable, qos_profile=CALLS)

@@ -12,6 +12,7 @@ the messages, `state` the state. `settings` defines the parameters.
 """
 
 from . import state
+from .commands import COMMANDS, Commands
 from .sensor import title
 from .session import BATCH, Session
 from .settings import (
@@ -23,9 +24,9 @@ from .worker import (
     Answer, answered, CallSoon, Compute, Event, Files, Log, LogFilter, Mounting, Result, Severity,
     ShowPoses, Step, Still, Task, Worker, WorkerProcess)
 
-__all__ = ['BATCH', 'WEB_PORT', 'Answer', 'CalibratorSettings', 'CallSoon', 'Check', 'Compute',
-           'Event', 'Files', 'Level', 'Log', 'LogFilter', 'Mounting', 'Progress', 'Result',
-           'Session', 'Settings', 'Severity', 'ShowPoses', 'Step', 'Still', 'Task', 'Worker',
-           'WorkerProcess', 'answered', 'changed', 'checks', 'columns_of', 'context_topics',
-           'default_of', 'expected', 'figures', 'parameter', 'ros_home', 'state', 'title',
-           'words_of_state', 'worst']
+__all__ = ['BATCH', 'COMMANDS', 'WEB_PORT', 'Answer', 'CalibratorSettings', 'CallSoon', 'Check',
+           'Commands', 'Compute', 'Event', 'Files', 'Level', 'Log', 'LogFilter', 'Mounting',
+           'Progress', 'Result', 'Session', 'Settings', 'Severity', 'ShowPoses', 'Step', 'Still',
+           'Task', 'Worker', 'WorkerProcess', 'answered', 'changed', 'checks', 'columns_of',
+           'context_topics', 'default_of', 'expected', 'figures', 'parameter', 'ros_home', 'state',
+           'title', 'words_of_state', 'worst']

@@ -5,9 +5,9 @@
 The commands of a session: what the services of the node do, and their computations.
 
 A command is a generator. It yields what is to be computed or stored, and returns its answer, or
-raises an error that says what to do. If the parameter ``confirm`` is set, or a command is called
-with `offered`, a new calibration is only offered: it is published on ~/preview, until ~/save
-stores it or ~/undo discards it. Most computations run in the worker process.
+raises an error that says what to do. If the parameter ``confirm`` is set, or the commands are of a
+page, a new calibration is only offered: it is published on ~/preview, until ~/save stores it or
+~/undo discards it. Most computations run in the worker process.
 
 """
 
@@ -55,15 +55,20 @@ _BEYOND = 100.0
 """Ratio to the typical size above which an effect is not caused by the sensor."""
 
 
+COMMANDS = ('capture_pose', 'undo_pose', 'fit', 'refine', 'set_level', 'set_heading',
+            'calibrate_at_rest', 'save', 'undo', 'load', 'reset')
+"""The commands without an argument, which are services of the node and buttons of the page."""
+
+
 class ChangedError(AccelCalibError):
     """The calibration changed during a fit or a refinement."""
 
 
 class Commands:
-    """The commands of a session, which is the only argument."""
+    """The commands of a session; those with `offers` only offer a new calibration."""
 
-    def __init__(self, session: Session) -> None:
-        self._session = session
+    def __init__(self, session: Session, *, offers: bool = False) -> None:
+        self._session, self._offers = session, offers
         self._refused, self._auto_fit_at = '', -math.inf
 
     # Poses
@@ -103,10 +108,9 @@ class Commands:
 
     # Calibrations
 
-    def fit(self, *, offered: bool = False) -> Task:
+    def fit(self) -> Task:
         """Fit the poses; use and store the calibration, or only offer it."""
-        fitted = yield from _fit(self._session)
-        return (yield from _use(self._session, fitted, offered=offered))
+        return (yield from self._use((yield from _fit(self._session))))
 
     def due(self) -> list[Task]:
         """Return an automatic fit if one is due."""
@@ -134,9 +138,9 @@ class Commands:
                 return ''
             raise
         self._refused = ''
-        return (yield from _use(self._session, fitted)) if fitted.differs else ''
+        return (yield from self._use(fitted)) if fitted.differs else ''
 
-    def refine(self, *, offered: bool = False) -> Task:
+    def refine(self) -> Task:
         """Refine the calibration; use and store the refined calibration, or only offer it."""
         session = self._session
         fitted = yield from _sound(session, 'refine', refined, session.units, session.name,
@@ -144,22 +148,21 @@ class Commands:
                                    session.own)
         if fitted.refinement is not None:
             session.sensor.guide.follow(fitted.refinement.plan.poses)
-        return (yield from _use(session, fitted, offered=offered))
+        return (yield from self._use(fitted))
 
     # The mounting
 
-    def set_level(self, *, offered: bool = False) -> Task:
+    def set_level(self) -> Task:
         """Level the mounting from the ongoing rest; without a calibration, the mounting alone."""
         session, rest = self._session, _rest(self._session)
         calibration = session.sensor.present
         if calibration is None:
             calibration = session.with_given(mounting_only(
                 poses_from([rest]), session.units, sensor=session.name, date=now()))
-        return (yield from _use_mounting(
-            session, _levelled(session, calibration, rest),
-            'the mounting is levelled by this pose', offered=offered))
+        return (yield from self._use_mounting(_levelled(session, calibration, rest),
+                                              'the mounting is levelled by this pose'))
 
-    def set_heading(self, *, offered: bool = False) -> Task:
+    def set_heading(self) -> Task:
         """Set the heading of the mounting from the ongoing rest, with the nose down."""
         session, calibration = self._session, self._session.sensor.present
         if calibration is None or not calibration.is_levelled:
@@ -171,9 +174,9 @@ class Commands:
         if headed.rotation[:, 0] @ calibration.rotation[:, 0] < 0.0:
             words += ('; the front of the robot is now on the other side of the sensor: if the '
                       'nose was up, tilt it down and call ~/set_heading again')
-        return (yield from _use_mounting(session, headed, words, offered=offered))
+        return (yield from self._use_mounting(headed, words))
 
-    def calibrate_at_rest(self, *, offered: bool = False) -> Task:
+    def calibrate_at_rest(self) -> Task:
         """Take mounting, gyro bias and the offset along gravity from the ongoing level rest."""
         session, rest = self._session, _rest(self._session)
         before = session.sensor.present
@@ -183,8 +186,39 @@ class Commands:
         if calibration.gyro is not None:
             bias = ', '.join(f'{np.degrees(part):+.3f}' for part in calibration.gyro.bias)
             words += f', gyro bias ({bias}) °/s'
-        return (yield from _use_mounting(session, _levelled(session, calibration, rest), words,
-                                         offered=offered))
+        return (yield from self._use_mounting(_levelled(session, calibration, rest), words))
+
+    def _use_mounting(self, calibration: Calibration, words: str) -> Part[str]:
+        """Use or offer a calibration with a new mounting; return the answer."""
+        sensor = self._session.sensor
+        details = [change_words(sensor.present, calibration), *(
+            each.words for each in calibration.noted if each.kind in ('flat_pose', 'heading'))]
+        return (yield from self._use(Fitted(
+            calibration, f'{words}; {angle_words(calibration.rotation)}', details,
+            refinement=sensor.refinement)))
+
+    def _use(self, fitted: Fitted) -> Part[str]:
+        """Store and use, or offer, a new calibration; log the details, and return the answer."""
+        session, calibration, words = self._session, fitted.calibration, fitted.words
+        store, mounting = session.files.usable(), session.mounting_words(calibration)
+        if self._offers or session.settings.confirm:
+            session.sensor.offer(calibration)
+            session.rate(fitted.refinement, fitted.rating)
+            session.log('info', '; '.join(filter(None, [*fitted.details, mounting])))
+            return (f'{words}; published on ~/preview only: call ~/save to use and store it, or '
+                    '~/undo to discard it')
+        try:
+            yield from _alone(session, Files(
+                store.write, after=Parse(store.prepared, calibration)))
+        except OSError as error:
+            session.adopt(calibration, fitted.refinement, fitted.rating)
+            session.sensor.unsaved = True
+            raise InputError(f'the calibration is in use but could not be stored: {error}',
+                             f'{writing_advice(error)}, and call ~/save') from error
+        session.adopt(calibration, fitted.refinement, fitted.rating)
+        session.log('info', '; '.join(filter(None, [
+            *fitted.details, f'stored in {store.calibration}', mounting])))
+        return f'{words}{next_words(session)}'
 
     # Files
 
@@ -297,39 +331,6 @@ def _levelled(session: Session, calibration: Calibration, rest: Dwell) -> Calibr
                          'mounting_rpy or base_frame', 'place the robot level, or correct the '
                          'given mounting and restart the node')
     return levelled
-
-
-def _use_mounting(session: Session, calibration: Calibration, words: str, *, offered: bool
-                  ) -> Part[str]:
-    """Store and use, or offer, a calibration with a new mounting; return the answer."""
-    details = [change_words(session.sensor.present, calibration), *(
-        each.words for each in calibration.noted if each.kind in ('flat_pose', 'heading'))]
-    return (yield from _use(session, Fitted(
-        calibration, f'{words}; {angle_words(calibration.rotation)}', details,
-        refinement=session.sensor.refinement), offered=offered))
-
-
-def _use(session: Session, fitted: Fitted, *, offered: bool = False) -> Part[str]:
-    """Store and use, or offer, a new calibration; log the details, and return the answer."""
-    calibration, words, store = fitted.calibration, fitted.words, session.files.usable()
-    mounting = session.mounting_words(calibration)
-    if offered or session.settings.confirm:
-        session.sensor.offer(calibration)
-        session.rate(fitted.refinement, fitted.rating)
-        session.log('info', '; '.join(filter(None, [*fitted.details, mounting])))
-        return (f'{words}; published on ~/preview only: call ~/save to use and store it, or '
-                '~/undo to discard it')
-    try:
-        yield from _alone(session, Files(store.write, after=Parse(store.prepared, calibration)))
-    except OSError as error:
-        session.adopt(calibration, fitted.refinement, fitted.rating)
-        session.sensor.unsaved = True
-        raise InputError(f'the calibration is in use but could not be stored: {error}',
-                         f'{writing_advice(error)}, and call ~/save') from error
-    session.adopt(calibration, fitted.refinement, fitted.rating)
-    session.log('info', '; '.join(filter(None, [
-        *fitted.details, f'stored in {store.calibration}', mounting])))
-    return f'{words}{next_words(session)}'
 
 
 def _alone(session: Session, step: Parse) -> Part[Any]:
