@@ -240,7 +240,7 @@ FLIGHTS = ({'flight': 'ULog\x01\x12\x35'},
 @pytest.mark.parametrize(('write', 'content', 'words'), [
     (zipped, {'gyro': f'{GYRO}\n0,0,0,0\n', 'baro': 't,p\n0,1\n'},
      'gyro.csv, baro.csv, expected one of an acc'),
-    (zipped, {'meta/time': 'a,b\n'}, 'holds 0 files'),
+    (zipped, {'meta/time': 'a,b\n'}, 'holds 0 tables'),
     (encrypted, ONE, 'needs a password'),
     (before_its_start, ONE, 'cannot be unpacked .*a file starts before'),
     *((write, flight, 'holds the flight log flight.*unpack it')
@@ -297,6 +297,25 @@ def test_a_small_container_takes_little_memory(kind: str, tmp_path: Path) -> Non
         assert tracemalloc.get_traced_memory()[1] < (250e6 if kind == 'mat' else 150e6)
     finally:
         tracemalloc.stop()
+
+
+@pytest.mark.parametrize(('part', 'old', 'new', 'words'), [
+    ('worksheets/sheet1.xml', b'<row r="2"', b'<row r="99999999"', 'has more than 1000 rows or'),
+    ('styles.xml', b'<fonts', b' ' * 9_000_000 + b'<fonts', 'of them not of cells'),
+    ('workbook.xml', b'<sheets>', b'<sheets>' + 500 * b'<sheet name="a" sheetId="1" r:id="rId1" '
+     b'xmlns:r="http://schemas.openxmlformats.org/officeDocument/2006/relationships"/>',
+     'holds 501 tables, expected 1 to 500')])
+def test_an_excel_file_that_would_take_minutes_is_refused(
+        part: str, old: bytes, new: bytes, words: str, tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr('accel_calib.logs.containers._MOST_ROWS', 1000)
+    sound, path = excel(tmp_path / 'a.xlsx', {'S': [['ax'], [1.0], [2.0]]}), tmp_path / 'log.xlsx'
+    with zipfile.ZipFile(sound) as archive, zipfile.ZipFile(path, 'w') as changed:
+        for name in archive.namelist():
+            data = archive.read(name)
+            changed.writestr(name, data.replace(old, new) if name == f'xl/{part}' else data)
+    with pytest.raises(InputError, match=words):
+        read_log(path)
 
 
 def test_a_long_name_in_a_damaged_archive_is_not_shown_whole(tmp_path: Path) -> None:

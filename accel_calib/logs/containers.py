@@ -24,6 +24,7 @@ from itertools import chain, islice
 import json
 import lzma
 from pathlib import Path
+import re
 from typing import Any
 import zipfile
 import zlib
@@ -44,11 +45,12 @@ from ..text import reason
 _WORKBOOK = 'xl/workbook.xml'
 
 _ENCRYPTED = 1
-_MOST_MEMBERS = 500
-_MOST_BYTES = 1 << 29
-"""Largest size of the parts of an Excel file [bytes]."""
+_MOST_TABLES = 500
+_MOST_BYTES, _MOST_ABOUT = 1 << 29, 1 << 23
+"""Largest size of the parts of an Excel file, and of those that are not cells [bytes]."""
 
-_MOST_CELLS = 50_000_000
+_CELLS = re.compile(r'xl/(worksheets|media)/|xl/sharedStrings')
+_MOST_ROWS, _MOST_CELLS = 1 << 20, 50_000_000
 _SMALL, _LARGEST_RATIO, _NUMBER_BYTES = 2_000_000, 100, 8
 """Numbers that any file may hold, largest ratio of unpacked to packed data, size of a number."""
 
@@ -144,8 +146,8 @@ def _members_of(path: Path, head: bytes) -> Iterator[Sequence[Member]]:
 def _member_of(path: Path, members: Sequence[Member], options: LogOptions) -> Member:
     names = [member.name for member in members]
     wanted = [member for member in members if options.topic in ('', member.name)]
-    if not names:
-        raise InputError(f'{path} has no tables, expected one',
+    if not 0 < len(names) <= _MOST_TABLES:
+        raise InputError(f'{path} holds {len(names)} tables, expected 1 to {_MOST_TABLES}',
                          'check that this is the intended file')
     if not wanted:
         raise InputError(f'{path} has no table {options.topic}, expected one of {shown(names)}',
@@ -215,9 +217,6 @@ def _files(path: Path, archive: zipfile.ZipFile) -> list[Member]:
     infos = [info for info in archive.infolist() if not info.is_dir() and not any(
         part.startswith(('.', '__MACOSX')) or part == 'meta'  # phyphox: about the phone
         for part in Path(info.filename).parts)]
-    if not 0 < len(infos) <= _MOST_MEMBERS:
-        raise InputError(f'{path} holds {len(infos)} files, expected 1 to {_MOST_MEMBERS}',
-                         _UNPACK)
     if any(info.flag_bits & _ENCRYPTED for info in infos):
         raise InputError(f'{path} needs a password, expected a ZIP archive without one',
                          _UNPACK)
@@ -238,9 +237,10 @@ def _unpacked(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> An
 
 def _sheets(path: Path, archive: zipfile.ZipFile) -> Iterator[Sequence[Member]]:
     size = sum(info.file_size for info in archive.infolist())
-    if size > _MOST_BYTES:
-        raise InputError(f'{path} unpacks to more than {_MOST_BYTES} bytes, expected a smaller '
-                         'Excel file', _AGAIN)
+    about = sum(info.file_size for info in archive.infolist() if not _CELLS.match(info.filename))
+    if size > _MOST_BYTES or about > _MOST_ABOUT:
+        raise InputError(f'{path} unpacks to {size} bytes, {about} of them not of cells, expected '
+                         f'at most {_MOST_BYTES} and {_MOST_ABOUT}', _AGAIN)
     with needing('openpyxl', 'an Excel file (.xlsx)'):
         import openpyxl
     with path.open('rb') as file:  # of a path, the suffix would have to be right
@@ -280,7 +280,7 @@ def _csv(rows: Iterator[Sequence[Any]]) -> Iterator[bytes]:
 
 def _padded(path: Path, rows: Iterator[Sequence[Any]]) -> Iterator[list[str]]:
     """Yield the rows of a sheet as text; all rows have the same number of cells."""
-    width = cells = 0
+    width = cells = rows_read = 0
     most = min(_MOST_CELLS, _most_numbers(path))
     while True:
         with sound_log(path, 'an Excel file', _AGAIN):
@@ -288,10 +288,10 @@ def _padded(path: Path, rows: Iterator[Sequence[Any]]) -> Iterator[list[str]]:
         if not block:
             return
         width = max(width, *map(len, block))
-        cells += (width + 1) * len(block)
-        if cells > most:
-            raise InputError(f'{path} has more than {most} cells, expected a smaller Excel file',
-                             _AGAIN)
+        cells, rows_read = cells + (width + 1) * len(block), rows_read + len(block)
+        if cells > most or rows_read > _MOST_ROWS:
+            raise InputError(f'{path} has more than {_MOST_ROWS} rows or {most} cells, expected a '
+                             'smaller Excel file', _AGAIN)
         yield from ([*row, *[''] * (width - len(row))] for row in block)
 
 
