@@ -18,6 +18,7 @@ from accel_calib.errors import InputError
 from accel_calib.logs import LogOptions, open_log, read_log
 from accel_calib.table import Recording
 from faults.sample import sample
+from inside import containers
 import numpy as np
 import openpyxl
 import pytest
@@ -308,7 +309,7 @@ def test_a_small_container_takes_little_memory(kind: str, tmp_path: Path) -> Non
 def test_an_excel_file_that_would_take_minutes_is_refused(
         part: str, old: bytes, new: bytes, words: str, tmp_path: Path,
         monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr('accel_calib.logs.containers._MOST_ROWS', 1000)
+    monkeypatch.setattr(containers, '_MOST_ROWS', 1000)
     sound, path = excel(tmp_path / 'a.xlsx', {'S': [['ax'], [1.0], [2.0]]}), tmp_path / 'log.xlsx'
     with zipfile.ZipFile(sound) as archive, zipfile.ZipFile(path, 'w') as changed:
         for name in archive.namelist():

@@ -155,8 +155,10 @@ class Store:
 
     def forget_lost(self) -> None:
         """Remove the marks of results whose Parquet file is gone, so that they are made again."""
+        known = {os.fsencode(each.parent.name.partition('=')[2])
+                 for each in self.rows.glob(f'sensor=*/{_DATA}')}
         for mark in self.folder.glob('done/*/*'):
-            if not os.path.exists(self.data(os.fsdecode(mark.read_bytes()))):
+            if mark.read_bytes() not in known:
                 mark.unlink()
 
     def replace_unread(self, rows: list[Row]) -> None:
