@@ -9,8 +9,9 @@ import math
 from accel_calib.effects import EFFECTS
 from inside import (
     accepted, beginning, Block, candidates, Curve, explored, fitted_state, grown_curve,
-    is_better_than_walk, Linear, linearised, Model, Near, Process, process_of, products_of, RARE,
-    REFINE_LEVEL, Set, SIGNIFICANT, simpler, simulate_poses, Walk, walk_beside, WORTH)
+    is_better_than_walk, Linear, linearised, Model, Near, outside_of, Process, process_of,
+    products_of, RARE, REFINE_LEVEL, Set, SIGNIFICANT, simpler, simulate_poses, Walk,
+    walk_beside, WORTH)
 import numpy as np
 import pytest
 from scipy.optimize import brentq
@@ -47,6 +48,22 @@ def by_hand(residual, columns, names, worth=WORTH, choice=0.0, tried=1.0, size=1
     return Linear(np.zeros((count, 0)), residual, np.arange(count), blocks, columns,
                   np.full(len(names), size), products_of(columns, residual), worth, count,
                   float(residual @ residual), np.zeros((count, 3)), choice)
+
+
+def test_poses_left_out_beside_a_walk_span_orthonormal_columns():
+    state, linear = problem_of(poses_of({'quadratic': [2e-3, -1e-3, 1e-3]}), 'quadratic', 'cubic')
+    whitened = Walk(process_of(linear, state.poses_g), 3.0, 0.0, 0.0).whitened(linear)
+    chosen = Set.of(whitened, (0,), (3, 7))
+    onto, residual = chosen.spanned
+    assert onto.T @ onto == pytest.approx(np.eye(5), abs=1e-9)
+    assert onto.T @ whitened.whitened(whitened.columns) == pytest.approx(
+        chosen.across[:, :-1], abs=1e-9)
+    assert residual @ residual == pytest.approx(chosen.rss)
+
+
+def test_a_column_whose_squares_underflow_is_a_column_of_zeros():
+    columns, sizes = outside_of(np.zeros((3, 0)), np.outer([1.0, 2.0, 3.0], [1.0, 1e-200]))
+    assert (sizes[1], *columns[:, 1]) == (1.0, 0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(('name', 'values'), [

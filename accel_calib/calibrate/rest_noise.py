@@ -71,6 +71,7 @@ _CONFIDENCE = 0.975        # quantile at which the uncertainty of τ is included
 _NORMAL = 1.959964         # the same quantile of the normal distribution
 _CORRELATION_MAX = 0.9
 _ROUNDING = 1e-9
+_MOST_STEPS = 50
 _PAIRED = 200              # rests used for the slopes of pairs
 _TINY = 1e-30              # variance added to rests without noise [(rad/s)²]
 _MAD = 1.4826
@@ -336,15 +337,19 @@ def _weighted(design: Floats, rate: Floats, variance: Floats) -> tuple[Floats, F
 
 
 def _scatter(design: Floats, rate: Floats, noise: Floats) -> float:
-    """Return τ², at which the weighted squares have their expected sum; see the module."""
-    dof = design.shape[0] - design.shape[1]
-    flat = _weighted(design, rate, np.ones(len(rate)))[2]
-    high = float(flat @ flat) / dof * (1.0 + _ROUNDING)
+    """
+    Return τ², at which the weighted squares have their expected sum; see the module.
 
-    def excess(scatter: float) -> float:
-        left = _weighted(design, rate, noise + scatter)[2]
-        return float(np.sum(left ** 2 / (noise + scatter))) - dof
+    The steps are Newton's for one over this sum, which is linear in τ² for rests of equal noise.
 
-    if excess(0.0) <= 0.0:
-        return 0.0
-    return float(scipy.optimize.brentq(excess, 0.0, high, xtol=_ROUNDING * high))
+    """
+    dof, scatter = design.shape[0] - design.shape[1], 0.0
+    for _ in range(_MOST_STEPS):
+        variance = noise + scatter
+        squares = _weighted(design, rate, variance)[2] ** 2 / variance
+        total = np.sum(squares)
+        step = float(total * (total / dof - 1.0) / max(np.sum(squares / variance), 1e-300))
+        if step <= _ROUNDING * scatter:
+            break
+        scatter += step
+    return scatter

@@ -290,8 +290,9 @@ def _subsets(count: int, most: int, free: int) -> Indices:
         return np.nonzero(inside)[1].reshape(len(out), -1)
     size = min(free + _SPARE, count - most)
     rng = np.random.default_rng(count)
-    return np.array([np.argpartition(rng.random(count), size - 1)[:size].copy()
-                     for _ in range(_MOST_SUBSETS)])
+    parts = np.array_split(np.arange(_MOST_SUBSETS), -(-_MOST_SUBSETS * count // _DISTANCES))
+    return np.concatenate([np.argpartition(rng.random((len(part), count)), size - 1, axis=1)[
+        :, :size] for part in parts])
 
 
 def _squared_distances(name: str, reading: Floats, subsets: Indices, noise: Floats

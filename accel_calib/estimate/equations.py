@@ -198,7 +198,7 @@ class _Kind(NamedTuple):
 
 @dataclass(frozen=True)
 class Measured:
-    """Poses in g by kind of orientation, those alone in blocks, and noise; see `measured`."""
+    """Poses in g by kind of orientation, `alone` in blocks, and their noise; see `measured`."""
 
     known: _Kind
     shared: _Kind
@@ -286,12 +286,13 @@ def equations(model: Model, poses: Measured) -> Equations:
     """Set up the equations near a model with ΔR = I; NaN where a reading's force is not unique."""
     parts: list[_Known | _Shared | _Alone] = []
     force, scale = np.empty((poses.count, 3)), np.empty(poses.count)
-    for make, kind in ((_Known, poses.known), (_Shared, poses.shared),
-                       *((_Alone, block) for block in poses.alone)):
-        if len(kind.which):
-            part = make(model, kind)
-            parts.append(part)
-            force[kind.which], scale[kind.which] = part.force, part.scale
+    if len(poses.known.which):
+        parts.append(_Known(model, poses.known))
+    if len(poses.shared.which):
+        parts.append(_Shared(model, poses.shared))
+    parts += [_Alone(model, block) for block in poses.alone]
+    for part in parts:
+        force[part.which], scale[part.which] = part.force, part.scale
     groups = poses.shared.group
     residual = np.concatenate([part.residual for part in parts])
     count = len(residual) - (2 * (int(groups[-1]) + 1) if len(groups) else 0)

@@ -118,7 +118,9 @@ class ByPose:
     def own(self, spread: Floats) -> Floats:
         """Return the (n, k, k) matrices I - leverage of each pose."""
         onto = (self.flat @ spread).reshape(self.columns.shape)
-        return np.eye(onto.shape[1]) - np.einsum('nkq,nlq->nkl', onto, self.columns)
+        own: Floats = (np.eye(self.columns.shape[1])
+                       - np.einsum('nkq,nlq->nkl', onto, self.columns))
+        return own
 
 
 def by_pose(residual: Floats, columns: Floats, pose: Indices,
@@ -212,7 +214,8 @@ class Fit:
         columns, size = _scaled(self.columns)
         found = columns[:0]
         for first in range(0, len(columns), _BLOCK):
-            found = np.linalg.qr(np.vstack([found, columns[first:first + _BLOCK]]), mode='r')
+            found = np.asarray(np.linalg.qr(
+                np.vstack([found, columns[first:first + _BLOCK]]), mode='r'))
         return found, size
 
     @cached_property
@@ -284,7 +287,7 @@ class Point:
     @cached_property
     def normal(self) -> Floats:
         """(q, q) array, JᵀJ."""
-        return self.columns.T @ self.columns
+        return np.dot(self.columns.T, self.columns)
 
     @cached_property
     def downhill(self) -> Floats:
@@ -293,9 +296,9 @@ class Point:
 
     @cached_property
     def cost(self) -> float:
-        """Sum of the squared residuals; infinite if a residual or derivative is not finite."""
-        cost = float(self.residual @ self.residual)
-        return cost if np.isfinite(cost) and np.all(np.isfinite(self.columns)) else np.inf
+        """Sum of the squared residuals; infinite if it or JᵀJ is not finite."""
+        cost = float(np.dot(self.residual, self.residual))
+        return cost if np.isfinite(cost) and np.all(np.isfinite(self.normal)) else np.inf
 
 
 def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upper: Floats,
@@ -304,14 +307,21 @@ def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upp
     """
     Return the (q,) values from `lower` to `upper` of least squares, and the point there.
 
-    `point_at` computes residuals and derivative at values; the step solves
-    residual = columns · step. `move` returns the values after a step to first order, by default
-    their sum. Raise `NotConvergedError` if the fit has not converged after `_MOST_STEPS` steps, or
-    as soon as it cannot lower the cost to `most`.
+    `point_at` computes residuals and derivative at values, which may be so wild that numbers
+    overflow; the step solves residual = columns · step. `move` returns the values after a step to
+    first order, by default their sum. Raise `NotConvergedError` if the fit has not converged after
+    `_MOST_STEPS` steps, or as soon as it cannot lower the cost to `most`.
 
     """
+    def tried_at(values: Floats) -> Point:
+        with np.errstate(all='ignore'):
+            try:
+                return point_at(values)
+            except np.linalg.LinAlgError:
+                return Point(np.array([np.inf]), np.zeros((1, len(values))))
+
     values = np.clip(start, lower, upper)
-    now, damping = point_at(values), 0.0
+    now, damping = tried_at(values), 0.0
     first = _FIRST_DAMPING * now.singular
     if not np.isfinite(now.cost):
         raise NotConvergedError
@@ -323,10 +333,10 @@ def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upp
         if now.cost - _HOPE * fall > most:
             raise NotConvergedError
         step = full if damping == 0.0 else _step(now, free, damping)[0]
-        tried_at = np.clip(move(values, step), lower, upper)
-        tried = point_at(tried_at)
+        moved = np.clip(move(values, step), lower, upper)
+        tried = tried_at(moved)
         if tried.cost < now.cost:
-            values, now, damping = tried_at, tried, damping / 10.0
+            values, now, damping = moved, tried, damping / 10.0
             damping = 0.0 if damping < first else damping
         else:
             damping = max(10.0 * damping, first)
@@ -402,13 +412,9 @@ def estimate(start: Model, poses_g: Poses, prior: Prior | None = None,
 
     def point_at(values: Floats) -> Point:
         model = model_at(values)
-        with np.errstate(all='ignore'):
-            try:
-                near = equations(model, poses)
-                return _with_prior(Point(near.residual, near.columns(model)[:, fitted], near),
-                                   values, prior, weight)
-            except np.linalg.LinAlgError:
-                return Point(np.array([np.inf]), np.zeros((1, 1)))
+        near = equations(model, poses)
+        return _with_prior(Point(near.residual, near.columns(model)[:, fitted], near),
+                           values, prior, weight)
 
     lower, upper = _bounds(start, poses_g)
     lower, upper = lower[fitted], upper[fitted]

@@ -273,9 +273,9 @@ class Walk:
         spread = 1.0 + self.ratio * self.process.values
         axes = self.process.axes
         across = np.column_stack([axes.T @ linear.columns, axes.T @ linear.residual])
-        taken = (1.0 - 1.0 / spread)[:, np.newaxis]
+        taken = np.sqrt(1.0 - 1.0 / spread)[:, np.newaxis] * across
         return replace(linear, white=(axes, 1.0 - 1.0 / np.sqrt(spread), across),
-                       products=linear.products - across.T @ (taken * across),
+                       products=linear.products - taken.T @ taken,
                        penalty=float(np.sum(np.log(spread))) + _charge(linear))
 
     def residuals(self, chosen: Set) -> tuple[Floats, Floats]:

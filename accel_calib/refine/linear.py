@@ -77,6 +77,9 @@ _LARGEST_LOG = 100.0
 _ALONE = 1e-12
 """Smallest part of the equations of a pose outside of the base, against division by zero."""
 
+_LEAST_NORM = 1e-100
+"""Norm below which a column counts as zero: products of smaller numbers underflow."""
+
 _LEAST_OWN = 0.02
 """Smallest 1 - leverage; below it, an equation alone determines a value."""
 
@@ -439,7 +442,7 @@ def outside_of(onto: Floats, columns: Floats) -> tuple[Floats, Floats]:
     sizes = _norms(columns)
     columns = columns / sizes
     columns -= onto @ (onto.T @ columns)
-    return columns, sizes
+    return columns, np.where(sizes < np.inf, sizes, 1.0)
 
 
 def products_of(columns: Floats, residual: Floats) -> Floats:
@@ -466,7 +469,7 @@ def orthonormal(columns: Floats) -> Floats:
 
 
 def _norms(columns: Floats) -> Floats:
-    """Return the norms of columns, 1 for a column of zeros."""
+    """Return the norms of columns, infinite for a column of zeros, which remains one."""
     sizes: Floats = np.sqrt(np.einsum('mc,mc->c', columns, columns))
-    sizes[sizes == 0.0] = 1.0
+    sizes[sizes < _LEAST_NORM] = np.inf
     return sizes

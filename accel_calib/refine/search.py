@@ -318,7 +318,7 @@ def _settled(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterab
             refused.add(frozenset(near.names))
             continue
         seen.append(near.key)
-        process = near.walk and near.walk.process
+        process = None if near.walk is None else near.walk.process
         settled, predicted = (near.names, near.chosen.out, process), _is_predicted(near, after)
         del near, linear  # before the next columns are made
         state, linear = after, trial.near(after)
@@ -343,10 +343,11 @@ def _significant(state: State, near: Near, trial: _Trial) -> tuple[State, Near]:
                 if near.chosen.probability(block) > LEVEL]
         if not weak:
             break
-        fewer, process = max(weak, key=lambda fewer: fewer.score), near.walk and near.walk.process
+        fewer = max(weak, key=lambda fewer: fewer.score)
         after = trial.fitted(fewer, state)
         if after is None:
             break
+        process = None if near.walk is None else near.walk.process
         state, near = after, _at(trial.near(after), fewer.effects, fewer.out, process,
                                  trial.poses_g)
     return state, near

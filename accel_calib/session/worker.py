@@ -67,7 +67,7 @@ _ENVIRONMENT = {
 """Arrays are small, so more threads would only wait. A set threshold is not adapted by glibc, so
 that freed arrays do not stay in the process."""
 
-_IMPORTED = ('accel_calib.refine', 'scipy.linalg', 'scipy.optimize', 'scipy.special')
+_IMPORTED = ('accel_calib.refine', 'scipy.linalg', 'scipy.special')
 """Modules imported at the start, so that the first fit is as fast as later ones."""
 
 _START = ('import sys; sys.path[:] = filter(None, sys.path); '
