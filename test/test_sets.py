@@ -10,8 +10,8 @@ from accel_calib.effects import EFFECTS
 from inside import (
     accepted, beginning, Block, candidates, Curve, explored, fitted_state, grown_curve,
     is_better_than_walk, Linear, linearised, Model, Near, outside_of, Process, process_of,
-    products_of, RARE, REFINE_LEVEL, Set, SIGNIFICANT, simpler, simulate_poses, Walk,
-    walk_beside, WORTH)
+    products_of, RARE, REFINE_LEVEL, Set, SIGNIFICANT, simpler, simulate_poses, Walk, walk_beside,
+    WORTH)
 import numpy as np
 import pytest
 from scipy.optimize import brentq

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from .sheet import (
     ACCENT, add_bar, AFTER, BEFORE, check_matplotlib, DISC, DIVERGING, Drawing, drawn, EDGE, FAINT,
     HEIGHT_INCHES, INK, legend_below, Mark, Marks, PAPER, RIM, SEQUENTIAL)
-from ..calibrate import (
-    Calibration, directions_in, errors_after, errors_before, in_g, with_history)
+from ..calibrate import Calibration, directions_in, errors_after, errors_before, in_g, with_history
 from ..effects import acting_temperature, AXES, effect_named, rate_at, sensor_force
 from ..geometry import rms, uncovered, unit
 from ..table import column_of, Floats, Poses
