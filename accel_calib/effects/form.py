@@ -245,7 +245,7 @@ class Effect:
 
     @cached_property
     def changes(self) -> str:
-        """What the effect changes: ``offset``, ``gain``, or ``force`` if it bends."""
+        """Return what the effect changes: ``offset``, ``gain``, or ``force`` if it bends."""
         if self.bends:
             return 'force'
         return 'offset' if all(term.monomial == ONE for term in self.terms) else 'gain'
