@@ -596,7 +596,9 @@ def test_ctrl_c_ends_the_program_and_its_workers_without_words(
     program = subprocess.Popen(
         [sys.executable, *COMMAND, 'fleet', str(recorded), '-o', str(results), '--workers', '2'],
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
-        env={**os.environ, 'TMPDIR': str(temporary)})
+        env={**os.environ, 'TMPDIR': str(temporary)},
+        # Background commands of a shell inherit that it is ignored.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
     seen = temporary.glob if moment == 'starts' else results.glob
     wait(lambda: [*seen('*')] or program.poll() is not None)
     os.killpg(program.pid, signal.SIGINT)  # as a terminal does

@@ -122,6 +122,7 @@ def cluster(address: str = '', workers: int | None = None) -> Iterator[Client]:
     with needing('dask distributed fsspec pyarrow bokeh', 'the command fleet'):
         import dask
         from distributed import Client, LocalCluster
+        from distributed.gc import disable_gc_diagnosis
         import pyarrow  # noqa: F401
     with ExitStack() as stack:
         ctrl_c = stack.enter_context(_CtrlC())
@@ -140,6 +141,7 @@ def cluster(address: str = '', workers: int | None = None) -> Iterator[Client]:
                 raise
             raise InputError(f'no scheduler answers at {address}: {err}', 'start dask scheduler, '
                              'or correct --scheduler') from err
+        disable_gc_diagnosis(force=True)  # Ctrl-C in its callback would be printed and lost
         with ctrl_c.passing():
             yield client
 
