@@ -109,11 +109,13 @@ def test_samples_are_distinguished_from_poses(step, rows, count, samples):
 
 
 @pytest.mark.parametrize(('size_kb', 'status', 'left'), [(64, 0, ['c.yaml']), (4, 2, [])])
+@pytest.mark.parametrize('command', ['calibrate', 'fit'])
 def test_a_page_or_calibration_that_does_not_fit_on_the_disk_is_one_line(
-        size_kb, status, left, recording, tmp_path):
+        command, size_kb, status, left, recording, tmp_path):
     disk = tmp_path / 'disk'
+    more = {'calibrate': ['--no-refine'], 'fit': ['--report', disk / 'c.html']}[command]
     done, copy = run_on_small_disk(
-        disk, size_kb, 'calibrate', recording, '-o', disk / 'c.yaml', '--no-refine')
+        disk, size_kb, command, recording, '-o', disk / 'c.yaml', *more)
     assert (done.returncode, done.stderr.count('\n')) == (status, 1 if status else 0)
     assert 'No space left on device' in (done.stderr if status else done.stdout)
     assert [each.name for each in copy.iterdir()] == left

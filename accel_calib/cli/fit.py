@@ -15,13 +15,13 @@ import numpy as np
 from rich.table import Table
 
 from .frame import (
-    console, Done, FAILED, given, intake, log_options, prior, rows_between, settings,
+    console, Done, FAILED, given, intake, log_options, no_page, prior, rows_between, settings,
     stored_calibration)
 from .output import error_line, progress, short_if_known, table, Verdict, working
 from ..calibrate import Calibration, Curve, GyroBias, NORM_MODELS, outlook
 from ..disk import STANDARD_OUTPUT
 from ..effects import AXES, effect_named
-from ..errors import InputError, system_error
+from ..errors import InputError
 from ..findings import (
     calibration_json, curve_json, effect_figures, linear_figures, rate_refinement, refinement_json)
 from ..pipeline import (
@@ -176,7 +176,7 @@ def page_beside(args: argparse.Namespace, page_of: Callable[[], str]) -> Iterato
             write_page(page, page_of())
         yield f'page: {page}'
     except OSError as err:  # the calibration is stored
-        yield f'no page {page}: {system_error(err)}'
+        yield no_page(page, err)
 
 
 def several_fit(results: Sequence[dict[str, Any]]) -> Iterator[str]:

@@ -134,12 +134,22 @@ def _done(args: argparse.Namespace) -> Done:
     if page is not None and done.page is not None:
         from ..report import write_page
 
-        with working('drawing the page'):
-            write_page(page, done.page())
-        done = replace(done, stored=[*done.stored, page])
+        try:
+            with working('drawing the page'):
+                write_page(page, done.page())
+            done = replace(done, stored=[*done.stored, page])
+        except OSError as err:
+            if not done.stored:
+                raise
+            done = replace(done, shown=[*done.shown, no_page(page, err)])
     if done.rating is not None:
         done = replace(done, result={**done.result, **rated(done.rating, args)})
     return done
+
+
+def no_page(page: Path, error: OSError) -> str:
+    """Return a line about a page that cannot be written beside what is stored."""
+    return f'no page {page}: {system_error(error)}'
 
 
 def _run_one(args: argparse.Namespace) -> int:

@@ -338,7 +338,7 @@ def _where(name: str, before: State, after: Floats) -> str:
     if name == 'offset_step':
         return _instant(before.poses_g, share_mg)
     column = next((key for key in effect_named(name).needs
-                   if key in before.poses_g and key != 'new'), None)
+                   if key in before.poses_g and key not in ('new', 'previous')), None)
     if column is None:
         return _directions(before.fit.equations.force, share_mg)
     return _range(column, before.poses_g[column], share_mg)

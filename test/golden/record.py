@@ -38,8 +38,6 @@ _WIDTH = 80
 _CHANGING = re.compile(r'\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d(\+00:00)?)?)?|'
                        + re.escape(ac.__version__))
 _SIGN_OF_ZERO = re.compile(r'[+-](?=0(\.0+)?([^\d.]|$))')
-_UNSTABLE = re.compile(r'over previous .* highest')
-"""Order of poses whose distances from the previous ones are equal up to rounding."""
 
 _SPECIAL = ('nan', 'inf', '-inf')
 
@@ -50,7 +48,7 @@ def plain(value: Any) -> Any:
         return value
     if isinstance(value, str | Path):
         text = _CHANGING.sub('…', str(value).replace(f'{Path.cwd()}/', ''))
-        return _UNSTABLE.sub('…', _SIGN_OF_ZERO.sub('', text))
+        return _SIGN_OF_ZERO.sub('', text)
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else str(float(value))
     if isinstance(value, bytes):
