@@ -607,6 +607,21 @@ def test_ctrl_c_ends_the_program_and_its_workers_without_words(
     assert not [*temporary.iterdir()]
 
 
+def test_ctrl_c_interrupts_where_the_program_waits_not_within_dask() -> None:
+    reached = []
+
+    def interrupted() -> None:
+        with cluster(workers=1) as own:
+            signal.raise_signal(signal.SIGINT)
+            reached.append(len(own.nthreads()))  # a call of Dask
+            list(mapped(own, str, range(3)))
+            reached.append('all done')
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert reached == [1]
+
+
 def deadly(name: str) -> str:
     """Kill the worker at one of the items."""
     if name == 'deadly':

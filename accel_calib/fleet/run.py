@@ -124,8 +124,10 @@ def cluster(address: str = '', workers: int | None = None) -> Iterator[Client]:
         from distributed import Client, LocalCluster
         from distributed.gc import disable_gc_diagnosis
         import pyarrow  # noqa: F401
-    with ExitStack() as stack:
-        ctrl_c = stack.enter_context(_CtrlC())
+    with _ctrl_c_waits(), ExitStack() as stack:
+        # Threads and processes inherit the mask; the tracker would lift it when it starts.
+        resource_tracker.ensure_running()
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             if not address:
                 scratch = stack.enter_context(TemporaryDirectory(prefix='accel_calib-'))
@@ -141,46 +143,48 @@ def cluster(address: str = '', workers: int | None = None) -> Iterator[Client]:
                 raise
             raise InputError(f'no scheduler answers at {address}: {err}', 'start dask scheduler, '
                              'or correct --scheduler') from err
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         disable_gc_diagnosis(force=True)  # Ctrl-C in its callback would be printed and lost
-        with ctrl_c.passing():
-            yield client
+        yield client
 
 
 class _CtrlC:
-    """Ctrl-C, which waits while the cluster starts and ends, and never reaches its processes."""
+    """Whether Ctrl-C came, and whether it may interrupt now; one per process, as the signal."""
 
-    def __enter__(self) -> _CtrlC:
-        self._came, self._waits = False, True
-        self._before = signal.getsignal(signal.SIGINT)
-        if self._before != signal.SIG_IGN:
-            signal.signal(signal.SIGINT, self._take)
-        # Threads and processes inherit the mask; the tracker would lift it when it starts.
-        resource_tracker.ensure_running()
-        self._mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        return self
+    came = passes = False
 
-    def __exit__(self, *_: object) -> None:
-        signal.pthread_sigmask(signal.SIG_SETMASK, self._mask)
-        signal.signal(signal.SIGINT, self._before)
-        if self._came:  # whatever else the interruption has caused
+
+@contextmanager
+def _ctrl_c_waits() -> Iterator[None]:
+    """Let Ctrl-C wait for `_ctrl_c_passes` or the end: within Dask it leaves half-done calls."""
+    def take(number: int, frame: object) -> None:
+        _CtrlC.came = True
+        if _CtrlC.passes:
             raise KeyboardInterrupt
 
-    def _take(self, number: int, frame: object) -> None:
-        self._came = True
-        if not self._waits:
+    before = signal.getsignal(signal.SIGINT)
+    if before != signal.SIG_IGN:
+        signal.signal(signal.SIGINT, take)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+        if _CtrlC.came:  # whatever else the interruption has caused
+            _CtrlC.came = False
             raise KeyboardInterrupt
 
-    @contextmanager
-    def passing(self) -> Iterator[None]:
-        """Let Ctrl-C interrupt the block."""
-        signal.pthread_sigmask(signal.SIG_SETMASK, self._mask)
-        if self._came:
+
+@contextmanager
+def _ctrl_c_passes() -> Iterator[None]:
+    """Let Ctrl-C interrupt the block."""
+    _CtrlC.passes = True
+    try:
+        if _CtrlC.came:
             raise KeyboardInterrupt
-        self._waits = False
-        try:
-            yield
-        finally:
-            self._waits = True
+        yield
+    finally:
+        _CtrlC.passes = False
 
 
 def run(client: Client, found: Sequence[Input], options: Options, store: Store,
@@ -308,7 +312,8 @@ def mapped(client: Client, function: Callable[..., Any], items: Iterable[_Item],
             done.add(future)
         if not waiting:
             return
-        future = next(done)
+        with _ctrl_c_passes():
+            future = next(done)
         batch = waiting.pop(future)
         try:
             results, seconds = _result_of(client, future)
