@@ -617,8 +617,13 @@ def test_ctrl_c_interrupts_where_the_program_waits_not_within_dask() -> None:
             list(mapped(own, str, range(3)))
             reached.append('all done')
 
-    with pytest.raises(KeyboardInterrupt):
-        interrupted()
+    # Background commands of a shell inherit that it is ignored.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            interrupted()
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert reached == [1]
 
 
