@@ -157,6 +157,7 @@ def _first_equal(rows: Floats) -> Indices:
 
     """
     bits = (rows + 0.0).view(np.uint64)  # -0.0 becomes 0.0
+    bits ^= bits >> 32  # the low bits of whole numbers are zero
     factors = np.random.default_rng(1).integers(2 ** 63, size=rows.shape[1], dtype=np.uint64)
     mixed, found = bits @ (2 * factors + 1), np.arange(len(rows))
     ordered = np.sort(mixed)
