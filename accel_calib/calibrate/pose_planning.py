@@ -40,13 +40,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import lru_cache
 
 import numpy as np
 import scipy
 
 from .calibration import Calibration, ORIENTED, PRIOR
-from ..effects import EFFECTS, Model, MODELS, parameter_names, with_vector
+from ..effects import EFFECTS, MODELS, parameter_names, with_vector
 from ..errors import RefusedFitError
 from ..estimate import pose_noise
 from ..finding import Finding
@@ -129,14 +129,10 @@ def poses_needed(name: str) -> int:
     return free_parameters(name) // (3 if MODELS[name].known_orientation else 1)
 
 
-@cache
-def _no_errors(name: str) -> Model:
-    return with_vector(effects_of(name), np.zeros(free_parameters(name)))
-
-
 def rows_of(name: str, directions: Floats) -> Floats:
     """Return Φ at (n, 3) unit vectors: (n, 1, p), or (n, 3, p) for model 12."""
-    basis = _no_errors(name).basis(directions, {})
+    ideal = with_vector(effects_of(name), np.zeros(free_parameters(name)))
+    basis = ideal.basis(directions, {})
     return basis.full if MODELS[name].known_orientation else basis.along(directions)[:, np.newaxis]
 
 
@@ -174,16 +170,9 @@ def _largest_error(name: str, information: Floats) -> float:
     """Return the dilution for the (p, p) information of poses."""
     ridge = _NOTHING * np.trace(information) + 1e-300
     inverse = np.linalg.inv(information + ridge * np.eye(len(information)))
-    found = float(np.sqrt(np.max(inverse.ravel() @ _pairs_over_the_sphere(name))))
-    return found if found < 1.0 / _SINGULAR else np.inf
-
-
-@lru_cache(maxsize=8)
-def _pairs_over_the_sphere(name: str) -> Floats:
-    """Return the (p², m) products of the entries of Φ in each direction."""
     around = _over_the_sphere(name)
-    pairs = np.einsum('mkp,mkq->mpq', around, around)
-    return np.ascontiguousarray(pairs.reshape(len(pairs), -1).T)
+    found = float(np.sqrt(np.max(np.sum((around @ inverse) * around, axis=(1, 2)))))
+    return found if found < 1.0 / _SINGULAR else np.inf
 
 
 @dataclass(frozen=True)
