@@ -275,6 +275,12 @@ class Table(Record):
         """Keys of the columns that are not in `COLUMNS`."""
         return tuple(key for key in self.columns if key not in COLUMNS)
 
+    def range_of(self, key: str) -> tuple[float, float]:
+        """Return the lowest and the highest known number of a column; NaN if none is known."""
+        values = self[key] if key in self else np.zeros(0)
+        known = values[np.isfinite(values)]
+        return (float(known.min()), float(known.max())) if len(known) else (np.nan, np.nan)
+
     def take(self: _Self, which: NDArray[Any] | slice) -> _Self:
         """Return the rows at these indices, or where this mask is true."""
         columns = {key: values[which] for key, values in self.columns.items()}

@@ -226,9 +226,8 @@ def gyro_bias_of(poses: Poses) -> GyroBias | None:
     slope = np.where(sloping, chosen.values[-1], 0.0)
     if 'temperature' not in rests:
         return GyroBias(bias, sd, len(rests), math.nan, slope, ())
-    temperature = rests['temperature']
-    limits = (float(temperature.min()), float(temperature.max()))
-    mean = float(np.clip(temperature.mean(), *limits))
+    limits = rests.range_of('temperature')
+    mean = float(np.clip(rests['temperature'].mean(), *limits))
     return GyroBias(bias, sd, len(rests), mean, slope, limits)
 
 

@@ -183,7 +183,7 @@ def curve_of(ramps: Sequence[Ramp]) -> Curve:
     """Return the offset over the temperature from the ramps of one board, of any orientation."""
     stretches, group = _joined(ramps)
     warm, rate = stretches['temperature'], np.concatenate([each.rate for each in ramps])
-    low, high = float(warm.min()), float(warm.max())
+    low, high = stretches.range_of('temperature')
     reference = float(np.clip(REFERENCE_TEMPERATURE, low, high))
     limit = _MOVING * float(np.quantile(np.abs(rate), 0.95))
     rising, falling = rate > limit, rate < -limit

@@ -251,12 +251,9 @@ def rest_errors(calibration: Calibration, reading: Floats, noise: Floats, contex
 
 def monitor(calibration: Calibration) -> Drift:
     """Return the initial state of the monitor after a calibration."""
-    poses = calibration.poses
-    temperatures: tuple[float, ...] = ()
-    if 'temperature' in poses and len(poses):
-        known = poses['temperature']
-        temperatures = (float(np.min(known)), float(np.max(known)))
-    return Drift(calibration.covariance, _repeats(calibration), temperatures)
+    limits = calibration.poses.range_of('temperature')
+    return Drift(calibration.covariance, _repeats(calibration),
+                 () if np.isnan(limits[0]) else limits)
 
 
 def _repeats(calibration: Calibration) -> float:

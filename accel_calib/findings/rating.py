@@ -262,10 +262,9 @@ def step_after(calibration: Calibration) -> NextStep:
 
 def temperature_words(calibration: Calibration) -> str:
     """Return the range of temperature in which a calibration is valid."""
-    poses = calibration.used_poses
-    if 'temperature' not in poses or not np.any(np.isfinite(poses['temperature'])):
+    low, high = calibration.used_poses.range_of('temperature')
+    if math.isnan(low):
         return 'record the temperature, too'
-    low, high = np.nanmin(poses['temperature']), np.nanmax(poses['temperature'])
     room = max(SPAN.value - (high - low), 0.0) / 2.0
     return (f'fit again when the temperature leaves {math.floor(low - room)}..'
             f'{math.ceil(high + room)} °C')
