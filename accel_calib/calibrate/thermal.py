@@ -335,22 +335,16 @@ def ramp_rows(curve: Curve, units: Units) -> Poses:
     share[[np.argmin(warm), np.argmax(warm)]] = _ROWS + np.arange(2)  # they state the range
     _, place = np.unique(np.column_stack([stretches['orientation'], share]), axis=0,
                          return_inverse=True)
-    place = place.ravel()
-    size = np.bincount(place)
-
-    def mean(values: Floats) -> Floats:
-        return np.bincount(place, values) / size
-
-    def of_axes(values: Floats) -> Floats:
-        return np.array([mean(column) for column in values.T]).T
-
-    noise = np.sqrt(np.mean(of_axes(curve.left) ** 2, axis=0))
-    count = np.bincount(place, stretches['count'])
-    columns = {'reading': units.from_g(of_axes(stretches.reading)), 'count': count,
+    members = (place.ravel() == np.arange(place.max() + 1)[:, np.newaxis]).astype(float)
+    members = members[np.argsort(members @ stretches['time'] / members.sum(axis=1), kind='stable')]
+    size, count = members.sum(axis=1), members @ stretches['count']
+    left, reading = (members @ values / size[:, np.newaxis]
+                     for values in (curve.left, stretches.reading))
+    noise = np.sqrt(np.mean(left ** 2, axis=0))
+    columns = {'reading': units.from_g(reading), 'count': count,
                'std': units.from_g(noise * np.sqrt(count)[:, np.newaxis]),
-               **{key: mean(stretches[key]) for key in ('time', 'temperature', 'orientation')}}
-    order = np.argsort(columns['time'], kind='stable')
-    columns = {key: values[order] for key, values in columns.items()}
+               **{key: members @ stretches[key] / size
+                  for key in ('time', 'temperature', 'orientation')}}
     return Poses(columns, numbered(columns), units.name, stretches.sensor, stretches.autopilot)
 
 

@@ -213,12 +213,10 @@ def _averaged(cells: Poses) -> tuple[Poses, Floats]:
                          f'{_LEAST_STRETCHES} s', 'record while the board warms up, for half an '
                          'hour')
     count = np.bincount(place, cells['count'])
-
-    def mean(values: Floats) -> Floats:
-        return np.bincount(place, values * cells['count']) / count
-
-    reading = np.array([mean(column) for column in cells.reading.T]).T
-    moment, warm = mean(cells['time']), mean(cells['temperature'])
+    moment, warm, *axes = (
+        np.bincount(place, column * cells['count']) / count
+        for column in (cells['time'], cells['temperature'], *cells.reading.T))
+    reading = np.array(axes).T
     bend = reading[2:] - 2.0 * reading[1:-1] + reading[:-2]
     noise = np.sqrt(np.median(bend ** 2, axis=0) / _MEDIAN_CHI2 / 6.0)
     columns = {'time': moment, 'reading': reading, 'temperature': warm, 'count': count,

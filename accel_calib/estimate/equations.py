@@ -51,7 +51,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import product
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -348,19 +347,18 @@ class _Shared:
     """
 
     def __init__(self, model: Model, poses: _Kind) -> None:
-        self._sigma, self._context, group = poses.s, poses.context, poses.group
-        self._group = group
+        self._sigma, self._context, self._group = poses.s, poses.context, poses.group
+        self._starts = np.flatnonzero(np.diff(poses.group, prepend=-1))
         self.which, self.pose = poses.which, np.repeat(poses.which, 3)
         self.scale = np.sqrt(np.mean(poses.s ** 2, axis=1))
         here = model.at(self._context)
-        mean = np.array([np.bincount(group, column) for column in here.force(poses.reading).T]).T
-        self.force = unit(mean)[group]
+        self.force = unit(self._summed(here.force(poses.reading)))[self._group]
         for _ in range(_TURNS):
             off, tangents = self._around(here, poses.reading)
             turn = self._normal @ self._summed(np.swapaxes(self._turn, 1, 2) @ off)
             if np.max(np.abs(turn)) < _STRAIGHT:
                 break
-            self.force = unit(self.force + (tangents @ turn[group])[:, :, 0])
+            self.force = unit(self.force + (tangents @ turn[self._group])[:, :, 0])
         off, _ = self._around(here, poses.reading)
         self.residual = self._projected(off).ravel()
 
@@ -374,11 +372,7 @@ class _Shared:
 
     def _summed(self, parts: Floats) -> Floats:
         """Return the sums of (n, …) parts by group."""
-        size, groups = math.prod(parts.shape[1:]), int(self._group[-1]) + 1
-        summed = np.zeros((groups, size))
-        for k, column in enumerate(parts.reshape(len(parts), size).T):
-            summed[:, k] = np.bincount(self._group, column, groups)
-        return summed.reshape(groups, *parts.shape[1:])
+        return np.add.reduceat(parts, self._starts)
 
     def _projected(self, rows: Floats) -> Floats:
         """Return (n, 3, p) rows minus the part that a rotation of the direction explains."""
