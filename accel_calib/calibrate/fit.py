@@ -116,7 +116,7 @@ def fit_poses(poses: Poses, units: Units, *, model: str = 'auto', method: Method
     every = calibration.poses if len(calibration.poses) == len(poses) else poses
     return finished(replace(
         calibration, poses=every, rejected=tuple(left_out),
-        noted=(*wiring(calibration), *calibration.noted)), poses, sensor, date)
+        noted=(*wiring(calibration), *calibration.noted)), sensor, date)
 
 
 def _without_doubtful(poses: Poses, rejected: tuple[Rejected, ...], units: Units, model: str,

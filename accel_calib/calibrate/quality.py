@@ -155,7 +155,7 @@ def record_of(fit: Fit, poses: Poses, units: Units, directions: Floats, name: st
 def noise_floor_mg(fit: Fit) -> float:
     """Return the residual that noise causes after the fit absorbs a part of it [mg]."""
     data, scale = fit.by_pose, fit.equations.scale
-    own = np.trace(data.own(data.spread), axis1=1, axis2=2) - (data.columns.shape[1] - data.rows)
+    own = np.trace(data.own, axis1=1, axis2=2) - (data.columns.shape[1] - data.rows)
     return rms_mg(scale * np.sqrt(np.maximum(own, 0.0)))
 
 
@@ -185,10 +185,9 @@ def _held_out(fit: Fit) -> Floats | None:
 
     """
     data = fit.by_pose
-    own = data.own(data.spread)
-    if np.any(np.linalg.svd(own, compute_uv=False) < _LEAST_OWN):
+    if np.any(np.linalg.svd(data.own, compute_uv=False) < _LEAST_OWN):
         return None
-    left_out = np.linalg.solve(own, data.residual[:, :, np.newaxis])[:, :, 0]
+    left_out = np.linalg.solve(data.own, data.residual[:, :, np.newaxis])[:, :, 0]
     if 'reference' in fit.poses_g:  # differences of readings; W⁻¹ converts them to forces
         noise = believable(fit.poses_g.noise)
         scaled = left_out * (fit.equations.scale[:, np.newaxis] if noise is None else noise)
@@ -273,10 +272,10 @@ def rival_findings(found: tuple[Rival, ...], row: NDArray[np.int64]) -> Iterator
         'take these poses again, or take more poses', 'USABLE', (*out, *instead))
 
 
-def finished(calibration: Calibration, poses: Poses, sensor: str, date: str) -> Calibration:
+def finished(calibration: Calibration, sensor: str, date: str) -> Calibration:
     """Return a calibration that has passed the gate, with the figures of its rests."""
-    named = replace(calibration, sensor=sensor or poses.sensor, date=date)
-    return with_rest_noise(gated(named), poses)
+    named = replace(calibration, sensor=sensor or calibration.sensor, date=date)
+    return with_rest_noise(gated(named), named.poses)
 
 
 @np.errstate(over='ignore', invalid='ignore')

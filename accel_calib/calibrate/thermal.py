@@ -367,7 +367,7 @@ def thermal_alone(curve: Curve, units: Units, *, sensor: str = '', date: str = '
     return finished(Calibration(
         'ideal', PRIOR, Model(values), units, rows.sensor, 'ros', '', covariance,
         quality, rows, (), f'offset over temperature alone, of degree {curve.degree}, relative to '
-        f'{curve.reference_c:.1f} °C', findings_of_curve(curve)), rows, sensor, date)
+        f'{curve.reference_c:.1f} °C', findings_of_curve(curve)), sensor, date)
 
 
 def _rms_mg(vectors: Floats) -> float:

@@ -112,12 +112,12 @@ class ByPose:
         """(n k, q) array, the derivative with one row per equation."""
         return self.columns.reshape(self.residual.size, self.columns.shape[2])
 
-    def own(self, spread: Floats) -> Floats:
-        """Return the (n, k, k) matrices I - leverage of each pose."""
-        onto = (self.flat @ spread).reshape(self.columns.shape)
-        own: Floats = (np.eye(self.columns.shape[1])
-                       - np.einsum('nkq,nlq->nkl', onto, self.columns))
-        return own
+    @cached_property
+    def own(self) -> Floats:
+        """(n, k, k) array, I - leverage of each pose."""
+        onto = (self.flat @ self.spread).reshape(self.columns.shape)
+        leverage = np.einsum('nkq,nlq->nkl', onto, self.columns)
+        return np.asarray(np.eye(self.columns.shape[1]) - leverage)
 
 
 def by_pose(residual: Floats, columns: Floats, pose: Indices,

@@ -167,7 +167,7 @@ def _removed_in_turn(data: ByPose, dof: int, most: int) -> _Removed:
     flat, (count, rows) = data.flat, data.residual.shape
     onto = flat @ data.spread
     residual, left = data.residual.ravel() - onto @ data.downhill, np.ones(count, bool)
-    own = data.own(data.spread)
+    own = data.own.copy()
     removed, solved = np.empty((2, len(flat), most * rows))  # columns of I - leverage
     poses, sizes = [], []
     rss = [float(residual @ residual)]
@@ -206,7 +206,7 @@ def _squared(own: Floats, residual: Floats) -> Floats:
 def _far_out(data: ByPose, chi2: float, dof: int, limit: int, *, noise_known: bool
              ) -> Outliers:
     """Find outliers among many poses, all at once, relative to the median."""
-    alone = _squared(data.own(data.spread), data.residual)
+    alone = _squared(data.own, data.residual)
     size = alone / data.rows
     usual = np.where(data.rows == 1, _MEDIAN_OF_CHI2[1], _MEDIAN_OF_CHI2[3]) / data.rows
     belief = belief_in(noise_known)
@@ -419,8 +419,7 @@ def unseen_mistakes(fit: Fit) -> Floats:
     0 for poses that the others check well, infinite for poses that alone determine a parameter.
 
     """
-    data = fit.by_pose
-    own = data.own(data.spread)
+    own = fit.by_pose.own
     least = own[:, 0, 0] if own.shape[1] == 1 else np.linalg.eigvalsh(own)[:, 0]
     size = np.zeros(len(least))
     weak = np.flatnonzero(least < _HARDLY)
