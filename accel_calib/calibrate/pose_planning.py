@@ -449,25 +449,25 @@ def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
     poses = calibration.used_poses
     directions = directions_in(poses, calibration)
     noise = pose_noise(poses.noise, directions)
-    alone = calibration.method == PRIOR and not calibration.form.effects
-    uncertainty = np.nan if alone or not calibration.model.effects else _uncertainty(calibration)
+    uncertainty = _uncertainty(calibration)
     planned = asked
     if asked in ('auto', ORIENTED):  # with wrong orientations model 12 became 10
         planned = ORIENTED if calibration.form.known_orientation else NORM_MODELS[-1]
-    known, noise_g = np.isfinite(uncertainty), None
-    if known and calibration.form.effects and determines(calibration.name, directions, noise):
+    noise_g = None
+    if uncertainty is not None and calibration.form.effects and determines(
+            calibration.name, directions, noise):
         noise_g = uncertainty / identifiability(calibration.name, directions, noise).mean_dilution
     return Outlook(identifiability(planned, directions, noise),
                    next_pose(directions, planned, noise, noise_g=noise_g),
-                   uncertainty * MG if known else None)
+                   None if uncertainty is None else uncertainty * MG)
 
 
-def _uncertainty(calibration: Calibration) -> float:
+def _uncertainty(calibration: Calibration) -> float | None:
     """Return the stated uncertainty of the corrected force, RMS over the sphere [g]."""
-    up = OVER_THE_SPHERE
+    up, alone = OVER_THE_SPHERE, calibration.method == PRIOR and not calibration.form.effects
     per_g, known = calibration.force_per_g, calibration.typical_context(len(up))
-    if any(key not in known for key in calibration.model.needs):
-        return np.nan
+    if alone or not calibration.model.effects or not known.keys() >= {*calibration.model.needs}:
+        return None
     covariance = calibration.force_covariance(up * per_g, known) / per_g ** 2
     errors = (np.trace(covariance, axis1=1, axis2=2) if calibration.form.known_orientation
               else np.einsum('ni,nij,nj->n', up, covariance, up))

@@ -36,7 +36,7 @@ from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import believable, Fit, judge, Rival, unseen_mistakes
 from ..finding import Finding, without
 from ..geometry import coverage, OVER_THE_SPHERE, unit
-from ..table import Floats, Poses
+from ..table import Floats, in_unit, Poses
 from ..text import listed
 from ..units import MG, Units
 
@@ -87,9 +87,7 @@ class Verification:
 
 def in_g(poses: Poses, units: Units) -> Poses:
     """Return the poses with readings, std and reference in g; native references are in g."""
-    keys = ('reading', 'std') if units.is_native else ('reading', 'std', 'reference')
-    columns = poses.columns
-    return poses.with_columns(**{key: units.to_g(columns[key]) for key in keys if key in columns})
+    return in_unit(poses, units.to_g, native=units.is_native)
 
 
 def verify(calibration: Calibration, poses: Poses) -> Verification:

@@ -51,7 +51,7 @@ import numpy as np
 from numpy.typing import NDArray
 import scipy
 
-from ..table import Floats, Poses, Record
+from ..table import Floats, Poses, range_of, Record
 
 if TYPE_CHECKING:
     from .calibration import Calibration
@@ -226,7 +226,7 @@ def gyro_bias_of(poses: Poses) -> GyroBias | None:
     slope = np.where(sloping, chosen.values[-1], 0.0)
     if 'temperature' not in rests:
         return GyroBias(bias, sd, len(rests), math.nan, slope, ())
-    limits = rests.range_of('temperature')
+    limits = range_of(rests, 'temperature')
     mean = float(np.clip(rests['temperature'].mean(), *limits))
     return GyroBias(bias, sd, len(rests), mean, slope, limits)
 

@@ -56,7 +56,7 @@ from ..errors import InputError
 from ..estimate import judge
 from ..finding import Finding
 from ..geometry import coverage, unit
-from ..table import Floats, numbered, Poses
+from ..table import Floats, numbered, Poses, range_of
 from ..units import MG, Units
 
 DEGREE = 3
@@ -183,7 +183,7 @@ def curve_of(ramps: Sequence[Ramp]) -> Curve:
     """Return the offset over the temperature from the ramps of one board, of any orientation."""
     stretches, group = _joined(ramps)
     warm, rate = stretches['temperature'], np.concatenate([each.rate for each in ramps])
-    low, high = stretches.range_of('temperature')
+    low, high = range_of(stretches, 'temperature')
     reference = float(np.clip(REFERENCE_TEMPERATURE, low, high))
     limit = _MOVING * float(np.quantile(np.abs(rate), 0.95))
     rising, falling = rate > limit, rate < -limit

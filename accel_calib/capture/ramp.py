@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from .detector import check_finite
 from ..errors import InputError
 from ..geometry import unit
-from ..table import Floats, numbered, Poses, Recording
+from ..table import Floats, numbered, Poses, range_of, Recording
 from ..text import counted
 from ..units import MG, Units
 
@@ -174,7 +174,7 @@ def ramp_of(cells: Poses) -> Ramp:
 
 
 def _check_range(cells: Poses) -> None:
-    low, high = cells.range_of('temperature')
+    low, high = range_of(cells, 'temperature')
     if np.isnan(low):
         raise InputError('the log has no temperature, expected that of the sensor', 'record it, '
                          'or name its column with --columns temperature=NAME, or its topic with '

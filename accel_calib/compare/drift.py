@@ -38,7 +38,7 @@ import numpy as np
 
 from ..calibrate import Calibration
 from ..effects import Context, length_rows, sensor_force
-from ..table import Floats
+from ..table import Floats, range_of
 from ..text import counted
 from ..units import MG
 
@@ -251,7 +251,7 @@ def rest_errors(calibration: Calibration, reading: Floats, noise: Floats, contex
 
 def monitor(calibration: Calibration) -> Drift:
     """Return the initial state of the monitor after a calibration."""
-    limits = calibration.poses.range_of('temperature')
+    limits = range_of(calibration.poses, 'temperature')
     return Drift(calibration.covariance, _repeats(calibration),
                  () if np.isnan(limits[0]) else limits)
 

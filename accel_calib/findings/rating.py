@@ -25,7 +25,7 @@ from ..effects import EMPIRICAL, kind_of, WANDER
 from ..errors import TAKE_ALL_SIDES
 from ..finding import Finding, NextStep, ranked, rated, Rating, without
 from ..geometry import coverage
-from ..table import Poses
+from ..table import Poses, range_of
 from ..text import counted, listed
 from ..units import MG
 
@@ -262,7 +262,7 @@ def step_after(calibration: Calibration) -> NextStep:
 
 def temperature_words(calibration: Calibration) -> str:
     """Return the range of temperature in which a calibration is valid."""
-    low, high = calibration.used_poses.range_of('temperature')
+    low, high = range_of(calibration.used_poses, 'temperature')
     if math.isnan(low):
         return 'record the temperature, too'
     room = max(SPAN.value - (high - low), 0.0) / 2.0
