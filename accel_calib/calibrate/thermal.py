@@ -55,7 +55,7 @@ from ..effects import effect_named, Model, OFFSET_POWERS, REFERENCE_TEMPERATURE,
 from ..errors import InputError
 from ..estimate import judge
 from ..finding import Finding
-from ..geometry import coverage, unit
+from ..geometry import coverage, rms, unit
 from ..table import Floats, numbered, Poses, range_of
 from ..units import MG, Units
 
@@ -371,7 +371,7 @@ def thermal_alone(curve: Curve, units: Units, *, sensor: str = '', date: str = '
 
 
 def _rms_mg(vectors: Floats) -> float:
-    return float(np.sqrt(np.mean(np.sum(vectors ** 2, axis=1)))) * MG
+    return rms(np.linalg.norm(vectors, axis=1)) * MG
 
 
 def without_curve(curve: Curve, poses: Poses, units: Units) -> Poses:

@@ -38,6 +38,7 @@ import numpy as np
 
 from ..calibrate import Calibration
 from ..effects import Context, length_rows, sensor_force
+from ..geometry import rms
 from ..table import Floats, range_of
 from ..text import counted
 from ..units import MG
@@ -152,8 +153,7 @@ def _described(kind: str, rests: int, clear: bool, error: Floats, covariance: Fl
     shift = found @ weighted @ error
     moved = slope[len(up) - rests:] @ shift
     sign = float(np.sign(moved[0])) if np.ptp(np.sign(moved)) == 0.0 else 1.0
-    return LastingChange(rests, kind, clear, shift, found,
-                         sign * float(np.sqrt(np.mean(moved ** 2))))
+    return LastingChange(rests, kind, clear, shift, found, sign * rms(moved))
 
 
 _LEAST_NOISE = 2e-5   # smallest noise of a rest [g]
