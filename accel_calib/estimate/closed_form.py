@@ -81,14 +81,6 @@ class Form:
         """(k + 4,) array, how often each monomial, r and 1 occurs in the quadric."""
         return np.append(np.where(self.first == self.second, 1.0, 2.0), np.ones(4))
 
-    @cached_property
-    def scatter(self) -> Floats:
-        """(k, 9) array, maps the coefficients to the entries of A."""
-        entries = np.zeros((len(self.first), 3, 3))
-        each = np.arange(len(self.first))
-        entries[each, self.first, self.second] = entries[each, self.second, self.first] = 1.0
-        return entries.reshape(-1, 9)
-
 
 DIAGONAL = Form(np.array([0, 1, 2]), np.array([0, 1, 2]))
 SYMMETRIC = Form(np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2]))
@@ -144,7 +136,8 @@ def _moments(form: Form, r: Floats) -> Floats:
 def _ellipsoid(form: Form, beta: Floats) -> tuple[Floats, Floats]:
     """Return W and V of the quadric with these coefficients; NaN where it is no ellipsoid."""
     size = len(form.first)
-    mat_a = (beta[..., :size] @ form.scatter).reshape(*beta.shape[:-1], 3, 3)
+    mat_a = np.zeros((*beta.shape[:-1], 3, 3))
+    mat_a[..., form.first, form.second] = mat_a[..., form.second, form.first] = beta[..., :size]
     values, vectors = np.linalg.eigh(mat_a)
     sign = np.copysign(1.0, values[..., 1:2])  # AN5286: negate the whole vector
     with np.errstate(invalid='ignore', divide='ignore'):
