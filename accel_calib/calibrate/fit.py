@@ -383,7 +383,7 @@ def _without_outliers(poses_g: Poses, method: Method) -> tuple[Fit, tuple[Reject
     rejected: tuple[Rejected, ...] = ()
     fit = estimate(with_vector(effects, np.zeros(12)), poses_g)
     while method == 'ml':
-        out = outliers(fit, len(poses_g)).poses
+        out = outliers(fit, len(poses_g))
         left = fit.poses_g.take(np.delete(np.arange(len(fit.poses_g)), out))
         if not len(out) or not determines(ORIENTED, unit(left['reference'])):
             break
