@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any, Literal, overload
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from .calibrate import (
     Calibration as _Calibration, mounting_of, Verification, verify as verify_calibration)
 from .compare import compare as compare_calibrations, Comparison
-from .effects import know, model_with, OwnEffect as Effect, simulate_poses, simulate_recording
+from .effects import know, model_with, OwnEffect, simulate_poses, simulate_recording
 from .errors import InputError
 from .finding import Finding
 from .findings import figures_of, rate, Rating
@@ -27,18 +27,15 @@ from .geometry import spread_directions
 from .logs import (
     are_untimed_samples, Frame, LogOptions, read_log, read_recording as read_whole_recording)
 from .pipeline import calibrated, calibrated_log, captured_from, Flat, options_for, Plan, poses_of
-from .refine import refine as find_effects, Refinement
+from .refine import refine as find_effects, Refinement as Refinement
 from .stored import read_calibration, write_calibration
 from .table import (
-    check_units, check_values, data_frame, Floats, LARGEST, median_length, numbered, Poses,
-    Recording, Table)
+    check_units, check_values, data_frame, Floats, in_unit, LARGEST, median_length, numbered,
+    Poses as Poses, Recording as Recording, Table)
 from .text import counted, now
-from .units import FrameName, is_native, Method, STANDARD_GRAVITY, UnitName, units_of
+from .units import FrameName, Method, STANDARD_GRAVITY, UnitName, units_of
 
-__all__ = ['Calibration', 'Effect', 'Poses', 'Recording', 'Refinement', 'calibrate', 'capture',
-           'compare', 'fit', 'load', 'read_poses', 'read_recording', 'refine', 'simulate',
-           'verify']
-
+Effect = OwnEffect
 Source = str | PathLike[str]
 Data = Any
 """A table, an (n, 3) array of readings, or a DataFrame with the column names of any log."""
@@ -595,15 +592,12 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
                 warm[0], warm[-1], len(up))
         found = simulate_poses(model, up, rng, noise_g=noise, samples=samples,
                                context={'reference': up, **columns})
-    kept = {key: values for key, values in found.columns.items()
-            if reference or key != 'reference'}
-    scaled: dict[str, NDArray[Any]] = {
-        key: known.from_g(kept[key]) for key in ('reading', 'std', 'reference')
-        if key in kept and (key != 'reference' or not is_native(units))}
-    if not np.all(np.abs(scaled['reading']) < LARGEST):
+    found = in_unit(found, known.from_g, native=known.is_native)
+    if not np.all(np.abs(found.reading) < LARGEST):
         raise InputError('the simulated readings are beyond any sensor, expected finite numbers '
                          f'below {LARGEST:g}', 'use smaller effects, noise and temperatures')
-    return replace(found, columns={**kept, **scaled}, units=units)  # type: ignore[return-value]
+    kept = found if reference else found.without_columns('reference')
+    return replace(kept, units=units)  # type: ignore[return-value]
 
 
 def _check_within(**numbers: tuple[float, float, float]) -> None:

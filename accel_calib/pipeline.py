@@ -33,7 +33,7 @@ from .errors import InputError, RefusedFitError, saying
 from .findings import rate, Rating
 from .geometry import unit
 from .logs import Frame, LogOptions, open_log, OpenLog, Piped, Progress
-from .table import check_units, Poses, Recording, Table
+from .table import check_units, Poses, range_of, Recording, Table
 from .text import counted, now, short
 from .units import FrameName, Method, UnitName, Units, units_of
 
@@ -207,7 +207,7 @@ class RampIntake:
     @property
     def lines(self) -> tuple[str, ...]:
         """Return `read_as`, the range of the temperature and the notes."""
-        low, high = self.ramp.range_c
+        low, high = range_of(self.ramp.stretches, 'temperature')
         words = (f'a still board for {self.ramp.seconds / 60.0:.0f} min, from {low:.1f} to '
                  f'{high:.1f} °C')
         return tuple(filter(None, (self.read_as and f'read as: {self.read_as}', words,
@@ -422,7 +422,7 @@ def calibrated_log(source: Source, options: LogOptions, found: Intake, plan: Pla
     if found.captured and not found.units.is_native and _is_one_direction(found.poses):
         with _opened(source, options) as log:
             cells = cells_of(log.blocks, log.units)
-            low, high = cells.range_c
+            low, high = range_of(cells, 'temperature')
             if high - low >= LEAST_RANGE:
                 return thermally_calibrated([
                     RampIntake(ramp_of(cells), log.units, log.read_as, log.notes)], plan)

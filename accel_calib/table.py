@@ -13,7 +13,7 @@ letters and digits.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 import re
 from typing import Any, get_args, Literal, TypeVar
@@ -308,6 +308,19 @@ class Recording(Table):
         super().__post_init__()
         if 'time' not in self.columns:
             raise ValueError('the recording has no times, expected the column time')
+
+
+def range_of(table: Table, key: str) -> tuple[float, float]:
+    """Return the lowest and the highest known number of a column; NaN if none is known."""
+    values = table[key] if key in table else np.zeros(0)
+    known = values[np.isfinite(values)]
+    return (float(known.min()), float(known.max())) if len(known) else (np.nan, np.nan)
+
+
+def in_unit(table: _Self, convert: Callable[[Floats], Floats], *, native: bool = False) -> _Self:
+    """Return a table in another unit; known forces beside native readings are in g."""
+    keys = ('reading', 'std') if native else ('reading', 'std', 'reference')
+    return table.with_columns(**{key: convert(table[key]) for key in keys if key in table})
 
 
 def data_frame(columns: Mapping[str, Any], index: Any) -> Any:

@@ -21,7 +21,7 @@ from accel_calib.calibrate import (
     Calibration, determines, mounting_figures, posterior, refuse_if_unfit, sound_rows)
 from accel_calib.calibrate.mounting import (
     axes_of, doubts_about_flat, fault_of, mounting, with_heading, with_heading_of)
-from accel_calib.calibrate.partial import carried, common_sensors, typical_spread, without_knocked
+from accel_calib.calibrate.partial import carried, common_sensors, without_knocked
 from accel_calib.calibrate.pose_planning import (
     missing_poses, poses_needed, rows_of, shape_words, unseen)
 from accel_calib.capture import rounding_left

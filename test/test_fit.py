@@ -11,7 +11,7 @@ import accel_calib as ac
 from accel_calib.calibrate import fit_poses, in_g, outlook, verify
 from accel_calib.errors import RefusedFitError
 from accel_calib.estimate import (
-    estimate, lower_triangular, NotConvergedError, Point, sensing_axes, solve, start_of,
+    estimate, lower_triangular, NotConvergedError, originals, Point, sensing_axes, solve, start_of,
     variance_factor)
 from accel_calib.finding import has
 from accel_calib.geometry import ATTITUDES
@@ -350,6 +350,14 @@ def test_readings_that_were_measured_again_are_not_copies():
     once, found = (fit_poses(each, G, model='10') for each in (poses, again))
     assert not [line for line in found.warnings if 'equal' in line]
     assert np.trace(found.covariance) < 0.75 * np.trace(once.covariance)
+
+
+def test_all_copies_of_readings_on_a_coarse_grid_are_found():
+    reading = np.repeat([*product(np.arange(-9, 10) * 1e-3, repeat=3)], 2, axis=0)
+    columns = {'reading': reading, 'std': np.full(reading.shape, 0.1),
+               'count': np.full(len(reading), 100.0)}
+    np.testing.assert_array_equal(originals(Poses(columns, numbered(columns))),
+                                  np.arange(len(reading)) // 2 * 2)
 
 
 def test_poses_that_count_once_are_too_few_for_the_model():

@@ -15,12 +15,13 @@ from accel_calib.table import Poses
 from accel_calib.units import units_of
 from inside import (
     carried, common_sensors, Model, MODELS, predict, sensor_force, simulate_poses,
-    spread_directions, typical_spread, unit, with_vector)
+    spread_directions, unit, with_vector)
 import numpy as np
 import pytest
 
 G, NATIVE = units_of('g'), units_of('native')
 UP, Z = spread_directions(200), np.array([[0.0, 0.0, 1.0]])
+SPREAD = np.sqrt(np.diag(common_sensors().covariance))
 
 
 def near_up(rng, count, degrees, axis=(0.0, 0.0, 1.0)):
@@ -33,7 +34,7 @@ def near_up(rng, count, degrees, axis=(0.0, 0.0, 1.0)):
 
 def common_sensor(rng):
     """Return a random sensor with values as the prior has them."""
-    return with_vector(MODELS['10'].effects, rng.normal(size=9) * typical_spread())
+    return with_vector(MODELS['10'].effects, rng.normal(size=9) * SPREAD)
 
 
 def tilting(seed, count=7, degrees=10.0, noise_g=0.003):
@@ -91,7 +92,7 @@ def test_poses_that_tell_nothing_leave_the_spread_of_common_sensors():
     found = fit_partial(tilting(1, 1)[1], G)
     names = ('offset.x', 'offset.y', 'axis_gain.x', 'axis_gain.y', 'cross_axis.xy')
     which = [found.parameters.index(name) for name in names]
-    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance))[which], typical_spread()[which],
+    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance))[which], SPREAD[which],
                                rtol=0.05)
     along = 0.1 * 0.03 / np.hypot(0.1, 0.03)
     assert found.offset_sd[2] == pytest.approx(along, rel=0.1)

@@ -30,7 +30,7 @@ from ..effects import (
 from ..errors import InputError, StoredCalibrationError
 from ..finding import Finding
 from ..geometry import over_axes, unit
-from ..table import column_of, Floats, Poses, Record, Table
+from ..table import column_of, Floats, in_unit, Poses, Record, Table
 from ..text import counted, table, with_sd
 from ..units import FrameName, METHODS, MG, UnitName, Units, units_of
 
@@ -45,8 +45,6 @@ FLEET = 'fleet'
 
 STORED_METHODS = (*METHODS, PRIOR, FLEET)
 """Methods of stored calibrations; the user selects one of `METHODS`."""
-
-_IN_READING_UNITS = ('reading', 'std', 'reference')
 
 _THERMAL = ('temperature_rate', 'temperature_of_offset', 'temperature_of_gain')
 """Context that is computed from time and temperature."""
@@ -500,8 +498,7 @@ def _conversion(before: UnitName, after: UnitName) -> float:
 def converted(table: _Known, before: UnitName, after: UnitName) -> _Known:
     """Return a table with its readings in another unit; errors as in `Calibration.in_units`."""
     factor = _conversion(before, after)
-    known = {key: table[key] * factor for key in _IN_READING_UNITS if key in table}
-    return replace(table.with_columns(**known), units=after)
+    return replace(in_unit(table, lambda values: values * factor), units=after)
 
 
 def check_sensor(calibration: Calibration, sensor: str) -> None:

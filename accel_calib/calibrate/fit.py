@@ -36,8 +36,7 @@ from .mounting import wiring
 from .pose_planning import (
     determines, dilution, free_parameters, LARGEST_DILUTION, NORM_MODELS, poses_needed,
     refuse_if_unfit, unseen, WEAK_DILUTION)
-from .quality import (
-    finished, fit_findings, in_g, LARGEST_OFFSET_G, record_of, rival_findings, rms_mg)
+from .quality import finished, fit_findings, in_g, LARGEST_OFFSET_G, record_of, rival_findings
 from ..effects import length_rows, linear_model, Model, MODELS, sensor_force, with_vector
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import (
@@ -45,7 +44,7 @@ from ..estimate import (
     lower_triangular, NotConvergedError, originals, outliers, Point, pose_noise, rivals, solve,
     start_of, TIES)
 from ..finding import Finding
-from ..geometry import unit
+from ..geometry import rms, unit
 from ..table import check_units, Poses
 from ..text import listed
 from ..units import Floats, Indices, Method, METHODS, MG, MODEL_NAMES, Units
@@ -116,7 +115,7 @@ def fit_poses(poses: Poses, units: Units, *, model: str = 'auto', method: Method
     every = calibration.poses if len(calibration.poses) == len(poses) else poses
     return finished(replace(
         calibration, poses=every, rejected=tuple(left_out),
-        noted=(*wiring(calibration), *calibration.noted)), poses, sensor, date)
+        noted=(*wiring(calibration), *calibration.noted)), sensor, date)
 
 
 def _without_doubtful(poses: Poses, rejected: tuple[Rejected, ...], units: Units, model: str,
@@ -331,7 +330,7 @@ def _choose(fits: Mapping[str, Fit]) -> tuple[str, str]:
         added = small.dof - large.dof
         gained = max(small.chi2 - large.chi2, 0.0) / added
         chance = float(scipy.special.fdtrc(added, large.variance_dof, gained / large.variance))
-        before, after = (rms_mg(fit.equations.of_poses(fit.residual)) for fit in (small, large))
+        before, after = (rms(fit.equations.of_poses(fit.residual)) * MG for fit in (small, large))
         change = f'{before:.3g} to {after:.3g} mg'
         if chance < _LEVEL_OF_MODELS:
             reasons.append(f'model {name} reduces the residual of model {chosen} from {change} '
@@ -384,7 +383,7 @@ def _without_outliers(poses_g: Poses, method: Method) -> tuple[Fit, tuple[Reject
     rejected: tuple[Rejected, ...] = ()
     fit = estimate(with_vector(effects, np.zeros(12)), poses_g)
     while method == 'ml':
-        out = outliers(fit, len(poses_g)).poses
+        out = outliers(fit, len(poses_g))
         left = fit.poses_g.take(np.delete(np.arange(len(fit.poses_g)), out))
         if not len(out) or not determines(ORIENTED, unit(left['reference'])):
             break

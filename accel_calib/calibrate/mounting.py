@@ -57,7 +57,7 @@ from ..effects import AXES, Context, Model, sensor_force
 from ..errors import InputError, RefusedFitError
 from ..estimate import fit_12
 from ..finding import Finding, Level, without
-from ..geometry import angle_of, quaternion_of, rotation_from_rpy, rpy_of
+from ..geometry import angle_of, axes_of_signs, quaternion_of, rotation_from_rpy, rpy_of
 from ..table import Floats, Poses
 from ..units import FrameName
 
@@ -81,7 +81,8 @@ _FORWARD_RIGHT_DOWN = np.diag([1.0, -1.0, -1.0])
 _SAME_HEADING = 1e-6
 _VERTICAL = 1e-9
 _DIGITS = 9
-_LEAST_HEADING_ANGLE = np.radians(10.0)
+_STEEP = np.cos(np.radians(10.0))
+"""Cosine of the angle from the vertical within which a direction has no heading."""
 
 _NEAR = 25.0
 """Largest angle between axes and a permutation that they match [°]."""
@@ -104,27 +105,17 @@ def mounting(flat: Floats, frame: str = 'ros') -> Floats:
         raise InputError(f'the flat pose has the force {flat}, expected about 1 g',
                          'repeat the flat pose with the sensor at rest')
     column_z = flat / length * flat_direction(frame)[2]
-    column_x = _x_of_win8(column_z) if frame == 'win8' else _x_without_yaw(column_z)
-    return np.column_stack([column_x, np.cross(column_z, column_x), column_z])
+    return _triad(column_z, _x_towards(column_z, frame))
 
 
-def _x_without_yaw(up: Floats) -> Floats:
-    """Return the x column for ned, android and ros: zero yaw, level y axis."""
+def _x_towards(up: Floats, frame: str) -> Floats:
+    """Return the direction whose horizontal part is the x column by the convention of a frame."""
     x, y, z = up
-    root = np.hypot(y, z)
-    if root < _VERTICAL:
-        return np.array([0.0, 0.0, -np.sign(x)])
-    return np.array([root, -x * y / root, -x * z / root])
-
-
-def _x_of_win8(up: Floats) -> Floats:
-    """Return the x column for win8: no y component, and x component not negative."""
-    x, _, z = up
-    root = np.hypot(x, z)
-    if root < _VERTICAL:
+    if frame != 'win8' and np.hypot(y, z) < _VERTICAL:  # a level y axis
+        return np.array([0.0, 0.0, -x])
+    if frame != 'win8' or np.hypot(x, z) < _VERTICAL:
         return np.array([1.0, 0.0, 0.0])
-    sign = -1.0 if z < 0.0 else 1.0
-    return np.array([z, 0.0, -x]) * sign / root
+    return np.array([z, 0.0, -x]) * (-1.0 if z < 0.0 else 1.0)
 
 
 def with_heading(rotation: Floats, nose_down: Floats, frame: str = 'ros') -> Floats:
@@ -135,31 +126,25 @@ def with_heading(rotation: Floats, nose_down: Floats, frame: str = 'ros') -> Flo
     170°. `nose_down` is its (3,) calibrated reading in the axes of the sensor, of any length.
 
     """
-    flat = flat_direction(frame)
-    return _triad(rotation @ flat, nose_down) @ _triad(flat, _NOSE_DOWN[frame]).T
+    up = rotation[:, 2]
+    if not abs(up @ nose_down) <= _STEEP * np.linalg.norm(nose_down):
+        raise InputError('the pose with the nose down is within 10° of the flat pose or of its '
+                         'opposite, expected a tilt of 10° to 170°',
+                         'tilt the nose of the robot further down')
+    return _triad(up, nose_down) @ _triad(np.array([0.0, 0.0, 1.0]), _NOSE_DOWN[frame]).T
 
 
 def with_heading_of(before: Floats, rotation: Floats) -> Floats:
     """Return ΔR with the heading of `before`, unless its x axis is within 10° of the vertical."""
     up, x = rotation[:, 2], before[:, 0]
-    level_x = x - up * (up @ x)
-    length = np.linalg.norm(level_x)
-    if length < np.sin(_LEAST_HEADING_ANGLE):
-        return rotation
-    level_x = level_x / length
-    return np.column_stack([level_x, np.cross(up, level_x), up])
+    return rotation if abs(up @ x) > _STEEP else _triad(up, x)
 
 
-def _triad(first: Floats, second: Floats) -> Floats:
-    """Return the (3, 3) matrix of orthonormal axes defined by two directions."""
-    unit = first / np.linalg.norm(first)
-    normal = np.cross(unit, second / np.linalg.norm(second))
-    if not np.linalg.norm(normal) >= np.sin(_LEAST_HEADING_ANGLE):
-        raise InputError('the pose with the nose down is within 10° of the flat pose or of its '
-                         'opposite, expected a tilt of 10° to 170°',
-                         'tilt the nose of the robot further down')
-    normal = normal / np.linalg.norm(normal)
-    return np.column_stack([np.cross(normal, unit), normal, unit])
+def _triad(up: Floats, towards: Floats) -> Floats:
+    """Return the axes with z up, a unit vector, and x along the horizontal part of `towards`."""
+    column_x = towards - up * (up @ towards)
+    column_x = column_x / np.linalg.norm(column_x)
+    return np.column_stack([column_x, np.cross(up, column_x), up])
 
 
 def in_frame(calibration: Calibration, frame: FrameName) -> Calibration:
@@ -239,8 +224,7 @@ def angle_words(rotation: Floats) -> str:
 
 def heading_is_arbitrary(rotation: Floats, frame: str) -> bool:
     """Return whether x (win8: y), which defines the heading, is within 10° of the vertical."""
-    axis = 1 if frame == 'win8' else 0
-    return bool(np.hypot(*np.delete(rotation[:, 2], axis)) < np.sin(_LEAST_HEADING_ANGLE))
+    return bool(abs(rotation[1 if frame == 'win8' else 0, 2]) > _STEEP)
 
 
 def level_by_rows(calibration: Calibration, poses: Poses, frame: FrameName, flat: int | None,
@@ -288,13 +272,11 @@ def level(calibration: Calibration, reading: Floats, frame: FrameName,
     arbitrary = not kept and heading_is_arbitrary(rotation, frame)
     if kept:
         rotation = with_heading_of(calibration.rotation, rotation)
-    others = without(calibration.noted, 'flat_pose', 'heading')
-    levelled = replace(calibration, model=Model(calibration.model.values, rotation), frame=frame)
     asked = kept and calibration.rotation[:, 2] @ rotation[:, 2] > _SAME_TILT
     doubts = () if asked else doubts_about_flat(rotation, frame)  # asked once
-    return replace(levelled, noted=(
-        *wiring(levelled), *without(others, 'wiring'), *doubts,
-        *((_ARBITRARY_HEADING,) if arbitrary else ())))
+    levelled = with_mounting(replace(calibration, frame=frame), rotation, 'flat_pose')
+    return replace(levelled, noted=(*levelled.noted, *doubts,
+                                    *(_ARBITRARY_HEADING,) * arbitrary))
 
 
 def set_heading(calibration: Calibration, reading: Floats, context: Context | None = None
@@ -343,7 +325,6 @@ def doubts_about_flat(rotation: Floats, frame: str) -> Iterator[Finding]:
         return
     face = int(np.argmax(np.abs(force)))
     seen = f'{"-" if force[face] < 0.0 else "+"}{AXES[face]}'
-    own = f'{"-" if expected[2] < 0.0 else "+"}z'
     if face == 2:
         causes = 'it is mounted upside down, or z (or every axis) has the wrong sign'
         advice = 'if it is not upside down, correct the sign, because a rotation does not'
@@ -351,8 +332,8 @@ def doubts_about_flat(rotation: Floats, frame: str) -> Iterator[Finding]:
         causes = f'it is mounted with {seen} up, or {AXES[face]} and z are swapped'
         advice = 'if it lies flat, correct the wiring or the driver'
     yield Finding('flat_pose', f'the flat pose reads {force[face]:+.2f} g on {AXES[face]}, where '
-                  f'a sensor that lies flat reads 1 g on {own}: {causes}; one flat pose cannot '
-                  'distinguish them', advice, 'USABLE')
+                  f'a sensor that lies flat reads 1 g on {axes_of_signs(expected)}: {causes}; one '
+                  'flat pose cannot distinguish them', advice, 'USABLE')
 
 
 def wiring(calibration: Calibration) -> Iterator[Finding]:
@@ -434,13 +415,8 @@ def _words(permutation: Floats) -> str:
 
 def _mapping(permutation: Floats) -> str:
     """Return the force that each axis reads, for axes that do not read their own force."""
-    parts = []
-    for axis, row in zip(AXES, permutation, strict=True):
-        other = int(np.argmax(np.abs(row)))
-        sign = '-' if row[other] < 0.0 else '+'
-        if f'{sign}{AXES[other]}' != f'+{axis}':
-            parts.append(f'{axis} reads {sign}{AXES[other]}')
-    return ', '.join(parts)
+    read = zip(AXES, map(axes_of_signs, permutation), strict=True)
+    return ', '.join(f'{axis} reads {other}' for axis, other in read if other != f'+{axis}')
 
 
 def _turn(rotation: Floats) -> str:

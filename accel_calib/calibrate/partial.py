@@ -137,15 +137,10 @@ class Candidate:
     is_unlike: bool = False
 
 
-def typical_spread() -> Floats:
-    """Return the (9,) standard deviations of the values of model 10 over common sensors."""
-    return np.array([EFFECTS[name].typical for name in _EFFECTS for _ in EFFECTS[name].parameters])
-
-
 def common_sensors() -> Prior:
     """Return the distribution of the values of model 10 over common sensors."""
-    spread = typical_spread()
-    return Prior(np.zeros(len(spread)), np.diag(spread ** 2))
+    spread = [EFFECTS[name].typical for name in _EFFECTS for _ in EFFECTS[name].parameters]
+    return Prior(np.zeros(len(spread)), np.diag(np.square(spread)))
 
 
 def priors_of(fleet: FleetPrior | None = None) -> tuple[Candidate, ...]:
@@ -209,7 +204,7 @@ def without_knocked(poses_g: Poses, kept: Indices, prior: Prior, noise_g: float,
     now = best = _likely(poses_g, kept, 0, prior, noise_g)
     for knocked in range(1, int(share * total) + 1):
         data = now.fit.by_pose
-        own = np.maximum(data.own(data.spread)[:, 0, 0], _LEAST_OWN)
+        own = np.maximum(data.own[:, 0, 0], _LEAST_OWN)
         away = data.residual[:, 0] ** 2 / own / now.factor  # from the fit of the others
         farthest = np.argsort(-away, kind='stable')[:_TRIED]
         if now.factor == 1.0 and away[farthest[0]] < _SUSPICIOUS:
@@ -306,7 +301,7 @@ def mounting_only(poses: Poses, units: Units, *, sensor: str = '', date: str = '
             'open', 'offset and gain are not calibrated: a common sensor has an offset of '
             f'{offset * MG:.0f} mg on each axis, so |a| is off by about as much, and away from '
             f'the level pose the tilt by about {np.degrees(np.arcsin(offset)):.0f}°'),)),
-        poses, sensor, date)
+        sensor, date)
 
 
 def fit_partial(poses: Poses, units: Units, *, sensor: str = '', date: str = '') -> Calibration:
@@ -345,7 +340,7 @@ def fit_partial(poses: Poses, units: Units, *, sensor: str = '', date: str = '')
     calibration = _recorded(found, poses, sound, units, PRIOR, rejected)
     about = carried(calibration)
     return finished(replace(calibration, reason=_known_words(about), noted=(
-        _open(about), *calibration.noted)), poses, sensor, date)
+        _open(about), *calibration.noted)), sensor, date)
 
 
 def fit_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, *, sensor: str = '',
@@ -371,7 +366,7 @@ def fit_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, *, sensor: str
     reason = (f'{counted(len(found.kept), "pose")} with the typical values of '
               f'{counted(fleet.sensors, "sensor")}{name}')
     return finished(replace(calibration, reason=reason, noted=(
-        *(UNLIKE_FLEET,) * found.is_unlike, *calibration.noted)), poses, sensor, date)
+        *(UNLIKE_FLEET,) * found.is_unlike, *calibration.noted)), sensor, date)
 
 
 def _recorded(found: PriorFit, poses: Poses, sound: Poses, units: Units, method: str,

@@ -40,13 +40,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import lru_cache
 
 import numpy as np
 import scipy
 
 from .calibration import Calibration, ORIENTED, PRIOR
-from ..effects import EFFECTS, Model, MODELS, parameter_names, with_vector
+from ..effects import EFFECTS, MODELS, parameter_names, with_vector
 from ..errors import RefusedFitError
 from ..estimate import pose_noise
 from ..finding import Finding
@@ -129,14 +129,10 @@ def poses_needed(name: str) -> int:
     return free_parameters(name) // (3 if MODELS[name].known_orientation else 1)
 
 
-@cache
-def _no_errors(name: str) -> Model:
-    return with_vector(effects_of(name), np.zeros(free_parameters(name)))
-
-
 def rows_of(name: str, directions: Floats) -> Floats:
     """Return Φ at (n, 3) unit vectors: (n, 1, p), or (n, 3, p) for model 12."""
-    basis = _no_errors(name).basis(directions, {})
+    ideal = with_vector(effects_of(name), np.zeros(free_parameters(name)))
+    basis = ideal.basis(directions, {})
     return basis.full if MODELS[name].known_orientation else basis.along(directions)[:, np.newaxis]
 
 
@@ -174,16 +170,9 @@ def _largest_error(name: str, information: Floats) -> float:
     """Return the dilution for the (p, p) information of poses."""
     ridge = _NOTHING * np.trace(information) + 1e-300
     inverse = np.linalg.inv(information + ridge * np.eye(len(information)))
-    found = float(np.sqrt(np.max(inverse.ravel() @ _pairs_over_the_sphere(name))))
-    return found if found < 1.0 / _SINGULAR else np.inf
-
-
-@lru_cache(maxsize=8)
-def _pairs_over_the_sphere(name: str) -> Floats:
-    """Return the (p², m) products of the entries of Φ in each direction."""
     around = _over_the_sphere(name)
-    pairs = np.einsum('mkp,mkq->mpq', around, around)
-    return np.ascontiguousarray(pairs.reshape(len(pairs), -1).T)
+    found = float(np.sqrt(np.max(np.sum((around @ inverse) * around, axis=(1, 2)))))
+    return found if found < 1.0 / _SINGULAR else np.inf
 
 
 @dataclass(frozen=True)
@@ -460,25 +449,25 @@ def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
     poses = calibration.used_poses
     directions = directions_in(poses, calibration)
     noise = pose_noise(poses.noise, directions)
-    alone = calibration.method == PRIOR and not calibration.form.effects
-    uncertainty = np.nan if alone or not calibration.model.effects else _uncertainty(calibration)
+    uncertainty = _uncertainty(calibration)
     planned = asked
     if asked in ('auto', ORIENTED):  # with wrong orientations model 12 became 10
         planned = ORIENTED if calibration.form.known_orientation else NORM_MODELS[-1]
-    known, noise_g = np.isfinite(uncertainty), None
-    if known and calibration.form.effects and determines(calibration.name, directions, noise):
+    noise_g = None
+    if uncertainty is not None and calibration.form.effects and determines(
+            calibration.name, directions, noise):
         noise_g = uncertainty / identifiability(calibration.name, directions, noise).mean_dilution
     return Outlook(identifiability(planned, directions, noise),
                    next_pose(directions, planned, noise, noise_g=noise_g),
-                   uncertainty * MG if known else None)
+                   None if uncertainty is None else uncertainty * MG)
 
 
-def _uncertainty(calibration: Calibration) -> float:
+def _uncertainty(calibration: Calibration) -> float | None:
     """Return the stated uncertainty of the corrected force, RMS over the sphere [g]."""
-    up = OVER_THE_SPHERE
+    up, alone = OVER_THE_SPHERE, calibration.method == PRIOR and not calibration.form.effects
     per_g, known = calibration.force_per_g, calibration.typical_context(len(up))
-    if any(key not in known for key in calibration.model.needs):
-        return np.nan
+    if alone or not calibration.model.effects or not known.keys() >= {*calibration.model.needs}:
+        return None
     covariance = calibration.force_covariance(up * per_g, known) / per_g ** 2
     errors = (np.trace(covariance, axis1=1, axis2=2) if calibration.form.known_orientation
               else np.einsum('ni,nij,nj->n', up, covariance, up))

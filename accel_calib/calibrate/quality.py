@@ -35,8 +35,8 @@ from ..effects import correct, LADDER, length_rows, Model, sensor_force
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import believable, Fit, judge, Rival, unseen_mistakes
 from ..finding import Finding, without
-from ..geometry import coverage, OVER_THE_SPHERE, unit
-from ..table import Floats, Poses
+from ..geometry import coverage, OVER_THE_SPHERE, rms, unit
+from ..table import Floats, in_unit, Poses
 from ..text import listed
 from ..units import MG, Units
 
@@ -87,9 +87,7 @@ class Verification:
 
 def in_g(poses: Poses, units: Units) -> Poses:
     """Return the poses with readings, std and reference in g; native references are in g."""
-    keys = ('reading', 'std') if units.is_native else ('reading', 'std', 'reference')
-    columns = poses.columns
-    return poses.with_columns(**{key: units.to_g(columns[key]) for key in keys if key in columns})
+    return in_unit(poses, units.to_g, native=units.is_native)
 
 
 def verify(calibration: Calibration, poses: Poses) -> Verification:
@@ -110,7 +108,7 @@ def verify(calibration: Calibration, poses: Poses) -> Verification:
     if believable(poses_g.noise) is not None:
         known = poses_g if vectors else poses_g.without_columns('reference', 'orientation')
         scale = judge(Model(model.values), known).equations.scale
-        floor = rms_mg(scale) * float(np.sqrt(3.0 if vectors else 1.0))
+        floor = rms(scale) * MG * float(np.sqrt(3.0 if vectors else 1.0))
     return Verification(*_residuals(model, poses_g, units, vectors), floor)
 
 
@@ -120,7 +118,7 @@ def _residuals(model: Model, poses_g: Poses, units: Units, vectors: bool
     errors = (errors_before(poses_g, units, vectors=vectors),
               errors_after(model, poses_g, vectors=vectors))
     before, after = (float(np.max(np.abs(each))) * 100.0 for each in errors)
-    return rms_mg(errors[0]), rms_mg(errors[1]), before, after
+    return rms(errors[0]) * MG, rms(errors[1]) * MG, before, after
 
 
 def quality_of(fit: Fit, units: Units, directions: Floats) -> Quality:
@@ -128,7 +126,7 @@ def quality_of(fit: Fit, units: Units, directions: Floats) -> Quality:
     vectors = 'reference' in fit.poses_g
     held_out = _held_out(fit)
     return Quality(*_residuals(fit.model, fit.poses_g, units, vectors),
-                   None if held_out is None else rms_mg(held_out),
+                   None if held_out is None else rms(held_out) * MG,
                    noise_floor_mg(fit) if fit.noise_known else None,
                    fit.chi2 / fit.dof if fit.noise_known and fit.dof > 0 else None,
                    coverage(directions))
@@ -155,8 +153,8 @@ def record_of(fit: Fit, poses: Poses, units: Units, directions: Floats, name: st
 def noise_floor_mg(fit: Fit) -> float:
     """Return the residual that noise causes after the fit absorbs a part of it [mg]."""
     data, scale = fit.by_pose, fit.equations.scale
-    own = np.trace(data.own(data.spread), axis1=1, axis2=2) - (data.columns.shape[1] - data.rows)
-    return rms_mg(scale * np.sqrt(np.maximum(own, 0.0)))
+    own = np.trace(data.own, axis1=1, axis2=2) - (data.columns.shape[1] - data.rows)
+    return rms(scale * np.sqrt(np.maximum(own, 0.0))) * MG
 
 
 def errors_before(poses_g: Poses, units: Units, *, vectors: bool) -> Floats:
@@ -185,21 +183,15 @@ def _held_out(fit: Fit) -> Floats | None:
 
     """
     data = fit.by_pose
-    own = data.own(data.spread)
-    if np.any(np.linalg.svd(own, compute_uv=False) < _LEAST_OWN):
+    if np.any(np.linalg.svd(data.own, compute_uv=False) < _LEAST_OWN):
         return None
-    left_out = np.linalg.solve(own, data.residual[:, :, np.newaxis])[:, :, 0]
+    left_out = np.linalg.solve(data.own, data.residual[:, :, np.newaxis])[:, :, 0]
     if 'reference' in fit.poses_g:  # differences of readings; W⁻¹ converts them to forces
         noise = believable(fit.poses_g.noise)
         scaled = left_out * (fit.equations.scale[:, np.newaxis] if noise is None else noise)
         left_out = scaled @ np.linalg.inv(fit.model.linear_part[0]).T
         return np.linalg.norm(left_out, axis=1)
     return np.linalg.norm(left_out, axis=1) * fit.equations.scale
-
-
-def rms_mg(errors_g: Floats) -> float:
-    """Return the RMS of errors [mg]."""
-    return float(np.sqrt(np.mean(np.square(errors_g)))) * MG
 
 
 _UNSEEN_G = 0.01
@@ -273,10 +265,10 @@ def rival_findings(found: tuple[Rival, ...], row: NDArray[np.int64]) -> Iterator
         'take these poses again, or take more poses', 'USABLE', (*out, *instead))
 
 
-def finished(calibration: Calibration, poses: Poses, sensor: str, date: str) -> Calibration:
+def finished(calibration: Calibration, sensor: str, date: str) -> Calibration:
     """Return a calibration that has passed the gate, with the figures of its rests."""
-    named = replace(calibration, sensor=sensor or poses.sensor, date=date)
-    return with_rest_noise(gated(named), poses)
+    named = replace(calibration, sensor=sensor or calibration.sensor, date=date)
+    return with_rest_noise(gated(named), named.poses)
 
 
 @np.errstate(over='ignore', invalid='ignore')

@@ -43,6 +43,7 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
 from typing import TYPE_CHECKING
@@ -51,7 +52,7 @@ import numpy as np
 from numpy.typing import NDArray
 import scipy
 
-from ..table import Floats, Poses, Record
+from ..table import Floats, Poses, range_of, Record
 
 if TYPE_CHECKING:
     from .calibration import Calibration
@@ -217,18 +218,16 @@ def gyro_bias_of(poses: Poses) -> GyroBias | None:
     if 'time' in poses:
         poses = poses.take(np.argsort(poses['time'], kind='stable'))
     rests = poses.take(_agreeing(poses))
-    constant, line = _fitted(np.ones((len(rests), 1)), rests), _lines(rests)
-    sloping = np.zeros(3, bool) if line is None else line.is_sloping(len(rests))
-    chosen = constant if line is None else line.where(sloping, constant)
-    bias, sd = chosen.values[0], chosen.deviation[0]
+    level, line = np.ones((len(rests), 1)), _line_over_temperature(rests)
+    sloping = _fitted([line] * 3, rests).is_sloping
+    chosen = _fitted([line if each else level for each in sloping], rests)
+    (bias, slope), (sd, _) = chosen.values, chosen.deviation
     if np.any(np.abs(bias) >= LARGEST_BIAS) or np.any(sd >= _LARGEST_SD):
         return None
-    slope = np.where(sloping, chosen.values[-1], 0.0)
     if 'temperature' not in rests:
         return GyroBias(bias, sd, len(rests), math.nan, slope, ())
-    temperature = rests['temperature']
-    limits = (float(temperature.min()), float(temperature.max()))
-    mean = float(np.clip(temperature.mean(), *limits))
+    limits = range_of(rests, 'temperature')
+    mean = float(np.clip(rests['temperature'].mean(), *limits))
     return GyroBias(bias, sd, len(rests), mean, slope, limits)
 
 
@@ -273,7 +272,7 @@ def _slope_of_pairs(values: Floats, temperature: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class _RateFit:
-    """(p, 3) values by axis, their variances, and (n, 3) residuals over their deviation."""
+    """(2, 3) bias and slope by axis, their variances, and (n, 3) residuals per deviation."""
 
     values: Floats
     variance: Floats
@@ -293,38 +292,33 @@ class _RateFit:
         correlation = min(max(neighbours / square + 1.0 / count, 0.0), _CORRELATION_MAX)
         return (1.0 + correlation) / (1.0 - correlation)
 
-    def is_sloping(self, count: int) -> NDArray[np.bool_]:
+    @property
+    def is_sloping(self) -> NDArray[np.bool_]:
         """Return which axes have a significant slope."""
-        limit = float(scipy.special.stdtrit(count - 2, 1.0 - _TAIL))
+        limit = float(scipy.special.stdtrit(len(self.residual) - 2, 1.0 - _TAIL))
         return np.asarray(np.abs(self.values[1]) > limit * self.deviation[1])
 
-    def where(self, mine: NDArray[np.bool_], other: _RateFit) -> _RateFit:
-        """Return this fit for some axes, and another without slope for the others."""
-        values, variance = (np.where(mine, one, np.vstack([two, np.zeros(3)])) for one, two in (
-            (self.values, other.values), (self.variance, other.variance)))
-        return _RateFit(values, variance, np.where(mine, self.residual, other.residual))
+
+def _line_over_temperature(rests: Poses) -> Floats:
+    """Return 1 and the temperature minus its mean, (n, 2); 1 alone if it shows no line."""
+    one, warm = np.ones(len(rests)), rests.columns.get('temperature', np.zeros(len(rests)))
+    if len(warm) < _ENOUGH or not np.ptp(warm) > 0.0:
+        return one[:, np.newaxis]
+    return np.column_stack([one, warm - warm.mean()])
 
 
-def _lines(rests: Poses) -> _RateFit | None:
-    """Return lines over temperature minus its mean; None if they are not determined."""
-    temperature = rests.columns.get('temperature')
-    if temperature is None or len(temperature) < _ENOUGH or not np.ptp(temperature) > 0.0:
-        return None
-    design = np.column_stack([np.ones(len(temperature)), temperature - temperature.mean()])
-    return _fitted(design, rests)
-
-
-def _fitted(design: Floats, rests: Poses) -> _RateFit:
-    """Fit the rates of each axis with noise and scatter; `design` is (n, p)."""
-    surplus = float(scipy.special.stdtrit(len(design) - design.shape[1], _CONFIDENCE)) / _NORMAL
+def _fitted(designs: Sequence[Floats], rests: Poses) -> _RateFit:
+    """Fit the rates of each axis with noise and scatter, by its (n, 1 or 2) design."""
     values, variance, residual = [], [], []
-    for rate, noise in zip(rests['rate'].T, _noise_of(rests).T, strict=True):
+    for design, rate, noise in zip(designs, rests['rate'].T, _noise_of(rests).T, strict=True):
+        count, size = design.shape
+        surplus = float(scipy.special.stdtrit(count - size, _CONFIDENCE)) / _NORMAL
         scatter = _scatter(design, rate, noise)
         found, inverse, left = _weighted(design, rate, noise + scatter)
         share = (noise + surplus ** 2 * scatter) / (noise + scatter) ** 2
         covariance = inverse @ (design.T * share @ design) @ inverse
-        values.append(found)
-        variance.append(np.diag(covariance))
+        values.append(np.pad(found, (0, 2 - size)))
+        variance.append(np.pad(np.diag(covariance), (0, 2 - size)))
         residual.append(left / np.sqrt(noise + scatter))
     return _RateFit(np.column_stack(values), np.column_stack(variance), np.column_stack(residual))
 

@@ -55,8 +55,8 @@ from ..effects import effect_named, Model, OFFSET_POWERS, REFERENCE_TEMPERATURE,
 from ..errors import InputError
 from ..estimate import judge
 from ..finding import Finding
-from ..geometry import coverage, unit
-from ..table import Floats, numbered, Poses
+from ..geometry import coverage, rms, unit
+from ..table import Floats, numbered, Poses, range_of
 from ..units import MG, Units
 
 DEGREE = 3
@@ -183,7 +183,7 @@ def curve_of(ramps: Sequence[Ramp]) -> Curve:
     """Return the offset over the temperature from the ramps of one board, of any orientation."""
     stretches, group = _joined(ramps)
     warm, rate = stretches['temperature'], np.concatenate([each.rate for each in ramps])
-    low, high = float(warm.min()), float(warm.max())
+    low, high = range_of(stretches, 'temperature')
     reference = float(np.clip(REFERENCE_TEMPERATURE, low, high))
     limit = _MOVING * float(np.quantile(np.abs(rate), 0.95))
     rising, falling = rate > limit, rate < -limit
@@ -335,22 +335,16 @@ def ramp_rows(curve: Curve, units: Units) -> Poses:
     share[[np.argmin(warm), np.argmax(warm)]] = _ROWS + np.arange(2)  # they state the range
     _, place = np.unique(np.column_stack([stretches['orientation'], share]), axis=0,
                          return_inverse=True)
-    place = place.ravel()
-    size = np.bincount(place)
-
-    def mean(values: Floats) -> Floats:
-        return np.bincount(place, values) / size
-
-    def of_axes(values: Floats) -> Floats:
-        return np.array([mean(column) for column in values.T]).T
-
-    noise = np.sqrt(np.mean(of_axes(curve.left) ** 2, axis=0))
-    count = np.bincount(place, stretches['count'])
-    columns = {'reading': units.from_g(of_axes(stretches.reading)), 'count': count,
+    members = (place.ravel() == np.arange(place.max() + 1)[:, np.newaxis]).astype(float)
+    members = members[np.argsort(members @ stretches['time'] / members.sum(axis=1), kind='stable')]
+    size, count = members.sum(axis=1), members @ stretches['count']
+    left, reading = (members @ values / size[:, np.newaxis]
+                     for values in (curve.left, stretches.reading))
+    noise = np.sqrt(np.mean(left ** 2, axis=0))
+    columns = {'reading': units.from_g(reading), 'count': count,
                'std': units.from_g(noise * np.sqrt(count)[:, np.newaxis]),
-               **{key: mean(stretches[key]) for key in ('time', 'temperature', 'orientation')}}
-    order = np.argsort(columns['time'], kind='stable')
-    columns = {key: values[order] for key, values in columns.items()}
+               **{key: members @ stretches[key] / size
+                  for key in ('time', 'temperature', 'orientation')}}
     return Poses(columns, numbered(columns), units.name, stretches.sensor, stretches.autopilot)
 
 
@@ -373,11 +367,11 @@ def thermal_alone(curve: Curve, units: Units, *, sensor: str = '', date: str = '
     return finished(Calibration(
         'ideal', PRIOR, Model(values), units, rows.sensor, 'ros', '', covariance,
         quality, rows, (), f'offset over temperature alone, of degree {curve.degree}, relative to '
-        f'{curve.reference_c:.1f} °C', findings_of_curve(curve)), rows, sensor, date)
+        f'{curve.reference_c:.1f} °C', findings_of_curve(curve)), sensor, date)
 
 
 def _rms_mg(vectors: Floats) -> float:
-    return float(np.sqrt(np.mean(np.sum(vectors ** 2, axis=1)))) * MG
+    return rms(np.linalg.norm(vectors, axis=1)) * MG
 
 
 def without_curve(curve: Curve, poses: Poses, units: Units) -> Poses:

@@ -14,10 +14,9 @@ stretches of a still board whose temperature changes.
 from .chunks import CaptureSettings, CONTEXT, REPEATED, Repeated, settings_from
 from .detector import capture, Captured, poses_from, samples_of, select, StillDetector
 from .dwell import Dwell
-from .ramp import Cells, cells_of, FASTEST, is_turned_over, LEAST_RANGE, Ramp, ramp_of
+from .ramp import cells_of, FASTEST, is_turned_over, LEAST_RANGE, Ramp, ramp_of
 from .rule import rounding_left
 
 __all__ = ['CONTEXT', 'FASTEST', 'LEAST_RANGE', 'REPEATED', 'Captured', 'CaptureSettings',
-           'Cells', 'Dwell', 'Ramp', 'Repeated', 'StillDetector', 'capture', 'cells_of',
-           'is_turned_over', 'poses_from', 'ramp_of', 'rounding_left', 'samples_of', 'select',
-           'settings_from']
+           'Dwell', 'Ramp', 'Repeated', 'StillDetector', 'capture', 'cells_of', 'is_turned_over',
+           'poses_from', 'ramp_of', 'rounding_left', 'samples_of', 'select', 'settings_from']

@@ -23,6 +23,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from itertools import pairwise
 import math
 from typing import Any, get_args, Literal, NamedTuple
@@ -146,6 +147,14 @@ def sums_type(columns: int) -> np.dtype[Any]:
         ('at_limit', float, 3),             # samples that repeat the extreme of the axis so far
         ('context_count', float, (columns,)),  # samples that have the context
         ('context_sum', float, (columns,))])
+
+
+@cache
+def window_type(sums: np.dtype[Any]) -> np.dtype[Any]:
+    """Return the type of the sums of a chunk with its window, from that of its sums alone."""
+    return np.dtype([*sums.descr,
+                     ('level', float, 6),  # variance of the window at each chunk
+                     ('windows', float)])  # number of windows in that sum
 
 
 def blank(kind: np.dtype[Any], count: int) -> Records:
@@ -384,9 +393,7 @@ class Chunker:
         latest = samples[0]
         if not in_order:
             latest = np.maximum.accumulate(np.concatenate([[self._latest], latest]))[1:]
-        index = latest - self._epoch
-        index /= self._length
-        np.floor(index, out=index)
+        index = np.floor((latest - self._epoch) / self._length)
         edges = np.flatnonzero(index[1:] != index[:-1]) + 1
         whole = int(edges[-1]) if len(edges) else 0
         if whole:

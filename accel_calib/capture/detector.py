@@ -145,9 +145,9 @@ class StillDetector:
                 found += self._leave()
             verdict = self._rule.feed(chunks)
             if self._tracker is None:
-                self._tracker = Tracker(self._settings, self._rule, verdict, self._number)
+                self._tracker = Tracker(self._settings, self._rule, chunks, self._number)
             found += self._tracker.feed(verdict)
-            self.still = bool(verdict.still[-1])
+            self.still = bool(verdict['still'][-1])
             self._mean = chunks.origin
         if self._chunker.fresh:  # the stamps were interrupted: what is known of the rest is over
             found += self._leave()
@@ -240,19 +240,18 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
     first = next(parts, None)
     context = CONTEXT if first is None else (*CONTEXT, *first.quantities)
     detector = StillDetector(settings, units, keep=None, context=context)
-    spans: list[tuple[float, float]] = []
-    recorded = 0
+    times, recorded = list[float](), 0
     about: dict[str, Any] = {}
     for part in parts if first is None else chain((first,), parts):
         detector.add_recording(part)
         if len(part):
-            spans = [*spans[:1], (float(part['time'][0]), float(part['time'][-1]))]
+            times = [*times[:1], float(part['time'][0]), float(part['time'][-1])]
             recorded += len(part)
             about = {name: getattr(part, name) for name in ABOUT}
     detector.close()
     dwells = select(detector.dwells(), settings, units)
     interruptions = detector.interruptions
-    seconds = spans[-1][1] - spans[0][0] if spans else 0.0
+    seconds = times[-1] - times[0] if times else 0.0
     poses = replace(poses_from(dwells, settings), **about)
     return Captured(poses, sum(each.samples for each in dwells),
                     detector.threshold, seconds - sum(each.seconds for each in interruptions),
@@ -290,9 +289,8 @@ def check_finite(given: Floats, row: NDArray[np.int64]) -> None:
     """Raise InputError if a time or a reading, (k, n), is not finite."""
     bad = np.flatnonzero(~np.isfinite(given).all(axis=0))
     if len(bad):
-        message = (f'row {row[bad[0]]} holds a time or reading that is not finite, expected '
-                   'finite numbers')
-        raise InputError(message, 'remove that row, or repair the recording')
+        raise InputError(f'row {row[bad[0]]} holds a time or reading that is not finite, expected '
+                         'finite numbers', 'remove that row, or repair the recording')
 
 
 def poses_from(dwells: Sequence[Dwell], settings: CaptureSettings = CaptureSettings()) -> Poses:

@@ -47,15 +47,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 import copy
 from dataclasses import dataclass, field
-from functools import cache
 import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .chunks import CaptureSettings, chained, Chunks, CHUNKS_PER_WINDOW, Records, summed, sums_type
-from .rule import DWELL_SLOPE_G, HORIZON, Judged, Rule, STRENGTH, WEAK_STRENGTH
+from .chunks import (
+    CaptureSettings, chained, Chunks, CHUNKS_PER_WINDOW, Records, summed, sums_type, window_type)
+from .rule import DWELL_SLOPE_G, HORIZON, judged_type, Rule, STRENGTH, WEAK_STRENGTH
 from .trend import excess_of_means, Line, lines_through, strength_of, Trend
 from ..table import Floats
 
@@ -300,14 +300,6 @@ def _dwell(context: Sequence[str], found: Any, std: Floats, count: float, rate_s
 CELLS = 256
 
 
-@cache
-def dwell_type(sums: np.dtype[Any]) -> np.dtype[Any]:
-    """Return the type of the sums of a chunk in a dwell, from that of its sums alone."""
-    return np.dtype([*sums.descr,
-                     ('level', float, 6),  # variance of the window at each chunk
-                     ('windows', float)])  # number of windows in that sum
-
-
 _AGREE_G = 2e-3
 """Largest change of the mean by a knock [g], in addition to the noise, at equal orientation."""
 
@@ -325,7 +317,7 @@ class OngoingDwell:
         self.epoch = chunks.epoch
         self.origin = chunks.origin
         self.length = chunks.length
-        self.cells = self._partial = np.empty(0, dwell_type(chunks.sums.dtype))
+        self.cells = self._partial = np.empty(0, window_type(chunks.sums.dtype))
         self.size = 1
         self.begin = self.end = 0.0
         self.chunks = 0
@@ -380,22 +372,14 @@ _LEAD = CHUNKS_PER_WINDOW - 2
 """Chunks before the first still window that belong to the dwell."""
 
 
-def _judged_type(sums: np.dtype[Any]) -> np.dtype[Any]:
-    """Return the type of a chunk with its verdict; see `rule.Judged`."""
-    return np.dtype([
-        ('sums', dwell_type(sums)), ('begin', float), ('end', float), ('limit', float, 6),
-        ('still', bool), ('trending', np.intp)])
-
-
-_NONE = np.empty(0, _judged_type(sums_type(0)))
+_NONE = np.empty(0, judged_type(sums_type(0)))
 """No chunks, of any type."""
 
 
 class Tracker:
     """Join still chunks to dwells, in one segment."""
 
-    def __init__(self, settings: CaptureSettings, rule: Rule, judged: Judged, number: int) -> None:
-        chunks = judged.chunks
+    def __init__(self, settings: CaptureSettings, rule: Rule, chunks: Chunks, number: int) -> None:
         self._rule = rule
         self._chunks = chunks
         shortest = max(settings.min_dwell, _SAMPLES * chunks.period)
@@ -408,9 +392,9 @@ class Tracker:
         self._beside_slope = False
         self.number = number
 
-    def feed(self, judged: Judged) -> list[OngoingDwell]:
-        """Return the dwells that end with these chunks."""
-        self._waiting = chained(self._waiting, _records(judged))
+    def feed(self, chunks: Records) -> list[OngoingDwell]:
+        """Return the dwells that end with these chunks, of a `judged_type`."""
+        self._waiting = chained(self._waiting, chunks)
         return self._decide(last=False)
 
     def close(self) -> list[OngoingDwell]:
@@ -493,18 +477,6 @@ class Tracker:
             return None
         self._dwell.beside_slope = self._beside_slope
         return self._dwell
-
-
-def _records(judged: Judged) -> Records:
-    chunks = judged.chunks
-    found = np.empty(len(judged.still), _judged_type(chunks.sums.dtype))
-    for name in chunks.sums.dtype.names or ():
-        found['sums'][name] = chunks.sums[name]
-    found['sums']['level'], found['sums']['windows'] = judged.level.T, 1.0
-    found['begin'], found['end'] = chunks.begin, chunks.end
-    found['limit'], found['still'] = judged.limit.T, judged.still
-    found['trending'] = judged.trending
-    return found
 
 
 def _verdict(chunks: Records, last: bool) -> NDArray[np.bool_]:

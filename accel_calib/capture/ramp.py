@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from .detector import check_finite
 from ..errors import InputError
 from ..geometry import unit
-from ..table import Autopilot, Floats, numbered, Poses, Recording
+from ..table import Floats, numbered, Poses, range_of, Recording
 from ..text import counted
 from ..units import MG, Units
 
@@ -60,46 +60,9 @@ _JUMP_G, _JUMP_NOISES, _NEIGHBOURS = 0.003, 8.0, 4
 _DEGREE = 3
 
 
-@dataclass(frozen=True)
-class Cells:
+def cells_of(blocks: Iterable[Recording], units: Units) -> Poses:
     """
-    Averages of a log over m cells of 1 s, in order of time.
-
-    `time` [s] and `temperature` [°C] are means, NaN where the temperature is not known. `count` is
-    the number of samples, and `reading` and `std` (m, 3) are in g. `sensor` and `autopilot` are as
-    in `accel_calib.table.Table`.
-
-    """
-
-    time: Floats
-    temperature: Floats
-    count: Floats
-    reading: Floats
-    std: Floats
-    sensor: str = ''
-    autopilot: Autopilot | None = None
-
-    def take(self, which: NDArray[np.bool_]) -> Cells:
-        """Return the cells where the mask is true."""
-        return Cells(self.time[which], self.temperature[which], self.count[which],
-                     self.reading[which], self.std[which], self.sensor, self.autopilot)
-
-    @property
-    def range_c(self) -> tuple[float, float]:
-        """Return the lowest and the highest temperature [°C]; NaN if none is known."""
-        known = self.temperature[np.isfinite(self.temperature)]
-        return (float(known.min()), float(known.max())) if len(known) else (np.nan, np.nan)
-
-    @property
-    def is_still(self) -> NDArray[np.bool_]:
-        """Return in which cells the board does not shake."""
-        size = np.max(self.std, axis=1)
-        return np.asarray(size <= max(_SHAKEN * float(np.median(size)), _SHAKEN_G))
-
-
-def cells_of(blocks: Iterable[Recording], units: Units) -> Cells:
-    """
-    Return the averages of samples over cells of 1 s.
+    Return the averages of samples over cells of 1 s, in g and in order of time.
 
     Raises
     ------
@@ -132,8 +95,9 @@ def cells_of(blocks: Iterable[Recording], units: Units) -> Cells:
     mean = first / n[:, np.newaxis]
     variance = (second - mean * first) / np.maximum(n - 1.0, 1.0)[:, np.newaxis]
     with np.errstate(invalid='ignore'):
-        return Cells(time / n + start, warm / n_warm, n.astype(float), mean + zero,
-                     np.sqrt(np.maximum(variance, 0.0)), sensor, autopilot)
+        columns = {'time': time / n + start, 'temperature': warm / n_warm, 'count': n,
+                   'reading': mean + zero, 'std': np.sqrt(np.maximum(variance, 0.0))}
+    return Poses(columns, numbered(columns), 'g', sensor, autopilot)
 
 
 def _sums(block: Recording, units: Units, start: float, zero: Floats) -> Floats:
@@ -147,9 +111,15 @@ def _sums(block: Recording, units: Units, start: float, zero: Floats) -> Floats:
     return np.array([cell, *(np.bincount(place, column) for column in columns)])
 
 
-def is_turned_over(cells: Cells) -> bool:
+def _is_still(cells: Poses) -> NDArray[np.bool_]:
+    """Return in which cells the board does not shake."""
+    size = np.max(cells['std'], axis=1)
+    return np.asarray(size <= max(_SHAKEN * float(np.median(size)), _SHAKEN_G))
+
+
+def is_turned_over(cells: Poses) -> bool:
     """Return whether a log has rests in many directions, as one of poses has."""
-    up, still = unit(cells.reading), cells.is_still
+    up, still = unit(cells.reading), _is_still(cells)
     rest = still[1:] & still[:-1] & (np.sum(up[1:] * up[:-1], axis=1) > np.cos(_TURNED / 6.0))
     found = list[Floats]()
     for each in up[1:][rest]:
@@ -174,14 +144,8 @@ class Ramp:
     seconds: float
     notes: tuple[str, ...] = ()
 
-    @property
-    def range_c(self) -> tuple[float, float]:
-        """Return the lowest and the highest temperature [°C]."""
-        warm = self.stretches['temperature']
-        return float(warm.min()), float(warm.max())
 
-
-def ramp_of(cells: Cells) -> Ramp:
+def ramp_of(cells: Poses) -> Ramp:
     """
     Return the stretches of a still board.
 
@@ -191,12 +155,10 @@ def ramp_of(cells: Cells) -> Ramp:
         If the cells cannot show what the temperature does; see the module.
 
     """
-    known = np.isfinite(cells.temperature)
+    still = _is_still(cells)
     _check_range(cells)
-    _check_direction(cells)
-    still = cells.is_still
-    kept, seconds = cells.take(known & still), float(cells.time[-1] - cells.time[0])
-    stretches, warm_rate = _averaged(kept)
+    _check_direction(cells, still)
+    stretches, warm_rate = _averaged(cells.take(np.isfinite(cells['temperature']) & still))
     _check_jumps(stretches)
     slow = np.abs(warm_rate) * 60.0 <= FASTEST
     _check_rate(stretches, warm_rate, slow)
@@ -207,11 +169,12 @@ def ramp_of(cells: Cells) -> Ramp:
     if not np.all(slow):
         notes.append(f'{int(np.sum(~slow))} of {len(slow)} stretches left out, in which the '
                      f'temperature changes by more than {FASTEST:g} °C/min')
-    return Ramp(stretches.take(slow), warm_rate[slow], seconds, tuple(notes))
+    return Ramp(stretches.take(slow), warm_rate[slow],
+                float(cells['time'][-1] - cells['time'][0]), tuple(notes))
 
 
-def _check_range(cells: Cells) -> None:
-    low, high = cells.range_c
+def _check_range(cells: Poses) -> None:
+    low, high = range_of(cells, 'temperature')
     if np.isnan(low):
         raise InputError('the log has no temperature, expected that of the sensor', 'record it, '
                          'or name its column with --columns temperature=NAME, or its topic with '
@@ -222,14 +185,14 @@ def _check_range(cells: Cells) -> None:
                          'while it warms up to room temperature')
 
 
-def _check_direction(cells: Cells) -> None:
+def _check_direction(cells: Poses, still: NDArray[np.bool_]) -> None:
     """Refuse a board that was turned."""
-    up, still = unit(cells.reading), cells.is_still
+    up = unit(cells.reading)
     first = unit(np.median(up[still][:_FIRST], axis=0)[np.newaxis])[0]
     away = np.arccos(np.clip(up @ first, -1.0, 1.0))
     turned = np.flatnonzero((away > _TURNED) & still)
     if len(turned):
-        raise _moved(cells.time[turned[0]] - cells.time[0],
+        raise _moved(cells['time'][turned[0]] - cells['time'][0],
                      f'it was turned by {np.degrees(away[turned[0]]):.0f}°')
 
 
@@ -239,9 +202,9 @@ def _moved(seconds: float, what: str) -> InputError:
                       'record again, or cut the log there')
 
 
-def _averaged(cells: Cells) -> tuple[Poses, Floats]:
+def _averaged(cells: Poses) -> tuple[Poses, Floats]:
     """Return the stretches with their noise, and the rate of the temperature in each [°C/s]."""
-    time = cells.time - cells.time[0]
+    time = cells['time'] - cells['time'][0]
     length = max(float(time[-1]) / _STRETCHES, 1.0)
     _, place, cell_count = np.unique(np.floor(time / length), return_inverse=True,
                                      return_counts=True)
@@ -249,13 +212,11 @@ def _averaged(cells: Cells) -> tuple[Poses, Floats]:
         raise InputError(f'the board lies still for {float(time[-1]):.0f} s, expected at least '
                          f'{_LEAST_STRETCHES} s', 'record while the board warms up, for half an '
                          'hour')
-    count = np.bincount(place, cells.count)
-
-    def mean(values: Floats) -> Floats:
-        return np.bincount(place, values * cells.count) / count
-
-    reading = np.array([mean(column) for column in cells.reading.T]).T
-    moment, warm = mean(cells.time), mean(cells.temperature)
+    count = np.bincount(place, cells['count'])
+    moment, warm, *axes = (
+        np.bincount(place, column * cells['count']) / count
+        for column in (cells['time'], cells['temperature'], *cells.reading.T))
+    reading = np.array(axes).T
     bend = reading[2:] - 2.0 * reading[1:-1] + reading[:-2]
     noise = np.sqrt(np.median(bend ** 2, axis=0) / _MEDIAN_CHI2 / 6.0)
     columns = {'time': moment, 'reading': reading, 'temperature': warm, 'count': count,

@@ -47,12 +47,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 import math
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .chunks import blank, CaptureSettings, chained, Chunks, Records
+from .chunks import blank, CaptureSettings, chained, Chunks, Records, window_type
 from .trend import columns_of, oscillation, Stretch, stretch, Trend, windows
 from ..table import Floats
 from ..units import Units
@@ -122,21 +122,26 @@ AT_LIMIT = 0.1
 """Share of samples at a limit above which a variance is too small by a sixth or more."""
 
 
-class Judged(NamedTuple):
-    """
-    m chunks with the verdict on the window that ends with each chunk.
+def judged_type(sums: np.dtype[Any]) -> np.dtype[Any]:
+    """Return the type of a chunk with the verdict on the window that ends with it."""
+    return np.dtype([
+        ('sums', window_type(sums)),  # the level of a missing rate is NaN
+        ('begin', float), ('end', float),
+        ('limit', float, 6),          # largest level of a still window; infinite without a rate
+        ('still', bool),              # the verdict
+        ('trending', np.intp)])       # chunks over which the reading has a slope or oscillates; 0
 
-    `level` (6, m) is the variance of reading and rate within the window, NaN if not known, and
-    `limit` its largest value for a still window. `still` (m,) is the verdict, and `trending` (m,)
-    the number of chunks over which the reading has a slope or oscillates; 0 if it does not.
 
-    """
-
-    chunks: Chunks
-    level: Floats
-    limit: Floats
-    still: NDArray[np.bool_]
-    trending: NDArray[np.intp]
+def judged_chunks(chunks: Chunks, level: Floats, limit: Floats) -> Records:
+    """Return chunks with the (3 or 6, m) level of their windows and its limit, not judged yet."""
+    found = np.empty(len(chunks.sums), judged_type(chunks.sums.dtype))
+    for name in chunks.sums.dtype.names or ():
+        found['sums'][name] = chunks.sums[name]
+    found['sums']['level'], found['sums']['windows'], found['limit'] = np.nan, 1.0, np.inf
+    found['sums']['level'][:, :len(level)] = level.T
+    found['limit'][:, :len(limit)] = limit.T
+    found['begin'], found['end'] = chunks.begin, chunks.end
+    return found
 
 
 class Rule:
@@ -205,8 +210,8 @@ class Rule:
             limit[:3] = (self._settings.still_std_max * self._per_g)**2
         return np.asarray(limit)
 
-    def feed(self, chunks: Chunks) -> Judged:
-        """Apply the rule to consecutive chunks."""
+    def feed(self, chunks: Chunks) -> Records:
+        """Apply the rule to consecutive chunks, and return records of a `judged_type`."""
         if chunks.fresh:
             self._before = blank(chunks.sums.dtype, HORIZON - 1)
         sums = chained(self._before, chunks.sums)
@@ -223,9 +228,10 @@ class Rule:
         noise = self._learn(seen[LONG], mean, chunks.step)
         scale = self._scales(mean, np.all(recent <= self.limit_of(noise), axis=0), noise)
         limit = self.limit_of(at_least_any(noise, scale))
-        trending = self._trending(seen, mean, limit, scale)
-        still = self._quiet(mean, recent, limit) & (trending == 0)
-        return Judged(chunks, _six(recent, np.nan), _six(limit, np.inf), still, trending)
+        judged = judged_chunks(chunks, recent, limit)
+        judged['trending'] = self._trending(seen, mean, limit, scale)
+        judged['still'] = self._quiet(mean, recent, limit) & (judged['trending'] == 0)
+        return judged
 
     def moved(self, found: Trend, scale: Floats, variance: Floats,
               strength: float | Floats = STRENGTH, drift_g: float = SLOPE_G
@@ -304,13 +310,6 @@ def _half_range(low: Floats, high: Floats, noise: Floats) -> Floats:
         turned = half >= np.maximum(TURNED * 0.5 * np.linalg.norm(low + high, axis=0),
                                     TURNED_NOISE * np.sqrt(np.max(noise, axis=0)))
     return np.where(turned, half, 0.0)
-
-
-def _six(values: Floats, fill: float) -> Floats:
-    """Return (6, m) values; the values of a missing rate are `fill`."""
-    if len(values) == 6:
-        return values
-    return np.concatenate([values, np.full_like(values, fill)])
 
 
 def at_least(floor: Floats, step: Floats, mean: Floats) -> Floats:

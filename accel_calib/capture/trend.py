@@ -289,12 +289,9 @@ def windows(sums: Columns) -> tuple[Floats, Floats]:
     """Return mean and variance of the windows that end with each chunk, (axes, n)."""
     count = sliding_sum(sums.count, CHUNKS_PER_WINDOW)
     first = sliding_sum(sums.first, CHUNKS_PER_WINDOW)
-    level = sliding_sum(sums.second, CHUNKS_PER_WINDOW)
     mean = first / count
-    level -= first * mean
-    np.maximum(level, 0.0, out=level)
-    level /= count - 1.0
-    return mean, level
+    power = sliding_sum(sums.second, CHUNKS_PER_WINDOW) - first * mean
+    return mean, np.maximum(power, 0.0) / (count - 1.0)
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,8 @@ import numpy as np
 
 from ..calibrate import Calibration
 from ..effects import Context, length_rows, sensor_force
-from ..table import Floats
+from ..geometry import rms
+from ..table import Floats, range_of
 from ..text import counted
 from ..units import MG
 
@@ -152,8 +153,7 @@ def _described(kind: str, rests: int, clear: bool, error: Floats, covariance: Fl
     shift = found @ weighted @ error
     moved = slope[len(up) - rests:] @ shift
     sign = float(np.sign(moved[0])) if np.ptp(np.sign(moved)) == 0.0 else 1.0
-    return LastingChange(rests, kind, clear, shift, found,
-                         sign * float(np.sqrt(np.mean(moved ** 2))))
+    return LastingChange(rests, kind, clear, shift, found, sign * rms(moved))
 
 
 _LEAST_NOISE = 2e-5   # smallest noise of a rest [g]
@@ -251,12 +251,9 @@ def rest_errors(calibration: Calibration, reading: Floats, noise: Floats, contex
 
 def monitor(calibration: Calibration) -> Drift:
     """Return the initial state of the monitor after a calibration."""
-    poses = calibration.poses
-    temperatures: tuple[float, ...] = ()
-    if 'temperature' in poses and len(poses):
-        known = poses['temperature']
-        temperatures = (float(np.min(known)), float(np.max(known)))
-    return Drift(calibration.covariance, _repeats(calibration), temperatures)
+    limits = range_of(calibration.poses, 'temperature')
+    return Drift(calibration.covariance, _repeats(calibration),
+                 () if np.isnan(limits[0]) else limits)
 
 
 def _repeats(calibration: Calibration) -> float:

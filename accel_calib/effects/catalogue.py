@@ -104,21 +104,17 @@ def _forms(context: Context) -> Iterator[Floats]:
     yield from np.array([[0.0], [1.0]])
 
 
-def _warming(context: Mapping[str, Any], shape: Floats) -> Any:
-    return context['temperature'] - REFERENCE_TEMPERATURE
-
-
 def _warming_to(power: int) -> Factor:
-    return lambda context, shape: _warming(context, shape) ** power
+    return lambda context, shape: (context['temperature'] - REFERENCE_TEMPERATURE) ** power
 
 
 def _lagged_warming(key: str) -> Factor:
     """Return the factor of an effect whose acting temperature is the column `key`."""
     def factor(context: Mapping[str, Any], shape: Floats) -> Any:
         lag, of_sensor = shape
-        if lag == 0.0:
-            return _warming(context, shape)
-        return acting_temperature(context, key, lag, bool(of_sensor)) - REFERENCE_TEMPERATURE
+        acting = (acting_temperature(context, key, lag, bool(of_sensor)) if lag
+                  else context['temperature'])
+        return acting - REFERENCE_TEMPERATURE
 
     return factor
 
@@ -348,23 +344,20 @@ def _empirical(name: str) -> Effect:
     if variable == 'direction':
         return _harmonic(modes)
     whole, _, part = carrier.partition('.')
-    parts = CARRIERS[whole]
-    terms = []
-    for k, mode in enumerate(modes):
-        for term in _CARRIED[whole]:
-            if part in ('', parts[term.parameter]):
-                own = 0 if part else term.parameter
-                monomial = (WAVE + 3 * (mode - 1) + term.axis if variable == 'force'
-                            else term.monomial)
-                terms.append(Term(k * (1 if part else len(parts)) + own, term.axis, monomial,
-                                  term.weight))
-    each = len(terms) // len(modes)
-    names = tuple(f'{own}_{mode}' for mode in modes for own in ((part,) if part else parts))
+    parts, of_force = (part,) if part else CARRIERS[whole], variable == 'force'
+    carried = [term._replace(parameter=parts.index(own)) for term in _CARRIED[whole]
+               if (own := CARRIERS[whole][term.parameter]) in parts]
+    terms = tuple(
+        term._replace(parameter=k * len(parts) + term.parameter,
+                      monomial=WAVE + 3 * (mode - 1) + term.axis if of_force else term.monomial)
+        for k, mode in enumerate(modes) for term in carried)
+    names = tuple(f'{own}_{mode}' for mode in modes for own in parts)
     words = f'{carrier.replace("_", "-")} as a smooth function of {variable_words(variable)}'
-    curve = partial(Effect, words, 'empirical curve', names, 'g', 0.001, 0.5, tuple(terms))
-    if variable == 'force':
+    curve = partial(Effect, words, 'empirical curve', names, 'g', 0.001, 0.5, terms)
+    if of_force:
         return curve(family='force')
-    return curve(factor=partial(_cosines, variable, np.repeat(modes, each)), needs=(variable,),
+    each_mode = np.repeat(modes, len(carried))
+    return curve(factor=partial(_cosines, variable, each_mode), needs=(variable,),
                  shape=('low', 'high'), shapes=partial(_ends, variable))
 
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
+from itertools import accumulate
 import math
 from typing import Any
 
@@ -48,14 +49,15 @@ class Terms:
     """
     The t terms of a list of effects as arrays, so that a model adds all of them at once.
 
-    `parts` are the values of each effect among all p values. Each term has its `place` in
-    `monomials` (those of `MONOMIALS` that are used), the `axis` of the reading, the place of its
-    `value` among all values, and its constant factor `weight`.
+    `parts` are the values of each effect among all p values, and `rows` its terms. Each term has
+    its `place` in `monomials` (those of `MONOMIALS` that are used), the `axis` of the reading, the
+    place of its `value` among all values, and its constant factor `weight`.
 
     """
 
     effects: tuple[Effect, ...]
     parts: tuple[slice, ...]
+    rows: tuple[slice, ...]
     monomials: tuple[int, ...]
     place: Indices
     axis: Indices
@@ -140,15 +142,19 @@ def terms_of(names: tuple[str, ...]) -> Terms:
             raise ValueError(f'effect is {name!r}, expected one of {", ".join(EFFECTS)}')
     effects = tuple(effect_named(name) for name in names)
     used = sorted({term.monomial for effect in effects for term in effect.terms} | {ONE})
-    rows, parts, start = [], [], 0
-    for effect in effects:
-        rows += [(used.index(term.monomial), term.axis, start + term.parameter, term.weight)
-                 for term in effect.terms]
-        parts.append(slice(start, start + len(effect.values)))
-        start += len(effect.values)
-    place, axis, value, weight = np.array(rows, float).reshape(-1, 4).T
-    return Terms(effects, tuple(parts), tuple(used), place.astype(np.intp), axis.astype(np.intp),
+    parts, rows = (_consecutive(map(len, each)) for each in (
+        [effect.values for effect in effects], [effect.terms for effect in effects]))
+    place, axis, value, weight = np.array([
+        (used.index(term.monomial), term.axis, part.start + term.parameter, term.weight)
+        for effect, part in zip(effects, parts) for term in effect.terms]).reshape(-1, 4).T
+    return Terms(effects, parts, rows, tuple(used), place.astype(np.intp), axis.astype(np.intp),
                  value.astype(np.intp), weight)
+
+
+def _consecutive(sizes: Iterable[int]) -> tuple[slice, ...]:
+    """Return the slices of these sizes in a row."""
+    ends = [0, *accumulate(sizes)]
+    return tuple(map(slice, ends, ends[1:]))
 
 
 def _sums(index: Indices, size: int) -> Floats:
@@ -363,12 +369,11 @@ class Model(Record):
     def _factors(self, context: Context) -> Floats:
         """Return the (t, n) factors of the terms; a factor is 0 where its context is NaN."""
         check_context(self, context)
-        rows = len(np.asarray(context[self.needs[0]])) if self.needs else 1
-        found, start = np.ones((len(self.terms.weight), rows)), 0
-        for effect, shape in self._by_effect:
+        count = len(np.asarray(context[self.needs[0]])) if self.needs else 1
+        found = np.ones((len(self.terms.weight), count))
+        for rows, (effect, shape) in zip(self.terms.rows, self._by_effect, strict=True):
             if effect.factor is not None:
-                found[start:start + len(effect.terms)] = effect.factor(context, shape)
-            start += len(effect.terms)
+                found[rows] = effect.factor(context, shape)
         return np.nan_to_num(found, copy=False)
 
     def _at(self, factors: Floats) -> AtContext:
@@ -409,11 +414,9 @@ class Model(Record):
     def _by_shape(self, plain: Floats, context: Context
                   ) -> Iterator[tuple[Floats, slice, int]]:
         """Yield the derivative by each fitted shape constant: rows, their terms, the value."""
-        start = 0
-        for part, (effect, shape) in zip(self.terms.parts, self._by_effect, strict=True):
-            which = slice(start, start + len(effect.terms))
-            start += len(effect.terms)
-            values = self.vector[self.terms.value[which]][:, np.newaxis]
+        terms = self.terms
+        for part, which, (effect, shape) in zip(terms.parts, terms.rows, self._by_effect):
+            values = self.vector[terms.value[which]][:, np.newaxis]
             if effect.factor is not None and np.any(values):
                 for place in fitted_places(effect, shape):
                     change = difference(effect.factor, context, shape, place)

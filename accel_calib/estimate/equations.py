@@ -51,7 +51,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import product
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -61,9 +60,6 @@ from ..effects import AtContext, Context, EachShape, Model, times
 from ..geometry import unit
 from ..table import Poses
 from ..units import Floats, Indices
-
-_BLOCK = 8192
-"""Number of poses per block; their equations fit in the cache."""
 
 USUAL_NOISE_G = 5e-4
 """Noise of a pose mean of a common MEMS sensor, assumed if it was not measured [g]."""
@@ -157,6 +153,7 @@ def _first_equal(rows: Floats) -> Indices:
 
     """
     bits = (rows + 0.0).view(np.uint64)  # -0.0 becomes 0.0
+    bits ^= bits >> 32  # the low bits of whole numbers are zero
     factors = np.random.default_rng(1).integers(2 ** 63, size=rows.shape[1], dtype=np.uint64)
     mixed, found = bits @ (2 * factors + 1), np.arange(len(rows))
     ordered = np.sort(mixed)
@@ -198,11 +195,11 @@ class _Kind(NamedTuple):
 
 @dataclass(frozen=True)
 class Measured:
-    """Poses in g by kind of orientation, `alone` in blocks, and their noise; see `measured`."""
+    """Poses in g by kind of orientation, and their noise; see `measured`."""
 
     known: _Kind
     shared: _Kind
-    alone: tuple[_Kind, ...]
+    alone: _Kind
     count: int
     noise_known: bool
 
@@ -223,11 +220,7 @@ def measured(poses_g: Poses) -> Measured:
         context = {key: values[which] for key, values in poses_g.columns.items()}
         return _Kind(which, group, context, reading[which], s[which])
 
-    # The context of a pose can be that of the others, too: a low pass has a history.
-    size = _BLOCK if {*poses_g.columns} <= {*_OF_READING} else max(len(alone), 1)
-    return Measured(kind([known]), kind(shared), tuple(
-        kind([alone[first:first + size]]) for first in range(0, len(alone), size)),
-        len(s), noise is not None)
+    return Measured(kind([known]), kind(shared), kind([alone]), len(s), noise is not None)
 
 
 @dataclass(frozen=True)
@@ -284,13 +277,9 @@ class Equations:
 
 def equations(model: Model, poses: Measured) -> Equations:
     """Set up the equations near a model with ΔR = I; NaN where a reading's force is not unique."""
-    parts: list[_Known | _Shared | _Alone] = []
+    parts = [of_kind(model, each) for of_kind, each in (
+        (_Known, poses.known), (_Shared, poses.shared), (_Alone, poses.alone)) if len(each.which)]
     force, scale = np.empty((poses.count, 3)), np.empty(poses.count)
-    if len(poses.known.which):
-        parts.append(_Known(model, poses.known))
-    if len(poses.shared.which):
-        parts.append(_Shared(model, poses.shared))
-    parts += [_Alone(model, block) for block in poses.alone]
     for part in parts:
         force[part.which], scale[part.which] = part.force, part.scale
     groups = poses.shared.group
@@ -358,19 +347,18 @@ class _Shared:
     """
 
     def __init__(self, model: Model, poses: _Kind) -> None:
-        self._sigma, self._context, group = poses.s, poses.context, poses.group
-        self._group = group
+        self._sigma, self._context, self._group = poses.s, poses.context, poses.group
+        self._starts = np.flatnonzero(np.diff(poses.group, prepend=-1))
         self.which, self.pose = poses.which, np.repeat(poses.which, 3)
         self.scale = np.sqrt(np.mean(poses.s ** 2, axis=1))
         here = model.at(self._context)
-        mean = np.array([np.bincount(group, column) for column in here.force(poses.reading).T]).T
-        self.force = unit(mean)[group]
+        self.force = unit(self._summed(here.force(poses.reading)))[self._group]
         for _ in range(_TURNS):
             off, tangents = self._around(here, poses.reading)
             turn = self._normal @ self._summed(np.swapaxes(self._turn, 1, 2) @ off)
             if np.max(np.abs(turn)) < _STRAIGHT:
                 break
-            self.force = unit(self.force + (tangents @ turn[group])[:, :, 0])
+            self.force = unit(self.force + (tangents @ turn[self._group])[:, :, 0])
         off, _ = self._around(here, poses.reading)
         self.residual = self._projected(off).ravel()
 
@@ -384,11 +372,7 @@ class _Shared:
 
     def _summed(self, parts: Floats) -> Floats:
         """Return the sums of (n, …) parts by group."""
-        size, groups = math.prod(parts.shape[1:]), int(self._group[-1]) + 1
-        summed = np.zeros((groups, size))
-        for k, column in enumerate(parts.reshape(len(parts), size).T):
-            summed[:, k] = np.bincount(self._group, column, groups)
-        return summed.reshape(groups, *parts.shape[1:])
+        return np.add.reduceat(parts, self._starts)
 
     def _projected(self, rows: Floats) -> Floats:
         """Return (n, 3, p) rows minus the part that a rotation of the direction explains."""

@@ -62,9 +62,6 @@ _SINGULAR_STEP = 1e-6
 _SINGULAR_WITH_PRIOR = 1e-12
 """As `Point.singular`; a prior determines all combinations."""
 
-_BLOCK = 8192
-"""Number of equations that are reduced to a triangle at once."""
-
 _SINGULAR = 1e-3
 """Relative singular value below which a combination of values is not determined."""
 
@@ -115,12 +112,12 @@ class ByPose:
         """(n k, q) array, the derivative with one row per equation."""
         return self.columns.reshape(self.residual.size, self.columns.shape[2])
 
-    def own(self, spread: Floats) -> Floats:
-        """Return the (n, k, k) matrices I - leverage of each pose."""
-        onto = (self.flat @ spread).reshape(self.columns.shape)
-        own: Floats = (np.eye(self.columns.shape[1])
-                       - np.einsum('nkq,nlq->nkl', onto, self.columns))
-        return own
+    @cached_property
+    def own(self) -> Floats:
+        """(n, k, k) array, I - leverage of each pose."""
+        onto = (self.flat @ self.spread).reshape(self.columns.shape)
+        leverage = np.einsum('nkq,nlq->nkl', onto, self.columns)
+        return np.asarray(np.eye(self.columns.shape[1]) - leverage)
 
 
 def by_pose(residual: Floats, columns: Floats, pose: Indices,
@@ -210,13 +207,9 @@ class Fit:
 
     @cached_property
     def _triangle(self) -> tuple[Floats, Floats]:
-        """(m, q) R of the QR decomposition of the scaled columns, block by block; the scales."""
+        """R of the QR decomposition of the scaled columns, at most (q, q); the scales."""
         columns, size = _scaled(self.columns)
-        found = columns[:0]
-        for first in range(0, len(columns), _BLOCK):
-            found = np.asarray(np.linalg.qr(
-                np.vstack([found, columns[first:first + _BLOCK]]), mode='r'))
-        return found, size
+        return np.asarray(np.linalg.qr(columns, mode='r')), size
 
     @cached_property
     def undetermined(self) -> tuple[str, ...]:

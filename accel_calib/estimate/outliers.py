@@ -91,37 +91,27 @@ _ALONE = 1e-9
 """1 - leverage below this: the pose alone determines a parameter."""
 
 
-@dataclass(frozen=True)
-class Outliers:
-    """Poses to leave out, as (d,) indices among the poses of a fit, and the chi² of the others."""
-
-    poses: Indices
-    chi2: float
-
-
-def outliers_among(data: ByPose, chi2: float, dof: int, total: int, *, noise_known: bool
-                   ) -> Outliers:
+def outliers_among(data: ByPose, dof: int, total: int, *, noise_known: bool) -> Indices:
     """
-    Find the outliers among poses, given their equations at a fit.
+    Return the indices of the outliers among poses, given their equations at a fit.
 
     They are at most `LARGEST_SHARE` of all poses, and at most so many that the other equations
-    identify them. `chi2` and `dof` are as in `variance_factor`; `total` includes the poses left
-    out before.
+    identify them. `dof` is as in `variance_factor`; `total` includes the poses left out before.
 
     """
     rows = int(data.rows.max())
     out = total - len(data.rows)
     limit = _limit(dof + rows * out, total, rows) - out
     if limit <= 0:
-        return Outliers(np.zeros(0, np.intp), chi2)
+        return np.zeros(0, np.intp)
     if len(data.rows) > _MANY:
-        return _far_out(data, chi2, dof, limit, noise_known=noise_known)
+        return _far_out(data, dof, limit, belief_in(noise_known))
     order = _removed_in_turn(data, dof, limit)
     count = order.extreme(belief_in(noise_known))
     if count:
         left = dof - int(np.sum(order.rows[:count]))
         count = order.extreme(belief_beside(left, order.rss[count], noise_known))
-    return Outliers(np.sort(order.pose[:count]), float(order.rss[count]))
+    return np.sort(order.pose[:count])
 
 
 def _limit(spare: int, total: int, rows: int) -> int:
@@ -167,7 +157,7 @@ def _removed_in_turn(data: ByPose, dof: int, most: int) -> _Removed:
     flat, (count, rows) = data.flat, data.residual.shape
     onto = flat @ data.spread
     residual, left = data.residual.ravel() - onto @ data.downhill, np.ones(count, bool)
-    own = data.own(data.spread)
+    own = data.own.copy()
     removed, solved = np.empty((2, len(flat), most * rows))  # columns of I - leverage
     poses, sizes = [], []
     rss = [float(residual @ residual)]
@@ -203,19 +193,15 @@ def _squared(own: Floats, residual: Floats) -> Floats:
     return np.sum(squares, axis=1)
 
 
-def _far_out(data: ByPose, chi2: float, dof: int, limit: int, *, noise_known: bool
-             ) -> Outliers:
-    """Find outliers among many poses, all at once, relative to the median."""
-    alone = _squared(data.own(data.spread), data.residual)
-    size = alone / data.rows
+def _far_out(data: ByPose, dof: int, limit: int, belief: float) -> Indices:
+    """Return the outliers among many poses, all at once, relative to the median."""
+    size = _squared(data.own, data.residual) / data.rows
     usual = np.where(data.rows == 1, _MEDIAN_OF_CHI2[1], _MEDIAN_OF_CHI2[3]) / data.rows
-    belief = belief_in(noise_known)
     scale = float(np.median(size / usual))
     size = size * (belief + dof) / (belief + scale * dof)
     extreme = beyond(size, data.rows, belief + dof) < LEVEL / len(size)
     largest = np.argsort(-size, kind='stable')[:limit]
-    found = np.sort(largest[extreme[largest]])
-    return Outliers(found, max(chi2 - float(np.sum(alone[found])), 0.0))
+    return np.sort(largest[extreme[largest]])
 
 
 def fit_norm(name: str, poses_g: Poses) -> tuple[Fit, Indices]:
@@ -243,9 +229,9 @@ def fit_norm(name: str, poses_g: Poses) -> tuple[Fit, Indices]:
     return robust
 
 
-def outliers(fit: Fit, total: int) -> Outliers:
+def outliers(fit: Fit, total: int) -> Indices:
     """Return the outliers among the poses of a fit; `total` as in `outliers_among`."""
-    return outliers_among(fit.by_pose, fit.chi2, fit.dof, total, noise_known=fit.noise_known)
+    return outliers_among(fit.by_pose, fit.dof, total, noise_known=fit.noise_known)
 
 
 def _grossest_first(fit: Fit, kept: Indices, poses_g: Poses) -> Indices:
@@ -260,8 +246,7 @@ def _without_outliers(name: str, poses_g: Poses, kept: Indices
     """Fit poses and leave out outliers until there are none; None if a fit does not converge."""
     fit = _fit(name, poses_g, kept)
     for _ in range(_ROUNDS):
-        out = () if fit is None else outliers(fit, len(poses_g)).poses
-        if not len(out):
+        if fit is None or not len(out := outliers(fit, len(poses_g))):
             break
         kept = np.delete(kept, out)
         fit = _fit(name, poses_g, kept)
@@ -419,8 +404,7 @@ def unseen_mistakes(fit: Fit) -> Floats:
     0 for poses that the others check well, infinite for poses that alone determine a parameter.
 
     """
-    data = fit.by_pose
-    own = data.own(data.spread)
+    own = fit.by_pose.own
     least = own[:, 0, 0] if own.shape[1] == 1 else np.linalg.eigvalsh(own)[:, 0]
     size = np.zeros(len(least))
     weak = np.flatnonzero(least < _HARDLY)

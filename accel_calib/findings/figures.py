@@ -28,7 +28,8 @@ import scipy
 
 from ..calibrate import (
     Calibration, Curve, deviations_g, directions_in, error_left_in, free_parameters,
-    identifiability, next_pose, NextPose, Outlook, PRIOR, Quality, Verification)
+    identifiability, next_pose, NextPose, Outlook, PRIOR, Quality, uncertainty_g, Verification)
+from ..compare import NAMES
 from ..effects import AXES, effect_named, LADDER, Model, MODELS, predict, value_unit
 from ..estimate import pose_noise, sensing_axes, variance_factor
 from ..finding import Rating
@@ -40,9 +41,7 @@ from ..units import MG
 if TYPE_CHECKING:
     from ..refine import Refinement
 
-OFFSETS = ('offset.x', 'offset.y', 'offset.z')
-GAINS = ('gain.x', 'gain.y', 'gain.z')
-CROSS = ('gain.xy', 'gain.xz', 'gain.yz')
+OFFSETS, GAINS, CROSS = NAMES[:3], NAMES[3:6], NAMES[6:]
 _ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2), (1, 0), (2, 0), (2, 1))
 """Order of the entries of W."""
 
@@ -356,7 +355,7 @@ class Expected:
         """Return the largest stated uncertainty over the sphere [mg]."""
         if not self.calibration.model.effects:
             return 0.0
-        return float(np.max(deviations_g(self.calibration, OVER_THE_SPHERE))) * MG
+        return uncertainty_g(self.calibration) * MG
 
     @cached_property
     def directions(self) -> Floats:

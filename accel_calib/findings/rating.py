@@ -25,7 +25,7 @@ from ..effects import EMPIRICAL, kind_of, WANDER
 from ..errors import TAKE_ALL_SIDES
 from ..finding import Finding, NextStep, ranked, rated, Rating, without
 from ..geometry import coverage
-from ..table import Poses
+from ..table import Poses, range_of
 from ..text import counted, listed
 from ..units import MG
 
@@ -262,10 +262,9 @@ def step_after(calibration: Calibration) -> NextStep:
 
 def temperature_words(calibration: Calibration) -> str:
     """Return the range of temperature in which a calibration is valid."""
-    poses = calibration.used_poses
-    if 'temperature' not in poses or not np.any(np.isfinite(poses['temperature'])):
+    low, high = range_of(calibration.used_poses, 'temperature')
+    if math.isnan(low):
         return 'record the temperature, too'
-    low, high = np.nanmin(poses['temperature']), np.nanmax(poses['temperature'])
     room = max(SPAN.value - (high - low), 0.0) / 2.0
     return (f'fit again when the temperature leaves {math.floor(low - room)}..'
             f'{math.ceil(high + room)} °C')

@@ -288,9 +288,9 @@ class Set:
             whole = Set.of(self.linear, self.blocks) if self.out else self
             linear, (onto, residual) = self.linear, whole.spanned
             found[key] = tuple(outliers_among(
-                by_pose(residual, np.hstack([linear.onto, onto]), linear.pose), whole.rss,
+                by_pose(residual, np.hstack([linear.onto, onto]), linear.pose),
                 linear.dof - int(whole.parameters), linear.poses, noise_known=linear.worth > 0.0
-            ).poses.tolist())
+            ).tolist())
         out = found[key]
         return [self] if out == self.out else [self, Set.of(self.linear, self.blocks, out)]
 

@@ -485,7 +485,7 @@ def _settled(model: Model, poses_g: Poses) -> State:
         state = fitted_state(Model(model.values), kept)
         if state is None:
             break
-        out = outliers(state.fit, len(poses_g)).poses
+        out = outliers(state.fit, len(poses_g))
         if not len(out):
             return state
     raise RefusedFitError('the effects of the calibration cannot be fitted to these poses, '
