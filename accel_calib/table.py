@@ -13,7 +13,7 @@ letters and digits.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 import re
 from typing import Any, get_args, Literal, TypeVar
@@ -320,22 +320,6 @@ def data_frame(columns: Mapping[str, Any], index: Any) -> Any:
 def numbered(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.int64]:
     """Return row numbers from 1 for these columns."""
     return np.arange(1, len(columns['reading']) + 1)
-
-
-def present(header: Sequence[str], needed: Sequence[str], source: str) -> list[str]:
-    """Return the keys of `COLUMNS` in a header; InputError if one or a part is missing."""
-    keys = []
-    for key, column in COLUMNS.items():
-        if column.made:
-            continue
-        missing = [name for name in column.names if name not in header]
-        if not missing:
-            keys.append(key)
-        elif key in needed or len(missing) < len(column.names):
-            raise InputError(f'{source} has the columns {", ".join(header)}, and lacks '
-                             f'{", ".join(missing)}', f'add the columns '
-                             f'{", ".join(column.names)}, or correct the header line')
-    return keys
 
 
 def check_values(columns: Mapping[str, NDArray[Any]], source: str) -> None:

@@ -28,28 +28,23 @@ from numpy.typing import NDArray
 from .autopilot import FlightLog
 from .bag import Bag, open_bag
 from .bag_samples import context_of, imu_samples, rate_words, together
-from .columns import check_once, chosen, is_log_header, LogOptions, Source, with_indices
+from .columns import chosen, is_log_header, LogOptions
 from .containers import Frame, open_table, Piped
 from .dialect import layout_of
 from .flight import read_dataflash, read_ulg
 from .formats import CONTAINERS, FLIGHT_LOG, HEAD, ULOG
-from .names import OURS, READING
 from .quantities import are_samples, are_untimed_samples, decided, Quantities
 from .text import Cells, open_text, TextTable
-from .times import Clock
 from ..disk import check_regular, FIRST_LINE, write_atomically
 from ..errors import InputError, saying
 from ..table import (
-    check_units, check_values, column_of, COLUMNS, is_quantity, numbered, Poses, present,
-    Recording, Table)
-from ..text import some
+    check_units, check_values, column_of, COLUMNS, is_quantity, Poses, Recording, Table)
+from ..text import counted, some
 from ..units import Units, units_of
 
 _BAG_SUFFIXES = ('.bag', '.mcap', '.db3')
 
 _DIGITS = '.12g'
-_SHOWN = 12
-"""Number of other columns in an error message."""
 
 Progress = Callable[[int, int], object]
 """Function called with the number of samples done, and that of all samples."""
@@ -113,6 +108,15 @@ def read_log(path: Path, options: LogOptions = LogOptions()) -> Log:
     with open_log(path, options) as log:
         table = log.poses if log.poses is not None else together(list(log.blocks))
         return Log(table, log.units, log.read_as, log.notes)
+
+
+def read_poses(path: Path) -> Poses:
+    """Return the poses of a pose table; a recording is an InputError, as others in `open_log`."""
+    table = read_log(path).table
+    if isinstance(table, Poses):
+        return table
+    raise InputError(f'{path} is a recording of {counted(len(table), "sample")}, expected a pose '
+                     'table', 'use capture')
 
 
 def read_recording(path: Path, topic: str = '', sensor: str = '') -> Recording:
@@ -285,35 +289,7 @@ def _as_samples(path: Path, poses: Poses) -> Iterator[Recording]:
     yield Recording(poses.columns, poses.row, poses.units, poses.sensor, poses.autopilot)
 
 
-# -------------------------------------------------------------------------- our own tables
-
-def read_poses(path: Path) -> Poses:
-    """
-    Read a pose table.
-
-    Raises
-    ------
-    InputError
-        If the table is empty, lacks columns, or contains a value that is not a finite number.
-    OSError
-        If the file cannot be read.
-
-    """
-    check_regular(path)
-    with open_text(path, lambda cells: set(READING) <= set(cells), strict=True,
-                   expected=','.join(READING)) as text:
-        layout = text.layout
-        check_once(layout)
-        others = [name for name in layout.header[:_SHOWN] if name not in OURS]
-        keys = present([*(name for name in layout.header if name in OURS), *others],
-                       ('reading',), str(path))
-        columns = with_indices(layout, {name: Source(layout.header.index(name), name)
-                                        for key in keys for name in COLUMNS[key].names})
-        text.choose(columns)
-        quantities = Quantities(columns, units_of('g'), Clock(columns))
-        table, _ = _whole(list(_converted(path, text.blocks(), quantities)), [])
-        return Poses(table, numbered(table), **layout.about)
-
+# ---------------------------------------------------------------------------- writing of tables
 
 def write_table(path: Path, table: Table) -> None:
     """Write poses or samples; errors as in `write_blocks`."""
@@ -374,11 +350,10 @@ class LineReader:
     def __init__(self, name: str, head: Sequence[str], seconds: float, options: LogOptions
                  ) -> None:
         lines = _ended(head)
-        layout = layout_of(Path(name), lines, lambda cells: is_log_header(cells, options),
-                           'utf-8', strict=False, expected='t,ax,ay,az')
+        layout = layout_of(Path(name), lines, lambda cells: is_log_header(cells, options), 'utf-8')
         self._name = name
         columns = chosen(layout, options)
-        self._table = TextTable(layout, iter(()), strict=False)
+        self._table = TextTable(layout, iter(()))
         self._table.choose(columns, skip_bad=True)
         first = self._table.read(lines[layout.start:])
         if not len(first.row):

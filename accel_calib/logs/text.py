@@ -59,9 +59,7 @@ class Cells:
 
 
 @contextmanager
-def open_text(path: Path, is_header: IsHeader, *, strict: bool = False,
-              expected: str = 'time,ax,ay,az',
-              stream: tuple[io.RawIOBase, int] | None = None
+def open_text(path: Path, is_header: IsHeader, stream: tuple[io.RawIOBase, int] | None = None
               ) -> Iterator[TextTable]:
     """Open the text table of a file, or of a stream with its size; see `layout_of`."""
     file, size = stream or (io.FileIO(path), path.stat().st_size)
@@ -69,9 +67,9 @@ def open_text(path: Path, is_header: IsHeader, *, strict: bool = False,
         encoding = _encoding(raw.peek())
         with io.TextIOWrapper(raw, encoding, errors='replace', newline=None) as text:
             head, whole = _head(path, text)
-            layout = layout_of(path, head, is_header, encoding, strict=strict, expected=expected)
+            layout = layout_of(path, head, is_header, encoding)
             lines = chain(head[layout.start:], () if whole else text)
-            yield TextTable(layout, lines, strict=strict, size=size)
+            yield TextTable(layout, lines, size)
 
 
 def _encoding(head: bytes) -> str:
@@ -114,14 +112,12 @@ class TextTable:
     """
     An open text table, read once, block by block; `open_text` makes it.
 
-    `lines` are those from the first row on. If `strict`, a last row that is cut is an error.
-    `size` is the number of bytes.
+    `lines` are those from the first row on. `size` is the number of bytes.
 
     """
 
-    def __init__(self, layout: Layout, lines: Iterator[str], *, strict: bool, size: int = 0
-                 ) -> None:
-        self.layout, self.strict, self.size = layout, strict, size
+    def __init__(self, layout: Layout, lines: Iterator[str], size: int = 0) -> None:
+        self.layout, self.size = layout, size
         self._lines = lines
         self._line, self._row = layout.start, 0
         self._bad = ''
@@ -171,7 +167,7 @@ class TextTable:
         where = (self._line, lines) if len(rows_of) == len(kept) else (-1, lines)
         self._line += len(lines)
         self._row += len(rows_of)
-        if last and rows_of and self._row > 1 and not self.strict:
+        if last and rows_of and self._row > 1:
             rows_of = self._without_cut(rows_of)
             number = number[:len(rows_of)]
         values = self._parsed(rows_of)
@@ -283,8 +279,8 @@ class TextTable:
 
     def _error(self, words: str) -> InputError:
         mark = ',' if words.startswith('line') else ':'
-        return InputError(f'{self.layout.path}{mark} {words}', 'correct the row or remove it'
-                          + ('' if self.strict else ', or add --skip-bad'))
+        return InputError(f'{self.layout.path}{mark} {words}',
+                          'correct the row or remove it, or add --skip-bad')
 
     def _fault(self, line: str) -> str | None:
         layout = self.layout
