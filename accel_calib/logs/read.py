@@ -201,13 +201,14 @@ def _bag(bag: Bag, options: LogOptions) -> OpenLog:
 
 
 def _flight(path: Path, log: FlightLog, options: LogOptions) -> OpenLog:
-    recording = log.recording(str(path))
+    recording = log.recording
+    check_values(recording.columns, str(path))
     units = units_of('m/s2', options.gravity)
     if options.units not in ('', units.name):
         raise InputError(f'{path} is in {units.name}, but --units is {options.units}',
                          'remove --units')
-    return OpenLog(_checked(path, iter((recording,)), units), len(recording), units, log.sensor,
-                   log.read_as, noted=lambda: log.notes)
+    return OpenLog(_checked(path, iter((recording,)), units), len(recording), units,
+                   recording.sensor, log.read_as, noted=lambda: log.notes)
 
 
 def _checked(path: Path, blocks: Iterator[Recording], units: Units) -> Iterator[Recording]:
