@@ -13,7 +13,7 @@ letters and digits.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 import re
 from typing import Any, get_args, Literal, TypeVar
@@ -300,6 +300,10 @@ class Poses(Table):
             return None
         return self['std'] / np.sqrt(self['count'])[:, np.newaxis]
 
+    def as_recording(self) -> Recording:
+        """Return the rows as samples; they have times."""
+        return Recording(**vars(self))
+
 
 class Recording(Table):
     """Samples in the order of time, one row per sample."""
@@ -308,6 +312,13 @@ class Recording(Table):
         super().__post_init__()
         if 'time' not in self.columns:
             raise ValueError('the recording has no times, expected the column time')
+
+
+def concatenated(parts: Sequence[_Self]) -> _Self:
+    """Return one or more tables as one, with the columns that all have."""
+    columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0].columns
+               if all(key in part for part in parts)}
+    return replace(parts[0], columns=columns, row=np.concatenate([part.row for part in parts]))
 
 
 def data_frame(columns: Mapping[str, Any], index: Any) -> Any:

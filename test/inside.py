@@ -62,7 +62,6 @@ from accel_calib.geometry import (
 from accel_calib.live import sources
 from accel_calib.live.sources import is_port, open_source
 from accel_calib.logs import bag_samples, bounded_bags, containers, layout_with, open_bag, text
-from accel_calib.logs.bag_samples import together
 from accel_calib.logs.bounded_bags import decompressed, largest
 from accel_calib.logs.flight import read_dataflash, read_ulg
 from accel_calib.logs.formats import ULOG as ULG_MAGIC

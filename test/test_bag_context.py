@@ -14,10 +14,10 @@ from accel_calib.errors import InputError
 from accel_calib.logs import LogOptions, open_log
 from accel_calib.messages import correct_bag
 from accel_calib.stored import write_calibration
-from accel_calib.table import Recording
+from accel_calib.table import concatenated, Recording
 from accel_calib.units import units_of
 from bag_files import fill, header, IMU, imu, writer_of
-from inside import main, model_with, simulate_poses, spread_directions, together
+from inside import main, model_with, simulate_poses, spread_directions
 import numpy as np
 import pytest
 from rosbags.typesys import get_types_from_msg
@@ -80,7 +80,7 @@ def write(folder: Path, topics: Mapping[str, tuple[str, Values]], kind: str = 'm
 
 def read(path: Path, **asked: str) -> tuple[Recording, tuple[str, ...]]:
     with open_log(path, LogOptions(**asked)) as opened:
-        return together(list(opened.blocks)), opened.notes
+        return concatenated(list(opened.blocks)), opened.notes
 
 
 def warming(seconds: float) -> float:

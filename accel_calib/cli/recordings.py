@@ -152,7 +152,7 @@ def _samples(log: OpenLog, path: Path, moved: Progress) -> Recording:
     if log.poses is None:
         return whole(log.watched(moved))
     if 'time' in log.poses and 'count' not in log.poses:
-        return Recording(log.poses.columns, log.poses.row, log.poses.units, log.poses.sensor)
+        return log.poses.as_recording()
     raise InputError(f'{path} is a pose table, expected a recording',
                      'use the samples of a long rest, with their time')
 

@@ -29,7 +29,7 @@ import numpy as np
 from .bag import Bag, BLOCK, NUMBERS, Received
 from .serialized import doubles_at, frame_ids, stamps_of
 from ..errors import InputError
-from ..table import Floats, Recording
+from ..table import concatenated, Floats, Recording
 from ..text import counted, listed, some
 
 if TYPE_CHECKING:
@@ -395,11 +395,11 @@ def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool, context: Con
             before += len(imus)
         parts += _ready(waiting, tracks)
         if sum(map(len, parts)) >= _ROWS:
-            yield together(parts)
+            yield concatenated(parts)
             parts = []
     parts += [_with_context(part, tracks) for part in waiting]
     if parts:
-        yield together(parts)
+        yield concatenated(parts)
     notes += bag.lost(topic, before)
 
 
@@ -429,9 +429,3 @@ def _blocks(bag: Bag, topic: str, used: Sequence[ContextTopic]
 def _with_context(samples: Recording, tracks: dict[str, Track]) -> Recording:
     columns = {key: track.at(samples['time']) for key, track in tracks.items()}
     return samples.with_columns(**columns) if columns else samples
-
-
-def together(parts: Sequence[Recording]) -> Recording:
-    """Concatenate one or more recordings."""
-    columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0].columns}
-    return replace(parts[0], columns=columns, row=np.concatenate([part.row for part in parts]))

@@ -433,7 +433,7 @@ def _about(path: Path, comments: Sequence[str]) -> dict[str, Any]:
         if colon and name.strip() in ABOUT:
             try:
                 value = json.loads(text)
-                about[name.strip()] = Autopilot(**value) if 'autopilot' in name else value
+                about[name.strip()] = Autopilot(**value) if 'autopilot' in name else str(value)
             except (TypeError, ValueError):
                 continue  # an ordinary comment
     if about.get('units', '') not in ('', *UNIT_NAMES):

@@ -13,7 +13,7 @@ Three kinds of comments are read, with values in JSON: ``# units: "m/s2"``,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 import csv
 from dataclasses import dataclass, replace
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from .autopilot import FlightLog
 from .bag import Bag, open_bag
-from .bag_samples import context_of, imu_samples, rate_words, together
+from .bag_samples import context_of, imu_samples, rate_words
 from .columns import chosen, is_log_header, LogOptions
 from .containers import Frame, open_table, Piped
 from .dialect import layout_of
@@ -38,7 +38,7 @@ from .text import Cells, open_text, TextTable
 from ..disk import check_regular, FIRST_LINE, write_atomically
 from ..errors import InputError, saying
 from ..table import (
-    check_units, check_values, column_of, COLUMNS, is_quantity, Poses, Recording, Table)
+    check_units, check_values, column_of, COLUMNS, concatenated, Poses, Recording, Table)
 from ..text import counted, some
 from ..units import Units, units_of
 
@@ -48,9 +48,6 @@ _DIGITS = '.12g'
 
 Progress = Callable[[int, int], object]
 """Function called with the number of samples done, and that of all samples."""
-
-Block = tuple[dict[str, NDArray[Any]], NDArray[np.int64]]
-"""Columns under the keys of `COLUMNS`, and row numbers."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +103,7 @@ class OpenLog:
 def read_log(path: Path, options: LogOptions = LogOptions()) -> Log:
     """Read the poses or the samples of a log; parameters and errors as in `open_log`."""
     with open_log(path, options) as log:
-        table = log.poses if log.poses is not None else together(list(log.blocks))
+        table = log.poses if log.poses is not None else concatenated(list(log.blocks))
         return Log(table, log.units, log.read_as, log.notes)
 
 
@@ -122,7 +119,7 @@ def read_poses(path: Path) -> Poses:
 def read_recording(path: Path, topic: str = '', sensor: str = '') -> Recording:
     """Return all samples of a recording; `topic`, `sensor` and errors as in `open_log`."""
     with open_log(path, LogOptions(topic=topic, sensor=sensor)) as log:
-        return together(list(log.blocks))
+        return concatenated(list(log.blocks))
 
 
 @contextmanager
@@ -231,19 +228,16 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
 
 def _decided(path: Path, text: TextTable, cells: Iterator[Cells], quantities: Quantities
              ) -> OpenLog:
-    blocks = _converted(path, cells, quantities)
+    blocks = _converted(path, text.layout.about, cells, quantities)
     head = next(blocks)
-    units, about = quantities.units, text.layout.about
-    sensor, autopilot = str(about.get('sensor', '')), about.get('autopilot')
-    check_units(Poses(*head), units, str(path))
+    check_units(head, quantities.units, str(path))
     poses = None
     samples: Iterator[Recording]
-    if are_samples(head[0]):
-        samples = (Recording(*block, units.name, sensor, autopilot)
-                   for block in chain((head,), blocks))
-        count = _estimated(text, head)
+    if are_samples(head.columns):
+        samples = (block.as_recording() for block in chain((head,), blocks))
+        count = _estimated(text, len(head))
     else:
-        poses = Poses(*_whole([head, *blocks], quantities.notes), units.name, sensor, autopilot)
+        poses = _without_lacking(concatenated([head, *blocks]), quantities.notes)
         if are_untimed_samples(poses.columns):
             raise InputError(f'{path} has no times, but its {len(poses)} rows look like samples '
                              'of a recording, expected a column time', 'state the samples per '
@@ -251,31 +245,29 @@ def _decided(path: Path, text: TextTable, cells: Iterator[Cells], quantities: Qu
                              'time=NAME; if each row is a pose, add a column orientation')
         samples, count = _as_samples(path, poses), len(poses)
     rate = '' if quantities.rate_hz is None else f'{quantities.rate_hz:g} Hz (stated)'
-    return OpenLog(samples, count, units, sensor,
+    return OpenLog(samples, count, quantities.units, head.sensor,
                    ', '.join(filter(None, (quantities.read_as, rate))), poses,
                    noted=lambda: (*text.notes, *quantities.all_notes))
 
 
-def _converted(path: Path, cells: Iterator[Cells], quantities: Quantities) -> Iterator[Block]:
+def _converted(path: Path, about: Mapping[str, Any], cells: Iterator[Cells],
+               quantities: Quantities) -> Iterator[Poses]:
     for block in cells:
         columns, row = quantities.columns(block)
         check_values(columns, str(path))
-        yield columns, row
+        yield Poses(columns, row, **{**about, 'units': quantities.units.name})
 
 
-def _whole(blocks: Sequence[Block], notes: list[str]) -> Block:
-    """Return blocks as one, without quantities that lack a number in a row; they are noted."""
-    columns = {key: np.concatenate([block[key] for block, _ in blocks]) for key in blocks[0][0]}
-    lacking = [key for key in columns if is_quantity(key) and not np.isfinite(columns[key]).all()]
+def _without_lacking(poses: Poses, notes: list[str]) -> Poses:
+    """Return poses without quantities that lack a number in a row; they are noted."""
+    lacking = [key for key in poses.quantities if not np.isfinite(poses[key]).all()]
     if lacking:
         notes.append(f'not used, because cells are not numbers: {some(lacking)}')
-    return ({key: values for key, values in columns.items() if key not in lacking},
-            np.concatenate([row for _, row in blocks]))
+    return poses.without_columns(*lacking)
 
 
-def _estimated(text: TextTable, head: Block) -> int:
-    """Return the number of rows, from the size of the file and of the first block."""
-    count = len(head[1])
+def _estimated(text: TextTable, count: int) -> int:
+    """Return the number of rows, from the size of the file and of the `count` of a block."""
     if not text.more:
         return count
     width = 2 if text.layout.encoding.startswith('utf-16') else 1
@@ -287,7 +279,7 @@ def _as_samples(path: Path, poses: Poses) -> Iterator[Recording]:
     if 'time' not in poses:
         raise InputError(f'{path} has no column time, expected a recording', 'add the times of '
                          'the samples, or name their column with --columns time=NAME')
-    yield Recording(poses.columns, poses.row, poses.units, poses.sensor, poses.autopilot)
+    yield poses.as_recording()
 
 
 # ---------------------------------------------------------------------------- writing of tables

@@ -66,7 +66,7 @@ from numpy.typing import NDArray
 
 from ..capture import CaptureSettings, StillDetector
 from ..errors import InputError
-from ..table import Floats, numbered, Recording
+from ..table import concatenated, Floats, Recording
 from ..text import counted
 from ..units import Units
 
@@ -326,6 +326,4 @@ def whole(blocks: Iterable[Recording]) -> Recording:
     if not parts:
         raise InputError('the recording has no samples, expected a long rest',
                          'check that this is the intended file')
-    names = [name for name in parts[0].columns if all(name in part for part in parts)]
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in names}
-    return Recording(columns, numbered(columns), parts[0].units, parts[0].sensor)
+    return concatenated(parts)
