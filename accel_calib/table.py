@@ -225,20 +225,18 @@ class Table(Record):
 
     def _repr_html_(self) -> str:
         """Return the first rows as a table, for notebooks."""
-        keys = self._in_order
-        names = [name for key in keys for name in column_of(key).names]
         first = self.take(slice(_PREVIEW_ROWS))
-        cells = [[str(row)] for row in first.row]
-        for key in keys:
-            for line, values in zip(cells, np.atleast_2d(first[key].T).T.reshape(len(first), -1)):
-                line += [f'{each:.6g}' if first[key].dtype.kind in 'fi' else str(each)
-                         for each in values]
+        columns = first._by_name()
+        texts = [[f'{each:.6g}' if values.dtype.kind in 'fi' else str(each) for each in values]
+                 for values in columns.values()]
         more = f'<p>{self!r}</p>' if len(self) > _PREVIEW_ROWS else ''
-        return table(['row', *names], cells) + more
+        return table(['row', *columns], zip(map(str, first.row), *texts)) + more
 
-    @property
-    def _in_order(self) -> list[str]:
-        return [*(key for key in COLUMNS if key in self), *self.quantities]
+    def _by_name(self) -> dict[str, NDArray[Any]]:
+        """Return the columns with the names and in the order of a file, (n,) each."""
+        keys = [*(key for key in COLUMNS if key in self), *self.quantities]
+        return {name: values for key in keys for name, values in zip(
+            column_of(key).names, np.atleast_2d(self[key].T), strict=True)}
 
     def to_dataframe(self) -> Any:
         """
@@ -252,9 +250,7 @@ class Table(Record):
             If pandas is not installed.
 
         """
-        parts = ((name, values) for key in self._in_order for name, values in zip(
-            column_of(key).names, np.atleast_2d(self[key].T), strict=True))
-        made = data_frame(dict(parts), self.row)
+        made = data_frame(self._by_name(), self.row)
         made.attrs |= self.about
         return made
 
