@@ -51,21 +51,6 @@ Progress = Callable[[int, int], object]
 
 
 @dataclass(frozen=True)
-class Log:
-    """
-    A log that was read; `read_as` and `notes` as in `OpenLog`.
-
-    Times are in s, and angular rates in rad/s.
-
-    """
-
-    table: Poses | Recording
-    units: Units
-    read_as: str = ''
-    notes: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
 class OpenLog:
     """
     An open log that is read block by block; `open_log` makes it.
@@ -100,20 +85,13 @@ class OpenLog:
             progress(done, max(done, self.samples))
 
 
-def read_log(path: Path, options: LogOptions = LogOptions()) -> Log:
-    """Read the poses or the samples of a log; parameters and errors as in `open_log`."""
-    with open_log(path, options) as log:
-        table = log.poses if log.poses is not None else concatenated(list(log.blocks))
-        return Log(table, log.units, log.read_as, log.notes)
-
-
 def read_poses(path: Path) -> Poses:
     """Return the poses of a pose table; a recording is an InputError, as others in `open_log`."""
-    table = read_log(path).table
-    if isinstance(table, Poses):
-        return table
-    raise InputError(f'{path} is a recording of {counted(len(table), "sample")}, expected a pose '
-                     'table', 'use capture')
+    with open_log(path) as log:
+        if log.poses is not None:
+            return log.poses
+        raise InputError(f'{path} is a recording of {counted(sum(map(len, log.blocks)), "sample")}'
+                         ', expected a pose table', 'use capture')
 
 
 def read_recording(path: Path, topic: str = '', sensor: str = '') -> Recording:
