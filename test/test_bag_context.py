@@ -229,8 +229,8 @@ def test_a_bag_is_corrected_with_a_named_temperature(
                                          'on the temperature; name the topic with'):
         correct_bag(path, thermal, out)
     notes: list[str] = []
-    assert correct_bag(path, thermal, out, temperature_topic='/imu/temp',
-                       note=notes.append) == COUNT
+    options = LogOptions(temperature_topic='/imu/temp')
+    assert correct_bag(path, thermal, out, options, note=notes.append) == COUNT
     assert 'have no stamp' in notes[0]
     raw, found = read(path, temperature_topic='/imu/temp')[0], read(out)[0]
     expected = thermal.correct(raw.reading / 9.80665, {'temperature': raw['temperature']})

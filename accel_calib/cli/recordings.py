@@ -76,11 +76,8 @@ def _correct_bag(args: argparse.Namespace, calibration: Calibration, lines: list
         raise InputError('a bag cannot be written to standard output, expected a file',
                          'name a file with -o')
     with progress('messages') as moved:
-        return correct_bag(args.recording, calibration, args.output, args.topic, moved,
-                           note=lambda line: lines.append(f'note: {line}'),
-                           temperature_topic=args.temperature_topic,
-                           supply_topic=args.supply_topic, units=args.units or 'm/s2',
-                           gravity=args.gravity)
+        return correct_bag(args.recording, calibration, args.output, log_options(args), moved,
+                           lambda line: lines.append(f'note: {line}'))
 
 
 def _correct_table(args: argparse.Namespace, calibration: Calibration, lines: list[str]) -> int:

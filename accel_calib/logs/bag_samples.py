@@ -35,6 +35,8 @@ from ..text import counted, listed, some
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
+    from .columns import LogOptions
+
 TEMPERATURE = 'sensor_msgs/msg/Temperature'
 _TEMPERATURE_DOUBLES = 2
 """Number of doubles of a Temperature: temperature and variance."""
@@ -204,8 +206,7 @@ class ContextTopics:
         return tracks
 
 
-def context_of(bag: Bag, imu: str, sensor: str, temperature_topic: str = '',
-               supply_topic: str = '') -> ContextTopics:
+def context_of(bag: Bag, imu: str, sensor: str, options: LogOptions) -> ContextTopics:
     """
     Return the topics with temperature and supply voltage.
 
@@ -213,10 +214,10 @@ def context_of(bag: Bag, imu: str, sensor: str, temperature_topic: str = '',
     ----------
     bag, imu, sensor
         The open bag; topic and frame_id of the readings.
-    temperature_topic, supply_topic : str
-        Topics to use, as ``TOPIC`` or ``TOPIC:FIELD``. By default, the temperature is that of the
-        only topic of type sensor_msgs/Temperature, or of the only one with the frame_id or in the
-        namespace of the Imu.
+    options : LogOptions
+        The topics to use. By default, the temperature is that of the only topic of type
+        sensor_msgs/Temperature, or of the only one with the frame_id or in the namespace of the
+        Imu.
 
     Raises
     ------
@@ -225,7 +226,8 @@ def context_of(bag: Bag, imu: str, sensor: str, temperature_topic: str = '',
 
     """
     used, notes = [], []
-    for quantity, asked in zip(QUANTITIES, (temperature_topic, supply_topic), strict=True):
+    topics = options.temperature_topic, options.supply_topic
+    for quantity, asked in zip(QUANTITIES, topics, strict=True):
         found = (_asked(bag, quantity, asked) if asked else
                  _own(bag, imu, sensor) if quantity.key == 'temperature' else None)
         if found is not None:

@@ -164,7 +164,7 @@ def is_bag(path: Path) -> bool:
 def _bag(bag: Bag, options: LogOptions) -> OpenLog:
     topic = bag.imu_topic(options.topic)
     sensor = options.sensor or bag.first_frame_id(topic)
-    context = context_of(bag, topic, sensor, options.temperature_topic, options.supply_topic)
+    context = context_of(bag, topic, sensor, options)
     notes = [*bag.notes, *context.notes]
     blocks = imu_samples(bag, topic, sensor, chosen=bool(options.sensor), context=context,
                          notes=notes)
