@@ -25,14 +25,15 @@ from .finding import Finding
 from .findings import figures_of, rate, Rating
 from .geometry import spread_directions
 from .logs import (
-    are_untimed_samples, Frame, LogOptions, read_log, read_recording as read_whole_recording)
+    are_untimed_samples, Frame, LogOptions, read_poses as read_pose_table,
+    read_recording as read_whole_recording)
 from .pipeline import calibrated, calibrated_log, captured_from, Flat, options_for, Plan, poses_of
 from .refine import refine as find_effects, Refinement as Refinement
 from .stored import read_calibration, write_calibration
 from .table import (
     check_units, check_values, data_frame, Floats, in_unit, LARGEST, median_length, numbered,
     Poses as Poses, Recording as Recording, Table)
-from .text import counted, now
+from .text import now
 from .units import FrameName, Method, STANDARD_GRAVITY, UnitName, units_of
 
 Effect = OwnEffect
@@ -216,11 +217,7 @@ def read_poses(path: Source) -> Poses:
         If the file cannot be read.
 
     """
-    table = read_log(Path(path)).table
-    if isinstance(table, Poses):
-        return table
-    raise InputError(f'{path} is a recording of {counted(len(table), "sample")}, expected a pose '
-                     'table', 'use capture')
+    return read_pose_table(Path(path))
 
 
 def read_recording(path: Source, *, topic: str = '', sensor: str = '') -> Recording:

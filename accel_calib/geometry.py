@@ -11,6 +11,7 @@ from itertools import product
 import math
 
 import numpy as np
+import scipy
 
 from .table import Floats
 
@@ -24,10 +25,7 @@ def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Floats:
     It transforms from the axes of the rotated body to the fixed axes.
 
     """
-    (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
-    return np.array([[cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-                     [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-                     [-sp, cp * sr, cp * cr]])
+    return scipy.spatial.transform.Rotation.from_euler('xyz', [roll, pitch, yaw]).as_matrix()
 
 
 def rpy_of(rotation: Floats) -> tuple[float, float, float]:
@@ -45,33 +43,19 @@ def rpy_of(rotation: Floats) -> tuple[float, float, float]:
 
 
 def quaternion_of(rotation: Floats) -> tuple[float, float, float, float]:
-    """
-    Return the unit quaternion (x, y, z, w) of a rotation matrix, with w >= 0.
-
-    q qᵀ, which is linear in the matrix, is formed, and its largest column is normalised.
-
-    """
-    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
-    outer = np.array([[1 + a - e - i, b + d, c + g, h - f],
-                      [b + d, 1 - a + e - i, f + h, c - g],
-                      [c + g, f + h, 1 - a - e + i, d - b],
-                      [h - f, c - g, d - b, 1 + a + e + i]])
-    column = outer[:, int(np.argmax(np.diag(outer)))]
-    x, y, z, w = (column / np.linalg.norm(column) * (-1.0 if column[3] < 0.0 else 1.0)).tolist()
+    """Return the unit quaternion (x, y, z, w) of a rotation matrix, with w >= 0."""
+    turn = scipy.spatial.transform.Rotation.from_matrix(rotation)
+    x, y, z, w = turn.as_quat(canonical=True).tolist()
     return x, y, z, w
 
 
 def rotation_from_quaternion(quaternion: Sequence[float]) -> Floats:
     """Return the (3, 3) rotation matrix of a quaternion (x, y, z, w) of any length but 0."""
-    x, y, z, w = quaternion
-    return np.eye(3) + 2.0 / (x * x + y * y + z * z + w * w) * np.array(
-        [[-y * y - z * z, x * y - w * z, x * z + w * y],
-         [x * y + w * z, -x * x - z * z, y * z - w * x],
-         [x * z - w * y, y * z + w * x, -x * x - y * y]])
+    return scipy.spatial.transform.Rotation.from_quat(quaternion).as_matrix()
 
 
 def angle_of(rotation: Floats) -> float:
-    """Return the angle of a rotation matrix [°], 0 to 180."""
+    """Return the angle of an orthogonal matrix [°], 0 to 180; that of a mirror is 90 or more."""
     cosine = (float(np.trace(rotation)) - 1.0) / 2.0
     return math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))
 

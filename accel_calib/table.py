@@ -225,20 +225,18 @@ class Table(Record):
 
     def _repr_html_(self) -> str:
         """Return the first rows as a table, for notebooks."""
-        keys = self._in_order
-        names = [name for key in keys for name in column_of(key).names]
         first = self.take(slice(_PREVIEW_ROWS))
-        cells = [[str(row)] for row in first.row]
-        for key in keys:
-            for line, values in zip(cells, np.atleast_2d(first[key].T).T.reshape(len(first), -1)):
-                line += [f'{each:.6g}' if first[key].dtype.kind in 'fi' else str(each)
-                         for each in values]
+        columns = first._by_name()
+        texts = [[f'{each:.6g}' if values.dtype.kind in 'fi' else str(each) for each in values]
+                 for values in columns.values()]
         more = f'<p>{self!r}</p>' if len(self) > _PREVIEW_ROWS else ''
-        return table(['row', *names], cells) + more
+        return table(['row', *columns], zip(map(str, first.row), *texts)) + more
 
-    @property
-    def _in_order(self) -> list[str]:
-        return [*(key for key in COLUMNS if key in self), *self.quantities]
+    def _by_name(self) -> dict[str, NDArray[Any]]:
+        """Return the columns with the names and in the order of a file, (n,) each."""
+        keys = [*(key for key in COLUMNS if key in self), *self.quantities]
+        return {name: values for key in keys for name, values in zip(
+            column_of(key).names, np.atleast_2d(self[key].T), strict=True)}
 
     def to_dataframe(self) -> Any:
         """
@@ -252,9 +250,7 @@ class Table(Record):
             If pandas is not installed.
 
         """
-        parts = ((name, values) for key in self._in_order for name, values in zip(
-            column_of(key).names, np.atleast_2d(self[key].T), strict=True))
-        made = data_frame(dict(parts), self.row)
+        made = data_frame(self._by_name(), self.row)
         made.attrs |= self.about
         return made
 
@@ -300,6 +296,10 @@ class Poses(Table):
             return None
         return self['std'] / np.sqrt(self['count'])[:, np.newaxis]
 
+    def as_recording(self) -> Recording:
+        """Return the rows as samples; they have times."""
+        return Recording(**vars(self))
+
 
 class Recording(Table):
     """Samples in the order of time, one row per sample."""
@@ -323,6 +323,13 @@ def in_unit(table: _Self, convert: Callable[[Floats], Floats], *, native: bool =
     return table.with_columns(**{key: convert(table[key]) for key in keys if key in table})
 
 
+def concatenated(parts: Sequence[_Self]) -> _Self:
+    """Return one or more tables as one, with the columns that all have."""
+    columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0].columns
+               if all(key in part for part in parts)}
+    return replace(parts[0], columns=columns, row=np.concatenate([part.row for part in parts]))
+
+
 def data_frame(columns: Mapping[str, Any], index: Any) -> Any:
     """Return columns as a DataFrame; raise InputError if pandas is not installed."""
     with needing('pandas', 'a DataFrame'):
@@ -333,22 +340,6 @@ def data_frame(columns: Mapping[str, Any], index: Any) -> Any:
 def numbered(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.int64]:
     """Return row numbers from 1 for these columns."""
     return np.arange(1, len(columns['reading']) + 1)
-
-
-def present(header: Sequence[str], needed: Sequence[str], source: str) -> list[str]:
-    """Return the keys of `COLUMNS` in a header; InputError if one or a part is missing."""
-    keys = []
-    for key, column in COLUMNS.items():
-        if column.made:
-            continue
-        missing = [name for name in column.names if name not in header]
-        if not missing:
-            keys.append(key)
-        elif key in needed or len(missing) < len(column.names):
-            raise InputError(f'{source} has the columns {", ".join(header)}, and lacks '
-                             f'{", ".join(missing)}', f'add the columns '
-                             f'{", ".join(column.names)}, or correct the header line')
-    return keys
 
 
 def check_values(columns: Mapping[str, NDArray[Any]], source: str) -> None:

@@ -16,7 +16,7 @@ import zlib
 
 from accel_calib.calibrate import Calibration, fit_poses
 from accel_calib.errors import InputError
-from accel_calib.logs import read_recording
+from accel_calib.logs import LogOptions, read_recording
 from accel_calib.messages import correct_bag
 from accel_calib.table import Recording
 from accel_calib.units import units_of
@@ -179,7 +179,8 @@ def check_refused(path: Path, words: str, topic: str = '') -> None:
     """Check that reading and correcting a bag end in one line, and that nothing is written."""
     before = {*path.parent.iterdir()}
     for work in (lambda: read_recording(path, topic),
-                 lambda: correct_bag(path, a_calibration(), path.with_name('out'), topic)):
+                 lambda: correct_bag(path, a_calibration(), path.with_name('out'),
+                                     LogOptions(topic=topic))):
         with pytest.raises(InputError, match=words) as refusal:
             work()
         assert '\n' not in str(refusal.value)

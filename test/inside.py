@@ -13,6 +13,7 @@ name that is not clear without its file has another one here.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -61,8 +62,8 @@ from accel_calib.geometry import (
     unit, words_of)
 from accel_calib.live import sources
 from accel_calib.live.sources import is_port, open_source
-from accel_calib.logs import bag_samples, bounded_bags, containers, layout_with, open_bag, text
-from accel_calib.logs.bag_samples import together
+from accel_calib.logs import (
+    bag_samples, bounded_bags, containers, layout_with, LogOptions, open_bag, open_log, text)
 from accel_calib.logs.bounded_bags import decompressed, largest
 from accel_calib.logs.flight import read_dataflash, read_ulg
 from accel_calib.logs.formats import ULOG as ULG_MAGIC
@@ -110,6 +111,8 @@ from accel_calib.stored.calibration_yaml import (
 from accel_calib.stored.exports import (
     CALIBRATION_ALONE, export, FORMATS as EXPORT_FORMATS, identifier, Options as ExportOptions)
 from accel_calib.stored.plain_yaml import MOST_BYTES, MOST_VALUES, read_plain
+from accel_calib.table import concatenated, Poses, Recording
+from accel_calib.units import Units
 
 COMMAND = ('-m', 'accel_calib.cli.main')
 """Arguments of Python that run the command line."""
@@ -130,6 +133,23 @@ def format_calibration(calibration: Calibration) -> str:
 def parse_calibration(text: str, name: str) -> Calibration:
     """Return the calibration in the text of a file."""
     return calibration_from(text.encode(), name)
+
+
+@dataclass(frozen=True)
+class Log:
+    """A log that was read; `read_as` and `notes` as in `OpenLog`."""
+
+    table: Poses | Recording
+    units: Units
+    read_as: str
+    notes: tuple[str, ...]
+
+
+def read_log(path: Path, options: LogOptions = LogOptions()) -> Log:
+    """Read the poses or the samples of a log; parameters and errors as in `open_log`."""
+    with open_log(path, options) as log:
+        table = log.poses if log.poses is not None else concatenated(list(log.blocks))
+        return Log(table, log.units, log.read_as, log.notes)
 
 
 PAGE_FOLDER = Path(sources.__file__).parent / 'page'

@@ -21,10 +21,11 @@ from typing import Any
 from accel_calib.calibrate import Calibration, fit_poses
 from accel_calib.capture import capture
 from accel_calib.errors import DamagedCalibrationError
-from accel_calib.logs import read_log, write_table
+from accel_calib.logs import write_table
 from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import Autopilot, Recording
-from inside import export, ExportOptions, main, model_with, simulate_recording, spread_directions
+from inside import (
+    export, ExportOptions, main, model_with, read_log, simulate_recording, spread_directions)
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 from shared import sensor
 import yaml
 
-UNITS = units_of('m/s2')
+UNITS, ON_A = units_of('m/s2'), LogOptions(topic='/imu/a')
 
 
 @pytest.fixture(scope='module')
@@ -240,7 +240,7 @@ def test_big_endian_messages_are_read_and_corrected(make, tmp_path):
     expected = deserialized(path)
     np.testing.assert_array_equal(np.column_stack([found['time'], found['rate'], found.reading]),
                                   expected)
-    correct_bag(path, a_calibration(), tmp_path / 'out', '/imu/a')
+    correct_bag(path, a_calibration(), tmp_path / 'out', ON_A)
     np.testing.assert_allclose(deserialized(tmp_path / 'out')[:, 4:],
                                a_calibration().correct(expected[:, 4:]), atol=1e-12)
 
@@ -254,7 +254,7 @@ def test_a_corrected_bag_keeps_all_other_content(make, turned, tmp_path):
         calibration = replace(calibration, model=model)
     path = write(tmp_path, make, messages(4, shuffled=make not in IN_ORDER))
     calls = []
-    count = correct_bag(path, calibration, tmp_path / 'out', '/imu/a',
+    count = correct_bag(path, calibration, tmp_path / 'out', ON_A,
                         lambda done, of: calls.append((done, of)))
     assert count == COUNT
     assert calls[-1] == (COUNT, COUNT) or make == 'split'  # whose metadata count the first file
@@ -266,7 +266,7 @@ def test_a_corrected_bag_keeps_all_other_content(make, turned, tmp_path):
 def test_a_copy_is_compressed_like_its_bag_unless_it_is_one_file(mode, tmp_path):
     path = rosbag2(StoragePlugin.MCAP, mode)(tmp_path, TOPICS, messages(4))
     for name, found in (('out', mode.name.lower()), ('out.mcap', None), ('out.db3', None)):
-        correct_bag(path, a_calibration(), tmp_path / name, '/imu/a')
+        correct_bag(path, a_calibration(), tmp_path / name, ON_A)
         assert len(deserialized(tmp_path / name)) == COUNT
         if found:
             with Reader(tmp_path / name) as copy:
@@ -278,9 +278,9 @@ def test_a_file_becomes_a_file_or_a_folder_with_the_metadata_of_its_messages(
         plugin, tmp_path):
     path = rosbag2(plugin)(tmp_path, TOPICS, messages(7))
     file = next(item for item in path.iterdir() if item.suffix != '.yaml')
-    correct_bag(file, a_calibration(), tmp_path / f'out{file.suffix}', '/imu/a')
+    correct_bag(file, a_calibration(), tmp_path / f'out{file.suffix}', ON_A)
     assert (tmp_path / f'out{file.suffix}').is_file()
-    correct_bag(file, a_calibration(), tmp_path / 'out', '/imu/a')
+    correct_bag(file, a_calibration(), tmp_path / 'out', ON_A)
     expected, found = (yaml.safe_load((folder / 'metadata.yaml').read_text())[
         'rosbag2_bagfile_information'] for folder in (path, tmp_path / 'out'))
     for about in (expected, found):

@@ -14,10 +14,10 @@ from accel_calib.errors import InputError
 from accel_calib.logs import LogOptions, open_log
 from accel_calib.messages import correct_bag
 from accel_calib.stored import write_calibration
-from accel_calib.table import Recording
+from accel_calib.table import concatenated, Recording
 from accel_calib.units import units_of
 from bag_files import fill, header, IMU, imu, writer_of
-from inside import main, model_with, simulate_poses, spread_directions, together
+from inside import main, model_with, simulate_poses, spread_directions
 import numpy as np
 import pytest
 from rosbags.typesys import get_types_from_msg
@@ -80,7 +80,7 @@ def write(folder: Path, topics: Mapping[str, tuple[str, Values]], kind: str = 'm
 
 def read(path: Path, **asked: str) -> tuple[Recording, tuple[str, ...]]:
     with open_log(path, LogOptions(**asked)) as opened:
-        return together(list(opened.blocks)), opened.notes
+        return concatenated(list(opened.blocks)), opened.notes
 
 
 def warming(seconds: float) -> float:
@@ -229,8 +229,8 @@ def test_a_bag_is_corrected_with_a_named_temperature(
                                          'on the temperature; name the topic with'):
         correct_bag(path, thermal, out)
     notes: list[str] = []
-    assert correct_bag(path, thermal, out, temperature_topic='/imu/temp',
-                       note=notes.append) == COUNT
+    options = LogOptions(temperature_topic='/imu/temp')
+    assert correct_bag(path, thermal, out, options, note=notes.append) == COUNT
     assert 'have no stamp' in notes[0]
     raw, found = read(path, temperature_topic='/imu/temp')[0], read(out)[0]
     expected = thermal.correct(raw.reading / 9.80665, {'temperature': raw['temperature']})

@@ -15,10 +15,10 @@ from typing import Any
 import zipfile
 
 from accel_calib.errors import InputError
-from accel_calib.logs import LogOptions, open_log, read_log
+from accel_calib.logs import LogOptions, open_log
 from accel_calib.table import Recording
 from faults.sample import sample
-from inside import containers
+from inside import containers, read_log
 import numpy as np
 import openpyxl
 import pytest

@@ -27,12 +27,12 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from accel_calib.errors import InputError
-from accel_calib.logs import LogOptions, read_log
+from accel_calib.logs import LogOptions
 from accel_calib.stored import read_calibration
 from accel_calib.table import Floats
 from inside import (
     announce, CLOCK_OF_A_SOURCE, COMMAND, HEAD_OF_A_PORT, is_port, main, open_source,
-    PATIENCE_OF_A_PORT)
+    PATIENCE_OF_A_PORT, read_log)
 from live_bench import TurnedSensor
 import numpy as np
 import pytest

@@ -13,10 +13,10 @@ from typing import Any
 from accel_calib.calibrate import Calibration, fit_poses, level_by_rows
 from accel_calib.capture import capture
 from accel_calib.errors import InputError
-from accel_calib.logs import LogOptions, read_log
+from accel_calib.logs import LogOptions
 from accel_calib.table import Recording
 from data.logs import make
-from inside import format_named, read_dataflash, read_ulg
+from inside import format_named, read_dataflash, read_log, read_ulg
 import numpy as np
 import pytest
 
@@ -122,32 +122,34 @@ def test_a_flat_pose_makes_a_level_vehicle_read_up() -> None:
 
 def test_a_log_of_the_default_profile_gives_the_selected_sensor_with_its_temperature() -> None:
     log, samples = px4('default.ulg'), make.recording(40, down=True)
-    assert log.sensor == 'sensor_combined 0'
-    np.testing.assert_allclose(log.columns['temperature'], samples['temperature'], atol=0.08)
-    np.testing.assert_allclose(np.diff(log.columns['time']), 1.0 / make.RATE_HZ, atol=1e-6)
+    assert log.recording.sensor == 'sensor_combined 0'
+    np.testing.assert_allclose(log.recording['temperature'], samples['temperature'], atol=0.08)
+    np.testing.assert_allclose(np.diff(log.recording['time']), 1.0 / make.RATE_HZ, atol=1e-6)
     assert any('CAL_ACC' in note for note in log.notes)
 
 
 def test_the_named_message_and_sensor_of_a_px4_log_are_read() -> None:
-    log, samples = px4('default.ulg', 'sensor_accel', '1'), make.recording(40, down=True)
-    assert log.sensor == 'sensor_accel 1'
-    np.testing.assert_allclose(log.columns['ax'], samples.reading[::20, 0] * make.G, rtol=1e-6)
+    found = px4('default.ulg', 'sensor_accel', '1').recording
+    samples = make.recording(40, down=True)
+    assert found.sensor == 'sensor_accel 1'
+    np.testing.assert_allclose(found.reading[:, 0], samples.reading[::20, 0] * make.G, rtol=1e-6)
     with pytest.raises(InputError, match='has sensor_accel 0, expected vehicle_imu'):
         px4('thermal.ulg', 'vehicle_imu')
 
 
 def test_a_name_of_the_sensor_names_it_and_does_not_choose() -> None:
     log = px4('thermal.ulg', sensor='left imu')
-    assert log.sensor == 'left imu'
+    assert log.recording.sensor == 'left imu'
     assert 'sensor_accel 0' in log.read_as
     with pytest.raises(InputError, match='expected a message 3'):
         px4('thermal.ulg', sensor='3')
 
 
 def test_vehicle_imu_is_divided_by_its_interval_and_not_read_without_it(tmp_path: Path) -> None:
-    log, samples = px4('default.ulg', 'vehicle_imu'), make.recording(40, down=True)
-    np.testing.assert_allclose(log.columns['az'], samples.reading[::10, 2] * make.G, rtol=1e-6)
-    np.testing.assert_allclose(log.columns['gy'], samples['rate'][::10, 1], atol=1e-6)
+    found = px4('default.ulg', 'vehicle_imu').recording
+    samples = make.recording(40, down=True)
+    np.testing.assert_allclose(found.reading[:, 2], samples.reading[::10, 2] * make.G, rtol=1e-6)
+    np.testing.assert_allclose(found['rate'][:, 1], samples['rate'][::10, 1], atol=1e-6)
     fields = make.imu_fields(make.recording(1), 1)  # of another version of PX4
     del fields['delta_velocity_dt']
     with pytest.raises(InputError, match='none of the messages'):
@@ -159,16 +161,16 @@ def test_samples_that_px4_marks_as_invalid_are_left_out_and_counted(tmp_path: Pa
     kind, relative = fields['accelerometer_timestamp_relative']
     fields['accelerometer_timestamp_relative'] = (kind, [0x7fffffff] * 3 + list(relative[3:]))
     log = px4(in_file(tmp_path, make.ulog_bytes([('sensor_combined', 0, fields)])))
-    assert len(log.columns['time']) == len(relative) - 3
+    assert len(log.recording['time']) == len(relative) - 3
     assert '3 rows of sensor_combined 0 left out' in log.notes[0]
 
 
 def test_flight_logs_that_are_cut_off_are_read_up_to_there(tmp_path: Path) -> None:
     data = (LOGS / 'px4/thermal.ulg').read_bytes()[:40_001]
-    assert 300 < len(px4(in_file(tmp_path, data)).columns['time']) < 600
+    assert 300 < len(px4(in_file(tmp_path, data)).recording['time']) < 600
     data = (LOGS / 'ardupilot/two_imus.bin').read_bytes()[:50_003]
     log = ardupilot(in_file(tmp_path, data))
-    assert 400 < len(log.columns['time']) < 600
+    assert 400 < len(log.recording['time']) < 600
     assert '1 message cut off at the end' in log.notes
 
 
@@ -176,10 +178,11 @@ def test_flight_logs_that_are_cut_off_are_read_up_to_there(tmp_path: Path) -> No
 
 def test_the_lowest_sensor_of_an_ardupilot_log_is_read_and_the_others_are_named() -> None:
     log, other = ardupilot('two_imus.bin'), ardupilot('two_imus.bin', sensor='1')
-    assert log.sensor == 'IMU 0'
+    assert log.recording.sensor == 'IMU 0'
     assert any('IMU 1' in note for note in log.notes)
     samples = make.recording(51, down=True, poses=6)
-    np.testing.assert_allclose(other.columns['ay'], samples.reading[:, 1] * make.G, rtol=1e-6)
+    np.testing.assert_allclose(other.recording.reading[:, 1], samples.reading[:, 1] * make.G,
+                               rtol=1e-6)
 
 
 @pytest.mark.parametrize('name', ['two_imus.bin', 'two_imus.csv'])
@@ -202,17 +205,17 @@ def test_the_csv_of_two_sensors_gives_the_lowest_or_the_one_that_is_named() -> N
 
 def test_the_text_log_has_the_numbers_of_the_binary_log() -> None:
     binary, text = ardupilot('two_imus.bin'), ardupilot('one_imu.log')
-    assert set(binary.columns) == set(text.columns)
-    for key, values in binary.columns.items():
-        np.testing.assert_allclose(text.columns[key], values, rtol=1e-6, atol=1e-9)
+    assert set(binary.recording.columns) == set(text.recording.columns)
+    for key, values in binary.recording.columns.items():
+        np.testing.assert_allclose(text.recording[key], values, rtol=1e-6, atol=1e-9)
 
 
 def test_garbage_within_an_ardupilot_log_is_passed_over(tmp_path: Path) -> None:
     whole = (LOGS / 'ardupilot/raw_acc.bin').read_bytes()
     start = whole.index(b'\xa3\x95\x65', 20_000)
     path = in_file(tmp_path, whole[:start] + b'\x00\x17\xff' * 9 + whole[start:])
-    np.testing.assert_array_equal(ardupilot(path).columns['az'],
-                                  ardupilot('raw_acc.bin').columns['az'])
+    np.testing.assert_array_equal(ardupilot(path).recording.reading[:, 2],
+                                  ardupilot('raw_acc.bin').recording.reading[:, 2])
 
 
 def test_the_messages_of_older_ardupilot_logs_are_read(tmp_path: Path) -> None:
@@ -225,10 +228,11 @@ def test_the_messages_of_older_ardupilot_logs_are_read(tmp_path: Path) -> None:
                    b'IMU2, 1020, 0.1, 0.2, 0.3, 1.6, 2.6, -9.6\n'
                    b'IMU, 1040, 0.1\n')
     log = read_dataflash(path)
-    np.testing.assert_allclose(log.columns['time'], [1.0, 1.02])
-    np.testing.assert_allclose(log.columns['az'], [-9.8, -9.9])
+    np.testing.assert_allclose(log.recording['time'], [1.0, 1.02])
+    np.testing.assert_allclose(log.recording.reading[:, 2], [-9.8, -9.9])
     assert any('1 line of another length' in note for note in log.notes)
-    np.testing.assert_allclose(read_dataflash(path, sensor='1').columns['ax'], [1.5, 1.6])
+    other = read_dataflash(path, sensor='1').recording
+    np.testing.assert_allclose(other.reading[:, 0], [1.5, 1.6])
 
 
 def test_the_calibration_that_an_ardupilot_log_holds_already_is_named(tmp_path: Path) -> None:

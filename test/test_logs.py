@@ -17,9 +17,9 @@ import accel_calib as ac
 from accel_calib.calibrate import fit_poses
 from accel_calib.capture import capture
 from accel_calib.errors import InputError
-from accel_calib.logs import LogOptions, open_log, read_log
+from accel_calib.logs import LogOptions, open_log
 from accel_calib.table import Poses, Recording
-from inside import meaning, spread_directions, unit_of
+from inside import meaning, read_log, spread_directions, unit_of
 import numpy as np
 import pytest
 

@@ -16,7 +16,7 @@ import math
 import os
 import struct
 
-from accel_calib.calibrate import fit_poses, thermal_stream
+from accel_calib.calibrate import fit_poses, of_samples, thermal_stream
 from accel_calib.effects import EFFECTS
 from accel_calib.errors import AccelCalibError, InputError
 from accel_calib.logs import (
@@ -89,7 +89,7 @@ def doubles_of(data):
 
 
 def rewriter_of(data, calibration, name='imu'):
-    return Rewriter(layout_of(data), calibration, 1.0, STANDARD_GRAVITY, name)
+    return Rewriter(layout_of(data), calibration, STANDARD_GRAVITY, name)
 
 
 def fields_of(count=6):
@@ -199,8 +199,9 @@ def test_lag_carries_over_from_block_to_block(calibration):
                'temperature': 25.0 + np.arange(300) * 0.01}
 
     def part(rows, *stream):
+        own = {key: values[rows] for key, values in context.items()}
         return corrected(calibration, doubles[rows],
-                         {key: values[rows] for key, values in context.items()}, *stream)
+                         of_samples(own, len(doubles[rows]), calibration.model, *stream))
 
     expected, stream = part(slice(None)), thermal_stream(calibration.model)
     parts = [part(slice(0, 77), stream), part(slice(77, 300), stream)]

@@ -55,7 +55,7 @@ def test_a_new_effect_is_simulated_named_fitted_corrected_and_reported(monkeypat
 
     store = get_typestore(Stores.ROS2_JAZZY)
     data = bytes(store.serialize_cdr(imu(store, header(store, 10 ** 9), poses.reading[7]), IMU))
-    rewrite = Rewriter(layout_of(data), calibration, 1.0, 9.80665, '')
+    rewrite = Rewriter(layout_of(data), calibration, 9.80665, '')
     corrected = rewrite(data, {'temperature': float(poses['temperature'][7])})
     force = store.deserialize_cdr(corrected, IMU).linear_acceleration
     np.testing.assert_allclose([force.x, force.y, force.z], forces[7], atol=1e-9)

@@ -146,7 +146,7 @@ def test_a_table_of_impossible_readings_does_not_stop_the_calibrator(
             for std, count in ((0, 1), (most, 1.0 / most), (1.0 / most, most))]
     store.poses.write_text('ax,ay,az,std_x,std_y,std_z,count\n' + ''.join(rows))
     driver = Driver(calibration_file=str(store.calibration))
-    assert bool(driver.logged()) is (most > 1e30)
+    assert 'kept as' in driver.logged()
     driver.session.close()
     works(store.calibration, readings)
 

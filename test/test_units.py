@@ -13,12 +13,12 @@ from typing import Any
 import accel_calib as ac
 from accel_calib.calibrate import converted, fit_poses
 from accel_calib.errors import InputError
-from accel_calib.logs import LogOptions, read_log, read_recording, write_table
+from accel_calib.logs import LogOptions, read_recording, write_table
 from accel_calib.stored import write_calibration
 from accel_calib.table import Poses, Table
 from accel_calib.units import STANDARD_GRAVITY as GRAVITY, Units, units_of
 from bag_files import write_bag
-from inside import in_units_of, model_with, simulate_recording, spread_directions
+from inside import in_units_of, model_with, read_log, simulate_recording, spread_directions
 import numpy as np
 import pytest
 from shared import run

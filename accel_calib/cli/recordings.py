@@ -76,11 +76,8 @@ def _correct_bag(args: argparse.Namespace, calibration: Calibration, lines: list
         raise InputError('a bag cannot be written to standard output, expected a file',
                          'name a file with -o')
     with progress('messages') as moved:
-        return correct_bag(args.recording, calibration, args.output, args.topic, moved,
-                           note=lambda line: lines.append(f'note: {line}'),
-                           temperature_topic=args.temperature_topic,
-                           supply_topic=args.supply_topic, units=args.units or 'm/s2',
-                           gravity=args.gravity)
+        return correct_bag(args.recording, calibration, args.output, log_options(args), moved,
+                           lambda line: lines.append(f'note: {line}'))
 
 
 def _correct_table(args: argparse.Namespace, calibration: Calibration, lines: list[str]) -> int:
@@ -152,7 +149,7 @@ def _samples(log: OpenLog, path: Path, moved: Progress) -> Recording:
     if log.poses is None:
         return whole(log.watched(moved))
     if 'time' in log.poses and 'count' not in log.poses:
-        return Recording(log.poses.columns, log.poses.row, log.poses.units, log.poses.sensor)
+        return log.poses.as_recording()
     raise InputError(f'{path} is a pose table, expected a recording',
                      'use the samples of a long rest, with their time')
 

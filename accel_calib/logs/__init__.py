@@ -18,8 +18,8 @@ from .containers import Frame, Piped
 from .names import NAMES
 from .quantities import are_untimed_samples
 from .read import (
-    is_bag, LineReader, Log, open_log, OpenLog, Progress, read_log, read_poses, read_recording,
-    write_blocks, write_table)
+    is_bag, LineReader, open_log, OpenLog, Progress, read_poses, read_recording, write_blocks,
+    write_table)
 from .serialized import (
     ACCELERATION, ACCELERATION_COVARIANCE, ANGULAR_VELOCITY, ANGULAR_VELOCITY_COVARIANCE,
     doubles_at, IMU_DOUBLES, joined, Layout, layout_of, layout_with, LITTLE_ENDIAN, Messages,
@@ -30,8 +30,7 @@ __all__ = ['ACCELERATION', 'ACCELERATION_COVARIANCE', 'ANGULAR_VELOCITY',
            'ANGULAR_VELOCITY_COVARIANCE', 'ARDUPILOT_REFERENCE', 'DEGREE', 'IMU_DOUBLES',
            'LITTLE_ENDIAN', 'NAMES', 'NAME_AT', 'NINE', 'ORIENTATION', 'ORIENTATION_COVARIANCE',
            'PER_MILLION', 'STAMP', 'STAMP_AT', 'THREE', 'Bag', 'ByAxis', 'ContextTopics', 'Frame',
-           'Layout', 'LineReader', 'Log', 'LogOptions', 'Messages', 'OpenLog', 'Piped',
-           'Progress', 'are_untimed_samples', 'context_of',
-           'damage_as_input_error', 'doubles_at', 'is_bag', 'joined', 'layout_of', 'layout_with',
-           'open_bag', 'open_log', 'put_doubles', 'read_log', 'read_poses', 'read_recording',
-           'renamed', 'samples_of', 'write_blocks', 'write_table']
+           'Layout', 'LineReader', 'LogOptions', 'Messages', 'OpenLog', 'Piped', 'Progress',
+           'are_untimed_samples', 'context_of', 'damage_as_input_error', 'doubles_at', 'is_bag',
+           'joined', 'layout_of', 'layout_with', 'open_bag', 'open_log', 'put_doubles',
+           'read_poses', 'read_recording', 'renamed', 'samples_of', 'write_blocks', 'write_table']

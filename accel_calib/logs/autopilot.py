@@ -46,10 +46,8 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..geometry import rotation_from_rpy
-from ..table import Autopilot, check_values, COLUMNS, Floats, numbered, Recording
+from ..table import Autopilot, Floats, numbered, Recording
 from ..text import counted, some
-
-AXES, RATES = COLUMNS['reading'].names, COLUMNS['rate'].names
 
 DENSE_HZ = 5.0
 """Samples per second below which another message is preferred."""
@@ -200,9 +198,7 @@ def raw_columns(columns: Mapping[str, Floats], parameters: Parameters, correctio
     """Return columns with the readings of the sensor in its own axes; rates are only turned."""
     if not parameters:
         raise _unknown('its parameters are not in the log')
-    time, found = columns['time'], dict(columns)
-    triples = [COLUMNS[key].names for key in ('reading', 'rate') if COLUMNS[key].names[0] in found]
-    reading, *rates = (np.column_stack([found[name] for name in names]) for names in triples)
+    time, found = columns['time'], {key: values.copy() for key, values in columns.items()}
     temperature = found.get('temperature', np.zeros(len(time)))
     spans = list(parameters.spans())
     for (start, values), (stop, _) in zip(spans, [*spans[1:], (np.inf, {})]):
@@ -212,11 +208,9 @@ def raw_columns(columns: Mapping[str, Floats], parameters: Parameters, correctio
         old = correction(values)
         if old.of_temperature and 'temperature' not in found:
             raise _unknown('it depends on the temperature, which the log lacks')
-        reading[which] = old.raw(reading[which], temperature[which])
-        for rate in rates:
-            rate[which] = rate[which] @ old.rotation
-    for names, vectors in zip(triples, (reading, *rates)):
-        found.update(zip(names, vectors.T))
+        found['reading'][which] = old.raw(found['reading'][which], temperature[which])
+        if 'rate' in found:
+            found['rate'][which] = found['rate'][which] @ old.rotation
     return found
 
 
@@ -352,26 +346,14 @@ class FlightLog:
     """
     The samples of one sensor of a flight log, in m/s².
 
-    Columns have the names of a recording: ``time`` [s], ``ax,ay,az``, and where the log has them
-    ``gx,gy,gz`` [rad/s] and ``temperature`` [°C]. The sensor is message and number, such as
-    ``sensor_accel 0``. Notes state what was not used, and what to know of the readings.
+    The sensor is message and number, such as ``sensor_accel 0``. Notes state what was not used,
+    and what to know of the readings.
 
     """
 
-    columns: Mapping[str, Floats]
-    sensor: str
+    recording: Recording
     read_as: str
-    autopilot: Autopilot
-    notes: tuple[str, ...] = ()
-
-    def recording(self, source: str) -> Recording:
-        """Return the samples as a recording; a number that is not finite is an InputError."""
-        parts = {key: [np.asarray(self.columns[name], float) for name in column.names]
-                 for key, column in COLUMNS.items() if set(column.names) <= self.columns.keys()}
-        columns = {key: np.column_stack(each) if len(each) > 1 else each[0]
-                   for key, each in parts.items()}
-        check_values(columns, source)
-        return Recording(columns, numbered(columns), 'm/s2', self.sensor, self.autopilot)
+    notes: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -421,8 +403,9 @@ class Choice:
         read_as = f'{kind}, {chosen} at {chosen.rate_hz:.4g} Hz, m/s2, {axes}'
         if 'temperature' in found.columns:
             read_as += f', {temperature}'
-        return FlightLog(found.columns, self.name or str(chosen), read_as, found.autopilot,
-                         (*notes, *self._others(), *found.notes))
+        recording = Recording(found.columns, numbered(found.columns), 'm/s2',
+                              self.name or str(chosen), found.autopilot)
+        return FlightLog(recording, read_as, (*notes, *self._others(), *found.notes))
 
     def _others(self) -> list[str]:
         """Return notes on the other sensors of the same message, and on other messages."""
@@ -447,9 +430,9 @@ class Choice:
         """Return the angular rates of the first source with these fields that is as dense."""
         for message in sources:
             if message.rate_hz >= 0.5 * self.message.rate_hz and set(names) <= set(message.fields):
-                rates = taken(message.fields, RATES, names)
-                if finite(*rates.values()):
-                    return {key: at(time, message, values) for key, values in rates.items()}
+                rates = vectors(message.fields, names)
+                if finite(rates):
+                    return {'rate': np.column_stack([at(time, message, each) for each in rates.T])}
         return {}
 
 
@@ -482,10 +465,9 @@ def choose(found: Sequence[Message], preferred: Sequence[str], topic: str, senso
     return Choice(best, found, preferred, '' if chooses else sensor)
 
 
-def taken(fields: Mapping[str, NDArray[Any]], keys: Sequence[str], names: Sequence[str]
-          ) -> dict[str, Floats]:
-    """Return the first fields as floats under our names."""
-    return {key: np.asarray(fields[name], float) for key, name in zip(keys, names)}
+def vectors(fields: Mapping[str, NDArray[Any]], names: Sequence[str]) -> Floats:
+    """Return the fields of three axes, (n, 3)."""
+    return np.column_stack([fields[name] for name in names]).astype(float)
 
 
 def at(time: Floats, source: Message, values: NDArray[Any]) -> Floats:
@@ -494,15 +476,15 @@ def at(time: Floats, source: Message, values: NDArray[Any]) -> Floats:
     return np.interp(time, source.time[order], values[order].astype(float))
 
 
-def finite(*columns: NDArray[Any]) -> bool:
+def finite(values: NDArray[Any]) -> bool:
     """Return whether there are values and all are finite numbers."""
-    return all(len(values) > 0 and bool(np.all(np.isfinite(values))) for values in columns)
+    return len(values) > 0 and bool(np.all(np.isfinite(values)))
 
 
 def sound(message: Message, columns: Mapping[str, Floats], why: str,
           valid: NDArray[np.bool_] | bool = True) -> tuple[dict[str, Floats], list[str]]:
     """Return the valid rows whose values are all finite, and a note on the others."""
-    valid = valid & np.logical_and.reduce([np.isfinite(values) for values in columns.values()])
-    dropped = int(np.sum(~valid))
+    kept = valid & np.all(np.isfinite(np.column_stack([*columns.values()])), axis=1)
+    dropped = int(np.sum(~kept))
     notes = [f'{counted(dropped, "row")} of {message} left out: {why}'] if dropped else []
-    return {key: values[valid] for key, values in columns.items()}, notes
+    return {key: values[kept] for key, values in columns.items()}, notes

@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass
-import errno
 from functools import cache
 from itertools import islice
 from pathlib import Path
@@ -24,11 +23,12 @@ import warnings
 import numpy as np
 from numpy.typing import NDArray
 
+from .formats import damage_refused
 from .serialized import frame_ids, IMU_DOUBLES, joined, Messages, samples_of
 from ..disk import check_regular
 from ..errors import InputError
 from ..table import Floats
-from ..text import reason, some
+from ..text import some
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -46,10 +46,6 @@ LARGEST = 1e6
 _BLOCK_BYTES = 1 << 24
 _AT_ONCE = 64
 """Number of bytes above which a block ends, and of messages after which they are counted."""
-
-_BY_VALUE = (errno.EINVAL, errno.EOVERFLOW, errno.EISDIR, errno.EFBIG,
-             errno.ENAMETOOLONG, errno.ENOTDIR)
-"""System errors that a damaged size or place in a file causes; others are not about its bytes."""
 
 NUMBERS = ('float32', 'float64', 'int8', 'uint8', 'int16', 'uint16', 'int32', 'uint32', 'int64',
            'uint64')
@@ -242,23 +238,11 @@ def open_bag(path: Path) -> Iterator[Bag]:
 
 @contextmanager
 def damage_as_input_error(path: Path) -> Iterator[None]:
-    """
-    Convert errors of `rosbags` to InputError; only calls of `rosbags` belong inside.
-
-    Errors of the system, such as a missing file or permission, pass.
-
-    """
-    try:
+    """Convert errors of `rosbags` to InputError; only calls of `rosbags` belong inside."""
+    inside = ' or the .mcap or .db3 file inside it' if path.is_dir() else ''
+    with damage_refused(f'{path} is damaged or not a bag', 'a rosbag2 folder, .mcap, .db3 or .bag',
+                        f'use another file{inside}; ros2 bag reindex may repair this one'):
         yield
-    except InputError:
-        raise
-    except Exception as err:  # damaged bytes cause many kinds of errors
-        if isinstance(err, OSError) and err.errno is not None and err.errno not in _BY_VALUE:
-            raise
-        inside = ' or the .mcap or .db3 file inside it' if path.is_dir() else ''
-        raise InputError(f'{path} is damaged or not a bag ({reason(err)}), expected a rosbag2 '
-                         'folder, .mcap, .db3 or .bag', f'use another file{inside}; ros2 bag '
-                         'reindex may repair this one') from err
 
 
 def _check(reader: Any) -> None:

@@ -29,11 +29,13 @@ import numpy as np
 from .bag import Bag, BLOCK, NUMBERS, Received
 from .serialized import doubles_at, frame_ids, stamps_of
 from ..errors import InputError
-from ..table import Floats, Recording
+from ..table import concatenated, Floats, Recording
 from ..text import counted, listed, some
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
+
+    from .columns import LogOptions
 
 TEMPERATURE = 'sensor_msgs/msg/Temperature'
 _TEMPERATURE_DOUBLES = 2
@@ -204,8 +206,7 @@ class ContextTopics:
         return tracks
 
 
-def context_of(bag: Bag, imu: str, sensor: str, temperature_topic: str = '',
-               supply_topic: str = '') -> ContextTopics:
+def context_of(bag: Bag, imu: str, sensor: str, options: LogOptions) -> ContextTopics:
     """
     Return the topics with temperature and supply voltage.
 
@@ -213,10 +214,10 @@ def context_of(bag: Bag, imu: str, sensor: str, temperature_topic: str = '',
     ----------
     bag, imu, sensor
         The open bag; topic and frame_id of the readings.
-    temperature_topic, supply_topic : str
-        Topics to use, as ``TOPIC`` or ``TOPIC:FIELD``. By default, the temperature is that of the
-        only topic of type sensor_msgs/Temperature, or of the only one with the frame_id or in the
-        namespace of the Imu.
+    options : LogOptions
+        The topics to use. By default, the temperature is that of the only topic of type
+        sensor_msgs/Temperature, or of the only one with the frame_id or in the namespace of the
+        Imu.
 
     Raises
     ------
@@ -225,7 +226,8 @@ def context_of(bag: Bag, imu: str, sensor: str, temperature_topic: str = '',
 
     """
     used, notes = [], []
-    for quantity, asked in zip(QUANTITIES, (temperature_topic, supply_topic), strict=True):
+    topics = options.temperature_topic, options.supply_topic
+    for quantity, asked in zip(QUANTITIES, topics, strict=True):
         found = (_asked(bag, quantity, asked) if asked else
                  _own(bag, imu, sensor) if quantity.key == 'temperature' else None)
         if found is not None:
@@ -395,11 +397,11 @@ def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool, context: Con
             before += len(imus)
         parts += _ready(waiting, tracks)
         if sum(map(len, parts)) >= _ROWS:
-            yield together(parts)
+            yield concatenated(parts)
             parts = []
     parts += [_with_context(part, tracks) for part in waiting]
     if parts:
-        yield together(parts)
+        yield concatenated(parts)
     notes += bag.lost(topic, before)
 
 
@@ -429,9 +431,3 @@ def _blocks(bag: Bag, topic: str, used: Sequence[ContextTopic]
 def _with_context(samples: Recording, tracks: dict[str, Track]) -> Recording:
     columns = {key: track.at(samples['time']) for key, track in tracks.items()}
     return samples.with_columns(**columns) if columns else samples
-
-
-def together(parts: Sequence[Recording]) -> Recording:
-    """Concatenate one or more recordings."""
-    columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0].columns}
-    return replace(parts[0], columns=columns, row=np.concatenate([part.row for part in parts]))

@@ -290,17 +290,11 @@ def _by_order(layout: Layout, found: Mapping[str, Source]) -> dict[str, Source]:
     return {name: Source(k, str(k + 1)) for k, name in enumerate(orders[layout.width])}
 
 
-def check_once(layout: Layout) -> None:
-    """Check that none of our names is in a header twice."""
-    counts = Counter(layout.header)
-    for name in OURS:
-        if counts[name] > 1:
-            raise InputError(f'{layout.path} has {counts[name]} columns {name}, expected one',
-                             'remove or rename the others')
-
-
 def _own(layout: Layout) -> dict[str, Source]:
-    check_once(layout)
+    for name, count in Counter(layout.header).items():
+        if count > 1 and name in OURS:
+            raise InputError(f'{layout.path} has {count} columns {name}, expected one',
+                             'remove or rename the others')
     index = {name: k for k, name in enumerate(layout.header)}
     return {name: _source(layout, index[name]) for own in COLUMNS.values()
             if not own.made and index.keys() >= set(own.names) for name in own.names}

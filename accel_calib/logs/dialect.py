@@ -64,6 +64,7 @@ _DECIMAL = re.compile(r'[-+]?\d*([.,])\d+(?:[eE][-+]?\d+)?', re.ASCII)
 _UNREADABLE = re.compile('[\x00-\x08\x0e-\x1a\x1c-\x1f\x7f\ufffd]')
 _UNREADABLE_SHARE = 0.3
 _SHOWN_CHARACTERS = 40
+_EXAMPLE = 'such as time,ax,ay,az and one row for each pose or sample'
 
 RATES_HZ = (1.0, 10_000.0)
 """Plausible numbers of samples per second."""
@@ -233,26 +234,22 @@ def shown(names: Sequence[str]) -> str:
     return some(map(short, names))
 
 
-def layout_of(path: Path, head: Sequence[str], is_header: IsHeader, encoding: str, *,
-              strict: bool, expected: str) -> Layout:
+def layout_of(path: Path, head: Sequence[str], is_header: IsHeader, encoding: str) -> Layout:
     """
     Return where a table begins, and how its cells are parted; raise InputError without a table.
 
     `head` are the first lines, and `is_header` returns whether cells are the names of columns of a
-    log. If `strict`, no other lines may come before the header. `expected` is an example of it
-    for error messages.
+    log.
 
     """
-    _check_text(path, head, expected)
+    _check_text(path, head)
     finder = _Finder(head, is_header)
-    found = (finder.strict() if strict else
-             finder.named() or finder.unnamed() or finder.narrow())
+    found = finder.named() or finder.unnamed() or finder.narrow()
     if found is None:
         raise InputError(f'{path} has no table of numbers in its first '
-                         f'{counted(len(head), "line")}, expected a header line such as '
-                         f'{expected} and one row for each pose or sample',
+                         f'{counted(len(head), "line")}, expected a header line {_EXAMPLE}',
                          'check that this is the intended file')
-    start = found.line if strict else finder.data_from(found)
+    start = finder.data_from(found)
     numbers = [k for k in finder.plain if k >= start]
     rate_hz = None if found.header else _rate_below_start(
         [found.dialect.cells(head[k]) for k in numbers[:2]])
@@ -277,14 +274,14 @@ def _rate_below_start(rows: Sequence[Sequence[str]]) -> float | None:
     return rate_hz if begun > EPOCH_S[0] and RATES_HZ[0] <= rate_hz <= RATES_HZ[1] else None
 
 
-def _check_text(path: Path, head: Sequence[str], expected: str) -> None:
+def _check_text(path: Path, head: Sequence[str]) -> None:
     bad = sum(len(_UNREADABLE.findall(line)) for line in head)
     if bad > _UNREADABLE_SHARE * sum(map(len, head)):
         raise InputError(f'{path} is not a text file, expected a CSV table',
                          'use a CSV table or a bag')
     if all(line.isspace() or line[0] == '#' for line in head):
-        raise InputError(f'{path} is empty, expected a header line such as {expected} and one row '
-                         'for each pose or sample', 'check that this is the intended file')
+        raise InputError(f'{path} is empty, expected a header line {_EXAMPLE}',
+                         'check that this is the intended file')
 
 
 @dataclass(frozen=True)
@@ -304,13 +301,6 @@ class _Finder:
         self.plain = [k for k in self.filled if not is_comment(head[k])]
         timed = sum(_MONITOR.match(head[k]) is not None for k in self.plain)
         self.monitor = timed > len(self.plain) / 2
-
-    def strict(self) -> _Found:
-        first = next(k for k in self.filled if self.head[k][0] != '#')
-        fitting = [each for each in DELIMITERS if self.is_header(split(self.head[first], each))]
-        delimiter = fitting[0] if fitting else ','
-        return _Found(Dialect(delimiter), tuple(split(self.head[first], delimiter)), first + 1,
-                      first)
 
     def named(self) -> _Found | None:
         """Return the names in the first line with known names."""
@@ -374,9 +364,10 @@ class _Finder:
                                                     split(self.head[k], ',')))]
         if not numbers:
             return None
-        if numbers[0] == self.plain[0]:
-            return _Found(Dialect(','), (), self.plain[0])
-        return self.strict()
+        first = self.plain[0]
+        if numbers[0] == first:
+            return _Found(Dialect(','), (), first)
+        return _Found(Dialect(','), tuple(split(self.head[first], ',')), first + 1, first)
 
     def data_from(self, found: _Found) -> int:
         """Return the index of the first row; a line without numbers is none."""
@@ -442,7 +433,7 @@ def _about(path: Path, comments: Sequence[str]) -> dict[str, Any]:
         if colon and name.strip() in ABOUT:
             try:
                 value = json.loads(text)
-                about[name.strip()] = Autopilot(**value) if 'autopilot' in name else value
+                about[name.strip()] = Autopilot(**value) if 'autopilot' in name else str(value)
             except (TypeError, ValueError):
                 continue  # an ordinary comment
     if about.get('units', '') not in ('', *UNIT_NAMES):

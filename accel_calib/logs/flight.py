@@ -38,6 +38,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 import io
+from itertools import chain
 import math
 from pathlib import Path
 import re
@@ -47,8 +48,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .autopilot import (
-    ardupilot_correction, as_sensed, AsSensed, at, AXES, choose, Correction, finite, FlightLog,
-    Message, Parameters, px4_correction, px4_slot, RATES, sound, Stated, taken)
+    ardupilot_correction, as_sensed, AsSensed, at, choose, Correction, finite, FlightLog, Message,
+    Parameters, px4_correction, px4_slot, sound, Stated, vectors)
 from .formats import DATAFLASH, sound_log
 from .names import MICRO, PX4_FIELDS, PX4_SPANS
 from ..errors import InputError, needing
@@ -69,7 +70,8 @@ _PX4_ADVICE = ('read sensor_accel, which CAL_ACC does not correct (add 4 or 64 t
 _RELATIVE = 'accelerometer_timestamp_relative'
 _RAW, _FILTERED = 'sensor_accel', 'vehicle_acceleration'
 _MORE = {'sensor_combined': (_RELATIVE,), 'vehicle_imu': tuple(PX4_SPANS)}
-_NEEDED = {name: {*fields, *_MORE.get(name, ())} for name, fields in PX4_FIELDS.items()}
+_NEEDED = {name: {*chain(*fields.values()), *_MORE.get(name, ())}
+           for name, fields in PX4_FIELDS.items()}
 _ALSO = ('sensor_gyro', 'sensor_selection')
 
 
@@ -168,17 +170,16 @@ def _px4_time(fields: Mapping[str, NDArray[Any]]) -> Floats:
 def _px4_samples(message: Message) -> tuple[dict[str, Floats], list[str]]:
     """Return time, readings and rates of the valid rows, and a note on the others."""
     fields, time = message.fields, message.time
-    columns = taken(fields, (*AXES, *RATES), PX4_FIELDS[message.name])
+    columns = {key: vectors(fields, names) for key, names in PX4_FIELDS[message.name].items()}
     valid = np.ones(len(time), dtype=bool)
     if _RELATIVE in fields:
         relative = fields[_RELATIVE].astype(float)
         time, valid = time + relative * MICRO, relative != _INVALID
-    for name, keys in PX4_SPANS.items():
+    for name, key in PX4_SPANS.items():
         if name in fields:
             seconds = fields[name] * MICRO
             valid &= seconds > 0.0
-            for key in keys:
-                columns[key] = columns[key] / np.where(seconds > 0.0, seconds, 1.0)
+            columns[key] /= np.where(seconds > 0.0, seconds, 1.0)[:, np.newaxis]
     return sound(message, {'time': time, **columns}, 'PX4 marks them as invalid', valid)
 
 
@@ -241,7 +242,7 @@ def read_dataflash(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
     choice = choose(found, ARDUPILOT_MESSAGES, topic, sensor, str(path))
     chosen = choice.message
     columns, dropped = sound(
-        chosen, {'time': chosen.time, **taken(chosen.fields, AXES, _READING)},
+        chosen, {'time': chosen.time, 'reading': vectors(chosen.fields, _READING)},
         'the reading is not a number')
     sources = (message for message in (chosen, *found) if message.instance == chosen.instance)
     columns |= choice.rates(columns['time'], sources, _RATES)

@@ -34,29 +34,40 @@ FLIGHT_LOG = re.compile(rb'\A(?:' + re.escape(ULOG) + b'|' + re.escape(DATAFLASH
 
 _STANDARD_ERROR = 2
 
+_BY_VALUE = (None, errno.EINVAL, errno.EOVERFLOW, errno.EISDIR, errno.EFBIG, errno.ENAMETOOLONG,
+             errno.ENOTDIR)
+"""System errors that a damaged size or place in a file causes; others are not about its bytes."""
+
 
 class DamagedLogError(InputError):
     """A library cannot read a log."""
 
 
 @contextmanager
-def sound_log(path: Path, expected: str, advice: str = 'copy it from the vehicle again'
-              ) -> Iterator[None]:
+def damage_refused(what: str, expected: str, advice: str) -> Iterator[None]:
     """
-    Turn what a library raises for a damaged log into one DamagedLogError, and drop what it prints.
+    Turn what a library raises for damaged bytes into a DamagedLogError.
 
-    Libraries of logs raise errors of any class, and print. Errors of the system pass.
+    Errors of the system, such as a missing file or permission, pass.
 
     """
     try:
-        with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()), _silent_c():
-            yield
-    except Exception as err:
-        # Of a library, or a seek to before the start of a file, by a damaged length.
-        if isinstance(err, OSError) and err.errno not in (None, errno.EINVAL):
+        yield
+    except InputError:
+        raise
+    except Exception as err:  # libraries of logs raise errors of any class
+        if isinstance(err, OSError) and err.errno not in _BY_VALUE:
             raise
-        raise DamagedLogError(f'{path} is damaged ({reason(err)}), expected {expected}',
-                              advice) from err
+        raise DamagedLogError(f'{what} ({reason(err)}), expected {expected}', advice) from err
+
+
+@contextmanager
+def sound_log(path: Path, expected: str, advice: str = 'copy it from the vehicle again'
+              ) -> Iterator[None]:
+    """Refuse damage as `damage_refused` does, and drop what a library prints."""
+    with damage_refused(f'{path} is damaged', expected, advice), redirect_stdout(
+            io.StringIO()), redirect_stderr(io.StringIO()), _silent_c():
+        yield
 
 
 @contextmanager

@@ -404,24 +404,26 @@ def _numbered(name: str) -> tuple[str, ...]:
     return tuple(f'{name}[{k}]' for k in range(3))
 
 
-PX4_FIELDS: dict[str, tuple[str, ...]] = {
-    'sensor_accel': _LOWER,
-    'sensor_combined': (*_numbered('accelerometer_m_s2'), *_numbered('gyro_rad')),
-    'vehicle_imu': (*_numbered('delta_velocity'), *_numbered('delta_angle')),
-    'vehicle_acceleration': _numbered('xyz')}
-"""Fields of the messages with accelerations, in order of preference: of the reading and rate."""
+PX4_FIELDS: dict[str, dict[str, tuple[str, ...]]] = {
+    'sensor_accel': {'reading': _LOWER},
+    'sensor_combined': {'reading': _numbered('accelerometer_m_s2'), 'rate': _numbered('gyro_rad')},
+    'vehicle_imu': {'reading': _numbered('delta_velocity'), 'rate': _numbered('delta_angle')},
+    'vehicle_acceleration': {'reading': _numbered('xyz')}}
+"""Fields of the messages with accelerations, in order of preference, by key of `COLUMNS`."""
 
-PX4_SPANS = {'delta_velocity_dt': READING, 'delta_angle_dt': RATE}
+PX4_SPANS = {'delta_velocity_dt': 'reading', 'delta_angle_dt': 'rate'}
 """Interval [µs] in which a change of velocity or angle was measured."""
 
 
 def _px4(message: str, marks: tuple[str, ...] = (), note: str = _FRD, *, changes: bool = False,
          **others: str) -> LogFormat:
     """Return the layout of a message; `changes` are divided by their intervals."""
-    divisors = {key: name for name, keys in PX4_SPANS.items() for key in keys if changes}
+    divisors = {axis: name for name, key in PX4_SPANS.items() for axis in COLUMNS[key].names
+                if changes}
     return LogFormat(
-        'px4', {'time': 'timestamp', **dict(zip((*READING, *RATE), PX4_FIELDS[message])),
-                **others},
+        'px4', {'time': 'timestamp', **others, **{
+            axis: name for key, names in PX4_FIELDS[message].items()
+            for axis, name in zip(COLUMNS[key].names, names)}},
         {'time': MICRO, **dict.fromkeys(divisors, 1.0 / MICRO)}, marks=marks, divisors=divisors,
         note=note)
 

@@ -13,7 +13,7 @@ Three kinds of comments are read, with values in JSON: ``# units: "m/s2"``,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 import csv
 from dataclasses import dataclass, replace
@@ -27,50 +27,27 @@ from numpy.typing import NDArray
 
 from .autopilot import FlightLog
 from .bag import Bag, open_bag
-from .bag_samples import context_of, imu_samples, rate_words, together
-from .columns import check_once, chosen, is_log_header, LogOptions, Source, with_indices
+from .bag_samples import context_of, imu_samples, rate_words
+from .columns import chosen, is_log_header, LogOptions
 from .containers import Frame, open_table, Piped
 from .dialect import layout_of
 from .flight import read_dataflash, read_ulg
 from .formats import CONTAINERS, FLIGHT_LOG, HEAD, ULOG
-from .names import OURS, READING
 from .quantities import are_samples, are_untimed_samples, decided, Quantities
 from .text import Cells, open_text, TextTable
-from .times import Clock
 from ..disk import check_regular, FIRST_LINE, write_atomically
 from ..errors import InputError, saying
 from ..table import (
-    check_units, check_values, column_of, COLUMNS, is_quantity, numbered, Poses, present,
-    Recording, Table)
-from ..text import some
+    check_units, check_values, column_of, COLUMNS, concatenated, Poses, Recording, Table)
+from ..text import counted, some
 from ..units import Units, units_of
 
 _BAG_SUFFIXES = ('.bag', '.mcap', '.db3')
 
 _DIGITS = '.12g'
-_SHOWN = 12
-"""Number of other columns in an error message."""
 
 Progress = Callable[[int, int], object]
 """Function called with the number of samples done, and that of all samples."""
-
-Block = tuple[dict[str, NDArray[Any]], NDArray[np.int64]]
-"""Columns under the keys of `COLUMNS`, and row numbers."""
-
-
-@dataclass(frozen=True)
-class Log:
-    """
-    A log that was read; `read_as` and `notes` as in `OpenLog`.
-
-    Times are in s, and angular rates in rad/s.
-
-    """
-
-    table: Poses | Recording
-    units: Units
-    read_as: str = ''
-    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -108,17 +85,19 @@ class OpenLog:
             progress(done, max(done, self.samples))
 
 
-def read_log(path: Path, options: LogOptions = LogOptions()) -> Log:
-    """Read the poses or the samples of a log; parameters and errors as in `open_log`."""
-    with open_log(path, options) as log:
-        table = log.poses if log.poses is not None else together(list(log.blocks))
-        return Log(table, log.units, log.read_as, log.notes)
+def read_poses(path: Path) -> Poses:
+    """Return the poses of a pose table; a recording is an InputError, as others in `open_log`."""
+    with open_log(path) as log:
+        if log.poses is not None:
+            return log.poses
+        raise InputError(f'{path} is a recording of {counted(sum(map(len, log.blocks)), "sample")}'
+                         ', expected a pose table', 'use capture')
 
 
 def read_recording(path: Path, topic: str = '', sensor: str = '') -> Recording:
     """Return all samples of a recording; `topic`, `sensor` and errors as in `open_log`."""
     with open_log(path, LogOptions(topic=topic, sensor=sensor)) as log:
-        return together(list(log.blocks))
+        return concatenated(list(log.blocks))
 
 
 @contextmanager
@@ -185,7 +164,7 @@ def is_bag(path: Path) -> bool:
 def _bag(bag: Bag, options: LogOptions) -> OpenLog:
     topic = bag.imu_topic(options.topic)
     sensor = options.sensor or bag.first_frame_id(topic)
-    context = context_of(bag, topic, sensor, options.temperature_topic, options.supply_topic)
+    context = context_of(bag, topic, sensor, options)
     notes = [*bag.notes, *context.notes]
     blocks = imu_samples(bag, topic, sensor, chosen=bool(options.sensor), context=context,
                          notes=notes)
@@ -197,13 +176,14 @@ def _bag(bag: Bag, options: LogOptions) -> OpenLog:
 
 
 def _flight(path: Path, log: FlightLog, options: LogOptions) -> OpenLog:
-    recording = log.recording(str(path))
+    recording = log.recording
+    check_values(recording.columns, str(path))
     units = units_of('m/s2', options.gravity)
     if options.units not in ('', units.name):
         raise InputError(f'{path} is in {units.name}, but --units is {options.units}',
                          'remove --units')
-    return OpenLog(_checked(path, iter((recording,)), units), len(recording), units, log.sensor,
-                   log.read_as, noted=lambda: log.notes)
+    return OpenLog(_checked(path, iter((recording,)), units), len(recording), units,
+                   recording.sensor, log.read_as, noted=lambda: log.notes)
 
 
 def _checked(path: Path, blocks: Iterator[Recording], units: Units) -> Iterator[Recording]:
@@ -226,19 +206,16 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
 
 def _decided(path: Path, text: TextTable, cells: Iterator[Cells], quantities: Quantities
              ) -> OpenLog:
-    blocks = _converted(path, cells, quantities)
+    blocks = _converted(path, text.layout.about, cells, quantities)
     head = next(blocks)
-    units, about = quantities.units, text.layout.about
-    sensor, autopilot = str(about.get('sensor', '')), about.get('autopilot')
-    check_units(Poses(*head), units, str(path))
+    check_units(head, quantities.units, str(path))
     poses = None
     samples: Iterator[Recording]
-    if are_samples(head[0]):
-        samples = (Recording(*block, units.name, sensor, autopilot)
-                   for block in chain((head,), blocks))
-        count = _estimated(text, head)
+    if are_samples(head.columns):
+        samples = (block.as_recording() for block in chain((head,), blocks))
+        count = _estimated(text, len(head))
     else:
-        poses = Poses(*_whole([head, *blocks], quantities.notes), units.name, sensor, autopilot)
+        poses = _without_lacking(concatenated([head, *blocks]), quantities.notes)
         if are_untimed_samples(poses.columns):
             raise InputError(f'{path} has no times, but its {len(poses)} rows look like samples '
                              'of a recording, expected a column time', 'state the samples per '
@@ -246,31 +223,29 @@ def _decided(path: Path, text: TextTable, cells: Iterator[Cells], quantities: Qu
                              'time=NAME; if each row is a pose, add a column orientation')
         samples, count = _as_samples(path, poses), len(poses)
     rate = '' if quantities.rate_hz is None else f'{quantities.rate_hz:g} Hz (stated)'
-    return OpenLog(samples, count, units, sensor,
+    return OpenLog(samples, count, quantities.units, head.sensor,
                    ', '.join(filter(None, (quantities.read_as, rate))), poses,
                    noted=lambda: (*text.notes, *quantities.all_notes))
 
 
-def _converted(path: Path, cells: Iterator[Cells], quantities: Quantities) -> Iterator[Block]:
+def _converted(path: Path, about: Mapping[str, Any], cells: Iterator[Cells],
+               quantities: Quantities) -> Iterator[Poses]:
     for block in cells:
         columns, row = quantities.columns(block)
         check_values(columns, str(path))
-        yield columns, row
+        yield Poses(columns, row, **{**about, 'units': quantities.units.name})
 
 
-def _whole(blocks: Sequence[Block], notes: list[str]) -> Block:
-    """Return blocks as one, without quantities that lack a number in a row; they are noted."""
-    columns = {key: np.concatenate([block[key] for block, _ in blocks]) for key in blocks[0][0]}
-    lacking = [key for key in columns if is_quantity(key) and not np.isfinite(columns[key]).all()]
+def _without_lacking(poses: Poses, notes: list[str]) -> Poses:
+    """Return poses without quantities that lack a number in a row; they are noted."""
+    lacking = [key for key in poses.quantities if not np.isfinite(poses[key]).all()]
     if lacking:
         notes.append(f'not used, because cells are not numbers: {some(lacking)}')
-    return ({key: values for key, values in columns.items() if key not in lacking},
-            np.concatenate([row for _, row in blocks]))
+    return poses.without_columns(*lacking)
 
 
-def _estimated(text: TextTable, head: Block) -> int:
-    """Return the number of rows, from the size of the file and of the first block."""
-    count = len(head[1])
+def _estimated(text: TextTable, count: int) -> int:
+    """Return the number of rows, from the size of the file and of the `count` of a block."""
     if not text.more:
         return count
     width = 2 if text.layout.encoding.startswith('utf-16') else 1
@@ -282,38 +257,10 @@ def _as_samples(path: Path, poses: Poses) -> Iterator[Recording]:
     if 'time' not in poses:
         raise InputError(f'{path} has no column time, expected a recording', 'add the times of '
                          'the samples, or name their column with --columns time=NAME')
-    yield Recording(poses.columns, poses.row, poses.units, poses.sensor, poses.autopilot)
+    yield poses.as_recording()
 
 
-# -------------------------------------------------------------------------- our own tables
-
-def read_poses(path: Path) -> Poses:
-    """
-    Read a pose table.
-
-    Raises
-    ------
-    InputError
-        If the table is empty, lacks columns, or contains a value that is not a finite number.
-    OSError
-        If the file cannot be read.
-
-    """
-    check_regular(path)
-    with open_text(path, lambda cells: set(READING) <= set(cells), strict=True,
-                   expected=','.join(READING)) as text:
-        layout = text.layout
-        check_once(layout)
-        others = [name for name in layout.header[:_SHOWN] if name not in OURS]
-        keys = present([*(name for name in layout.header if name in OURS), *others],
-                       ('reading',), str(path))
-        columns = with_indices(layout, {name: Source(layout.header.index(name), name)
-                                        for key in keys for name in COLUMNS[key].names})
-        text.choose(columns)
-        quantities = Quantities(columns, units_of('g'), Clock(columns))
-        table, _ = _whole(list(_converted(path, text.blocks(), quantities)), [])
-        return Poses(table, numbered(table), **layout.about)
-
+# ---------------------------------------------------------------------------- writing of tables
 
 def write_table(path: Path, table: Table) -> None:
     """Write poses or samples; errors as in `write_blocks`."""
@@ -374,11 +321,10 @@ class LineReader:
     def __init__(self, name: str, head: Sequence[str], seconds: float, options: LogOptions
                  ) -> None:
         lines = _ended(head)
-        layout = layout_of(Path(name), lines, lambda cells: is_log_header(cells, options),
-                           'utf-8', strict=False, expected='t,ax,ay,az')
+        layout = layout_of(Path(name), lines, lambda cells: is_log_header(cells, options), 'utf-8')
         self._name = name
         columns = chosen(layout, options)
-        self._table = TextTable(layout, iter(()), strict=False)
+        self._table = TextTable(layout, iter(()))
         self._table.choose(columns, skip_bad=True)
         first = self._table.read(lines[layout.start:])
         if not len(first.row):

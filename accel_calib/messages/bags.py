@@ -30,11 +30,11 @@ from .correction import corrected, output_frame, output_scale
 from ..calibrate import Calibration, on_topics
 from ..errors import InputError
 from ..logs import (
-    Bag, context_of, damage_as_input_error, doubles_at, IMU_DOUBLES, Messages, open_bag, Progress,
-    put_doubles, renamed)
+    Bag, context_of, damage_as_input_error, doubles_at, IMU_DOUBLES, LogOptions, Messages,
+    open_bag, Progress, put_doubles, renamed)
 from ..pipeline import Correction
 from ..table import check_units, Recording
-from ..units import STANDARD_GRAVITY, UnitName, Units, units_of
+from ..units import Units, units_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -47,11 +47,10 @@ _NO_HASH = 'RIHS01_' + 64 * '0'
 """Hash of a type whose definition is neither in the bag nor in Jazzy."""
 
 
-def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = '',
-                progress: Progress = lambda done, count: None, *,
-                note: Callable[[str], object] = lambda line: None,
-                temperature_topic: str = '', supply_topic: str = '', units: UnitName = 'm/s2',
-                gravity: float = STANDARD_GRAVITY) -> int:
+def correct_bag(path: Path, calibration: Calibration, out: Path,
+                options: LogOptions = LogOptions(),
+                progress: Progress = lambda done, count: None,
+                note: Callable[[str], object] = lambda line: None) -> int:
     """
     Write a corrected copy of a bag, and return the number of corrected Imu messages.
 
@@ -64,18 +63,12 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
     out : Path
         The copy, a bag of the same kind. A copy of a rosbag2 is a folder, or a file if `out` has
         the suffix of the storage.
-    topic : str
-        Imu topic, for a bag with several Imu topics.
+    options : LogOptions
+        How to read the bag: its topics, unit and gravity. The corrected accelerations are in
+        m/s², the unit of Imu messages.
     progress, note : callable
         Functions that are called after each block of messages, and with each note about topics,
         lost messages, and what the messages lack or left the range of the calibration.
-    temperature_topic, supply_topic : str
-        As in `accel_calib.logs.context_of`.
-    units : {'m/s2', 'g', 'native'}
-        Unit of the recorded accelerations. The corrected ones are in m/s², the unit of Imu
-        messages.
-    gravity : float
-        Local gravity [m/s²].
 
     Raises
     ------
@@ -94,14 +87,14 @@ def correct_bag(path: Path, calibration: Calibration, out: Path, topic: str = ''
         raise InputError(f'{out} exists, expected a new file', 'choose another name')
     with open_bag(path) as bag:
         _check_kind(bag, out)
-        name = bag.imu_topic(topic)
+        name = bag.imu_topic(options.topic)
         sensor = bag.first_frame_id(name)
-        correction = Correction(on_topics(calibration, calibration.frame), units, sensor)
-        context = context_of(bag, name, sensor, temperature_topic, supply_topic)
-        context = context.needed(bag, calibration.model.needs)
+        units = units_of(options.units or 'm/s2', options.gravity)
+        correction = Correction(on_topics(calibration, calibration.frame), units.name, sensor)
+        context = context_of(bag, name, sensor, options).needed(bag, calibration.model.needs)
         with _new(out) as folder:
-            imus = _Topic(bag, name, sensor, context.tracks(), correction,
-                          units_of(units, gravity), output_scale(correction.calibration, gravity))
+            imus = _Topic(bag, name, sensor, context.tracks(), correction, units,
+                          output_scale(correction.calibration, options.gravity))
             count = _copy(bag, folder, out, imus, progress)
         for line in (*bag.notes, *context.notes, *bag.lost(name, count), *correction.notes):
             note(line)

@@ -61,8 +61,8 @@ def output_scale(calibration: Calibration, gravity: float) -> float:
     return 1.0 if calibration.units.is_si else gravity / calibration.force_per_g
 
 
-def corrected(calibration: Calibration, doubles: Floats, context: Context | None = None,
-              stream: ThermalStream | None = None, scale: float = 1.0) -> Floats:
+def corrected(calibration: Calibration, doubles: Floats, context: Context = {},
+              scale: float = 1.0) -> Floats:
     """
     Return the corrected doubles of Imu messages, (n, 37).
 
@@ -74,13 +74,11 @@ def corrected(calibration: Calibration, doubles: Floats, context: Context | None
         One row per message; see `accel_calib.logs.serialized`.
     context : mapping of str to array, optional
         Columns that the effects need, n rows each.
-    stream : ThermalStream, optional
-        Temperature before these messages; they are added to it.
     scale : float
         Factor on the corrected force.
 
     """
-    known = of_samples(context or {}, len(doubles), calibration.model, stream)
+    known = of_samples(context, len(doubles), calibration.model)
     rotation = calibration.model.rotation
     result = doubles.copy()
     force = calibration.correct(doubles[:, ACCELERATION], known)
@@ -167,8 +165,8 @@ class Rewriter:
     ----------
     layout, calibration
         Layout of the messages, and the calibration in the unit of the readings.
-    scale, gravity : float
-        m/s² per unit of the corrected force, and local gravity [m/s²].
+    gravity : float
+        Local gravity [m/s²].
     frame_id : str
         frame_id of the corrected messages.
     noise : SampleNoise, optional
@@ -185,9 +183,9 @@ class Rewriter:
 
     """
 
-    def __init__(self, layout: Layout, calibration: Calibration, scale: float, gravity: float,
-                 frame_id: str, noise: SampleNoise | None = None,
-                 thermal: ThermalStream | None = None) -> None:
+    def __init__(self, layout: Layout, calibration: Calibration, gravity: float, frame_id: str,
+                 noise: SampleNoise | None = None, thermal: ThermalStream | None = None) -> None:
+        scale = output_scale(calibration, gravity)
         self.bias: Triple = _NONE
         self._turns = calibration.is_levelled
         self._turn = tuple(calibration.rotation.T.ravel().tolist())

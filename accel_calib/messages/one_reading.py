@@ -27,7 +27,7 @@ from ..effects import (
 from ..table import Floats
 
 Triple = tuple[float, float, float]
-Matrix = tuple[float, float, float, float, float, float, float, float, float]
+Matrix = Sequence[float]
 """Nine numbers, row by row."""
 
 Known = Mapping[str, Any]
@@ -41,7 +41,7 @@ _Bend = tuple[int, float, Callable[[float, float, float], float],
               Callable[[float, float, float], Triple]]
 """Axis, coefficient, value and gradient of a bending term with its context fixed."""
 
-_NO_BEND: Matrix = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+_NO_BEND = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 _SLOW = 3
 """Iterations after which the slope is computed at the present force."""
 
@@ -53,9 +53,9 @@ class OneReading:
         model = calibration.model
         self.needs = model.needs
         self._calibration = calibration
-        self._unit = calibration.force_per_g * scale
-        self.turn = _flat(model.rotation.T * self._unit)
-        self.back = _flat(model.rotation / self._unit)
+        unit = calibration.force_per_g * scale
+        self.turn: Matrix = (model.rotation.T * unit).ravel().tolist()
+        self.back: Matrix = (model.rotation / unit).ravel().tolist()
         self.per_g = calibration.units.per_g
         self._fixed = [0.0] * 12
         self._bends: list[_Bend] = []
@@ -115,7 +115,7 @@ class OneReading:
                 for term in effect.terms:
                     at = start + term.parameter if own is None else own
                     size = 1.0 if own is None else values[term.parameter]
-                    rows.append(_row(term.axis, term.weight * size * root[at]))
+                    rows.append(np.kron(np.eye(3)[term.axis], term.weight * size * root[at]))
                     monomials.append(term.monomial)
             start += len(effect.values)
         which = np.equal.outer(self.monomials, monomials).astype(float)
@@ -154,12 +154,6 @@ def _factor(effect: Effect, known: Known, shape: Any) -> Any:
     if isinstance(factor, np.ndarray):
         return np.nan_to_num(factor).tolist()
     return 0.0 if factor != factor else float(factor)
-
-
-def _row(axis: int, values: Floats) -> Floats:
-    row = np.zeros((3, len(values)))
-    row[axis] = values
-    return row.ravel()
 
 
 class AtReading:
@@ -230,12 +224,9 @@ class AtReading:
         """Return the slope of the reading at a force."""
         slope = list(self._gain)
         for axis, size, _, gradient in self._bends:
-            i, j, k = gradient(*u)
-            slope[3 * axis] += size * float(i)
-            slope[3 * axis + 1] += size * float(j)
-            slope[3 * axis + 2] += size * float(k)
-        a, b, c, d, e, f, g, h, i = slope
-        return a, b, c, d, e, f, g, h, i
+            for at, part in enumerate(gradient(*u), 3 * axis):
+                slope[at] += size * float(part)
+        return slope
 
     def with_spread(self, force: Triple, own: Sequence[float]) -> Sequence[float]:
         """
@@ -272,12 +263,7 @@ class AtReading:
         return self._owner.spread_basis(self._known)
 
 
-def _flat(matrix: Floats) -> Matrix:
-    a, b, c, d, e, f, g, h, i = matrix.ravel().tolist()
-    return a, b, c, d, e, f, g, h, i
-
-
-def _affine(matrix: Sequence[float], less: Triple) -> Callable[[float, float, float], Triple]:
+def _affine(matrix: Matrix, less: Triple) -> Callable[[float, float, float], Triple]:
     """Return the function v -> matrix @ v - less."""
     a, b, c, d, e, f, g, h, i = matrix
     p, q, r = less
@@ -297,18 +283,17 @@ def _quadratic(a: float, b: float, c: float, d: float, e: float, f: float, g: fl
     return apply
 
 
-def _times(matrix: Sequence[float], x: float, y: float, z: float) -> Triple:
+def _times(matrix: Matrix, x: float, y: float, z: float) -> Triple:
     a, b, c, d, e, f, g, h, i = matrix
     return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z
 
 
-def _product(one: Sequence[float], other: Sequence[float]) -> Matrix:
+def _product(one: Matrix, other: Matrix) -> Matrix:
     columns = [_times(one, *other[k::3]) for k in range(3)]
-    (a, d, g), (b, e, h), (c, f, i) = columns
-    return a, b, c, d, e, f, g, h, i
+    return [part for row in zip(*columns) for part in row]
 
 
-def _inverse(matrix: Sequence[float]) -> Matrix:
+def _inverse(matrix: Matrix) -> Matrix:
     """Return the inverse of a gain. `calibrate.gated` has checked that it is not singular."""
     a, b, c, d, e, f, g, h, i = matrix
     p, q, r = e * i - f * h, f * g - d * i, d * h - e * g

@@ -66,7 +66,7 @@ from numpy.typing import NDArray
 
 from ..capture import CaptureSettings, StillDetector
 from ..errors import InputError
-from ..table import Floats, numbered, Recording
+from ..table import concatenated, Floats, Recording
 from ..text import counted
 from ..units import Units
 
@@ -194,9 +194,7 @@ def _weights(lag: Counts, one: int, two: int, samples: int) -> Floats:
     """Return the weights of γ² at the lags: 2/(n_i n_j) times the number of pairs."""
     counts = samples + 1 - 2 * one, samples + 1 - 2 * two
     pairs = np.minimum(min(counts), samples + 1 - one - two - lag).astype(float)
-    width = np.zeros(len(lag))
-    width[1:] += 0.5 * np.diff(lag)
-    width[:-1] += 0.5 * np.diff(lag)
+    width = np.convolve(np.diff(lag), [0.5, 0.5])  # of the trapezoidal rule
     return 4.0 / (float(counts[0]) * float(counts[1])) * width * np.maximum(pairs, 0.0)
 
 
@@ -326,6 +324,4 @@ def whole(blocks: Iterable[Recording]) -> Recording:
     if not parts:
         raise InputError('the recording has no samples, expected a long rest',
                          'check that this is the intended file')
-    names = [name for name in parts[0].columns if all(name in part for part in parts)]
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in names}
-    return Recording(columns, numbered(columns), parts[0].units, parts[0].sensor)
+    return concatenated(parts)

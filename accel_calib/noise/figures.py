@@ -19,6 +19,7 @@ curve rises over two octaves. Common parts need hours.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -234,8 +235,10 @@ def noise_of(recording: Recording, units: Units, gravity: float = STANDARD_GRAVI
     if not rad_s:
         notes.append('the angular rates are not in rad/s, because their noise is too large: they '
                      'are taken as native')
-    for k, values in enumerate(rest.values):
-        kind, axis, scale, unit = _channel(k, units, gravity, rad_s=rad_s)
+    scales = {'accelerometer': ('native', units.per_g) if units.is_native else ('m/s²', gravity),
+              'gyroscope': ('rad/s' if rad_s else 'native', 1.0)}
+    for k, (values, (kind, axis)) in enumerate(zip(rest.values, product(KINDS, 'xyz'))):
+        unit, scale = scales[kind]
         if np.ptp(values) > 0.0 and np.std(values) > 0.0:
             axes.append(_axis(kind, axis, unit, values * scale, rest.rate, spread))
         else:
@@ -255,16 +258,6 @@ def _in_rad_s(rest: LongRest) -> bool:
         return True
     density = np.std(np.diff(rates), axis=1) / np.sqrt(2.0 * rest.rate)
     return bool(np.all(density < _MOST_RATE))
-
-
-def _channel(row: int, units: Units, gravity: float, *, rad_s: bool
-             ) -> tuple[Kind, str, float, str]:
-    """Return sensor, axis, factor from g or rad/s, and unit of a row of `LongRest.values`."""
-    if row > 2:
-        return 'gyroscope', 'xyz'[row - 3], 1.0, 'rad/s' if rad_s else 'native'
-    if units.is_native:
-        return 'accelerometer', 'xyz'[row], units.per_g, 'native'
-    return 'accelerometer', 'xyz'[row], gravity, 'm/s²'
 
 
 def _axis(kind: Kind, axis: str, unit: str, values: Floats, rate: float, spread: Spread

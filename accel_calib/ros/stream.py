@@ -32,7 +32,7 @@ from ..errors import AccelCalibError, InputError
 from ..logs import (
     ACCELERATION, IMU_DOUBLES, joined, Layout, layout_of, LITTLE_ENDIAN, NAME_AT, samples_of,
     THREE)
-from ..messages.correction import motion_of, output_frame, output_scale, Rewriter
+from ..messages.correction import motion_of, output_frame, Rewriter
 from ..messages.one_reading import Triple
 from ..session import BATCH, CalibratorSettings, columns_of, context_topics, Session
 from ..table import Floats
@@ -68,10 +68,9 @@ class Output:
         self._made_for, self.rewriter = made_for, None
         if calibration is not None:
             frame_id = output_frame(calibration, layout.frame_id, settings.output_frame_id)
-            self.rewriter = Rewriter(
-                layout, calibration, output_scale(calibration, settings.gravity),
-                settings.gravity, frame_id, sensor.noise if fills else None,
-                sensor.temperatures.stream(calibration.model))
+            self.rewriter = Rewriter(layout, calibration, settings.gravity, frame_id,
+                                     sensor.noise if fills else None,
+                                     sensor.temperatures.stream(calibration.model))
 
 
 _NUMBERS: dict[str, tuple[Any, tuple[str, ...]]] = {

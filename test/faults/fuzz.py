@@ -39,14 +39,14 @@ sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 
 import accel_calib as ac  # noqa: E402
 from accel_calib.errors import AccelCalibError, InputError, StoredCalibrationError  # noqa: E402
-from accel_calib.logs import LogOptions, read_log, write_table  # noqa: E402
+from accel_calib.logs import LogOptions, write_table  # noqa: E402
 from accel_calib.messages import correct_bag  # noqa: E402
 from accel_calib.stored import read_calibration  # noqa: E402
 from bag_files import a_calibration  # noqa: E402
 from faults import inputs  # noqa: E402
 from faults.inputs import BAGS, EXTREME, Files  # noqa: E402
 from inside import (  # noqa: E402
-    format_calibration, main as command_line, parse_calibration, poses_of)
+    format_calibration, main as command_line, parse_calibration, poses_of, read_log)
 import numpy as np  # noqa: E402
 
 Rng = np.random.Generator

@@ -16,9 +16,10 @@ from typing import Any, TypeVar
 
 import accel_calib as ac
 from accel_calib.errors import AccelCalibError
-from accel_calib.logs import read_log, write_table
+from accel_calib.logs import write_table
 from accel_calib.stored import write_calibration
 import bag_files as bags
+from inside import read_log
 import numpy as np
 import yaml
 

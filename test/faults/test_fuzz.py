@@ -10,12 +10,11 @@ from pathlib import Path
 import struct
 
 from accel_calib.errors import InputError
-from accel_calib.logs import read_log
 from faults import inputs
 from faults.fuzz import KINDS, outcomes
 from faults.inputs import Files
 from faults.sample import FACTOR, sample
-from inside import ULG_MAGIC
+from inside import read_log, ULG_MAGIC
 import pytest
 
 CASES = 30 * FACTOR

@@ -128,7 +128,7 @@ def messages() -> Any:
         raws = list(_messages(frame_id, len(frame_id)))
         layout, to = layout_of(raws[0]), output_frame(calibration, frame_id)
         assert layout is not None
-        write, single = Rewriter(layout, calibration, 1.0, G, to, noise if frame_id else None), []
+        write, single = Rewriter(layout, calibration, G, to, noise if frame_id else None), []
         for k, raw in enumerate(raws):
             write.bias = (0.01, -0.02, 0.03) if k == 5 else (0.0, 0.0, 0.0)
             out, begin = write(raw, {'temperature': 20.0 + 2.0 * k}) or b'', write.layout.begin
