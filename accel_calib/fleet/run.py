@@ -221,7 +221,9 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
 
     """
     with store.locked():
-        damaged = tuple(_set_aside(client, store))
+        files = list(store.files())
+        damaged = tuple(str(store.set_aside(path)) for path, is_so in zip(
+            files, _in_order(client, is_damaged, files), strict=True) if is_so)
         store.forget_lost()
         _merge(client, store)  # what an interrupted run left
         counts, unread = Counter[str](), list[Row]()
@@ -233,7 +235,7 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
             progress(sum(counts.values()), len(found))
         store.replace_unread(unread)
         sensors = tuple(_merge(client, store))
-        known = overview(_by_sensor(client, digest_of, [*store.sensors(), UNREAD], store))
+        known = overview(_in_order(client, digest_of, [*store.sensors(), UNREAD], store))
         priors, path = priors_of(known.typical), store.folder / PRIOR_FILE
         if priors:
             write_priors(path, priors)
@@ -243,15 +245,6 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
         return Summary(counts, sensors, priors, damaged, rating_of(known, sensors))
 
 
-def _set_aside(client: Client, store: Store) -> Iterator[str]:
-    """Move the damaged files of the results away, and yield their new names."""
-    for path, damaged in mapped(client, is_damaged, store.files()):
-        if isinstance(damaged, Exception):
-            raise damaged
-        if damaged:
-            yield str(store.set_aside(path))
-
-
 def _merge(client: Client, store: Store) -> list[Row]:
     """Merge all pending rows, and compare the calibrations; return the rows of all sensors."""
     names = store.waiting()
@@ -259,25 +252,20 @@ def _merge(client: Client, store: Store) -> list[Row]:
         names = sorted({*names, *store.sensors()})
     if not names:
         return read_parquet(store.sensors_file)
-    found = write_sensors(store, list(_by_sensor(client, merge_sensor, names, store)))
-    for _ in _by_sensor(client, _finish, names, store):
+    found = write_sensors(store, list(_in_order(client, merge_sensor, names, store)))
+    for _ in _in_order(client, store.finish, names):
         pass
     return found
 
 
-def _finish(name: str, store: Store) -> None:
-    """Remove the pending rows of a sensor; it runs on a worker."""
-    store.finish(name)
-
-
-def _by_sensor(client: Client, function: Callable[[str, Store], _Result], names: Sequence[str],
-               store: Store) -> Iterator[_Result]:
-    """Yield the result of a function for each sensor, in order of `names`; raise its exception."""
-    due, early = deque(names), dict[str, _Result]()
-    for name, result in mapped(client, function, names, store):
+def _in_order(client: Client, function: Callable[..., _Result], items: Sequence[_Item],
+              *others: Any) -> Iterator[_Result]:
+    """Yield the result of a function for each item, in their order; raise its exception."""
+    due, early = deque(items), dict[_Item, _Result]()
+    for item, result in mapped(client, function, items, *others):
         if isinstance(result, Exception):
             raise result
-        early[name] = result
+        early[item] = result
         while due and due[0] in early:
             yield early.pop(due.popleft())
 
