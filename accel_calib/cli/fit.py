@@ -274,15 +274,12 @@ def _page_of_effects(args: argparse.Namespace, result: Refinement) -> str:
 
 def _refined(args: argparse.Namespace) -> tuple[Intake, Refinement]:
     """Refine with one log."""
-    from ..refine import refine, refine_with_fleet  # a fit alone does not load the search
+    from ..refine import refine  # a fit alone does not load the search
 
     stored = args.calibration and stored_calibration(args.calibration)
     with intake(args, args.poses, stored) as found, working('refining'):
         poses = found.poses.take(rows_between(found.poses, args.rows))
-        base, fleet = stored.in_units(found.units) if stored else args.base, prior(args)
-        if fleet is not None:
-            return found, refine_with_fleet(poses, found.units, fleet, sensor=args.sensor,
-                                            date=now(), also=args.own)
+        base = stored.in_units(found.units) if stored else prior(args) or args.base
         return found, refine(poses, found.units, base=base, sensor=args.sensor, date=now(),
                              also=args.own)
 
