@@ -421,7 +421,7 @@ COMMANDS = {
         'write a calibration in the format of a firmware, an autopilot or another tool',
         'recordings', 'accel-calib export calibration.yaml --to c -o imu.h', _export, 'export'),
     'noise': Command(
-        'find noise density, bias instability and random walk from a long rest', 'recordings',
+        'find noise density, bias instability and random walk from a long rest', 'compare',
         'accel-calib noise rest.mcap --json noise.json --report noise.html', _noise),
     'simulate': Command(
         'simulate poses or a recording of a sensor with known effects', 'recordings',

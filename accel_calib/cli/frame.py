@@ -36,7 +36,7 @@ from ..capture import CaptureSettings
 from ..disk import replaceable, STANDARD_OUTPUT, write_atomically
 from ..effects import know_file
 from ..errors import AccelCalibError, InputError, RefusedFitError, saying, system_error
-from ..logs import LogOptions
+from ..logs import LogOptions, OpenLog
 from ..pipeline import Intake, options_for, poses_of
 from ..stored import calibration_from, OF_FILE, read_calibration, read_prior
 from ..table import Poses
@@ -372,6 +372,12 @@ def intake(args: argparse.Namespace, path: Path, calibration: Calibration | None
         found = poses_of(path, log_options(args, calibration), settings(args), moved)
     with saying(found.said):
         yield found
+
+
+def read_lines(log: OpenLog) -> list[str]:
+    """Return how a log was read."""
+    said = [f'read as: {log.read_as}'] if log.read_as else []
+    return said + [f'note: {line}' for line in log.notes]
 
 
 def stored_calibration(path: Path) -> Calibration:
