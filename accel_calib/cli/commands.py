@@ -38,7 +38,7 @@ class Command(NamedTuple):
     summary: str
     module: str
     example: str
-    options: Callable[[options.Parser], None]
+    options: Callable[[options.Parser], None] = lambda made: None
     writes: str = ''
     about: str = ''
 
@@ -370,10 +370,6 @@ def _live(made: options.Parser) -> None:
     options.share(made, '--also')
 
 
-def _none(made: options.Parser) -> None:
-    """Add no options."""
-
-
 _FOR_ROS = 'all arguments after --ros-args are passed to ROS'
 
 COMMANDS = {
@@ -439,10 +435,10 @@ COMMANDS = {
         'open the link that it prints in a browser; Ctrl-C ends it', _live, 'calibration'),
     'node': Command(
         'run the calibrator node', 'nodes',
-        f'accel-calib node --ros-args -r imu/data_raw:=/imu/raw\n\n{_FOR_ROS}', _none),
+        f'accel-calib node --ros-args -r imu/data_raw:=/imu/raw\n\n{_FOR_ROS}'),
     'simulator': Command(
         'run the simulated Imu node', 'nodes',
-        f'accel-calib simulator --ros-args -p poses:=12\n\n{_FOR_ROS}', _none),
+        f'accel-calib simulator --ros-args -p poses:=12\n\n{_FOR_ROS}'),
 }
 
 
