@@ -226,11 +226,16 @@ def add_capture(made: Parser) -> None:
                      'repeated poses'}})
 
 
+def add_source(made: Parser, name: str, about: str, **more: Any) -> None:
+    """Add the argument for a log, which can come through standard input."""
+    made.add_argument(name, type=log_path, help=f'{about}; - for standard input',
+                      **{'metavar': name.upper(), **more})
+
+
 def add_poses(made: Parser, number: str | None = '+') -> None:
     """Add the options for reading the poses of one or several logs."""
-    made.add_argument('poses', nargs=number, type=log_path, metavar='POSES',
-                      help='pose table, or a recording, whose poses are captured first; - for '
-                      'standard input')
+    add_source(made, 'poses', 'pose table, or a recording, whose poses are captured first',
+               nargs=number)
     share(made, '--rows')
     add_log(made)
     add_capture(made)
