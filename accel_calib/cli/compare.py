@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.table import Table
 
 from .frame import (
@@ -20,7 +19,7 @@ from .frame import (
     stored_calibration)
 from .output import error_line, NARROW, progress, short_if_known, table, Verdict
 from ..calibrate import verify
-from ..compare import compare, Comparison, History, history_of, LEVEL
+from ..compare import compare, Comparison, History, history_of
 from ..errors import InputError
 from ..findings import (
     change_in_words, GAINS, in_words, OFFSETS, rate_comparison, rate_noise, rate_verification)
@@ -29,11 +28,12 @@ from ..noise import check_allantools, duration, noise_of, NoiseFigures, to_json,
 from ..pipeline import Correction
 from ..report import calibration_page
 from ..report.stability import (
-    comparison_page, figure_rows, history_page, kalibr_lines, need_lines, noise_page)
+    comparison_page, figure_rows, history_page, kalibr_lines, need_lines, noise_page,
+    parameter_rows)
 from ..stored import read_calibration
 from ..table import check_units, Recording
 from ..text import counted, plain, short
-from ..units import MG, units_of
+from ..units import units_of
 
 
 def run_verify(args: argparse.Namespace) -> Done:
@@ -99,29 +99,14 @@ def _comparison_lines(paths: list[Path], models: list[str], comparison: Comparis
           f'{run.largest_mg:.3g}', f'{run.p_value:.2g}') for number, (path, model, run) in
          enumerate(zip(paths, models, comparison.runs, strict=True), 1)))
     yield table(
-        'Spread of the parameters over the runs [mg]',
-        ('', 'mean', 'spread', 'stated', 'ratio'),
-        ((one.name, f'{one.values.mean() * MG:.2f}', f'{one.spread * MG:.3g}',
-          f'{(one.stated_sd ** 2).mean() ** 0.5 * MG:.3g}',
-          '' if one.ratio is None else f'{one.ratio:.2f}')
-         for one in comparison.parameters if np.any(one.stated_sd)))
+        'Spread of the parameters over the runs', ('', 'mean', 'spread', 'stated', 'ratio'),
+        parameter_rows(comparison))
     for note in comparison.notes:
         yield f'note: {note}'
     if comparison.tilt_words:
         yield comparison.tilt_words
-    yield _answer(comparison)
-
-
-def _answer(comparison: Comparison) -> str:
-    """Return the result as one line."""
-    test = f'p = {comparison.p_value:.2g}, limit {LEVEL:g}'
-    if comparison.agree:
-        return f'The calibrations agree within their uncertainties ({test}).'
-    if comparison.outlier is None:
-        more = '' if len(comparison.runs) > 2 else '; a third run would show which one differs'
-        return f'The calibrations do not agree ({test}){more}.'
-    return (f'The calibrations do not agree ({test}): run {comparison.outlier + 1} differs, the '
-            'others agree.')
+    if not comparison.agree and len(comparison.runs) == 2:
+        yield 'a third run would show which one differs'
 
 
 def run_history(args: argparse.Namespace) -> Done:

@@ -28,6 +28,7 @@ from ..compare import Comparison, History, Parameter
 from ..findings import (
     change_in_words, CROSS, GAINS, in_words, OFFSETS, rate_comparison, rate_noise, scale_of)
 from ..noise import AxisNoise, duration, FIGURES, Kind, NoiseFigures, shown_unit, TYPICAL, WORDS
+from ..geometry import rms
 from ..table import Floats
 from ..text import power_of_ten, short, with_minus, with_sd
 from ..units import is_native
@@ -321,7 +322,8 @@ def comparison_page(comparison: Comparison, rating: Rating, sources: Sequence[Pa
     title = f'Comparison of {len(calibrations)} calibrations{_of_sensor(calibrations)}'
     body = [section('Calibrations', _runs(comparison, calibrations, labels)),
             section('Parameters', figures(of_parameters(comparison, labels)), HINT,
-                    _parameters(comparison)),
+                    scroll_table('Parameters', ('', 'mean', 'spread', 'stated', 'ratio'),
+                                 list(parameter_rows(comparison)))),
             section('Notes', listing(filter(None, (*comparison.notes, comparison.tilt_words)))),
             how_to_read(*_HOW_TO_READ)]
     return rated_sheet(title, map(str, sources), rating, body)
@@ -342,17 +344,14 @@ def _runs(comparison: Comparison, calibrations: Sequence[Calibration], labels: S
     return scroll_table('Calibrations', head, rows)
 
 
-def _parameters(comparison: Comparison) -> str:
-    """Return a table of the spread of each parameter."""
-    rows = []
-    for each in comparison.parameters:
+def parameter_rows(comparison: Comparison) -> Iterator[tuple[str, ...]]:
+    """Yield name, mean, spread, stated deviation and their ratio of each fitted parameter."""
+    for each in (one for one in comparison.parameters if np.any(one.stated_sd)):
         zero, factor, unit = scale_of(each.name)
-        stated = float(np.sqrt(np.mean(each.stated_sd ** 2)))
         mean = with_minus(short((each.values.mean() - zero) * factor))
-        rows.append((spoken(each.name), f'{mean} {unit}',
-                     short(each.spread * factor), short(stated * factor),
-                     '' if each.ratio is None else f'{each.ratio:.2f}'))
-    return scroll_table('Parameters', ('', 'mean', 'spread', 'stated', 'ratio'), rows)
+        yield (spoken(each.name), f'{mean} {unit}', short(each.spread * factor),
+               short(rms(each.stated_sd) * factor),
+               '' if each.ratio is None else f'{each.ratio:.2f}')
 
 
 def history_page(history: History, sources: Sequence[Path],
