@@ -186,6 +186,8 @@ def _system(text: str) -> tuple[Any, str]:
 @contextmanager
 def on_disk(path: str) -> Iterator[Path]:
     """Yield a recording as a local path; an address is copied to a temporary folder."""
+    if (written := as_text(path)) != path:
+        raise InputError(f'the name {written} is not UTF-8, expected UTF-8', 'rename it')
     if '://' not in path:
         yield Path(path)
         return
