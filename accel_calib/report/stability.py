@@ -41,7 +41,6 @@ _NOISE_INCHES = 4.0
 _LOOKS = dict(zip('xyz', zip(AXIS_COLOURS, 'os^')))
 """Colour and marker of each axis."""
 
-_NAMES = {'accelerometer': 'Accelerometer', 'gyroscope': 'Gyroscope'}
 _KALIBR: dict[tuple[Kind, str], str] = {
     ('accelerometer', 'noise_density'): 'm/s²/√Hz', ('accelerometer', 'random_walk'): 'm/s³/√Hz',
     ('gyroscope', 'noise_density'): 'rad/s/√Hz', ('gyroscope', 'random_walk'): 'rad/s²/√Hz'}
@@ -74,7 +73,7 @@ def _allan(axes: Sequence[AxisNoise]) -> Drawing:
     """Draw the Allan deviation of the axes of one sensor over τ, with their 95 % bands."""
     kind, hover = axes[0].kind, {}
     unit, scale = shown_unit(kind, 'bias_instability', axes[0].unit)
-    with drawn(_NOISE_INCHES, f'{_NAMES[kind]}: Allan deviation') as (figure, (panel,)):
+    with drawn(_NOISE_INCHES, f'{kind.capitalize()}: Allan deviation') as (figure, (panel,)):
         panel.set(xscale='log', yscale='log', xlabel='averaging time τ [s]',
                   ylabel=f'Allan deviation [{unit}]')
         for axis in axes:
@@ -118,7 +117,7 @@ def _table(found: NoiseFigures, kind: Kind) -> str:
     rows.append(['from τ', *(f'{duration(axis.used[0])} to {duration(axis.used[1])}'
                              for axis in axes), ''])
     head = ['', *(axis.axis for axis in axes), 'typical']
-    return section(_NAMES[kind], scroll_table(f'Noise of the {kind}', head, rows),
+    return section(kind.capitalize(), scroll_table(f'Noise of the {kind}', head, rows),
                    paragraph('± is one standard deviation; < is the upper limit with 95 % '
                              'probability of a figure that the curve does not show. Typical: '
                              'common parts, from the data sheets of ICM-42688-P and MPU-6050, '
