@@ -214,6 +214,8 @@ def _gyro_line(gyro: GyroBias) -> str:
 
 def run_refine(args: argparse.Namespace) -> Done:
     """Refine a calibration, and store it unless it is refused."""
+    from ..report import refinement_page
+
     found, result = _refined(args)
     stored = []
     if args.output is not None and not result.refusal:
@@ -226,26 +228,20 @@ def run_refine(args: argparse.Namespace) -> Done:
         stored.append(args.plan)
     return Done({'file': args.poses, **refinement_json(result), 'read_as': found.read_as},
                 [*found.lines, *_shown(args, result)], rate_refinement(result), stored=stored,
-                page=partial(_page_of_effects, args, result),
+                page=partial(refinement_page, result, str(args.poses)),
                 refusal=result.refusal if args.output else ())
 
 
 def run_report(args: argparse.Namespace) -> Done:
     """Refine a calibration, and write the report and the figures."""
-    from ..report import write_figures
+    from ..report import refinement_page, write_figures
 
     _, result = _refined(args)
     lines: list[str] = [result.verdict]
     if args.figures is not None:
         count = len(write_figures(args.figures, result))
         lines.append(f'{counted(count, "file")}, stored in {args.figures}')
-    return Done(shown=lines, page=partial(_page_of_effects, args, result))
-
-
-def _page_of_effects(args: argparse.Namespace, result: Refinement) -> str:
-    from ..report import refinement_page
-
-    return refinement_page(result, str(args.poses))
+    return Done(shown=lines, page=partial(refinement_page, result, str(args.poses)))
 
 
 def _refined(args: argparse.Namespace) -> tuple[Intake, Refinement]:
