@@ -142,21 +142,16 @@ def _done(args: argparse.Namespace) -> Done:
 
 def _with_page(done: Done, page: Path, text_of: Callable[[], str], *, beside: bool) -> Done:
     """Write the page; one that cannot be written beside a calibration is only noted."""
-    from ..report import has_matplotlib, write_page
+    from ..report import check_matplotlib, write_page
 
-    reason = ''
-    if beside and not has_matplotlib():
-        reason = 'matplotlib is not installed'
-    else:
-        try:
-            with working('drawing the page'):
-                write_page(page, text_of())
-        except OSError as err:
-            if not (beside or done.stored):
-                raise
-            reason = str(system_error(err))
-    if reason:
-        return replace(done, shown=[*done.shown, f'no page {page}: {reason}'])
+    try:
+        check_matplotlib()
+        with working('drawing the page'):
+            write_page(page, text_of())
+    except (InputError, OSError) as err:
+        if not (beside or done.stored):
+            raise
+        return replace(done, shown=[*done.shown, f'no page {page}: {_known(err)}'])
     return replace(done, stored=[*done.stored, page])
 
 
@@ -201,8 +196,12 @@ def _attempt(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     return BAD_INPUT if refused else done.status, {**plain(done.result), **refused}
 
 
+def _known(error: AccelCalibError | OSError) -> AccelCalibError:
+    return system_error(error) if isinstance(error, OSError) else error
+
+
 def _of_error(error: AccelCalibError | OSError) -> dict[str, str]:
-    known = system_error(error) if isinstance(error, OSError) else error
+    known = _known(error)
     read_as = {'read_as': known.read_as} if known.read_as else {}
     return {'error': known.message, 'advice': known.advice, **read_as}
 
