@@ -15,8 +15,7 @@ the poses that separate effects from their rivals.
 """
 
 from .plan import PlannedPose, PosePlan
-from .refinement import (
-    base_words, refine, Refinement, refitted, residual_words, verdict_words)
+from .refinement import base_words, refine, Refinement, refitted, residual_words, verdict_words
 from .steps import chance, shown_name, Stage, Step, times_typical, values_of
 
 __all__ = ['PlannedPose', 'PosePlan', 'Refinement', 'Stage', 'Step', 'base_words', 'chance',
