@@ -303,6 +303,11 @@ def sensors_schema() -> pa.Schema:
         ('last', text), ('changes', pa.list_(change)), ('drift', drift), ('note', text)])
 
 
+def model_of(rows: Sequence[Row]) -> str:
+    """Return the model of a sensor, as its newest row has it."""
+    return rows[-1]['sensor_model'] or '' if rows else ''
+
+
 def merge_sensor(name: str, store: Store) -> Row:
     """
     Merge the pending rows of a sensor, compare its calibrations, and return the row of the sensor.
@@ -317,7 +322,7 @@ def merge_sensor(name: str, store: Store) -> Row:
     about: Row = {**dict.fromkeys(sensors_schema().names), 'sensor': unquote(name),
                   'recordings': len(rows), 'calibrations': len(good),
                   'errors': sum(row['status'] != 'ok' for row in rows), 'changes': [],
-                  'sensor_model': rows[-1]['sensor_model'] if rows else ''}
+                  'sensor_model': model_of(rows)}
     if good:
         about |= {'first': good[0]['date'], 'last': good[-1]['date']}
     if len(good) < 2:
