@@ -501,19 +501,17 @@ def _row(poses: Poses, flat: Flat) -> int | None:
 def _refinement(poses: Poses, units: Units, plan: Plan, date: str
                 ) -> tuple[Refinement | None, str]:
     """Return the search for effects, and a line about it; None if the poses are too few."""
-    from .refine import refine, refine_with_fleet  # a fit alone does not load the search
+    from .refine import refine  # a fit alone does not load the search
 
-    fleet, named = plan.fleet, {'sensor': plan.sensor, 'date': date}
     try:
-        found = (refine(poses, units, base='auto' if plan.before is None else plan.before,
-                        **named, also=plan.also) if fleet is None
-                 else refine_with_fleet(poses, units, fleet, **named, also=plan.also))
+        found = refine(poses, units, base=plan.fleet or plan.before or 'auto', sensor=plan.sensor,
+                       date=date, also=plan.also)
     except RefusedFitError as err:
         return None, f'not refined: {err.message}'
     if found.refusal:
         return found, f'not refined: {found.refusal[0]}'
     if not found.steps:
-        why = 'these poses show no further effect' if fleet is None else found.advice[0]
+        why = found.advice[0] if plan.fleet else 'these poses show no further effect'
         return found, f'not refined: {why}'
     change = f'residual {short(found.gap_mg)} -> {short(found.remaining_gap_mg)} mg'
     added = [step.effect for step in found.steps if step.effect not in PROCESSES]

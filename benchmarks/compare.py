@@ -13,7 +13,6 @@ pose mean and axis. The change is 1 mg of offset on one axis in one run::
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 import os
@@ -30,7 +29,7 @@ from accel_calib.effects import Model, model_with, simulate_poses  # noqa: E402
 from accel_calib.geometry import rotation_from_rpy, spread_directions  # noqa: E402
 from accel_calib.table import Poses  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
-from figures import Line, publish, table  # noqa: E402
+from figures import Line, parser, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 from shared import sensor  # noqa: E402
 
@@ -146,11 +145,10 @@ def _share(count: int, total: int) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--sets', type=int, default=200, help='sets of each case, half of 20 runs')
-    parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--markdown', type=Path, help='write the table to this file')
-    given = parser.parse_args(arguments)
+    options = parser(__doc__, seed=1)
+    options.add_argument('--sets', type=int, default=200,
+                         help='sets of each case, half of 20 runs')
+    given = options.parse_args(arguments)
     lines = []
     for case in CASES:
         sets = max(given.sets // 2 if case.runs > 5 else given.sets, 1)

@@ -15,12 +15,10 @@ its processes after the other is stopped for a while, as by a machine that hangs
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import json
 import os
 from pathlib import Path
-import platform
 import signal
 import subprocess
 import sys
@@ -29,7 +27,7 @@ import time
 
 ROOT = Path(__file__).resolve().parents[1]
 
-from figures import busy, Line, processor, publish, table  # noqa: E402
+from figures import busy, Line, machine, parser, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 
 BETWEEN = 1.0
@@ -89,14 +87,11 @@ def turn(hidden: str, stop: float) -> tuple[int, float, int, dict[str, float]]:
 
 def main() -> None:
     """Run the turns and print the figures."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--turns', type=int, default=20)
-    parser.add_argument('--loops', type=int, default=0)
-    parser.add_argument('--stop', type=float, default=0.0, help='duration of a stop [s]')
-    parser.add_argument('--hidden', default='')
-    parser.add_argument('--markdown', type=Path)
-    args = parser.parse_args()
-    rows = []
+    options = parser(__doc__, turns=20, loops=0)
+    options.add_argument('--stop', type=float, default=0.0, help='duration of a stop [s]')
+    options.add_argument('--hidden', default='')
+    args = options.parse_args()
+    before, rows = machine(), []
     with busy(args.loops):
         for number in range(args.turns):
             rows.append(turn(args.hidden, args.stop))
@@ -115,7 +110,7 @@ def main() -> None:
              Line('largest [mg]', f'{np.max(errors):.2f}', '', sets, None)]
     command = f'--turns {args.turns} --loops {args.loops} --stop {args.stop:g}'
     about = ABOUT.format(command=command, loops=args.loops, stop=args.stop,
-                         machine=f'{processor()}, Python {platform.python_version()}')
+                         machine=before)
     publish(f'{about}\n\n{table(lines)}\n', args.markdown)
     sys.exit(len(good) != len(rows))
 

@@ -14,14 +14,12 @@ is started and killed by SIGKILL at a random time. The benchmark itself does not
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 import multiprocessing
 import os
 from pathlib import Path
-import platform
 import signal
 import subprocess
 import sys
@@ -32,7 +30,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 
 import driver_kills_clients as clients  # noqa: E402
-from figures import busy, processor, publish  # noqa: E402
+from figures import busy, machine, markdown, parser, publish  # noqa: E402
 import numpy as np  # noqa: E402
 
 PARTIES = ('driver', 'calibrator', 'listener')
@@ -268,7 +266,7 @@ def words_of(status: int) -> str:
     return signal.Signals(-status).name if status < 0 else f'status {status}'
 
 
-def row_of(case: Case, found: list[Trial]) -> str:
+def row_of(case: Case, found: list[Trial]) -> tuple[object, ...]:
     """Return the row of the table."""
     def ended(names: tuple[str, ...]) -> str:
         every = [words_of(status) for each in found for name, status in each.died.items()
@@ -281,22 +279,18 @@ def row_of(case: Case, found: list[Trial]) -> str:
     sent = sum(each.sent for each in found)
     lost = sent - sum(each.heard for each in found)
     arrived = f'{lost:,} of {sent:,}' if case.victim == 'driver' and not case.ends else ''
-    return (f'| {case.words} | {len(found)} | {ended(("calibrator",))} | '
-            f'{ended(("driver", "listener"))} | {sum(each.silent for each in found)} | '
-            f'{arrived} | {start} |')
+    return (case.words, len(found), ended(('calibrator',)), ended(('driver', 'listener')),
+            sum(each.silent for each in found), arrived, start)
 
 
 def main() -> int:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
-    parser.add_argument('--cases', nargs='+', choices=list(CASES), default=list(CASES))
-    parser.add_argument('--kills', type=int, default=200, help='kills of each case')
-    parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--folder', type=Path, help='keep the logs of the processes here')
-    parser.add_argument('--markdown', type=Path, help='write the page to this file')
-    given = parser.parse_args()
-    machine = (f'{processor()} before; Linux {platform.release()}, '
-               f'Python {platform.python_version()}')
+    options = parser(__doc__, seed=1)
+    options.add_argument('--cases', nargs='+', choices=list(CASES), default=list(CASES))
+    options.add_argument('--kills', type=int, default=200, help='kills of each case')
+    options.add_argument('--folder', type=Path, help='keep the logs of the processes here')
+    given = options.parse_args()
+    before = machine()
     os.environ.update(ROS_DOMAIN_ID=str(os.getpid() % 101 + 1), PYTHONPATH=os.pathsep.join(
         [str(ROOT), str(ROOT / 'benchmarks')]))
     rows, loads = [], []
@@ -304,14 +298,13 @@ def main() -> int:
         found = list(run(CASES[name], given.kills, given.seed, given.folder))
         loads.append(f'{os.getloadavg()[0]:.0f}')
         rows.append(row_of(CASES[name], found))
-        print(rows[-1], file=sys.stderr, flush=True)
+        print(*rows[-1], sep=', ', file=sys.stderr, flush=True)
     about = _ABOUT.format(
-        kills=given.kills, rate=RATE, latest=LATEST, patience=PATIENCE, machine=machine,
+        kills=given.kills, rate=RATE, latest=LATEST, patience=PATIENCE, machine=before,
         loads=f'Load of the machine after each case: {", ".join(loads)}.')
-    head = ('| | kills | ends of the calibrator | ends of the others | silent | '
-            'messages lost | from the start to the first message, s: median, longest |\n'
-            '|---|---|---|---|---|---|---|')
-    publish('\n'.join(['# Figures of processes that are killed\n', about, '', head, *rows, '']),
+    heads = ('', 'kills', 'ends of the calibrator', 'ends of the others', 'silent',
+             'messages lost', 'from the start to the first message, s: median, longest')
+    publish(f'# Figures of processes that are killed\n\n{about}\n\n{markdown(heads, rows)}\n',
             given.markdown)
     return 0
 

@@ -1,13 +1,15 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What benchmarks share: the pages with what is measured beside what is asked, and a load."""
+"""What benchmarks share: options, pages with what is measured beside what is asked, a load."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import argparse
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.metadata import version
 import os
 from pathlib import Path
 import platform
@@ -42,10 +44,24 @@ class Line:
 
 def table(lines: Sequence[Line]) -> str:
     """Return the lines as a Markdown table."""
-    rows = ['| | measured | asked | sets | met |', '|---|---|---|---|---|']
     words = {True: 'yes', False: '**no**', None: ''}
-    rows += [f'| {x.what} | {x.measured} | {x.asked} | {x.sets} | {words[x.met]} |' for x in lines]
-    return '\n'.join(rows)
+    return markdown(('', 'measured', 'asked', 'sets', 'met'), (
+        (x.what, x.measured, x.asked, x.sets, words[x.met]) for x in lines))
+
+
+def markdown(heads: Sequence[str], rows: Iterable[Iterable[object]]) -> str:
+    """Return a Markdown table."""
+    lines = ['| ' + ' | '.join(map(str, row)) + ' |' for row in (heads, *rows)]
+    return '\n'.join([lines[0], '|---' * len(heads) + '|', *lines[1:]])
+
+
+def parser(about: str | None, **numbers: float) -> argparse.ArgumentParser:
+    """Return the parser of a benchmark: options with numbers, such as the seed, and the page."""
+    made = argparse.ArgumentParser(description=(about or '').strip().splitlines()[0])
+    for name, usual in numbers.items():
+        made.add_argument(f'--{name}', type=type(usual), default=usual)
+    made.add_argument('--markdown', type=Path, help='file to write the page to')
+    return made
 
 
 def publish(page: str, path: Path | None) -> None:
@@ -63,15 +79,16 @@ def commit() -> str:
                           text=True).stdout.strip()
 
 
-def processor() -> str:
-    """Return the processor, its number of cores and the load of the machine now."""
+def machine() -> str:
+    """Return the processor with its load before the benchmark, the system and the versions."""
     try:
         text = Path('/proc/cpuinfo').read_text(encoding='utf-8')
         name = next(line.split(':')[1].strip() for line in text.splitlines()
                     if line.startswith('model name'))
     except (OSError, StopIteration):
         name = platform.processor() or platform.machine()
-    return f'{name}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}'
+    return (f'{name}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before; Linux '
+            f'{platform.release()}, Python {platform.python_version()}, numpy {version("numpy")}')
 
 
 @contextmanager

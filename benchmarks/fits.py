@@ -16,12 +16,10 @@ that of the process::
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 import os
 from pathlib import Path
-import platform
 import sys
 from tempfile import TemporaryDirectory
 import time
@@ -34,7 +32,7 @@ from accel_calib.calibrate import fit_poses  # noqa: E402
 from accel_calib.estimate import closed_form  # noqa: E402
 from accel_calib.table import Floats  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
-from figures import Line, processor, publish, table  # noqa: E402
+from figures import Line, machine, parser, publish, table  # noqa: E402
 from generator import Setup, simulate, write_csv  # noqa: E402
 import numpy as np  # noqa: E402
 from robust_sets import Case, draw, draw_sensor, NOISE, spread  # noqa: E402
@@ -178,12 +176,11 @@ def draw_growth(curves: Curves, path: Path) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--quick', action='store_true',
-                        help='without the growth, and with one refinement')
-    parser.add_argument('--markdown', type=Path, help='write table and figure beside this file')
-    given = parser.parse_args(arguments)
-    before = processor()
+    options = parser(__doc__)
+    options.add_argument('--quick', action='store_true',
+                         help='without the growth, and with one refinement')
+    given = options.parse_args(arguments)
+    before = machine()
     lines = [*one_sensor(), many_sensors(), *refinements(HIDDEN[:1] if given.quick else HIDDEN)]
     drawn = ''
     if not given.quick:
@@ -192,8 +189,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if given.markdown:
             draw_growth(curves, given.markdown.with_suffix('.svg'))
             drawn = f'\n![time over poses]({given.markdown.stem}.svg)\n'
-    text = (f'# Figures of fits\n\n{__doc__.strip()}\n\n{before} before; Python '
-            f'{platform.python_version()}, numpy {np.__version__}.\n\n{table(lines)}\n{drawn}')
+    text = (f'# Figures of fits\n\n{__doc__.strip()}\n\n{before}.\n\n{table(lines)}\n{drawn}')
     publish(text, given.markdown)
     return 0
 

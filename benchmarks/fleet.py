@@ -26,7 +26,6 @@ from importlib import import_module
 import json
 import os
 from pathlib import Path
-import platform
 import shutil
 import sys
 from tempfile import TemporaryDirectory
@@ -47,7 +46,7 @@ from accel_calib.fleet.overview import not_agreeing  # noqa: E402
 from accel_calib.fleet.recording import Row  # noqa: E402
 from accel_calib.logs import write_table  # noqa: E402
 import accel_calib.pipeline as pipeline  # noqa: E402
-from figures import Line, processor, publish, table  # noqa: E402
+from figures import Line, machine, parser, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 
 RUN, SENSORS, ROWS = (import_module(f'accel_calib.fleet.{name}')
@@ -459,16 +458,11 @@ def cost_lines(spent: dict[str, float], done: Whole, given: argparse.Namespace
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
-    parser.add_argument('--sensors', type=int, default=10_000)
-    parser.add_argument('--calibrations', type=int, default=20)
-    parser.add_argument('--workers', type=int, default=2)
-    parser.add_argument('--no-refine', action='store_true')
-    parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--folder', type=Path, help='folder of the recordings and the results; a '
-                        'second call continues (default: a temporary one)')
-    parser.add_argument('--markdown', type=Path, help='write the table to this file')
-    given = parser.parse_args(arguments)
+    options = parser(__doc__, sensors=10_000, calibrations=20, workers=2, seed=1)
+    options.add_argument('--no-refine', action='store_true')
+    options.add_argument('--folder', type=Path, help='folder of the recordings and the results; a '
+                         'second call continues (default: a temporary one)')
+    given = options.parse_args(arguments)
     with TemporaryDirectory() as temporary:
         publish(measured(given, (given.folder or Path(temporary)).absolute()), given.markdown)
     return 0
@@ -476,7 +470,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def measured(given: argparse.Namespace, folder: Path) -> str:
     """Run the benchmark in a folder, and return the page."""
-    machine = f'{processor()} before; Python {platform.python_version()}, numpy {np.__version__}'
+    before = machine()
     options = Options(model_from='^([AB])-', refined=not given.no_refine)
     write_inputs(folder / 'in', given)
     found = list(recordings([str(folder / 'in')]))
@@ -490,7 +484,7 @@ def measured(given: argparse.Namespace, folder: Path) -> str:
     lines = [*ratios, *memory_lines(folder / 'memory.jsonl', given.workers),
              *run_lines(done, given), *cost_lines(spent, done, given)]
     command = f'--sensors {given.sensors} --calibrations {given.calibrations}'
-    about = ABOUT.format(command=command + ' --no-refine' * given.no_refine, machine=machine,
+    about = ABOUT.format(command=command + ' --no-refine' * given.no_refine, machine=before,
                          sensors=given.sensors, calibrations=given.calibrations, poses=POSES,
                          damaged=100.0 * DAMAGED, turns=TURNS)
     after = AFTER.format(staged=len(staged), calibrations=given.calibrations)

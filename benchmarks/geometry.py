@@ -15,7 +15,6 @@ of two axes. Some sets of 12 random directions leave a region of the sphere unco
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,14 +24,14 @@ import sys
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from accel_calib.calibrate import fit_poses  # noqa: E402
-from accel_calib.effects import model_with, predict, sensor_force, simulate_poses  # noqa: E402
+from accel_calib.effects import predict, sensor_force, simulate_poses  # noqa: E402
 from accel_calib.errors import RefusedFitError  # noqa: E402
 from accel_calib.estimate import closed_form, estimate, start_of  # noqa: E402
 from accel_calib.geometry import spread_directions  # noqa: E402
-from accel_calib.table import Floats, numbered, Poses  # noqa: E402
-from accel_calib.units import MG, units_of  # noqa: E402
-from directions import random_directions  # noqa: E402
-from figures import Line, publish, table  # noqa: E402
+from accel_calib.table import Floats, Poses  # noqa: E402
+from accel_calib.units import units_of  # noqa: E402
+from directions import held, joined, length_error_mg, random_directions, sensor  # noqa: E402
+from figures import Line, markdown, parser, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 
 G = units_of('g')
@@ -75,13 +74,6 @@ class Outcome:
     offered: str
     added: int
     with_added: float
-
-
-def held(directions: Floats, degrees: float, rng: np.random.Generator) -> Floats:
-    """Turn each direction by some degrees in each of two axes."""
-    off = rng.normal(size=directions.shape) * np.radians(degrees)
-    turned = directions + off - directions * np.sum(off * directions, axis=1, keepdims=True)
-    return turned / np.linalg.norm(turned, axis=1, keepdims=True)
 
 
 def some(directions: Floats) -> Floats:
@@ -133,18 +125,13 @@ CASES: dict[str, tuple[Draw, float | None]] = {
 """How the directions are drawn, and the share of sets to be refused; None: nothing is asked."""
 
 
-def rms(force: Floats) -> float:
-    """Return the RMS error of |force| [mg]."""
-    return float(np.sqrt(np.mean((np.linalg.norm(force, axis=1) - 1.0) ** 2)) * MG)
-
-
 def forced(poses: Poses, reading: Floats) -> float:
     """Return the error of a fit [mg], whatever the geometry; infinite if it fails."""
     if not np.all(np.isfinite(closed_form('10', poses.reading)[0])):
         return np.inf
     try:
         model = estimate(start_of('10', poses.reading), poses).model
-        return rms(sensor_force(model, reading, {}))
+        return length_error_mg(sensor_force(model, reading, {}))
     except (RefusedFitError, np.linalg.LinAlgError):
         return np.inf
 
@@ -152,7 +139,7 @@ def forced(poses: Poses, reading: Floats) -> float:
 def fitted(poses: Poses, reading: Floats, model: str) -> float:
     """Return the error of a fit [mg]; NaN if it is refused."""
     try:
-        return rms(fit_poses(poses, G, model=model).correct(reading))
+        return length_error_mg(fit_poses(poses, G, model=model).correct(reading))
     except RefusedFitError:
         return np.nan
 
@@ -170,8 +157,7 @@ def named(advice: str) -> Floats:
 def run(draw: Draw, seed: Sequence[int]) -> Outcome:
     """Draw a set and fit it."""
     rng = np.random.default_rng(seed)
-    sizes = {'offset': 0.03, 'axis_gain': 0.02, 'cross_axis': 0.01}
-    model = model_with({name: rng.normal(size=3) * size for name, size in sizes.items()})
+    model = sensor(rng)
     reading = predict(model, random_directions(500, rng), {})
     directions = draw(rng)
     poses = simulate_poses(model, directions, rng)
@@ -180,7 +166,7 @@ def run(draw: Draw, seed: Sequence[int]) -> Outcome:
     determined = tuple(not np.isnan(fitted(known if name == '12' else poses, reading, name))
                        for name in MODELS)
     try:
-        found = rms(fit_poses(poses, G, model='10').correct(reading))
+        found = length_error_mg(fit_poses(poses, G, model='10').correct(reading))
         return Outcome(False, determined, found, error, '', 0, np.nan)
     except RefusedFitError as refusal:
         more = named(refusal.advice)
@@ -192,12 +178,6 @@ def run(draw: Draw, seed: Sequence[int]) -> Outcome:
                        fitted(again, reading, '10'))
 
 
-def joined(poses: Poses, more: Poses) -> Poses:
-    """Return poses followed by others."""
-    columns = {key: np.concatenate([poses[key], more[key]]) for key in poses.columns}
-    return Poses(columns, numbered(columns))
-
-
 def median(values: Sequence[float]) -> str:
     """Return the median and the largest value as text; empty if there is none."""
     known = [value for value in values if not np.isnan(value)]
@@ -206,17 +186,16 @@ def median(values: Sequence[float]) -> str:
     return f'{np.median(known):.3g} ({np.max(known):.3g})'
 
 
-def row(name: str, outcomes: Sequence[Outcome]) -> str:
+def row(name: str, outcomes: Sequence[Outcome]) -> list[str]:
     """Return a row of the table by case."""
     out = [each for each in outcomes if each.refused]
     kept = [each for each in outcomes if not each.refused]
     offers = [f'{np.mean([each.offered == name for each in out]):.0%} {name}'
               for name in ('7', '4') if any(each.offered == name for each in out)]
-    cells = [name, f'{len(out) / len(outcomes):.1%}', median([each.forced for each in out]),
-             median([each.error for each in kept]), ', '.join(offers),
-             median([each.error for each in out]),
-             median([each.added for each in out]), median([each.with_added for each in out])]
-    return f'| {" | ".join(cells)} |'
+    return [name, f'{len(out) / len(outcomes):.1%}', median([each.forced for each in out]),
+            median([each.error for each in kept]), ', '.join(offers),
+            median([each.error for each in out]),
+            median([each.added for each in out]), median([each.with_added for each in out])]
 
 
 def lines_of(name: str, outcomes: Sequence[Outcome], share: float | None) -> list[Line]:
@@ -245,28 +224,22 @@ def overall(outcomes: Sequence[Outcome]) -> list[Line]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--sets', type=int, default=200)
-    parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--markdown', type=Path, help='write the tables to this file')
-    given = parser.parse_args(arguments)
-    lines, everything = [], []
+    given = parser(__doc__, sets=200, seed=1).parse_args(arguments)
+    lines, everything, rows, models = [], [], [], []
     heads = ('12 poses', 'model 10 refused', 'error of the refused fit, median (worst) [mg]',
              'error if not refused [mg]', 'offered instead', 'its error [mg]', 'poses to add',
              'error with them [mg]')
-    rows = [f'| {" | ".join(heads)} |', '|---' * len(heads) + '|']
-    models = [f'| refused for model | {" | ".join(MODELS)} |', '|---' * 6 + '|']
     for name, (draw, share) in CASES.items():
         outcomes = [run(draw, [given.seed, k]) for k in range(given.sets)]
         everything += outcomes
         lines += lines_of(name, outcomes, share)
         rows.append(row(name, outcomes))
         shares = 1.0 - np.mean([each.determined for each in outcomes], axis=0)
-        models.append(f'| {name} | {" | ".join(f"{each:.1%}" for each in shares)} |')
+        models.append((name, *(f'{each:.1%}' for each in shares)))
     text = (f'# Figures of poor geometry\n\n{__doc__.strip()}\n\nMade by `python '
             f'benchmarks/geometry.py --sets {given.sets} --seed {given.seed} --markdown FILE`.'
-            f'\n\n{table(lines + overall(everything))}\n\n' + '\n'.join(rows)
-            + '\n\n' + '\n'.join(models) + '\n')
+            f'\n\n{table(lines + overall(everything))}\n\n{markdown(heads, rows)}\n\n'
+            f'{markdown(("refused for model", *MODELS), models)}\n')
     publish(text, given.markdown)
     return 0
 

@@ -14,13 +14,11 @@ machine::
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 import os
 from pathlib import Path
-import platform
 import sys
 import tempfile
 import time
@@ -35,7 +33,7 @@ from accel_calib.geometry import spread_directions  # noqa: E402
 from accel_calib.logs import write_table  # noqa: E402
 from accel_calib.stored import write_calibration  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
-from figures import Line, processor, publish, table  # noqa: E402
+from figures import Line, machine, markdown, parser, publish, table  # noqa: E402
 from imu_trial import node, relay, Trial, trial  # noqa: E402
 import numpy as np  # noqa: E402
 
@@ -246,15 +244,15 @@ def while_computing(runs: list[tuple[Trial, Calls]]) -> list[Line]:
 
 def figures_of(trials: Trials) -> str:
     """Return the plain figures as Markdown; they show the noise of the machine."""
-    rows = ['| at 1 kHz | CPU per message, µs: median (least to most) | p50, µs | p99, µs |',
-            '|---|---|---|---|']
+    rows = []
     for name, each in trials.items():
         used = [one.cpu_us for one in each]
         heard = len(each[0].heard) > 0
         p50, p99 = ((f'{median(each, quantile(q)):.0f}' for q in (50, 99)) if heard else ('', ''))
-        rows.append(f'| {name} | {np.median(used):.0f} ({min(used):.0f} to {max(used):.0f}) | '
-                    f'{p50} | {p99} |')
-    return '\n'.join(rows)
+        rows.append((name, f'{np.median(used):.0f} ({min(used):.0f} to {max(used):.0f})', p50,
+                     p99))
+    return markdown(('at 1 kHz', 'CPU per message, µs: median (least to most)', 'p50, µs',
+                     'p99, µs'), rows)
 
 
 def run(turns: int, seconds: float, long: float) -> Iterator[Any]:
@@ -300,13 +298,10 @@ def run(turns: int, seconds: float, long: float) -> Iterator[Any]:
 
 def main() -> int:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--turns', type=int, default=5)
-    parser.add_argument('--quick', action='store_true', help='one short turn')
-    parser.add_argument('--markdown', type=Path, help='write the table to this file')
-    given = parser.parse_args()
-    before = (f'{processor()} before; Linux {platform.release()}, '
-              f'Python {platform.python_version()}')
+    options = parser(__doc__, turns=5)
+    options.add_argument('--quick', action='store_true', help='one short turn')
+    given = options.parse_args()
+    before = machine()
     lines, plain = run(*((1, 2.0, 5.0) if given.quick else (given.turns, 6.0, 60.0)))
     command = '--quick' if given.quick else f'--turns {given.turns}'
     text = (f'# Figures of the Imu path\n\n{_ABOUT.format(command=command, machine=before)}\n\n'

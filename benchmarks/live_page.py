@@ -17,13 +17,12 @@ import argparse
 import asyncio
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 import socket
 import subprocess
 import sys
 import time
 
-from figures import Line, processor, publish, table
+from figures import Line, machine, parser, publish, table
 from imu_path import cpu, median, quantile, ratio, stored
 from imu_trial import node, Trial, trial
 
@@ -126,18 +125,15 @@ def lines(trials: dict[str, list[Trial]]) -> list[Line]:
 
 def main() -> None:
     """Print the table, or write it to a file."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--turns', type=int, default=7)
-    parser.add_argument('--seconds', type=float, default=20.0)
-    parser.add_argument('--markdown', type=Path, help='write the table to this file')
-    parser.add_argument(_WATCH, type=int, metavar='PORT', help=argparse.SUPPRESS)
-    given = parser.parse_args()
+    options = parser(__doc__, turns=7, seconds=20.0)
+    options.add_argument(_WATCH, type=int, metavar='PORT', help=argparse.SUPPRESS)
+    given = options.parse_args()
     if given.watch is not None:
         print(*asyncio.run(watch(given.watch)))
         return
     command = ''.join(f'--{name} {getattr(given, name):g} ' for name in ('turns', 'seconds')
                       if getattr(given, name) != parser.get_default(name))
-    about = _ABOUT.format(command=command, machine=processor())
+    about = _ABOUT.format(command=command, machine=machine())
     made = table(lines(run(given.turns, given.seconds)))
     publish(f'# Figures of the live page\n\n{about}\n\n{made}\n', given.markdown)
 

@@ -18,13 +18,11 @@ pattern of its own: memory and CPU time depend on the number of poses and on the
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass
 import os
 from pathlib import Path
-import platform
 from select import select
 import signal
 import subprocess
@@ -36,7 +34,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 
-from figures import Line, processor, publish, table  # noqa: E402
+from figures import Line, machine, markdown, parser, publish, table  # noqa: E402
 from imu_trial import cpu_seconds, end, first_of, process, SETTLE  # noqa: E402
 import numpy as np  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
@@ -449,30 +447,24 @@ def lines_of(run: LongRun) -> list[Line]:
 
 def calls_of(run: LongRun) -> str:
     """Return a table of the calls."""
-    rows = ['| service | calls | failed | longest answer, s |', '|---|---|---|---|']
-    for name in (*CALLS, 'reset'):
-        found = run.called(name)
-        if found:
-            rows.append(f'| `~/{name}` | {len(found)} | '
-                        f'{sum(not each.success for each in found)} | '
-                        f'{max(each.seconds for each in found):.2f} |')
-    return '\n'.join(rows)
+    called = {name: found for name in (*CALLS, 'reset') if (found := run.called(name))}
+    return markdown(('service', 'calls', 'failed', 'longest answer, s'), (
+        (f'`~/{name}`', len(found), sum(not each.success for each in found),
+         f'{max(each.seconds for each in found):.2f}') for name, found in called.items()))
 
 
 def intervals_of(run: LongRun) -> str:
     """Return a table with one line per interval."""
-    rows = ['| to, min | sent | received | lost | node, MB | own part, MB | worker, MB | '
-            'CPU, µs | p50, µs | p99, µs | bare CPU, µs | bare p50, µs | bare p99, µs |',
-            '|---' * 13 + '|']
+    heads = ('to, min', 'sent', 'received', 'lost', 'node, MB', 'own part, MB', 'worker, MB',
+             'CPU, µs', 'p50, µs', 'p99, µs', 'bare CPU, µs', 'bare p50, µs', 'bare p99, µs')
     heard, ends = run.ours, (run.edges[1:] - run.edges[0]) * 1e-9 / 60.0
     columns = [run.count(run.sent), run.count(heard[:, 0]), run.lost(heard),
                run.column('node')[1:], run.column('own')[1:], run.column('worker')[1:],
                run.cpu_us('cpu'), run.latency_us(heard, 50), run.latency_us(heard, 99),
                run.cpu_us('bare'), run.latency_us(run.bare, 50), run.latency_us(run.bare, 99)]
     forms = ['{:.1f}', *3 * ['{:d}'], *3 * ['{:.1f}'], *6 * ['{:.0f}']]
-    rows += ['| ' + ' | '.join(form.format(value) for form, value in zip(forms, row)) + ' |'
-             for row in zip(ends, *columns, strict=True)]
-    return '\n'.join(rows)
+    return markdown(heads, ([form.format(value) for form, value in zip(forms, row)]
+                            for row in zip(ends, *columns, strict=True)))
 
 
 def plan(minutes: float) -> tuple[int, float, float]:
@@ -485,13 +477,10 @@ def plan(minutes: float) -> tuple[int, float, float]:
 
 def main() -> int:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--minutes', type=float, default=60.0)
-    parser.add_argument('--rate', type=float, default=1000.0, help='messages per second')
-    parser.add_argument('--markdown', type=Path, help='write the page to this file')
-    given = parser.parse_args()
-    before = (f'{processor()} before; Linux {platform.release()}, '
-              f'Python {platform.python_version()}')
+    options = parser(__doc__, minutes=60.0)
+    options.add_argument('--rate', type=float, default=1000.0, help='messages per second')
+    given = options.parse_args()
+    before = machine()
     rounds, seconds, interval = plan(given.minutes)
     run = long_run(rounds, seconds, interval, given.rate)
     for each in run.answers:

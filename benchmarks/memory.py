@@ -14,11 +14,9 @@ second; the sensor rests for 4 s and turns for 1 s, so the number of poses grows
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator, Sequence
 import os
 from pathlib import Path
-import platform
 import subprocess
 import sys
 from tempfile import TemporaryDirectory
@@ -27,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT)]
 
 import accel_calib as ac  # noqa: E402
-from figures import Line, processor, publish, table  # noqa: E402
+from figures import Line, machine, parser, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 
 MILLION = 1_000_000
@@ -117,23 +115,19 @@ def lines_of(found: Sequence[tuple[str, int, float]]) -> Iterator[Line]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
-    parser.add_argument('--commands', nargs='+', choices=list(COMMANDS), default=list(COMMANDS))
-    parser.add_argument('--millions', nargs='+', type=float, default=[1, 3, 10],
-                        help='samples, in millions, ascending')
-    parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--markdown', type=Path, help='write the table to this file')
-    given = parser.parse_args(arguments)
-    machine = (f'{processor()} before; Python {platform.python_version()}, '
-               f'numpy {np.__version__}')
-    found = []
+    options = parser(__doc__, seed=1)
+    options.add_argument('--commands', nargs='+', choices=list(COMMANDS), default=list(COMMANDS))
+    options.add_argument('--millions', nargs='+', type=float, default=[1, 3, 10],
+                         help='samples, in millions, ascending')
+    given = options.parse_args(arguments)
+    before, found = machine(), []
     with TemporaryDirectory() as name:
         sizes = [round(each * MILLION) for each in given.millions]
         for each in peaks(given.commands, sizes, given.seed, Path(name)):
             found.append(each)
             print(*each, file=sys.stderr, flush=True)
     millions = ' '.join(f'{each:g}' for each in given.millions)
-    about = ABOUT.format(command=f'--millions {millions} --seed {given.seed}', machine=machine)
+    about = ABOUT.format(command=f'--millions {millions} --seed {given.seed}', machine=before)
     publish(f'{about}\n\n{table(list(lines_of(found)))}\n', given.markdown)
     return 0
 

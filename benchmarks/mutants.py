@@ -13,7 +13,6 @@ processes are left out, and the share that is killed is a lower bound.
 
 """
 
-import argparse
 import ast
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
@@ -36,7 +35,7 @@ from cosmic_ray.mutating import mutate_code
 from cosmic_ray.operators.operator import Operator
 from cosmic_ray.plugins import get_operator, operator_names
 import coverage
-from figures import publish
+from figures import markdown, parser, publish
 
 ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = ('calibrate', 'capture', 'compare', 'effects', 'estimate', 'findings',
@@ -185,11 +184,7 @@ def is_killed(given: Mutant, tests: Tests, where: Path) -> bool:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument('--count', type=int, default=300)
-    parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--markdown', type=Path)
-    options = parser.parse_args()
+    options = parser(__doc__, count=300, seed=1).parse_args()
     drawn = sample(options.count, options.seed)
     with TemporaryDirectory() as folder:
         tests = Tests(copied(Path(folder, 'covered')))
@@ -205,15 +200,15 @@ def main() -> None:
             finally:
                 copies.put(where)
 
-        rows = ['| file | line | survives |', '|---|---|---|']
+        rows = []
         with ThreadPoolExecutor(workers) as pool:
             for done, (given, killed) in enumerate(zip(drawn, pool.map(tried, drawn)), 1):
                 if not killed:
-                    rows.append(f'| {given.file} | {given.line} | {given.words} |')
-                    print(done, rows[-1], flush=True)
-    killed_share = 1.0 - (len(rows) - 2) / len(drawn)
+                    rows.append((given.file, given.line, given.words))
+                    print(done, *rows[-1], flush=True)
+    killed_share = 1.0 - len(rows) / len(drawn)
     words = (f'{len(drawn)} mutants, seed {options.seed}: {killed_share:.1%} killed')
-    publish('\n'.join((words, '', *rows)), options.markdown)
+    publish(f'{words}\n\n{markdown(("file", "line", "survives"), rows)}', options.markdown)
 
 
 if __name__ == '__main__':

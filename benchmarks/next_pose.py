@@ -14,7 +14,6 @@ over the sets stays below 0.3 mg.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Sequence
 from pathlib import Path
 import sys
@@ -22,31 +21,26 @@ import sys
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from accel_calib.calibrate import directions_of, fit_poses, next_pose  # noqa: E402
-from accel_calib.effects import Model, model_with, predict, simulate_poses  # noqa: E402
+from accel_calib.effects import Model, predict, simulate_poses  # noqa: E402
 from accel_calib.errors import RefusedFitError  # noqa: E402
 from accel_calib.estimate import pose_noise  # noqa: E402
 from accel_calib.geometry import ATTITUDES  # noqa: E402
 from accel_calib.table import Floats, Poses  # noqa: E402
-from accel_calib.units import MG, units_of  # noqa: E402
-from directions import random_directions  # noqa: E402
-from figures import Line, publish, table  # noqa: E402
+from accel_calib.units import units_of  # noqa: E402
+from directions import held, joined, length_error_mg, random_directions, sensor  # noqa: E402
+from figures import Line, markdown, parser, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 
 G = units_of('g')
 AIM = 0.3
 NOISE, SAMPLES = 0.003, 100
 FEWEST, MOST = 9, 26
-OFF = np.radians(10.0)
+OFF = 10.0
+"""How far a person holds an attitude off, in each of two axes [°]."""
+
 SHOWN = (9, 10, 11, 12, 14, 16, 18, 20, 24)
 
 Order = Callable[[Poses | None, int, np.random.Generator], Floats]
-
-
-def held(direction: Floats, rng: np.random.Generator) -> Floats:
-    """Return a direction as a person holds it."""
-    off = rng.normal(size=3) * OFF
-    turned = direction + off - direction * (off @ direction)
-    return turned / np.linalg.norm(turned)
 
 
 def asked(poses: Poses | None, count: int, rng: np.random.Generator) -> Floats:
@@ -83,20 +77,13 @@ ORDERS: dict[str, tuple[Order, bool]] = {
     'random directions': (at_random, False)}
 
 
-def sensor(rng: np.random.Generator) -> Model:
-    """Draw a sensor."""
-    return model_with({'offset': rng.normal(size=3) * 0.03, 'axis_gain': rng.normal(size=3) * 0.02,
-                       'cross_axis': rng.normal(size=3) * 0.01})
-
-
 def error(model: Model, poses: Poses, fresh: Floats) -> float:
     """Return the RMS error of |a| on fresh directions [mg]; infinite if the fit is refused."""
     try:
         fitted = fit_poses(poses, G, model='10')
     except RefusedFitError:
         return np.inf
-    force = fitted.correct(predict(model, fresh, {}))
-    return float(np.sqrt(np.mean((np.linalg.norm(force, axis=1) - 1.0) ** 2)) * MG)
+    return length_error_mg(fitted.correct(predict(model, fresh, {})))
 
 
 def run(order: Order, by_hand: bool, seed: Sequence[int]) -> tuple[list[float], float]:
@@ -106,9 +93,9 @@ def run(order: Order, by_hand: bool, seed: Sequence[int]) -> tuple[list[float], 
     poses: Poses | None = None
     errors, enough = [], np.inf
     for count in range(MOST):
-        direction = order(poses, count, rng)
-        direction = held(direction, rng) if by_hand else direction
-        one = simulate_poses(model, direction[np.newaxis], rng, noise_g=NOISE, samples=SAMPLES)
+        direction = order(poses, count, rng)[np.newaxis]
+        direction = held(direction, OFF, rng) if by_hand else direction
+        one = simulate_poses(model, direction, rng, noise_g=NOISE, samples=SAMPLES)
         poses = one if poses is None else joined(poses, one)
         if count + 1 >= FEWEST:
             errors.append(error(model, poses, fresh))
@@ -116,12 +103,6 @@ def run(order: Order, by_hand: bool, seed: Sequence[int]) -> tuple[list[float], 
             if next_pose(directions, '10').direction is None:
                 enough = min(enough, count + 1)
     return errors, enough
-
-
-def joined(poses: Poses, one: Poses) -> Poses:
-    """Return poses followed by one more."""
-    columns = {key: np.concatenate([poses[key], one[key]]) for key in poses.columns}
-    return Poses(columns, np.arange(1, len(poses) + 2))
 
 
 def first_below(medians: Floats) -> int | None:
@@ -138,20 +119,13 @@ def words_of(count: int | None) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--sets', type=int, default=200)
-    parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--markdown', type=Path, help='write the tables to this file')
-    given = parser.parse_args(arguments)
-    lines, needed = [], {}
-    heads = ['poses', *map(str, SHOWN)]
-    rows = [f'| {" | ".join(heads)} |', '|---' * len(heads) + '|']
+    given = parser(__doc__, sets=200, seed=1).parse_args(arguments)
+    lines, needed, rows = [], {}, []
     for name, (order, by_hand) in ORDERS.items():
         found = [run(order, by_hand, [given.seed, k]) for k in range(given.sets)]
         medians = np.median([errors for errors, _ in found], axis=0)
         needed[name] = first_below(medians)
-        rows.append(f'| {name} | ' + ' | '.join(
-            f'{medians[count - FEWEST]:.3f}' for count in SHOWN) + ' |')
+        rows.append((name, *(f'{medians[count - FEWEST]:.3f}' for count in SHOWN)))
         lines.append(Line(f'poses to {AIM} mg, {name}', words_of(needed[name]), '', given.sets,
                           None))
         if order is asked:
@@ -169,7 +143,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                           given.sets, ours is not None and ours < (needed[name] or np.inf)))
     text = (f'# Figures of the next pose\n\n{__doc__.strip()}\n\nMade by `python '
             f'benchmarks/next_pose.py --sets {given.sets} --seed {given.seed} --markdown FILE`.'
-            f'\n\n{table(lines)}\n\nMedian error of |a| [mg]:\n\n' + '\n'.join(rows) + '\n')
+            f'\n\n{table(lines)}\n\nMedian error of |a| [mg]:\n\n'
+            f'{markdown(("poses", *SHOWN), rows)}\n')
     publish(text, given.markdown)
     return 0
 

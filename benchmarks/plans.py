@@ -20,7 +20,6 @@ The expected probability is compared with the outcome of the whole first plan: t
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -35,7 +34,7 @@ os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')  # each process
 
 from accel_calib.refine import PlannedPose, refine, Refinement, Step  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
-from figures import Line, publish, table  # noqa: E402
+from figures import Line, parser, publish, table  # noqa: E402
 from generator import Around, basis_of, plain_reading, Setup, simulate, Simulated  # noqa: E402
 from generator_effects import Floats, STANDARD_GRAVITY, unit  # noqa: E402
 import numpy as np  # noqa: E402
@@ -228,12 +227,9 @@ def lines_of(name: str, outcomes: Sequence[Outcome]) -> list[Line]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--sets', type=int, default=12, help='sets for each pair of twins')
-    parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--jobs', type=int, default=1, help='processes')
-    parser.add_argument('--markdown', type=Path, help='write the tables to this file')
-    given = parser.parse_args(arguments)
+    options = parser(__doc__, seed=1, jobs=1)
+    options.add_argument('--sets', type=int, default=12, help='sets for each pair of twins')
+    given = options.parse_args(arguments)
     lines = []
     for index, (first, second, *_) in enumerate(TWINS):
         outcomes = outcomes_of(index, given.sets, given.seed, given.jobs)

@@ -18,7 +18,6 @@ not among the sets, because still poses cannot show it::
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 import os
@@ -35,7 +34,7 @@ from accel_calib.findings import Expected, GOOD_MG, rate, rate_refinement, Ratin
 from accel_calib.refine import refine  # noqa: E402
 from accel_calib.table import Floats, numbered, Poses  # noqa: E402
 from accel_calib.units import MG, units_of  # noqa: E402
-from figures import Line, publish, table  # noqa: E402
+from figures import Line, markdown, parser, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 from robust_sets import draw_sensor, FACES, Sensor, spread, unit  # noqa: E402
 
@@ -285,28 +284,24 @@ def _share(part: int, whole: int) -> str:
 
 def by_kind(results: Sequence[Result]) -> str:
     """Return the ratings of each kind as a Markdown table."""
-    rows = ['| set | GOOD | USABLE | BAD | refused | median true error [mg] | largest of GOOD |',
-            '|---|---|---|---|---|---|---|']
+    rows = []
     for kind in KINDS:
         own = [each for each in results if each.kind == kind]
         if not own:
             continue
-        counts = ' | '.join(str(sum(each.name == name for each in own)) for name in NAMES)
+        counts = [sum(each.name == name for each in own) for name in NAMES]
         errors = [each.true_mg for each in own if each.rating is not None]
         middle = f'{np.median(errors):.2g}' if errors else ''
         largest = [each.true_mg for each in own if each.name == 'GOOD']
-        rows.append(f'| {kind.name} | {counts} | {middle} | '
-                    f'{f"{max(largest):.2g}" if largest else ""} |')
-    return '\n'.join(rows)
+        rows.append((kind.name, *counts, middle, f'{max(largest):.2g}' if largest else ''))
+    return markdown(('set', *NAMES, 'median true error [mg]', 'largest of GOOD'), rows)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--sets', type=int, default=100, help='sets of each kind')
-    parser.add_argument('--seed', type=int, default=SEED)
-    parser.add_argument('--markdown', type=Path, help='write the page')
-    given = parser.parse_args(arguments)
+    options = parser(__doc__, seed=SEED)
+    options.add_argument('--sets', type=int, default=100, help='sets of each kind')
+    given = options.parse_args(arguments)
     results = [tried(kind, number, given.seed) for kind in KINDS
                for number in range(max(given.sets // (4 if kind.refined else 1), 1))]
     text = (f'# Figures of the rating\n\n{__doc__.strip()}\n\n{table([*lines(results)])}\n\n'

@@ -15,13 +15,11 @@ each in a temporary folder, where 4 GB must be free.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from contextlib import redirect_stdout
 from importlib.metadata import version
 import os
 from pathlib import Path
-import platform
 import shutil
 from statistics import median
 import subprocess
@@ -38,7 +36,7 @@ from accel_calib.cli.main import main as accel_calib  # noqa: E402
 from accel_calib.effects import model_with, simulate_recording  # noqa: E402
 from accel_calib.geometry import spread_directions  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
-from figures import Line, processor, publish, table  # noqa: E402
+from figures import Line, machine, parser, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 from rosbags.rosbag2 import StoragePlugin, Writer  # noqa: E402
@@ -199,16 +197,12 @@ def command_lines(folder: Path, poses: Path, repeats: int) -> list[Line]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__.strip().split('\n')[0])
-    parser.add_argument('--messages', type=int, default=FULL)
-    parser.add_argument('--repeats', type=int, default=3)
-    parser.add_argument('--quick', action='store_true', help='200,000 messages, once')
-    parser.add_argument('--temporary', type=Path, help='parent of the temporary folder')
-    parser.add_argument('--markdown', type=Path, help='write the table to this file')
-    given = parser.parse_args(arguments)
+    options = parser(__doc__, messages=FULL, repeats=3)
+    options.add_argument('--quick', action='store_true', help='200,000 messages, once')
+    options.add_argument('--temporary', type=Path, help='parent of the temporary folder')
+    given = options.parse_args(arguments)
     count, repeats = (200_000, 1) if given.quick else (given.messages, given.repeats)
-    before = (f'{processor()} before; Python {platform.python_version()}, numpy {np.__version__}, '
-              f'rosbags {version("rosbags")}')
+    before = f'{machine()}, rosbags {version("rosbags")}'
     with TemporaryDirectory(dir=given.temporary) as name:
         folder = Path(name)
         poses, calibration = folder / 'poses.csv', folder / 'calibration.yaml'

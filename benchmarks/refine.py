@@ -16,7 +16,6 @@ or above, on sets that nothing was tuned with.
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter
 from collections.abc import Sequence
 import multiprocessing
@@ -28,7 +27,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')  # each process has one core
 
-from figures import publish, table  # noqa: E402
+from figures import markdown, parser, publish, table  # noqa: E402
 from generator_effects import CARRIER  # noqa: E402
 import numpy as np  # noqa: E402
 from refine_case import Case, Outcome, run  # noqa: E402
@@ -48,17 +47,16 @@ def by_effect(outcomes: Sequence[Outcome]) -> str:
     heads = ('row', 'hidden', 'sets', 'exact', 'rival', 'wrong', 'missed', 'error',
              'clean poses left out', 'parameters inside 3 sd', 'held-out residual over true form',
              'located', 'fresh over base', 'fresh over noise', 'instead')
-    rows = [f'| {" | ".join(heads)} |', '|---' * len(heads) + '|']
+    rows = []
     for kind in sorted({_kind(o) for o in outcomes}, key=lambda kind: (ROWS.index(kind[0]), kind)):
         group = [o for o in outcomes if _kind(o) == kind]
         counts = Counter(o.judgement for o in group)
         left_out = sum(len(o.disturbed - set(o.knocked)) for o in group) / len(group)
-        cells = (', '.join(filter(None, kind[:2])), kind[2], str(len(group)),
-                 *(str(counts[word]) for word in ('exact', 'rival', 'wrong', 'missed', 'error')),
-                 f'{left_out:.1f}', _inside(group), _over_true_form(group), _located(group),
-                 *_fresh_ratios(group), _instead(group))
-        rows.append(f'| {" | ".join(cells)} |')
-    return '\n'.join(rows)
+        rows.append((', '.join(filter(None, kind[:2])), kind[2], len(group),
+                     *(counts[word] for word in ('exact', 'rival', 'wrong', 'missed', 'error')),
+                     f'{left_out:.1f}', _inside(group), _over_true_form(group), _located(group),
+                     *_fresh_ratios(group), _instead(group)))
+    return markdown(heads, rows)
 
 
 def _kind(outcome: Outcome) -> tuple[str, str, str]:
@@ -119,14 +117,11 @@ def measured(cases: Sequence[Case], jobs: int) -> list[Outcome]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--sets', type=int, default=20, help='sets of each kind in each row')
-    parser.add_argument('--jobs', type=int, default=2, help='processes')
-    parser.add_argument('--only', action='append', choices=ROWS, help='only this row; repeatable')
-    parser.add_argument('--hidden', help='only sets in which this effect hides')
-    parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--markdown', type=Path, help='write the tables to this file')
-    given = parser.parse_args(arguments)
+    options = parser(__doc__, jobs=2, seed=1)
+    options.add_argument('--sets', type=int, default=20, help='sets of each kind in each row')
+    options.add_argument('--only', action='append', choices=ROWS, help='only this row; repeatable')
+    options.add_argument('--hidden', help='only sets in which this effect hides')
+    given = options.parse_args(arguments)
     lines, everything = [], []
     for row in given.only or ROWS:
         cases = [case for case in cases_of(row, given.sets, given.seed)

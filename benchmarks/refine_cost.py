@@ -12,7 +12,6 @@ Each case runs in a process of its own, so that its largest memory is its own::
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 import multiprocessing
@@ -26,7 +25,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 
 from accel_calib.refine import refine  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
-from figures import Line, processor, publish, table  # noqa: E402
+from figures import Line, machine, parser, publish, table  # noqa: E402
 from generator import Setup, simulate  # noqa: E402
 import numpy as np  # noqa: E402
 from refine_case import poses_of  # noqa: E402
@@ -59,27 +58,25 @@ def _memory_mb() -> float:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--poses', type=int, action='append', choices=list(LIMITS),
-                        help='number of poses; repeatable')
-    parser.add_argument('--seed', type=int, default=2028)
-    parser.add_argument('--markdown', type=Path, help='write the table to this file')
-    given = parser.parse_args(arguments)
-    lines = []
+    options = parser(__doc__, seed=2028)
+    options.add_argument('--poses', type=int, action='append', choices=list(LIMITS),
+                         help='number of poses; repeatable')
+    given = options.parse_args(arguments)
+    before, lines = machine(), []
     for poses in given.poses or LIMITS:
         for hidden in CASES:
             alone = ProcessPoolExecutor(1, multiprocessing.get_context('spawn'))
             with alone:
-                seconds, before, memory, result = alone.submit(
+                seconds, start, memory, result = alone.submit(
                     measured, hidden, poses, given.seed).result()
             lines.append(Line(f'{poses:,} poses, {hidden or "nothing"} hidden: seconds '
-                              f'({result}; memory {before:.0f} → {memory:.0f} MB)',
+                              f'({result}; memory {start:.0f} → {memory:.0f} MB)',
                               f'{seconds:.1f}', f'≤ {LIMITS[poses]:g}', 1,
                               seconds <= LIMITS[poses]))
             print(lines[-1].what, lines[-1].measured, file=sys.stderr, flush=True)
     only = ''.join(f' --poses {poses}' for poses in given.poses or ())
     publish(f'# Cost of refine with many poses\n\nMade by `python benchmarks/refine_cost.py{only} '
-            f'--markdown FILE` on {processor()}.\n\n{table(lines)}\n', given.markdown)
+            f'--markdown FILE` on {before}.\n\n{table(lines)}\n', given.markdown)
     return 0
 
 

@@ -18,7 +18,6 @@ nothing shows the cross-axis gains that it lacks.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterator, Sequence
 import multiprocessing
 import os
@@ -36,7 +35,7 @@ from accel_calib.errors import AccelCalibError  # noqa: E402
 from accel_calib.table import Floats, numbered, Recording  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
 from directions import random_directions  # noqa: E402
-from figures import Line, publish, table  # noqa: E402
+from figures import Line, parser, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 from robust_sets import (  # noqa: E402
     Case, draw, draw_sensor, error_mg, knock, misplaced, NOISE, spread, without_noise)
@@ -311,13 +310,9 @@ ROWS = {'knocks': knocks, 'bounds': bounds, 'placements': placements, 'intervals
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--sets', type=int, default=200)
-    parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--jobs', type=int, default=2, help='processes')
-    parser.add_argument('--only', choices=ROWS, action='append', help='only these; repeatable')
-    parser.add_argument('--markdown', type=Path, help='write the table to this file')
-    given = parser.parse_args(arguments)
+    options = parser(__doc__, sets=200, seed=1, jobs=2)
+    options.add_argument('--only', choices=ROWS, action='append', help='only these; repeatable')
+    given = options.parse_args(arguments)
     lines = []
     with multiprocessing.get_context('spawn').Pool(given.jobs) as pool:
         def run(one: Callable[[Job], Any], jobs: Sequence[Job]) -> list[Any]:

@@ -15,7 +15,6 @@ statement is right::
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Sequence
 from pathlib import Path
 import sys
@@ -30,7 +29,7 @@ from accel_calib.errors import AccelCalibError  # noqa: E402
 from accel_calib.logs import read_recording  # noqa: E402
 from accel_calib.table import Floats, numbered, Poses  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
-from figures import Line, publish, table  # noqa: E402
+from figures import Line, markdown, parser, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 from scipy.signal import butter, lfilter  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
@@ -268,12 +267,10 @@ def compared(found: dict[tuple[str, str], Sum]) -> str:
              'false poses',
              'median error of a mean, mg', 'largest, mg',
              'RMS error of its norm, mg', 'normalised error', 'the same of false poses')
-    rows = [f'| {" | ".join(heads)} |', '|---' * len(heads) + '|']
-    for (kind, rule), x in found.items():
-        rows.append(f'| {WHAT[kind]} | {rule} | {x.taken:.2%} | {x.used:.1%} | {x.missed:.1%} '
-                    f'| {x.false} | {x.error:.3f} | {x.worst:.1f} | {x.norm:.3f} '
-                    f'| {x.normalised:.2f} | {_figure(x.of_false)} |')
-    return '\n'.join(rows)
+    return markdown(heads, (
+        (WHAT[kind], rule, f'{x.taken:.2%}', f'{x.used:.1%}', f'{x.missed:.1%}', x.false,
+         f'{x.error:.3f}', f'{x.worst:.1f}', f'{x.norm:.3f}', f'{x.normalised:.2f}',
+         _figure(x.of_false)) for (kind, rule), x in found.items()))
 
 
 def _figure(value: float) -> str:
@@ -315,20 +312,20 @@ def real_cases(folder: Path) -> list[tuple[str, Case, int]]:
 
 def table_of_real(folder: Path) -> str:
     """Return the table of all rules on the real recordings, as Markdown."""
-    rows = ['| recording | rule | poses | taken by hand | samples used | residual, mg '
-            '| chi² per degree of freedom |', '|---|---|---|---|---|---|---|']
+    rows = []
     for name, case, wanted in real_cases(folder):
         for rule, find in RULES.items():
             poses = find(case)
             used = sum((case.time >= each.start) & (case.time <= each.end) for each in poses)
-            rows.append(f'| {name} | {rule} | {len(poses)} | {wanted} | {np.mean(used):.1%} '
-                        f'| {_fitted(poses, case.units)} |')
-    return '\n'.join(rows)
+            rows.append((name, rule, len(poses), wanted, f'{np.mean(used):.1%}',
+                         *_fitted(poses, case.units)))
+    return markdown(('recording', 'rule', 'poses', 'taken by hand', 'samples used',
+                     'residual, mg', 'chi² per degree of freedom'), rows)
 
 
-def _fitted(poses: Sequence[Pose], unit: str) -> str:
+def _fitted(poses: Sequence[Pose], unit: str) -> tuple[str, str]:
     if not poses:
-        return 'no poses | '
+        return 'no poses', ''
     columns = {'time': np.array([each.start for each in poses]),
                'reading': np.array([each.mean for each in poses]),
                'std': np.array([each.noise for each in poses]), 'count': np.ones(len(poses))}
@@ -336,19 +333,17 @@ def _fitted(poses: Sequence[Pose], unit: str) -> str:
         quality = fit_poses(Poses(columns, numbered(columns)), units_of(unit),  # type: ignore
                             model='10', method='algebraic').quality
     except AccelCalibError as error:
-        return f'no fit ({type(error).__name__}) | '
+        return f'no fit ({type(error).__name__})', ''
     chi2 = quality.chi2_per_dof
-    return f'{quality.rms_after_mg:.3f} | {"" if chi2 is None else f"{chi2:.1f}"}'
+    return f'{quality.rms_after_mg:.3f}', '' if chi2 is None else f'{chi2:.1f}'
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
-    parser.add_argument('--sets', type=int, default=60, help='recordings of each kind')
-    parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--data', type=Path, default=DATA, help='folder of the real recordings')
-    parser.add_argument('--markdown', type=Path, help='write the tables to this file')
-    given = parser.parse_args(arguments)
+    options = parser(__doc__, seed=1)
+    options.add_argument('--sets', type=int, default=60, help='recordings of each kind')
+    options.add_argument('--data', type=Path, default=DATA, help='folder of the real recordings')
+    given = options.parse_args(arguments)
     usual = measured(given.sets, given.seed, noisy=False)
     noisy = measured(given.sets, given.seed, noisy=True)
     lines = lines_of(usual, 'noise 0.3 to 5 mg', given.sets)

@@ -14,11 +14,9 @@ sensor rests for 4 s and is shaken for 1 s, with 2 mg of noise in steps of 1/163
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 import os
 from pathlib import Path
-import platform
 import sys
 import time
 import tracemalloc
@@ -32,7 +30,7 @@ from accel_calib.capture import capture, CaptureSettings, StillDetector  # noqa:
 from accel_calib.logs import read_recording  # noqa: E402
 from accel_calib.table import Recording  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
-from figures import Line, processor, publish, table  # noqa: E402
+from figures import Line, machine, parser, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 
 DATA = ROOT.parent / 'shared' / 'data'
@@ -150,14 +148,11 @@ def of_stream(seed: int) -> list[Line]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
-    parser.add_argument('--largest', type=int, default=SIZES[-1], help='samples, at most')
-    parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--data', type=Path, default=DATA, help='folder of the real recordings')
-    parser.add_argument('--markdown', type=Path, help='write the table to this file')
-    given = parser.parse_args(arguments)
-    before = (f'{processor()} before; Python {platform.python_version()}, '
-              f'numpy {np.__version__}')
+    options = parser(__doc__, seed=1)
+    options.add_argument('--largest', type=int, default=SIZES[-1], help='samples, at most')
+    options.add_argument('--data', type=Path, default=DATA, help='folder of the real recordings')
+    given = options.parse_args(arguments)
+    before = machine()
     sizes = [size for size in SIZES if size <= given.largest] or [given.largest]
     capture(recording_of(SIZES[0], RATES_HZ[0], given.seed), G)
     lines, each = of_arrays(sizes, given.seed)

@@ -12,12 +12,10 @@ The figures are messages lost, memory and latency::
 
 from __future__ import annotations
 
-import argparse
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 import time
 
-from figures import Line, processor, publish, table
+from figures import Line, machine, parser, publish, table
 from imu_path import quantile, stored
 from imu_trial import node, Trial, trial
 
@@ -60,13 +58,10 @@ def lines(trials: list[Trial], seconds: float) -> list[Line]:
 
 def main() -> None:
     """Print the table, or write it to a file."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--seconds', type=float, default=600.0)
-    parser.add_argument('--markdown', type=Path, help='write the table to this file')
-    given = parser.parse_args()
+    given = parser(__doc__, seconds=600.0).parse_args()
     command = '' if given.seconds == 600.0 else f'--seconds {given.seconds:g}'
+    about = _ABOUT.format(command=command, machine=machine())
     made = table(lines(run(given.seconds), given.seconds))
-    about = _ABOUT.format(command=command, machine=processor())
     publish(f'# Figures of two Imus\n\n{about}\n\n{made}\n', given.markdown)
 
 

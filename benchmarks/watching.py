@@ -31,7 +31,7 @@ from accel_calib.geometry import spread_directions  # noqa: E402
 from accel_calib.table import Floats  # noqa: E402
 from accel_calib.units import MG, units_of  # noqa: E402
 from directions import random_directions  # noqa: E402
-from figures import Line, publish, table  # noqa: E402
+from figures import Line, parser, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 
 Attitudes = Callable[[int, np.random.Generator], Floats]
@@ -217,13 +217,11 @@ The noise is that of a pose mean, by axis; {BEFORE} rests precede the change. A 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__.split('\n')[1])
-    parser.add_argument('--sets', type=int, default=200, help='sensors per kind of change')
-    parser.add_argument('--long', type=int, default=20, help='sensors monitored for alarms')
-    parser.add_argument('--rests', type=int, default=10000, help='rests of each of these sensors')
-    parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--markdown', type=Path, help='write the table here')
-    given = parser.parse_args(arguments)
+    options = parser(__doc__, seed=1)
+    options.add_argument('--sets', type=int, default=200, help='sensors per kind of change')
+    options.add_argument('--long', type=int, default=20, help='sensors monitored for alarms')
+    options.add_argument('--rests', type=int, default=10000, help='rests of each of these sensors')
+    given = options.parse_args(arguments)
     text = table(lines(given.sets, given.long, given.rests, given.seed))
     publish(f'{heading(given)}\n\n{text}\n\n{LIMITS}\n', given.markdown)
 

@@ -102,7 +102,7 @@ def test_workers_do_what_is_to_be_done_for_each_sensor(
         client: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_fleet(tmp_path / 'in', 6, 2)
     (tmp_path / 'in' / 'bad.csv').write_text('nothing of use\n')
-    for name in ('merge', 'of_sensor', 'finish'):
+    for name in ('merge', 'of_sensor'):
         monkeypatch.setattr(Store, name, None)  # in this process, which must not need them
     summary = run(client, found_in(tmp_path / 'in'), QUICK, Store(tmp_path / 'out'))
     assert summary.counts == {'ok': 12, 'error': 1}

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Mapping
 from pathlib import Path
 import re
@@ -23,7 +22,7 @@ from accel_calib.units import Units
 from fleet_case import page_of
 from inside import (
     as_folder, digest, digest_of, drift_of, merge_sensor, Months, not_agreeing, odd_sensors,
-    overview, schema, shared_effects, write_fleet_page, write_parquet)
+    overview, schema, SensorValues, shared_effects, write_fleet_page, write_parquet)
 import numpy as np
 import pytest
 
@@ -32,15 +31,19 @@ NAMES = ('offset.x', 'offset.y', 'offset.z', 'gain.x', 'gain.y', 'gain.z', 'gain
 
 
 def test_the_odd_sensors_of_a_fleet_are_named_and_few_others_by_chance() -> None:
-    rng, sure = np.random.default_rng(1), defaultdict(lambda: np.zeros(9))
-    values = {f's{k}': 0.01 * rng.normal(size=9) for k in range(60)}
-    assert odd_sensors(values, sure) == []
-    values['s7'][2] += 0.15
-    ((sensor, name, value, far),) = odd_sensors(values, sure)
-    assert (sensor, name, value) == ('s7', 'offset.z', values['s7'][2])
+    rng = np.random.default_rng(1)
+
+    def drawn(count: int) -> dict[str, SensorValues]:
+        return {f's{k}': SensorValues(0.01 * rng.normal(size=9), np.zeros(9), {})
+                for k in range(count)}
+
+    values = drawn(60)
+    assert odd_sensors(values) == []
+    values['s7'].mean[2] += 0.15
+    ((sensor, name, value, far),) = odd_sensors(values)
+    assert (sensor, name, value) == ('s7', 'offset.z', values['s7'].mean[2])
     assert far == pytest.approx(15.0, rel=0.4)
-    assert sum(bool(odd_sensors({str(k): rng.normal(size=9) for k in range(40)}, sure))
-               for _ in range(100)) <= 10
+    assert sum(bool(odd_sensors(drawn(40))) for _ in range(100)) <= 10
 
 
 def test_effects_that_sensors_share_are_counted_with_their_range() -> None:
@@ -48,7 +51,8 @@ def test_effects_that_sensors_share_are_counted_with_their_range() -> None:
     effects = {f's{k}': ({'offset_temperature.x': float(values[k])} if k < 31 else {})
                for k in range(40)}
     effects['s39'] = {'quadratic.x': 0.001}
-    (line,) = shared_effects(effects)
+    (line,) = shared_effects({name: SensorValues(np.zeros(9), np.zeros(9), each)
+                              for name, each in effects.items()})
     assert line == '31 of 40 sensors: offset_temperature.x 0.52 to 0.68 mg/°C'
 
 
@@ -73,7 +77,7 @@ def test_bad_calibrations_and_errors_do_not_enter_the_values() -> None:
     known = overview([digest('s', [
         row('ok', 'GOOD', 0.01), row('ok', 'USABLE', 0.03), row('ok', 'BAD', 5.0),
         row('ok', 'USABLE', 7.0), row('error', None, 9.0)])])
-    np.testing.assert_allclose(known.models[''].values['s'], 0.02)
+    np.testing.assert_allclose(known.models[''].values['s'].mean, 0.02)
     assert known.counts == {'GOOD': 1, 'USABLE': 2, 'BAD': 1, 'error': 1}
     assert known.left_out == 1
     assert len(known.errors) == 1
@@ -81,11 +85,10 @@ def test_bad_calibrations_and_errors_do_not_enter_the_values() -> None:
 
 def test_a_value_that_is_known_badly_is_not_odd() -> None:
     """Most sensors have no cross-axis gain, so that its spread over the fleet is zero."""
-    values = {f's{k}': np.zeros(9) for k in range(60)}
-    sds = {name: np.zeros(9) for name in values}
+    values = {f's{k}': SensorValues(np.zeros(9), np.zeros(9), {}) for k in range(60)}
     for name, size in (('s3', 3.0), ('s4', 30.0)):
-        values[name][6], sds[name][6] = size * 2e-4, 2e-4
-    assert [each[:2] for each in odd_sensors(values, sds)] == [('s4', 'gain.xy')]
+        values[name].mean[6], values[name].deviation[6] = size * 2e-4, 2e-4
+    assert [each[:2] for each in odd_sensors(values)] == [('s4', 'gain.xy')]
 
 
 def test_months_have_the_quantiles_of_all_calibrations() -> None:

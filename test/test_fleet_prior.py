@@ -13,7 +13,7 @@ from typing import Any
 from accel_calib.calibrate import Calibration, fit_poses, fit_with_fleet, FleetPrior
 from accel_calib.errors import InputError
 from accel_calib.logs import write_table
-from accel_calib.refine import refine, refine_with_fleet
+from accel_calib.refine import refine
 from accel_calib.stored import read_calibration, read_prior, write_calibration, write_priors
 from accel_calib.table import Floats, Poses
 from accel_calib.units import Units
@@ -152,7 +152,7 @@ def test_poses_that_carry_no_search_are_refined_to_the_fit_with_the_fleet(
         fleet: FleetPrior) -> None:
     rng = np.random.default_rng(7)
     poses = poses_of(bent(a_sensor(rng)), 6, rng)
-    result, fitted = refine_with_fleet(poses, IN_G, fleet), fit_with_fleet(poses, IN_G, fleet)
+    result, fitted = refine(poses, IN_G, base=fleet), fit_with_fleet(poses, IN_G, fleet)
     np.testing.assert_array_equal(result.calibration.model.vector, fitted.model.vector)
     assert result.steps == ()
     assert result.advice[0].startswith('no effects were searched: 6 poses, expected at least 9')
@@ -163,7 +163,7 @@ def test_a_refinement_with_the_fleet_finds_an_effect_beyond_it(fleet: FleetPrior
     rng = np.random.default_rng(8)
     sensor = bent(a_sensor(rng))
     poses = poses_of(sensor, 16, rng)
-    result = refine_with_fleet(poses, IN_G, fleet)
+    result = refine(poses, IN_G, base=fleet)
     assert [step.effect for step in result.steps] == ['quadratic']
     refined = result.calibration
     assert refined.method == 'fleet'
@@ -180,7 +180,7 @@ def test_a_refinement_of_few_noisy_poses_is_better_with_the_fleet(fleet: FleetPr
         poses = poses_of(sensor, 11, rng)
         noisy = poses.with_columns(reading=poses.reading + 0.008 * rng.normal(size=(11, 3)),
                                    std=np.full((11, 3), 0.08), count=np.full(11, 100.0))
-        with_fleet.append(error_mg(refine_with_fleet(noisy, IN_G, fleet).calibration, sensor))
+        with_fleet.append(error_mg(refine(noisy, IN_G, base=fleet).calibration, sensor))
         alone.append(error_mg(refine(noisy, IN_G, base='10').calibration, sensor))
     assert rms(with_fleet) < rms(alone)
 

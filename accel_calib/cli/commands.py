@@ -38,7 +38,7 @@ class Command(NamedTuple):
     summary: str
     module: str
     example: str
-    options: Callable[[options.Parser], None]
+    options: Callable[[options.Parser], None] = lambda made: None
     writes: str = ''
     about: str = ''
 
@@ -101,6 +101,10 @@ def next_command(step: NextStep, args: argparse.Namespace) -> str:
     return ''
 
 
+_ANY_LOG = ('CSV in any dialect, rosbag2 folder, .mcap, .db3, ROS 1 .bag, PX4 .ulg or '
+            'ArduPilot .bin')
+
+
 def _flat(text: str) -> int | str:
     if text in ('first', 'last'):
         return text
@@ -144,18 +148,14 @@ def _fit(made: options.Parser) -> None:
 
 
 def _calibrate(made: options.Parser) -> None:
-    made.add_argument(
-        'log', type=options.log_path, metavar='LOG', help='recording or pose table: CSV in any '
-        'dialect, rosbag2, .mcap, .db3, ROS 1 .bag, PX4 .ulg, ArduPilot .bin; - for standard '
-        'input')
+    options.add_source(made, 'log', f'recording or pose table: {_ANY_LOG}')
     _calibration_of_logs(made, '--prior', '--sensor-model', '--no-refine')
 
 
 def _thermal(made: options.Parser) -> None:
-    made.add_argument(
-        'logs', nargs='+', type=options.log_path, metavar='LOG', help='log of a still board whose '
-        'temperature changes; several are fitted together, and one of them may be of poses in '
-        'many directions; - for standard input')
+    options.add_source(
+        made, 'logs', 'log of a still board whose temperature changes; several are fitted '
+        'together, and one of them may be of poses in many directions', nargs='+', metavar='LOG')
     _calibration_of_logs(made)
 
 
@@ -206,9 +206,7 @@ def _compare(made: options.Parser) -> None:
 
 
 def _capture(made: options.Parser) -> None:
-    made.add_argument('recording', type=options.log_path, metavar='RECORDING', help='CSV in any '
-                      'dialect, rosbag2 folder, .mcap, .db3, ROS 1 .bag, PX4 .ulg or ArduPilot '
-                      '.bin; - for standard input')
+    options.add_source(made, 'recording', _ANY_LOG)
     made.add_argument('-o', '--output', type=Path, required=True, metavar='FILE',
                       help='pose table to write; - for standard output')
     options.add_capture(made)
@@ -217,9 +215,7 @@ def _capture(made: options.Parser) -> None:
 
 
 def _apply(made: options.Parser) -> None:
-    made.add_argument('recording', type=options.log_path, metavar='RECORDING',
-                      help='any log: CSV, rosbag2 folder, .mcap, .db3, ROS 1 .bag, …; - for '
-                      'standard input')
+    options.add_source(made, 'recording', _ANY_LOG)
     options.add_stored(made, required=True)
     made.add_argument('-o', '--output', type=Path, required=True, metavar='OUT',
                       help='CSV table or bag to write, of the same kind as the recording; - '
@@ -258,8 +254,7 @@ def _export(made: options.Parser) -> None:
 
 
 def _noise(made: options.Parser) -> None:
-    made.add_argument('recording', type=options.log_path, metavar='RECORDING',
-                      help='recording with a long rest: any log, or a bag; - for standard input')
+    options.add_source(made, 'recording', f'recording with a long rest: {_ANY_LOG}')
     options.add_stored(made, 'stored calibration to apply first, for readings in counts or volts')
     options.add_page(made, 'page to write with the Allan deviation and the figures (HTML)')
     options.add_log(made)
@@ -370,10 +365,6 @@ def _live(made: options.Parser) -> None:
     options.share(made, '--also')
 
 
-def _none(made: options.Parser) -> None:
-    """Add no options."""
-
-
 _FOR_ROS = 'all arguments after --ros-args are passed to ROS'
 
 COMMANDS = {
@@ -421,7 +412,7 @@ COMMANDS = {
         'write a calibration in the format of a firmware, an autopilot or another tool',
         'recordings', 'accel-calib export calibration.yaml --to c -o imu.h', _export, 'export'),
     'noise': Command(
-        'find noise density, bias instability and random walk from a long rest', 'recordings',
+        'find noise density, bias instability and random walk from a long rest', 'compare',
         'accel-calib noise rest.mcap --json noise.json --report noise.html', _noise),
     'simulate': Command(
         'simulate poses or a recording of a sensor with known effects', 'recordings',
@@ -439,10 +430,10 @@ COMMANDS = {
         'open the link that it prints in a browser; Ctrl-C ends it', _live, 'calibration'),
     'node': Command(
         'run the calibrator node', 'nodes',
-        f'accel-calib node --ros-args -r imu/data_raw:=/imu/raw\n\n{_FOR_ROS}', _none),
+        f'accel-calib node --ros-args -r imu/data_raw:=/imu/raw\n\n{_FOR_ROS}'),
     'simulator': Command(
         'run the simulated Imu node', 'nodes',
-        f'accel-calib simulator --ros-args -p poses:=12\n\n{_FOR_ROS}', _none),
+        f'accel-calib simulator --ros-args -p poses:=12\n\n{_FOR_ROS}'),
 }
 
 

@@ -1,30 +1,39 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""``accel-calib verify``, ``compare`` and ``history``: judge stored calibrations."""
+"""``accel-calib verify``, ``compare``, ``history``, ``noise``: judge calibrations and sensors."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from rich import box
 from rich.table import Table
 
-from .frame import Done, FAILED, intake, rated, rating_lines, rows_between, stored_calibration
-from .output import error_line, short_if_known, table, Verdict
+from .frame import (
+    Done, FAILED, intake, log_options, rated, rating_lines, read_lines, rows_between,
+    stored_calibration)
+from .output import error_line, NARROW, progress, short_if_known, table, Verdict
 from ..calibrate import verify
-from ..compare import compare, Comparison, History, history_of, LEVEL
+from ..compare import compare, Comparison, History, history_of
+from ..errors import InputError
 from ..findings import (
-    change_in_words, GAINS, in_words, OFFSETS, rate_comparison, rate_verification)
+    change_in_words, GAINS, in_words, OFFSETS, rate_comparison, rate_noise, rate_verification)
+from ..logs import open_log, OpenLog, Progress
+from ..noise import check_allantools, duration, noise_of, NoiseFigures, to_json, whole
+from ..pipeline import Correction
+from ..report import calibration_page
+from ..report.stability import (
+    comparison_page, figure_rows, history_page, kalibr_lines, need_lines, noise_page,
+    parameter_rows)
 from ..stored import read_calibration
-from ..table import check_units
-from ..text import plain, short
-from ..units import MG
+from ..table import check_units, Recording
+from ..text import counted, plain, short
+from ..units import units_of
 
 
 def run_verify(args: argparse.Namespace) -> Done:
@@ -36,13 +45,8 @@ def run_verify(args: argparse.Namespace) -> Done:
         check_units(poses, calibration.units)
         verification = verify(calibration, poses)
     rating = rate_verification(verification, calibration, poses)
-
-    def page() -> str:
-        from ..report import calibration_page
-
-        return calibration_page(calibration, rating, str(args.poses), notes=found.lines,
-                                verification=(verification, poses), stored=str(args.calibration))
-
+    page = partial(calibration_page, calibration, rating, str(args.poses), notes=found.lines,
+                   verification=(verification, poses), stored=str(args.calibration))
     result = {'file': args.poses, 'poses': len(poses), **asdict(verification),
               **rated(rating, args), 'read_as': found.read_as, 'read_lines': found.lines,
               'rating_lines': [str(line) for line in rating_lines(rating, args)]}
@@ -76,19 +80,14 @@ def run_compare(args: argparse.Namespace) -> Done:
     paths, calibrations = args.calibrations, [read_calibration(path) for path in args.calibrations]
     comparison = compare(calibrations)
     rating = rate_comparison(comparison)
-
-    def page() -> str:
-        from ..report.stability import comparison_page
-
-        return comparison_page(comparison, rating, paths, calibrations)
-
     models = [calibration.name for calibration in calibrations]
     outlier = comparison.outlier
     result = {**asdict(comparison), 'outlier': None if outlier is None else outlier + 1,
               'runs': [{'file': path, 'model': model, **asdict(run)} for path, model, run in
                        zip(paths, models, comparison.runs, strict=True)]}
     return Done(result, _comparison_lines(paths, models, comparison), rating,
-                status=0 if comparison.agree else FAILED, page=page)
+                status=0 if comparison.agree else FAILED,
+                page=partial(comparison_page, comparison, rating, paths, calibrations))
 
 
 def _comparison_lines(paths: list[Path], models: list[str], comparison: Comparison
@@ -100,42 +99,22 @@ def _comparison_lines(paths: list[Path], models: list[str], comparison: Comparis
           f'{run.largest_mg:.3g}', f'{run.p_value:.2g}') for number, (path, model, run) in
          enumerate(zip(paths, models, comparison.runs, strict=True), 1)))
     yield table(
-        'Spread of the parameters over the runs [mg]',
-        ('', 'mean', 'spread', 'stated', 'ratio'),
-        ((one.name, f'{one.values.mean() * MG:.2f}', f'{one.spread * MG:.3g}',
-          f'{(one.stated_sd ** 2).mean() ** 0.5 * MG:.3g}',
-          '' if one.ratio is None else f'{one.ratio:.2f}')
-         for one in comparison.parameters if np.any(one.stated_sd)))
+        'Spread of the parameters over the runs', ('', 'mean', 'spread', 'stated', 'ratio'),
+        parameter_rows(comparison))
     for note in comparison.notes:
         yield f'note: {note}'
     if comparison.tilt_words:
         yield comparison.tilt_words
-    yield _answer(comparison)
-
-
-def _answer(comparison: Comparison) -> str:
-    """Return the result as one line."""
-    test = f'p = {comparison.p_value:.2g}, limit {LEVEL:g}'
-    if comparison.agree:
-        return f'The calibrations agree within their uncertainties ({test}).'
-    if comparison.outlier is None:
-        more = '' if len(comparison.runs) > 2 else '; a third run would show which one differs'
-        return f'The calibrations do not agree ({test}){more}.'
-    return (f'The calibrations do not agree ({test}): run {comparison.outlier + 1} differs, the '
-            'others agree.')
+    if not comparison.agree and len(comparison.runs) == 2:
+        yield 'a third run would show which one differs'
 
 
 def run_history(args: argparse.Namespace) -> Done:
     """Sort calibrations by date, and compare them."""
     calibrations = [read_calibration(path) for path in args.calibrations]
     history = history_of(calibrations)
-
-    def page() -> str:
-        from ..report.stability import history_page
-
-        return history_page(history, args.calibrations, calibrations)
-
-    return Done(_history_result(args, history), _history_lines(history), page=page)
+    return Done(_history_result(args, history), _history_lines(history),
+                page=partial(history_page, history, args.calibrations, calibrations))
 
 
 def _history_result(args: argparse.Namespace, history: History) -> dict[str, Any]:
@@ -174,17 +153,61 @@ def _history_lines(history: History) -> Iterator[Any]:
 
 def _dates_table(history: History) -> Table:
     """Return a table of offset and gain, one row per calibration and axis."""
-    made = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, pad_edge=False)
-    for name in ('date', ''):
-        made.add_column(name, no_wrap=True)
-    for name in ('offset [mg]', 'gain - 1 [%]'):
-        made.add_column(name, no_wrap=True, justify='right')
+    rows = []
     found = {each.name: each for each in history.parameters}
     for k, (label, moment) in enumerate(zip(history.labels, history.moments, strict=True)):
         warm = '' if moment.temperature is None else f'{moment.temperature:.0f} °C'
         for begin, names in zip((label, warm, ''), zip(OFFSETS, GAINS, strict=True), strict=True):
             cells = (in_words(name, found[name].values[k], found[name].stated_sd[k])
                      for name in names)
-            made.add_row(begin, names[0][-1], *(cell.rpartition(' ')[0].replace('−', '-')
-                                                for cell in cells))
-    return made
+            rows.append((begin, names[0][-1], *(cell.rpartition(' ')[0].replace('−', '-')
+                                                for cell in cells)))
+    return table('', ('date', '', 'offset [mg]', 'gain - 1 [%]'), rows, show_edge=False, **NARROW)
+
+
+def run_noise(args: argparse.Namespace) -> Done:
+    """Find a long rest, and compute the figures of its noise."""
+    check_allantools()
+    calibration = args.calibration and stored_calibration(args.calibration)
+    with open_log(args.recording, log_options(args, calibration)) as log:
+        with progress('samples') as moved:
+            recording = _samples(log, args.recording, moved)
+        lines, units = read_lines(log), log.units
+    if calibration:
+        recording = Correction(calibration, units, recording.sensor)(recording)
+        units = units_of('g') if units.is_native else units
+    with progress('axes') as moved:
+        found = noise_of(recording, units, args.gravity, moved)
+    return Done({'recording': args.recording, **to_json(found)}, [*lines, *_noise_lines(found)],
+                rate_noise(found), page=partial(noise_page, found, str(args.recording)))
+
+
+def _samples(log: OpenLog, path: Path, moved: Progress) -> Recording:
+    """
+    Return the samples of a log.
+
+    A table of slow samples has the form of a pose table without the columns of a pose.
+
+    """
+    if log.poses is None:
+        return whole(log.watched(moved))
+    if 'time' in log.poses and 'count' not in log.poses:
+        return log.poses.as_recording()
+    raise InputError(f'{path} is a pose table, expected a recording',
+                     'use the samples of a long rest, with their time')
+
+
+def _noise_lines(found: NoiseFigures) -> Iterator[str | Table]:
+    """Yield the figures by axis, the notes, and the figures for Kalibr."""
+    yield (f'rest of {duration(found.seconds)}: {counted(found.samples, "sample")} at '
+           f'{found.rate:.5g} Hz')
+    for kind in found.kinds:
+        axes = found.of(kind)
+        rows = list(figure_rows(axes))
+        yield table(kind, ('', *(axis.axis for axis in axes)), (
+            (f'{label}, {unit}', *cells[:-1]) for label, unit, cells in rows), **NARROW)
+        yield from (f'typical {label}: {cells[-1]} {unit}'
+                    for label, unit, cells in rows if cells[-1])
+    yield from (f'note: {note}' for note in found.notes)
+    yield from need_lines(found)
+    yield from kalibr_lines(found)

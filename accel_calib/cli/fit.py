@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
@@ -15,11 +15,10 @@ import numpy as np
 from rich.table import Table
 
 from .frame import (
-    console, Done, FAILED, given, intake, log_options, no_page, prior, rows_between, settings,
+    console, Done, FAILED, given, intake, log_options, prior, rows_between, settings,
     stored_calibration)
 from .output import error_line, progress, short_if_known, table, Verdict, working
 from ..calibrate import Calibration, Curve, GyroBias, NORM_MODELS, outlook
-from ..disk import STANDARD_OUTPUT
 from ..effects import AXES, effect_named
 from ..errors import InputError
 from ..findings import (
@@ -54,7 +53,7 @@ def run_fit(args: argparse.Namespace) -> Done:
 
 
 def run_calibrate(args: argparse.Namespace) -> Done:
-    """Calibrate, store, and write the page."""
+    """Calibrate and store."""
     with intake(args, args.log) as found, working('fitting'):
         outcome = calibrated_log(args.log, log_options(args), found, plan_of(args))
     if isinstance(outcome, ThermalOutcome):
@@ -66,9 +65,8 @@ def run_calibrate(args: argparse.Namespace) -> Done:
         {'file': args.log, **calibration_json(calibration, outlook(calibration, 'auto')),
          'read_as': found.read_as, 'read_lines': found.lines, 'refined': outcome.line,
          'refinement': None if refinement is None else refinement_json(refinement)},
-        [*found.lines, *calibration_lines(calibration), outcome.line, *lines,
-         *page_beside(args, partial(_page, args, args.log, found, outcome))],
-        outcome.rating, status_of(outcome), stored)
+        [*found.lines, *calibration_lines(calibration), outcome.line, *lines],
+        outcome.rating, status_of(outcome), stored, partial(_page, args, args.log, found, outcome))
 
 
 def run_thermal(args: argparse.Namespace) -> Done:
@@ -84,23 +82,19 @@ def run_thermal(args: argparse.Namespace) -> Done:
 
 def _thermal_done(args: argparse.Namespace, logs: Sequence[Path], outcome: ThermalOutcome,
                   *notes: str) -> Done:
-    """Store, write the page, and return what is done, with further notes on the logs."""
+    """Store, and return what is done, with further notes on the logs."""
+    from ..report import thermal_page
+
     calibration, (left_out, stored) = outcome.calibration, store(args, outcome)
     lines = [*(line for each in outcome.logs for line in each.lines), *notes]
     is_whole = any(isinstance(each, Intake) for each in outcome.logs)
-
-    def page() -> str:
-        from ..report import thermal_page
-
-        return thermal_page(outcome, list(map(str, logs)), stored=str(args.output), notes=lines)
-
     return Done(
         {'file': list(logs), **calibration_json(calibration, outlook(calibration, 'auto')),
          'read_as': outcome.read_as, 'read_lines': lines, 'thermal': curve_json(outcome.curve)},
         [*lines, *_curve_lines(outcome.curve),
-         *(calibration_lines(calibration) if is_whole else _notes(calibration)), *left_out,
-         *page_beside(args, page)],
-        outcome.rating, status_of(outcome), stored)
+         *(calibration_lines(calibration) if is_whole else _notes(calibration)), *left_out],
+        outcome.rating, status_of(outcome), stored,
+        partial(thermal_page, outcome, list(map(str, logs)), stored=str(args.output), notes=lines))
 
 
 def _curve_lines(curve: Curve) -> Iterator[Any]:
@@ -159,24 +153,6 @@ def _page(args: argparse.Namespace, log: Path, found: Intake, outcome: Outcome) 
     return calibration_page(outcome.calibration, outcome.rating, str(log), notes=found.lines,
                             refinement=outcome.refinement,
                             stored=str(args.output or 'calibration.yaml'))
-
-
-def page_beside(args: argparse.Namespace, page_of: Callable[[], str]) -> Iterator[str]:
-    """Write the page beside the calibration, if that is possible; yield a line about it."""
-    from ..report import has_matplotlib, write_page
-
-    if str(args.output) == STANDARD_OUTPUT:
-        return
-    page = args.output.with_suffix('.html')
-    if not has_matplotlib():
-        yield f'no page {page}: matplotlib is not installed'
-        return
-    try:
-        with working('drawing the page'):
-            write_page(page, page_of())
-        yield f'page: {page}'
-    except OSError as err:  # the calibration is stored
-        yield no_page(page, err)
 
 
 def several_fit(results: Sequence[dict[str, Any]]) -> Iterator[str]:
@@ -238,6 +214,8 @@ def _gyro_line(gyro: GyroBias) -> str:
 
 def run_refine(args: argparse.Namespace) -> Done:
     """Refine a calibration, and store it unless it is refused."""
+    from ..report import refinement_page
+
     found, result = _refined(args)
     stored = []
     if args.output is not None and not result.refusal:
@@ -250,39 +228,30 @@ def run_refine(args: argparse.Namespace) -> Done:
         stored.append(args.plan)
     return Done({'file': args.poses, **refinement_json(result), 'read_as': found.read_as},
                 [*found.lines, *_shown(args, result)], rate_refinement(result), stored=stored,
-                page=partial(_page_of_effects, args, result),
+                page=partial(refinement_page, result, str(args.poses)),
                 refusal=result.refusal if args.output else ())
 
 
 def run_report(args: argparse.Namespace) -> Done:
     """Refine a calibration, and write the report and the figures."""
-    from ..report import write_figures
+    from ..report import refinement_page, write_figures
 
     _, result = _refined(args)
     lines: list[str] = [result.verdict]
     if args.figures is not None:
         count = len(write_figures(args.figures, result))
         lines.append(f'{counted(count, "file")}, stored in {args.figures}')
-    return Done(shown=lines, page=partial(_page_of_effects, args, result))
-
-
-def _page_of_effects(args: argparse.Namespace, result: Refinement) -> str:
-    from ..report import refinement_page
-
-    return refinement_page(result, str(args.poses))
+    return Done(shown=lines, page=partial(refinement_page, result, str(args.poses)))
 
 
 def _refined(args: argparse.Namespace) -> tuple[Intake, Refinement]:
     """Refine with one log."""
-    from ..refine import refine, refine_with_fleet  # a fit alone does not load the search
+    from ..refine import refine  # a fit alone does not load the search
 
     stored = args.calibration and stored_calibration(args.calibration)
     with intake(args, args.poses, stored) as found, working('refining'):
         poses = found.poses.take(rows_between(found.poses, args.rows))
-        base, fleet = stored.in_units(found.units) if stored else args.base, prior(args)
-        if fleet is not None:
-            return found, refine_with_fleet(poses, found.units, fleet, sensor=args.sensor,
-                                            date=now(), also=args.own)
+        base = stored.in_units(found.units) if stored else prior(args) or args.base
         return found, refine(poses, found.units, base=base, sensor=args.sensor, date=now(),
                              also=args.own)
 

@@ -36,7 +36,7 @@ from ..capture import CaptureSettings
 from ..disk import replaceable, STANDARD_OUTPUT, write_atomically
 from ..effects import know_file
 from ..errors import AccelCalibError, InputError, RefusedFitError, saying, system_error
-from ..logs import LogOptions
+from ..logs import LogOptions, OpenLog
 from ..pipeline import Intake, options_for, poses_of
 from ..stored import calibration_from, OF_FILE, read_calibration, read_prior
 from ..table import Poses
@@ -108,7 +108,7 @@ def run(args: argparse.Namespace) -> int:
     """
     each = _for_each(args)
     _check_targets(args, each)
-    if _page_of(args) is not None:
+    if args.command not in _WITH_PAGE and _page_of(args) is not None:
         from ..report import check_matplotlib
 
         check_matplotlib()
@@ -121,7 +121,9 @@ def _function(kind: str, command: str) -> Callable[[Any], Any]:
 
 
 def _page_of(args: argparse.Namespace) -> Path | None:
-    """Return the page that is asked for."""
+    """Return the page that is asked for, or is beside the calibration."""
+    if args.command in _WITH_PAGE:
+        return None if str(args.output) == STANDARD_OUTPUT else args.output.with_suffix('.html')
     name = 'output' if COMMANDS[args.command].writes == 'page' else 'report'
     return getattr(args, name, None)
 
@@ -132,24 +134,25 @@ def _done(args: argparse.Namespace) -> Done:
     args.own = () if path is None else know_file(path)
     done: Done = _function('run', args.command)(args)
     if page is not None and done.page is not None:
-        from ..report import write_page
-
-        try:
-            with working('drawing the page'):
-                write_page(page, done.page())
-            done = replace(done, stored=[*done.stored, page])
-        except OSError as err:
-            if not done.stored:
-                raise
-            done = replace(done, shown=[*done.shown, no_page(page, err)])
+        done = _with_page(done, page, done.page, beside=args.command in _WITH_PAGE)
     if done.rating is not None:
         done = replace(done, result={**done.result, **rated(done.rating, args)})
     return done
 
 
-def no_page(page: Path, error: OSError) -> str:
-    """Return a line about a page that cannot be written beside what is stored."""
-    return f'no page {page}: {system_error(error)}'
+def _with_page(done: Done, page: Path, text_of: Callable[[], str], *, beside: bool) -> Done:
+    """Write the page; one that cannot be written beside a calibration is only noted."""
+    from ..report import check_matplotlib, write_page
+
+    try:
+        check_matplotlib()
+        with working('drawing the page'):
+            write_page(page, text_of())
+    except (InputError, OSError) as err:
+        if not (beside or done.stored):
+            raise
+        return replace(done, shown=[*done.shown, f'no page {page}: {_known(err)}'])
+    return replace(done, stored=[*done.stored, page])
 
 
 def _run_one(args: argparse.Namespace) -> int:
@@ -193,8 +196,12 @@ def _attempt(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     return BAD_INPUT if refused else done.status, {**plain(done.result), **refused}
 
 
+def _known(error: AccelCalibError | OSError) -> AccelCalibError:
+    return system_error(error) if isinstance(error, OSError) else error
+
+
 def _of_error(error: AccelCalibError | OSError) -> dict[str, str]:
-    known = system_error(error) if isinstance(error, OSError) else error
+    known = _known(error)
     read_as = {'read_as': known.read_as} if known.read_as else {}
     return {'error': known.message, 'advice': known.advice, **read_as}
 
@@ -204,23 +211,17 @@ def _in_parallel(function: Any, items: Sequence[Any], jobs: int) -> list[Any]:
     if jobs <= 1:
         return [function(item) for item in items]
     from concurrent.futures import ThreadPoolExecutor
-    from queue import SimpleQueue
+    from threading import local
 
     from ..session import WorkerProcess
 
-    count, free = min(jobs, len(items)), SimpleQueue[WorkerProcess]()
+    own, workers = local(), ExitStack()
 
-    def one(item: Any) -> Any:
-        worker = free.get()
-        try:
-            return worker.call(function, item)
-        finally:
-            free.put(worker)
+    def begin() -> None:
+        own.worker = workers.enter_context(closing(WorkerProcess(idle=False)))
 
-    with ThreadPoolExecutor(count) as pool, ExitStack() as workers:
-        for _ in range(count):
-            free.put(workers.enter_context(closing(WorkerProcess(idle=False))))
-        return list(pool.map(one, items))
+    with ThreadPoolExecutor(min(jobs, len(items)), initializer=begin) as pool, workers:
+        return list(pool.map(lambda item: own.worker.call(function, item), items))
 
 
 def rated(rating: Rating, args: argparse.Namespace) -> dict[str, Any]:
@@ -372,6 +373,12 @@ def intake(args: argparse.Namespace, path: Path, calibration: Calibration | None
         found = poses_of(path, log_options(args, calibration), settings(args), moved)
     with saying(found.said):
         yield found
+
+
+def read_lines(log: OpenLog) -> list[str]:
+    """Return how a log was read."""
+    said = [f'read as: {log.read_as}'] if log.read_as else []
+    return said + [f'note: {line}' for line in log.notes]
 
 
 def stored_calibration(path: Path) -> Calibration:

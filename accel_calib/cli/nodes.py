@@ -19,7 +19,6 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 import math
-import os
 import signal
 import sys
 from typing import Any, NamedTuple, TYPE_CHECKING
@@ -204,15 +203,11 @@ def run_watch(args: argparse.Namespace) -> Done:
             raise InputError(f'ROS 2 is not installed ({err}), but the command needs it',
                              NEEDS_ROS) from err
         for_ros = [args.command, *args.for_ros]
-        try:
-            if args.once:
-                _print(*watch.current(args.node, is_over, for_ros))
-            else:
-                with _output(args.bell) as show:
-                    watch.watch(args.node, show, is_over, for_ros)
-        except BrokenPipeError:
-            # The reader of the pipe has ended. Python must not write the rest at its exit.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if args.once:
+            _print(*watch.current(args.node, is_over, for_ros))
+        else:
+            with _output(args.bell) as show:
+                watch.watch(args.node, show, is_over, for_ros)
     return Done()
 
 

@@ -132,19 +132,6 @@ def _columns(text: str) -> dict[str, str]:
 _TYPES: dict[str, Any] = {'float': positive, 'float | None': positive, 'int | None': int}
 """Types of options by those of the fields of records; others are text."""
 
-_CAPTURE: dict[str, dict[str, Any]] = {
-    'still_window': {'metavar': 'S', 'help': 'length of the sliding window [s]'},
-    'still_std_max': {'metavar': 'STD', 'help': 'largest standard deviation of a still sensor, in '
-                      'the unit of ax (default: adapts to the noise of the sensor)'},
-    'still_gyro_max': {'metavar': 'RAD/S', 'help': 'largest mean angular rate (default: not '
-                       'checked)'},
-    'still_norm_tolerance': {'metavar': 'G', 'help': 'largest difference of |mean| from 1 g'},
-    'min_dwell': {'metavar': 'S', 'help': 'shortest still stretch that becomes a pose'},
-    'max_dwell': {'metavar': 'S', 'help': 'split longer rests into poses with the same '
-                  'orientation'},
-    'min_pose_angle': {'metavar': 'RAD', 'help': 'poses within this angle count as repeated'}}
-"""Options of the capture, by the fields of `CaptureSettings`."""
-
 _SHARED: dict[str, dict[str, Any]] = {
     '--rows': {'metavar': 'A:B', 'help': 'rows A to B, 1-based, inclusive'},
     '--jobs': {'type': int, 'default': 1, 'metavar': 'N',
@@ -173,13 +160,14 @@ def share(made: Any, *names: str) -> None:
         made.add_argument(name, **_SHARED[name])
 
 
-def add_fields(made: Any, record: Any, options: Mapping[str, Mapping[str, Any]]) -> None:
+def add_fields(made: Any, record: Any, options: Mapping[str, Mapping[str, Any]],
+               **usual: Any) -> None:
     """Add options for fields of a record to a parser or a group, with types and defaults."""
     for name, about in options.items():
         field = record.__dataclass_fields__[name]
         kind = ({'action': 'store_true'} if field.type == 'bool' else
                 {'default': field.default, 'type': _TYPES.get(field.type, utf8)})
-        made.add_argument(f'--{name.replace("_", "-")}', **{**kind, **about})
+        made.add_argument(f'--{name.replace("_", "-")}', **{**kind, **usual, **about})
 
 
 def units(default: str = '') -> dict[str, dict[str, Any]]:
@@ -221,16 +209,31 @@ def add_capture(made: Parser) -> None:
 
     group = made.add_argument_group('capture of poses from a recording')
     add_fields(group, CaptureSettings, {
-        **{name: {'default': None, **about} for name, about in _CAPTURE.items()},
-        'repeated': {'default': None, 'choices': REPEATED, 'help': 'keep, merge or refuse '
-                     'repeated poses'}})
+        'still_window': {'metavar': 'S', 'help': 'length of the sliding window [s]'},
+        'still_std_max': {'metavar': 'STD', 'help': 'largest standard deviation of a still '
+                          'sensor, in the unit of ax (default: adapts to the noise of the '
+                          'sensor)'},
+        'still_gyro_max': {'metavar': 'RAD/S', 'help': 'largest mean angular rate (default: not '
+                           'checked)'},
+        'still_norm_tolerance': {'metavar': 'G', 'help': 'largest difference of |mean| from 1 g'},
+        'min_dwell': {'metavar': 'S', 'help': 'shortest still stretch that becomes a pose'},
+        'max_dwell': {'metavar': 'S', 'help': 'split longer rests into poses with the same '
+                      'orientation'},
+        'min_pose_angle': {'metavar': 'RAD', 'help': 'poses within this angle count as repeated'},
+        'repeated': {'choices': REPEATED, 'help': 'keep, merge or refuse repeated poses'}},
+        default=None)
+
+
+def add_source(made: Parser, name: str, about: str, **more: Any) -> None:
+    """Add the argument for a log, which can come through standard input."""
+    made.add_argument(name, type=log_path, help=f'{about}; - for standard input',
+                      **{'metavar': name.upper(), **more})
 
 
 def add_poses(made: Parser, number: str | None = '+') -> None:
     """Add the options for reading the poses of one or several logs."""
-    made.add_argument('poses', nargs=number, type=log_path, metavar='POSES',
-                      help='pose table, or a recording, whose poses are captured first; - for '
-                      'standard input')
+    add_source(made, 'poses', 'pose table, or a recording, whose poses are captured first',
+               nargs=number)
     share(made, '--rows')
     add_log(made)
     add_capture(made)

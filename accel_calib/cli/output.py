@@ -20,6 +20,7 @@ import sys
 from textwrap import wrap
 from typing import Any, TYPE_CHECKING
 
+from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -92,9 +93,14 @@ def shown(text: str, encoding: str) -> str:
     return safe.encode(encoding, plain_handler()).decode(encoding)
 
 
-def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
+NARROW: Any = {'box': box.SIMPLE_HEAD, 'padding': (0, 1, 0, 0), 'pad_edge': False}
+"""Style of a table whose cells are long."""
+
+
+def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], **style: Any
+          ) -> Table:
     """Return a table whose first column holds names, and the others numbers."""
-    made = Table(title=title)
+    made = Table(title=title, **style)
     made.add_column(columns[0], overflow='fold')
     for name in columns[1:]:
         made.add_column(name, justify='right')

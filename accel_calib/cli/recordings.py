@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""``accel-calib capture``, ``apply``, ``simulate``, ``noise``, ``export``: files to files."""
+"""``accel-calib capture``, ``apply``, ``simulate``, ``export``: files to files."""
 
 from __future__ import annotations
 
@@ -12,25 +12,19 @@ from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich import box
-from rich.table import Table
-
-from .frame import check_target, Done, given, log_options, settings, stored_calibration, Target
+from .frame import (
+    check_target, Done, given, log_options, read_lines, settings, stored_calibration, Target)
 from .output import Output, progress
 from ..calibrate import Calibration
 from ..capture import Captured
 from ..disk import STANDARD_OUTPUT, write_atomically
 from ..effects import parse_effect
 from ..errors import InputError
-from ..findings import rate_noise
-from ..logs import is_bag, open_log, OpenLog, Progress, write_blocks, write_table
+from ..logs import is_bag, open_log, write_blocks, write_table
 from ..pipeline import captured_from, Correction
-from ..table import Recording
 from ..text import counted
-from ..units import units_of
 
 if TYPE_CHECKING:
-    from ..noise import AxisNoise, NoiseFigures
     from ..stored.exports import Exported
 
 
@@ -87,15 +81,9 @@ def _correct_table(args: argparse.Namespace, calibration: Calibration, lines: li
         correction = Correction(calibration, log.units, log.sensor)
         blocks = log.watched(moved) if log.poses is None else (log.poses,)
         count = write_blocks(args.output, map(correction, blocks))
-        lines += _read_lines(log)
+        lines += read_lines(log)
     lines += [f'note: {line}' for line in correction.notes]
     return count
-
-
-def _read_lines(log: OpenLog) -> list[str]:
-    """Return how a log was read."""
-    said = [f'read as: {log.read_as}'] if log.read_as else []
-    return said + [f'note: {line}' for line in log.notes]
 
 
 def run_simulate(args: argparse.Namespace) -> Done:
@@ -107,80 +95,6 @@ def run_simulate(args: argparse.Namespace) -> Done:
     table = simulate(dict(parse_effect(text) for text in args.effect), **chosen)
     write_table(args.output, table)
     return Done(shown=[counted(len(table), 'row')], stored=[args.output])
-
-
-def run_noise(args: argparse.Namespace) -> Done:
-    """Find a long rest, and compute the figures of its noise."""
-    from ..noise import check_allantools, to_json
-    from ..report.stability import noise_page
-
-    check_allantools()
-    found, lines = _noise(args)
-    return Done({'recording': args.recording, **to_json(found)}, [*lines, *_noise_lines(found)],
-                rate_noise(found),
-                page=lambda: noise_page(found, str(args.recording)))
-
-
-def _noise(args: argparse.Namespace) -> tuple[NoiseFigures, list[str]]:
-    """Return the figures, and how the recording was read."""
-    from ..noise import noise_of
-
-    calibration = args.calibration and stored_calibration(args.calibration)
-    with open_log(args.recording, log_options(args, calibration)) as log:
-        with progress('samples') as moved:
-            recording = _samples(log, args.recording, moved)
-        lines, units = _read_lines(log), log.units
-    if calibration:
-        recording = Correction(calibration, units, recording.sensor)(recording)
-        units = units_of('g') if units.is_native else units
-    with progress('axes') as moved:
-        return noise_of(recording, units, args.gravity, moved), lines
-
-
-def _samples(log: OpenLog, path: Path, moved: Progress) -> Recording:
-    """
-    Return the samples of a log.
-
-    A table of slow samples has the form of a pose table without the columns of a pose.
-
-    """
-    from ..noise import whole
-
-    if log.poses is None:
-        return whole(log.watched(moved))
-    if 'time' in log.poses and 'count' not in log.poses:
-        return log.poses.as_recording()
-    raise InputError(f'{path} is a pose table, expected a recording',
-                     'use the samples of a long rest, with their time')
-
-
-def _noise_lines(found: NoiseFigures) -> Iterator[str | Table]:
-    """Yield the figures by axis, the notes, and the figures for Kalibr."""
-    from ..noise import duration
-    from ..report.stability import figure_rows, kalibr_lines, need_lines
-
-    yield (f'rest of {duration(found.seconds)}: {counted(found.samples, "sample")} at '
-           f'{found.rate:.5g} Hz')
-    for kind in found.kinds:
-        yield _noise_table(kind, found.of(kind))
-        yield from (f'typical {label}: {cells[-1]} {unit}'
-                    for label, unit, cells in figure_rows(found.of(kind)) if cells[-1])
-    yield from (f'note: {note}' for note in found.notes)
-    yield from need_lines(found)
-    yield from kalibr_lines(found)
-
-
-def _noise_table(kind: str, axes: tuple[AxisNoise, ...]) -> Table:
-    """Return the table of one sensor, at most 60 columns wide."""
-    from ..report.stability import figure_rows
-
-    table = Table(title=kind, box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    table.add_column('')
-    for axis in axes:
-        table.add_column(axis.axis, justify='right', no_wrap=True)
-    for label, unit, cells in figure_rows(axes):
-        table.add_row(f'{label}, {unit}', *cells[:-1])
-    return table
 
 
 def run_export(args: argparse.Namespace) -> Done:

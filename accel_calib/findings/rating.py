@@ -21,6 +21,7 @@ from .figures import (
     LEFT_OUT, MATTERS, mg, NEAR_FLAT, number, PER_OUTLIER, SPAN, TILT, TO_CHECK, without_noise,
     WORST_ERROR)
 from ..calibrate import Calibration, directions_in, flat_direction, Verification
+from ..compare import LEVEL
 from ..effects import EMPIRICAL, kind_of, WANDER
 from ..errors import TAKE_ALL_SIDES
 from ..finding import Finding, NextStep, ranked, rated, Rating, without
@@ -338,9 +339,10 @@ def rate_comparison(comparison: Comparison) -> Rating:
 
     """
     largest = max(comparison.runs, key=lambda run: run.rms_mg)
-    figures = (f'{counted(len(comparison.runs), "calibration")}, difference '
-               f'{mg(largest.rms_mg)}, up to {mg(max(r.largest_mg for r in comparison.runs))}, '
-               f'expected {mg(largest.expected_mg)}, p = {comparison.p_value:.1g}')
+    figures = (f'{counted(len(comparison.runs), "calibration")} '
+               f'{"agree" if comparison.agree else "differ"}: difference {mg(largest.rms_mg)}, '
+               f'up to {mg(max(run.largest_mg for run in comparison.runs))}, expected '
+               f'{mg(largest.expected_mg)}, p = {comparison.p_value:.1g}, limit {LEVEL:g}')
     found = []
     which = ('' if comparison.outlier is None
              else f'; run {comparison.outlier + 1} differs from the others')

@@ -43,10 +43,10 @@ import numpy as np
 import scipy
 
 from .recording import Row, UNKNOWN
-from .sensors import alike, Store
+from .sensors import alike, model_of, Store
 from ..calibrate import FleetPrior
 from ..compare import NAMES
-from ..effects import LADDER, MODELS, parameter_names
+from ..effects import LADDER
 from ..estimate import Prior
 from ..findings import rate_fleet, Rating, scale_of
 from ..table import Floats
@@ -112,28 +112,13 @@ class Values:
     The calibrations of a sensor that can be compared.
 
     `mean` (9,) of `NAMES` has the standard `deviation` (9,). `effects` are the values beyond V and
-    W of the newest calibration. `differences` (n, 9) from the median of the sensor are those of
-    calibrations with a date, in `months`; there are none of a single calibration.
+    W of the newest calibration.
 
     """
 
     mean: Floats
     deviation: Floats
-    effects: dict[str, float]
-    months: list[str]
-    differences: Floats
-
-    @classmethod
-    def of(cls, rows: Sequence[Row]) -> Values:
-        """Return the values of rows."""
-        values, deviations = table_of(rows)
-        dated = [k for k, row in enumerate(rows) if row.get('date') and len(rows) > 1]
-        return cls(np.mean(values, axis=0),
-                   np.sqrt(np.sum(deviations ** 2, axis=0)) / len(rows),
-                   {each['name']: each['value'] for each in rows[-1]['parameters']
-                    if each['name'].partition('.')[0] not in LADDER},
-                   [rows[k]['date'][:7] for k in dated],
-                   (values - np.median(values, axis=0))[dated])
+    effects: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -143,15 +128,19 @@ class Digest:
 
     `counts` are recordings by rating, or by status without a rating. `errors` are the first
     `MOST_ERRORS` rows with an error. `left_out` recordings have a calibration that is not
-    compared; `values` are those that are, by model of sensor. `typical` is for `priors_of`.
+    compared; `values` are those that are, and None without any. `differences` (9,) from the median
+    of the sensor are those of calibrations with a date, with their month; there are none of a
+    single calibration. `typical` is for `priors_of`.
 
     """
 
     sensor: str
+    model: str
     counts: Counter[str]
     errors: list[Row]
     left_out: int
-    values: dict[str, Values]
+    values: Values | None
+    differences: list[tuple[str, Floats]]
     typical: list[Typical]
 
 
@@ -170,36 +159,33 @@ def digest_of(name: str, store: Store) -> Digest:
 
 def digest(sensor: str, rows: Sequence[Row]) -> Digest:
     """Return the digest of the rows of a sensor, in order of date."""
-    by_model = _grouped((row for row in rows if row['status'] == 'ok' and row['calibration']),
-                        lambda row: row['sensor_model'] or '')
-    compared = {model: alike(of_model) for model, of_model in by_model.items()}
+    good = alike(rows)
+    values, differences = _values_of(good) if good else (None, [])
     return Digest(
-        sensor, Counter(row['rating'] or row['status'] for row in rows),
+        sensor, model_of(rows), Counter(row['rating'] or row['status'] for row in rows),
         [row for row in rows if row['status'] != 'ok'][:MOST_ERRORS],
-        sum(map(len, by_model.values())) - sum(map(len, compared.values())),
-        {model: Values.of(good) for model, good in compared.items() if good}, typical_of(rows))
+        sum(bool(row['calibration']) for row in rows) - len(good), values, differences,
+        typical_of(rows))
+
+
+def _values_of(rows: Sequence[Row]) -> tuple[Values, list[tuple[str, Floats]]]:
+    """Return the values of rows that can be compared, and their differences by month."""
+    values, deviations = table_of(rows)
+    away = values - np.median(values, axis=0)
+    effects = {each['name']: each['value'] for each in rows[-1]['parameters']
+               if each['name'].partition('.')[0] not in LADDER}
+    return (Values(np.mean(values, axis=0), np.sqrt(np.sum(deviations ** 2, axis=0)) / len(rows),
+                   effects),
+            [(row['date'][:7], change) for row, change in zip(rows, away, strict=True)
+             if row.get('date') and len(rows) > 1])
 
 
 @dataclass(frozen=True)
 class OfModel:
-    """
-    What is known of the sensors of one model: the fields of `Values`, by sensor.
+    """What is known of the sensors of one model: values by sensor, and all differences."""
 
-    `values` are the means, and `months` has the differences of all sensors.
-
-    """
-
-    values: dict[str, Floats]
-    deviations: dict[str, Floats]
-    effects: dict[str, dict[str, float]]
+    values: dict[str, Values]
     months: Months
-
-    def add(self, sensor: str, values: Values) -> None:
-        """Add a sensor."""
-        self.values[sensor], self.deviations[sensor] = values.mean, values.deviation
-        self.effects[sensor] = values.effects
-        for month, differences in zip(values.months, values.differences, strict=True):
-            self.months.add(month, differences)
 
 
 @dataclass
@@ -226,9 +212,11 @@ def overview(digests: Iterable[Digest]) -> Overview:
         found.errors += each.errors[:MOST_ERRORS - len(found.errors)]
         found.left_out += each.left_out
         found.typical += each.typical
-        for model, values in each.values.items():
-            known = found.models.setdefault(model, OfModel({}, {}, {}, Months(rng)))
-            known.add(each.sensor, values)
+        if each.values is not None:
+            known = found.models.setdefault(each.model, OfModel({}, Months(rng)))
+            known.values[each.sensor] = each.values
+            for month, differences in each.differences:
+                known.months.add(month, differences)
     return found
 
 
@@ -238,17 +226,12 @@ def table_of(rows: Sequence[Row]) -> tuple[Floats, Floats]:
             np.array([[row.get(f'{name}.sd') or 0.0 for name in NAMES] for row in rows], float))
 
 
-def odd_sensors(values: Mapping[str, Floats], deviations: Mapping[str, Floats]) -> list[Odd]:
-    """
-    Return the sensors of one model that are far from the others, the farthest first.
-
-    The (9,) values and standard deviations are by sensor.
-
-    """
+def odd_sensors(values: Mapping[str, Values]) -> list[Odd]:
+    """Return the sensors of one model that are far from the others, the farthest first."""
     if len(values) < FEWEST:
         return []
-    names, table = list(values), np.array(list(values.values()))
-    own = np.array([deviations[name] for name in names])
+    names, table = list(values), np.array([each.mean for each in values.values()])
+    own = np.array([each.deviation for each in values.values()])
     away = table - np.median(table, axis=0)
     spread = np.hypot(_MAD * np.median(np.abs(away), axis=0), own)
     far = np.abs(away) / np.maximum(spread, 1e-9)
@@ -274,16 +257,16 @@ def rating_of(known: Overview, sensors: Sequence[Row]) -> Rating:
     return rate_fleet(known.counts, len(sensors), len(not_agreeing(sensors)), unnamed)
 
 
-def shared_effects(effects: Mapping[str, Mapping[str, float]]) -> list[str]:
+def shared_effects(values: Mapping[str, Values]) -> list[str]:
     """Return a line per value beyond V and W that two or more sensors have, with its range."""
-    found = _grouped((each for values in effects.values() for each in values.items()),
+    found = _grouped((each for own in values.values() for each in own.effects.items()),
                      lambda each: each[0])
     lines = []
     for name, known in sorted(found.items(), key=lambda each: -len(each[1])):
         low, high = np.quantile([value for _, value in known], [0.1, 0.9])
         _, factor, unit = scale_of(name)
         if len(known) > 1:
-            lines.append(f'{len(known)} of {counted(len(effects), "sensor")}: {name} '
+            lines.append(f'{len(known)} of {counted(len(values), "sensor")}: {name} '
                          f'{short(low * factor)} to {short(high * factor)} {unit}')
     return lines
 
@@ -305,13 +288,13 @@ _LEAST_SPREAD_G = 1e-5
 
 
 def typical_of(rows: Iterable[Row]) -> list[Typical]:
-    """Return what `priors_of` needs of a sensor, by model; rows without values are left out."""
-    size = len(parameter_names(MODELS['10'].effects))
-    by_model = _grouped((row for row in rows if row['prior_values']),
-                        lambda row: row['sensor_model'] or '')
-    return [(model, np.mean([row['prior_values'] for row in good], axis=0),
-             np.sum([row['prior_covariance'] for row in good], axis=0).reshape(size, size)
-             / len(good) ** 2) for model, good in by_model.items()]
+    """Return what `priors_of` needs of a sensor; nothing if no row has values."""
+    good = [row for row in rows if row['prior_values']]
+    if not good:
+        return []
+    mean = np.mean([row['prior_values'] for row in good], axis=0)
+    covariance = np.sum([row['prior_covariance'] for row in good], axis=0) / len(good) ** 2
+    return [(model_of(good), mean, covariance.reshape(len(mean), len(mean)))]
 
 
 def priors_of(sensors: Iterable[Typical]) -> dict[str, FleetPrior]:

@@ -23,7 +23,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from .overview import (
-    not_agreeing, Odd, odd_sensors, OfModel, Overview, rating_of, shared_effects, table_of)
+    not_agreeing, Odd, odd_sensors, OfModel, Overview, rating_of, shared_effects, table_of, Values)
 from .recording import Row
 from .sensors import alike, Store
 from ..calibrate import FleetPrior
@@ -83,7 +83,7 @@ def _body(store: Store, known: Overview, sensors: Sequence[Row],
     odd_names: list[str] = []
     models = sorted(known.models.items(), key=lambda each: (-len(each[1].values), each[0]))
     for number, (model, of_model) in enumerate(models):
-        odd = odd_sensors(of_model.values, of_model.deviations)
+        odd = odd_sensors(of_model.values)
         odd_names += [sensor for sensor, _, _, _ in odd]
         yield from _of_model(model, of_model, odd, f'model{number}', priors.get(model),
                              shown=number < _MOST_MODELS)
@@ -107,7 +107,7 @@ def _of_model(model: str, known: OfModel, odd: Sequence[Odd], prefix: str,
         _odd_words(known, each) for each in odd[:_MOST]),
         _not_shown(len(odd) - _MOST, 'odd value'))
     yield section(f'Effects that several sensors share{name}',
-                  listing(shared_effects(known.effects)))
+                  listing(shared_effects(known.values)))
     drift = _figures(_of_months(f'{prefix}_months', known)) if shown else ''
     yield section(f'Drift of all sensors{name}', drift and paragraph(
         'Difference of each calibration from the median of its sensor, by month: the median, and '
@@ -115,9 +115,9 @@ def _of_model(model: str, known: OfModel, odd: Sequence[Odd], prefix: str,
     yield section(f'Typical values{name}', _typical(prior) if prior else '')
 
 
-def _distribution(values: Mapping[str, object]) -> str:
+def _distribution(values: Mapping[str, Values]) -> str:
     """Return a table of the distribution of each value over the sensors."""
-    table = np.array(list(values.values()))
+    table = np.array([each.mean for each in values.values()])
     rows = []
     for name, column in zip(NAMES, table.T, strict=True):
         zero, factor, unit = scale_of(name)
@@ -235,7 +235,7 @@ _COLOURS = (AFTER, THIRD, BEFORE)
 
 def _of_values(prefix: str, known: OfModel, odd: Sequence[Odd]) -> Iterator[Drawing]:
     """Yield histograms of each value over the sensors of a model, with the odd sensors."""
-    table = np.array(list(known.values.values()))
+    table = np.array([each.mean for each in known.values.values()])
     for key, words, names in GROUPS:
         hover = {}
         with drawn(3.6, f'{words} [{scale_of(names[0])[2]}]', 3, grid='') as (figure, panels):
@@ -284,7 +284,7 @@ def _draw_odd(panel: Any, name: str, odd: Sequence[Odd], middle: float, reach: f
 def _odd_words(known: OfModel, odd: Odd) -> str:
     """Return an odd sensor with its value."""
     sensor, name, value, far = odd
-    sd = float(known.deviations[sensor][NAMES.index(name)])
+    sd = float(known.values[sensor].deviation[NAMES.index(name)])
     return f'{sensor}: {named_words(name, value, sd)}, {far:.0f} spreads from the median'
 
 

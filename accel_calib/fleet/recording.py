@@ -109,10 +109,7 @@ def _local(text: str) -> Iterator[Input]:
         raise InputError(f'{text} does not exist, expected a recording, a folder, a glob or @LIST',
                          'correct the name')
     for each in found:
-        if each.is_dir():
-            yield from _below(each, root)
-        elif each.is_file():
-            yield Input(str(each), each.relative_to(root).as_posix())
+        yield from _at(each, root)
 
 
 def _is_bag_folder(path: Path) -> bool:
@@ -120,18 +117,15 @@ def _is_bag_folder(path: Path) -> bool:
     return (path / 'metadata.yaml').is_file()
 
 
-def _below(path: Path, root: Path) -> Iterator[Input]:
-    """Yield the recordings in a folder and its subfolders, in order; a bag is one recording."""
-    if _is_bag_folder(path):
+def _at(path: Path, root: Path) -> Iterator[Input]:
+    """Yield a recording, or those in a folder and its subfolders, in order."""
+    if path.is_file() or _is_bag_folder(path):
         yield Input(str(path), path.relative_to(root).as_posix())
-        return
-    for each in sorted(path.iterdir()):
-        if each.name.startswith('.'):
-            continue
-        if each.is_dir():
-            yield from _below(each, root)
-        elif each.is_file() and each.suffix.lower() in _SUFFIXES:
-            yield Input(str(each), each.relative_to(root).as_posix())
+    elif path.is_dir():
+        for each in sorted(path.iterdir()):
+            if not each.name.startswith('.') and (
+                    each.is_dir() or each.suffix.lower() in _SUFFIXES):
+                yield from _at(each, root)
 
 
 def _addresses(text: str) -> Iterator[Input]:
@@ -192,6 +186,8 @@ def _system(text: str) -> tuple[Any, str]:
 @contextmanager
 def on_disk(path: str) -> Iterator[Path]:
     """Yield a recording as a local path; an address is copied to a temporary folder."""
+    if (written := as_text(path)) != path:
+        raise InputError(f'the name {written} is not UTF-8, expected UTF-8', 'rename it')
     if '://' not in path:
         yield Path(path)
         return

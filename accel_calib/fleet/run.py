@@ -29,7 +29,7 @@ from typing import Any, TYPE_CHECKING, TypeVar
 from .overview import digest_of, overview, priors_of, rating_of
 from .page import write_fleet_page
 from .recording import (
-    as_folder, as_text, content_hash, Input, key_of, on_disk, Options, Row, row_of, unread_row)
+    as_folder, content_hash, Input, key_of, on_disk, Options, Row, row_of, unread_row)
 from .sensors import is_damaged, merge_sensor, read_parquet, Store, UNREAD, write_sensors
 from ..calibrate import Calibration, FleetPrior
 from ..disk import write_atomically
@@ -221,19 +221,23 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
 
     """
     with store.locked():
-        damaged = tuple(_set_aside(client, store))
+        files = list(store.files())
+        damaged = tuple(str(store.set_aside(path)) for path, is_so in zip(
+            files, _in_order(client, is_damaged, files), strict=True) if is_so)
         store.forget_lost()
         _merge(client, store)  # what an interrupted run left
         counts, unread = Counter[str](), list[Row]()
         for item, status in mapped(client, calibrate_recording, found, options, store, limit_s):
             if isinstance(status, Exception):
-                unread.append(_row_of_unread(item, options, status))
+                status = _row_of_killed(item, options, status)
+            if not isinstance(status, str):
+                unread.append(status)
                 status = 'unread'
             counts[status] += 1
             progress(sum(counts.values()), len(found))
         store.replace_unread(unread)
         sensors = tuple(_merge(client, store))
-        known = overview(_by_sensor(client, digest_of, [*store.sensors(), UNREAD], store))
+        known = overview(_in_order(client, digest_of, [*store.sensors(), UNREAD], store))
         priors, path = priors_of(known.typical), store.folder / PRIOR_FILE
         if priors:
             write_priors(path, priors)
@@ -243,15 +247,6 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
         return Summary(counts, sensors, priors, damaged, rating_of(known, sensors))
 
 
-def _set_aside(client: Client, store: Store) -> Iterator[str]:
-    """Move the damaged files of the results away, and yield their new names."""
-    for path, damaged in mapped(client, is_damaged, store.files()):
-        if isinstance(damaged, Exception):
-            raise damaged
-        if damaged:
-            yield str(store.set_aside(path))
-
-
 def _merge(client: Client, store: Store) -> list[Row]:
     """Merge all pending rows, and compare the calibrations; return the rows of all sensors."""
     names = store.waiting()
@@ -259,40 +254,33 @@ def _merge(client: Client, store: Store) -> list[Row]:
         names = sorted({*names, *store.sensors()})
     if not names:
         return read_parquet(store.sensors_file)
-    found = write_sensors(store, list(_by_sensor(client, merge_sensor, names, store)))
-    for _ in _by_sensor(client, _finish, names, store):
+    found = write_sensors(store, list(_in_order(client, merge_sensor, names, store)))
+    for _ in _in_order(client, store.finish, names):
         pass
     return found
 
 
-def _finish(name: str, store: Store) -> None:
-    """Remove the pending rows of a sensor; it runs on a worker."""
-    store.finish(name)
-
-
-def _by_sensor(client: Client, function: Callable[[str, Store], _Result], names: Sequence[str],
-               store: Store) -> Iterator[_Result]:
-    """Yield the result of a function for each sensor, in order of `names`; raise its exception."""
-    due, early = deque(names), dict[str, _Result]()
-    for name, result in mapped(client, function, names, store):
+def _in_order(client: Client, function: Callable[..., _Result], items: Sequence[_Item],
+              *others: Any) -> Iterator[_Result]:
+    """Yield the result of a function for each item, in their order; raise its exception."""
+    due, early = deque(items), dict[_Item, _Result]()
+    for item, result in mapped(client, function, items, *others):
         if isinstance(result, Exception):
             raise result
-        early[name] = result
+        early[item] = result
         while due and due[0] in early:
             yield early.pop(due.popleft())
 
 
-def _row_of_unread(item: Input, options: Options, error: Exception) -> Row:
-    """Return the row of a recording that was not read; raise an error that is not its own."""
+def _row_of_killed(item: Input, options: Options, error: Exception) -> Row:
+    """Return the row of a recording that kills workers; raise an error that is not its own."""
     from distributed import KilledWorker
 
-    if isinstance(error, KilledWorker):
-        return unread_row(item, options, InputError(
-            'the workers that calibrated this recording died, expected them to finish',
-            'give the workers more memory, and run again'))
-    if isinstance(error, UnreadError):
-        return unread_row(item, options, error)
-    raise error
+    if not isinstance(error, KilledWorker):
+        raise error
+    return unread_row(item, options, InputError(
+        'the workers that calibrated this recording died, expected them to finish',
+        'give the workers more memory, and run again'))
 
 
 def mapped(client: Client, function: Callable[..., Any], items: Iterable[_Item], *others: Any
@@ -376,10 +364,6 @@ class _Pace:
 
 # ----------------------------------------------------------------------------- one recording
 
-class UnreadError(AccelCalibError):
-    """A recording could not be read; the next run tries it again."""
-
-
 class _Apart(threading.local):
     """The process of each thread in which recordings are calibrated, so that it can be ended."""
 
@@ -390,21 +374,25 @@ class _Apart(threading.local):
 _apart = _Apart()
 
 
-def calibrate_recording(found: Input, options: Options, store: Store, limit_s: float) -> str:
+def calibrate_recording(found: Input, options: Options, store: Store, limit_s: float
+                        ) -> str | Row:
     """
     Calibrate one recording, add the result to the store, and return what happened to it.
 
-    UnreadError is raised if it cannot be read or takes longer than `limit_s` [s], and OSError if
-    the result cannot be written.
+    The row is returned, and not stored, if the recording cannot be read or takes longer than
+    `limit_s` [s]. OSError is raised if the result cannot be written.
 
     """
     begin = time.perf_counter()
-    with _reading(found.path, limit_s), on_disk(found.path) as path:
-        content = content_hash(path)
-        key = key_of(content, found, options)
-        if store.has(key):
-            return 'skipped'
-        row, calibration = _apart.process.call_within(limit_s, row_of, found, path, options)
+    try:
+        with on_disk(found.path) as path:
+            content = content_hash(path)
+            key = key_of(content, found, options)
+            if store.has(key):
+                return 'skipped'
+            row, calibration = _apart.process.call_within(limit_s, row_of, found, path, options)
+    except (OSError, EOFError, AccelCalibError) as err:
+        return unread_row(found, options, _reason(err, found.path, limit_s))
     row |= {'key': key, 'content': content, 'seconds': time.perf_counter() - begin}
     if calibration is not None:
         name = f'calibrations/{as_folder(row["sensor"])}/{key}.yaml'
@@ -416,21 +404,14 @@ def calibrate_recording(found: Input, options: Options, store: Store, limit_s: f
     return str(row['status'])
 
 
-@contextmanager
-def _reading(name: str, limit_s: float) -> Iterator[None]:
-    """Raise UnreadError for the errors of reading a recording."""
-    try:
-        if (written := as_text(name)) != name:
-            raise InputError(f'the name {written} is not UTF-8, expected UTF-8', 'rename it')
-        yield
-    except TimeoutError as err:
-        raise UnreadError(f'{name} takes longer than {limit_s:g} s, expected less',
-                          'raise --time-limit, or leave it out') from err
-    except (OSError, EOFError) as err:
-        error = system_error(err if isinstance(err, OSError) else OSError(str(err)))
-        raise UnreadError(error.message, error.advice) from err
-    except AccelCalibError as err:  # an address without its package, or a missing match
-        raise UnreadError(err.message, err.advice) from err
+def _reason(error: Exception, name: str, limit_s: float) -> AccelCalibError:
+    """Return why a recording could not be read."""
+    if isinstance(error, TimeoutError):
+        return InputError(f'{name} takes longer than {limit_s:g} s, expected less',
+                          'raise --time-limit, or leave it out')
+    if isinstance(error, AccelCalibError):  # an address without its package, or a missing match
+        return error
+    return system_error(error if isinstance(error, OSError) else OSError(str(error)))
 
 
 def _exported(calibration: Calibration, path: Path, formats: Sequence[str]) -> list[str]:

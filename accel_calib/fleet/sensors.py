@@ -48,7 +48,7 @@ import scipy
 
 from .recording import as_folder, Row, schema
 from ..calibrate import Calibration
-from ..compare import History, history_of, LEVEL
+from ..compare import History, history_of, LEVEL, Parameter
 from ..disk import write_atomically
 from ..effects import LADDER
 from ..errors import AccelCalibError, InputError
@@ -303,6 +303,11 @@ def sensors_schema() -> pa.Schema:
         ('last', text), ('changes', pa.list_(change)), ('drift', drift), ('note', text)])
 
 
+def model_of(rows: Sequence[Row]) -> str:
+    """Return the model of a sensor, as its newest row has it."""
+    return rows[-1]['sensor_model'] or '' if rows else ''
+
+
 def merge_sensor(name: str, store: Store) -> Row:
     """
     Merge the pending rows of a sensor, compare its calibrations, and return the row of the sensor.
@@ -317,7 +322,7 @@ def merge_sensor(name: str, store: Store) -> Row:
     about: Row = {**dict.fromkeys(sensors_schema().names), 'sensor': unquote(name),
                   'recordings': len(rows), 'calibrations': len(good),
                   'errors': sum(row['status'] != 'ok' for row in rows), 'changes': [],
-                  'sensor_model': rows[-1]['sensor_model'] if rows else ''}
+                  'sensor_model': model_of(rows)}
     if good:
         about |= {'first': good[0]['date'], 'last': good[-1]['date']}
     if len(good) < 2:
@@ -341,15 +346,17 @@ def _compared(calibrations: Sequence[Calibration], rows: Sequence[Row]) -> Row:
     lasting: dict[int, bool | None] = {}
     steady = _Steady.of(history)
     for k, change in enumerate(history.changes):
-        name = steady.changed(k, k + 1, limit)
-        if back or name is None or change.comparison.p_value >= limit:
+        most = steady.changed(k, k + 1, limit)
+        if back or most is None or change.comparison.p_value >= limit:
             back = False  # no change, or from the odd one back to the others
             continue
-        lasting[k + 1] = for_good = _stays(history, steady, k, limit)
+        lasting[k + 1] = for_good = steady.stays(k, limit)
         back = for_good is False
         row = rows[order[k + 1]]
-        changes.append({'key': row['key'], 'date': row['date'], 'parameter': name,
-                        'p_value': change.comparison.p_value, **steady.change(name, k),
+        changes.append({'key': row['key'], 'date': row['date'], 'parameter': most.name,
+                        'p_value': change.comparison.p_value,
+                        'change': float(most.values[k + 1] - most.values[k]),
+                        'sd': float(np.hypot(*most.stated_sd[k:k + 2])),
                         'for_good': for_good, 'recording': row['recording']})
     return {**found, 'changes': changes, 'drift': drift_of(history, lasting)}
 
@@ -357,55 +364,46 @@ def _compared(calibrations: Sequence[Calibration], rows: Sequence[Row]) -> Row:
 @dataclass(frozen=True)
 class _Steady:
     """
-    The (t, n) values of a sensor with their standard deviations [g], and their steady drift.
+    The calibrations of a sensor, and the steady drift of their values.
 
     `at` are the (n,) times of the calibrations [year], or their numbers without dates. `rates` are
     the (t,) median changes per unit of `at`; 0 with fewer than `_FEWEST_STEPS` steps.
 
     """
 
-    names: Sequence[str]
+    history: History
     at: Floats
-    values: Floats
-    deviations: Floats
     rates: Floats
 
     @classmethod
     def of(cls, history: History) -> _Steady:
-        """Return the values of a history."""
+        """Return a history with its drift."""
         years = years_of(history)
         at = np.arange(float(len(history.moments))) if years is None else years
-        values = np.array([each.values for each in history.parameters])
         steps = np.diff(at)
-        rates = np.zeros(len(values))
+        rates = np.zeros(len(history.parameters))
         if len(steps) >= _FEWEST_STEPS and np.all(steps > 0.0):
-            rates = np.median(np.diff(values) / steps, axis=1)
-        return cls([each.name for each in history.parameters], at, values,
-                   np.array([each.stated_sd for each in history.parameters]), rates)
+            rates = np.median([np.diff(each.values) for each in history.parameters] / steps,
+                              axis=1)
+        return cls(history, at, rates)
 
-    def changed(self, one: int, other: int, limit: float) -> str | None:
+    def changed(self, one: int, other: int, limit: float) -> Parameter | None:
         """Return the value that changed most between two calibrations; None if none did."""
-        away = self.values[:, other] - self.values[:, one]
+        values = self.history.parameters
+        away = np.array([each.values[other] - each.values[one] for each in values])
         away -= self.rates * (self.at[other] - self.at[one])
-        sd = np.hypot(self.deviations[:, one], self.deviations[:, other])
-        far = np.where(sd > 0.0, np.abs(away) / np.where(sd > 0.0, sd, 1.0), 0.0)
+        sd = np.array([np.hypot(each.stated_sd[one], each.stated_sd[other]) for each in values])
+        far = np.divide(np.abs(away), sd, out=np.zeros(len(sd)), where=sd > 0.0)
         most = int(np.argmax(far))
         least = -scipy.special.ndtri(limit / (2.0 * len(far)))
-        return self.names[most] if far[most] > least else None
+        return values[most] if far[most] > least else None
 
-    def change(self, name: str, step: int) -> Row:
-        """Return the change of a value at a step, with its standard deviation."""
-        row = self.names.index(name)
-        return {'change': float(self.values[row, step + 1] - self.values[row, step]),
-                'sd': float(np.hypot(*self.deviations[row, step:step + 2]))}
-
-
-def _stays(history: History, steady: _Steady, before: int, limit: float) -> bool | None:
-    """Return whether the calibration after the next differs, too; None if there is none."""
-    if before + 2 >= len(history.runs):
-        return None
-    return (steady.changed(before, before + 2, limit) is not None
-            and history.between(before, before + 2).p_value < limit)
+    def stays(self, before: int, limit: float) -> bool | None:
+        """Return whether the calibration after the next differs, too; None if there is none."""
+        if before + 2 >= len(self.at):
+            return None
+        return (self.changed(before, before + 2, limit) is not None
+                and self.history.between(before, before + 2).p_value < limit)
 
 
 def years_of(history: History) -> Floats | None:

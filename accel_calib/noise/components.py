@@ -29,8 +29,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import nnls
-from scipy.stats import chi2
+import scipy
 
 from .curve import Counts, shares, Spread
 from ..units import Floats, is_native, STANDARD_GRAVITY
@@ -167,11 +166,11 @@ class _RangeFit:
         """Return the fit of the free components."""
         squares: Floats = np.zeros(len(COMPONENTS))
         given = self._shape[:, free] / self._variances[:, np.newaxis]
-        squares[free] = nnls(given, np.ones(len(given)))[0]
+        squares[free] = scipy.optimize.nnls(given, np.ones(len(given)))[0]
         for _ in range(_ROUNDS):
             before, squares = squares, np.zeros(len(COMPONENTS))
             shape, variances = self._whitened(before)
-            squares[free] = nnls(shape[:, free], variances)[0]
+            squares[free] = scipy.optimize.nnls(shape[:, free], variances)[0]
             if np.all(np.abs(squares - before) <= _CONVERGED * before):
                 break
         shape, variances = self._whitened(squares)
@@ -182,12 +181,12 @@ class _RangeFit:
         """Return the rise of χ² without a component, with the covariance of the fit without."""
         rest = self.solve([c for c in kept if c != without])
         shape, variances = self._whitened(rest.squares)
-        return rest.chi_square - float(nnls(shape[:, kept], variances)[1])**2
+        return rest.chi_square - float(scipy.optimize.nnls(shape[:, kept], variances)[1])**2
 
     def p_value(self, found: _Solution) -> float:
         """Return the probability of χ²."""
         freedom = len(self._variances) - int(np.sum(found.squares > 0.0))
-        return float(chi2.sf(found.chi_square, max(freedom, 1)))
+        return float(scipy.stats.chi2.sf(found.chi_square, max(freedom, 1)))
 
     def parts(self, squares: Floats) -> Floats:
         """Return the largest part of the variance of each component."""
@@ -200,7 +199,7 @@ class _RangeFit:
             return Component(np.nan, np.nan, (np.nan, np.nan), self._upper(found, which))
         square, variance = found.squares[which], found.covariance[which, which]
         value, freedom = float(np.sqrt(square)), 2.0 * square**2 / variance
-        ends = np.sqrt(square * freedom / chi2.ppf(
+        ends = np.sqrt(square * freedom / scipy.stats.chi2.ppf(
             [0.5 + 0.5 * LEVEL, 0.5 - 0.5 * LEVEL], freedom))
         return Component(value, float(np.sqrt(variance)) / (2.0 * value),
                          (float(ends[0]), float(ends[1])), float(ends[1]))

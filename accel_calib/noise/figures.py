@@ -23,7 +23,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
+import scipy
 
 from .components import (
     AxisNoise, COMPONENTS, FIGURES, fit_components, Fitted, Kind, KINDS, LEVEL, NoiseFigures,
@@ -289,7 +289,7 @@ def _band(variances: Floats, lengths: Counts, fitted: Fitted, spread: Spread
                       for squares in forms)
     freedom = np.where(np.arange(len(variances)) > fitted.last, beyond, within)
     tail = 0.5 - 0.5 * LEVEL
-    low, high = (np.sqrt(variances * freedom / chi2.ppf(part, freedom))
+    low, high = (np.sqrt(variances * freedom / scipy.stats.chi2.ppf(part, freedom))
                  for part in (1.0 - tail, tail))
     return low, high
 

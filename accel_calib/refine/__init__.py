@@ -15,10 +15,9 @@ the poses that separate effects from their rivals.
 """
 
 from .plan import PlannedPose, PosePlan
-from .refinement import (
-    base_words, refine, refine_with_fleet, Refinement, refitted, residual_words, verdict_words)
+from .refinement import base_words, refine, Refinement, refitted, residual_words, verdict_words
 from .steps import chance, shown_name, Stage, Step, times_typical, values_of
 
 __all__ = ['PlannedPose', 'PosePlan', 'Refinement', 'Stage', 'Step', 'base_words', 'chance',
-           'refine', 'refine_with_fleet', 'refitted', 'residual_words', 'shown_name',
-           'times_typical', 'values_of', 'verdict_words']
+           'refine', 'refitted', 'residual_words', 'shown_name', 'times_typical', 'values_of',
+           'verdict_words']

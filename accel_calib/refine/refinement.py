@@ -173,8 +173,8 @@ def base_words(result: Refinement) -> str:
     return 'ideal sensor' if name == 'ideal' else f'model {name}'
 
 
-def refine(poses: Poses, units: Units, *, base: str | Calibration = 'auto', sensor: str = '',
-           date: str = '', also: tuple[str, ...] = ()) -> Refinement:
+def refine(poses: Poses, units: Units, *, base: str | Calibration | FleetPrior = 'auto',
+           sensor: str = '', date: str = '', also: tuple[str, ...] = ()) -> Refinement:
     """
     Find effects that a model lacks, and add them to it.
 
@@ -184,9 +184,10 @@ def refine(poses: Poses, units: Units, *, base: str | Calibration = 'auto', sens
         Poses of known, shared or unknown orientation, in the unit of the readings.
     units : Units
         Unit of the readings.
-    base : Calibration or {'auto', 'ideal', '4', '7', '10', '12'}
+    base : Calibration, FleetPrior or {'auto', 'ideal', '4', '7', '10', '12'}
         The model to start from. A Calibration is compared as it is stored; the search first finds
-        changes of the sensor since then, and then further effects.
+        changes of the sensor since then, and then further effects. The typical values of sensors
+        of the same model are combined with model 10 of these poses.
     sensor, date : str
         Name of the sensor and date for the refined calibration.
     also : tuple of str
@@ -197,11 +198,13 @@ def refine(poses: Poses, units: Units, *, base: str | Calibration = 'auto', sens
     RefusedFitError
         If the poses do not determine the base, or are too few to find an effect.
     InputError
-        If the readings are clearly in another unit.
+        If the readings are clearly in another unit, or in native units with a FleetPrior.
     StoredCalibrationError
         If the calibration belongs to another sensor.
 
     """
+    if isinstance(base, FleetPrior):
+        return _refine_with_fleet(poses, units, base, sensor, date, also)
     check_units(poses, units)
     if isinstance(base, Calibration):
         check_sensor(base, poses.sensor)
@@ -286,21 +289,13 @@ def _rejected(found: Found, given: Given) -> tuple[Rejected, ...]:
                         key=lambda each: each.row))
 
 
-def refine_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, *, sensor: str = '',
-                      date: str = '', also: tuple[str, ...] = ()) -> Refinement:
+def _refine_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, sensor: str, date: str,
+                       also: tuple[str, ...]) -> Refinement:
     """
     Find effects beyond model 10, with the typical values of a fleet for model 10.
 
-    Arguments as `refine`; `fleet` has the typical values of sensors of the same model. The refined
-    calibration has the method ``fleet``, and its covariance includes the prior. The steps have the
-    residuals of the search, which does not use the fleet.
-
-    Raises
-    ------
-    InputError
-        If the readings are in native units, or clearly in another unit.
-    RefusedFitError
-        As `accel_calib.calibrate.fit_with_fleet`.
+    The refined calibration has the method ``fleet``, and its covariance includes the prior. The
+    steps have the residuals of the search, which does not use the fleet.
 
     """
     fitted = fit_with_fleet(poses, units, fleet, sensor=sensor, date=date)

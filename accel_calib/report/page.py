@@ -39,7 +39,7 @@ from ..effects import (
 from ..findings import effect_figures, Figure, rate_refinement, residual_figures
 from ..geometry import coverage
 from ..refine import verdict_words
-from ..table import COLUMNS, Floats
+from ..table import Floats
 from ..text import counted, milli, percentage, short, signed, with_minus
 from ..units import MG
 
@@ -415,8 +415,8 @@ def snippets(calibration: Calibration, stored: str) -> tuple[tuple[str, str], ..
 
 
 def _python(calibration: Calibration, stored: str) -> str:
-    known = ''.join(f', {key}={key}' for key in calibration.model.needs if key in COLUMNS
-                    and key in ('time', 'temperature', 'supply_voltage', 'rate'))
+    known = ''.join(f', {key}={key}' for key in calibration.model.needs
+                    if key in ('time', 'temperature', 'supply_voltage', 'rate'))
     unit, force = calibration.units.symbol, calibration.units.symbol
     if calibration.units.is_native:
         unit, force = 'native units', 'g'

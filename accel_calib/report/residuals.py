@@ -23,7 +23,7 @@ from .sheet import (
     HEIGHT_INCHES, INK, legend_below, Mark, Marks, PAPER, RIM, SEQUENTIAL)
 from ..calibrate import Calibration, directions_in, errors_after, errors_before, in_g, with_history
 from ..effects import acting_temperature, AXES, effect_named, rate_at, sensor_force
-from ..geometry import rms, uncovered, unit
+from ..geometry import over_axes, rms, uncovered, unit
 from ..table import column_of, Floats, Poses
 from ..text import milli, percentage, short, with_minus
 from ..units import MG
@@ -106,8 +106,7 @@ def variable_of(key: str, values: Floats) -> Variable:
         name, size = next((each for each in _SPANS if np.max(since) > 3.0 * each[1]), _SPANS[-1])
         return Variable(f'time since the first pose [{name}]', since / size)
     if values.ndim > 1:
-        mean = np.mean if key == 'std' else np.sum
-        values = np.sqrt(mean(values ** 2, axis=1))
+        values = over_axes(values) if key == 'std' else np.linalg.norm(values, axis=1)
     label, factor = _LABELS.get(key) or (column_of(key).meaning, 1.0)
     return Variable(label, values * factor)
 
@@ -271,11 +270,8 @@ def _draw_disc(disc: Any, *, up: bool) -> None:
 
 def _equal_area(force: Floats) -> Floats:
     """Return the (n, 2) positions of (n, 3) directions on the maps, which are unit discs."""
-    unit = force / np.linalg.norm(force, axis=1, keepdims=True)
-    flat = unit[:, :2]
-    across = np.linalg.norm(flat, axis=1, keepdims=True)
-    radius = np.sqrt(1.0 - np.abs(unit[:, 2:]))
-    return flat / np.where(across > 0.0, across, 1.0) * radius
+    towards = unit(force)
+    return unit(towards[:, :2]) * np.sqrt(1.0 - np.abs(towards[:, 2:]))
 
 
 def _draw_left_out(disc: Any, residuals: Residuals, name: str, up: bool) -> Marks:

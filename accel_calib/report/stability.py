@@ -27,6 +27,7 @@ from .sheet import (
 from ..compare import Comparison, History, Parameter
 from ..findings import (
     change_in_words, CROSS, GAINS, in_words, OFFSETS, rate_comparison, rate_noise, scale_of)
+from ..geometry import rms
 from ..noise import AxisNoise, duration, FIGURES, Kind, NoiseFigures, shown_unit, TYPICAL, WORDS
 from ..table import Floats
 from ..text import power_of_ten, short, with_minus, with_sd
@@ -40,7 +41,6 @@ _NOISE_INCHES = 4.0
 _LOOKS = dict(zip('xyz', zip(AXIS_COLOURS, 'os^')))
 """Colour and marker of each axis."""
 
-_NAMES = {'accelerometer': 'Accelerometer', 'gyroscope': 'Gyroscope'}
 _KALIBR: dict[tuple[Kind, str], str] = {
     ('accelerometer', 'noise_density'): 'm/s²/√Hz', ('accelerometer', 'random_walk'): 'm/s³/√Hz',
     ('gyroscope', 'noise_density'): 'rad/s/√Hz', ('gyroscope', 'random_walk'): 'rad/s²/√Hz'}
@@ -73,7 +73,7 @@ def _allan(axes: Sequence[AxisNoise]) -> Drawing:
     """Draw the Allan deviation of the axes of one sensor over τ, with their 95 % bands."""
     kind, hover = axes[0].kind, {}
     unit, scale = shown_unit(kind, 'bias_instability', axes[0].unit)
-    with drawn(_NOISE_INCHES, f'{_NAMES[kind]}: Allan deviation') as (figure, (panel,)):
+    with drawn(_NOISE_INCHES, f'{kind.capitalize()}: Allan deviation') as (figure, (panel,)):
         panel.set(xscale='log', yscale='log', xlabel='averaging time τ [s]',
                   ylabel=f'Allan deviation [{unit}]')
         for axis in axes:
@@ -117,7 +117,7 @@ def _table(found: NoiseFigures, kind: Kind) -> str:
     rows.append(['from τ', *(f'{duration(axis.used[0])} to {duration(axis.used[1])}'
                              for axis in axes), ''])
     head = ['', *(axis.axis for axis in axes), 'typical']
-    return section(_NAMES[kind], scroll_table(f'Noise of the {kind}', head, rows),
+    return section(kind.capitalize(), scroll_table(f'Noise of the {kind}', head, rows),
                    paragraph('± is one standard deviation; < is the upper limit with 95 % '
                              'probability of a figure that the curve does not show. Typical: '
                              'common parts, from the data sheets of ICM-42688-P and MPU-6050, '
@@ -321,7 +321,8 @@ def comparison_page(comparison: Comparison, rating: Rating, sources: Sequence[Pa
     title = f'Comparison of {len(calibrations)} calibrations{_of_sensor(calibrations)}'
     body = [section('Calibrations', _runs(comparison, calibrations, labels)),
             section('Parameters', figures(of_parameters(comparison, labels)), HINT,
-                    _parameters(comparison)),
+                    scroll_table('Parameters', ('', 'mean', 'spread', 'stated', 'ratio'),
+                                 list(parameter_rows(comparison)))),
             section('Notes', listing(filter(None, (*comparison.notes, comparison.tilt_words)))),
             how_to_read(*_HOW_TO_READ)]
     return rated_sheet(title, map(str, sources), rating, body)
@@ -342,17 +343,14 @@ def _runs(comparison: Comparison, calibrations: Sequence[Calibration], labels: S
     return scroll_table('Calibrations', head, rows)
 
 
-def _parameters(comparison: Comparison) -> str:
-    """Return a table of the spread of each parameter."""
-    rows = []
-    for each in comparison.parameters:
+def parameter_rows(comparison: Comparison) -> Iterator[tuple[str, ...]]:
+    """Yield name, mean, spread, stated deviation and their ratio of each fitted parameter."""
+    for each in (one for one in comparison.parameters if np.any(one.stated_sd)):
         zero, factor, unit = scale_of(each.name)
-        stated = float(np.sqrt(np.mean(each.stated_sd ** 2)))
         mean = with_minus(short((each.values.mean() - zero) * factor))
-        rows.append((spoken(each.name), f'{mean} {unit}',
-                     short(each.spread * factor), short(stated * factor),
-                     '' if each.ratio is None else f'{each.ratio:.2f}'))
-    return scroll_table('Parameters', ('', 'mean', 'spread', 'stated', 'ratio'), rows)
+        yield (spoken(each.name), f'{mean} {unit}', short(each.spread * factor),
+               short(rms(each.stated_sd) * factor),
+               '' if each.ratio is None else f'{each.ratio:.2f}')
 
 
 def history_page(history: History, sources: Sequence[Path],

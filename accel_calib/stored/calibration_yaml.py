@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 import yaml
 
 from .plain_yaml import (
-    array_at, choice_at, MOST_BYTES, MOST_VALUES, name_at, number_at, read_plain, shown, value_at,
-    values_at)
+    array_at, choice_at, decoded, MOST_BYTES, MOST_VALUES, name_at, number_at, read_plain, shown,
+    value_at, values_at)
 from .. import __version__
 from ..calibrate import (
     Calibration, FleetPrior, gated, GyroBias, in_g, LARGEST_OFFSET_G, mounting_figures, Quality,
@@ -42,10 +42,8 @@ from ..table import (
 from ..text import some
 from ..units import FRAMES, MODEL_NAMES, UNIT_NAMES, Units
 
-try:  # eight times as fast, but not in every build of PyYAML
-    from yaml import CSafeDumper as SafeDumper
-except ImportError:
-    from yaml import SafeDumper  # type: ignore[assignment]
+# The first is eight times as fast, but not in every build of PyYAML.
+SafeDumper: Any = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 
 T = TypeVar('T')
 
@@ -89,13 +87,6 @@ _NOT_ALWAYS = ('autopilot', 'mounting', 'gyro_bias', 'noise', 'checksum')
 """Keys of mappings with known keys, and keys that not every file has."""
 
 
-class _Dumper(SafeDumper):
-    """The safe dumper without anchors: equal lists are written in full."""
-
-    def ignore_aliases(self, data: Any) -> bool:
-        return True
-
-
 def calibration_bytes(calibration: Calibration) -> bytes:
     """
     Return the content of the file of a calibration, which passes the gate and the reader.
@@ -108,7 +99,7 @@ def calibration_bytes(calibration: Calibration) -> bytes:
         If it has more poses than a file can hold.
 
     """
-    text: str = yaml.dump(_content(gated(calibration)), Dumper=_Dumper, sort_keys=False,
+    text: str = yaml.dump(_content(gated(calibration)), Dumper=SafeDumper, sort_keys=False,
                           allow_unicode=True, width=99, default_flow_style=None).rstrip()
     data = f'{text}{_CHECKSUM}{_digest(text)}\n'.encode()
     if len(data) > MOST_BYTES or _values_in(calibration) > MOST_VALUES:
@@ -234,13 +225,7 @@ def _text_of(data: bytes, name: str) -> str:
     if not data.startswith(FIRST_LINE.encode()):
         raise StoredCalibrationError(f'{name} is not a calibration of accel_calib, expected the '
                                      f'first line "{FIRST_LINE}"', 'use a file that fit wrote')
-    if len(data) > MOST_BYTES:
-        raise ValueError(f'it has more than {MOST_BYTES} bytes')
-    try:
-        return data.decode().replace('\r\n', '\n').replace('\r', '\n')
-    except UnicodeDecodeError as err:
-        line = 1 + data.count(b'\n', 0, err.start)
-        raise ValueError(f'line {line} is not text in UTF-8') from err
+    return decoded(data)
 
 
 def _check_known(content: Mapping[str, Any], name: str) -> None:
@@ -496,10 +481,7 @@ def read_prior(path: Path, model: str = '') -> FleetPrior:
 
     """
     try:
-        data = _beginning_of(path)
-        if len(data) > MOST_BYTES:
-            raise ValueError(f'it has more than {MOST_BYTES} bytes')
-        content = read_plain(data.decode())
+        content = read_plain(decoded(_beginning_of(path)))
         if content['format'] != _PRIORS:
             raise InputError(f'{path} has format {shown(content["format"])}, expected {_PRIORS}',
                              'update accel_calib, or make the file again')

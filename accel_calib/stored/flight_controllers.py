@@ -87,19 +87,17 @@ def _fit_by_axis(calibration: Calibration, options: Options, reference: float | 
     reference = middle if reference is None else reference
     grid, degree = steady_grid(calibration), _degree(calibration)
     s = (grid.temperature - middle) / half if degree else grid.temperature
-    columns = np.column_stack([s ** k for k in range(degree + 1)])
-    offset, scale = np.zeros((degree + 1, 3)), np.zeros(3)
+    columns = np.vander(s, degree + 1, increasing=True)
+    inner = Polynomial([(reference - middle) / half, 1.0 / half] if degree else [0.0])
+    offset, scale = np.zeros((DEGREE + 1, 3)), np.zeros(3)
     for axis in range(3):
         found = np.linalg.lstsq(np.column_stack([grid.reading[:, axis], columns]),
                                 grid.force[:, axis] * calibration.units.per_g, rcond=None)[0]
-        scale[axis], offset[:, axis] = found[0], -found[1:] / found[0]
-    shifted = np.zeros((DEGREE + 1, 3))
-    inner = Polynomial([(reference - middle) / half, 1.0 / half] if degree else [0.0])
-    for axis in range(3):  # from a polynomial in s to one in T - reference
-        parts = Polynomial(offset[:, axis])(inner).coef
-        shifted[:len(parts), axis] = parts
-    shifted *= _signs(options)
-    return ByAxis(shifted[0], scale, shifted[1:], reference, (low, high))
+        # From a polynomial in s to one in T - reference.
+        parts = Polynomial(-found[1:] / found[0])(inner).coef
+        scale[axis], offset[:len(parts), axis] = found[0], parts
+    offset *= _signs(options)
+    return ByAxis(offset[0], scale, offset[1:], reference, (low, high))
 
 
 def _degree(calibration: Calibration) -> int:

@@ -56,6 +56,17 @@ _EXPECTED: Mapping[type, str] = {dict: 'names with values', list: 'a list', str:
                                  int: 'a whole number'}
 
 
+def decoded(data: bytes) -> str:
+    """Return the text of a file; ValueError if it is too large, or not in UTF-8."""
+    if len(data) > MOST_BYTES:
+        raise ValueError(f'it has more than {MOST_BYTES} bytes')
+    try:
+        return data.decode().replace('\r\n', '\n').replace('\r', '\n')
+    except UnicodeDecodeError as err:
+        line = 1 + data.count(b'\n', 0, err.start)
+        raise ValueError(f'line {line} is not text in UTF-8') from err
+
+
 def read_plain(text: str) -> Any:
     """
     Return the content of a text in plain YAML, which has at most `MOST_BYTES` bytes in UTF-8.
