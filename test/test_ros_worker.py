@@ -17,7 +17,7 @@ from typing import Any
 
 from accel_calib.errors import InputError, RefusedFitError
 from accel_calib.logs import write_table
-from accel_calib.session import CalibratorSettings, Files, Task
+from accel_calib.session import CalibratorSettings, Files, nothing, Task
 from accel_calib.stored import read_calibration
 from faults.sample import sample
 from inside import fit_in_node, PATIENCE_OF_A_WORKER, Worker, WorkerProcess
@@ -55,7 +55,7 @@ def test_callbacks_continue_while_a_service_works(bench: Any, make_executor: Any
         return found
 
     def load() -> Task:
-        yield Files()
+        yield Files(nothing)
         raise InputError('no such thing', 'try another')
 
     def save() -> Task:

@@ -37,7 +37,7 @@ from ..findings import rate, residual_figures
 from ..messages.one_reading import Triple
 from ..report import calibration_page, STORED
 from ..session import (
-    Answer, BATCH, CalibratorSettings, CallSoon, checks, Commands, Compute, Level, Log, LogFilter,
+    Answer, BATCH, CalibratorSettings, CallSoon, checks, Commands, Compute, Level, Log,
     Progress, Session, Severity, ShowPoses, state, Task, title, words_of_state, Worker)
 from ..stored.exports import export, Exported
 from ..table import Floats
@@ -303,7 +303,7 @@ class Host:
 
     def __init__(self, source: Source, settings: CalibratorSettings,
                  log: Callable[[Log], None]) -> None:
-        self._source, self._print, self._filter = source, log, LogFilter()
+        self._source, self._print = source, log
         self._tasks: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._waiting: list[Floats] = []
         self._passed = self._ticked = self._shown = -math.inf
@@ -410,7 +410,8 @@ class Host:
         self._handle_events()
 
     def _handle_events(self) -> None:
-        for event in self.session.events():
+        while self.session.events:
+            event = self.session.events.popleft()
             if isinstance(event, Log):
                 self._log(event)
             elif isinstance(event, ShowPoses):
@@ -419,10 +420,10 @@ class Host:
                 self._worker.run(event, self._on_done)
 
     def _on_done(self, success: bool, words: str) -> None:
-        self._log(Log('info' if success else 'warning', words))
+        if words:
+            self._log(Log('info' if success else 'warning', words))
         self.exchange.show_state()
 
     def _log(self, line: Log) -> None:
-        if self._filter.passes(line):
-            self._print(replace(line, words=_with_buttons(line.words)))
-            self.exchange.show_line(line)
+        self._print(replace(line, words=_with_buttons(line.words)))
+        self.exchange.show_line(line)

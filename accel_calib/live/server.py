@@ -35,7 +35,7 @@ from .viewer import (
     text_of, TooManyError, Viewer)
 from .. import __version__
 from ..report import policy
-from ..session import Log, LogFilter
+from ..session import LogFilter
 from ..stored.exports import CALIBRATION_ALONE, FORMATS
 
 if TYPE_CHECKING:
@@ -297,7 +297,7 @@ class PageServer:
     def report(self, what: str) -> None:
         """Count what the page had to do, and log it at most once in `_QUIET_S`."""
         self._reported[what] += 1
-        if self._filter.passes(Log('warning', what, what, _QUIET_S)):
+        if self._filter.passes(what, _QUIET_S):
             self._desk.warn(f'the live page {what} ({self._reported[what]} so far)')
 
     def _look(self) -> None:

@@ -44,7 +44,7 @@ from ..live import check_installed
 from ..messages.correction import output_frame
 from ..session import (
     CalibratorSettings, Check, checks, COMMANDS, context_topics, Event, figures, Level, Log,
-    LogFilter, Mounting, Result, Session, ShowPoses, state, Still, Worker, worst)
+    Mounting, Result, Session, ShowPoses, state, Still, Worker, worst)
 from ..table import Floats
 
 if TYPE_CHECKING:
@@ -135,7 +135,7 @@ class Calibrator:
         self._worker = Worker(self._call_soon, self._handle_events,
                               lambda words: self._log(Log('error', words)),
                               lambda: self.stream.flush())
-        self._filter, self._progress_at = LogFilter(), 0.0
+        self._progress_at = 0.0
         self._still = node.create_publisher(Bool, '~/still', LATCHED)
         self._poses = node.create_publisher(MarkerArray, '~/poses', LATCHED)
         self._progress = node.create_publisher(DiagnosticStatus, '~/progress', LATCHED)
@@ -243,7 +243,8 @@ class Calibrator:
 
     def _handle_events(self) -> None:
         shown = False
-        for event in self.session.events():
+        while self.session.events:
+            event = self.session.events.popleft()
             self._handle(event)
             shown |= isinstance(event, ShowPoses)
         due = monotonic() - self._progress_at >= _PROGRESS_EVERY
@@ -270,7 +271,8 @@ class Calibrator:
             self._worker.run(event, self._on_done)
 
     def _on_done(self, success: bool, words: str) -> None:
-        self._log(Log('info' if success else 'warning', words))
+        if words:
+            self._log(Log('info' if success else 'warning', words))
         self._show_state()
 
     def _show_state(self) -> None:
@@ -287,8 +289,6 @@ class Calibrator:
                                   event.rotation)
 
     def _log(self, line: Log) -> None:
-        if not self._filter.passes(line):
-            return
         if self._page is not None:
             self._page.show_line(line)
         log = self._node.get_logger()  # rclpy needs a separate line of code for each severity

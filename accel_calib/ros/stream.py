@@ -284,8 +284,7 @@ class Stream:
                                     self._around(changes, len(waiting))])
             self._session.push(rows, self._arrived)
             self._on_events()
-        self._session.around.expire()
-        self._note_context()
+        self._note_context()  # the session may have dropped old values
 
     def _around(self, changes: list[tuple[int, Mapping[str, float]]], count: int) -> Floats:
         """Return the context of each message, (n, k), from its changes."""

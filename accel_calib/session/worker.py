@@ -35,6 +35,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
+import math
 import os
 import pickle
 from queue import SimpleQueue
@@ -231,27 +232,25 @@ def here(function: Callable[..., Found], *given: object) -> Found:
     return function(*given)
 
 
-class Step:
+def nothing() -> None:
+    """Do nothing: a task with such a step only waits until the steps before it are done."""
+
+
+class Step(partial[Any]):
     """
     What a task waits for: the result of a function with these arguments.
 
     The function does not use the session, and can raise AccelCalibError or OSError, which are
-    raised in the task. Without a function, the task only waits until the steps before it are done.
-    With `after`, the result of that step is its first argument.
+    raised in the task. An argument that is a step is computed first.
 
     """
 
-    def __init__(self, function: Callable[..., Any] | None = None, *given: Any,
-                 after: Step | None = None) -> None:
-        self._function, self._given, self._after = function, given, after
-
     def run(self, call: Callable[..., Any]) -> Any:
         """Return the result; `call` is `WorkerProcess.call`."""
-        return self._result(call, call)
+        return None if self.func is nothing else call(self.func, *self._given(call))
 
-    def _result(self, call: Callable[..., Any], call_before: Callable[..., Any]) -> Any:
-        before = () if self._after is None else (self._after.run(call_before),)
-        return None if self._function is None else call(self._function, *before, *self._given)
+    def _given(self, call: Callable[..., Any]) -> list[Any]:
+        return [each.run(call) if isinstance(each, Step) else each for each in self.args]
 
 
 class Parse(Step):
@@ -267,8 +266,8 @@ class Files(Parse):
     """A function that writes files, in this process, which holds their lock."""
 
     def run(self, call: Callable[..., Any]) -> Any:
-        """Return the result; only a step before it needs the worker process."""
-        return self._result(here, call)
+        """Return the result; only a step among the arguments uses the worker process."""
+        return self.func(*self._given(call))
 
 
 class Compute(Step):
@@ -306,12 +305,10 @@ Severity = Literal['info', 'warning', 'error']
 
 @dataclass(frozen=True)
 class Log:
-    """A log line; lines of one kind, if it has one, are logged at most once in `once_in` [s]."""
+    """A log line."""
 
     severity: Severity
     words: str
-    kind: str = ''
-    once_in: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -350,20 +347,18 @@ Event = Log | Mounting | Result | Still | ShowPoses | Task
 
 
 class LogFilter:
-    """Decide which lines are logged: not empty, and none of the same kind within `once_in`."""
+    """Decide which lines are logged: of each kind, at most one within a time."""
 
     def __init__(self, clock: Callable[[], float] = monotonic) -> None:
         self._clock = clock
         self._last: dict[str, float] = {}
 
-    def passes(self, line: Log) -> bool:
-        """Return whether to log a line, and note it."""
-        if not line.kind:
-            return bool(line.words)
+    def passes(self, kind: str, once_in: float) -> bool:
+        """Return whether to log a line of this kind, at most once in `once_in` [s]; note it."""
         now = self._clock()
-        if now - self._last.get(line.kind, -line.once_in) < line.once_in:
+        if now - self._last.get(kind, -math.inf) < once_in:
             return False
-        self._last[line.kind] = now
+        self._last[kind] = now
         return True
 
 

@@ -40,7 +40,8 @@ class _Driver:
         self._handle()
 
     def _handle(self) -> None:
-        for event in self.session.events():
+        while self.session.events:
+            event = self.session.events.popleft()
             if isinstance(event, Generator):
                 self._done(event)
             elif isinstance(event, Log):
