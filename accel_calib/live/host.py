@@ -25,7 +25,7 @@ import math
 from queue import Empty, SimpleQueue
 import re
 from time import monotonic, time
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -38,19 +38,15 @@ from ..messages.one_reading import Triple
 from ..report import calibration_page, STORED
 from ..session import (
     Answer, BATCH, CalibratorSettings, CallSoon, checks, Commands, Compute, Level, Log,
-    Progress, Session, Severity, ShowPoses, state, Task, title, words_of_state, Worker)
+    Session, Severity, ShowPoses, state, Task, title, words_of_state, Worker)
 from ..stored.exports import export, Exported
 from ..table import Floats
-from ..units import MG
 
 if TYPE_CHECKING:
     from .sources import Source
 
 Show = Callable[[Message], object]
 """Function that shows a message to all viewers."""
-
-_DIGITS = 7
-_DECIMALS = 6
 
 _NO_CALIBRATION = InputError('there is no calibration yet', 'capture poses and press Fit')
 
@@ -87,11 +83,12 @@ class Exchange:
 
     def show_progress(self, reading: Triple | None = None) -> None:
         """Show the progress; the parameter is as in `state.progress`."""
-        self.show(_progress(monotonic(), state.progress(self._session, reading)))
+        now = state.progress(self._session, reading)
+        self.show({'kind': 'progress', 'time': monotonic(), **vars(now)})
 
     def show_poses(self, event: ShowPoses) -> None:
         """Show the directions of up of the poses, and the state that may have changed."""
-        self.show({'kind': 'poses', 'up': _rounded(event.up)})
+        self.show({'kind': 'poses', 'up': event.up})
         self.show_state()
 
     def show_line(self, line: Log) -> None:
@@ -188,18 +185,6 @@ def drawn(calibration: Calibration, source: str, stored: str) -> str:
     return calibration_page(calibration, rate(calibration), source, stored=stored)
 
 
-def _progress(time: float, now: Progress) -> Message:
-    return {
-        'kind': 'progress', 'time': round(time, 3), 'still': now.still,
-        'stillness': _fixed(now.stillness), 'dwell': _fixed(now.dwell),
-        'min_dwell': now.min_dwell, 'poses': now.poses, 'total': now.total,
-        'coverage': _fixed(now.coverage), 'accuracy_mg': _fixed(now.accuracy * MG),
-        'step': now.step, 'advice': now.advice, 'command': now.command,
-        'direction': list(now.direction),
-        'up': [round(part, _DECIMALS) for part in now.up], 'raw': _fixed(now.length),
-        'corrected': _fixed(now.corrected), 'temperature': _fixed(now.temperature)}
-
-
 def log_line(number: int, severity: Severity, words: str, time: float) -> Message:
     """Return a log line with its number; `time` is that since 1970 [s]."""
     return {'kind': 'log', 'number': number, 'severity': severity, 'words': words,
@@ -240,39 +225,19 @@ def _problem(session: Session) -> str:
 def _result(calibration: Calibration) -> Message:
     quality, used = calibration.quality, len(calibration.used_poses)
     return {
-        'model': calibration.name, 'date': calibration.date, 'unit': calibration.units.name,
-        'poses': used, 'left_out': len(calibration.poses) - used,
-        'coverage': _number(quality.coverage),
-        'residuals': [[figure.label, _number(figure.value), figure.unit]
+        'unit': calibration.units.name, 'poses': used, 'left_out': len(calibration.poses) - used,
+        'coverage': quality.coverage,
+        'residuals': [(figure.label, figure.value, figure.unit)
                       for figure in residual_figures(quality)],
-        'effects': list(calibration.model.effects), 'warnings': list(calibration.warnings),
-        'offset': _rounded(calibration.offset), 'offset_sd': _rounded(calibration.offset_sd),
-        'gain': _rounded(calibration.gain), 'gain_sd': _rounded(calibration.gain_sd)}
+        'effects': calibration.model.effects, 'warnings': calibration.warnings,
+        'offset': calibration.offset, 'gain': np.diag(calibration.gain)}
 
 
 def _counts_per_g(calibration: Calibration) -> float | None:
     """Return the mean sensitivity of a sensor in native units; None in other units."""
     if not calibration.units.is_native:
         return None
-    return _number(float(np.mean(np.linalg.norm(calibration.gain, axis=0))))
-
-
-def _fixed(value: float) -> float | None:
-    """Return a number with the decimals of progress; this is faster than `_number`."""
-    return round(value, _DECIMALS) if math.isfinite(value) else None
-
-
-def _number(value: float | None) -> float | None:
-    if value is None or not math.isfinite(value):
-        return None
-    return float(f'{value:.{_DIGITS}g}')
-
-
-def _rounded(values: Any) -> Any:
-    array = np.asarray(values, float)
-    if array.ndim == 0:
-        return _number(float(array))
-    return [_rounded(each) for each in array]
+    return float(np.mean(np.linalg.norm(calibration.gain, axis=0)))
 
 
 @cache

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import hmac
 from importlib.resources import files
 from ipaddress import ip_address
+from itertools import takewhile
 from pathlib import PurePath
 import secrets
 import socket
@@ -32,11 +33,12 @@ from aiohttp import web
 
 from .viewer import (
     announce, COMMANDS, Connection, LARGEST, Message, not_bound, reachable, secured, STUCK_S,
-    text_of, TooManyError, Viewer)
+    TooManyError, Viewer)
 from .. import __version__
 from ..report import policy
 from ..session import LogFilter
 from ..stored.exports import CALIBRATION_ALONE, FORMATS
+from ..text import plain
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -83,43 +85,31 @@ class Board:
     """What viewers are shown: the newest message of each kind, log lines, and the history."""
 
     def __init__(self) -> None:
-        self._newest: dict[str, tuple[Message, str]] = {}
-        self._lines: deque[tuple[int, str]] = deque(maxlen=_LINES)
+        self.newest: dict[str, Message] = {}
         self.history: deque[Message] = deque(maxlen=int(_HISTORY_S / PERIOD))
+        self._lines: deque[Message] = deque(maxlen=_LINES)
 
-    def take(self, message: Message, *, is_seen: bool) -> bool:
-        """Keep a message; return whether it is new. `is_seen`: there are viewers."""
-        kind = message['kind']
-        if kind == 'log':
-            self._lines.append((message['number'], text_of(message)))
-            return True
-        before = self._newest.get(kind, ({}, ''))[0]
-        if before is message or (kind != 'progress' and before == message):
+    def take(self, message: Message) -> bool:
+        """Keep a message; return whether it is new."""
+        if message['kind'] == 'log':
+            self._lines.append(message)
+        elif message == self.newest.get(message['kind']):
             return False
-        self._newest[kind] = message, text_of(message) if is_seen else ''
+        else:
+            self.newest[message['kind']] = message
         return True
 
-    def newest(self, kind: str) -> tuple[Message, str] | None:
-        """Return the newest message of a kind, and its text."""
-        found = self._newest.get(kind)
-        if found is not None and not found[1]:
-            found = self._newest[kind] = found[0], text_of(found[0])
-        return found
+    def lines_after(self, number: int) -> list[Message]:
+        """Return the log lines with larger numbers, the newest first."""
+        return list(takewhile(lambda line: line['number'] > number, reversed(self._lines)))
 
-    def lines_after(self, number: int) -> list[tuple[int, str]]:
-        """Return the log lines with larger numbers."""
-        if not self._lines or self._lines[-1][0] <= number:
-            return []
-        return [line for line in self._lines if line[0] > number]
-
-    def welcome(self, why: str) -> str:
+    def welcome(self, why: str) -> Message:
         """Return the answer to ``hello``; `why` commands are not accepted is empty if they are."""
         kept = self.history.copy()
-        return text_of({
-            'kind': 'welcome', 'may': not why, 'why': why, 'version': __version__,
-            'seconds': _HISTORY_S, 'commands': COMMANDS, 'exports': CALIBRATION_ALONE,
-            'history': {key: [each[key] for each in kept]
-                        for key in ('time', 'raw', 'corrected', 'temperature')}})
+        return {'kind': 'welcome', 'may': not why, 'why': why, 'version': __version__,
+                'seconds': _HISTORY_S, 'commands': COMMANDS, 'exports': CALIBRATION_ALONE,
+                'history': {key: [each[key] for each in kept]
+                            for key in ('time', 'length', 'corrected')}}
 
 
 @dataclass(frozen=True)
@@ -228,6 +218,7 @@ class PageServer:
 
     def show(self, message: Message) -> None:
         """Show a message to all viewers, and keep it for those who come later."""
+        message = plain(message)
         if message['kind'] == 'progress':  # without waking the thread of the server
             self.board.history.append(message)
         else:
@@ -313,7 +304,7 @@ class PageServer:
         loop.call_later(wait, self._look)
 
     def _take(self, message: Message) -> None:
-        if self.board.take(message, is_seen=bool(self.viewers)):
+        if self.board.take(message):
             for viewer in self.viewers:
                 viewer.wake()
 
