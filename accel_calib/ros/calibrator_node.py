@@ -174,7 +174,7 @@ class Calibrator:
         if 'temperature' not in context_topics(self.session.settings):
             self._heard.append(node.create_subscription(
                 Temperature, 'temperature',
-                lambda message: self.stream.set_context('temperature', message.temperature),
+                lambda message: self.session.around.take('temperature', message.temperature),
                 SENSOR, qos_overriding_options=overrides))
         node.create_timer(1.0, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
         if self.session.settings.web_port:
@@ -211,7 +211,7 @@ class Calibrator:
         self.session.imus, self.session.thermometers = published_by_others(
             self._node, ('sensor_msgs/msg/Imu', 'sensor_msgs/msg/Temperature'))
         self.session.mismatches = mismatches(self._node, self._heard, self._said)
-        self._context.look(self.session, self.stream.set_context)
+        self._context.look(self.session)
         self.stream.flush()
         self.session.tick()
         self._on_transforms()

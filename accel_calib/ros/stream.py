@@ -100,7 +100,7 @@ class ContextTopics:
                                  f'{str(error).splitlines()[0]}', 'correct the entry') from error
             self._waiting[column] = node.resolve_topic_name(topic)
 
-    def look(self, session: Session, set_context: Callable[[str, float], None]) -> None:
+    def look(self, session: Session) -> None:
         """Subscribe to the topics that exist by now, and note why others do not arrive."""
         types = dict(self._node.get_topic_names_and_types()) if self._waiting else {}
         for column, topic in list(self._waiting.items()):
@@ -110,7 +110,7 @@ class ContextTopics:
                 kind, fields = _NUMBERS[known[0]]
                 field = next((each for each in fields if each in column), fields[0])
                 self._node.create_subscription(
-                    kind, topic, lambda message, column=column, field=field: set_context(
+                    kind, topic, lambda message, column=column, field=field: session.around.take(
                         column, getattr(message, field)), SENSOR)
                 session.missing[column] = f'nothing comes on {topic} ({_short(known[0])})'
             else:
@@ -148,9 +148,7 @@ class Stream:
         self._outputs = [Output(publisher) for publisher in publishers]
         self._calibrated, self._preview, self._motion = self._outputs
         self._layout = _NO_LAYOUT
-        self._waiting: list[bytes] = []
-        self._context: Mapping[str, float] = {}
-        self._changes: list[tuple[int, Mapping[str, float]]] = [(0, self._context)]
+        self._waiting: list[tuple[bytes, Mapping[str, float]]] = []
         self._due = self._arrived = 0.0
         self._listened = False
         self._applied: Calibration | None = None
@@ -163,26 +161,12 @@ class Stream:
         self._active = active
         self._prepare()
 
-    def set_context(self, column: str, value: float) -> None:
-        """Set the context of the following messages; NaN is ignored."""
-        self._session.around.take(column, value)
-        self._note_context()
-
-    def _note_context(self) -> None:
-        """Note from which message on the context has its present values."""
-        context, count = self._session.around.values, len(self._waiting)
-        if context is not self._context:
-            self._context = context
-            if self._changes[-1][0] == count:
-                self._changes.pop()
-            self._changes.append((count, context))
-
     @property
     def newest(self) -> Triple | None:
         """Return the newest reading, unless the session has it already."""
         if not self._waiting:
             return None
-        x, y, z = THREE.unpack_from(self._waiting[-1], self._layout.place(ACCELERATION))
+        x, y, z = THREE.unpack_from(self._waiting[-1][0], self._layout.place(ACCELERATION))
         return x, y, z
 
     def on_message(self, data: bytes) -> None:
@@ -204,7 +188,7 @@ class Stream:
             self._prepare()
         if self._listened:
             self._send(data)
-        self._waiting.append(data)
+        self._waiting.append((data, session.around.values))
         self._arrived = now
         if due:
             self._due = now + BATCH
@@ -262,7 +246,7 @@ class Stream:
         if rewriter is None:
             return
         try:
-            corrected = rewriter(data, self._context)
+            corrected = rewriter(data, self._session.around.values)
         except AccelCalibError as error:
             self._session.reports.uncorrected(error)
             return
@@ -277,21 +261,18 @@ class Stream:
     def flush(self) -> None:
         """Pass the waiting messages to the session."""
         if self._waiting:
-            waiting, self._waiting = self._waiting, []
-            changes, self._changes = self._changes, [(0, self._context)]
-            found = samples_of(joined(waiting, IMU_DOUBLES, 'imu/data_raw'))
+            messages, contexts = zip(*self._waiting)
+            self._waiting = []
+            found = samples_of(joined(messages, IMU_DOUBLES, 'imu/data_raw'))
             rows = np.column_stack([found['time'], found['reading'], found['rate'],
-                                    self._around(changes, len(waiting))])
+                                    self._around(contexts)])
             self._session.push(rows, self._arrived)
             self._on_events()
-        self._note_context()  # the session may have dropped old values
 
-    def _around(self, changes: list[tuple[int, Mapping[str, float]]], count: int) -> Floats:
-        """Return the context of each message, (n, k), from its changes."""
-        starts = [start for start, _ in changes]
-        values = [[known.get(column, math.nan) for column in self._columns]
-                  for _, known in changes]
-        return np.repeat(np.array(values), np.diff([*starts, count]), axis=0)
+    def _around(self, contexts: Sequence[Mapping[str, float]]) -> Floats:
+        """Return the columns of the context of each message, (n, k)."""
+        return np.array([[known.get(column, math.nan) for column in self._columns]
+                         for known in contexts])
 
 
 def _usual(data: bytes) -> bytes:
