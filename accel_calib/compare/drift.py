@@ -184,23 +184,27 @@ class Drift:
     """
     The state of the monitor: the last rests since a calibration, and the number of all.
 
-    `covariance` (p, p) is that of the calibration [g²], `repeats` the variance of its poses beyond
-    the noise of their samples [g²], and `temperatures` their lowest and highest temperature [°C],
-    empty if not known. `scatter` is the factor on the stated scatter of the rests. `change` is the
-    lasting change, None if the sensor is unchanged, and `since` the number of the first rest with
-    it, 1-based, or 0. It was clearly absent in the last `without` rests.
+    `scatter` is the factor on the stated scatter of the rests. `change` is the lasting change,
+    None if the sensor is unchanged, and `since` the number of the first rest with it, 1-based, or
+    0. It was clearly absent in the last `without` rests.
 
     """
 
-    covariance: Floats
-    repeats: float
-    temperatures: tuple[float, ...]
+    calibration: Calibration
     rests: tuple[RestError, ...] = ()
     count: int = 0
     scatter: float = 1.0
     change: LastingChange | None = None
     since: int = 0
     without: int = 0
+
+    @property
+    def temperatures(self) -> tuple[float, ...]:
+        """Lowest and highest temperature of the poses [°C]; empty if not known."""
+        poses = self.calibration.poses
+        if 'temperature' not in poses or not len(poses):
+            return ()
+        return float(np.min(poses['temperature'])), float(np.max(poses['temperature']))
 
     @property
     def stated(self) -> float:
@@ -249,16 +253,6 @@ def rest_errors(calibration: Calibration, reading: Floats, noise: Floats, contex
                       u[k] / length[k], float(temperature[k])) for k in range(len(u))]
 
 
-def monitor(calibration: Calibration) -> Drift:
-    """Return the initial state of the monitor after a calibration."""
-    poses = calibration.poses
-    temperatures: tuple[float, ...] = ()
-    if 'temperature' in poses and len(poses):
-        known = poses['temperature']
-        temperatures = (float(np.min(known)), float(np.max(known)))
-    return Drift(calibration.covariance, _repeats(calibration), temperatures)
-
-
 def _repeats(calibration: Calibration) -> float:
     """Return the variance of pose means beyond their noise [g²]; infinite for a mounting."""
     if not calibration.model.effects:
@@ -295,8 +289,9 @@ def compared(before: Drift, rest: RestError, least: float) -> Drift:
 def _covariance(state: Drift, rests: tuple[RestError, ...]) -> Floats:
     """Return the (n, n) covariance of the errors of these rests without a change [g²]."""
     slope = np.array([rest.slope for rest in rests])
-    noise = np.array([rest.variance + state.repeats for rest in rests])
-    return np.asarray(slope @ state.covariance @ slope.T + np.diag(state.scatter ** 2 * noise))
+    noise = np.array([rest.variance for rest in rests]) + _repeats(state.calibration)
+    spread = slope @ state.calibration.covariance @ slope.T
+    return np.asarray(spread + np.diag(state.scatter ** 2 * noise))
 
 
 def _scatter(state: Drift, rests: tuple[RestError, ...]) -> float:

@@ -17,8 +17,10 @@ EventsExecutor.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from queue import SimpleQueue
 from time import monotonic
+from traceback import format_exc
 from typing import Any, TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -31,20 +33,20 @@ from rclpy.node import Node
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool, ColorRGBA, String
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
 from .declare import (
-    CALLS, declared, follow, in_executor, LATCHED, mismatches, MountingBroadcaster, name_of,
-    published_by_others, SENSOR, serve, STREAM, watch_static)
+    CALLS, declared, follow, LATCHED, mismatches, MountingBroadcaster, name_of,
+    published_by_others, SENSOR, STREAM, watch_static)
 from .stream import ContextTopics, Stream
 from ..calibrate import NextPose
 from ..errors import AccelCalibError
 from ..live import check_installed
 from ..messages.correction import output_frame
 from ..session import (
-    CalibratorSettings, Check, checks, COMMANDS, context_topics, Event, figures, Level, Log,
-    Mounting, Result, Session, ShowPoses, state, Still, Worker, worst)
+    CalibratorSettings, CallSoon, Check, checks, COMMANDS, context_topics, Event, figures, Level,
+    Log, Mounting, Result, Session, ShowPoses, state, Still, Task, Worker, worst)
 from ..table import Floats
 
 if TYPE_CHECKING:
@@ -307,6 +309,43 @@ class Calibrator:
             self._server.close()
         self._worker.close()
         self.session.close()
+
+
+def in_executor(node: Node) -> CallSoon:
+    """Return a function that lets the executor of a node call functions, in their order."""
+    waiting: SimpleQueue[Callable[[], None]] = SimpleQueue()
+
+    def call_next() -> None:
+        try:
+            waiting.get()()
+        except Exception:  # EventsExecutor crashes on an exception in a task (rclpy issue 1641)
+            node.get_logger().error(f'unexpected error in accel_calib:\n{format_exc()}')
+
+    def call_soon(function: Callable[[], None]) -> None:
+        waiting.put(function)
+        executor = node.executor
+        if executor is not None:
+            # The executor may run tasks in any order; the queue keeps their order.
+            executor.create_task(call_next)
+
+    return call_soon
+
+
+def serve(node: Node, name: str, command: Callable[[], Task], worker: Worker,
+          log: Callable[[Log], object]) -> None:
+    """Create the service ``~/name``, which logs and responds the result of a command."""
+    service = node.create_service(Trigger, f'~/{name}', lambda request, response: response,
+                                  qos_profile=CALLS)
+    send = service.send_response
+
+    def send_response(response: Any, header: Any) -> None:
+        def answer(success: bool, words: str) -> None:
+            log(Log('info' if success else 'warning', words))
+            send(Trigger.Response(success=success, message=words), header)
+
+        worker.do(name, command(), answer)
+
+    service.send_response = send_response
 
 
 class CalibratorNode(Node):

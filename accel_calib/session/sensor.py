@@ -31,7 +31,7 @@ from .stream import StreamStatistics
 from ..calibrate import (
     Calibration, GyroBias, on_topics, Outside, outside, SampleNoise, thermal_stream)
 from ..capture import Dwell
-from ..compare import compared, Drift, monitor, rest_errors
+from ..compare import compared, Drift, rest_errors
 from ..effects import Context, Model, ThermalStream
 from ..errors import InputError
 from ..messages import output_scale
@@ -134,7 +134,7 @@ class Sensor:
         self.offer(None)
         self.unsaved = False
         if not _only_levelled(self.calibration, calibration):
-            self._past = None if calibration is None else monitor(calibration)
+            self._past = None if calibration is None else Drift(calibration)
             self._counted = self.rest
         self.calibration, self.drift = calibration, self._past
         self.temperatures.forget()

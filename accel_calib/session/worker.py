@@ -50,7 +50,7 @@ from typing import Any, BinaryIO, cast, Literal, TypeVar
 
 from .store import writing_advice
 from ..calibrate import NextPose
-from ..effects import know_code, known_code
+from ..effects import know_code, KNOWN_CODE
 from ..errors import AccelCalibError, InputError
 from ..table import Floats
 
@@ -166,7 +166,7 @@ class WorkerProcess:
             self._end()
         if process is None or process.stdin is None or process.stdout is None:
             raise EOFError
-        process.stdin.write(pickle.dumps((known_code(), pickle.dumps((function, given)))))
+        process.stdin.write(pickle.dumps((KNOWN_CODE, pickle.dumps((function, given)))))
         process.stdin.flush()
         if self._idle and not select([process.stdout], [], [], _PATIENCE)[0]:
             self._idle = False  # raising the priority needs privileges, so restart it
