@@ -135,7 +135,7 @@ def test_messages_of_another_sensor_are_dropped_and_end_the_rest(readings: Readi
     assert not driver.sensor.live.detector.still
     assert "frame_id 'another', expected 'imu_link'" in driver.logged()
     assert driver.feed(rest[100:]) == len(rest) - 100
-    assert driver.session.statistics.foreign == 1
+    assert driver.session.statistics.dropped['foreign'] == 1
     assert 'dropped 1 message of another sensor' in driver.finding('stream').words
 
 

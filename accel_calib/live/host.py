@@ -20,7 +20,6 @@ from collections.abc import Callable, Generator, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache
-from importlib.resources import files
 import math
 from queue import Empty, SimpleQueue
 import re
@@ -29,7 +28,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .server import PageServer, PERIOD
+from .server import PAGE, PageServer, PERIOD
 from .viewer import Message
 from ..calibrate import Calibration
 from ..errors import AccelCalibError, InputError, system_error
@@ -243,8 +242,7 @@ def _counts_per_g(calibration: Calibration) -> float | None:
 @cache
 def _buttons() -> dict[str, str]:
     """Return what stands for the services where no ROS runs: the labels of the buttons."""
-    page = (files(__package__) / 'page' / 'index.html').read_text(encoding='utf-8')
-    labels = re.findall(r'data-command="(\w+)"[^>]*>([^<]+)<', page)
+    labels = re.findall(r'data-command="(\w+)"[^>]*>([^<]+)<', PAGE.read_text(encoding='utf-8'))
     return {'preview': 'the preview', **dict(reversed(labels))}
 
 

@@ -19,10 +19,9 @@ from collections import Counter, deque
 from concurrent.futures import Future
 from dataclasses import dataclass
 import hmac
-from importlib.resources import files
 from ipaddress import ip_address
 from itertools import takewhile
-from pathlib import PurePath
+from pathlib import Path
 import secrets
 import socket
 from threading import Thread
@@ -42,13 +41,14 @@ from ..text import plain
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
-    from importlib.resources.abc import Traversable
-    from pathlib import Path
 
     from .host import Exchange
 
 PERIOD = 0.05
 """Interval between two messages of progress [s]."""
+
+PAGE = Path(__file__).with_name('page') / 'index.html'
+"""The page; what it loads is in the same folder."""
 
 _VIEWERS = 16
 """Largest number of viewers, and of connections that have not said hello yet."""
@@ -182,10 +182,9 @@ class PageServer:
         self._connections: list[Connection] = []
         self._reported, self._filter = Counter[str](), LogFilter()
         self._address = Address(port, frozenset(), frozenset())
-        page = files(__package__) / 'page'
-        self._files: dict[str, Traversable] = {
-            f'/page/{each.name}': each for each in page.iterdir() if _suffix_of(each) in _KINDS}
-        self._files['/'] = page / 'index.html'
+        self._files = {f'/page/{each.name}': each for each in PAGE.parent.iterdir()
+                       if each.suffix in _KINDS}
+        self._files['/'] = PAGE
 
     # In any thread
 
@@ -331,7 +330,7 @@ class PageServer:
         file = self._files.get(path)
         if file is None:
             return web.Response(status=404, text='there is no such page; open /\n')
-        return web.Response(body=file.read_bytes(), content_type=_KINDS[_suffix_of(file)],
+        return web.Response(body=file.read_bytes(), content_type=_KINDS[file.suffix],
                             charset='utf-8')
 
     async def _page(self) -> web.Response:
@@ -419,7 +418,3 @@ class PageServer:
     def ask(self, command: str, answer: Callable[[bool, str], object]) -> None:
         """Ask the desk, and call `answer` in this thread."""
         self._desk.ask(command, lambda success, words: self._call(lambda: answer(success, words)))
-
-
-def _suffix_of(file: Traversable) -> str:
-    return PurePath(file.name).suffix
