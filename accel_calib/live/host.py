@@ -207,7 +207,8 @@ def _state(session: Session, problem: str, *, busy: str, page: int) -> Message:
         'preview': sensor.offered is not None,
         'levelled': shown is not None and shown.is_levelled,
         'file': session.files.path, 'busy': busy,
-        'counts_per_g': None if shown is None else _counts_per_g(shown),
+        'counts_per_g': None if shown is None or not shown.units.is_native else np.mean(
+            np.linalg.norm(shown.gain, axis=0)),
         'rating': None if shown is None or rating is None else {
             'rating': rating.name, 'reason': rating.reason},
         'result': None if shown is None else _result(shown),
@@ -230,13 +231,6 @@ def _result(calibration: Calibration) -> Message:
                       for figure in residual_figures(quality)],
         'effects': calibration.model.effects, 'warnings': calibration.warnings,
         'offset': calibration.offset, 'gain': np.diag(calibration.gain)}
-
-
-def _counts_per_g(calibration: Calibration) -> float | None:
-    """Return the mean sensitivity of a sensor in native units; None in other units."""
-    if not calibration.units.is_native:
-        return None
-    return float(np.mean(np.linalg.norm(calibration.gain, axis=0)))
 
 
 @cache

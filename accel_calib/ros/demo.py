@@ -21,6 +21,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+import json
 import os
 from pathlib import Path
 import signal
@@ -357,7 +358,7 @@ def running(command: str, parameters: dict[str, Any], severity: str = 'error'
             ) -> Iterator[subprocess.Popen[bytes]]:
     """Run a node in a process, which prints log lines from this severity on, and end it."""
     given = [part for name, value in parameters.items()
-             for part in ('-p', f'{name}:={_in_yaml(value)}')]
+             for part in ('-p', f'{name}:={json.dumps(value)}')]
     process = subprocess.Popen(
         [sys.executable, '-m', 'accel_calib.cli.main', command, '--ros-args',
          '--log-level', severity, *given])
@@ -370,10 +371,6 @@ def running(command: str, parameters: dict[str, Any], severity: str = 'error'
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
-
-
-def _in_yaml(value: Any) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 @contextmanager

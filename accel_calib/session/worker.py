@@ -124,15 +124,7 @@ class WorkerProcess:
 
         """
         with self._turn:
-            self.start()
-            try:
-                good, found = self._ask(function, given, limit_s)
-            except (OSError, EOFError, pickle.UnpicklingError) as err:
-                self._end()
-                raise err if isinstance(err, TimeoutError) else EOFError from err
-            if not good:
-                raise found
-            return cast('Found', found)
+            return self._call(function, given, limit_s)
 
     def call_if_free(self, function: Callable[..., Found], *given: Any) -> Found:
         """Call a function as `call` does, or at once in this process if the other one is busy."""
@@ -146,14 +138,17 @@ class WorkerProcess:
         finally:
             self._turn.release()
 
-    def _call(self, function: Callable[..., Found], given: tuple[Any, ...]) -> Found:
+    def _call(self, function: Callable[..., Found], given: tuple[Any, ...],
+              limit_s: float | None = None) -> Found:
         self.start()
         try:
-            good, found = self._ask(function, given)
-        except (OSError, EOFError, pickle.UnpicklingError):
+            good, found = self._ask(function, given, limit_s)
+        except (OSError, EOFError, pickle.UnpicklingError) as err:
             if self._closed:
                 raise ClosedError('the node is shutting down', 'start it again') from None
             self._end()
+            if limit_s is not None:
+                raise err if isinstance(err, TimeoutError) else EOFError from err
             return function(*given)
         if not good:
             raise found
