@@ -17,6 +17,7 @@ and `warn`, in its own thread, and they pass the work on.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator
+from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache
@@ -74,8 +75,7 @@ class Exchange:
         self.problem = ''
         self._shown: Calibration | None = None
         self._number = 0
-        self._page: tuple[int, str] = (-1, '')
-        self._waiting: dict[int, list[Answer]] = {}
+        self._drawing: tuple[int, Future[tuple[bool, str]]] = -1, Future()
         self._line = int(time()) * 1000  # a viewer of an earlier server has smaller numbers
 
     # The session has news
@@ -143,29 +143,19 @@ class Exchange:
         return (yield from getattr(self._commands, name)())
 
     def _draw(self, answer: Answer) -> None:
-        """Draw the calibration page, unless it is drawn already."""
+        """Draw the calibration page, unless it is drawn already, or being drawn."""
         self.show_state()  # the calibration may have changed since
-        calibration, number = self._shown, self._number
-        if calibration is None:
+        if self._shown is None:
             answer(False, str(_NO_CALIBRATION))
             return
-        if self._page[0] == number:
-            answer(True, self._page[1])
-            return
-        waiting = self._waiting.setdefault(number, [])
-        waiting.append(answer)
-        if len(waiting) > 1:
-            return  # it is being drawn
-        store = self._session.files.store
-        drawing = self._drawn(calibration, store.calibration.name if store else STORED)
-
-        def answer_all(success: bool, words: str) -> None:
-            if success:
-                self._page = number, words
-            for each in self._waiting.pop(number):
-                each(success, words)
-
-        self._worker.run(drawing, answer_all)
+        number, page = self._drawing
+        if number != self._number or (page.done() and not page.result()[0]):
+            page = Future()
+            self._drawing, store = (self._number, page), self._session.files.store
+            self._worker.run(
+                self._drawn(self._shown, store.calibration.name if store else STORED),
+                lambda *found: page.set_result(found))
+        page.add_done_callback(lambda done: answer(*done.result()))
 
     def _drawn(self, calibration: Calibration, stored: str) -> Task:
         return (yield Compute(drawn, calibration, self._session.topic, stored))
