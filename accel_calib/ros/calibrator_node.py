@@ -147,9 +147,6 @@ class Calibrator:
         outputs = [self._published(Imu, 'imu/data_calibrated'), self._published(Imu, '~/preview'),
                    self._published(Vector3Stamped, '~/linear_acceleration')]
         self.stream = Stream(self.session, outputs, self._handle_events)
-        self._heard: list[Any] = []
-        self._said = [*outputs, self._still, self._poses, self._progress, self._result,
-                      self._diagnostics]
         self._page: Exchange | None = None
         self._server: PageServer | None = None
         self._still.publish(Bool(data=False))
@@ -170,14 +167,13 @@ class Calibrator:
         """Start; to be called when the node has an executor."""
         self._handle_events()
         node, overrides = self._node, self._overrides
-        self._heard = [
-            node.create_subscription(Imu, 'imu/data_raw', self.stream.on_message, SENSOR,
-                                     raw=True, qos_overriding_options=overrides)]
+        node.create_subscription(Imu, 'imu/data_raw', self.stream.on_message, SENSOR, raw=True,
+                                 qos_overriding_options=overrides)
         if 'temperature' not in context_topics(self.session.settings):
-            self._heard.append(node.create_subscription(
+            node.create_subscription(
                 Temperature, 'temperature',
                 lambda message: self.session.around.take('temperature', message.temperature),
-                SENSOR, qos_overriding_options=overrides))
+                SENSOR, qos_overriding_options=overrides)
         node.create_timer(1.0, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
         if self.session.settings.web_port:
             try:
@@ -212,7 +208,7 @@ class Calibrator:
             map(name_of, self._node.get_publishers_info_by_topic(self._topic)))
         self.session.imus, self.session.thermometers = published_by_others(
             self._node, ('sensor_msgs/msg/Imu', 'sensor_msgs/msg/Temperature'))
-        self.session.mismatches = mismatches(self._node, self._heard, self._said)
+        self.session.mismatches = mismatches(self._node)
         self._context.look(self.session)
         self.stream.flush()
         self.session.tick()

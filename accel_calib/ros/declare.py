@@ -148,24 +148,23 @@ def published_by_others(node: Node, types: Iterable[str]) -> list[tuple[str, ...
             for wanted in types]
 
 
-def mismatches(node: Node, subscriptions: Iterable[Any], publishers: Iterable[Any]
-               ) -> tuple[str, ...]:
+def mismatches(node: Node) -> tuple[str, ...]:
     """
-    Return one line for each endpoint that cannot exchange messages with these of a node.
+    Return one line for each endpoint that cannot exchange messages with those of a node.
 
     A line is what is wrong and what to do. Of other policies than reliability and durability,
     rclpy reports a difference.
 
     """
     lines = []
-    for own in subscriptions:
+    for own in node.subscriptions:
         for other in node.get_publishers_info_by_topic(own.topic_name):
             why = _mismatch(other.qos_profile, own.qos_profile)
             if why:
                 lines.append(f'{name_of(other)} publishes on {own.topic_name} with the QoS {why}, '
                              'so that nothing arrives here: start this node without '
                              f'qos_overrides.{own.topic_name}.subscription')
-    for own in publishers:
+    for own in node.publishers:
         for other in node.get_subscriptions_info_by_topic(own.topic_name):
             why = _mismatch(own.qos_profile, other.qos_profile)
             if why:

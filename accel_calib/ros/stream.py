@@ -54,12 +54,9 @@ class Output:
         self.rewriter: Rewriter | None = None
         self._made_for: tuple[object, ...] = ()
 
-    def count(self) -> None:
-        """Count the subscribers."""
-        self.listeners = self._publisher.get_subscription_count()
-
     def prepare(self, layout: Layout, calibration: Calibration | None, session: Session) -> None:
-        """Prepare the correction of messages by this calibration, unless it is prepared."""
+        """Count the subscribers, and prepare the correction by this calibration for them."""
+        self.listeners = self._publisher.get_subscription_count()
         settings, sensor = session.settings, session.sensor
         fills = settings.fill_covariance and sensor.noise is not None
         made_for = layout, calibration, settings, fills
@@ -195,20 +192,17 @@ class Stream:
             self.flush()
 
     def _prepare(self) -> None:
-        """Count the subscribers, and prepare the corrections."""
+        """Prepare the outputs."""
         session = self._session
-        self._applied, self._offered = session.sensor.applied, session.sensor.offered
-        self._settings = session.settings
-        for output in self._outputs:
-            output.count()
-        self._listened = self._active and any(output.listeners for output in self._outputs)
-        gyro = session.sensor.gyro if session.settings.gyro_bias else None
+        sensor, self._settings = session.sensor, session.settings
+        self._applied, self._offered = sensor.applied, sensor.offered
+        gyro = sensor.gyro if session.settings.gyro_bias else None
         bias = _NO_BIAS if gyro is None else gyro.at(session.around.temperature)
-        for output, calibration in ((self._calibrated, self._applied),
-                                    (self._preview, session.sensor.previewed)):
+        for output, calibration in zip(self._outputs, (sensor.applied, sensor.previewed, None)):
             output.prepare(self._layout, calibration, session)
             if output.rewriter is not None:
                 output.rewriter.bias = tuple(bias.tolist())
+        self._listened = self._active and any(output.listeners for output in self._outputs)
 
     def _adopted(self, data: bytes) -> bytes | None:
         """Return a message with a new layout as usual; None: not readable, or another sensor."""
