@@ -75,12 +75,9 @@ class Commands:
 
     def capture_pose(self) -> Task:
         """Capture the ongoing rest as a pose."""
-        session, sensor = self._session, self._session.sensor
-        _check_fresh(session)
+        session, sensor, dwell = self._session, self._session.sensor, _rest(self._session)
         session.files.usable()
-        dwell = sensor.live.capture_now()
-        if dwell is None:
-            raise _not_still(session)
+        sensor.live.capture(dwell)
         sensor.guide.is_new_rest(dwell.start)  # the answer is the line about this pose
         session.poses_changed(ended=False)
         poses = sensor.live.book.poses()

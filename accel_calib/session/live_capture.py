@@ -270,13 +270,10 @@ class LiveCapture:
         self._looked, self._known_until = time, time + _LOOK_EVERY
         return self._look(capture) if still else self._doubt_held(time)
 
-    def capture_now(self) -> Dwell | None:
-        """Capture the ongoing rest as a pose, and return it; None if there is no rest."""
-        dwell = self.detector.current()
-        if dwell is not None:
-            self.book.hold(dwell)
-            self._declined = None
-        return dwell
+    def capture(self, rest: Dwell) -> None:
+        """Capture the ongoing rest as a pose."""
+        self.book.hold(rest)
+        self._declined = None
 
     def refresh(self) -> None:
         """Update the pose of the ongoing rest, if it is a provisional one."""

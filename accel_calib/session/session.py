@@ -124,11 +124,8 @@ class Session:
                          else _LARGEST_G * self.units.per_g)
         self.events, self._filter = deque[Event](), LogFilter(clock)
         known = settings.sensor or settings.calibration_file
-        store = _take_files(self, settings.sensor) if known else None
-        if store is None:
+        if not known or not self._open(answered):
             self.show_poses(store=False)
-        else:
-            answered(_load(self, store, self.sensor))
 
     @property
     def name(self) -> str:
@@ -282,9 +279,16 @@ class Session:
     def _begin_again(self) -> None:
         """Discard poses and calibration of another sensor, and load those of this sensor."""
         self.sensor = Sensor(self.settings, self.units)
-        store = _take_files(self, self.name)
+        self._open(self.events.append)
+
+    def _open(self, run: Callable[[Task], object]) -> bool:
+        """Lock and load the files of the sensor; return whether no other node uses them."""
+        store = self.files.take(self.name)
+        self.problem = self.files.problem
+        self.log('error', self.problem)
         if store is not None:
-            self.events.append(_load(self, store, self.sensor))
+            run(_load(self, store, self.sensor))
+        return store is not None
 
     # The calibration
 
@@ -366,15 +370,6 @@ class Session:
         added = sensor.guide.added(len(poses), self.statistics.stamp)
         self.events.append(_draw_poses(self, sensor, poses, added, new_rest,
                                 self.files.store if store else None))
-
-
-def _take_files(session: Session, sensor: str) -> Store | None:
-    """Lock the files of a sensor and return the store; None if another node uses them."""
-    store = session.files.take(sensor)
-    if session.files.problem:
-        session.problem = session.files.problem
-        session.log('error', session.problem)
-    return store
 
 
 def _load(session: Session, store: Store, sensor: Sensor) -> Task:
