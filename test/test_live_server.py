@@ -120,7 +120,6 @@ def test_a_new_viewer_gets_all_kinds_of_messages(bench: Bench) -> None:
         'welcome', 'state', 'poses', 'progress', 'log'})
     assert viewer.got[0]['kind'] == 'welcome'
     assert viewer.got[0]['may']
-    assert set(viewer.got[0]['commands']) == set(LIVE_COMMANDS)
     bench.played.wait(60.0)
     wait(lambda: viewer.of('progress')[-1]['poses'] == 3)
     now = [each for each in viewer.of('progress') if each['up']][-1]  # before the end

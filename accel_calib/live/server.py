@@ -31,8 +31,8 @@ from urllib.parse import urlsplit
 from aiohttp import web
 
 from .viewer import (
-    announce, COMMANDS, Connection, LARGEST, Message, not_bound, reachable, secured, STUCK_S,
-    TooManyError, Viewer)
+    announce, Connection, LARGEST, Message, not_bound, reachable, secured, STUCK_S, TooManyError,
+    Viewer)
 from .. import __version__
 from ..report import policy
 from ..session import LogFilter
@@ -107,7 +107,7 @@ class Board:
         """Return the answer to ``hello``; `why` commands are not accepted is empty if they are."""
         kept = self.history.copy()
         return {'kind': 'welcome', 'may': not why, 'why': why, 'version': __version__,
-                'seconds': _HISTORY_S, 'commands': COMMANDS, 'exports': CALIBRATION_ALONE,
+                'exports': CALIBRATION_ALONE,
                 'history': {key: [each[key] for each in kept]
                             for key in ('time', 'length', 'corrected')}}
 
