@@ -16,7 +16,7 @@ and `warn`, in its own thread, and they pass the work on.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import replace
@@ -37,8 +37,8 @@ from ..findings import rate, residual_figures
 from ..messages.one_reading import Triple
 from ..report import calibration_page, STORED
 from ..session import (
-    Answer, BATCH, CalibratorSettings, CallSoon, checks, Commands, Compute, Level, Log,
-    Session, Severity, ShowPoses, state, Task, title, words_of_state, Worker)
+    Answer, BATCH, CalibratorSettings, CallSoon, checks, Commands, Compute, Event, Level, Log,
+    Result, Session, Severity, ShowPoses, state, Task, title, words_of_state, Worker)
 from ..stored.exports import export, Exported
 from ..table import Floats
 
@@ -53,7 +53,7 @@ _NO_CALIBRATION = InputError('there is no calibration yet', 'capture poses and p
 
 class Exchange:
     """
-    The messages of a session, and its answers, which are logged.
+    The messages of a session, and its answers.
 
     `call_soon` lets the thread of the session call a function.
 
@@ -66,11 +66,9 @@ class Exchange:
 
     """
 
-    def __init__(self, session: Session, worker: Worker, call_soon: CallSoon,
-                 log: Callable[[Log], None]) -> None:
-        self._session, self._worker = session, worker
+    def __init__(self, session: Session, worker: Worker, call_soon: CallSoon) -> None:
+        self._session, self._worker, self._call_soon = session, worker, call_soon
         self._commands = Commands(session, offers=True)
-        self._call_soon, self._log = call_soon, log
         self.show: Show = lambda message: None
         self.problem = ''
         self._shown: Calibration | None = None
@@ -85,15 +83,15 @@ class Exchange:
         now = state.progress(self._session, reading)
         self.show({'kind': 'progress', 'time': monotonic(), **vars(now)})
 
-    def show_poses(self, event: ShowPoses) -> None:
-        """Show the directions of up of the poses, and the state that may have changed."""
-        self.show({'kind': 'poses', 'up': event.up})
-        self.show_state()
-
-    def show_line(self, line: Log) -> None:
-        """Show a log line."""
-        self._line += 1
-        self.show(log_line(self._line, line.severity, line.words, time()))
+    def show_event(self, event: Event) -> None:
+        """Show a log line, or the poses; and the state where it may have changed."""
+        if isinstance(event, Log):
+            self._line += 1
+            self.show(log_line(self._line, event.severity, event.words, time()))
+        elif isinstance(event, ShowPoses):
+            self.show({'kind': 'poses', 'up': event.up})
+        if isinstance(event, ShowPoses | Result):
+            self.show_state()
 
     def show_state(self) -> None:
         """Show the state; the server sends it only if it has changed."""
@@ -121,7 +119,7 @@ class Exchange:
 
     def warn(self, words: str) -> None:
         """Log a warning of the server."""
-        self._call_soon(lambda: self._log(Log('warning', words)))
+        self._call_soon(lambda: self._worker.log('warning', words))
 
     def _ask(self, name: str, answer: Answer) -> None:
         if name in self._worker.running:
@@ -129,7 +127,6 @@ class Exchange:
             return
 
         def done(success: bool, words: str) -> None:
-            self._log(Log('info' if success else 'warning', words))
             self.show_state()  # a viewer knows what has changed when the answer comes
             answer(success, words)
 
@@ -256,9 +253,8 @@ class Host:
         self._passed = self._ticked = self._shown = -math.inf
         self.session = Session(settings, source.name)
         self.session.publishers = None
-        self._worker = Worker(self._tasks.put, self._handle_events,
-                              lambda words: self._log(Log('error', words)), self._flush)
-        self.exchange = Exchange(self.session, self._worker, self._tasks.put, self._log)
+        self._worker = Worker(self.session, self._tasks.put, self._show, self._flush)
+        self.exchange = Exchange(self.session, self._worker, self._tasks.put)
         try:
             self.server = PageServer(self.exchange, settings.web_host, settings.web_port)
             self.server.start()
@@ -268,7 +264,7 @@ class Host:
 
     def run(self, is_over: Callable[[], bool]) -> None:
         """Serve until `is_over`, which is called about 20 times per second, returns true."""
-        self._handle_events()
+        self._worker.handle_events()
         for block in self._blocks():
             if is_over():
                 return
@@ -303,21 +299,21 @@ class Host:
     def _end(self, severity: Severity, words: str) -> None:
         """Show why no more samples come."""
         self.session.ended = True
-        self._show_problem(words, Log(severity, words))
+        self._show_problem(words, severity, words)
 
     def _report_source(self) -> None:
         """Show and log that the source is interrupted, or is back."""
         problem = self._source.problem()
         if bool(problem) != bool(self.exchange.problem):
-            self._show_problem(problem, Log('warning', problem) if problem else Log(
-                'info', f'{self._source.name} is back; continue with the next pose'))
+            self._show_problem(problem, 'warning' if problem else 'info', problem or (
+                f'{self._source.name} is back; continue with the next pose'))
         self.exchange.problem = problem
 
-    def _show_problem(self, problem: str, line: Log) -> None:
+    def _show_problem(self, problem: str, severity: Severity, words: str) -> None:
         """Show what is wrong, or that nothing is, and log it."""
         self.exchange.problem = problem
         self.exchange.show_state()
-        self._log(line)
+        self._worker.log(severity, words)
 
     def _work(self, wait: float = 0.0) -> None:
         """Run the tasks so far, waiting for the first one [s], and do what is due."""
@@ -334,7 +330,7 @@ class Host:
             self._ticked = now
             if not self.exchange.problem:
                 self.session.tick()
-                self._handle_events()
+                self._worker.handle_events()
             self.exchange.show_state()
         if now - self._shown >= PERIOD:
             self._shown = now
@@ -354,23 +350,9 @@ class Host:
                 if len(known):
                     self.session.around.take('temperature', float(known[-1]))
                 self.session.push(samples, monotonic())
-        self._handle_events()
+        self._worker.handle_events()
 
-    def _handle_events(self) -> None:
-        while self.session.events:
-            event = self.session.events.popleft()
-            if isinstance(event, Log):
-                self._log(event)
-            elif isinstance(event, ShowPoses):
-                self.exchange.show_poses(event)
-            elif isinstance(event, Generator):
-                self._worker.run(event, self._on_done)
-
-    def _on_done(self, success: bool, words: str) -> None:
-        if words:
-            self._log(Log('info' if success else 'warning', words))
-        self.exchange.show_state()
-
-    def _log(self, line: Log) -> None:
-        self._print(replace(line, words=_with_buttons(line.words)))
-        self.exchange.show_line(line)
+    def _show(self, event: Event) -> None:
+        if isinstance(event, Log):
+            self._print(replace(event, words=_with_buttons(event.words)))
+        self.exchange.show_event(event)

@@ -46,13 +46,16 @@ import sys
 from threading import Lock, Thread
 from time import monotonic
 from traceback import format_exc
-from typing import Any, BinaryIO, cast, Literal, TypeVar
+from typing import Any, BinaryIO, cast, Literal, TYPE_CHECKING, TypeVar
 
 from .store import writing_advice
 from ..calibrate import NextPose
 from ..effects import know_code, KNOWN_CODE
 from ..errors import AccelCalibError, InputError
 from ..table import Floats
+
+if TYPE_CHECKING:
+    from .session import Session
 
 Found = TypeVar('Found')
 
@@ -369,16 +372,15 @@ class Worker:
     The threads for the tasks of a session.
 
     `running` names the commands that are not answered, the oldest first. `call_soon` lets the
-    thread of the session call a function. `on_events` is called after each step of a task, in the
-    thread of the session, and `report` for an unexpected error. `flush` passes all samples so far
-    to the session, before a command begins.
+    thread of the session call a function. `show` is called with each event that is no task, in
+    the thread of the session. `flush` passes all samples so far to the session, before a command
+    begins.
 
     """
 
-    def __init__(self, call_soon: CallSoon, on_events: Callable[[], None],
-                 report: Callable[[str], object],
+    def __init__(self, session: Session, call_soon: CallSoon, show: Callable[[Any], object],
                  flush: Callable[[], object] = lambda: None) -> None:
-        self._call_soon, self._on_events, self._report = call_soon, on_events, report
+        self._session, self._call_soon, self._show = session, call_soon, show
         self._flush = flush
         self._files = ThreadPoolExecutor(1, 'accel_calib_files')
         self._computation = ThreadPoolExecutor(1, 'accel_calib')
@@ -389,10 +391,30 @@ class Worker:
         self.running: list[str] = []
         self._is_busy = self._closed = False
 
+    def handle_events(self) -> None:
+        """Show the events of the session, run its tasks, and log their answers."""
+        events = self._session.events
+        while events:
+            event = events.popleft()
+            if isinstance(event, Generator):
+                self.run(event, self._log_answer)
+            else:
+                self._show(event)
+
+    def log(self, severity: Severity, words: str) -> None:
+        """Log a line, and show it at once."""
+        self._session.log(severity, words)
+        self.handle_events()
+
+    def _log_answer(self, success: bool, words: str) -> None:
+        self.log('info' if success else 'warning', words)
+
     def do(self, name: str, command: Task, answer: Answer) -> None:
-        """Begin a command when no files are used, run its steps, and call `answer`."""
+        """Begin a command when no files are used, run its steps, log its words, and `answer`."""
         def done(success: bool, found: Any) -> None:
             self.running.remove(name)
+            if isinstance(found, str):
+                self._log_answer(success, found)
             answer(success, found)
 
         self.running.append(name)
@@ -444,7 +466,7 @@ class Worker:
         self._is_busy = True
         try:
             outcome = self._outcome(task, done)
-            self._on_events()  # first, so that a command is answered after its poses are stored
+            self.handle_events()  # first, so that a command is answered after its poses are stored
             self._proceed(task, answer, outcome)
         finally:
             self._is_busy = False
@@ -474,7 +496,7 @@ class Worker:
         except OSError as error:
             return False, f'{error}; {writing_advice(error)}'
         except Exception as error:
-            self._report(f'unexpected error in accel_calib:\n{format_exc()}')
+            self.log('error', f'unexpected error in accel_calib:\n{format_exc()}')
             return False, (f'unexpected error in accel_calib ({error!r}); please report it with '
                            'the log')
 
