@@ -368,8 +368,8 @@ class Session:
         sensor = self.sensor
         poses = sensor.live.book.poses()
         added = sensor.guide.added(len(poses), self.statistics.stamp)
-        self.events.append(_draw_poses(self, sensor, poses, added, new_rest,
-                                self.files.store if store else None))
+        self.events.append(_draw_poses(
+            self, sensor, poses, added, new_rest, self.files.store if store else None))
 
 
 def _load(session: Session, store: Store, sensor: Sensor) -> Task:
