@@ -207,6 +207,17 @@ class Drift:
         return float(np.min(poses['temperature'])), float(np.max(poses['temperature']))
 
     @property
+    def repeats(self) -> float:
+        """Variance of the pose means beyond their noise [g²]; infinite for a mounting."""
+        own = self.calibration
+        if not own.model.effects:
+            return np.inf
+        quality, used = own.quality, len(own.poses) - len(own.rejected)
+        spare = used - int(np.linalg.matrix_rank(np.nan_to_num(own.covariance)))
+        excess = quality.rms_after_mg ** 2 - (quality.noise_floor_mg or 0.0) ** 2
+        return max(excess, 0.0) / MG ** 2 * used / spare if spare > 0 else 0.0
+
+    @property
     def stated(self) -> float:
         """Stated standard deviation of the error of the last rest [g]."""
         return float(np.sqrt(_covariance(self, self.rests[-1:])[0, 0])) if self.rests else np.nan
@@ -253,16 +264,6 @@ def rest_errors(calibration: Calibration, reading: Floats, noise: Floats, contex
                       u[k] / length[k], float(temperature[k])) for k in range(len(u))]
 
 
-def _repeats(calibration: Calibration) -> float:
-    """Return the variance of pose means beyond their noise [g²]; infinite for a mounting."""
-    if not calibration.model.effects:
-        return np.inf
-    quality, used = calibration.quality, len(calibration.poses) - len(calibration.rejected)
-    spare = used - int(np.linalg.matrix_rank(np.nan_to_num(calibration.covariance)))
-    excess = quality.rms_after_mg ** 2 - (quality.noise_floor_mg or 0.0) ** 2
-    return max(excess, 0.0) / MG ** 2 * used / spare if spare > 0 else 0.0
-
-
 def compared(before: Drift, rest: RestError, least: float) -> Drift:
     """Return the state of the monitor after one more rest; `least` is the least change [g]."""
     rests = (*before.rests, rest)
@@ -289,7 +290,7 @@ def compared(before: Drift, rest: RestError, least: float) -> Drift:
 def _covariance(state: Drift, rests: tuple[RestError, ...]) -> Floats:
     """Return the (n, n) covariance of the errors of these rests without a change [g²]."""
     slope = np.array([rest.slope for rest in rests])
-    noise = np.array([rest.variance for rest in rests]) + _repeats(state.calibration)
+    noise = np.array([rest.variance for rest in rests]) + state.repeats
     spread = slope @ state.calibration.covariance @ slope.T
     return np.asarray(spread + np.diag(state.scatter ** 2 * noise))
 
