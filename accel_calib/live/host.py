@@ -259,7 +259,7 @@ class Host:
             self.server = PageServer(self.exchange, settings.web_host, settings.web_port)
             self.server.start()
         except AccelCalibError:
-            self._end_session()
+            self._worker.close()
             raise
 
     def run(self, is_over: Callable[[], bool]) -> None:
@@ -279,11 +279,7 @@ class Host:
     def close(self) -> None:
         """Stop serving, finish writing, and release the files."""
         self.server.close()
-        self._end_session()
-
-    def _end_session(self) -> None:
         self._worker.close()
-        self.session.close()
 
     def _blocks(self) -> Iterator[Floats]:
         """Yield the blocks of the source; an error of it is logged and ends them."""

@@ -292,7 +292,6 @@ class Calibrator:
         if self._server is not None:
             self._server.close()
         self._worker.close()
-        self.session.close()
 
 
 def in_executor(node: Node) -> CallSoon:

@@ -501,10 +501,11 @@ class Worker:
                            'the log')
 
     def close(self) -> None:
-        """Stop the computation, and finish writing."""
+        """Stop the computation, finish writing, and unlock the files."""
         self._closed = True
         self._process.close()
         self._computation.shutdown(wait=True)
         for step, _, _ in self._steps:
             self._files.submit(step.run, self._process.call_if_free)
         self._files.shutdown(wait=True)
+        self._session.close()
