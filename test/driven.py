@@ -31,7 +31,8 @@ class Driver:
         self.handle()
 
     def handle(self) -> None:
-        for event in self.session.events():
+        while self.session.events:
+            event = self.session.events.popleft()
             if isinstance(event, Generator):
                 words = self.done(event)
                 self.log += [Log('info', words)] if words else []

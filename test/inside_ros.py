@@ -7,9 +7,9 @@
 from collections.abc import Sequence
 from typing import Any
 
-from accel_calib.ros.calibrator_node import pose_markers
+from accel_calib.ros.calibrator_node import in_executor, pose_markers, serve
 from accel_calib.ros.declare import (
-    in_executor, MountingBroadcaster, serve, StaticTransforms, TOPIC as TF_TOPIC, watch_static)
+    MountingBroadcaster, StaticTransforms, TOPIC as TF_TOPIC, watch_static)
 from accel_calib.ros.simulator_node import SimulatedImu, SimulatorSettings
 
 Link = tuple[str, str, Sequence[float]]

@@ -10,7 +10,7 @@ from typing import Any
 
 from accel_calib.calibrate import Calibration, fit_poses, level
 from accel_calib.capture import capture
-from accel_calib.compare import compare, compared, Drift, history_of, monitor, rest_errors, status
+from accel_calib.compare import compare, compared, Drift, history_of, rest_errors, status
 from accel_calib.estimate import estimate
 from accel_calib.logs import read_recording
 from accel_calib.table import Floats, Poses
@@ -186,7 +186,7 @@ class Watched:
         """Fit poses with this noise of each of 100 samples, and begin again."""
         table = simulate_poses(self.truth, directions, self.rng, noise_g=noise_g, samples=100)
         self.calibration = fit_poses(table.with_columns(**columns), G, model='10')
-        self.state = monitor(self.calibration)
+        self.state = Drift(self.calibration)
 
     def rest(self, up: Any, shift: Any = 0.0, **context: float) -> Drift:
         """Return the state after one rest in each orientation, with shifted readings [g]."""
@@ -333,7 +333,7 @@ def test_real_rests_are_not_a_change_unless_shifted(name: str, unit_name: Any) -
     calibration, rests = fit_poses(poses.take(~odd), units, model='10'), poses.take(odd)
     force = calibration.correct(rests.reading)
     shift = calibration.predict(1.005 * force) - calibration.predict(force)
-    state = monitor(calibration)
+    state = Drift(calibration)
     for k in range(len(rests)):
         state = after(state, calibration, rests.reading[k:k + 1], rests.noise[k:k + 1], {})
         assert state.change is None

@@ -111,7 +111,9 @@ def test_without_auto_capture_only_requested_poses_are_captured(readings: Readin
     live = LiveCapture(CaptureSettings(), UNITS)
     turned = readings(FACES, dwell=2.0)
     push_all(live, turned[:90], capture=False)
-    assert live.capture_now() is not None
+    rest = live.detector.current()
+    assert rest is not None
+    live.capture(rest)
     push_all(live, turned[90:], start=1.8, capture=False)
     poses = live.book.poses()
     assert len(poses) == 1

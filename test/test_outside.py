@@ -107,7 +107,8 @@ def test_session_logs_once_for_each_leaving(tmp_path, monkeypatch):
     monkeypatch.setenv('ROS_HOME', str(tmp_path))
     path = tmp_path / 'calibration.yaml'
     write_calibration(path, calibrated({**TCO, 'temperature_rate': np.array([0.0, 0.02, 0.0])}))
-    session = Session(CalibratorSettings(calibration_file=str(path)), '/imu/data_raw', lambda: 0.0)
+    now = 0.0
+    session = Session(CalibratorSettings(calibration_file=str(path)), '/imu/data_raw', lambda: now)
     assert session.accepts('imu')
     rows = np.full((1, 9), np.nan)
     rows[:, 1:4] = 0.0, 0.0, 9.81
@@ -115,10 +116,11 @@ def test_session_logs_once_for_each_leaving(tmp_path, monkeypatch):
     for k, warm in enumerate([25.0, 35.0, 36.0, 37.0, 29.0, 29.0, 36.0]):
         rows[:, 0], rows[:, 7] = 1000.0 + 3000.0 * k, warm
         session.around.take('temperature', warm)
-        session.push(rows, 0.0)
-        session.events()
+        session.push(rows, now)
+        session.events.clear()
+        now += 61.0
         session.tick()
-        told.append([event.words for event in session.events() if isinstance(event, Log)
+        told.append([event.words for event in session.events if isinstance(event, Log)
                      and event.words.startswith('temperature has left')])
     assert [len(each) for each in told] == [0, 1, 0, 0, 0, 0, 1]
     assert told[1][0] == ('temperature has left the range of the calibration, 20 to 30 °C: it is '

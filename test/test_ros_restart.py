@@ -114,7 +114,7 @@ def test_a_managed_node_is_cleaned_up_while_messages_and_requests_arrive(bench: 
 @pytest.mark.parametrize(('name', 'given', 'words'), sample([
     ('calibrator', {'gravity': 900.0}, 'gravity'),
     ('calibrator', {'still_window': 'wide'}, 'still_window'),
-    ('calibrator', {'max_dwell': 1.5}, 'contradict each other'),
+    ('calibrator', {'max_dwell': 1.5}, 'expected at least twice min_dwell'),
     ('simulator', {'effects': ['nonsense=1']}, 'nonsense')], 1))
 def test_bad_parameters_get_one_line_and_status_2(
         bench: Any, name: str, given: dict[str, Any], words: str) -> None:

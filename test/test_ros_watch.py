@@ -199,7 +199,7 @@ def test_a_whole_calibration_through_the_commands_of_the_page(
     count = len(viewer.of('progress'))
     for k in range(10):  # the last one is shown, and not the batch of the session
         bench.send(bench.imu([0.0, 0.0, 9.80665 * (1.0 + 0.01 * k)]))
-    bench.spin(lambda: any(math.isclose(each['raw'] or 0.0, 1.09, abs_tol=1e-6)
+    bench.spin(lambda: any(math.isclose(each['length'] or 0.0, 1.09, abs_tol=1e-6)
                            for each in viewer.of('progress')[count:]))
 
     status, headers, page = fetch(viewer.base + viewer.state['page'])
@@ -250,7 +250,7 @@ def test_the_managed_node_serves_the_page_while_it_is_configured(
         bench.spin(lambda viewer=viewer: viewer.of('state') and viewer.state['calibration'])
         bench.go(Transition.TRANSITION_ACTIVATE)
         bench.spin(lambda viewer=viewer: publisher.publish(bench.imu([0.1, 0.2, 9.8])) or any(
-            each['raw'] for each in viewer.of('progress')))
+            each['length'] for each in viewer.of('progress')))
         assert viewer.ask('disable', bench.spin)['success']
         bench.go(Transition.TRANSITION_DEACTIVATE)
         bench.go(Transition.TRANSITION_CLEANUP)

@@ -127,7 +127,8 @@ def test_files_that_are_read_too_late_are_not_used_for_the_next_sensor(
     stored(sensor='imu_link').rename(home / 'imu.data_raw@imu_link.yaml')
     driver, rest = Driver(), readings([[0, 0, 1]])[:30]
     assert driver.session.accepts('imu_link')
-    late = [event for event in driver.session.events() if isinstance(event, Generator)]
+    late = [event for event in driver.session.events if isinstance(event, Generator)]
+    driver.session.events.clear()
     driver.now += 3.0
     driver.feed(rest, 'other')
     for task in late:
@@ -162,5 +163,5 @@ def test_mounting_is_published_in_the_frame_of_the_messages_and_not_under_the_pa
         stored: Stored) -> None:
     driver = Driver(sensor='arm', calibration_file=str(stored(sensor='arm', flat=[0, 0.6, 0.8])))
     driver.session.accepts('imu_link')
-    found = [event.frame_id for event in driver.session.events() if isinstance(event, Mounting)]
+    found = [event.frame_id for event in driver.session.events if isinstance(event, Mounting)]
     assert found == ['imu_link']

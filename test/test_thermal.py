@@ -182,7 +182,7 @@ def test_points_do_not_depend_on_the_batches():
     found = []
     for batch in (1, 7, 40, len(time)):  # a recording that is played fast has long ones
         history = TemperatureHistory()
-        history.follow(known)
+        history.columns_of(known)
         for begin in range(0, len(time), batch):
             history.add(time[begin:begin + batch], warm[begin:begin + batch])
         during = history.during(known, START + 60.0, START + 70.0)[KEY]

@@ -13,8 +13,8 @@ the calibrations. `drift` compares every rest with the calibration in use.
 
 from .agreement import LEVEL, NAMES, rotation_free
 from .comparison import compare, Comparison, DatedChange, History, history_of, Moment, Parameter
-from .drift import compared, Drift, monitor, rest_errors, status
+from .drift import compared, Drift, rest_errors, status
 
 __all__ = ['LEVEL', 'NAMES', 'Comparison', 'DatedChange', 'Drift', 'History', 'Moment',
-           'Parameter', 'compare', 'compared', 'history_of', 'monitor', 'rest_errors',
+           'Parameter', 'compare', 'compared', 'history_of', 'rest_errors',
            'rotation_free', 'status']

@@ -184,23 +184,36 @@ class Drift:
     """
     The state of the monitor: the last rests since a calibration, and the number of all.
 
-    `covariance` (p, p) is that of the calibration [g²], `repeats` the variance of its poses beyond
-    the noise of their samples [g²], and `temperatures` their lowest and highest temperature [°C],
-    empty if not known. `scatter` is the factor on the stated scatter of the rests. `change` is the
-    lasting change, None if the sensor is unchanged, and `since` the number of the first rest with
-    it, 1-based, or 0. It was clearly absent in the last `without` rests.
+    `scatter` is the factor on the stated scatter of the rests. `change` is the lasting change,
+    None if the sensor is unchanged, and `since` the number of the first rest with it, 1-based, or
+    0. It was clearly absent in the last `without` rests.
 
     """
 
-    covariance: Floats
-    repeats: float
-    temperatures: tuple[float, ...]
+    calibration: Calibration
     rests: tuple[RestError, ...] = ()
     count: int = 0
     scatter: float = 1.0
     change: LastingChange | None = None
     since: int = 0
     without: int = 0
+
+    @property
+    def temperatures(self) -> tuple[float, ...]:
+        """Lowest and highest temperature of the poses [°C]; empty if not known."""
+        limits = range_of(self.calibration.poses, 'temperature')
+        return () if np.isnan(limits[0]) else limits
+
+    @property
+    def repeats(self) -> float:
+        """Variance of the pose means beyond their noise [g²]; infinite for a mounting."""
+        own = self.calibration
+        if not own.model.effects:
+            return np.inf
+        quality, used = own.quality, len(own.poses) - len(own.rejected)
+        spare = used - int(np.linalg.matrix_rank(np.nan_to_num(own.covariance)))
+        excess = quality.rms_after_mg ** 2 - (quality.noise_floor_mg or 0.0) ** 2
+        return max(excess, 0.0) / MG ** 2 * used / spare if spare > 0 else 0.0
 
     @property
     def stated(self) -> float:
@@ -249,23 +262,6 @@ def rest_errors(calibration: Calibration, reading: Floats, noise: Floats, contex
                       u[k] / length[k], float(temperature[k])) for k in range(len(u))]
 
 
-def monitor(calibration: Calibration) -> Drift:
-    """Return the initial state of the monitor after a calibration."""
-    limits = range_of(calibration.poses, 'temperature')
-    return Drift(calibration.covariance, _repeats(calibration),
-                 () if np.isnan(limits[0]) else limits)
-
-
-def _repeats(calibration: Calibration) -> float:
-    """Return the variance of pose means beyond their noise [g²]; infinite for a mounting."""
-    if not calibration.model.effects:
-        return np.inf
-    quality, used = calibration.quality, len(calibration.poses) - len(calibration.rejected)
-    spare = used - int(np.linalg.matrix_rank(np.nan_to_num(calibration.covariance)))
-    excess = quality.rms_after_mg ** 2 - (quality.noise_floor_mg or 0.0) ** 2
-    return max(excess, 0.0) / MG ** 2 * used / spare if spare > 0 else 0.0
-
-
 def compared(before: Drift, rest: RestError, least: float) -> Drift:
     """Return the state of the monitor after one more rest; `least` is the least change [g]."""
     rests = (*before.rests, rest)
@@ -292,8 +288,9 @@ def compared(before: Drift, rest: RestError, least: float) -> Drift:
 def _covariance(state: Drift, rests: tuple[RestError, ...]) -> Floats:
     """Return the (n, n) covariance of the errors of these rests without a change [g²]."""
     slope = np.array([rest.slope for rest in rests])
-    noise = np.array([rest.variance + state.repeats for rest in rests])
-    return np.asarray(slope @ state.covariance @ slope.T + np.diag(state.scatter ** 2 * noise))
+    noise = np.array([rest.variance for rest in rests]) + state.repeats
+    spread = slope @ state.calibration.covariance @ slope.T
+    return np.asarray(spread + np.diag(state.scatter ** 2 * noise))
 
 
 def _scatter(state: Drift, rests: tuple[RestError, ...]) -> float:

@@ -153,9 +153,8 @@ def know_code(name: str, code: bytes) -> tuple[str, ...]:
     executed, or defines no effect.
 
     """
-    before, names = _EXECUTED.get(name, (b'', ()))
-    if names and before == code:
-        return names
+    if KNOWN_CODE.get(name) == code:
+        return _DEFINED[name]
     defined: dict[str, Any] = {'__file__': name, '__name__': Path(name).stem}
     try:
         exec(compile(code, name, 'exec'), defined)
@@ -168,14 +167,13 @@ def know_code(name: str, code: bytes) -> tuple[str, ...]:
     if not found:
         raise InputError(f'{name} defines no effect, expected at least one accel_calib.Effect',
                          'see docs/effects.md for an example')
-    _EXECUTED[name] = code, know(found.values())
-    return _EXECUTED[name][1]
+    _DEFINED[name] = know(found.values())
+    KNOWN_CODE[name] = code
+    return _DEFINED[name]
 
 
-_EXECUTED: dict[str, tuple[bytes, tuple[str, ...]]] = {}
-"""Code and names of effects of the files that this process has executed, by name."""
+KNOWN_CODE: dict[str, bytes] = {}
+"""Code of the files with own effects that this process has executed, for another process."""
 
-
-def known_code() -> dict[str, bytes]:
-    """Return the code of the files with own effects, so that another process can know them."""
-    return {name: code for name, (code, _) in _EXECUTED.items()}
+_DEFINED: dict[str, tuple[str, ...]] = {}
+"""Names of the effects of these files."""

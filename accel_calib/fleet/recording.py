@@ -33,7 +33,7 @@ from .. import __version__
 from ..calibrate import Calibration, determines, directions_of, fit_poses
 from ..compare import NAMES, rotation_free
 from ..disk import check_regular
-from ..effects import known_code, MODELS
+from ..effects import KNOWN_CODE, MODELS
 from ..errors import AccelCalibError, crash_words, InputError, RefusedFitError
 from ..findings import residual_figures
 from ..logs import LogOptions
@@ -366,7 +366,7 @@ def key_of(content: str, found: Input, options: Options) -> str:
     except AccelCalibError as err:
         place = str(err)
     stated = asdict(options)
-    own = [code.hex() for code in known_code().values()] if stated.pop('own') else []
+    own = [code.hex() for code in KNOWN_CODE.values()] if stated.pop('own') else []
     about = json.dumps([content, place, __version__, RESULTS, stated, *own], default=str,
                        sort_keys=True)
     return hashlib.blake2b(about.encode(), digest_size=16).hexdigest()

@@ -33,7 +33,7 @@ from .recording import (
 from .sensors import is_damaged, merge_sensor, read_parquet, Store, UNREAD, write_sensors
 from ..calibrate import Calibration, FleetPrior
 from ..disk import write_atomically
-from ..effects import know_code, known_code
+from ..effects import know_code, KNOWN_CODE
 from ..errors import AccelCalibError, InputError, needing, system_error
 from ..findings import Rating
 from ..logs import Progress
@@ -295,7 +295,7 @@ def mapped(client: Client, function: Callable[..., Any], items: Iterable[_Item],
     while True:
         while len(waiting) < limit and (batch := [alone.pop()] if alone else
                                         list(islice(rest, pace.size))):
-            future = client.submit(_each, known_code(), function, batch, *others, pure=False)
+            future = client.submit(_each, KNOWN_CODE, function, batch, *others, pure=False)
             waiting[future] = batch
             done.add(future)
         if not waiting:

@@ -16,20 +16,20 @@ and `warn`, in its own thread, and they pass the work on.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache
-from importlib.resources import files
 import math
 from queue import Empty, SimpleQueue
 import re
 from time import monotonic, time
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .server import PageServer, PERIOD
+from .server import PAGE, PageServer, PERIOD
 from .viewer import Message
 from ..calibrate import Calibration
 from ..errors import AccelCalibError, InputError, system_error
@@ -37,11 +37,10 @@ from ..findings import rate, residual_figures
 from ..messages.one_reading import Triple
 from ..report import calibration_page, STORED
 from ..session import (
-    Answer, BATCH, CalibratorSettings, CallSoon, checks, Commands, Compute, Level, Log, LogFilter,
-    Progress, Session, Severity, ShowPoses, state, Task, title, words_of_state, Worker)
+    Answer, BATCH, CalibratorSettings, CallSoon, checks, Commands, Compute, Event, Level, Log,
+    Result, Session, Severity, ShowPoses, state, Task, title, words_of_state, Worker)
 from ..stored.exports import export, Exported
 from ..table import Floats
-from ..units import MG
 
 if TYPE_CHECKING:
     from .sources import Source
@@ -49,15 +48,12 @@ if TYPE_CHECKING:
 Show = Callable[[Message], object]
 """Function that shows a message to all viewers."""
 
-_DIGITS = 7
-_DECIMALS = 6
-
 _NO_CALIBRATION = InputError('there is no calibration yet', 'capture poses and press Fit')
 
 
 class Exchange:
     """
-    The messages of a session, and its answers, which are logged.
+    The messages of a session, and its answers.
 
     `call_soon` lets the thread of the session call a function.
 
@@ -70,34 +66,32 @@ class Exchange:
 
     """
 
-    def __init__(self, session: Session, worker: Worker, call_soon: CallSoon,
-                 log: Callable[[Log], None]) -> None:
-        self._session, self._worker = session, worker
+    def __init__(self, session: Session, worker: Worker, call_soon: CallSoon) -> None:
+        self._session, self._worker, self._call_soon = session, worker, call_soon
         self._commands = Commands(session, offers=True)
-        self._call_soon, self._log = call_soon, log
         self.show: Show = lambda message: None
         self.problem = ''
         self._shown: Calibration | None = None
         self._number = 0
-        self._page: tuple[int, str] = (-1, '')
-        self._waiting: dict[int, list[Answer]] = {}
+        self._drawing: tuple[int, Future[tuple[bool, str]]] = -1, Future()
         self._line = int(time()) * 1000  # a viewer of an earlier server has smaller numbers
 
     # The session has news
 
     def show_progress(self, reading: Triple | None = None) -> None:
         """Show the progress; the parameter is as in `state.progress`."""
-        self.show(_progress(monotonic(), state.progress(self._session, reading)))
+        now = state.progress(self._session, reading)
+        self.show({'kind': 'progress', 'time': monotonic(), **vars(now)})
 
-    def show_poses(self, event: ShowPoses) -> None:
-        """Show the directions of up of the poses, and the state that may have changed."""
-        self.show({'kind': 'poses', 'up': _rounded(event.up)})
-        self.show_state()
-
-    def show_line(self, line: Log) -> None:
-        """Show a log line."""
-        self._line += 1
-        self.show(log_line(self._line, line.severity, line.words, time()))
+    def show_event(self, event: Event) -> None:
+        """Show a log line, or the poses; and the state where it may have changed."""
+        if isinstance(event, Log):
+            self._line += 1
+            self.show(log_line(self._line, event.severity, event.words, time()))
+        elif isinstance(event, ShowPoses):
+            self.show({'kind': 'poses', 'up': event.up})
+        if isinstance(event, ShowPoses | Result):
+            self.show_state()
 
     def show_state(self) -> None:
         """Show the state; the server sends it only if it has changed."""
@@ -125,7 +119,7 @@ class Exchange:
 
     def warn(self, words: str) -> None:
         """Log a warning of the server."""
-        self._call_soon(lambda: self._log(Log('warning', words)))
+        self._call_soon(lambda: self._worker.log('warning', words))
 
     def _ask(self, name: str, answer: Answer) -> None:
         if name in self._worker.running:
@@ -133,7 +127,6 @@ class Exchange:
             return
 
         def done(success: bool, words: str) -> None:
-            self._log(Log('info' if success else 'warning', words))
             self.show_state()  # a viewer knows what has changed when the answer comes
             answer(success, words)
 
@@ -147,29 +140,19 @@ class Exchange:
         return (yield from getattr(self._commands, name)())
 
     def _draw(self, answer: Answer) -> None:
-        """Draw the calibration page, unless it is drawn already."""
+        """Draw the calibration page, unless it is drawn already, or being drawn."""
         self.show_state()  # the calibration may have changed since
-        calibration, number = self._shown, self._number
-        if calibration is None:
+        if self._shown is None:
             answer(False, str(_NO_CALIBRATION))
             return
-        if self._page[0] == number:
-            answer(True, self._page[1])
-            return
-        waiting = self._waiting.setdefault(number, [])
-        waiting.append(answer)
-        if len(waiting) > 1:
-            return  # it is being drawn
-        store = self._session.files.store
-        drawing = self._drawn(calibration, store.calibration.name if store else STORED)
-
-        def answer_all(success: bool, words: str) -> None:
-            if success:
-                self._page = number, words
-            for each in self._waiting.pop(number):
-                each(success, words)
-
-        self._worker.run(drawing, answer_all)
+        number, page = self._drawing
+        if number != self._number or (page.done() and not page.result()[0]):
+            page = Future()
+            self._drawing, store = (self._number, page), self._session.files.store
+            self._worker.run(
+                self._drawn(self._shown, store.calibration.name if store else STORED),
+                lambda *found: page.set_result(found))
+        page.add_done_callback(lambda done: answer(*done.result()))
 
     def _drawn(self, calibration: Calibration, stored: str) -> Task:
         return (yield Compute(drawn, calibration, self._session.topic, stored))
@@ -186,18 +169,6 @@ class Exchange:
 def drawn(calibration: Calibration, source: str, stored: str) -> str:
     """Return the page of a calibration; `stored` is the name of its file."""
     return calibration_page(calibration, rate(calibration), source, stored=stored)
-
-
-def _progress(time: float, now: Progress) -> Message:
-    return {
-        'kind': 'progress', 'time': round(time, 3), 'still': now.still,
-        'stillness': _fixed(now.stillness), 'dwell': _fixed(now.dwell),
-        'min_dwell': now.min_dwell, 'poses': now.poses, 'total': now.total,
-        'coverage': _fixed(now.coverage), 'accuracy_mg': _fixed(now.accuracy * MG),
-        'step': now.step, 'advice': now.advice, 'command': now.command,
-        'direction': list(now.direction),
-        'up': [round(part, _DECIMALS) for part in now.up], 'raw': _fixed(now.length),
-        'corrected': _fixed(now.corrected), 'temperature': _fixed(now.temperature)}
 
 
 def log_line(number: int, severity: Severity, words: str, time: float) -> Message:
@@ -223,7 +194,8 @@ def _state(session: Session, problem: str, *, busy: str, page: int) -> Message:
         'preview': sensor.offered is not None,
         'levelled': shown is not None and shown.is_levelled,
         'file': session.files.path, 'busy': busy,
-        'counts_per_g': None if shown is None else _counts_per_g(shown),
+        'counts_per_g': None if shown is None or not shown.units.is_native else np.mean(
+            np.linalg.norm(shown.gain, axis=0)),
         'rating': None if shown is None or rating is None else {
             'rating': rating.name, 'reason': rating.reason},
         'result': None if shown is None else _result(shown),
@@ -240,46 +212,18 @@ def _problem(session: Session) -> str:
 def _result(calibration: Calibration) -> Message:
     quality, used = calibration.quality, len(calibration.used_poses)
     return {
-        'model': calibration.name, 'date': calibration.date, 'unit': calibration.units.name,
-        'poses': used, 'left_out': len(calibration.poses) - used,
-        'coverage': _number(quality.coverage),
-        'residuals': [[figure.label, _number(figure.value), figure.unit]
+        'unit': calibration.units.name, 'poses': used, 'left_out': len(calibration.poses) - used,
+        'coverage': quality.coverage,
+        'residuals': [(figure.label, figure.value, figure.unit)
                       for figure in residual_figures(quality)],
-        'effects': list(calibration.model.effects), 'warnings': list(calibration.warnings),
-        'offset': _rounded(calibration.offset), 'offset_sd': _rounded(calibration.offset_sd),
-        'gain': _rounded(calibration.gain), 'gain_sd': _rounded(calibration.gain_sd)}
-
-
-def _counts_per_g(calibration: Calibration) -> float | None:
-    """Return the mean sensitivity of a sensor in native units; None in other units."""
-    if not calibration.units.is_native:
-        return None
-    return _number(float(np.mean(np.linalg.norm(calibration.gain, axis=0))))
-
-
-def _fixed(value: float) -> float | None:
-    """Return a number with the decimals of progress; this is faster than `_number`."""
-    return round(value, _DECIMALS) if math.isfinite(value) else None
-
-
-def _number(value: float | None) -> float | None:
-    if value is None or not math.isfinite(value):
-        return None
-    return float(f'{value:.{_DIGITS}g}')
-
-
-def _rounded(values: Any) -> Any:
-    array = np.asarray(values, float)
-    if array.ndim == 0:
-        return _number(float(array))
-    return [_rounded(each) for each in array]
+        'effects': calibration.model.effects, 'warnings': calibration.warnings,
+        'offset': calibration.offset, 'gain': np.diag(calibration.gain)}
 
 
 @cache
 def _buttons() -> dict[str, str]:
     """Return what stands for the services where no ROS runs: the labels of the buttons."""
-    page = (files(__package__) / 'page' / 'index.html').read_text(encoding='utf-8')
-    labels = re.findall(r'data-command="(\w+)"[^>]*>([^<]+)<', page)
+    labels = re.findall(r'data-command="(\w+)"[^>]*>([^<]+)<', PAGE.read_text(encoding='utf-8'))
     return {'preview': 'the preview', **dict(reversed(labels))}
 
 
@@ -303,25 +247,24 @@ class Host:
 
     def __init__(self, source: Source, settings: CalibratorSettings,
                  log: Callable[[Log], None]) -> None:
-        self._source, self._print, self._filter = source, log, LogFilter()
+        self._source, self._print = source, log
         self._tasks: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._waiting: list[Floats] = []
         self._passed = self._ticked = self._shown = -math.inf
         self.session = Session(settings, source.name)
         self.session.publishers = None
-        self._worker = Worker(self._tasks.put, self._handle_events,
-                              lambda words: self._log(Log('error', words)), self._flush)
-        self.exchange = Exchange(self.session, self._worker, self._tasks.put, self._log)
+        self._worker = Worker(self.session, self._tasks.put, self._show, self._flush)
+        self.exchange = Exchange(self.session, self._worker, self._tasks.put)
         try:
             self.server = PageServer(self.exchange, settings.web_host, settings.web_port)
             self.server.start()
         except AccelCalibError:
-            self._end_session()
+            self._worker.close()
             raise
 
     def run(self, is_over: Callable[[], bool]) -> None:
         """Serve until `is_over`, which is called about 20 times per second, returns true."""
-        self._handle_events()
+        self._worker.handle_events()
         for block in self._blocks():
             if is_over():
                 return
@@ -336,11 +279,7 @@ class Host:
     def close(self) -> None:
         """Stop serving, finish writing, and release the files."""
         self.server.close()
-        self._end_session()
-
-    def _end_session(self) -> None:
         self._worker.close()
-        self.session.close()
 
     def _blocks(self) -> Iterator[Floats]:
         """Yield the blocks of the source; an error of it is logged and ends them."""
@@ -356,21 +295,21 @@ class Host:
     def _end(self, severity: Severity, words: str) -> None:
         """Show why no more samples come."""
         self.session.ended = True
-        self._show_problem(words, Log(severity, words))
+        self._show_problem(words, severity, words)
 
     def _report_source(self) -> None:
         """Show and log that the source is interrupted, or is back."""
         problem = self._source.problem()
         if bool(problem) != bool(self.exchange.problem):
-            self._show_problem(problem, Log('warning', problem) if problem else Log(
-                'info', f'{self._source.name} is back; continue with the next pose'))
+            self._show_problem(problem, 'warning' if problem else 'info', problem or (
+                f'{self._source.name} is back; continue with the next pose'))
         self.exchange.problem = problem
 
-    def _show_problem(self, problem: str, line: Log) -> None:
+    def _show_problem(self, problem: str, severity: Severity, words: str) -> None:
         """Show what is wrong, or that nothing is, and log it."""
         self.exchange.problem = problem
         self.exchange.show_state()
-        self._log(line)
+        self._worker.log(severity, words)
 
     def _work(self, wait: float = 0.0) -> None:
         """Run the tasks so far, waiting for the first one [s], and do what is due."""
@@ -387,7 +326,7 @@ class Host:
             self._ticked = now
             if not self.exchange.problem:
                 self.session.tick()
-                self._handle_events()
+                self._worker.handle_events()
             self.exchange.show_state()
         if now - self._shown >= PERIOD:
             self._shown = now
@@ -407,22 +346,9 @@ class Host:
                 if len(known):
                     self.session.around.take('temperature', float(known[-1]))
                 self.session.push(samples, monotonic())
-        self._handle_events()
+        self._worker.handle_events()
 
-    def _handle_events(self) -> None:
-        for event in self.session.events():
-            if isinstance(event, Log):
-                self._log(event)
-            elif isinstance(event, ShowPoses):
-                self.exchange.show_poses(event)
-            elif isinstance(event, Generator):
-                self._worker.run(event, self._on_done)
-
-    def _on_done(self, success: bool, words: str) -> None:
-        self._log(Log('info' if success else 'warning', words))
-        self.exchange.show_state()
-
-    def _log(self, line: Log) -> None:
-        if self._filter.passes(line):
-            self._print(replace(line, words=_with_buttons(line.words)))
-            self.exchange.show_line(line)
+    def _show(self, event: Event) -> None:
+        if isinstance(event, Log):
+            self._print(replace(event, words=_with_buttons(event.words)))
+        self.exchange.show_event(event)

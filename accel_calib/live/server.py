@@ -19,9 +19,9 @@ from collections import Counter, deque
 from concurrent.futures import Future
 from dataclasses import dataclass
 import hmac
-from importlib.resources import files
 from ipaddress import ip_address
-from pathlib import PurePath
+from itertools import takewhile
+from pathlib import Path
 import secrets
 import socket
 from threading import Thread
@@ -31,22 +31,24 @@ from urllib.parse import urlsplit
 from aiohttp import web
 
 from .viewer import (
-    announce, COMMANDS, Connection, LARGEST, Message, not_bound, reachable, secured, STUCK_S,
-    text_of, TooManyError, Viewer)
+    announce, Connection, LARGEST, Message, not_bound, reachable, secured, STUCK_S, TooManyError,
+    Viewer)
 from .. import __version__
 from ..report import policy
-from ..session import Log, LogFilter
+from ..session import LogFilter
 from ..stored.exports import CALIBRATION_ALONE, FORMATS
+from ..text import plain
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
-    from importlib.resources.abc import Traversable
-    from pathlib import Path
 
     from .host import Exchange
 
 PERIOD = 0.05
 """Interval between two messages of progress [s]."""
+
+PAGE = Path(__file__).with_name('page') / 'index.html'
+"""The page; what it loads is in the same folder."""
 
 _VIEWERS = 16
 """Largest number of viewers, and of connections that have not said hello yet."""
@@ -83,43 +85,31 @@ class Board:
     """What viewers are shown: the newest message of each kind, log lines, and the history."""
 
     def __init__(self) -> None:
-        self._newest: dict[str, tuple[Message, str]] = {}
-        self._lines: deque[tuple[int, str]] = deque(maxlen=_LINES)
+        self.newest: dict[str, Message] = {}
         self.history: deque[Message] = deque(maxlen=int(_HISTORY_S / PERIOD))
+        self._lines: deque[Message] = deque(maxlen=_LINES)
 
-    def take(self, message: Message, *, is_seen: bool) -> bool:
-        """Keep a message; return whether it is new. `is_seen`: there are viewers."""
-        kind = message['kind']
-        if kind == 'log':
-            self._lines.append((message['number'], text_of(message)))
-            return True
-        before = self._newest.get(kind, ({}, ''))[0]
-        if before is message or (kind != 'progress' and before == message):
+    def take(self, message: Message) -> bool:
+        """Keep a message; return whether it is new."""
+        if message['kind'] == 'log':
+            self._lines.append(message)
+        elif message == self.newest.get(message['kind']):
             return False
-        self._newest[kind] = message, text_of(message) if is_seen else ''
+        else:
+            self.newest[message['kind']] = message
         return True
 
-    def newest(self, kind: str) -> tuple[Message, str] | None:
-        """Return the newest message of a kind, and its text."""
-        found = self._newest.get(kind)
-        if found is not None and not found[1]:
-            found = self._newest[kind] = found[0], text_of(found[0])
-        return found
+    def lines_after(self, number: int) -> list[Message]:
+        """Return the log lines with larger numbers, the newest first."""
+        return list(takewhile(lambda line: line['number'] > number, reversed(self._lines)))
 
-    def lines_after(self, number: int) -> list[tuple[int, str]]:
-        """Return the log lines with larger numbers."""
-        if not self._lines or self._lines[-1][0] <= number:
-            return []
-        return [line for line in self._lines if line[0] > number]
-
-    def welcome(self, why: str) -> str:
+    def welcome(self, why: str) -> Message:
         """Return the answer to ``hello``; `why` commands are not accepted is empty if they are."""
         kept = self.history.copy()
-        return text_of({
-            'kind': 'welcome', 'may': not why, 'why': why, 'version': __version__,
-            'seconds': _HISTORY_S, 'commands': COMMANDS, 'exports': CALIBRATION_ALONE,
-            'history': {key: [each[key] for each in kept]
-                        for key in ('time', 'raw', 'corrected', 'temperature')}})
+        return {'kind': 'welcome', 'may': not why, 'why': why, 'version': __version__,
+                'exports': CALIBRATION_ALONE,
+                'history': {key: [each[key] for each in kept]
+                            for key in ('time', 'length', 'corrected')}}
 
 
 @dataclass(frozen=True)
@@ -192,10 +182,9 @@ class PageServer:
         self._connections: list[Connection] = []
         self._reported, self._filter = Counter[str](), LogFilter()
         self._address = Address(port, frozenset(), frozenset())
-        page = files(__package__) / 'page'
-        self._files: dict[str, Traversable] = {
-            f'/page/{each.name}': each for each in page.iterdir() if _suffix_of(each) in _KINDS}
-        self._files['/'] = page / 'index.html'
+        self._files = {f'/page/{each.name}': each for each in PAGE.parent.iterdir()
+                       if each.suffix in _KINDS}
+        self._files['/'] = PAGE
 
     # In any thread
 
@@ -228,6 +217,7 @@ class PageServer:
 
     def show(self, message: Message) -> None:
         """Show a message to all viewers, and keep it for those who come later."""
+        message = plain(message)
         if message['kind'] == 'progress':  # without waking the thread of the server
             self.board.history.append(message)
         else:
@@ -297,7 +287,7 @@ class PageServer:
     def report(self, what: str) -> None:
         """Count what the page had to do, and log it at most once in `_QUIET_S`."""
         self._reported[what] += 1
-        if self._filter.passes(Log('warning', what, what, _QUIET_S)):
+        if self._filter.passes(what, _QUIET_S):
             self._desk.warn(f'the live page {what} ({self._reported[what]} so far)')
 
     def _look(self) -> None:
@@ -313,7 +303,7 @@ class PageServer:
         loop.call_later(wait, self._look)
 
     def _take(self, message: Message) -> None:
-        if self.board.take(message, is_seen=bool(self.viewers)):
+        if self.board.take(message):
             for viewer in self.viewers:
                 viewer.wake()
 
@@ -340,7 +330,7 @@ class PageServer:
         file = self._files.get(path)
         if file is None:
             return web.Response(status=404, text='there is no such page; open /\n')
-        return web.Response(body=file.read_bytes(), content_type=_KINDS[_suffix_of(file)],
+        return web.Response(body=file.read_bytes(), content_type=_KINDS[file.suffix],
                             charset='utf-8')
 
     async def _page(self) -> web.Response:
@@ -428,7 +418,3 @@ class PageServer:
     def ask(self, command: str, answer: Callable[[bool, str], object]) -> None:
         """Ask the desk, and call `answer` in this thread."""
         self._desk.ask(command, lambda success, words: self._call(lambda: answer(success, words)))
-
-
-def _suffix_of(file: Traversable) -> str:
-    return PurePath(file.name).suffix

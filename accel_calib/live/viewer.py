@@ -5,7 +5,7 @@
 The link of the live page, its connections, its viewers, and the messages that they exchange.
 
 All messages are JSON. A viewer sends ``hello`` first and then ``ask``. The server sends messages
-with a ``kind``. Numbers that are not known are null. Lengths of vectors are in g, errors in mg,
+with a ``kind``. Numbers that are not known are null. Lengths of vectors and the accuracy are in g,
 temperatures in °C, and times in seconds: of a log line since 1970, otherwise of a steady clock.
 
 A connection is for one request. It is closed unless the request arrives within `_REQUEST_S`. A
@@ -107,11 +107,6 @@ def request_of(text: str) -> Hello | Ask:
         case {'ask': {'id': int(number), 'command': str(command)}}:
             return Ask(number, command)
     raise wrong
-
-
-def text_of(message: Message) -> str:
-    """Return a message as JSON."""
-    return json.dumps(message, ensure_ascii=False, allow_nan=False, separators=(',', ':'))
 
 
 def qr_code(link: str) -> str:
@@ -245,7 +240,7 @@ class Viewer:
                  connection: Connection) -> None:
         self._server, self._socket, self.abort = server, websocket, connection.abort
         self._sent: dict[str, Message] = {}
-        self._answers: deque[str] = deque()
+        self._answers: deque[Message] = deque()
         self._seen = 0
         self.why, self._asking = '', 0
         self._news = asyncio.Event()
@@ -295,8 +290,8 @@ class Viewer:
         """Run a command, if the viewer may."""
         def answer(success: bool, words: str) -> None:
             self._asking -= 1
-            self._answers.append(text_of({'kind': 'answer', 'id': request.id,
-                                          'success': success, 'words': words}))
+            self._answers.append({'kind': 'answer', 'id': request.id, 'success': success,
+                                  'words': words})
             self.wake()
 
         if self._asking + len(self._answers) >= _COMMANDS:
@@ -324,18 +319,19 @@ class Viewer:
     async def _send_new(self) -> None:
         """Send the log lines, the newest message of each kind, and then the answers."""
         answers = len(self._answers)  # later ones may be about a state that is not sent yet
-        for number, text in self._server.board.lines_after(self._seen):
-            await self._send(text)
-            self._seen = number
+        for line in reversed(self._server.board.lines_after(self._seen)):
+            await self._send(line)
+            self._seen = line['number']
         for kind in ('state', 'poses', 'progress'):
-            newest = self._server.board.newest(kind)
-            if newest is not None and newest[0] is not self._sent.get(kind):
-                self._sent[kind] = newest[0]
-                await self._send(newest[1])
+            newest = self._server.board.newest.get(kind)
+            if newest is not None and newest is not self._sent.get(kind):
+                self._sent[kind] = newest
+                await self._send(newest)
         for _ in range(answers):
             await self._send(self._answers.popleft())
 
-    async def _send(self, text: str) -> None:
+    async def _send(self, message: Message) -> None:
+        text = json.dumps(message, ensure_ascii=False, allow_nan=False, separators=(',', ':'))
         self._sending_since = asyncio.get_running_loop().time()
         await self._socket.send_str(text)  # waits only if the buffers are full
         self._sending_since = math.inf

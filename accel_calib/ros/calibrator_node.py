@@ -17,8 +17,10 @@ EventsExecutor.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from queue import SimpleQueue
 from time import monotonic
+from traceback import format_exc
 from typing import Any, TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -31,20 +33,20 @@ from rclpy.node import Node
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import Imu, Temperature
 from std_msgs.msg import Bool, ColorRGBA, String
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
 from .declare import (
-    CALLS, declared, follow, in_executor, LATCHED, mismatches, MountingBroadcaster, name_of,
-    published_by_others, SENSOR, serve, STREAM, watch_static)
+    CALLS, declared, follow, LATCHED, mismatches, MountingBroadcaster, name_of,
+    published_by_others, SENSOR, STREAM, watch_static)
 from .stream import ContextTopics, Stream
 from ..calibrate import NextPose
 from ..errors import AccelCalibError
 from ..live import check_installed
 from ..messages.correction import output_frame
 from ..session import (
-    CalibratorSettings, Check, checks, COMMANDS, context_topics, Event, figures, Level, Log,
-    LogFilter, Mounting, Result, Session, ShowPoses, state, Still, Worker, worst)
+    CalibratorSettings, CallSoon, Check, checks, COMMANDS, context_topics, Event, figures, Level,
+    Log, Mounting, Result, Session, ShowPoses, state, Still, Task, Worker, worst)
 from ..table import Floats
 
 if TYPE_CHECKING:
@@ -132,10 +134,9 @@ class Calibrator:
         self.session = Session(settings, self._topic)  # last, because it locks the files
         self._followed = follow(node, lambda: self.session.settings, self.session.set_settings)
         self._call_soon = in_executor(node)
-        self._worker = Worker(self._call_soon, self._handle_events,
-                              lambda words: self._log(Log('error', words)),
+        self._worker = Worker(self.session, self._call_soon, self._show,
                               lambda: self.stream.flush())
-        self._filter, self._progress_at = LogFilter(), 0.0
+        self._progress_at = 0.0
         self._still = node.create_publisher(Bool, '~/still', LATCHED)
         self._poses = node.create_publisher(MarkerArray, '~/poses', LATCHED)
         self._progress = node.create_publisher(DiagnosticStatus, '~/progress', LATCHED)
@@ -144,10 +145,7 @@ class Calibrator:
         self._overrides = QoSOverridingOptions.with_default_policies()
         outputs = [self._published(Imu, 'imu/data_calibrated'), self._published(Imu, '~/preview'),
                    self._published(Vector3Stamped, '~/linear_acceleration')]
-        self.stream = Stream(self.session, outputs, self._handle_events)
-        self._heard: list[Any] = []
-        self._said = [*outputs, self._still, self._poses, self._progress, self._result,
-                      self._diagnostics]
+        self.stream = Stream(self.session, outputs, self._on_samples)
         self._page: Exchange | None = None
         self._server: PageServer | None = None
         self._still.publish(Bool(data=False))
@@ -160,39 +158,38 @@ class Calibrator:
     def _serve(self) -> None:
         for name in COMMANDS:
             command = getattr(self.session.commands, name)
-            serve(self._node, name, command, self._worker, self._log)
+            serve(self._node, name, command, self._worker)
         self._node.create_service(SetBool, '~/enable', self._on_enable, qos_profile=CALLS)
         self._node.create_service(SelfTest, '~/self_test', self._on_self_test, qos_profile=CALLS)
 
     def start(self) -> None:
         """Start; to be called when the node has an executor."""
-        self._handle_events()
+        self._worker.handle_events()
         node, overrides = self._node, self._overrides
-        self._heard = [
-            node.create_subscription(Imu, 'imu/data_raw', self.stream.on_message, SENSOR,
-                                     raw=True, qos_overriding_options=overrides)]
+        node.create_subscription(Imu, 'imu/data_raw', self.stream.on_message, SENSOR, raw=True,
+                                 qos_overriding_options=overrides)
         if 'temperature' not in context_topics(self.session.settings):
-            self._heard.append(node.create_subscription(
+            node.create_subscription(
                 Temperature, 'temperature',
-                lambda message: self.stream.set_context('temperature', message.temperature),
-                SENSOR, qos_overriding_options=overrides))
+                lambda message: self.session.around.take('temperature', message.temperature),
+                SENSOR, qos_overriding_options=overrides)
         node.create_timer(1.0, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
         if self.session.settings.web_port:
             try:
                 self._serve_page(self.session.settings)
             except AccelCalibError as error:
-                self._log(Log('error', str(error)))
+                self._worker.log('error', str(error))
 
     def _serve_page(self, settings: CalibratorSettings) -> None:
         """Serve the live page; its server has its own thread."""
         check_installed()
         from ..live.host import Exchange
         from ..live.server import PageServer, PERIOD
-        page = Exchange(self.session, self._worker, self._call_soon, self._log)
+        page = Exchange(self.session, self._worker, self._call_soon)
         server = PageServer(page, settings.web_host, settings.web_port)
         server.start()
         self._page, self._server = page, server
-        self._log(Log('info', server.announce()))
+        self._worker.log('info', server.announce())
         self._node.create_timer(PERIOD, lambda: page.show_progress(self.stream.newest),
                                 clock=Clock(clock_type=ClockType.STEADY_TIME))
 
@@ -210,19 +207,20 @@ class Calibrator:
             map(name_of, self._node.get_publishers_info_by_topic(self._topic)))
         self.session.imus, self.session.thermometers = published_by_others(
             self._node, ('sensor_msgs/msg/Imu', 'sensor_msgs/msg/Temperature'))
-        self.session.mismatches = mismatches(self._node, self._heard, self._said)
-        self._context.look(self.session, self.stream.set_context)
+        self.session.mismatches = mismatches(self._node)
+        self._context.look(self.session)
         self.stream.flush()
         self.session.tick()
         self._on_transforms()
-        self._handle_events()
+        self._on_samples()
         found = checks(self.session)
         array = DiagnosticArray(status=[
             self._status(worst(self.session, found), figures(self.session)),
             *map(self._status, found)])
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._diagnostics.publish(array)
-        self._show_state()
+        if self._page is not None:
+            self._page.show_state()
 
     def _status(self, check: Check, values: Iterable[tuple[str, str]] = ()) -> DiagnosticStatus:
         return DiagnosticStatus(
@@ -241,41 +239,33 @@ class Calibrator:
         response.passed = bytes([all(each.level == Level.OK for each in found)])
         return response
 
-    def _handle_events(self) -> None:
-        shown = False
-        for event in self.session.events():
-            self._handle(event)
-            shown |= isinstance(event, ShowPoses)
+    def _on_samples(self) -> None:
+        """Show what the samples caused, and the progress if it is due."""
+        self._worker.handle_events()
         due = monotonic() - self._progress_at >= _PROGRESS_EVERY
-        if shown or (due and self._progress.get_subscription_count()):
-            self._progress_at = monotonic()
-            now = state.progress(self.session)
-            self._progress.publish(self._status(Check('progress', Level.OK, now.advice),
-                                                now.figures()))
+        if due and self._progress.get_subscription_count():
+            self._show_progress()
 
-    def _handle(self, event: Event) -> None:
+    def _show_progress(self) -> None:
+        self._progress_at = monotonic()
+        now = state.progress(self.session)
+        self._progress.publish(self._status(Check('progress', Level.OK, now.advice),
+                                            now.figures()))
+
+    def _show(self, event: Event) -> None:
+        if self._page is not None:
+            self._page.show_event(event)
         if isinstance(event, Log):
             self._log(event)
         elif isinstance(event, Still):
             self._still.publish(Bool(data=event.still))
         elif isinstance(event, ShowPoses):
             self._poses.publish(pose_markers(event.up, event.asked, event.frame_id))
-            if self._page is not None:
-                self._page.show_poses(event)
+            self._show_progress()
         elif isinstance(event, Mounting):
             self._broadcast(event)
         elif isinstance(event, Result):
             self._result.publish(String(data=event.text))
-        else:
-            self._worker.run(event, self._on_done)
-
-    def _on_done(self, success: bool, words: str) -> None:
-        self._log(Log('info' if success else 'warning', words))
-        self._show_state()
-
-    def _show_state(self) -> None:
-        if self._page is not None:
-            self._page.show_state()
 
     def _broadcast(self, event: Mounting) -> None:
         """Publish the levelled frame as a child of the frame of the sensor."""
@@ -287,10 +277,6 @@ class Calibrator:
                                   event.rotation)
 
     def _log(self, line: Log) -> None:
-        if not self._filter.passes(line):
-            return
-        if self._page is not None:
-            self._page.show_line(line)
         log = self._node.get_logger()  # rclpy needs a separate line of code for each severity
         if line.severity == 'error':
             log.error(line.words)
@@ -306,7 +292,39 @@ class Calibrator:
         if self._server is not None:
             self._server.close()
         self._worker.close()
-        self.session.close()
+
+
+def in_executor(node: Node) -> CallSoon:
+    """Return a function that lets the executor of a node call functions, in their order."""
+    waiting: SimpleQueue[Callable[[], None]] = SimpleQueue()
+
+    def call_next() -> None:
+        try:
+            waiting.get()()
+        except Exception:  # EventsExecutor crashes on an exception in a task (rclpy issue 1641)
+            node.get_logger().error(f'unexpected error in accel_calib:\n{format_exc()}')
+
+    def call_soon(function: Callable[[], None]) -> None:
+        waiting.put(function)
+        executor = node.executor
+        if executor is not None:
+            # The executor may run tasks in any order; the queue keeps their order.
+            executor.create_task(call_next)
+
+    return call_soon
+
+
+def serve(node: Node, name: str, command: Callable[[], Task], worker: Worker) -> None:
+    """Create the service ``~/name``, which responds the result of a command."""
+    service = node.create_service(Trigger, f'~/{name}', lambda request, response: response,
+                                  qos_profile=CALLS)
+    send = service.send_response
+
+    def send_response(response: Any, header: Any) -> None:
+        worker.do(name, command(), lambda success, words: send(
+            Trigger.Response(success=success, message=words), header))
+
+    service.send_response = send_response
 
 
 class CalibratorNode(Node):

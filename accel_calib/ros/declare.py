@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What the nodes declare: their parameters, services, quality of service and static transforms.
+What the nodes declare: their parameters, quality of service and static transforms.
 
 At 1 kHz, a busy machine loses a few messages in 10,000 with depth 10, and none with depth 100.
 
@@ -18,8 +18,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import Field, fields
 from difflib import get_close_matches
 import math
-from queue import SimpleQueue
-from traceback import format_exc
 from typing import Any, TYPE_CHECKING
 
 from geometry_msgs.msg import Quaternion, TransformStamped
@@ -29,11 +27,10 @@ from rcl_interfaces.msg import (
 from rclpy.exceptions import InvalidParameterValueException
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from std_srvs.srv import Trigger
 
 from ..errors import InputError
 from ..geometry import quaternion_of, rotation_from_quaternion
-from ..session import CallSoon, changed, default_of, expected, Log, Settings, Task, Worker
+from ..session import changed, default_of, expected, Settings
 from ..table import Floats
 
 if TYPE_CHECKING:
@@ -151,24 +148,23 @@ def published_by_others(node: Node, types: Iterable[str]) -> list[tuple[str, ...
             for wanted in types]
 
 
-def mismatches(node: Node, subscriptions: Iterable[Any], publishers: Iterable[Any]
-               ) -> tuple[str, ...]:
+def mismatches(node: Node) -> tuple[str, ...]:
     """
-    Return one line for each endpoint that cannot exchange messages with these of a node.
+    Return one line for each endpoint that cannot exchange messages with those of a node.
 
     A line is what is wrong and what to do. Of other policies than reliability and durability,
     rclpy reports a difference.
 
     """
     lines = []
-    for own in subscriptions:
+    for own in node.subscriptions:
         for other in node.get_publishers_info_by_topic(own.topic_name):
             why = _mismatch(other.qos_profile, own.qos_profile)
             if why:
                 lines.append(f'{name_of(other)} publishes on {own.topic_name} with the QoS {why}, '
                              'so that nothing arrives here: start this node without '
                              f'qos_overrides.{own.topic_name}.subscription')
-    for own in publishers:
+    for own in node.publishers:
         for other in node.get_subscriptions_info_by_topic(own.topic_name):
             why = _mismatch(own.qos_profile, other.qos_profile)
             if why:
@@ -187,43 +183,6 @@ def _mismatch(offered: QoSProfile, wanted: QoSProfile) -> str:
             and wanted.durability == DurabilityPolicy.TRANSIENT_LOCAL):
         words.append('volatile, but the subscriber expects transient local')
     return ' and '.join(words)
-
-
-def in_executor(node: Node) -> CallSoon:
-    """Return a function that lets the executor of a node call functions, in their order."""
-    waiting: SimpleQueue[Callable[[], None]] = SimpleQueue()
-
-    def call_next() -> None:
-        try:
-            waiting.get()()
-        except Exception:  # EventsExecutor crashes on an exception in a task (rclpy issue 1641)
-            node.get_logger().error(f'unexpected error in accel_calib:\n{format_exc()}')
-
-    def call_soon(function: Callable[[], None]) -> None:
-        waiting.put(function)
-        executor = node.executor
-        if executor is not None:
-            # The executor may run tasks in any order; the queue keeps their order.
-            executor.create_task(call_next)
-
-    return call_soon
-
-
-def serve(node: Node, name: str, command: Callable[[], Task], worker: Worker,
-          log: Callable[[Log], object]) -> None:
-    """Create the service ``~/name``, which logs and responds the result of a command."""
-    service = node.create_service(Trigger, f'~/{name}', lambda request, response: response,
-                                  qos_profile=CALLS)
-    send = service.send_response
-
-    def send_response(response: Any, header: Any) -> None:
-        def answer(success: bool, words: str) -> None:
-            log(Log('info' if success else 'warning', words))
-            send(Trigger.Response(success=success, message=words), header)
-
-        worker.do(name, command(), answer)
-
-    service.send_response = send_response
 
 
 # ----------------------------------------------------------------------------- static transforms

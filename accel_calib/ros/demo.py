@@ -21,6 +21,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from itertools import takewhile
+import json
 import os
 from pathlib import Path
 import signal
@@ -79,6 +81,9 @@ _NODE = {'sensor': 'demo', 'still_window': 0.25, 'min_dwell': 0.6}
 
 _SERVICES = ('calibrator/fit', 'calibrator/refine', 'calibrator/set_level', 'simulator/flat',
              'simulator/next')
+
+_KINDS = ('raw', 'corrected', 'truth')
+"""Kinds of messages that are compared: before and after the correction, and the truth."""
 
 _PATIENCE = 120.0
 """Longest time that a step may take, on the slowest machine [s]."""
@@ -143,7 +148,7 @@ class User(Node):
         self._temperature = float('nan')
         self._poses = np.zeros((0, 3))
         self._messages: dict[str, dict[int, tuple[float, float, float]]] = {
-            'raw': {}, 'corrected': {}, 'truth': {}}
+            name: {} for name in _KINDS}
         self.create_subscription(MarkerArray, 'calibrator/poses', self._on_poses, LATCHED)
         self.create_subscription(Temperature, 'temperature', self._on_temperature, SENSOR)
         for name, topic, kind in (('raw', 'imu/data_raw', Imu),
@@ -176,25 +181,22 @@ class User(Node):
         truth = self._messages['truth']
         return truth[max(truth)] if truth else ()
 
-    def _rest(self, *names: str) -> list[Rest]:
-        """Return the messages of these kinds in the ongoing rest, oldest first [g]."""
-        truth = self._messages['truth']
-        common = sorted(set.intersection(*(set(self._messages[name]) for name in names)))
-        moving = next((k for k in range(len(common), 0, -1) if truth[common[k - 1]] != self._up),
-                      0)
-        return [{name: np.array(self._messages[name][stamp]) / STANDARD_GRAVITY for name in names}
-                for stamp in common[moving:]]
+    def _rest(self, *names: str) -> Floats:
+        """Return the messages of these kinds in the ongoing rest [g], (messages, kinds, 3)."""
+        truth, up = self._messages['truth'], self._up
+        kept = [self._messages[name] for name in names]
+        common = sorted(set(truth).intersection(*kept), reverse=True)
+        resting = takewhile(lambda stamp: truth[stamp] == up, common)
+        found = [[messages[stamp] for messages in kept] for stamp in resting]
+        return np.reshape(found, (-1, len(names), 3)) / STANDARD_GRAVITY
 
     def _has_captured(self) -> bool:
         """Return whether there is a pose in the direction of the ongoing rest."""
-        rest = self._rest('raw', 'truth')
-        if not rest:
-            return False
-        up = np.mean([each['raw'] for each in rest], axis=0)
+        up = self._rest('raw').sum(axis=(0, 1))
         return bool(np.any(self._poses @ up > _SAME_POSE * np.linalg.norm(up)))
 
-    def _has_rested(self, count: int) -> bool:
-        return len(self._rest('raw', 'truth')) >= count
+    def _has_rested(self, count: int, *names: str) -> bool:
+        return len(self._rest(*names)) >= count
 
     def turn(self, service: str = 'next') -> None:
         """Turn the sensor, and wait until it rests."""
@@ -204,7 +206,7 @@ class User(Node):
         for kept in self._messages.values():
             kept.clear()
         self._spin(lambda: self._up not in ((), before)
-                   and len(self._rest('truth')) >= _SETTLED, 'rest of the simulated sensor')
+                   and self._has_rested(_SETTLED, 'truth'), 'rest of the simulated sensor')
 
     def capture(self, count: int) -> None:
         """Let the calibrator capture this number of poses."""
@@ -220,11 +222,9 @@ class User(Node):
         rests = []
         for done in range(1, count + 1):
             self.turn()
-            self._spin(lambda: len(self._rest('raw', 'corrected', 'truth')) >= _SAMPLES
-                       and self._has_captured(), f'rest {done}')
-            samples = self._rest('raw', 'corrected', 'truth')
-            rests.append({name: np.mean([each[name] for each in samples], axis=0)
-                          for name in samples[0]})
+            self._spin(lambda: self._has_rested(_SAMPLES, *_KINDS) and self._has_captured(),
+                       f'rest {done}')
+            rests.append(dict(zip(_KINDS, self._rest(*_KINDS).mean(axis=0))))
             error = np.linalg.norm(rests[-1]['corrected'] - rests[-1]['truth']) * MG
             self._report(f'  rest {done:2d} of {count}, now {self._temperature:.1f} °C: '
                          f'imu/data_calibrated is {error:5.2f} mg from the truth')
@@ -234,7 +234,7 @@ class User(Node):
         """Put the robot flat, and call ``~/set_level`` as soon as the rest is long enough."""
         self.turn('flat')
         for count in range(_SETTLED, _LONGEST_REST, _SETTLED):
-            self._spin(partial(self._has_rested, count), 'a longer rest')
+            self._spin(partial(self._has_rested, count, 'raw'), 'a longer rest')
             answer = self._request('calibrator/set_level')
             if answer.success:
                 return str(answer.message)
@@ -357,7 +357,7 @@ def running(command: str, parameters: dict[str, Any], severity: str = 'error'
             ) -> Iterator[subprocess.Popen[bytes]]:
     """Run a node in a process, which prints log lines from this severity on, and end it."""
     given = [part for name, value in parameters.items()
-             for part in ('-p', f'{name}:={_in_yaml(value)}')]
+             for part in ('-p', f'{name}:={json.dumps(value)}')]
     process = subprocess.Popen(
         [sys.executable, '-m', 'accel_calib.cli.main', command, '--ros-args',
          '--log-level', severity, *given])
@@ -370,10 +370,6 @@ def running(command: str, parameters: dict[str, Any], severity: str = 'error'
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
-
-
-def _in_yaml(value: Any) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 @contextmanager

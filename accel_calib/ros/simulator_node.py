@@ -15,6 +15,7 @@ it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import cycle
 import math
 import time
 
@@ -103,7 +104,8 @@ class SimulatedImu:
         self._thermal = thermal_stream(self._model)
         self._rng = np.random.default_rng(settings.seed)
         self.directions = _directions(settings)
-        self._up = self.directions[0]
+        self._coming = cycle(self.directions) if settings.loop else iter(self.directions)
+        self._up = next(self._coming)
         self.next_pose = 1
         self._resting = round(settings.dwell * settings.rate)
         self._path = self._rest(max(1, self._resting))
@@ -122,19 +124,16 @@ class SimulatedImu:
 
     def turn_on(self) -> bool:
         """Let the sensor turn to the next pose now; return whether there is one."""
-        if self._is_over:
-            return False
-        self.turn_to(self._next())
-        return True
+        up = self._next()
+        if up is not None:
+            self.turn_to(up)
+        return up is not None
 
-    @property
-    def _is_over(self) -> bool:
-        return self.next_pose >= len(self.directions) and not self._settings.loop
-
-    def _next(self) -> Floats:
-        """Return the direction of the next pose, which is then one of those so far."""
-        self.next_pose += 1
-        return self.directions[(self.next_pose - 1) % len(self.directions)]
+    def _next(self) -> Floats | None:
+        """Return the direction of the next pose, which is then one of those so far; None: over."""
+        up = next(self._coming, None)
+        self.next_pose += up is not None
+        return up
 
     def samples(self, count: int) -> Recording:
         """Return the next samples [g], at most this number; none after the end."""
@@ -158,12 +157,13 @@ class SimulatedImu:
 
     def _extend(self, lacking: int) -> bool:
         """Append the next pose, or this number of samples at rest; return whether there is any."""
-        if not self._resting or (self._is_over and self._settings.hold):
+        up = self._next() if self._resting else None
+        if up is not None:
+            self._append(up)
+        elif self._settings.hold or not self._resting:
             self._path = np.concatenate([self._path, self._rest(lacking)])
-        elif self._is_over:
-            return False
         else:
-            self._append(self._next())
+            return False
         return True
 
     def _append(self, up: Floats) -> None:

@@ -54,12 +54,9 @@ class Output:
         self.rewriter: Rewriter | None = None
         self._made_for: tuple[object, ...] = ()
 
-    def count(self) -> None:
-        """Count the subscribers."""
-        self.listeners = self._publisher.get_subscription_count()
-
     def prepare(self, layout: Layout, calibration: Calibration | None, session: Session) -> None:
-        """Prepare the correction of messages by this calibration, unless it is prepared."""
+        """Count the subscribers, and prepare the correction by this calibration for them."""
+        self.listeners = self._publisher.get_subscription_count()
         settings, sensor = session.settings, session.sensor
         fills = settings.fill_covariance and sensor.noise is not None
         made_for = layout, calibration, settings, fills
@@ -99,7 +96,7 @@ class ContextTopics:
                                  f'{str(error).splitlines()[0]}', 'correct the entry') from error
             self._waiting[column] = node.resolve_topic_name(topic)
 
-    def look(self, session: Session, set_context: Callable[[str, float], None]) -> None:
+    def look(self, session: Session) -> None:
         """Subscribe to the topics that exist by now, and note why others do not arrive."""
         types = dict(self._node.get_topic_names_and_types()) if self._waiting else {}
         for column, topic in list(self._waiting.items()):
@@ -109,7 +106,7 @@ class ContextTopics:
                 kind, fields = _NUMBERS[known[0]]
                 field = next((each for each in fields if each in column), fields[0])
                 self._node.create_subscription(
-                    kind, topic, lambda message, column=column, field=field: set_context(
+                    kind, topic, lambda message, column=column, field=field: session.around.take(
                         column, getattr(message, field)), SENSOR)
                 session.missing[column] = f'nothing comes on {topic} ({_short(known[0])})'
             else:
@@ -147,9 +144,7 @@ class Stream:
         self._outputs = [Output(publisher) for publisher in publishers]
         self._calibrated, self._preview, self._motion = self._outputs
         self._layout = _NO_LAYOUT
-        self._waiting: list[bytes] = []
-        self._context: Mapping[str, float] = {}
-        self._changes: list[tuple[int, Mapping[str, float]]] = [(0, self._context)]
+        self._waiting: list[tuple[bytes, Mapping[str, float]]] = []
         self._due = self._arrived = 0.0
         self._listened = False
         self._applied: Calibration | None = None
@@ -162,26 +157,12 @@ class Stream:
         self._active = active
         self._prepare()
 
-    def set_context(self, column: str, value: float) -> None:
-        """Set the context of the following messages; NaN is ignored."""
-        self._session.around.take(column, value)
-        self._note_context()
-
-    def _note_context(self) -> None:
-        """Note from which message on the context has its present values."""
-        context, count = self._session.around.values, len(self._waiting)
-        if context is not self._context:
-            self._context = context
-            if self._changes[-1][0] == count:
-                self._changes.pop()
-            self._changes.append((count, context))
-
     @property
     def newest(self) -> Triple | None:
         """Return the newest reading, unless the session has it already."""
         if not self._waiting:
             return None
-        x, y, z = THREE.unpack_from(self._waiting[-1], self._layout.place(ACCELERATION))
+        x, y, z = THREE.unpack_from(self._waiting[-1][0], self._layout.place(ACCELERATION))
         return x, y, z
 
     def on_message(self, data: bytes) -> None:
@@ -203,27 +184,24 @@ class Stream:
             self._prepare()
         if self._listened:
             self._send(data)
-        self._waiting.append(data)
+        self._waiting.append((data, session.around.values))
         self._arrived = now
         if due:
             self._due = now + BATCH
             self.flush()
 
     def _prepare(self) -> None:
-        """Count the subscribers, and prepare the corrections."""
+        """Prepare the outputs."""
         session = self._session
-        self._applied, self._offered = session.sensor.applied, session.sensor.offered
-        self._settings = session.settings
-        for output in self._outputs:
-            output.count()
-        self._listened = self._active and any(output.listeners for output in self._outputs)
-        gyro = session.sensor.gyro if session.settings.gyro_bias else None
+        sensor, self._settings = session.sensor, session.settings
+        self._applied, self._offered = sensor.applied, sensor.offered
+        gyro = sensor.gyro if session.settings.gyro_bias else None
         bias = _NO_BIAS if gyro is None else gyro.at(session.around.temperature)
-        for output, calibration in ((self._calibrated, self._applied),
-                                    (self._preview, session.sensor.previewed)):
+        for output, calibration in zip(self._outputs, (sensor.applied, sensor.previewed, None)):
             output.prepare(self._layout, calibration, session)
             if output.rewriter is not None:
                 output.rewriter.bias = tuple(bias.tolist())
+        self._listened = self._active and any(output.listeners for output in self._outputs)
 
     def _adopted(self, data: bytes) -> bytes | None:
         """Return a message with a new layout as usual; None: not readable, or another sensor."""
@@ -261,7 +239,7 @@ class Stream:
         if rewriter is None:
             return
         try:
-            corrected = rewriter(data, self._context)
+            corrected = rewriter(data, self._session.around.values)
         except AccelCalibError as error:
             self._session.reports.uncorrected(error)
             return
@@ -276,22 +254,18 @@ class Stream:
     def flush(self) -> None:
         """Pass the waiting messages to the session."""
         if self._waiting:
-            waiting, self._waiting = self._waiting, []
-            changes, self._changes = self._changes, [(0, self._context)]
-            found = samples_of(joined(waiting, IMU_DOUBLES, 'imu/data_raw'))
+            messages, contexts = zip(*self._waiting)
+            self._waiting = []
+            found = samples_of(joined(messages, IMU_DOUBLES, 'imu/data_raw'))
             rows = np.column_stack([found['time'], found['reading'], found['rate'],
-                                    self._around(changes, len(waiting))])
+                                    self._around(contexts)])
             self._session.push(rows, self._arrived)
             self._on_events()
-        self._session.around.expire()
-        self._note_context()
 
-    def _around(self, changes: list[tuple[int, Mapping[str, float]]], count: int) -> Floats:
-        """Return the context of each message, (n, k), from its changes."""
-        starts = [start for start, _ in changes]
-        values = [[known.get(column, math.nan) for column in self._columns]
-                  for _, known in changes]
-        return np.repeat(np.array(values), np.diff([*starts, count]), axis=0)
+    def _around(self, contexts: Sequence[Mapping[str, float]]) -> Floats:
+        """Return the columns of the context of each message, (n, k)."""
+        return np.array([[known.get(column, math.nan) for column in self._columns]
+                         for known in contexts])
 
 
 def _usual(data: bytes) -> bytes:

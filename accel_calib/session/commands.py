@@ -25,7 +25,7 @@ from .sensor import gyro_bias_of_rest, Sensor
 from .settings import CalibratorSettings
 from .store import writing_advice
 from .stream import thermometer_words
-from .worker import Compute, Files, Parse, Part, Task
+from .worker import Compute, Files, nothing, Parse, Part, Task
 from ..calibrate import (
     angle_words, Calibration, fit_partial, level, mounting_only, outlook, set_heading)
 from ..capture import Dwell, poses_from
@@ -75,19 +75,16 @@ class Commands:
 
     def capture_pose(self) -> Task:
         """Capture the ongoing rest as a pose."""
-        session, sensor = self._session, self._session.sensor
-        _check_fresh(session)
+        session, sensor, dwell = self._session, self._session.sensor, _rest(self._session)
         session.files.usable()
-        dwell = sensor.live.capture_now()
-        if dwell is None:
-            raise _not_still(session)
+        sensor.live.capture(dwell)
         sensor.guide.is_new_rest(dwell.start)  # the answer is the line about this pose
         session.poses_changed(ended=False)
         poses = sensor.live.book.poses()
         words = (f'{counted(len(poses), "pose")}: the sensor has been still for '
                  f'{dwell.end - dwell.start:.1f} s')
         if session.computing:
-            yield Files()
+            yield Files(nothing)
             return f'{words}; the next pose is on ~/poses after the computation that is running'
         plan = yield Compute(plan_for, poses, session.units, session.settings.model)
         if session.sensor is sensor:
@@ -103,7 +100,7 @@ class Commands:
             raise InputError('there are no poses to remove', 'capture a pose first')
         session.poses_changed(ended=False)
         count = len(session.sensor.live.book.poses())
-        yield Files()  # until the poses are stored
+        yield Files(nothing)  # until the poses are stored
         return f'the last pose is removed; remaining: {counted(count, "pose")}'
 
     # Calibrations
@@ -208,8 +205,7 @@ class Commands:
             return (f'{words}; published on ~/preview only: call ~/save to use and store it, or '
                     '~/undo to discard it')
         try:
-            yield from _alone(session, Files(
-                store.write, after=Parse(store.prepared, calibration)))
+            yield from _alone(session, Files(store.write, Parse(store.prepared, calibration)))
         except OSError as error:
             session.adopt(calibration, fitted.refinement, fitted.rating)
             session.sensor.unsaved = True
@@ -228,7 +224,7 @@ class Commands:
         calibration = sensor.present
         if calibration is None:
             raise InputError('there is no calibration', 'capture poses and call ~/fit first')
-        yield Files(store.write, after=Parse(store.prepared, calibration))
+        yield Files(store.write, Parse(store.prepared, calibration))
         yield Files(store.save_poses, sensor.live.book.poses())
         sensor.unsaved = False
         if sensor.offered is calibration:
@@ -265,7 +261,7 @@ class Commands:
     def reset(self) -> Task:
         """Remove poses and calibration; the stored files are renamed."""
         session, store = self._session, self._session.files.usable()
-        kept = yield from _alone(session, Files(store.set_aside, after=Parse(store.is_good)))
+        kept = yield from _alone(session, Files(store.set_aside, Parse(store.is_good)))
         session.sensor.live.clear()
         session.adopt(None)
         session.sensor.fitted_poses = 0

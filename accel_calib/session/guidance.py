@@ -105,8 +105,7 @@ class Guide:
 
     def __init__(self) -> None:
         self._plan: Plan | None = None
-        self._planned: tuple[PlannedPose, ...] = ()
-        self._all_taken = False
+        self._planned: tuple[PlannedPose, ...] | None = None  # of a refinement; none left: ()
         self._begun = 0
         self._count = 0
         self._new_at = math.inf
@@ -128,25 +127,25 @@ class Guide:
     def plan(self, plan: Plan | None) -> None:
         self._plan = plan
         if plan is None or plan.poses < self._begun:
-            self.follow(())
+            self._planned = None
         elif self._planned:
             new = plan.up[self._begun:]
-            left = tuple(each for each in self._planned if not np.any(new @ each.up >= _TAKEN))
-            self._planned, self._all_taken = left, not left
+            self._planned = tuple(
+                each for each in self._planned if not np.any(new @ each.up >= _TAKEN))
 
     def follow(self, planned: Sequence[PlannedPose]) -> None:
         """Ask for these poses of a refinement next; for none, ask for poses for a fit."""
-        self._planned, self._all_taken, self._begun = tuple(planned), False, self.poses
+        self._planned, self._begun = tuple(planned) or None, self.poses
 
     @property
     def follows(self) -> bool:
         """Whether the poses of a refinement are asked for, or have just been taken."""
-        return bool(self._planned) or self._all_taken
+        return self._planned is not None
 
     @property
     def action(self) -> Action:
         """Return what to do next with the poses; `NOT_KNOWN` before the first choice."""
-        if self._all_taken:
+        if self._planned == ():
             return _calling('refine', 'all poses of the plan are taken')
         plan = self.plan
         if plan is None:

@@ -46,18 +46,18 @@ _BANDS = 5
 
 
 class PoseBook:
-    """Poses in the order of their capture, as dwells, so that the last pose can be undone."""
+    """Poses as dwells in the order of their capture, of which the last are `held`: provisional."""
 
     def __init__(self, settings: CaptureSettings, units: Units) -> None:
         self._settings, self._units = settings, units
         self._earlier: list[Dwell] = []
         self._dwells: list[Dwell] = []
-        self._held: list[Dwell] = []
+        self.held: list[Dwell] = []
         self._made: tuple[list[Dwell], Poses] | None = None
 
     def poses(self) -> Poses:
         """Return the pose table."""
-        dwells = [*self._earlier, *self._dwells, *self._held]
+        dwells = [*self._earlier, *self._dwells, *self.held]
         made = self._made
         if made is None or len(made[0]) != len(dwells) or not all(map(is_, made[0], dwells)):
             # Merging compares all pairs; the diagnostics ask every second.
@@ -75,7 +75,7 @@ class PoseBook:
 
     def lacking(self, column: str) -> tuple[int, int]:
         """Return how many dwells have no value in a column of the context, and how many have."""
-        known = [column in each.context for each in (*self._earlier, *self._dwells, *self._held)]
+        known = [column in each.context for each in (*self._earlier, *self._dwells, *self.held)]
         return known.count(False), known.count(True)
 
     def add_stored(self, poses: Poses) -> None:
@@ -85,7 +85,7 @@ class PoseBook:
 
     def holds(self, dwell: Dwell) -> bool:
         """Return whether this rest is a provisional pose."""
-        return any(overlap(dwell, each) for each in self._held)
+        return any(overlap(dwell, each) for each in self.held)
 
     def _has(self, dwell: Dwell) -> bool:
         """Return whether a rest is known already: a recording is played again."""
@@ -93,13 +93,13 @@ class PoseBook:
 
     def hold(self, dwell: Dwell) -> None:
         """Add or update the provisional pose of an ongoing rest."""
-        self._held = [each for each in self._held if not overlap(dwell, each)]
+        self.held = [each for each in self.held if not overlap(dwell, each)]
         if not self._has(dwell):
-            self._held.append(dwell)
+            self.held.append(dwell)
 
     def end(self, dwell: Dwell) -> None:
         """Add a rest that ended, in place of its provisional pose."""
-        self._held = [each for each in self._held if not overlap(dwell, each)]
+        self.held = [each for each in self.held if not overlap(dwell, each)]
         self._add(dwell)
 
     def _add(self, dwell: Dwell) -> None:
@@ -111,8 +111,8 @@ class PoseBook:
 
     def doubt_held(self, is_over: Callable[[Dwell], bool]) -> int:
         """Mark provisional poses without a final average as doubtful; return their number."""
-        over = [each for each in self._held if is_over(each)]
-        self._held = [each for each in self._held if not is_over(each)]
+        over = [each for each in self.held if is_over(each)]
+        self.held = [each for each in self.held if not is_over(each)]
         for dwell in over:
             self._add(replace(dwell, doubtful=True))
         return len(over)
@@ -126,12 +126,12 @@ class PoseBook:
 
     def undo(self) -> bool:
         """Remove the last pose; return whether there was one."""
-        entries = self._held or self._dwells or self._earlier
+        entries = self.held or self._dwells or self._earlier
         return bool(entries and entries.pop())
 
     def clear(self) -> None:
         """Remove all poses."""
-        self._earlier, self._dwells, self._held = [], [], []
+        self._earlier, self._dwells, self.held = [], [], []
 
 
 def _bands(dwells: list[Dwell]) -> NDArray[np.int64]:
@@ -270,17 +270,14 @@ class LiveCapture:
         self._looked, self._known_until = time, time + _LOOK_EVERY
         return self._look(capture) if still else self._doubt_held(time)
 
-    def capture_now(self) -> Dwell | None:
-        """Capture the ongoing rest as a pose, and return it; None if there is no rest."""
-        dwell = self.detector.current()
-        if dwell is not None:
-            self.book.hold(dwell)
-            self._declined = None
-        return dwell
+    def capture(self, rest: Dwell) -> None:
+        """Capture the ongoing rest as a pose."""
+        self.book.hold(rest)
+        self._declined = None
 
     def refresh(self) -> None:
-        """Update the pose of the ongoing rest."""
-        dwell = self.detector.current()
+        """Update the pose of the ongoing rest, if it is a provisional one."""
+        dwell = self.detector.current() if self.book.held else None
         if dwell is not None and self.book.holds(dwell):
             self.book.hold(dwell)
 

@@ -31,7 +31,7 @@ from .stream import StreamStatistics
 from ..calibrate import (
     Calibration, GyroBias, on_topics, Outside, outside, SampleNoise, thermal_stream)
 from ..capture import Dwell
-from ..compare import compared, Drift, monitor, rest_errors
+from ..compare import compared, Drift, rest_errors
 from ..effects import Context, Model, ThermalStream
 from ..errors import InputError
 from ..messages import output_scale
@@ -134,10 +134,10 @@ class Sensor:
         self.offer(None)
         self.unsaved = False
         if not _only_levelled(self.calibration, calibration):
-            self._past = None if calibration is None else monitor(calibration)
+            self._past = None if calibration is None else Drift(calibration)
             self._counted = self.rest
         self.calibration, self.drift = calibration, self._past
-        self.temperatures.follow(Model({}) if calibration is None else calibration.model)
+        self.temperatures.forget()
         self.set_rotates(self._rotates)
 
     def set_rotates(self, rotates: bool) -> None:
@@ -345,6 +345,9 @@ _RECENT = int(2.0 * LONG_REST / _APART)
 _Columns = deque[tuple[float, dict[str, float]]]
 """Columns by time [s]."""
 
+_Followed = tuple[ThermalStream | None, _Columns]
+"""The stream of a model, None if it needs none, and its columns at the recent points."""
+
 
 class TemperatureHistory:
     """
@@ -356,15 +359,11 @@ class TemperatureHistory:
 
     def __init__(self) -> None:
         self._points: deque[tuple[float, float]] = deque(maxlen=_POINTS)
-        self._columns = _Columns(maxlen=_RECENT)
-        self._stream: ThermalStream | None = None
-        self._followed = Model({})
+        self._followed: dict[tuple[object, ...], _Followed] = {}
 
-    def follow(self, model: Model) -> None:
-        """Compute the columns of this model from now on, and for the history."""
-        same, self._followed = _key(model) == _key(self._followed), model
-        if not same:
-            self._stream, self._columns = self._replayed(model)
+    def forget(self) -> None:
+        """Compute no columns any more, except for the models that are asked for from now on."""
+        self._followed.clear()
 
     def add(self, time: Floats, temperature: Floats) -> None:
         """
@@ -380,25 +379,32 @@ class TemperatureHistory:
         time, temperature = time[known], temperature[known]
         if self._points and time[-1] < self._points[-1][0]:  # the stream starts again
             self._points.clear()
-            self._columns.clear()
+            for _, columns in self._followed.values():
+                columns.clear()
         back = np.flatnonzero(np.diff(time) < -_APART)
         begin = int(back[-1]) + 1 if len(back) else 0
         while begin < len(time):
             due = self._points[-1][0] + _APART if self._points else -np.inf
             later = np.flatnonzero(time[begin:] >= due)
             end = begin + int(later[0]) + 1 if len(later) else len(time)
-            if self._stream is not None:
-                self._stream.add_all(time[begin:end], temperature[begin:end])
-            if len(later):
-                now = float(time[end - 1])
-                self._points.append((now, float(temperature[end - 1])))
-                if self._stream is not None:
-                    self._columns.append((now, self._stream.value))
+            self._take(time[begin:end], temperature[begin:end], is_point=len(later) > 0)
             begin = end
 
+    def _take(self, time: Floats, temperature: Floats, *, is_point: bool) -> None:
+        """Add successive samples; the last one may be a point of the history."""
+        now = float(time[-1])
+        if is_point:
+            self._points.append((now, float(temperature[-1])))
+        for stream, columns in self._followed.values():
+            if stream is None:
+                continue
+            stream.add_all(time, temperature)
+            if is_point:
+                columns.append((now, stream.value))
+
     def columns_of(self, model: Model) -> Mapping[str, float]:
-        """Return the present columns of a model; those of the followed one are at hand."""
-        stream = self._stream if _key(model) == _key(self._followed) else self.stream(model)
+        """Return the present columns of a model."""
+        stream, _ = self._follow(model)
         return {} if stream is None else stream.value
 
     def stream(self, model: Model) -> ThermalStream | None:
@@ -407,15 +413,20 @@ class TemperatureHistory:
 
     def during(self, model: Model, start: float, end: float) -> Context:
         """Return the mean columns that a model needs between two times; empty if not known."""
-        columns = self._columns
-        if model is not self._followed and _key(model) != _key(self._followed):
-            columns = self._replayed(model)[1]
+        _, columns = self._follow(model)
         inside = [each for time, each in columns if start - _APART <= time <= end]
         if not inside:
             return {}
         return {key: np.array([np.mean([each[key] for each in inside])]) for key in inside[0]}
 
-    def _replayed(self, model: Model) -> tuple[ThermalStream | None, _Columns]:
+    def _follow(self, model: Model) -> _Followed:
+        """Return the stream and columns of a model, which are computed from now on."""
+        key = tuple(model.lags.items()), 'temperature_rate' in model.over
+        if key not in self._followed:
+            self._followed[key] = self._replayed(model)
+        return self._followed[key]
+
+    def _replayed(self, model: Model) -> _Followed:
         """Return the stream of a model after this history, and the columns at its last points."""
         stream, columns = thermal_stream(model), _Columns(maxlen=_RECENT)
         if stream is None:
@@ -427,7 +438,3 @@ class TemperatureHistory:
             stream.add(time, temperature)
             columns.append((time, stream.value))
         return stream, columns
-
-
-def _key(model: Model) -> tuple[object, ...]:
-    return dict(model.lags), 'temperature_rate' in model.over

@@ -13,6 +13,7 @@ uses a steady clock.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable
 import json
 import math
@@ -29,8 +30,8 @@ from .settings import CalibratorSettings, own_effects
 from .store import SensorFiles, Store, tidied, unusable, writing_advice
 from .stream import AGAIN, Around, Reports, SILENT, StreamStatistics
 from .worker import (
-    answered, Compute, Event, Files, Log, Mounting, Parse, Result, Severity, ShowPoses, Still,
-    Task)
+    answered, Compute, Event, Files, Log, LogFilter, Mounting, nothing, Parse, Result, Severity,
+    ShowPoses, Still, Task)
 from ..calibrate import (
     Calibration, in_frame, mounting_figures, mounting_of, mounting_words, on_topics,
     with_given_mounting)
@@ -92,6 +93,8 @@ class Session:
         Number of fits and refinements that are running.
     ended : bool
         Whether no more samples can come, because a recording has ended.
+    events : deque of Event
+        What the session reports, in order; whoever shows it removes it.
 
     """
 
@@ -119,13 +122,10 @@ class Session:
         self._given = mounting_of(settings.mounting_rpy) if any(settings.mounting_rpy) else None
         self._largest = (_LARGEST_NATIVE if self.units.is_native
                          else _LARGEST_G * self.units.per_g)
-        self._events: list[Event] = []
+        self.events, self._filter = deque[Event](), LogFilter(clock)
         known = settings.sensor or settings.calibration_file
-        store = _take_files(self, settings.sensor) if known else None
-        if store is None:
+        if not known or not self._open(answered):
             self.show_poses(store=False)
-        else:
-            answered(_load(self, store, self.sensor))
 
     @property
     def name(self) -> str:
@@ -147,27 +147,20 @@ class Session:
             self.sensor.guide.plan = None
             self.show_poses(store=False)
 
-    def events(self) -> list[Event]:
-        """Return the events since the last call, in order."""
-        found, self._events = self._events, []
-        return found
-
-    def report(self, event: Event) -> None:
-        """Add an event."""
-        self._events.append(event)
-
     def log(self, severity: Severity, words: str, kind: str = '', once_in: float = 0.0) -> None:
-        """Add a log line to the events; parameters as in `Log`."""
-        self.report(Log(severity, words, kind, once_in))
+        """Add a log line to the events; of a kind, if it has one, at most one in `once_in` [s]."""
+        if words and (not kind or self._filter.passes(kind, once_in)):
+            self.events.append(Log(severity, words))
 
     def tick(self) -> None:
         """Check the stream, and try to lock the files; to be called about once per second."""
         store = self.files.try_again()
         if store is not None:
-            self.report(_load(self, store, self.sensor))
+            self.events.append(_load(self, store, self.sensor))
         self._report_still()
+        self.around.expire()
         self.reports.tick()
-        self._events += self.commands.due()
+        self.events += self.commands.due()
 
     def close(self) -> None:
         """Unlock the files."""
@@ -247,7 +240,7 @@ class Session:
         if (self.sensor.live.still and not blind) is not self.still:
             self.still = not self.still
             self.still_since = self.statistics.stamp - self.settings.still_window
-            self.report(Still(self.still))
+            self.events.append(Still(self.still))
 
     # The sensor and its files
 
@@ -281,14 +274,21 @@ class Session:
         self._show_mounting()
         plan = self.sensor.guide.plan
         if plan is not None:
-            self.report(ShowPoses(plan.up, plan.asked, frame_id or ''))
+            self.events.append(ShowPoses(plan.up, plan.asked, frame_id or ''))
 
     def _begin_again(self) -> None:
         """Discard poses and calibration of another sensor, and load those of this sensor."""
         self.sensor = Sensor(self.settings, self.units)
-        store = _take_files(self, self.name)
+        self._open(self.events.append)
+
+    def _open(self, run: Callable[[Task], object]) -> bool:
+        """Lock and load the files of the sensor; return whether no other node uses them."""
+        store = self.files.take(self.name)
+        self.problem = self.files.problem
+        self.log('error', self.problem)
         if store is not None:
-            self.report(_load(self, store, self.sensor))
+            run(_load(self, store, self.sensor))
+        return store is not None
 
     # The calibration
 
@@ -323,7 +323,7 @@ class Session:
         calibration = self.sensor.calibration
         if self.frame_id and calibration is not None and calibration.is_levelled:
             levelled = on_topics(calibration, self.settings.frame)
-            self.report(Mounting(levelled.rotation, self.frame_id))
+            self.events.append(Mounting(levelled.rotation, self.frame_id))
 
     def rate(self, refinement: Refinement | None, rating: Rating | None = None) -> None:
         """Add a task that rates the present calibration, if need be, and reports it as JSON."""
@@ -332,7 +332,7 @@ class Session:
         if rating is not None or sensor.present is None:
             sensor.rating = rating
         if sensor.present is not None:
-            self.report(_report_rating(self, sensor, sensor.present, rating))
+            self.events.append(_report_rating(self, sensor, sensor.present, rating))
 
     def set_mounting(self, rotation: Floats) -> None:
         """Use a mounting ΔR that is known from elsewhere, (3, 3)."""
@@ -361,24 +361,15 @@ class Session:
         self.show_poses(store=self.files.locked, new_rest=new_rest)
         if ended or len(self.sensor.live.book.poses()) > self.sensor.fitted_poses:
             self.sensor.auto_fit_waits = True
-        self._events += self.commands.due()
+        self.events += self.commands.due()
 
     def show_poses(self, *, store: bool, new_rest: bool = False) -> None:
         """Add a task that stores the poses, and draws them with the next pose."""
         sensor = self.sensor
         poses = sensor.live.book.poses()
         added = sensor.guide.added(len(poses), self.statistics.stamp)
-        self.report(_draw_poses(self, sensor, poses, added, new_rest,
-                                self.files.store if store else None))
-
-
-def _take_files(session: Session, sensor: str) -> Store | None:
-    """Lock the files of a sensor and return the store; None if another node uses them."""
-    store = session.files.take(sensor)
-    if session.files.problem:
-        session.problem = session.files.problem
-        session.log('error', session.problem)
-    return store
+        self.events.append(_draw_poses(
+            self, sensor, poses, added, new_rest, self.files.store if store else None))
 
 
 def _load(session: Session, store: Store, sensor: Sensor) -> Task:
@@ -430,7 +421,7 @@ def _report_rating(session: Session, sensor: Sensor, calibration: Calibration,
             found['mounting'] = mounting_figures(
                 calibration.rotation, session.frame_id or '', session.settings.base_frame)
         command = action.command and f'~/{action.command}'
-        session.report(Result(json.dumps({
+        session.events.append(Result(json.dumps({
             **found, **rating_json(rating, action.kind, action.words, command)})))
     return ''
 
@@ -441,17 +432,17 @@ def _draw_poses(session: Session, sensor: Sensor, poses: Poses, added: int, new_
     guide, given = sensor.guide, (poses, session.units, session.settings.model)
     due = added != 0 or guide.plan is None
     try:
-        yield Files() if store is None else Files(store.save_poses, poses)
+        yield Files(nothing) if store is None else Files(store.save_poses, poses)
     except OSError as error:
         session.log('error', f'the poses could not be stored: {error}; {writing_advice(error)}',
                     'not_stored', AGAIN)
     # Computed even where only an average has changed, so that the lines keep their order.
-    plan = yield Compute(plan_for, *given) if due and len(poses) else Compute()
+    plan = yield Compute(plan_for, *given) if due and len(poses) else Compute(nothing)
     if due and not len(poses):  # without the start of the worker process
         plan = plan_for(*given)
     if plan is not None and sensor is session.sensor:
         guide.plan = plan
-        session.report(ShowPoses(plan.up, plan.asked, session.frame_id or ''))
+        session.events.append(ShowPoses(plan.up, plan.asked, session.frame_id or ''))
     if not new_rest or sensor is not session.sensor:
         return ''
     return guide.line(poses, session.units, next_action(session), added=added > 0)

@@ -20,13 +20,13 @@ import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING, TypeVar
 
-from ..capture import CaptureSettings, CONTEXT, REPEATED, Repeated
+from ..capture import CaptureSettings, CONTEXT, REPEATED, Repeated, settings_from
 from ..effects import know_file, MODELS
 from ..errors import InputError
 from ..table import quantity_key
 from ..units import (
     FrameName, FRAMES, is_native, Method, METHODS, MODEL_NAMES, STANDARD_GRAVITY, UNIT_NAMES,
-    UnitName)
+    UnitName, units_of)
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -261,13 +261,7 @@ def columns_of(settings: CalibratorSettings) -> tuple[str, ...]:
 
 def capture_settings(settings: CalibratorSettings) -> CaptureSettings:
     """Return the settings of the capture, in g if the unit is known; InputError if impossible."""
-    std_max = settings.still_std_max
-    try:
-        return CaptureSettings(
-            settings.still_window,
-            std_max if is_native(settings.units) else std_max / settings.gravity,
-            settings.still_gyro_max, settings.still_norm_tolerance, settings.min_dwell,
-            settings.max_dwell or math.inf, settings.min_pose_angle, settings.repeated)
-    except ValueError as error:
-        raise InputError(f'the parameters contradict each other: {error}',
-                         'change one of them') from error
+    given = {each.name: getattr(settings, each.name) for each in fields(CaptureSettings)}
+    given['max_dwell'] = settings.max_dwell or math.inf
+    given['still_std_max'] /= 1.0 if is_native(settings.units) else settings.gravity
+    return settings_from(given, units_of('g'))

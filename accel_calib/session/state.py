@@ -290,9 +290,9 @@ def figures(session: Session) -> Iterator[tuple[str, str]]:
     yield 'calibration file', session.files.path
     yield 'rate [Hz]', f'{counts.rate:.1f}'
     yield 'messages', str(counts.messages)
-    yield 'readings not finite', str(counts.not_finite)
-    yield 'messages of another sensor', str(counts.foreign)
-    yield 'corrected messages not plausible', str(counts.implausible)
+    yield 'readings not finite', str(counts.dropped['not_finite'])
+    yield 'messages of another sensor', str(counts.dropped['foreign'])
+    yield 'corrected messages not plausible', str(counts.dropped['implausible'])
     yield 'residual |a| - 1 g at last rest [mg]', _number(sensor.residual * MG)
     yield from _drift_figures(sensor.drift)
     yield 'since last rest [s]', _number(sensor.rest_ago(counts.stamp))

@@ -11,7 +11,7 @@ is played at another speed. They cover the last `_SPAN` seconds.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 import math
 from typing import NamedTuple, TYPE_CHECKING
@@ -49,9 +49,18 @@ _FEW = 0.5
 
 
 class _Batch(NamedTuple):
-    """Messages that were added together: counts, and arrival of the last one [s]."""
+    """
+    Messages that were added together.
+
+    `arrived` and `stamp` are those of the last one [s]; `mean` is the (3,) mean reading, and
+    `spread` the largest standard deviation over its axes. The others are numbers of messages.
+
+    """
 
     arrived: float
+    stamp: float
+    mean: Floats
+    spread: float
     messages: int
     zero: int
     repeated: int
@@ -64,13 +73,14 @@ class StreamStatistics:
 
     Attributes
     ----------
-    messages, not_finite, foreign, implausible : int
-        Number of messages, and of dropped ones: not finite or absurd, of another sensor, and
-        corrected ones that are not plausible.
+    messages : int
+        Number of messages.
+    dropped : Counter of str
+        Number of dropped ones, by the kinds of `_DROPPED`.
     stamp, arrived : float
         Stamp of the last message, and its arrival by the steady clock [s].
-    reading, newest : (3,) array or None
-        Mean reading of the last batch, and the last reading.
+    newest : (3,) array or None
+        The last reading.
     spread : float
         Largest standard deviation over the axes of the last batch [unit of the reading].
 
@@ -78,47 +88,43 @@ class StreamStatistics:
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
-        self.messages = self.not_finite = self.foreign = self.implausible = 0
+        self.messages, self.dropped = 0, Counter[str]()
         self.stamp = self.spread = math.nan
         self.arrived = self._advanced = self._dropped_at = -math.inf
-        self.reading: Floats | None = None
         self.newest: Floats | None = None
         self._batches: deque[_Batch] = deque()
-        self._track: deque[tuple[float, Floats, float]] = deque()
 
     def add(self, rows: Floats, arrived: float) -> None:
         """Count messages; parameters as in `Session.push`."""
         stamps = rows[:, 0]
         steps = np.diff(stamps, prepend=self.stamp)  # the first step of a stream is NaN
+        readings = rows[:, 1:4]
+        self.spread = float(np.max(readings.std(axis=0)))
         self._batches.append(_Batch(
-            arrived, len(rows), int(np.sum(stamps == 0.0)), int(np.sum(steps == 0.0)),
-            int(np.sum(steps < 0.0))))
+            arrived, float(stamps[-1]), readings.mean(axis=0), self.spread, len(rows),
+            *(int(np.sum(each)) for each in (stamps == 0.0, steps == 0.0, steps < 0.0))))
         while self._batches[0].arrived < arrived - _SPAN:
             self._batches.popleft()
         self.messages += len(rows)
         if np.any(steps):  # NaN, too
             self._advanced = arrived
-        self.stamp, self.arrived = float(stamps[-1]), arrived
-        self.reading, self.newest = rows[:, 1:4].mean(axis=0), rows[-1, 1:4]
-        self.spread = float(np.max(rows[:, 1:4].std(axis=0)))
-        self._track.append((self.stamp, self.reading, self.spread))
-        while not 0.0 <= self.stamp - self._track[0][0] <= _HELD:
-            self._track.popleft()
+        self.stamp, self.arrived, self.newest = float(stamps[-1]), arrived, readings[-1]
 
     def turn_rate(self, threshold: float, expected: float) -> float:
         """Return the rate of a slow turn without shaking [°/s]; 0 if there is none."""
-        if self._track and (max(spread for *_, spread in self._track) < threshold
-                            and self.stamp - self._track[0][0] > 0.8 * _HELD):
-            means = np.array([mean for _, mean, _ in self._track])
-            way = float(np.sum(np.linalg.norm(np.diff(means, axis=0), axis=1))) / expected
-            rate = math.degrees(way) / (self.stamp - self._track[0][0])
-            return rate if rate > _TURNS else 0.0
-        return 0.0
+        track = [each for each in self._batches if 0.0 <= self.stamp - each.stamp <= _HELD]
+        if not track or max(each.spread for each in track) >= threshold:
+            return 0.0
+        seconds = self.stamp - track[0].stamp
+        steps = np.diff([each.mean for each in track], axis=0)
+        way = float(np.sum(np.linalg.norm(steps, axis=1))) / expected
+        rate = math.degrees(way) / seconds if seconds > 0.8 * _HELD else 0.0
+        return rate if rate > _TURNS else 0.0
 
-    def drop(self, name: str, count: int = 1) -> None:
-        """Count dropped messages; `name` is ``not_finite``, ``foreign`` or ``implausible``."""
-        setattr(self, name, getattr(self, name) + count)
-        if name != 'implausible':  # its raw message is already counted
+    def drop(self, kind: str, count: int = 1) -> None:
+        """Count dropped messages of one of the kinds of `_DROPPED`."""
+        self.dropped[kind] += count
+        if kind != 'implausible':  # its raw message is already counted
             self.messages += count
         self._dropped_at = self._clock()
 
@@ -148,17 +154,19 @@ class StreamStatistics:
 
     def length_g(self, units: Units) -> float:
         """Return |a| of the last messages [g]; NaN if not known."""
-        if self.reading is None or units.is_native:
-            return math.nan
-        return float(np.linalg.norm(self.reading)) / units.per_g
+        return math.nan if units.is_native else self.length / units.per_g
+
+    @property
+    def length(self) -> float:
+        """Length of the mean reading of the last batch; NaN without messages."""
+        return float(np.linalg.norm(self._batches[-1].mean)) if self._batches else math.nan
 
     @property
     def stamp_fault(self) -> str:
         """Return what is wrong with the stamps of the last seconds, and what to do, or ''."""
         if self.age > SILENT:
             return ''
-        _, messages, zero, repeated, backward = (
-            sum(column) for column in zip(*self._batches, strict=True))
+        messages, zero, repeated, backward = np.sum([each[4:] for each in self._batches], axis=0)
         if messages < _FEWEST:
             return ''
         if zero > _FEW * messages:
@@ -168,7 +176,7 @@ class StreamStatistics:
             return (f'the stamps are constant ({self.stamp:.3f} s), expected the time of each '
                     'reading: set header.stamp in the driver')
         if backward > 1:
-            return (f'the stamps are out of order in {backward:.0f} of the last {messages:.0f} '
+            return (f'the stamps are out of order in {backward} of the last {messages} '
                     'messages, expected increasing stamps: check that only one driver publishes')
         return ''
 
@@ -262,6 +270,12 @@ def slow_turn(session: Session) -> str:
 _DROPPED_SHOWN_FOR = 60.0
 """Duration of the warning after a dropped message [s]."""
 
+_DROPPED = {
+    'not_finite': ('message', 'with NaN, infinite or absurd readings: check the driver'),
+    'foreign': ('message', 'of another sensor: use a separate topic for each sensor'),
+    'implausible': ('corrected message', 'with implausible values: check the calibration')}
+"""Kinds of dropped messages: what was dropped, and what to do."""
+
 _LIKELY_G = (0.2, 5.0)
 """Range of |a| [g]; outside of it the unit is probably wrong."""
 
@@ -307,19 +321,14 @@ def _silence(statistics: StreamStatistics, topic: str, publishers: Sequence[str]
 def _dropped(statistics: StreamStatistics) -> dict[str, str]:
     if statistics.dropped_ago >= _DROPPED_SHOWN_FOR:
         return {}
-    words = {'not_finite': ('message', 'with NaN, infinite or absurd readings: check the driver'),
-             'foreign': ('message', 'of another sensor: use a separate topic for each sensor'),
-             'implausible': ('corrected message',
-                             'with implausible values: check the calibration')}
-    return {kind: f'dropped {counted(getattr(statistics, kind), what)} {why}'
-            for kind, (what, why) in words.items() if getattr(statistics, kind)}
+    return {kind: f'dropped {counted(statistics.dropped[kind], what)} {why}'
+            for kind, (what, why) in _DROPPED.items() if statistics.dropped[kind]}
 
 
 def _wrong_unit(statistics: StreamStatistics, units: Units) -> str:
-    length = statistics.length_g(units)
-    if statistics.reading is None or not (length < _LIKELY_G[0] or length > _LIKELY_G[1]):
+    length, size = statistics.length_g(units), statistics.length
+    if not (length < _LIKELY_G[0] or length > _LIKELY_G[1]):
         return ''
-    size = float(np.linalg.norm(statistics.reading))
     likely = next((name for name, low, high in _UNITS if low < size < high), 'native')
     return (f'|a| is {length:.3g} g, expected about 1 g at rest: start the node with '
             f'units:={likely}')

@@ -35,6 +35,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
+import math
 import os
 import pickle
 from queue import SimpleQueue
@@ -45,13 +46,16 @@ import sys
 from threading import Lock, Thread
 from time import monotonic
 from traceback import format_exc
-from typing import Any, BinaryIO, cast, Literal, TypeVar
+from typing import Any, BinaryIO, cast, Literal, TYPE_CHECKING, TypeVar
 
 from .store import writing_advice
 from ..calibrate import NextPose
-from ..effects import know_code, known_code
+from ..effects import know_code, KNOWN_CODE
 from ..errors import AccelCalibError, InputError
 from ..table import Floats
+
+if TYPE_CHECKING:
+    from .session import Session
 
 Found = TypeVar('Found')
 
@@ -123,15 +127,7 @@ class WorkerProcess:
 
         """
         with self._turn:
-            self.start()
-            try:
-                good, found = self._ask(function, given, limit_s)
-            except (OSError, EOFError, pickle.UnpicklingError) as err:
-                self._end()
-                raise err if isinstance(err, TimeoutError) else EOFError from err
-            if not good:
-                raise found
-            return cast('Found', found)
+            return self._call(function, given, limit_s)
 
     def call_if_free(self, function: Callable[..., Found], *given: Any) -> Found:
         """Call a function as `call` does, or at once in this process if the other one is busy."""
@@ -145,14 +141,17 @@ class WorkerProcess:
         finally:
             self._turn.release()
 
-    def _call(self, function: Callable[..., Found], given: tuple[Any, ...]) -> Found:
+    def _call(self, function: Callable[..., Found], given: tuple[Any, ...],
+              limit_s: float | None = None) -> Found:
         self.start()
         try:
-            good, found = self._ask(function, given)
-        except (OSError, EOFError, pickle.UnpicklingError):
+            good, found = self._ask(function, given, limit_s)
+        except (OSError, EOFError, pickle.UnpicklingError) as err:
             if self._closed:
                 raise ClosedError('the node is shutting down', 'start it again') from None
             self._end()
+            if limit_s is not None:
+                raise err if isinstance(err, TimeoutError) else EOFError from err
             return function(*given)
         if not good:
             raise found
@@ -165,7 +164,7 @@ class WorkerProcess:
             self._end()
         if process is None or process.stdin is None or process.stdout is None:
             raise EOFError
-        process.stdin.write(pickle.dumps((known_code(), pickle.dumps((function, given)))))
+        process.stdin.write(pickle.dumps((KNOWN_CODE, pickle.dumps((function, given)))))
         process.stdin.flush()
         if self._idle and not select([process.stdout], [], [], _PATIENCE)[0]:
             self._idle = False  # raising the priority needs privileges, so restart it
@@ -231,27 +230,25 @@ def here(function: Callable[..., Found], *given: object) -> Found:
     return function(*given)
 
 
-class Step:
+def nothing() -> None:
+    """Do nothing: a task with such a step only waits until the steps before it are done."""
+
+
+class Step(partial[Any]):
     """
     What a task waits for: the result of a function with these arguments.
 
     The function does not use the session, and can raise AccelCalibError or OSError, which are
-    raised in the task. Without a function, the task only waits until the steps before it are done.
-    With `after`, the result of that step is its first argument.
+    raised in the task. An argument that is a step is computed first.
 
     """
 
-    def __init__(self, function: Callable[..., Any] | None = None, *given: Any,
-                 after: Step | None = None) -> None:
-        self._function, self._given, self._after = function, given, after
-
     def run(self, call: Callable[..., Any]) -> Any:
         """Return the result; `call` is `WorkerProcess.call`."""
-        return self._result(call, call)
+        return None if self.func is nothing else call(self.func, *self._given(call))
 
-    def _result(self, call: Callable[..., Any], call_before: Callable[..., Any]) -> Any:
-        before = () if self._after is None else (self._after.run(call_before),)
-        return None if self._function is None else call(self._function, *before, *self._given)
+    def _given(self, call: Callable[..., Any]) -> list[Any]:
+        return [each.run(call) if isinstance(each, Step) else each for each in self.args]
 
 
 class Parse(Step):
@@ -267,8 +264,8 @@ class Files(Parse):
     """A function that writes files, in this process, which holds their lock."""
 
     def run(self, call: Callable[..., Any]) -> Any:
-        """Return the result; only a step before it needs the worker process."""
-        return self._result(here, call)
+        """Return the result; only a step among the arguments uses the worker process."""
+        return self.func(*self._given(call))
 
 
 class Compute(Step):
@@ -306,12 +303,10 @@ Severity = Literal['info', 'warning', 'error']
 
 @dataclass(frozen=True)
 class Log:
-    """A log line; lines of one kind, if it has one, are logged at most once in `once_in` [s]."""
+    """A log line."""
 
     severity: Severity
     words: str
-    kind: str = ''
-    once_in: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -350,20 +345,18 @@ Event = Log | Mounting | Result | Still | ShowPoses | Task
 
 
 class LogFilter:
-    """Decide which lines are logged: not empty, and none of the same kind within `once_in`."""
+    """Decide which lines are logged: of each kind, at most one within a time."""
 
     def __init__(self, clock: Callable[[], float] = monotonic) -> None:
         self._clock = clock
         self._last: dict[str, float] = {}
 
-    def passes(self, line: Log) -> bool:
-        """Return whether to log a line, and note it."""
-        if not line.kind:
-            return bool(line.words)
+    def passes(self, kind: str, once_in: float) -> bool:
+        """Return whether to log a line of this kind, at most once in `once_in` [s]; note it."""
         now = self._clock()
-        if now - self._last.get(line.kind, -line.once_in) < line.once_in:
+        if now - self._last.get(kind, -math.inf) < once_in:
             return False
-        self._last[line.kind] = now
+        self._last[kind] = now
         return True
 
 
@@ -379,16 +372,15 @@ class Worker:
     The threads for the tasks of a session.
 
     `running` names the commands that are not answered, the oldest first. `call_soon` lets the
-    thread of the session call a function. `on_events` is called after each step of a task, in the
-    thread of the session, and `report` for an unexpected error. `flush` passes all samples so far
-    to the session, before a command begins.
+    thread of the session call a function. `show` is called with each event that is no task, in
+    the thread of the session. `flush` passes all samples so far to the session, before a command
+    begins.
 
     """
 
-    def __init__(self, call_soon: CallSoon, on_events: Callable[[], None],
-                 report: Callable[[str], object],
+    def __init__(self, session: Session, call_soon: CallSoon, show: Callable[[Any], object],
                  flush: Callable[[], object] = lambda: None) -> None:
-        self._call_soon, self._on_events, self._report = call_soon, on_events, report
+        self._session, self._call_soon, self._show = session, call_soon, show
         self._flush = flush
         self._files = ThreadPoolExecutor(1, 'accel_calib_files')
         self._computation = ThreadPoolExecutor(1, 'accel_calib')
@@ -399,10 +391,30 @@ class Worker:
         self.running: list[str] = []
         self._is_busy = self._closed = False
 
+    def handle_events(self) -> None:
+        """Show the events of the session, run its tasks, and log their answers."""
+        events = self._session.events
+        while events:
+            event = events.popleft()
+            if isinstance(event, Generator):
+                self.run(event, self._log_answer)
+            else:
+                self._show(event)
+
+    def log(self, severity: Severity, words: str) -> None:
+        """Log a line, and show it at once."""
+        self._session.log(severity, words)
+        self.handle_events()
+
+    def _log_answer(self, success: bool, words: str) -> None:
+        self.log('info' if success else 'warning', words)
+
     def do(self, name: str, command: Task, answer: Answer) -> None:
-        """Begin a command when no files are used, run its steps, and call `answer`."""
+        """Begin a command when no files are used, run its steps, log its words, and `answer`."""
         def done(success: bool, found: Any) -> None:
             self.running.remove(name)
+            if isinstance(found, str):
+                self._log_answer(success, found)
             answer(success, found)
 
         self.running.append(name)
@@ -454,7 +466,7 @@ class Worker:
         self._is_busy = True
         try:
             outcome = self._outcome(task, done)
-            self._on_events()  # first, so that a command is answered after its poses are stored
+            self.handle_events()  # first, so that a command is answered after its poses are stored
             self._proceed(task, answer, outcome)
         finally:
             self._is_busy = False
@@ -484,15 +496,16 @@ class Worker:
         except OSError as error:
             return False, f'{error}; {writing_advice(error)}'
         except Exception as error:
-            self._report(f'unexpected error in accel_calib:\n{format_exc()}')
+            self.log('error', f'unexpected error in accel_calib:\n{format_exc()}')
             return False, (f'unexpected error in accel_calib ({error!r}); please report it with '
                            'the log')
 
     def close(self) -> None:
-        """Stop the computation, and finish writing."""
+        """Stop the computation, finish writing, and unlock the files."""
         self._closed = True
         self._process.close()
         self._computation.shutdown(wait=True)
         for step, _, _ in self._steps:
             self._files.submit(step.run, self._process.call_if_free)
         self._files.shutdown(wait=True)
+        self._session.close()

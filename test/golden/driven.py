@@ -17,7 +17,7 @@ from accel_calib.messages import corrected, motion_of, output_frame, Rewriter
 from accel_calib.session import (
     answered, CalibratorSettings, checks, Log, Session, ShowPoses, state, Task)
 from accel_calib.units import units_of
-from golden.figures import attempt
+from golden.figures import attempt, those
 from golden.inputs import G, samples
 from inside import figures as health_figures, frame_ids, layout_with, Model, stamps_of
 import numpy as np
@@ -40,7 +40,8 @@ class _Driver:
         self._handle()
 
     def _handle(self) -> None:
-        for event in self.session.events():
+        while self.session.events:
+            event = self.session.events.popleft()
             if isinstance(event, Generator):
                 self._done(event)
             elif isinstance(event, Log):
@@ -76,9 +77,11 @@ class _Driver:
 
     def state(self) -> Any:
         """Return progress, diagnostics, checks and poses."""
+        drift = self.session.sensor.drift
         return [state.progress(self.session), dict(health_figures(self.session)),
                 checks(self.session), self.shown, self.session.sensor.live.book.poses(),
-                self.session.sensor.drift]
+                drift and {'covariance': drift.calibration.covariance, **those(
+                    drift, 'repeats temperatures rests count scatter change since without')}]
 
     def lines(self) -> Any:
         return self.log

@@ -11,7 +11,7 @@ from typing import Any
 from accel_calib.calibrate import (
     Calibration, fit_partial, fit_poses, in_g, mounting_only, outlook, outside, verify,
     with_history)
-from accel_calib.compare import monitor
+from accel_calib.compare import Drift
 from accel_calib.errors import AccelCalibError
 from accel_calib.estimate import estimate, Fit, judge
 from accel_calib.findings import Expected, rate
@@ -75,7 +75,7 @@ def of_calibration(calibration: Calibration) -> dict[str, Any]:
         'free': free if isinstance(free, Exception) else {
             **those(free, 'values axes'), 'slope': np.linalg.norm(free.slope, axis=1)},
         'scatter': those(scatter_of(calibration), 'chi2 dof stated belief') if effects else '',
-        'repeats': monitor(calibration).repeats ** 0.5, 'outside': outside(calibration, wide),
+        'repeats': Drift(calibration).repeats ** 0.5, 'outside': outside(calibration, wide),
         'partial': carried(calibration) if calibration.method == 'prior' and effects else ''}
 
 

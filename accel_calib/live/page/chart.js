@@ -25,9 +25,9 @@ export class Chart {
   }
 
   /** Replace all readings by a history of columns. */
-  setHistory({ time = [], raw = [], corrected = [] }) {
+  setHistory({ time, length, corrected }) {
     this.#rows = [];
-    time.forEach((at, k) => this.add(at, raw[k], corrected[k]));
+    time.forEach((at, k) => this.add(at, length[k], corrected[k]));
   }
 
   /** Add |a| of the newest message [g]. */

@@ -74,7 +74,7 @@ function takeProgress(now) {
     : 'How it is held now is known after about 4 poses. Hold it like the other box.');
   redraw = wanted.set(progress.direction) || redraw;
   ball.set(progress.direction, progress.up);
-  chart.add(now.time, now.raw, now.corrected);
+  chart.add(now.time, now.length, now.corrected);
   showNumbers(progress);
   guide(isNew);
 }
@@ -109,16 +109,16 @@ function guide(captured) {
 function showNumbers(now) {
   text(element('poses'), countOf(now.poses, now.total));
   text(element('coverage'), now.coverage === null ? '–' : `${Math.round(100 * now.coverage)} %`);
-  text(element('accuracy'), accuracyOf(now.accuracy_mg, state?.counts_per_g));
-  text(element('length'), fixed(now.corrected ?? now.raw, 4, ' g'));
+  text(element('accuracy'), accuracyOf(now.accuracy, state?.counts_per_g));
+  text(element('length'), fixed(now.corrected ?? now.length, 4, ' g'));
   text(element('temperature'), fixed(now.temperature, 1, ' °C'));
 }
 
-/** Return an accuracy in mg, and in counts if the readings are counts. */
-function accuracyOf(mg, countsPerG) {
-  if (mg === null) return '–';
-  const counts = countsPerG ? ` (${figure(mg / 1000 * countsPerG)} counts)` : '';
-  return `${figure(mg)} mg${counts}`;
+/** Return an accuracy [g] in mg, and in counts if the readings are counts. */
+function accuracyOf(error, countsPerG) {
+  if (error === null) return '–';
+  const counts = countsPerG ? ` (${figure(error * countsPerG)} counts)` : '';
+  return `${figure(1000 * error)} mg${counts}`;
 }
 
 function showConnection(name) {

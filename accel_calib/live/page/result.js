@@ -6,7 +6,6 @@
 import { element, text } from './canvas.js';
 import { figure, fixed, withButtons } from './words.js';
 
-const diagonal = (rows) => rows.map((row, k) => row[k]);
 const joined = (values, decimals) => values.map((value) => fixed(value, decimals)).join('  ');
 
 /** Name, key in the message, and text of each number. */
@@ -14,7 +13,7 @@ const FIGURES = [
   ['poses used', 'poses', (count, { left_out: out }) => (out ? `${count} of ${count + out}` : count)],
   ['coverage', 'coverage', (share) => (share === null ? '–' : `${Math.round(100 * share)} %`)],
   ['offset x, y, z', 'offset', (offset, { unit }) => `${joined(offset, 4)} ${unit}`],
-  ['gain x, y, z', 'gain', (gain) => joined(diagonal(gain), 4)],
+  ['gain x, y, z', 'gain', (gain) => joined(gain, 4)],
   ['effects', 'effects', (names) => names.map((name) => name.replaceAll('_', ' ')).join(', ')],
 ];
 

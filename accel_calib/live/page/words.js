@@ -11,11 +11,10 @@ export const SIDES = [['front', 'back'], ['left', 'right'], ['top', 'bottom']];
 const WHAT = ['', 'side', 'edge', 'corner'];
 const NEAR = 0.38;  // half way between a side (0) and an edge (0.71), about
 
-const BUTTONS = {
-  capture_pose: 'Capture', undo_pose: 'Undo pose', fit: 'Fit', refine: 'Refine',
-  set_level: 'Set level', set_heading: 'Set heading', save: 'Accept', undo: 'Take back', reset: 'Reset',
-  export: 'Export',
-};
+/** Labels of the buttons by command; of two for one command, the first one. */
+const BUTTONS = Object.fromEntries(
+  [...document.querySelectorAll('[data-command], #reset, #export')].reverse()
+    .map((button) => [button.dataset.command ?? button.id, button.textContent.replace(' …', '')]));
 
 /** Return the side, edge or corner nearest to a direction, such as “left side”. */
 export function sideOf(direction) {
