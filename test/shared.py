@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Helpers of several tests: recordings, sensors, the command line, and tasks of a session."""
+"""Helpers of several tests: recordings, sensors, commands, waits, and tasks of a session."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -12,6 +12,7 @@ import re
 import shlex
 import subprocess
 import sys
+import time
 from typing import Any
 
 from accel_calib.calibrate import Calibration
@@ -127,6 +128,14 @@ def run_json(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[in
     capsys.readouterr()  # what was printed before
     status = run(*arguments, '--json', '-')
     return status, json.loads(capsys.readouterr().out)
+
+
+def wait(until: Callable[[], Any], seconds: float = 300.0) -> None:
+    """Wait until a condition holds."""
+    ends = time.monotonic() + seconds
+    while not until():
+        assert time.monotonic() < ends, f'not so within {seconds} s'
+        time.sleep(0.001)
 
 
 def result(step: Step) -> Any:

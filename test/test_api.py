@@ -55,18 +55,9 @@ def test_functions_stay_when_a_folder_of_their_name_is_imported():
         assert python('-c', code.format(name)).stdout == 'True\n'
 
 
-@pytest.mark.parametrize(('imported', 'without'), [
-    ('accel_calib', 'numpy'), ('accel_calib.session', 'scipy.special')])
-def test_what_is_slow_to_import_is_imported_when_it_is_used(imported, without):
-    code = f'import {imported}, sys; print("{without}" in sys.modules)'
+def test_what_is_slow_to_import_is_imported_when_it_is_used():
+    code = 'import accel_calib.session, sys; print("scipy.special" in sys.modules)'
     assert python('-c', code).stdout == 'False\n'
-
-
-def test_offset_and_matrix_are_in_the_unit_of_the_readings(calibration):
-    np.testing.assert_allclose(calibration.offset, np.array(SENSOR['offset']) * 9.80665,
-                               atol=0.01)
-    np.testing.assert_allclose(calibration.matrix, MATRIX, atol=2e-3)
-    np.testing.assert_allclose(calibration.matrix @ calibration.gain, np.eye(3), atol=1e-12)
 
 
 def test_poses_are_a_path_a_table_a_data_frame_or_an_array(poses, tmp_path):

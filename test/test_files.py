@@ -48,12 +48,6 @@ def test_every_column_is_read_as_it_was_written(tmp_path):
     np.testing.assert_allclose(np.diff(found['time']), 0.0025, atol=5e-7)
 
 
-def test_columns_may_come_in_any_order_among_others(tmp_path):
-    poses = read_poses(write(tmp_path, '# a comment\naz,what,ay,ax\n3,x,2,1\n6,y,5,4\n'))
-    np.testing.assert_array_equal(poses.reading, [[1, 2, 3], [4, 5, 6]])
-    assert list(poses.row) == [1, 2]
-
-
 @pytest.mark.parametrize(('text', 'message'), [
     ('', 'is empty'), ('# only a comment\n\n', 'is empty'),
     ('ax,ay,az\n', 'a header line but no rows'),
@@ -270,12 +264,3 @@ def test_a_failed_write_leaves_the_file_unchanged(tmp_path):
         write_atomically(path, fail)
     assert path.read_text() == 'old\n'
     assert [each.name for each in tmp_path.iterdir()] == ['file']
-
-
-def test_a_full_disk_has_its_own_advice(tmp_path, capsys, monkeypatch):
-    def full(handle):
-        raise OSError(28, 'No space left on device')
-
-    monkeypatch.setattr(os, 'fsync', full)
-    assert run('simulate', '-o', tmp_path / 'x.csv') == 2
-    assert 'free space on the disk' in capsys.readouterr().err

@@ -99,12 +99,6 @@ def test_no_result_depends_on_a_text(name, monkeypatch):
     assert figures(made) == expected
 
 
-def test_the_verdict_is_the_level_of_the_first_finding():
-    found = rate(RESULTS['mirrored']())
-    assert found.name == 'BAD'
-    assert (found.findings[0].level, found.findings[0].text) == ('BAD', found.reason)
-
-
 def test_findings_are_ranked_by_level_and_then_by_kind():
     first, other, *_, last = KINDS
     note, usable = Finding(first, 'a'), Finding(last, 'b', level='USABLE')

@@ -16,7 +16,7 @@ from live_bench import chromium, GRAVITY, live_page, LivePage, SIZES, TRUTH, Vie
 import numpy as np
 from playwright.sync_api import Browser, expect, Locator, Page, sync_playwright
 import pytest
-from viewer import wait
+from shared import wait
 
 _SHOW_WAKE_LOCK = """
 const request = WakeLock.prototype.request;
@@ -351,6 +351,8 @@ def test_a_sensor_that_falls_silent_is_noticed(idle: LivePage, viewers: Viewers)
         idle.sensor.silent = silent
         expect(page.locator('#ring')).to_have_attribute('data-kind', kind)
         expect(page.locator('#problem')).to_be_visible(visible=silent)
+        expect(page.locator('#problem')).to_have_text(
+            re.compile('^simulated sends no samples: check the board' if silent else '^$'))
 
 
 def test_a_browser_without_a_voice_says_so(idle: LivePage, viewers: Viewers) -> None:

@@ -28,8 +28,8 @@ from inside import (
     PERIOD_OF_A_COMPLAINT, qr_code, reachable, simulate_recording, spread_directions, STUCK)
 import numpy as np
 import pytest
-from shared import children
-from viewer import fetch, hosted, Viewer, wait
+from shared import children, wait
+from viewer import fetch, hosted, Viewer
 
 GRAVITY = 9.80665
 OFFSET = (0.03, -0.02, 0.04)
@@ -467,25 +467,6 @@ def test_a_source_that_fails_is_reported_and_the_page_continues(tmp_path: Path) 
         wait(lambda: any('the port has ended' in line['words'] for line in viewer.of('log')))
         wait(lambda: 'the port has ended' in viewer.state['problem'])
         assert not viewer.ask('fit')['success']
-
-
-def test_a_board_that_falls_silent_is_reported_until_it_sends_again(tmp_path: Path) -> None:
-    def interrupted(rows: Floats, over: Event) -> Iterator[Floats]:
-        yield rows[:40]
-        while not over.wait(PAUSE):
-            yield rows[:0]
-        rows[:, 0] += 100.0
-        for row in rows:
-            time.sleep(PAUSE)
-            yield row[np.newaxis]
-
-    with ExitStack() as stack:
-        bench = Bench(stack, tmp_path, blocks=interrupted)
-        viewer = bench.viewer()
-        wait(lambda: 'bench.csv sends no samples' in viewer.state['problem'])
-        assert 'publisher' not in viewer.state['problem']
-        bench.played.set()
-        wait(lambda: 'sends no samples' not in viewer.state['problem'])
 
 
 def test_the_link_names_a_reachable_address() -> None:

@@ -36,7 +36,8 @@ from inside import (
 from live_bench import TurnedSensor
 import numpy as np
 import pytest
-from viewer import link_of, Viewer, wait
+from shared import wait
+from viewer import link_of, Viewer
 
 RATE_HZ = 200.0
 

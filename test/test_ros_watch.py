@@ -29,7 +29,8 @@ import numpy as np
 import pytest
 import rcl_interfaces.msg
 from sensor_msgs.msg import Imu
-from viewer import fetch, link_of, Viewer, wait
+from shared import wait
+from viewer import fetch, link_of, Viewer
 
 Readings = Callable[..., Any]
 WATCH = (*COMMAND, 'watch')

@@ -11,12 +11,12 @@ from contextlib import contextmanager
 import json
 from pathlib import Path
 from threading import Event, Thread
-import time
 from typing import Any
 
 from accel_calib.session import CalibratorSettings, Log
 import aiohttp
 from inside import Host
+from shared import wait
 
 
 @contextmanager
@@ -113,10 +113,3 @@ def fetch(url: str, method: str = 'GET', **headers: str) -> tuple[int, dict[str,
 
     return asyncio.run(run())
 
-
-def wait(until: Callable[[], Any], seconds: float = 120.0) -> None:
-    """Wait until a condition holds."""
-    ends = time.monotonic() + seconds
-    while not until():
-        assert time.monotonic() < ends, f'not so within {seconds} s'
-        time.sleep(0.01)

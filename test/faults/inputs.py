@@ -246,8 +246,7 @@ def _change(rng: Rng, content: Any) -> None:
 
 def random_messages() -> Callable[[Rng], Files]:
     """Return the maker of sound bags with damaged messages, times and names of topics."""
-    made = [(topic, stamp, bytes(bags.STORE.serialize_cdr(each, bags.TOPICS[topic][1])))
-            for topic, stamp, each in bags.messages()]
+    made = bags.raw_messages()
     words = ('/imu', '', '/imu\x1b[31m', 'imu', '/' + 300 * 'a', '/temperature', '/ä')
 
     def make(rng: Rng) -> Files:
