@@ -354,6 +354,14 @@ def in_time() -> Iterator[None]:
     signal.signal(signal.SIGALRM, before)
 
 
+@pytest.fixture(scope='module')
+def browser() -> Iterator[Any]:
+    """Yield Chromium."""
+    from live_bench import chromium
+    with chromium() as started:
+        yield started
+
+
 @pytest.fixture
 def tf_message() -> Any:
     """Return the message type of transforms; `make test` builds tf2_msgs."""

@@ -19,7 +19,7 @@ from accel_calib.calibrate import Calibration
 from accel_calib.geometry import unit
 from accel_calib.session import Step
 from accel_calib.table import Floats
-from inside import COMMAND, main, Model, model_with
+from inside import COMMAND, main, Model, model_with, OVER_THE_SPHERE, predict
 import numpy as np
 import pytest
 
@@ -63,6 +63,19 @@ def with_effects(calibration: Calibration, values: Mapping[str, Any], variance: 
 def random_directions(count: int, rng: np.random.Generator) -> Floats:
     """Return (count, 3) unit vectors, uniformly distributed over the sphere."""
     return unit(rng.normal(size=(count, 3)))
+
+
+def rms(values: Any, axis: int | None = None) -> Any:
+    """Return the root mean square."""
+    return np.sqrt(np.mean(np.square(values), axis=axis))
+
+
+def error_mg(calibration: Calibration, true: Model) -> float:
+    """Return the RMS error of the corrected |a| over the sphere [mg]."""
+    units = calibration.units
+    force = calibration.correct(units.from_g(predict(true, OVER_THE_SPHERE, {})))
+    lengths = np.linalg.norm(force, axis=1) / calibration.force_per_g
+    return 1e3 * float(rms(lengths - 1.0))
 
 
 def run_on_small_disk(folder: Path, size_kb: int, *command: object

@@ -250,17 +250,3 @@ def test_leftovers_of_killed_processes_are_removed_if_they_are_old_and_can_be(tm
         os.utime(path, (0.0, 0.0))
     put(tmp_path / 'file')
     assert [each.exists() for each in (folder, old, young)] == [True, False, True]
-
-
-def test_a_failed_write_leaves_the_file_unchanged(tmp_path):
-    path = tmp_path / 'file'
-    path.write_text('old\n')
-
-    def fail(file):
-        file.write('half')
-        raise OSError(28, 'No space left on device')
-
-    with pytest.raises(OSError, match='No space'):
-        write_atomically(path, fail)
-    assert path.read_text() == 'old\n'
-    assert [each.name for each in tmp_path.iterdir()] == ['file']

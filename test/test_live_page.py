@@ -12,9 +12,9 @@ import re
 from accel_calib.logs import write_table
 from accel_calib.stored import read_calibration
 from inside import model_with, simulate_poses, spread_directions
-from live_bench import chromium, GRAVITY, live_page, LivePage, SIZES, TRUTH, Viewers
+from live_bench import GRAVITY, live_page, LivePage, SIZES, TRUTH, Viewers
 import numpy as np
-from playwright.sync_api import Browser, expect, Locator, Page, sync_playwright
+from playwright.sync_api import Browser, expect, Locator, Page
 import pytest
 from shared import wait
 
@@ -49,14 +49,6 @@ _CONTRASTS = """() => {
       return [(Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05), each.textContent.slice(0, 40)];
     });
 }"""
-
-
-@pytest.fixture(scope='module')
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        browser = chromium(playwright)
-        yield browser
-        browser.close()
 
 
 @pytest.fixture
