@@ -13,10 +13,12 @@ from accel_calib.stored import read_calibration
 from inside import COMMAND, COMMANDS, main, parser, rotation_from_rpy, spread_directions
 import numpy as np
 import pytest
-from shared import python, run, run_json, shell
+from shared import python, ROOT, run, run_json, shell
 
 EFFECTS = ['--effect', 'offset=0.02,-0.01,0.03', '--effect', 'axis_gain=0.01,-0.02,0.005',
            '--effect', 'cross_axis=0.004,0.002,-0.003']
+
+LOGS = ROOT / 'test' / 'data' / 'logs'
 
 
 @pytest.fixture
@@ -322,15 +324,20 @@ def test_the_report_has_a_page_and_figures(poses, tmp_path):
     assert {'ladder.svg', 'ladder.png', 'remaining_sphere.png'} <= names
 
 
-def test_without_matplotlib_one_line_advises_what_to_install(poses, tmp_path, capsys,
-                                                             monkeypatch):
-    monkeypatch.setitem(sys.modules, 'matplotlib', None)
-    page = tmp_path / 'r.html'
-    assert run('refine', poses, '--report', page) == 2
-    printed = capsys.readouterr()
-    assert 'pip install matplotlib' in printed.err
-    assert printed.err.count('\n') == 1
-    assert not page.exists()
+@pytest.mark.parametrize(('module', 'line'), [
+    ('matplotlib', 'refine poses.csv --report r.html'), ('aiohttp', 'live poses.csv'),
+    ('pyulog', f'capture {LOGS}/px4/default.ulg -o p.csv'),
+    ('pymavlink.DFReader', f'capture {LOGS}/ardupilot/two_imus.bin -o p.csv')])
+def test_a_missing_library_is_named_in_one_line_with_how_to_install_it(module, line, poses, capsys,
+                                                                       monkeypatch):
+    monkeypatch.chdir(poses.parent)
+    monkeypatch.setitem(sys.modules, module, None)
+    capsys.readouterr()
+    assert run(*line.split()) == 2
+    printed = capsys.readouterr().err
+    assert f'pip install {module.partition(".")[0]}' in printed
+    assert printed.count('\n') == 1
+    assert [*poses.parent.iterdir()] == [poses]
     assert run('refine', poses) == 0
 
 

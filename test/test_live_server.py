@@ -14,7 +14,6 @@ from pathlib import Path
 import re
 import signal
 import socket
-import sys
 from threading import Event
 import time
 from types import SimpleNamespace
@@ -23,7 +22,7 @@ from accel_calib.errors import InputError
 from accel_calib.session import CalibratorSettings
 from accel_calib.table import Floats
 from inside import (
-    CALIBRATION_ALONE, Host, LARGEST_LIVE_MESSAGE, LIVE_COMMANDS, live_log, LIVE_PERIOD, main,
+    CALIBRATION_ALONE, Host, LARGEST_LIVE_MESSAGE, LIVE_COMMANDS, live_log, LIVE_PERIOD,
     model_with, PAGE_FOLDER, PageServer, PATIENCE_FOR_A_HELLO, PATIENCE_FOR_A_REQUEST,
     PERIOD_OF_A_COMPLAINT, qr_code, reachable, simulate_recording, spread_directions, STUCK)
 import numpy as np
@@ -391,14 +390,6 @@ def test_a_port_in_use_is_an_error_in_one_line(shared: Bench, tmp_path: Path) ->
         Host(SimpleNamespace(name='bench.csv'), settings, print)
     with pytest.raises(InputError, match='cannot be served at 192.0.2.7'):
         PageServer(shared.host.exchange, '192.0.2.7', 0).start()
-
-
-def test_a_missing_package_is_an_error_in_one_line(
-        capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, 'aiohttp', None)
-    assert main(['live', 'recording.csv']) == 2
-    found = capsys.readouterr().err
-    assert re.fullmatch('.*aiohttp is not installed.*run pip install.*\n', found)
 
 
 def send_slowly(client: socket.socket) -> None:
