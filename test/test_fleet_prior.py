@@ -13,7 +13,7 @@ from typing import Any
 from accel_calib.calibrate import fit_poses, fit_with_fleet, FleetPrior
 from accel_calib.errors import InputError
 from accel_calib.logs import write_table
-from accel_calib.refine import refine, refine_with_fleet
+from accel_calib.refine import refine_with_fleet
 from accel_calib.stored import read_calibration, read_prior, write_calibration, write_priors
 from accel_calib.table import Floats, Poses
 from accel_calib.units import Units
@@ -161,19 +161,6 @@ def test_a_refinement_with_the_fleet_finds_an_effect_beyond_it(fleet: FleetPrior
     assert error_mg(refined, sensor) < 0.2 * error_mg(fit_with_fleet(poses, IN_G, fleet), sensor)
     deviation = np.sqrt(np.diag(refined.covariance))
     assert rms((refined.model.vector - sensor.vector) / deviation) < 2.0
-
-
-def test_a_refinement_of_few_noisy_poses_is_better_with_the_fleet(fleet: FleetPrior) -> None:
-    rng = np.random.default_rng(9)
-    with_fleet, alone = [], []
-    for _ in range(6):
-        sensor = a_sensor(rng)
-        poses = poses_of(sensor, 11, rng)
-        noisy = poses.with_columns(reading=poses.reading + 0.008 * rng.normal(size=(11, 3)),
-                                   std=np.full((11, 3), 0.08), count=np.full(11, 100.0))
-        with_fleet.append(error_mg(refine_with_fleet(noisy, IN_G, fleet).calibration, sensor))
-        alone.append(error_mg(refine(noisy, IN_G, base='10').calibration, sensor))
-    assert rms(with_fleet) < rms(alone)
 
 
 def test_the_command_line_refines_with_the_file_of_the_fleet(
