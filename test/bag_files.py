@@ -3,8 +3,6 @@
 
 """Messages and small sound bags of every kind; `McapFile` writes by the specification alone."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache
 from pathlib import Path

@@ -10,8 +10,6 @@ condition and a time limit.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib.util import find_spec
 import os

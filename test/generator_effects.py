@@ -10,8 +10,6 @@ have. This module shares no code with the package either.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -40,6 +38,7 @@ OUTSIDE = ('ripple', 'periodic_offset', 'repeatability', 'quartic', 'quintic', '
            'gain_periodic', 'offset_temperature_knee', 'offset_supply_quadratic', 'wander_1f',
            'oblique_cubic', 'oblique_hinge')
 """Effects that can be hidden but are not in the catalogue."""
+
 
 @dataclass(frozen=True)
 class Around:

@@ -11,8 +11,6 @@ name that is not clear without its file has another one here.
 
 """
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 from pathlib import Path
 

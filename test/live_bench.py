@@ -8,8 +8,6 @@ The person knows only what the page shows.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 
 """A small file can't take much memory or work: it ends in one line, or in a result."""
 
-from __future__ import annotations
-
 import bz2
 import os
 from pathlib import Path

@@ -9,8 +9,6 @@ all the rest; test_fleet_page.py tests them.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 import functools

@@ -3,8 +3,6 @@
 
 """Few poses are fitted with the typical values of a fleet."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 import json
 from pathlib import Path

@@ -3,8 +3,6 @@
 
 """The live page in Chromium, with a simulated sensor that is turned as the page says."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 import re

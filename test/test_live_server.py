@@ -3,8 +3,6 @@
 
 """The server of the live page with a real session, without ROS and without a browser."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, ExitStack, suppress
 from functools import partial

@@ -3,8 +3,6 @@
 
 """Samples of a serial port (a pseudo-terminal) or a recording, and ``accel-calib live``."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, ExitStack, suppress
 import fcntl

@@ -3,8 +3,6 @@
 
 """Samples of the makers' layouts: each is read, captured and fitted, and the truth is found."""
 
-from __future__ import annotations
-
 from pathlib import Path
 import re
 from typing import Any

@@ -3,8 +3,6 @@
 
 """Text logs of any dialect: the same numbers are read, and what is assumed is said."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from datetime import datetime, timezone
 from pathlib import Path

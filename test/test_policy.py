@@ -3,8 +3,6 @@
 
 """The layouts show topics of the policy for SROS 2; test_ros_services compares it with nodes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 import re

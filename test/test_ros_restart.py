@@ -3,8 +3,6 @@
 
 """Shutdown of the nodes by signals and by a kill, and restart."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 import shutil

@@ -3,8 +3,6 @@
 
 """What a robot in the field meets: transforms, several drivers, QoS, a preview, signals."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import json
 import math

@@ -3,8 +3,6 @@
 
 """The services, the parameters, and all names of the nodes, as stated in files of config/."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path

@@ -3,8 +3,6 @@
 
 """Processing of messages between imu/data_raw and imu/data_calibrated."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 import math

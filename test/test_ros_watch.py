@@ -3,8 +3,6 @@
 
 """``accel-calib watch`` beside a calibrator node, and the live page of a node."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 import fcntl
 import math

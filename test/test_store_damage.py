@@ -3,8 +3,6 @@
 
 """Whatever is in place of the stored files, the calibrator starts, says so, and works."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 import os
 from pathlib import Path

@@ -3,8 +3,6 @@
 
 """Text on terminals of any width and encoding, wrong arguments, and ``accel-calib watch``."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 import io
 import json

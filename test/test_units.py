@@ -3,8 +3,6 @@
 
 """Calibrations and readings in g and m/s², and a bag and a table of the same samples."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 import json
 from pathlib import Path

@@ -3,8 +3,6 @@
 
 """Damaged and hostile calibration files end in a calibration or in one line."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache

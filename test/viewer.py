@@ -3,8 +3,6 @@
 
 """A host in a thread, and viewers of its page: clients of its WebSocket in their own threads."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -112,4 +110,3 @@ def fetch(url: str, method: str = 'GET', **headers: str) -> tuple[int, dict[str,
             return found.status, dict(found.headers), await found.read()
 
     return asyncio.run(run())
-

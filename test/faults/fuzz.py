@@ -16,8 +16,6 @@ Run many cases by hand: ``python test/faults/fuzz.py --count 100000 --seed 7 csv
 
 """
 
-from __future__ import annotations
-
 import argparse
 from collections import Counter
 from collections.abc import Callable, Iterator

@@ -3,8 +3,6 @@
 
 """Inputs of fuzz.py: small sound files of every kind, and random tables, trees and messages."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 import copy
 from dataclasses import dataclass

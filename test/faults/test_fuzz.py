@@ -3,8 +3,6 @@
 
 """A part of the seeded cases of fuzz.py: every file ends in a result or in one line."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 from pathlib import Path
 import struct

@@ -3,8 +3,6 @@
 
 """Nodes that are killed at random times, and two nodes on one store: nothing answered is lost."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 import json
 from pathlib import Path
