@@ -143,6 +143,16 @@ def run_json(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[in
     return status, json.loads(capsys.readouterr().out)
 
 
+def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """Run a command that is refused with status 2 and one line, and return this line."""
+    capsys.readouterr()  # what was printed before
+    assert run(*arguments) == 2
+    error = capsys.readouterr().err
+    assert re.fullmatch(rf'accel-calib {arguments[0]}: .*\n', error), error
+    assert 'internal error' not in error
+    return error
+
+
 def wait(until: Callable[[], Any], seconds: float = 300.0) -> None:
     """Wait until a condition holds."""
     ends = time.monotonic() + seconds

@@ -13,7 +13,7 @@ from accel_calib.stored import read_calibration
 from inside import COMMAND, COMMANDS, main, parser, rotation_from_rpy, spread_directions
 import numpy as np
 import pytest
-from shared import python, ROOT, run, run_json, shell
+from shared import python, refused, ROOT, run, run_json, shell
 
 EFFECTS = ['--effect', 'offset=0.02,-0.01,0.03', '--effect', 'axis_gain=0.01,-0.02,0.005',
            '--effect', 'cross_axis=0.004,0.002,-0.003']
@@ -108,10 +108,8 @@ def test_a_refusal_says_how_the_log_was_read(command, kind, calibration, tmp_pat
     assert status == 2
     assert 'ax' in result['read_as']
     assert run(*arguments) == 2
-    printed = capsys.readouterr()
-    assert printed.out == f'read as: {result["read_as"]}\n'
-    assert printed.err.startswith(f'accel-calib {command}: ')
-    assert printed.err.count('\n') == 1
+    assert capsys.readouterr().out == f'read as: {result["read_as"]}\n'
+    refused(capsys, *arguments)
 
 
 @pytest.mark.parametrize(('text', 'message'), [
@@ -123,12 +121,7 @@ def test_a_bad_table_does_not_change_a_stored_calibration(text, message, calibra
                                                           capsys):
     stored, bad = calibration.read_text(), tmp_path / 'bad.csv'
     bad.write_text(text)
-    capsys.readouterr()
-    assert run('fit', bad, '-o', calibration) == 2
-    printed = capsys.readouterr()
-    assert message in printed.err
-    assert printed.err.count('\n') == 1
-    assert not printed.out or printed.out.startswith('read as: ')
+    assert message in refused(capsys, 'fit', bad, '-o', calibration)
     assert calibration.read_text() == stored
 
 
@@ -174,13 +167,7 @@ def test_bad_input_is_one_line_and_status_2_and_an_error_in_the_json(
     error.unlink(missing_ok=True)
     (tmp_path / 'circle').symlink_to('circle')
     there = sorted(tmp_path.iterdir())
-    capsys.readouterr()
-    assert run(*arguments) == 2
-    printed = capsys.readouterr()
-    assert printed.err.startswith(f'accel-calib {arguments[0]}: ')
-    assert printed.err.count('\n') == 1
-    assert 'Traceback' not in printed.err
-    assert 'internal error' not in printed.err
+    refused(capsys, *arguments)
     assert sorted(tmp_path.iterdir()) == there
     if arguments[-1] == '../error.json':
         result = json.loads(error.read_text())
@@ -332,11 +319,7 @@ def test_a_missing_library_is_named_in_one_line_with_how_to_install_it(module, l
                                                                        monkeypatch):
     monkeypatch.chdir(poses.parent)
     monkeypatch.setitem(sys.modules, module, None)
-    capsys.readouterr()
-    assert run(*line.split()) == 2
-    printed = capsys.readouterr().err
-    assert f'pip install {module.partition(".")[0]}' in printed
-    assert printed.count('\n') == 1
+    assert f'pip install {module.partition(".")[0]}' in refused(capsys, *line.split())
     assert [*poses.parent.iterdir()] == [poses]
     assert run('refine', poses) == 0
 

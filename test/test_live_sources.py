@@ -29,12 +29,11 @@ from accel_calib.logs import LogOptions, read_log
 from accel_calib.stored import read_calibration
 from accel_calib.table import Floats
 from inside import (
-    announce, CLOCK_OF_A_SOURCE, COMMAND, HEAD_OF_A_PORT, is_port, main, open_source,
-    PATIENCE_OF_A_PORT)
+    announce, CLOCK_OF_A_SOURCE, COMMAND, HEAD_OF_A_PORT, is_port, open_source, PATIENCE_OF_A_PORT)
 from live_bench import TurnedSensor
 import numpy as np
 import pytest
-from shared import wait
+from shared import refused, wait
 from viewer import link_of, Viewer
 
 RATE_HZ = 200.0
@@ -334,8 +333,7 @@ def test_a_missing_recording_or_port_is_one_line_and_status_2(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for source, words in ((tmp_path / 'missing.csv', 'missing.csv'),
                           ('/dev/ttyUSB97', 'cannot be opened')):
-        assert main(['live', str(source)]) == 2
-        assert re.fullmatch(f'.*{words}.*\n', capsys.readouterr().err)
+        assert words in refused(capsys, 'live', source)
 
 
 @contextmanager
