@@ -16,6 +16,7 @@ import time
 from typing import Any
 
 from accel_calib.calibrate import Calibration
+from accel_calib.effects import effect_named
 from accel_calib.geometry import unit
 from accel_calib.session import Step
 from accel_calib.table import Floats
@@ -58,6 +59,27 @@ def with_effects(calibration: Calibration, values: Mapping[str, Any], variance: 
     covariance[:size, :size] = calibration.covariance
     return replace(calibration, model=model, covariance=covariance,
                    poses=calibration.poses.with_columns(**columns))
+
+
+SHAPES = {'start': 1000.0, 'tau': 900.0, 'instant': 4000.0, 'lag': 200.0, 'of_sensor': 0.0,
+          'form': 1.0, 'low': 10.0, 'high': 3000.0}
+"""Values of the shapes of effects, in the context of `context_of`."""
+
+
+def values_of(name: str, parts: Any) -> Floats:
+    """Return the values of an effect: parts of twice its typical size, and its shape."""
+    effect = effect_named(name)
+    values = 2.0 * effect.typical * np.asarray(parts)[:len(effect.parameters)]
+    return np.array([*values, *(SHAPES[part] for part in effect.shape)])
+
+
+def context_of(rng: np.random.Generator, count: int) -> dict[str, Floats]:
+    """Return random context that every effect accepts."""
+    return {'temperature': rng.uniform(-20, 60, count), 'std': rng.uniform(0, 0.2, (count, 3)),
+            'time': 1000.0 + np.sort(rng.uniform(0, 7200, count)),
+            'supply_voltage': rng.uniform(3, 3.6, count), 'rate': rng.normal(size=(count, 3)),
+            'previous': random_directions(count, rng),
+            'temperature_rate': rng.uniform(-0.1, 0.1, count)}
 
 
 def random_directions(count: int, rng: np.random.Generator) -> Floats:
