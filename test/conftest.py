@@ -177,7 +177,10 @@ class Bench:
         """Call any service, and return its answer."""
         client = self.node.create_client(kind, name)
         self.spin(client.service_is_ready)
-        future = client.call_async(kind.Request(**fields))
+        return self._answer(client, fields)
+
+    def _answer(self, client: Any, fields: Mapping[str, Any]) -> Any:
+        future = client.call_async(client.srv_type.Request(**fields))
         self.spin(future.done)
         return future.result()
 
@@ -190,10 +193,7 @@ class Bench:
 
     def call(self, name: str, **fields: Any) -> Any:
         """Call a service of the calibrator and return its answer."""
-        client = self.client(name)
-        future = client.call_async(client.srv_type.Request(**fields))
-        self.spin(future.done)
-        return future.result()
+        return self._answer(self.client(name), fields)
 
     def call_while(self, name: str, make: Callable[[], Any]) -> Any:
         """
