@@ -28,9 +28,8 @@ sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')  # each process has one core
 
 from figures import markdown, parser, publish, table  # noqa: E402
-from generator_effects import CARRIER  # noqa: E402
 import numpy as np  # noqa: E402
-from refine_case import Case, Outcome, run  # noqa: E402
+from refine_case import CARRIER, Case, Outcome, run  # noqa: E402
 from refine_lines import lines_of  # noqa: E402
 from refine_rows import cases_of, ROWS  # noqa: E402
 

@@ -29,7 +29,7 @@ from accel_calib.refine import refine
 from accel_calib.table import COLUMNS, Floats, Poses
 from accel_calib.units import units_of
 from generator import again, Setup, simulate, Simulated
-from generator_effects import basis_of, CARRIER, ON_OUTPUT, OUTSIDE, STANDARD_GRAVITY
+from generator_effects import basis_of, ON_OUTPUT, OUTSIDE, STANDARD_GRAVITY
 import numpy as np
 from scipy.optimize import least_squares
 
@@ -49,6 +49,42 @@ VARIABLES = (('temperature_rate', r'\brate\b'), ('temperature', r'\btemperature\
              ('supply', r'\bsupply\b'), ('vibration', r'\bvibration\b'), ('time', r'\btime\b'),
              ('force', r'\bforce along\b'), ('direction', r'\bdirection\b'))
 """Words of carriers and variables, more specific ones first."""
+
+Carried = tuple[tuple[str, str], ...]
+
+
+def _all(effects: tuple[str, ...], *carried: tuple[str, str]) -> dict[str, Carried]:
+    return dict.fromkeys(effects, carried)
+
+
+CARRIER: dict[str, Carried] = {
+    **_all(('quadratic', 'cubic', 'odd_quadratic', 'gain_asymmetry', 'ripple', 'quartic',
+            'quintic', 'dead_zone'), ('offset', 'force'), ('gain', 'force'), ('force', 'force')),
+    **_all(('cross_coupling',), ('cross_axis', 'force')),
+    **_all(('oblique_cubic', 'oblique_hinge'), ('force', 'direction')),
+    **_all(('offset_temperature', 'offset_temperature_quadratic', 'offset_temperature_knee'),
+           ('offset', 'temperature')),
+    **_all(('temperature_rate',), ('offset', 'temperature_rate')),
+    **_all(('gain_temperature', 'gain_temperature_quadratic', 'gain_temperature_steep'),
+           ('gain', 'temperature')),
+    **_all(('cross_axis_temperature',), ('cross_axis', 'temperature')),
+    **_all(('supply_ratio',), ('offset', 'supply'), ('gain', 'supply')),
+    **_all(('offset_supply_quadratic',), ('offset', 'supply')),
+    **_all(('offset_drift', 'warm_up', 'offset_wander', 'offset_step', 'periodic_offset',
+            'wander_1f'), ('offset', 'time')),
+    **_all(('gain_drift', 'gain_step', 'gain_periodic'), ('gain', 'time')),
+    **_all(('vibration_rectification',), ('offset', 'vibration')),
+    **_all(('hysteresis', 'lever_arm', 'saturation', 'quantisation', 'repeatability')),
+}
+"""
+What each effect changes, and with what: pairs of carrier and variable.
+
+The carriers are offset, gain, cross_axis and force, the size of the force. The variables are time,
+temperature, temperature_rate, force (along an axis), direction (of the force), supply and
+vibration. Any one of the pairs is right. A function of the force along an axis has three: on the
+unit sphere, the same change of |a| is that of an offset, of a gain or of the size of the force.
+Effects without a pair have no such form.
+"""
 
 LAG_WITHIN = 0.1
 """Largest relative error of the lag of a thermometer."""

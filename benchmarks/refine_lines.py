@@ -8,9 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from figures import Line
-from generator_effects import CARRIER
 import numpy as np
-from refine_case import Outcome, SHOWS
+from refine_case import CARRIER, Outcome, SHOWS
 from refine_rows import ALONE, GROUPS, LOOK_ALIKE, LOST, NOTHING
 
 WORSE = 1.05

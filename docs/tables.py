@@ -2,20 +2,23 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Make the tables of the documentation and the API reference: ``python docs/tables.py``.
+Make tables and API reference of the documentation, and the parameters: ``python docs/tables.py``.
 
 A table stands between ``<!-- NAME -->`` and ``<!-- end -->`` in a page. The reference is the whole
-page ``api.md``. Tests compare both with the code. The package need not be installed.
+page ``api.md``, and the parameters of the calibrator are ``config/calibrator.yaml``. Tests compare
+all with the code. The package need not be installed.
 
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import fields
 from functools import partial
 from pathlib import Path
 import re
 import sys
+from textwrap import wrap
 
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parent), str(HERE)]
@@ -24,6 +27,8 @@ from accel_calib.effects import EFFECTS, OF_RAMPS  # noqa: E402
 from accel_calib.finding import KINDS, STEPS  # noqa: E402
 from accel_calib.findings import LIMITS  # noqa: E402
 from accel_calib.logs.names import UNITS, WORDS  # noqa: E402
+from accel_calib.session import CalibratorSettings  # noqa: E402
+from accel_calib.session.settings import default_of, expected  # noqa: E402
 from accel_calib.table import COLUMNS  # noqa: E402
 import api_page  # noqa: E402
 
@@ -82,6 +87,22 @@ def names() -> Iterator[str]:
 TABLES = {'columns': columns, 'effects': effects, 'findings': partial(kinds, KINDS),
           'names': names, 'rating': rating, 'steps': partial(kinds, STEPS)}
 REFERENCE = 'api.md'
+PARAMETERS = HERE.parent / 'config' / 'calibrator.yaml'
+COMMENT = '    # '
+
+
+def parameters() -> Iterator[str]:
+    """Yield the lines of a parameter file with all defaults, for any node name."""
+    yield '# Parameters of the calibrator with their defaults; generated from'
+    yield '# accel_calib/session/settings.py. Parameters with * can be set while the node runs.'
+    yield '/**:'
+    yield '  ros__parameters:'
+    for each in fields(CalibratorSettings):
+        live = ' *' if each.metadata['live'] else ''
+        words = f"{each.metadata['words']} ({expected(each)}){live}"
+        yield from wrap(words, 99, initial_indent=COMMENT, subsequent_indent=COMMENT)
+        value = default_of(each)
+        yield f'    {each.name}: {str(value).lower() if isinstance(value, bool) else repr(value)}'
 
 
 def with_tables(text: str) -> str:
@@ -94,8 +115,9 @@ def with_tables(text: str) -> str:
 
 
 def main() -> None:
-    """Write the reference, and the tables into all other pages."""
+    """Write reference and parameters, and the tables into all other pages."""
     (HERE / REFERENCE).write_text(api_page.page(), encoding='utf-8')
+    PARAMETERS.write_text('\n'.join([*parameters(), '']), encoding='utf-8')
     for page in sorted(HERE.glob('*.md')):
         if page.name != REFERENCE:
             page.write_text(with_tables(page.read_text(encoding='utf-8')), encoding='utf-8')

@@ -3,8 +3,6 @@
 
 """Messages and small sound bags of every kind; `McapFile` writes by the specification alone."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
@@ -16,7 +14,7 @@ import zlib
 
 from accel_calib.calibrate import Calibration, fit_poses
 from accel_calib.errors import InputError
-from accel_calib.logs import LogOptions, read_recording
+from accel_calib.logs import IMU_DOUBLES, LogOptions, read_recording
 from accel_calib.messages import correct_bag
 from accel_calib.table import Recording
 from accel_calib.units import units_of
@@ -126,6 +124,13 @@ def raw_messages() -> list[tuple[int, int, bytes]]:
     """Return (number of the topic, time of receipt [ns], CDR)."""
     return [(topic, stamp, bytes(STORE.serialize_cdr(each, TOPICS[topic][1])))
             for topic, stamp, each in messages()]
+
+
+def swapped(data: bytes) -> bytes:
+    """Return an Imu in little-endian CDR as a big-endian machine writes it."""
+    stamp, begin = struct.unpack_from('<iII', data, 4), len(data) - 8 * IMU_DOUBLES
+    return (bytes(4) + struct.pack('>iII', *stamp) + data[16:begin]
+            + np.frombuffer(data[begin:], '<f8').astype('>f8').tobytes())
 
 
 def by_hand(compression: str = '', **how: bool) -> Write:

@@ -10,8 +10,6 @@ condition and a time limit.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib.util import find_spec
 import os
@@ -179,7 +177,10 @@ class Bench:
         """Call any service, and return its answer."""
         client = self.node.create_client(kind, name)
         self.spin(client.service_is_ready)
-        future = client.call_async(kind.Request(**fields))
+        return self._answer(client, fields)
+
+    def _answer(self, client: Any, fields: Mapping[str, Any]) -> Any:
+        future = client.call_async(client.srv_type.Request(**fields))
         self.spin(future.done)
         return future.result()
 
@@ -192,10 +193,7 @@ class Bench:
 
     def call(self, name: str, **fields: Any) -> Any:
         """Call a service of the calibrator and return its answer."""
-        client = self.client(name)
-        future = client.call_async(client.srv_type.Request(**fields))
-        self.spin(future.done)
-        return future.result()
+        return self._answer(self.client(name), fields)
 
     def call_while(self, name: str, make: Callable[[], Any]) -> Any:
         """
@@ -352,6 +350,14 @@ def in_time() -> Iterator[None]:
     yield
     signal.alarm(0)
     signal.signal(signal.SIGALRM, before)
+
+
+@pytest.fixture(scope='module')
+def browser() -> Iterator[Any]:
+    """Yield Chromium."""
+    from live_bench import chromium
+    with chromium() as started:
+        yield started
 
 
 @pytest.fixture

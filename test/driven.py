@@ -3,8 +3,6 @@
 
 """A session without threads, and a person who does what it says."""
 
-from __future__ import annotations
-
 from collections.abc import Generator
 from typing import Any
 

@@ -3,8 +3,6 @@
 
 """Recordings of a simulated fleet, and its results, for the tests of fleets."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

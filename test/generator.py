@@ -25,8 +25,6 @@ larger. Saturation clips at least `LEAST_CLIPPED` poses, even if the size is the
 is that of the samples, also if the poses repeat worse (`Setup.understated`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 import csv
 from dataclasses import dataclass, replace

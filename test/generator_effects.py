@@ -6,12 +6,9 @@ The effects that the independent simulator can hide: what each adds to the readi
 
 An effect is a basis: the (n, 3, p) derivative of the readings by its p values, at the true force
 and context of each pose. `OUTSIDE` lists the effects that the catalogue of the package does not
-have, and `CARRIER` what each effect changes and with what. This module shares no code with the
-package either.
+have. This module shares no code with the package either.
 
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -41,42 +38,6 @@ OUTSIDE = ('ripple', 'periodic_offset', 'repeatability', 'quartic', 'quintic', '
            'gain_periodic', 'offset_temperature_knee', 'offset_supply_quadratic', 'wander_1f',
            'oblique_cubic', 'oblique_hinge')
 """Effects that can be hidden but are not in the catalogue."""
-
-Carried = tuple[tuple[str, str], ...]
-
-
-def _all(effects: tuple[str, ...], *carried: tuple[str, str]) -> dict[str, Carried]:
-    return dict.fromkeys(effects, carried)
-
-
-CARRIER: dict[str, Carried] = {
-    **_all(('quadratic', 'cubic', 'odd_quadratic', 'gain_asymmetry', 'ripple', 'quartic',
-            'quintic', 'dead_zone'), ('offset', 'force'), ('gain', 'force'), ('force', 'force')),
-    **_all(('cross_coupling',), ('cross_axis', 'force')),
-    **_all(('oblique_cubic', 'oblique_hinge'), ('force', 'direction')),
-    **_all(('offset_temperature', 'offset_temperature_quadratic', 'offset_temperature_knee'),
-           ('offset', 'temperature')),
-    **_all(('temperature_rate',), ('offset', 'temperature_rate')),
-    **_all(('gain_temperature', 'gain_temperature_quadratic', 'gain_temperature_steep'),
-           ('gain', 'temperature')),
-    **_all(('cross_axis_temperature',), ('cross_axis', 'temperature')),
-    **_all(('supply_ratio',), ('offset', 'supply'), ('gain', 'supply')),
-    **_all(('offset_supply_quadratic',), ('offset', 'supply')),
-    **_all(('offset_drift', 'warm_up', 'offset_wander', 'offset_step', 'periodic_offset',
-            'wander_1f'), ('offset', 'time')),
-    **_all(('gain_drift', 'gain_step', 'gain_periodic'), ('gain', 'time')),
-    **_all(('vibration_rectification',), ('offset', 'vibration')),
-    **_all(('hysteresis', 'lever_arm', 'saturation', 'quantisation', 'repeatability')),
-}
-"""
-What each effect changes, and with what: pairs of carrier and variable.
-
-The carriers are offset, gain, cross_axis and force, the size of the force. The variables are time,
-temperature, temperature_rate, force (along an axis), direction (of the force), supply and
-vibration. Any one of the pairs is right. A function of the force along an axis has three: on the
-unit sphere, the same change of |a| is that of an offset, of a gain or of the size of the force.
-Effects without a pair have no such form.
-"""
 
 
 @dataclass(frozen=True)

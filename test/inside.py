@@ -11,8 +11,6 @@ name that is not clear without its file has another one here.
 
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -99,7 +97,7 @@ from accel_calib.session.commands import fit as fit_in_node
 from accel_calib.session.guidance import Guide, next_action, Plan, plan_for
 from accel_calib.session.live_capture import LiveCapture, PoseBook, with_temperature
 from accel_calib.session.sensor import rest_after, Sensor, TemperatureHistory
-from accel_calib.session.settings import capture_settings, changed, default_of, expected
+from accel_calib.session.settings import capture_settings, changed, default_of
 from accel_calib.session.state import figures
 from accel_calib.session.store import (
     aside, Identity, Lock, MOST_STEPS, Store as SensorStore, store_of, writing_advice)

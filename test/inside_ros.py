@@ -11,9 +11,17 @@ from accel_calib.ros.calibrator_node import in_executor, pose_markers, serve
 from accel_calib.ros.declare import (
     MountingBroadcaster, StaticTransforms, TOPIC as TF_TOPIC, watch_static)
 from accel_calib.ros.simulator_node import SimulatedImu, SimulatorSettings
+import numpy as np
+from numpy.typing import NDArray
 
 Link = tuple[str, str, Sequence[float]]
 """Parent, child, and quaternion (x, y, z, w) of a static transform."""
+
+
+def force_of(message: Any) -> NDArray[np.float64]:
+    """Return the acceleration of an Imu."""
+    force = message.linear_acceleration
+    return np.array([force.x, force.y, force.z])
 
 
 def publish_static(node: Any, *links: Link) -> None:

@@ -8,8 +8,6 @@ The person knows only what the page shows.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,7 +22,7 @@ from accel_calib.session import Log
 from accel_calib.table import Floats
 from inside import Host, model_with, predict, unit
 import numpy as np
-from playwright.sync_api import Browser, expect, Page, Playwright
+from playwright.sync_api import Browser, expect, Page, sync_playwright
 import pytest
 from viewer import hosted
 
@@ -160,7 +158,8 @@ def live_page(folder: Path, *, speed: float = 20.0, name: str = 'imu_link', file
         yield LivePage(sensor, host, lines)
 
 
-def chromium(playwright: Playwright) -> Browser:
+@contextmanager
+def chromium() -> Iterator[Browser]:
     """Start Chromium; without one, skip the test, but not in continuous integration."""
     found = shutil.which('chromium') or shutil.which('chromium-browser') or shutil.which(
         'google-chrome')
@@ -169,7 +168,10 @@ def chromium(playwright: Playwright) -> Browser:
         if os.environ.get('CI'):
             pytest.fail(words)
         pytest.skip(words)
-    return playwright.chromium.launch(executable_path=found, args=list(_FLAGS))
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=found, args=list(_FLAGS))
+        yield browser
+        browser.close()
 
 
 class Viewers:

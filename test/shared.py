@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Helpers of several tests: recordings, sensors, the command line, and tasks of a session."""
+"""Helpers of several tests: recordings, sensors, commands, waits, and tasks of a session."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -12,13 +12,15 @@ import re
 import shlex
 import subprocess
 import sys
+import time
 from typing import Any
 
 from accel_calib.calibrate import Calibration
+from accel_calib.effects import effect_named
 from accel_calib.geometry import unit
 from accel_calib.session import Step
 from accel_calib.table import Floats
-from inside import COMMAND, main, Model, model_with
+from inside import COMMAND, main, Model, model_with, OVER_THE_SPHERE, predict
 import numpy as np
 import pytest
 
@@ -59,9 +61,43 @@ def with_effects(calibration: Calibration, values: Mapping[str, Any], variance: 
                    poses=calibration.poses.with_columns(**columns))
 
 
+SHAPES = {'start': 1000.0, 'tau': 900.0, 'instant': 4000.0, 'lag': 200.0, 'of_sensor': 0.0,
+          'form': 1.0, 'low': 10.0, 'high': 3000.0}
+"""Values of the shapes of effects, in the context of `context_of`."""
+
+
+def values_of(name: str, parts: Any) -> Floats:
+    """Return the values of an effect: parts of twice its typical size, and its shape."""
+    effect = effect_named(name)
+    values = 2.0 * effect.typical * np.asarray(parts)[:len(effect.parameters)]
+    return np.array([*values, *(SHAPES[part] for part in effect.shape)])
+
+
+def context_of(rng: np.random.Generator, count: int) -> dict[str, Floats]:
+    """Return random context that every effect accepts."""
+    return {'temperature': rng.uniform(-20, 60, count), 'std': rng.uniform(0, 0.2, (count, 3)),
+            'time': 1000.0 + np.sort(rng.uniform(0, 7200, count)),
+            'supply_voltage': rng.uniform(3, 3.6, count), 'rate': rng.normal(size=(count, 3)),
+            'previous': random_directions(count, rng),
+            'temperature_rate': rng.uniform(-0.1, 0.1, count)}
+
+
 def random_directions(count: int, rng: np.random.Generator) -> Floats:
     """Return (count, 3) unit vectors, uniformly distributed over the sphere."""
     return unit(rng.normal(size=(count, 3)))
+
+
+def rms(values: Any, axis: int | None = None) -> Any:
+    """Return the root mean square."""
+    return np.sqrt(np.mean(np.square(values), axis=axis))
+
+
+def error_mg(calibration: Calibration, true: Model) -> float:
+    """Return the RMS error of the corrected |a| over the sphere [mg]."""
+    units = calibration.units
+    force = calibration.correct(units.from_g(predict(true, OVER_THE_SPHERE, {})))
+    lengths = np.linalg.norm(force, axis=1) / calibration.force_per_g
+    return 1e3 * float(rms(lengths - 1.0))
 
 
 def run_on_small_disk(folder: Path, size_kb: int, *command: object
@@ -127,6 +163,24 @@ def run_json(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[in
     capsys.readouterr()  # what was printed before
     status = run(*arguments, '--json', '-')
     return status, json.loads(capsys.readouterr().out)
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """Run a command that is refused with status 2 and one line, and return this line."""
+    capsys.readouterr()  # what was printed before
+    assert run(*arguments) == 2
+    error = capsys.readouterr().err
+    assert re.fullmatch(rf'accel-calib {arguments[0]}: .*\n', error), error
+    assert 'internal error' not in error
+    return error
+
+
+def wait(until: Callable[[], Any], seconds: float = 300.0) -> None:
+    """Wait until a condition holds."""
+    ends = time.monotonic() + seconds
+    while not until():
+        assert time.monotonic() < ends, f'not so within {seconds} s'
+        time.sleep(0.001)
 
 
 def result(step: Step) -> Any:

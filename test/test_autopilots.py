@@ -10,8 +10,6 @@ the readings of the sensor.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path

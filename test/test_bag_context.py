@@ -3,8 +3,6 @@
 
 """Temperature and supply voltage from topics of any type, with or without stamps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 
 """Every damaged bag ends in one clear line or in a result, and leaves nothing half-written."""
 
-from __future__ import annotations
-
 from pathlib import Path
 import shutil
 import sqlite3

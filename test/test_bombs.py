@@ -3,8 +3,6 @@
 
 """A small file can't take much memory or work: it ends in one line, or in a result."""
 
-from __future__ import annotations
-
 import bz2
 import os
 from pathlib import Path
@@ -15,25 +13,20 @@ import struct
 import tracemalloc
 from typing import Any
 
-from accel_calib.calibrate import Calibration
 from accel_calib.errors import InputError
 from accel_calib.logs import read_recording
 from accel_calib.messages import correct_bag
 from accel_calib.stored import write_calibration
 from bag_files import (
-    a_calibration, COMPRESS, copied, COUNT, execute, McapFile, messages, rosbag2 as folder_of,
-    STORE, TOPICS)
-from inside import check_regular, DECOMPRESSED, decompressed, largest, main, open_bag
+    a_calibration, COMPRESS, copied, COUNT, execute, McapFile, messages, raw_messages,
+    rosbag2 as folder_of, TOPICS, zstd)
+from inside import check_regular, DECOMPRESSED, decompressed, largest, open_bag
 import pytest
 from rosbags import rosbag2
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from rosbags.typesys import get_typestore, Stores
-
-try:
-    from compression import zstd
-except ImportError:
-    from backports import zstd
+import shared
 
 pytestmark = pytest.mark.usefixtures('in_time')
 
@@ -42,13 +35,7 @@ ZSTD_BOMB = zstd.compress(bytes(1 << 26)) * (BOMB_SIZE >> 26)
 MOST_BYTES = 150e6
 """Largest memory, and largest size of all that is decompressed, until a file is refused."""
 
-RAWS = [(topic, stamp, bytes(STORE.serialize_cdr(each, TOPICS[topic][1])))
-        for topic, stamp, each in messages()]
-
-
-@pytest.fixture(scope='module')
-def calibration() -> Calibration:
-    return a_calibration()
+RAWS = raw_messages()
 
 
 def refused(path: Path, words: str) -> None:
@@ -264,7 +251,7 @@ def test_pages_that_are_listed_many_times_are_refused(tmp_path: Path) -> None:
 
 
 def test_correcting_leaves_a_database_as_it_is_and_refuses_a_copy_that_lacks_messages(
-        calibration: Calibration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write, count = rosbag2.Writer.write, iter(range(10 ** 6))
 
     def losing(self: Any, *message: Any) -> None:
@@ -277,11 +264,11 @@ def test_correcting_leaves_a_database_as_it_is_and_refuses_a_copy_that_lacks_mes
         return {each: (each.read_bytes(), each.stat().st_mtime_ns) for each in path.iterdir()}
 
     before = state()
-    assert correct_bag(path, calibration, tmp_path / 'whole') == COUNT
+    assert correct_bag(path, a_calibration(), tmp_path / 'whole') == COUNT
     assert state() == before
     monkeypatch.setattr(rosbag2.Writer, 'write', losing)
     with pytest.raises(InputError, match='the copy holds 83 of 84 messages'):
-        correct_bag(path, calibration, tmp_path / 'out')
+        correct_bag(path, a_calibration(), tmp_path / 'out')
     assert sorted(each.name for each in tmp_path.iterdir()) == ['bag', 'whole']
 
 
@@ -320,16 +307,14 @@ COMMANDS = [('fit', '{}'), ('fit', '{}', '--rows', '1:9'), ('verify', '{}', '-c'
     *((('capture', '{}', '-o', '{out}'), suffix)
       for suffix in ('.bag', '.mcap', '.db3', '.ulg', '.bin'))])
 def test_a_pipe_ends_every_command_in_one_line(
-        command: tuple[str, ...], suffix: str, tmp_path: Path, calibration: Calibration,
+        command: tuple[str, ...], suffix: str, tmp_path: Path,
         capsys: pytest.CaptureFixture[str]) -> None:
     pipe, stored, out = tmp_path / f'pipe{suffix}', tmp_path / 'c.yaml', tmp_path / 'out'
     os.mkfifo(pipe)
-    write_calibration(stored, calibration)
+    write_calibration(stored, a_calibration())
     given = [each.replace('{out}', str(out)).replace('{yaml}', str(stored)).replace(
         '{}', str(pipe)) for each in command]
-    assert main(given) == 2
-    line = ' '.join(capsys.readouterr().err.split())
-    assert f'{pipe} is a pipe (FIFO), expected a regular file' in line
+    assert f'{pipe} is a pipe (FIFO), expected a regular file' in shared.refused(capsys, *given)
     assert not out.exists()
 
 

@@ -13,10 +13,12 @@ from accel_calib.stored import read_calibration
 from inside import COMMAND, COMMANDS, main, parser, rotation_from_rpy, spread_directions
 import numpy as np
 import pytest
-from shared import python, run, run_json, shell
+from shared import python, refused, ROOT, run, run_json, shell
 
 EFFECTS = ['--effect', 'offset=0.02,-0.01,0.03', '--effect', 'axis_gain=0.01,-0.02,0.005',
            '--effect', 'cross_axis=0.004,0.002,-0.003']
+
+LOGS = ROOT / 'test' / 'data' / 'logs'
 
 
 @pytest.fixture
@@ -106,10 +108,8 @@ def test_a_refusal_says_how_the_log_was_read(command, kind, calibration, tmp_pat
     assert status == 2
     assert 'ax' in result['read_as']
     assert run(*arguments) == 2
-    printed = capsys.readouterr()
-    assert printed.out == f'read as: {result["read_as"]}\n'
-    assert printed.err.startswith(f'accel-calib {command}: ')
-    assert printed.err.count('\n') == 1
+    assert capsys.readouterr().out == f'read as: {result["read_as"]}\n'
+    refused(capsys, *arguments)
 
 
 @pytest.mark.parametrize(('text', 'message'), [
@@ -121,12 +121,7 @@ def test_a_bad_table_does_not_change_a_stored_calibration(text, message, calibra
                                                           capsys):
     stored, bad = calibration.read_text(), tmp_path / 'bad.csv'
     bad.write_text(text)
-    capsys.readouterr()
-    assert run('fit', bad, '-o', calibration) == 2
-    printed = capsys.readouterr()
-    assert message in printed.err
-    assert printed.err.count('\n') == 1
-    assert not printed.out or printed.out.startswith('read as: ')
+    assert message in refused(capsys, 'fit', bad, '-o', calibration)
     assert calibration.read_text() == stored
 
 
@@ -172,13 +167,7 @@ def test_bad_input_is_one_line_and_status_2_and_an_error_in_the_json(
     error.unlink(missing_ok=True)
     (tmp_path / 'circle').symlink_to('circle')
     there = sorted(tmp_path.iterdir())
-    capsys.readouterr()
-    assert run(*arguments) == 2
-    printed = capsys.readouterr()
-    assert printed.err.startswith(f'accel-calib {arguments[0]}: ')
-    assert printed.err.count('\n') == 1
-    assert 'Traceback' not in printed.err
-    assert 'internal error' not in printed.err
+    refused(capsys, *arguments)
     assert sorted(tmp_path.iterdir()) == there
     if arguments[-1] == '../error.json':
         result = json.loads(error.read_text())
@@ -322,15 +311,16 @@ def test_the_report_has_a_page_and_figures(poses, tmp_path):
     assert {'ladder.svg', 'ladder.png', 'remaining_sphere.png'} <= names
 
 
-def test_without_matplotlib_one_line_advises_what_to_install(poses, tmp_path, capsys,
-                                                             monkeypatch):
-    monkeypatch.setitem(sys.modules, 'matplotlib', None)
-    page = tmp_path / 'r.html'
-    assert run('refine', poses, '--report', page) == 2
-    printed = capsys.readouterr()
-    assert 'pip install matplotlib' in printed.err
-    assert printed.err.count('\n') == 1
-    assert not page.exists()
+@pytest.mark.parametrize(('module', 'line'), [
+    ('matplotlib', 'refine poses.csv --report r.html'), ('aiohttp', 'live poses.csv'),
+    ('pyulog', f'capture {LOGS}/px4/default.ulg -o p.csv'),
+    ('pymavlink.DFReader', f'capture {LOGS}/ardupilot/two_imus.bin -o p.csv')])
+def test_a_missing_library_is_named_in_one_line_with_how_to_install_it(module, line, poses, capsys,
+                                                                       monkeypatch):
+    monkeypatch.chdir(poses.parent)
+    monkeypatch.setitem(sys.modules, module, None)
+    assert f'pip install {module.partition(".")[0]}' in refused(capsys, *line.split())
+    assert [*poses.parent.iterdir()] == [poses]
     assert run('refine', poses) == 0
 
 

@@ -3,8 +3,6 @@
 
 """Calibrations, or rests, of one sensor agree, and those of a changed sensor do not."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

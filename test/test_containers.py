@@ -3,8 +3,6 @@
 
 """Logs in ZIP archives, Excel files and MATLAB files are read as their tables are."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 import datetime

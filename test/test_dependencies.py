@@ -3,8 +3,6 @@
 
 """What is imported is required, and requirements are bounded by what was tested."""
 
-from __future__ import annotations
-
 from importlib.metadata import packages_distributions
 from pathlib import Path
 import re

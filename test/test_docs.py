@@ -18,6 +18,7 @@ from inside import parser
 import pytest
 from shared import ROOT
 from test_policy import names_of_the_calibrator
+import yaml
 
 PAGES = ['README.md', 'CONTRIBUTING.md', 'QUALITY_DECLARATION.md', 'SECURITY.md', *(
     str(path.relative_to(ROOT)) for path in sorted((ROOT / 'docs').rglob('*.md')))]
@@ -37,6 +38,14 @@ def tables(monkeypatch):
 @pytest.mark.parametrize('page', OWN_PAGES)
 def test_tables_are_those_of_the_code(page, tables):
     assert tables.with_tables(text_of(page)) == text_of(page), 'run: python docs/tables.py'
+
+
+def test_parameter_file_describes_all_parameters_and_has_their_defaults(tables):
+    text = tables.PARAMETERS.read_text(encoding='utf-8')
+    assert text.splitlines() == [*tables.parameters()], 'run: python docs/tables.py'
+    given = yaml.safe_load(text)['/**']['ros__parameters']
+    assert CalibratorSettings(**given) == CalibratorSettings()
+    assert list(given) == [parameter.name for parameter in fields(CalibratorSettings)]
 
 
 def test_every_table_is_in_a_page(tables):

@@ -22,7 +22,7 @@ from inside import (
     spread_directions, unit)
 import numpy as np
 import pytest
-from shared import random_directions, sensor
+from shared import error_mg, random_directions, sensor
 
 G = units_of('g')
 
@@ -72,11 +72,6 @@ def test_nine_parameters_are_ten_in_the_sensing_axes():
     assert np.linalg.matrix_rank(nine.covariance, tol=1e-14) == 9
 
 
-def error_mg(calibration, model):
-    force = calibration.correct(predict(model, spread_directions(300), {}))
-    return np.sqrt(np.mean((np.linalg.norm(force, axis=1) - 1.0) ** 2)) * 1e3
-
-
 @pytest.mark.parametrize(('count', 'limit_mg'), [(12, 0.33), (36, 0.2)])
 def test_a_knocked_pose_is_named_and_left_out(count, limit_mg):
     errors = []
@@ -96,25 +91,21 @@ def test_noisy_poses_have_less_weight():
     added = rng.normal(size=std.shape) * std * np.sqrt((worse ** 2 - 1.0) / 100)
     noisy = poses.with_columns(std=std * worse, reading=poses.reading + added)
     weighted, equal = (np.linalg.norm(fit_poses(each, G, model='10').model.vector - model.vector)
-                       for each in (noisy, without(noisy, 'std')))
+                       for each in (noisy, noisy.without_columns('std')))
     assert weighted < 0.5 * equal
-
-
-def without(poses, *keys):
-    return Poses({key: poses[key] for key in poses.columns if key not in keys}, poses.row)
 
 
 def test_unknown_noise_is_estimated_from_the_residuals():
     poses = simulated(9, 60)[1]
     known = fit_poses(poses, G, model='10')
-    unknown = fit_poses(without(poses, 'std'), G, model='10')
+    unknown = fit_poses(poses.without_columns('std'), G, model='10')
     assert unknown.quality.noise_floor_mg is None
     np.testing.assert_allclose(unknown.offset_sd, known.offset_sd, rtol=0.4)
     assert any('uncertainty comes from the residuals' in text for text in unknown.warnings)
 
 
 def test_held_out_residual_is_that_of_a_fit_without_the_pose():
-    poses = without(simulated(10, 16)[1], 'std')
+    poses = simulated(10, 16)[1].without_columns('std')
     errors = [verify(fit_poses(poses.take(np.arange(16) != k), G, model='7'),
                      poses.take(np.arange(16) == k)).rms_after_mg for k in range(16)]
     held_out = fit_poses(poses, G, model='7').quality.held_out_rms_mg
@@ -330,8 +321,8 @@ def test_copies_of_a_pose_make_no_pose_an_outlier(copies, lacks, apart):
     for seed in range(3):
         rng = np.random.default_rng(seed)
         model = Model({**sensor(rng).values, 'offset_temperature': 0.0005 * rng.normal(size=3)})
-        poses = without(simulate_poses(model, spread_directions(12), rng, noise_g=1e-4, context={
-            'temperature': rng.uniform(15.0, 45.0, 12)}), *lacks)
+        poses = simulate_poses(model, spread_directions(12), rng, noise_g=1e-4, context={
+            'temperature': rng.uniform(15.0, 45.0, 12)}).without_columns(*lacks)
         again = with_copies(poses, copies)
         again.reading[12:] += apart * rng.normal(size=(len(copies), 3))
         once, found = (fit_poses(each, G, model='10') for each in (poses, again))

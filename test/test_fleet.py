@@ -9,8 +9,6 @@ all the rest; test_fleet_page.py tests them.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 import functools
@@ -23,7 +21,6 @@ import signal
 import subprocess
 import sys
 from threading import Thread
-import time
 from typing import Any
 
 from accel_calib import simulate
@@ -39,7 +36,7 @@ from inside import (
     alike, as_folder, COMMAND, content_hash, date_of, export, main, mapped, on_disk, sensor_of)
 import numpy as np
 import pytest
-from shared import python, run_on_small_disk
+from shared import python, run_on_small_disk, run_snippets, wait
 
 KilledWorker = pytest.importorskip('distributed').KilledWorker
 pytest.importorskip('pyarrow')
@@ -403,10 +400,7 @@ def test_pandas_reads_the_results_as_the_page_says(client: Any, tmp_path: Path,
     (tmp_path / 'in' / 'bad.csv').write_text('nothing to see\n')
     run(client, found_in(tmp_path / 'in'), QUICK, Store(tmp_path / 'results'))
     monkeypatch.chdir(tmp_path)
-    page = Path(__file__).resolve().parents[1] / 'docs' / 'fleet.md'
-    found = page.read_text(encoding='utf-8').partition('```python\n')[2].partition('```')[0]
-    names: dict[str, Any] = {}
-    exec(compile(found, 'fleet.md', 'exec'), names)
+    names = run_snippets('docs/fleet.md')
     assert names['errors'].recording.tolist() == [str(tmp_path / 'in' / 'bad.csv')]
     assert len(names['rows']) == 2
 
@@ -475,14 +469,6 @@ class Site:
     def run(self, client: Any, progress: Callable[[int, int], object]) -> None:
         """Calibrate the recordings."""
         run(client, found_in(self.recorded), QUICK, Store(self.results), progress)
-
-
-def wait(until: Callable[[], object]) -> None:
-    """Wait until a condition holds."""
-    ends = time.monotonic() + WAIT_S
-    while not until():
-        assert time.monotonic() < ends, f'not so within {WAIT_S:g} s'
-        time.sleep(0.001)
 
 
 def killed(pattern: str, enough: int) -> Callable[[Site], None]:
@@ -646,10 +632,6 @@ def test_of_recordings_that_share_a_task_only_the_deadly_one_fails(client: Any) 
     assert found == {name: name for name in items if name != 'deadly'}
 
 
-def set_environment(values: dict[str, str]) -> None:
-    os.environ.update(values)
-
-
 @pytest.mark.skipif(FACTOR == 1, reason='a store takes long to start: make faults')
 def test_recordings_are_read_from_a_store_of_s3(
         client: Any, recorded: Path, undisturbed: dict[str, Any], tmp_path: Path,
@@ -664,7 +646,7 @@ def test_recordings_are_read_from_a_store_of_s3(
                  'AWS_DEFAULT_REGION': 'us-east-1', 'AWS_ENDPOINT_URL': f'http://{host}:{port}'}
         for name, value in known.items():
             monkeypatch.setenv(name, value)
-        client.run(set_environment, known)
+        client.run(lambda: os.environ.update(known))
         store = s3fs.S3FileSystem(skip_instance_cache=True)
         store.mkdir('fleet')
         store.put(f'{recorded}/', 'fleet/recorded/', recursive=True)

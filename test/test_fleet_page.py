@@ -3,8 +3,6 @@
 
 """What the page of a fleet names: odd sensors, shared effects, sensors that changed."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 import re

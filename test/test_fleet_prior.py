@@ -3,14 +3,12 @@
 
 """Few poses are fitted with the typical values of a fleet."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 import json
 from pathlib import Path
 from typing import Any
 
-from accel_calib.calibrate import Calibration, fit_poses, fit_with_fleet, FleetPrior
+from accel_calib.calibrate import fit_poses, fit_with_fleet, FleetPrior
 from accel_calib.errors import InputError
 from accel_calib.logs import write_table
 from accel_calib.refine import refine
@@ -18,10 +16,11 @@ from accel_calib.stored import read_calibration, read_prior, write_calibration, 
 from accel_calib.table import Floats, Poses
 from accel_calib.units import Units
 from inside import (
-    estimated, main, Model, MODELS, OVER_THE_SPHERE, priors_of, sensor_force, simulate_poses,
-    spread_directions, typical_of, unit, with_vector)
+    estimated, main, Model, MODELS, priors_of, simulate_poses, spread_directions, typical_of, unit,
+    with_vector)
 import numpy as np
 import pytest
+from shared import error_mg, rms
 
 IN_G = Units('g', 1.0)
 MEAN = np.array([0.010, -0.015, 0.030, 0.010, 0.012, -0.020, 0.004, 0.000, -0.003])
@@ -35,16 +34,6 @@ def a_sensor(rng: np.random.Generator, factor: float = 1.0) -> Model:
 def poses_of(sensor: Model, count: int, rng: np.random.Generator) -> Poses:
     directions = unit(spread_directions(count) + 0.05 * rng.normal(size=(count, 3)))
     return simulate_poses(sensor, directions, rng)
-
-
-def error_mg(calibration: Calibration, sensor: Model) -> float:
-    """Return the RMS error of the corrected |a| over the sphere [mg]."""
-    corrected = sensor_force(calibration.model, sensor.at({}).reading(OVER_THE_SPHERE), {})
-    return 1e3 * float(np.sqrt(np.mean((np.linalg.norm(corrected, axis=1) - 1.0) ** 2)))
-
-
-def rms(values: list[float]) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 @pytest.fixture(scope='module')
@@ -170,19 +159,6 @@ def test_a_refinement_with_the_fleet_finds_an_effect_beyond_it(fleet: FleetPrior
     assert error_mg(refined, sensor) < 0.2 * error_mg(fit_with_fleet(poses, IN_G, fleet), sensor)
     deviation = np.sqrt(np.diag(refined.covariance))
     assert rms((refined.model.vector - sensor.vector) / deviation) < 2.0
-
-
-def test_a_refinement_of_few_noisy_poses_is_better_with_the_fleet(fleet: FleetPrior) -> None:
-    rng = np.random.default_rng(9)
-    with_fleet, alone = [], []
-    for _ in range(6):
-        sensor = a_sensor(rng)
-        poses = poses_of(sensor, 11, rng)
-        noisy = poses.with_columns(reading=poses.reading + 0.008 * rng.normal(size=(11, 3)),
-                                   std=np.full((11, 3), 0.08), count=np.full(11, 100.0))
-        with_fleet.append(error_mg(refine(noisy, IN_G, base=fleet).calibration, sensor))
-        alone.append(error_mg(refine(noisy, IN_G, base='10').calibration, sensor))
-    assert rms(with_fleet) < rms(alone)
 
 
 def test_the_command_line_refines_with_the_file_of_the_fleet(

@@ -3,13 +3,12 @@
 
 """The gate: bad rows, absurd numbers and edited files never lead to a wrong calibration."""
 
-from contextlib import suppress
 from dataclasses import replace
 import json
 from pathlib import Path
 
 from accel_calib.calibrate import fit_poses, gated
-from accel_calib.errors import AccelCalibError, RefusedFitError
+from accel_calib.errors import RefusedFitError
 from accel_calib.stored import OF_FILE, read_calibration
 from accel_calib.table import Poses
 from accel_calib.units import units_of
@@ -63,14 +62,6 @@ def test_an_absurd_deviation_is_left_out_and_named(absurd):
     found = fit_poses(poses.with_columns(**columns), G)
     assert left_out(found) == [6]
     assert 'reading' in absurd or 'not at rest' in found.rejected[0].reason
-
-
-def test_poses_that_are_not_on_a_sphere_are_refused_with_a_message():
-    rng = np.random.default_rng(3)
-    for _ in range(20):
-        reading = rng.normal(size=(int(rng.integers(6, 20)), 3)) * 6.0
-        with suppress(AccelCalibError):
-            assert fit_poses(table(reading), MPS2).quality.rms_after_mg < 50.0
 
 
 @pytest.fixture(scope='module')

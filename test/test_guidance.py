@@ -3,8 +3,6 @@
 
 """The next step of a session leads from the first message to a calibration that is done."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

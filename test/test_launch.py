@@ -9,8 +9,6 @@ misspelt keyword fails here too. `started` visits a launch file as launch does.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, make_dataclass
 from pathlib import Path

@@ -3,8 +3,6 @@
 
 """Poses captured while samples arrive, and rests compared with the calibration in use."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path

@@ -3,8 +3,6 @@
 
 """The live page in Chromium, with a simulated sensor that is turned as the page says."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 import re
@@ -12,11 +10,11 @@ import re
 from accel_calib.logs import write_table
 from accel_calib.stored import read_calibration
 from inside import model_with, simulate_poses, spread_directions
-from live_bench import chromium, GRAVITY, live_page, LivePage, SIZES, TRUTH, Viewers
+from live_bench import GRAVITY, live_page, LivePage, SIZES, TRUTH, Viewers
 import numpy as np
-from playwright.sync_api import Browser, expect, Locator, Page, sync_playwright
+from playwright.sync_api import Browser, expect, Locator, Page
 import pytest
-from viewer import wait
+from shared import wait
 
 _SHOW_WAKE_LOCK = """
 const request = WakeLock.prototype.request;
@@ -49,14 +47,6 @@ _CONTRASTS = """() => {
       return [(Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05), each.textContent.slice(0, 40)];
     });
 }"""
-
-
-@pytest.fixture(scope='module')
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        browser = chromium(playwright)
-        yield browser
-        browser.close()
 
 
 @pytest.fixture
@@ -351,6 +341,8 @@ def test_a_sensor_that_falls_silent_is_noticed(idle: LivePage, viewers: Viewers)
         idle.sensor.silent = silent
         expect(page.locator('#ring')).to_have_attribute('data-kind', kind)
         expect(page.locator('#problem')).to_be_visible(visible=silent)
+        expect(page.locator('#problem')).to_have_text(
+            re.compile('^simulated sends no samples: check the board' if silent else '^$'))
 
 
 def test_a_browser_without_a_voice_says_so(idle: LivePage, viewers: Viewers) -> None:

@@ -3,8 +3,6 @@
 
 """The server of the live page with a real session, without ROS and without a browser."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, ExitStack, suppress
 from functools import partial
@@ -14,7 +12,6 @@ from pathlib import Path
 import re
 import signal
 import socket
-import sys
 from threading import Event
 import time
 from types import SimpleNamespace
@@ -23,13 +20,13 @@ from accel_calib.errors import InputError
 from accel_calib.session import CalibratorSettings
 from accel_calib.table import Floats
 from inside import (
-    CALIBRATION_ALONE, Host, LARGEST_LIVE_MESSAGE, LIVE_COMMANDS, live_log, LIVE_PERIOD, main,
+    CALIBRATION_ALONE, Host, LARGEST_LIVE_MESSAGE, LIVE_COMMANDS, live_log, LIVE_PERIOD,
     model_with, PAGE_FOLDER, PageServer, PATIENCE_FOR_A_HELLO, PATIENCE_FOR_A_REQUEST,
     PERIOD_OF_A_COMPLAINT, qr_code, reachable, simulate_recording, spread_directions, STUCK)
 import numpy as np
 import pytest
-from shared import children
-from viewer import fetch, hosted, Viewer, wait
+from shared import children, wait
+from viewer import fetch, hosted, Viewer
 
 GRAVITY = 9.80665
 OFFSET = (0.03, -0.02, 0.04)
@@ -392,14 +389,6 @@ def test_a_port_in_use_is_an_error_in_one_line(shared: Bench, tmp_path: Path) ->
         PageServer(shared.host.exchange, '192.0.2.7', 0).start()
 
 
-def test_a_missing_package_is_an_error_in_one_line(
-        capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, 'aiohttp', None)
-    assert main(['live', 'recording.csv']) == 2
-    found = capsys.readouterr().err
-    assert re.fullmatch('.*aiohttp is not installed.*run pip install.*\n', found)
-
-
 def send_slowly(client: socket.socket) -> None:
     """Send a header that does not end."""
     while True:
@@ -466,25 +455,6 @@ def test_a_source_that_fails_is_reported_and_the_page_continues(tmp_path: Path) 
         wait(lambda: any('the port has ended' in line['words'] for line in viewer.of('log')))
         wait(lambda: 'the port has ended' in viewer.state['problem'])
         assert not viewer.ask('fit')['success']
-
-
-def test_a_board_that_falls_silent_is_reported_until_it_sends_again(tmp_path: Path) -> None:
-    def interrupted(rows: Floats, over: Event) -> Iterator[Floats]:
-        yield rows[:40]
-        while not over.wait(PAUSE):
-            yield rows[:0]
-        rows[:, 0] += 100.0
-        for row in rows:
-            time.sleep(PAUSE)
-            yield row[np.newaxis]
-
-    with ExitStack() as stack:
-        bench = Bench(stack, tmp_path, blocks=interrupted)
-        viewer = bench.viewer()
-        wait(lambda: 'bench.csv sends no samples' in viewer.state['problem'])
-        assert 'publisher' not in viewer.state['problem']
-        bench.played.set()
-        wait(lambda: 'sends no samples' not in viewer.state['problem'])
 
 
 def test_the_link_names_a_reachable_address() -> None:

@@ -3,8 +3,6 @@
 
 """Samples of a serial port (a pseudo-terminal) or a recording, and ``accel-calib live``."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, ExitStack, suppress
 import fcntl
@@ -31,12 +29,13 @@ from accel_calib.logs import LogOptions
 from accel_calib.stored import read_calibration
 from accel_calib.table import Floats
 from inside import (
-    announce, CLOCK_OF_A_SOURCE, COMMAND, HEAD_OF_A_PORT, is_port, main, open_source,
+    announce, CLOCK_OF_A_SOURCE, COMMAND, HEAD_OF_A_PORT, is_port, open_source,
     PATIENCE_OF_A_PORT, read_log)
 from live_bench import TurnedSensor
 import numpy as np
 import pytest
-from viewer import link_of, Viewer, wait
+from shared import refused, wait
+from viewer import link_of, Viewer
 
 RATE_HZ = 200.0
 
@@ -335,8 +334,7 @@ def test_a_missing_recording_or_port_is_one_line_and_status_2(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for source, words in ((tmp_path / 'missing.csv', 'missing.csv'),
                           ('/dev/ttyUSB97', 'cannot be opened')):
-        assert main(['live', str(source)]) == 2
-        assert re.fullmatch(f'.*{words}.*\n', capsys.readouterr().err)
+        assert words in refused(capsys, 'live', source)
 
 
 @contextmanager

@@ -3,11 +3,8 @@
 
 """Samples of the makers' layouts: each is read, captured and fitted, and the truth is found."""
 
-from __future__ import annotations
-
 from pathlib import Path
 import re
-import sys
 from typing import Any
 
 from accel_calib.calibrate import Calibration, fit_poses, level_by_rows
@@ -254,13 +251,3 @@ def test_what_is_no_flight_log_is_refused_in_one_line(read: Any, content: bytes,
     with pytest.raises(InputError, match=re.escape(str(path))) as caught:
         read(path)
     assert '\n' not in str(caught.value)
-
-
-@pytest.mark.parametrize(('module', 'read', 'name'), [
-    ('pyulog', read_ulg, 'px4/default.ulg'),
-    ('pymavlink.DFReader', read_dataflash, 'ardupilot/two_imus.bin')])
-def test_without_its_library_a_binary_log_says_how_to_install_it(
-        module: str, read: Any, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(InputError, match=f'pip install {module.split(".")[0]}'):
-        read(LOGS / name)

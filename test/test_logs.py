@@ -3,8 +3,6 @@
 
 """Text logs of any dialect: the same numbers are read, and what is assumed is said."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from datetime import datetime, timezone
 from pathlib import Path
@@ -19,7 +17,8 @@ from accel_calib.capture import capture
 from accel_calib.errors import InputError
 from accel_calib.logs import LogOptions, open_log
 from accel_calib.table import Poses, Recording
-from inside import meaning, read_log, spread_directions, unit_of
+from inside import (
+    meaning, model_with, read_log, simulate_recording, spread_directions, unit_of)
 import numpy as np
 import pytest
 
@@ -32,26 +31,15 @@ NOISE = 0.002
 Reads = Callable[..., Any]
 
 
-def motion(rng: np.random.Generator, poses: int = 12, rest: int = 200, turn: int = 80
-           ) -> tuple[np.ndarray, np.ndarray]:
-    """Return forces [g] and rates [rad/s] of a sensor that is turned through poses by hand."""
-    ups = spread_directions(poses)[rng.permutation(poses)]
-    parts, rates = [], []
-    for one, two in zip(ups, np.roll(ups, -1, axis=0)):
-        share = np.linspace(0.0, 1.0, turn)[:, np.newaxis]
-        path = (1.0 - share) * one + share * two + 1e-6
-        parts += [np.tile(one, (rest, 1)), path / np.linalg.norm(path, axis=1)[:, np.newaxis]]
-        rates += [np.zeros((rest, 3)), np.full((turn, 3), 2.0) * np.sin(np.pi * share)]
-    forces = np.concatenate(parts)
-    return forces, np.concatenate(rates) + 0.001 * rng.normal(size=forces.shape)
-
-
-def samples(seed: int = 1, per_g: float = G, **settings: int) -> dict[str, np.ndarray]:
+def samples(seed: int = 1, per_g: float = G, *, poses: int = 12, rest: int = 200, turn: int = 80
+            ) -> dict[str, np.ndarray]:
     """Return time [s], readings with `per_g` to the g, and rates [rad/s] of a recording."""
     rng = np.random.default_rng(seed)
-    forces, rates = motion(rng, **settings)
-    reading = per_g * (forces * GAIN + OFFSET + NOISE * rng.normal(size=forces.shape))
-    return {'time': np.arange(len(forces)) / RATE_HZ, 'reading': reading, 'rate': rates}
+    made = simulate_recording(
+        model_with({'offset': OFFSET, 'axis_gain': GAIN - 1.0}),
+        spread_directions(poses)[rng.permutation(poses)], rng, noise_g=NOISE, rate_hz=RATE_HZ,
+        dwell=rest / RATE_HZ, turn=turn / RATE_HZ, gyro_noise=0.001)
+    return {'time': made['time'], 'reading': per_g * made.reading, 'rate': made['rate']}
 
 
 def rows_of(*columns: np.ndarray | list[str], digits: str = '.9g') -> list[list[str]]:
@@ -619,9 +607,8 @@ def test_the_unit_that_the_user_states_goes_first(reads: Reads) -> None:
 def test_a_log_without_gravity_is_refused_in_those_words(header: str, per_g: float, reads: Reads
                                                          ) -> None:
     rng = np.random.default_rng(7)
-    forces, rates = motion(rng)
-    moving = np.abs(rates).max(axis=1) > 0.1
-    free = 0.004 * rng.normal(size=forces.shape) + 0.005
+    moving = np.abs(samples()['rate']).max(axis=1) > 0.1
+    free = 0.004 * rng.normal(size=(len(moving), 3)) + 0.005
     free[moving] += 0.4 * rng.normal(size=(int(moving.sum()), 3))
     for units in ('', 'm/s2' if per_g == G else 'g'):
         with pytest.raises(InputError, match='linear acceleration, gravity removed') as refusal:

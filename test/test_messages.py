@@ -5,8 +5,7 @@
 Correction of Imu messages: their bytes (`Rewriter`), their numbers (`corrected`), one reading.
 
 All correct the same random messages, with extreme values in every field. The number of messages is
-the variable IMU_MESSAGES, 800 by default. Bytes that are no message never raise anything but an
-error of this package.
+the variable IMU_MESSAGES, 800 by default.
 
 """
 
@@ -25,6 +24,7 @@ from accel_calib.logs import (
     renamed, samples_of)
 from accel_calib.messages import corrected, output_frame, Rewriter
 from accel_calib.units import STANDARD_GRAVITY, units_of
+from bag_files import swapped
 from inside import (
     frame_ids, Model, OneReading, rotation_from_rpy, simulate_poses, spread_directions, stamps_of)
 import numpy as np
@@ -101,14 +101,6 @@ def fields_of(count=6):
     return fields
 
 
-def test_without_a_mounting_only_the_acceleration_changes(calibration):
-    fields = fields_of()
-    found = corrected(calibration, fields)
-    np.testing.assert_allclose(found[:, ACCELERATION],
-                               calibration.correct(fields[:, ACCELERATION]))
-    np.testing.assert_array_equal(found[:, :ACCELERATION.start], fields[:, :ACCELERATION.start])
-
-
 def test_with_a_mounting_all_fields_are_in_one_frame(levelled):
     fields, rotation = fields_of(), levelled.model.rotation
     found = corrected(levelled, fields)
@@ -121,13 +113,6 @@ def test_with_a_mounting_all_fields_are_in_one_frame(levelled):
     after = Rotation.from_quat(found[:, ORIENTATION])
     np.testing.assert_allclose(after.apply(found[:, ANGULAR_VELOCITY]),
                                before.apply(fields[:, ANGULAR_VELOCITY]))
-
-
-def test_corrected_messages_have_the_frame_they_are_in(calibration, levelled):
-    assert output_frame(calibration, 'imu_link', 'base') == 'imu_link'
-    assert output_frame(levelled, 'imu_link') == 'imu_link_levelled'
-    assert output_frame(levelled, 'imu_link', 'base') == 'base'
-    assert output_frame(levelled.in_sensor_frame, 'imu_link', 'base') == 'imu_link'
 
 
 def test_a_known_covariance_is_transformed_and_grows_by_that_of_the_calibration(levelled):
@@ -152,14 +137,6 @@ def test_the_bias_of_the_gyro_is_subtracted_before_the_rate_is_turned(turned):
         expected = fields[ANGULAR_VELOCITY] - np.array(bias) * known
         np.testing.assert_allclose(doubles_of(rewriter(data, {}))[ANGULAR_VELOCITY],
                                    used.rotation.T @ expected, rtol=1e-12)
-
-
-def swapped(data):
-    """Return a little-endian message as a big-endian machine writes it."""
-    begin = layout_of(data).begin
-    stamp = struct.unpack_from('<iII', data, 4)
-    return b'\0\0\0\0' + struct.pack('>iII', *stamp) + data[16:begin] + doubles_of(data).astype(
-        '>f8').tobytes()
 
 
 @pytest.mark.parametrize('ros2', [False, True])
@@ -305,41 +282,6 @@ def test_a_covariance_that_is_not_finite_becomes_unknown(part, turned):
     data = message(doubles)
     found = rewriter_of(data, calibration_of({}, turned=turned))(data, {'temperature': 25.0})
     np.testing.assert_array_equal(doubles_of(found)[part], 0.0)
-
-
-def damaged(data, rng):
-    """Return a message with bytes changed, removed or added."""
-    changed = bytearray(data)
-    kind = rng.integers(4)
-    if kind == 0:
-        changed[rng.integers(16)] = rng.integers(256)
-    elif kind == 1:
-        del changed[rng.integers(len(changed)):]
-    elif kind == 2:
-        changed[12:16] = rng.bytes(4)
-    else:
-        changed += rng.bytes(rng.integers(1, 9))
-    return bytes(changed)
-
-
-def refusal(data):
-    """Return why a message is refused; empty if it is not."""
-    try:
-        joined([data], 37, 'imu')
-    except AccelCalibError as error:
-        return str(error)
-    return ''
-
-
-def test_bytes_that_are_no_message_have_no_layout_or_end_in_one_error():
-    rng, refused = np.random.default_rng(5), 0
-    for _ in range(COUNT):
-        data = damaged(random_message(rng)[0], rng)
-        layout, error = layout_of(data), refusal(data)
-        assert layout is None or (len(data) == layout.size and not error)
-        assert not error or 'damaged, expected a whole message' in error
-        refused += bool(error)
-    assert refused > COUNT // 2
 
 
 OTHERS = [name for name, effect in EFFECTS.items() if not effect.linear]

@@ -8,7 +8,7 @@ from accel_calib.errors import InputError
 from inside import correct, linear_model, Model, parse_effect, predict, rotation_from_rpy
 import numpy as np
 import pytest
-from shared import random_directions
+from shared import context_of, random_directions, values_of
 
 
 @pytest.fixture
@@ -16,24 +16,13 @@ def rng():
     return np.random.default_rng(7)
 
 
-@pytest.fixture
-def context(rng):
-    return {'temperature': rng.uniform(0, 50, 40), 'std': rng.uniform(0, 0.2, (40, 3)),
-            'time': 1000.0 + np.sort(rng.uniform(0, 7200, 40)),
-            'supply_voltage': rng.uniform(3, 3.6, 40), 'rate': rng.normal(size=(40, 3)),
-            'previous': random_directions(40, rng)}
-
-
 ADDED = [name for name, effect in EFFECTS.items() if not effect.output]
-SHAPES = {'start': 1000.0, 'tau': 900.0, 'instant': 4000.0, 'lag': 200.0, 'of_sensor': 0.0,
-          'form': 1.0}
 
 
 @pytest.mark.parametrize('name', ADDED)
-def test_basis_and_slope_are_the_derivatives_by_the_values_and_by_the_force(name, rng, context):
-    effect, force = EFFECTS[name], random_directions(40, rng)
-    values = np.array([*rng.normal(size=len(effect.parameters)) * effect.typical * 0.3,
-                       *(SHAPES[part] for part in effect.shape)])
+def test_basis_and_slope_are_the_derivatives_by_the_values_and_by_the_force(name, rng):
+    effect, force, context = EFFECTS[name], random_directions(40, rng), context_of(rng, 40)
+    values = values_of(name, 0.15 * rng.normal(size=18))
     basis = Model({name: values}).basis(force, context).full
     for k, part in enumerate(effect.values):
         if part in ('start', 'instant', 'of_sensor', 'form'):  # taken from the data, not fitted

@@ -8,9 +8,6 @@ The poses of columns are simulated with numpy alone.
 
 """
 
-import subprocess
-import sys
-
 import accel_calib as ac
 from accel_calib.effects import AXES, by_axis, Effect, EFFECTS, ONE
 from accel_calib.errors import InputError
@@ -23,14 +20,12 @@ import numpy as np
 import pandas as pd
 import pytest
 from rosbags.typesys import get_typestore, Stores
-from shared import random_directions, run, run_json
+from shared import python, random_directions, refused, run, run_json, SENSOR
 
 NEW = Effect('offset that grows with the cube of temperature', 'third-order TCO', AXES, 'g',
              0.005, 0.5, by_axis(ONE),
              lambda context, shape: ((context['temperature'] - 25.0) / 20.0) ** 3,
              ('temperature',))
-SENSOR = {'offset': [0.02, -0.01, 0.03], 'axis_gain': [0.01, -0.02, 0.005],
-          'cross_axis': [0.004, 0.002, -0.003]}
 VALUES = [0.02, -0.015, 0.01]
 
 
@@ -159,17 +154,16 @@ def test_an_own_effect_is_simulated_named_stored_and_needed(tmp_path, capsys):
                                [0.01, -0.008, 0.006], atol=1e-3)
 
     def verified(*more):
-        command = [sys.executable, *COMMAND, 'verify', str(poses), '-c', str(stored), *more]
-        done = subprocess.run(command, capture_output=True, text=True)
+        done = python(*COMMAND, 'verify', poses, '-c', stored, *more)
         return done.returncode, done.stderr.splitlines()
 
     status, (line,) = verified()
     assert status == 2
     assert 'needs the effect' in line
     assert '--also FILE.py' in line
-    assert verified('--also', str(own)) == (0, [])
+    assert verified('--also', own) == (0, [])
     own.write_text(OWN.replace('0.05', '0.06'))
-    status, (line,) = verified('--also', str(own))
+    status, (line,) = verified('--also', own)
     assert status == 2
     assert 'another definition' in line
 
@@ -206,8 +200,7 @@ def test_an_own_effect_does_not_hide_one_of_the_catalogue():
     ('def\n', 'SyntaxError')])
 def test_a_file_without_own_effects_is_refused(text, message, tmp_path, capsys):
     (tmp_path / 'own.py').write_text(text)
-    assert run('refine', 'poses.csv', '--also', tmp_path / 'own.py') == 2
-    assert message in capsys.readouterr().err
+    assert message in refused(capsys, 'refine', 'poses.csv', '--also', tmp_path / 'own.py')
 
 
 def test_a_recording_gives_its_poses_any_other_column(tmp_path):

@@ -3,8 +3,6 @@
 
 """Noise figures from a long rest, by Allan deviation."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 import json

@@ -18,7 +18,7 @@ from inside import (
     model_with, ROWS_OF_A_TEXT, simulate_poses, simulate_recording, spread_directions)
 import numpy as np
 import pytest
-from shared import run, sensor, with_effects
+from shared import refused, run, sensor, with_effects
 
 UNITS = units_of('m/s2')
 LOW, HIGH = 20.0, 30.0
@@ -202,8 +202,7 @@ def test_an_error_in_a_late_block_leaves_the_earlier_file(stored, tmp_path, monk
     path.write_text(''.join(lines))
     write_table(out, samples_of(10))
     before = out.read_bytes()
-    assert run('apply', path, '-c', stored, '-o', out) == 2
-    assert 'line 4501' in ' '.join(capsys.readouterr().err.split())
+    assert 'line 4501' in refused(capsys, 'apply', path, '-c', stored, '-o', out)
     assert out.read_bytes() == before
     assert sorted(each.name for each in tmp_path.iterdir()) == ['out.csv', 'recording.csv']
 

@@ -3,8 +3,6 @@
 
 """The metadata of the package are consistent, and all files are shipped."""
 
-from __future__ import annotations
-
 import importlib
 import os
 from pathlib import Path

@@ -21,9 +21,9 @@ from accel_calib.units import Units
 from inside import (
     all_drawings, axis_figures, comparison_page, curve_parts, history_page, linear_model,
     model_with, residuals_of, residuals_of_refinement, sheet, simulate_poses, snippets)
-from live_bench import chromium, PATIENCE
+from live_bench import PATIENCE
 import numpy as np
-from playwright.sync_api import expect, sync_playwright
+from playwright.sync_api import expect
 import pytest
 from shared import random_directions, SENSOR
 
@@ -142,14 +142,6 @@ def test_hostile_names_are_text(calibration, poses):
                             [hostile, hostile])
     assert shown.count('<script>') == 1
     assert '<b onload' not in shown
-
-
-@pytest.fixture(scope='module')
-def browser():
-    with sync_playwright() as playwright:
-        started = chromium(playwright)
-        yield started
-        started.close()
 
 
 def opened(browser, path, text):

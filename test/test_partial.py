@@ -18,6 +18,7 @@ from inside import (
     spread_directions, unit, with_vector)
 import numpy as np
 import pytest
+from shared import rms
 
 G, NATIVE = units_of('g'), units_of('native')
 UP, Z = spread_directions(200), np.array([[0.0, 0.0, 1.0]])
@@ -56,10 +57,6 @@ def fitted(request):
     """Return common sensors, each with its fit to 1 or 7 poses."""
     pairs = [tilting((seed, request.param), request.param) for seed in range(100)]
     return [(model, fit_partial(poses, G)) for model, poses in pairs]
-
-
-def rms(values, axis=None):
-    return np.sqrt(np.mean(np.square(values), axis=axis))
 
 
 def test_stated_uncertainties_of_values_tilt_and_all_directions_hold(fitted):

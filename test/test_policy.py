@@ -3,16 +3,10 @@
 
 """The layouts show topics of the policy for SROS 2; test_ros_services compares it with nodes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
-import json
 from pathlib import Path
 import re
-from typing import Any
 from xml.etree import ElementTree
-
-import yaml
 
 CONFIG = Path(__file__).parent.parent / 'config'
 FILE = CONFIG / 'sros2_policy.xml'
@@ -42,42 +36,18 @@ def names_of_the_calibrator() -> set[str]:
             | granted(profile, 'services', 'reply'))
 
 
-def of_rviz() -> set[str]:
-    layout = yaml.safe_load((CONFIG / 'calibrator.rviz').read_text(encoding='utf-8'))
-    return {display['Topic']['Value'] for display in layout['Visualization Manager']['Displays']
-            if 'Topic' in display}
-
-
-def of_foxglove() -> set[str]:
-    """Return the topics and services; a path is a topic and fields."""
-    def of(value: Any) -> set[str]:
-        if isinstance(value, str):
-            found = re.match(r'(/[\w/]+)(\.[\w.@]+)?$', value)
-            return {found.group(1)} if found else set()
-        items = [*value, *value.values()] if isinstance(value, dict) else value
-        return {name for item in items for name in of(item)} if isinstance(
-            items, list) else set()
-
-    return of(json.loads((CONFIG / 'foxglove.json').read_text(encoding='utf-8'))['configById'])
-
-
-def of_plotjuggler() -> set[str]:
-    """Return the topics of the curves, of the equations and of the subscription."""
-    root = ElementTree.parse(CONFIG / 'plotjuggler.xml').getroot()
-    sources = [element.text for tag in ('linked_source', 'v1', 'v2') for element in root.iter(tag)]
-    curves = {element.get('name') for element in root.iter('curve')}
-    made = {element.get('name') for element in root.iter('snippet')}
-    subscribed = {name for element in root.iter('selected_topics')
-                  for name in element.get('value').split(';')}
-    of_series = {next((topic for topic in subscribed if one.startswith(f'{topic}/')), one)
-                 for one in [*sources, *(curves - made)]}
-    return subscribed | of_series
+def shown_by(layout: str, names: set[str]) -> set[str]:
+    """Return the topics and services in a file; of a series of a topic, the topic."""
+    text = (CONFIG / layout).read_text(encoding='utf-8')
+    return {next((name for name in names if found.startswith(f'{name}/')), found)
+            for found in re.findall(r'["\s;>](/[a-z][\w/]*)', text)}
 
 
 def test_each_layout_shows_topics_of_the_calibrator_and_all_together_what_it_publishes() -> None:
     names = {'/' + name.replace('~/', 'calibrator/').lstrip('/')
              for name in names_of_the_calibrator()}
-    layouts = [of_rviz(), of_foxglove(), of_plotjuggler()]
+    layouts = [shown_by(layout, names) for layout in (
+        'calibrator.rviz', 'foxglove.json', 'plotjuggler.xml')]
     assert all(set() < topics <= names for topics in layouts), layouts
     assert set().union(*layouts) >= {
         '/imu/data_raw', '/imu/data_calibrated', '/calibrator/poses', '/calibrator/still',

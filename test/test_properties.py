@@ -6,7 +6,7 @@
 
 import accel_calib as ac
 from accel_calib.calibrate import Calibration, fit_poses, outlook
-from accel_calib.effects import effect_named, EFFECTS, empirical_name, modes_of, VARIABLES
+from accel_calib.effects import EFFECTS, empirical_name, modes_of, VARIABLES
 from accel_calib.errors import InputError, RefusedFitError
 from accel_calib.finding import has
 from accel_calib.findings import rate
@@ -17,7 +17,7 @@ from inside import (
     spread_directions)
 import numpy as np
 import pytest
-from shared import random_directions
+from shared import context_of, random_directions, values_of
 
 hypothesis = pytest.importorskip('hypothesis')
 st = pytest.importorskip('hypothesis.strategies')
@@ -29,9 +29,6 @@ OUTPUT = [name for name, effect in EFFECTS.items() if effect.output]
 ADDED = [name for name in EFFECTS if name not in OUTPUT]
 CURVES = [empirical_name({'force': 'offset', 'direction': 'force'}.get(variable, 'gain'), variable,
                          modes_of(variable)[::2][:2]) for variable in VARIABLES]
-
-SHAPES = {'start': 1000.0, 'tau': 900.0, 'instant': 4000.0, 'lag': 200.0, 'of_sensor': 0.0,
-          'form': 1.0, 'low': 10.0, 'high': 3000.0}
 
 SEEDS = st.integers(0, 2 ** 32 - 1)
 COUNTS = st.integers(14, 30)
@@ -57,22 +54,6 @@ def tried(count):
     phases = [hypothesis.Phase.generate]  # a failing case is not made simpler: that takes minutes
     return hypothesis.settings(max_examples=count, deadline=None, derandomize=True, database=None,
                                phases=phases, suppress_health_check=list(hypothesis.HealthCheck))
-
-
-def context_of(rng, count):
-    """Return random context that every effect accepts."""
-    return {'temperature': rng.uniform(-20, 60, count), 'std': rng.uniform(0, 0.2, (count, 3)),
-            'time': 1000.0 + np.sort(rng.uniform(0, 7200, count)),
-            'supply_voltage': rng.uniform(3, 3.6, count), 'rate': rng.normal(size=(count, 3)),
-            'previous': random_directions(count, rng),
-            'temperature_rate': rng.uniform(-0.1, 0.1, count)}
-
-
-def with_values(name, parts):
-    """Return the values of an effect: parts of twice its typical size, and its shape."""
-    effect = effect_named(name)
-    values = [2.0 * effect.typical * part for part in parts[:len(effect.parameters)]]
-    return {name: np.array([*values, *(SHAPES[part] for part in effect.shape)])}
 
 
 def poses_of(errors, count, seed, angles, *, known=False):
@@ -115,7 +96,7 @@ def assert_equal_forces(found, expected, reading, other_reading):
 @given(parts=PARTS, seed=SEEDS, angles=ANGLES)
 def test_predict_and_correct_undo_each_other(name, parts, seed, angles):
     rng = np.random.default_rng(seed)
-    model = Model(with_values(name, parts), rotation_from_rpy(*angles))
+    model = Model({name: values_of(name, parts)}, rotation_from_rpy(*angles))
     force, context = random_directions(12, rng), context_of(rng, 12)
     reading = predict(model, force, context)
     np.testing.assert_allclose(correct(model, reading, context), force, atol=1e-11)

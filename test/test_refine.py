@@ -175,15 +175,6 @@ def test_shared_orientation_shows_temperature_across_gravity():
     np.testing.assert_allclose(values, [5e-4, 4e-4, -4e-4, 0.0, 0.0], atol=3e-5)  # without lag
 
 
-def test_an_effect_that_was_tested_is_not_listed_as_untestable(taken):
-    listed = [effect for effect, _ in refine(taken(13, poses=60)[0], MPS2).not_testable]
-    assert listed == ['misalignment']
-    bare = refine(taken(13, poses=60, dropped=('temperature', 'time'))[0], MPS2).not_testable
-    assert {'offset_temperature', 'offset_temperature_quadratic', 'gain_temperature',
-            'temperature_rate', 'offset_drift', 'warm_up', 'offset_step', 'gain_drift',
-            'gain_step', 'offset_wander', 'misalignment'} == {effect for effect, _ in bare}
-
-
 def test_a_long_table_is_refined_from_a_sample_and_says_so(monkeypatch):
     monkeypatch.setattr(*LARGEST_SAMPLE, 400)
     rng = np.random.default_rng(4)

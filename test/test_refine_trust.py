@@ -70,17 +70,6 @@ def test_a_temperature_that_is_not_recorded_leaves_no_absurd_offset(seed, is_ref
         assert found.remaining_gap_mg > 0.01
 
 
-def test_an_effect_that_the_catalogue_lacks_leaves_a_sound_calibration():
-    rng = np.random.default_rng(0)
-    warm = rng.uniform(0.0, 50.0, 200)
-    model = with_effects(rng)
-    poses = poses_of(model, rng, 200, temperature=warm, time=np.arange(200) * 20.0)
-    curve = ((warm - 25.0) / 25.0)[:, np.newaxis] ** 3 * rng.normal(size=3) * 0.006
-    found = refine(plus(poses, curve), G)
-    assert not found.refusal
-    np.testing.assert_allclose(found.calibration.offset, model.linear_part[1], atol=0.02)
-
-
 def test_a_refinement_warns_of_what_a_fit_warns_of():
     poses = near_up(np.random.default_rng(1), 62.0)
     expected = {words for words in fit_poses(poses, G).warnings if 'do not determine' in words}

@@ -3,8 +3,6 @@
 
 """Bias of the gyro and noise of the samples, from simulated and real rests."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from accel_calib.calibrate import fit_poses, gyro_bias_of, GyroBias, level, sample_noise_of

@@ -3,8 +3,6 @@
 
 """The simulated Imu, and the demonstration with it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 import json
 from pathlib import Path

@@ -3,8 +3,6 @@
 
 """The short form of `benchmarks/long_run.py`: rounds of captures, fits and refinements."""
 
-from __future__ import annotations
-
 from pathlib import Path
 import sys
 

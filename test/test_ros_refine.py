@@ -13,6 +13,7 @@ from accel_calib.effects import empirical_name
 from accel_calib.stored import read_calibration, write_calibration
 from diagnostic_msgs.msg import DiagnosticArray
 from inside import spread_directions
+from inside_ros import force_of
 import numpy as np
 import pytest
 from sensor_msgs.msg import BatteryState, FluidPressure, Imu, Temperature
@@ -23,11 +24,6 @@ Readings = Callable[..., Any]
 POSES = 26
 MOVES = np.array([0.002, -0.0015, 0.001])
 """Offset per ampere [g]."""
-
-
-def force_of(message: Imu) -> list[float]:
-    force = message.linear_acceleration
-    return [force.x, force.y, force.z]
 
 
 def message(publisher: Any, value: float) -> Any:

@@ -3,16 +3,10 @@
 
 """Shutdown of the nodes by signals and by a kill, and restart."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
-from itertools import product
-import os
 from pathlib import Path
 import shutil
 import signal
-import subprocess
-import sys
 from typing import Any
 
 from accel_calib.logs import write_table
@@ -32,12 +26,10 @@ TROUBLE = ('Traceback', 'FATAL', 'ERROR', 'Fatal Python error', 'Failed to')
 """What no node may print at its end: of Python, of the log, and of the layers below."""
 
 
-@pytest.mark.parametrize(('name', 'number'), sample(
-    product(('calibrator', 'simulator'), (signal.SIGINT, signal.SIGTERM)), 2))
-def test_signals_end_the_nodes_with_status_0(bench: Any, name: str, number: int) -> None:
-    node = bench.start(name)
-    bench.spin(lambda: bench.node.count_publishers('imu/data_calibrated')
-               or bench.node.count_publishers('imu/data_raw'))
+@pytest.mark.parametrize('number', sample((signal.SIGINT, signal.SIGTERM), 1))
+def test_signals_end_the_simulator_with_status_0(bench: Any, number: int) -> None:
+    node = bench.start('simulator')
+    bench.spin(lambda: bench.node.count_publishers('imu/data_raw'))
     bench.spin(iter([False, False, True]).__next__)
     status, printed = bench.end(node, number)
     assert status == 0, printed
@@ -123,14 +115,3 @@ def test_bad_parameters_get_one_line_and_status_2(
     assert node.returncode == 2
     assert words in printed
     assert len(printed.strip().splitlines()) == 1, printed
-
-
-def test_without_ros_there_is_one_line_and_status_2(tmp_path: Path) -> None:
-    (tmp_path / 'rclpy.py').write_text("raise ImportError('no rclpy')\n")
-    paths = [str(tmp_path), str(ROOT)]
-    done = subprocess.run(
-        [sys.executable, *CALIBRATOR], env={**os.environ, 'PYTHONPATH': os.pathsep.join(paths)},
-        capture_output=True, text=True, timeout=60, check=False, cwd=tmp_path)
-    assert done.returncode == 2
-    assert 'source /opt/ros/jazzy/setup.bash' in done.stderr
-    assert len(done.stderr.splitlines()) == 1

@@ -3,8 +3,6 @@
 
 """What a robot in the field meets: transforms, several drivers, QoS, a preview, signals."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import json
 import math
@@ -19,7 +17,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from faults.sample import sample
 from geometry_msgs.msg import Vector3
 from inside import CALIBRATOR, NODES, rotation_from_rpy, spread_directions
-from inside_ros import publish_static
+from inside_ros import force_of, publish_static
 import numpy as np
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -30,11 +28,6 @@ GRAVITY = 9.80665
 
 Readings = Callable[..., Any]
 Stored = Callable[..., Path]
-
-
-def force_of(message: Imu) -> Any:
-    vector = message.linear_acceleration
-    return np.array([vector.x, vector.y, vector.z])
 
 
 def test_the_mounting_comes_from_the_static_transforms_and_is_published(

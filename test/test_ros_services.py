@@ -3,13 +3,10 @@
 
 """The services, the parameters, and all names of the nodes, as stated in files of config/."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 import re
-from textwrap import wrap
 from typing import Any
 
 from accel_calib.errors import InputError
@@ -17,9 +14,7 @@ from accel_calib.logs import read_poses
 from accel_calib.session import CalibratorSettings
 from accel_calib.units import units_of
 from diagnostic_msgs.msg import DiagnosticArray
-from inside import (
-    capture_settings, changed, default_of, expected, Model, plan_for, simulate_poses,
-    spread_directions)
+from inside import capture_settings, changed, Model, plan_for, simulate_poses, spread_directions
 from inside_ros import pose_markers, SimulatorSettings
 import numpy as np
 import pytest
@@ -27,7 +22,6 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import Bool
 from test_policy import granted, optional_elements, profile_of
 from visualization_msgs.msg import MarkerArray
-import yaml
 
 Readings = Callable[..., Any]
 Stored = Callable[..., Path]
@@ -109,34 +103,6 @@ def test_self_test_names_what_fails(bench: Any, stored: Stored) -> None:
     answer = bench.call('self_test')
     assert answer.passed == b'\x01', [status.message for status in answer.status]
     assert answer.id == 'imu_link'
-
-
-CONFIG = Path(__file__).parent.parent / 'config' / 'calibrator.yaml'
-WIDTH = 99
-COMMENT = '    # '
-
-
-def yaml_lines() -> Iterator[str]:
-    """Yield the lines of a parameter file with all defaults, for any node name."""
-    yield '# Parameters of the calibrator with their defaults; generated from'
-    yield '# accel_calib/session/settings.py. Parameters with * can be set while the node runs.'
-    yield '/**:'
-    yield '  ros__parameters:'
-    for each in fields(CalibratorSettings):
-        live = ' *' if each.metadata['live'] else ''
-        words = f"{each.metadata['words']} ({expected(each)}){live}"
-        yield from wrap(words, WIDTH, initial_indent=COMMENT, subsequent_indent=COMMENT)
-        value = default_of(each)
-        yield f'    {each.name}: {str(value).lower() if isinstance(value, bool) else repr(value)}'
-
-
-def test_parameter_file_describes_all_parameters_and_has_their_defaults() -> None:
-    """Check the file; write it with: python test/test_ros_services.py."""
-    text = CONFIG.read_text(encoding='utf-8')
-    assert text.splitlines() == list(yaml_lines())
-    given = yaml.safe_load(text)['/**']['ros__parameters']
-    assert CalibratorSettings(**given) == CalibratorSettings()
-    assert list(given) == [parameter.name for parameter in fields(CalibratorSettings)]
 
 
 def test_parameters_accept_numbers_of_other_types_and_lists() -> None:
@@ -235,7 +201,3 @@ def test_each_node_uses_all_that_the_policy_grants_and_nothing_else(
     bench.spin(lambda: node in bench.node.get_node_names())
     bench.spin(lambda: all(expected[right] <= names for right, names in used(bench, node).items()))
     assert used(bench, node) == expected
-
-
-if __name__ == '__main__':
-    CONFIG.write_text('\n'.join(yaml_lines()) + '\n', encoding='utf-8')

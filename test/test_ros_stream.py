@@ -3,21 +3,19 @@
 
 """Processing of messages between imu/data_raw and imu/data_calibrated."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 import math
 import os
 from pathlib import Path
-import struct
 from typing import Any
 
-from accel_calib.logs import layout_of
 from accel_calib.stored import read_calibration
+from bag_files import swapped
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Quaternion, Vector3, Vector3Stamped
 from inside import Model
+from inside_ros import force_of
 import numpy as np
 import pytest
 from rclpy.serialization import serialize_message
@@ -32,11 +30,6 @@ KNOWN = np.array([4.0, 1.0, 0.0, 1.0, 5.0, 0.5, 0.0, 0.5, 6.0]) * 1e-3
 FLAT = np.array([0.2, -0.4, 0.8]) / np.sqrt(0.84)
 
 Stored = Callable[..., Path]
-
-
-def force_of(message: Imu) -> Any:
-    vector = message.linear_acceleration
-    return np.array([vector.x, vector.y, vector.z])
 
 
 def rate_of(message: Imu) -> Any:
@@ -161,16 +154,6 @@ def test_motion_is_the_force_without_the_gravity_of_the_last_rest(
     bench.spin(lambda: abs(motion[-1].vector.z - push[2]) < 0.02)
     got = motion[-1].vector
     np.testing.assert_allclose([got.x, got.y, got.z], push, atol=0.02)
-
-
-def swapped(data: bytes) -> bytes:
-    """Return a little-endian message as a big-endian machine writes it."""
-    layout = layout_of(data)
-    assert layout is not None
-    stamp = struct.unpack_from('<iII', data, 4)
-    doubles = np.frombuffer(data, '<f8', -1, layout.begin)
-    return (b'\x00\x00\x00\x00' + struct.pack('>iII', *stamp) + data[16:layout.begin]
-            + doubles.astype('>f8').tobytes())
 
 
 def test_messages_in_another_encoding_are_corrected_and_unusable_ones_dropped_and_reported(

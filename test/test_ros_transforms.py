@@ -3,8 +3,6 @@
 
 """Static transforms: the tree of frames, and the topic /tf_static."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -3,8 +3,6 @@
 
 """Services that answer later, in every executor, and the worker process."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 import math
 import os

@@ -9,8 +9,6 @@ the user states (parameter or option `sensor`). An unnamed one fits every sensor
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Generator
 from dataclasses import replace
 from pathlib import Path

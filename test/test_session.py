@@ -3,8 +3,6 @@
 
 """The calibrator without ROS: files of each sensor, accepted messages and refusals."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 import errno

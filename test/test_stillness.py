@@ -3,8 +3,6 @@
 
 """The stillness detector: many sensors, tremor, slow turning, real recordings."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from accel_calib.capture import (

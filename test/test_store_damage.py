@@ -3,8 +3,6 @@
 
 """Whatever is in place of the stored files, the calibrator starts, says so, and works."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 import os
 from pathlib import Path
@@ -31,9 +29,7 @@ Readings = Callable[..., Any]
 @pytest.fixture
 def folder() -> Iterator[Path]:
     """Yield a folder of a user who cannot read everything, unlike root."""
-    as_root = os.geteuid() == 0
-    # TMPDIR may be a folder of root alone.
-    made = Path(tempfile.mkdtemp(dir='/tmp' if as_root else None))
+    as_root, made = os.geteuid() == 0, Path(tempfile.mkdtemp())
     if as_root:
         os.chown(made, NOBODY, NOBODY)
         os.seteuid(NOBODY)

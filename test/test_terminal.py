@@ -3,8 +3,6 @@
 
 """Text on terminals of any width and encoding, wrong arguments, and ``accel-calib watch``."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 import io
 import json
@@ -20,7 +18,7 @@ import accel_calib as ac
 from accel_calib.errors import InputError
 from accel_calib.session import Progress
 from inside import (
-    changes, COMMAND, in_one_line, main, Output, screen, shown, state, unit, words_of)
+    CALIBRATOR, changes, COMMAND, in_one_line, main, Output, screen, shown, state, unit, words_of)
 import numpy as np
 import pytest
 from rich.console import Console
@@ -348,11 +346,11 @@ def test_end_of_the_poses_is_clear() -> None:
     assert list(state(NODE, ENOUGH))[-1] == f'ros2 service call {NODE}/fit std_srvs/srv/Trigger'
 
 
-def test_missing_ros_is_one_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize('command', [(*COMMAND, 'watch', '--once'), CALIBRATOR])
+def test_missing_ros_is_one_line(command: tuple[str, ...], tmp_path: Path) -> None:
     for name in ('diagnostic_msgs', 'rclpy'):
         (tmp_path / f'{name}.py').write_text(f"raise ImportError('no {name}')\n")
-    done = python(*COMMAND, 'watch', '--once', folder=tmp_path,
-                  PYTHONPATH=f'{tmp_path}{os.pathsep}{ROOT}')
+    done = python(*command, folder=tmp_path, PYTHONPATH=f'{tmp_path}{os.pathsep}{ROOT}')
     assert done.returncode == 2
     line, = done.stderr.splitlines()
     assert 'ROS 2 is not installed' in line

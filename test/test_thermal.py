@@ -11,7 +11,7 @@ from inside import (
     TemperatureHistory, ThermalStream)
 import numpy as np
 import pytest
-from shared import random_directions
+from shared import random_directions, rms, SENSOR
 
 KEY = 'temperature_of_offset'
 START = 1.7e9
@@ -32,10 +32,6 @@ class Wave:
         turned = self.speed * (self.lag if lag is None else lag)
         angle = np.multiply.outer(time, self.speed) + self.phase - np.arctan(turned)
         return 25.0 + np.sin(angle) @ (self.size / np.hypot(1.0, turned))
-
-
-def rms(errors):
-    return float(np.sqrt(np.mean(np.square(errors))))
 
 
 def stepped(temperature, step):
@@ -128,10 +124,6 @@ def test_stream_begins_with_the_first_temperature_and_again_if_the_time_jumps_ba
     assert stream.value == {'temperature_rate': 0.0, **dict.fromkeys(LAGS, 30.0)}
 
 
-BASE = {'offset': [0.02, -0.01, 0.03], 'axis_gain': [0.01, -0.02, 0.005],
-        'cross_axis': [0.004, 0.002, -0.003]}
-
-
 @pytest.mark.parametrize('effect', ['offset_temperature', 'gain_temperature'])
 @pytest.mark.parametrize('of_sensor', [0.0, 1.0])
 @pytest.mark.parametrize('lag', [40.0, 150.0])
@@ -142,9 +134,9 @@ def test_fit_recovers_the_lag_within_its_uncertainty(effect, of_sensor, lag):
     temperature = stepped(Wave(rng, 60.0).low_passed(time), 0.01)
     context = {'time': time, 'temperature': temperature}
     values = np.array([1e-3, -1.5e-3, 1.2e-3, lag, of_sensor])
-    true = Model({**{name: np.array(each) for name, each in BASE.items()}, effect: values})
+    true = Model({**{name: np.array(each) for name, each in SENSOR.items()}, effect: values})
     poses = simulate_poses(true, random_directions(count, rng), rng, context=context)
-    start = Model({**{name: np.zeros(3) for name in BASE},
+    start = Model({**{name: np.zeros(3) for name in SENSOR},
                    effect: np.array([5e-4, -5e-4, 5e-4, 1.5 * lag, of_sensor])})
     fit = estimate(start, with_history(poses, start))
     assert fit.model.needs == ('temperature', 'time')

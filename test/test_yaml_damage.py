@@ -3,8 +3,6 @@
 
 """Damaged and hostile calibration files end in a calibration or in one line."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -47,19 +45,15 @@ BOMBS: dict[str, tuple[str, str]] = {
     # libyaml 0.2.6 refuses these itself, before its first event.
     'lists': (nested('['), 'more than 8 levels|maximum nesting depth'),
     'mappings': (nested('{a: '), 'more than 8 levels'),
-    'compact lists': (f'{FIRST}x:\n{"- " * 100_000}1\n', 'more than 8 levels'),
     'compact keys': (f'{FIRST}{"? " * 100_000}1\n', 'a key is a mapping or a list'),
     'indented': (FIRST + ''.join(f'{" " * k}a:\n' for k in range(3000)), 'more than 8 levels'),
     'aliases': (FIRST + ''.join(f'x{k}: &x{k} [{", ".join(9 * [f"*x{k - 1}" if k else "1"])}]\n'
                                 for k in range(12)), "the anchor 'x0'"),
-    'alias of itself': (f'{FIRST}x: &x [*x]\n', "the anchor 'x'"),
     'alias alone': (f'{FIRST}x: *y\n', "the alias 'y'"),
-    'merged keys': (f'{FIRST}a: {{<<: *y}}\n', "the alias 'y'"),
     'code': (f'{FIRST}x: !!python/object/apply:os.system [exit]\n', 'the tag .*os.system'),
     'second file': (f'{FIRST}---\nx: 1\n', 'a second document starts'),
     'twice': (f'{FIRST}date: 1\ndate: 2\n', "line 3, the key 'date' is stated twice"),
     'date': (f'{FIRST}date: 2001-99-99\n', "at date, line 2, the value is '2001-99-99'"),
-    'no digits': (f'{FIRST}x:\n  y: 0x_\n', "at x.y, line 3, the value is '0x_'"),
     'octal': (f'{FIRST}x: 010\n', "the value is '010', expected a decimal number"),
     'minutes': (f'{FIRST}x: 1:30\n', "the value is '1:30', expected a decimal number"),
     'huge': (f'{FIRST}version: 1{400 * "0"}\n', "its version is '1000"),
@@ -195,7 +189,6 @@ DAMAGE = [
     ('version: 3\n', 'version: 4\n', 'has version 4, expected 3; update accel_calib, or fit'),
     ('version: 3\n', 'version: 2\n', 'has version 2, expected 3; fit the poses again'),
     ('version: 3\n', 'version: 0\n', 'its version is 0'),
-    ('version: 3\n', 'version: x\n', 'is damaged .* expected a whole calibration'),
     ('format: accel_calib calibration', 'format: other', 'is not a calibration of accel_calib'),
     ('frame: ros', 'frame: moon', "frame is 'moon', expected one of"),
     ('effects:', 'causes:', 'is damaged .* expected a whole calibration'),
@@ -207,24 +200,17 @@ DAMAGE = [
     ('rms_after_mg: ', 'rms_after_mg: soon, was: ', "rms_after_mg is 'soon', expected a finite"),
     ('\nchecksum: ', '\n# checksum: ', 'the checksum, is missing'),
     ('\nsensor: ', '\nnote: x\nsensor: ', "the key 'note' is not known"),
-    ('\nreason: ', '\nreasons: x\nreason: ', "the key 'reasons' is not known"),
     ('  row: ', '  rows: [1]\n  row: ', "the key 'rows' of poses is not known"),
     ('tau: ', 'tuu: 1.0, tau: ', "the key 'tuu' of an effect is not known"),
     ('reading:\n', 'reading:\n  - [0.0, 0.0, x]\n', "reading has shape|reading contains 'x'"),
-    ('count: [', 'count: [-1.0, ', 'count has shape|count holds'),
     ('offset: {', 'offset: {x: 1e200, ', 'stated twice'),
     ('rejected: []', 'rejected: [1]', 'rejected contains 1, expected names'),
-    ('findings: [', 'findings: [1, ', 'findings contains 1, expected names'),
     ('  bias: [', '  bias: [2.0, 0.0, 0.0]\n  was: [', 'below 1 in magnitude'),
     ('  bias: [', '  bias: [.nan, 0.0, 0.0]\n  was: [', 'bias contains a number that is not'),
-    ('  bias: [', '  bias: [0.0, 0.0]\n  was: [', 'bias has shape'),
-    ('  bias: [', '  bais: [', 'bias is missing'),
     ('  sd: [', '  sd: [-0.1, 0.0, 0.0]\n  was: [', 'expected 0 or more'),
     ('  rests: 24', '  rests: 0', 'has 0 rests, expected at least 1'),
-    ('  rests: 24', '  rests: many', 'expected a whole number'),
     ('  slope: [', '  slope: [0.1, 0.0, 0.0]\n  was: [', 'or none and no slope'),
     ('  temperatures: []', '  temperatures: [20.0]', 'between the lowest and the highest'),
-    ('  temperature: null', '  temperature: warm', 'temperature is .warm., expected a finite'),
     ('  force: [', '  force: [-1.0, 0.0, 0.0]\n  was: [', 'noise of the force'),
     ('  force: [', '  force: [.inf, 0.0, 0.0]\n  was: [', 'noise of the force'),
     ('\nnoise:\n', '\nnoise: 3\nwas:\n', 'noise is 3, expected names with values'),

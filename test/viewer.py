@@ -3,20 +3,18 @@
 
 """A host in a thread, and viewers of its page: clients of its WebSocket in their own threads."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 import json
 from pathlib import Path
 from threading import Event, Thread
-import time
 from typing import Any
 
 from accel_calib.session import CalibratorSettings, Log
 import aiohttp
 from inside import Host
+from shared import wait
 
 
 @contextmanager
@@ -112,11 +110,3 @@ def fetch(url: str, method: str = 'GET', **headers: str) -> tuple[int, dict[str,
             return found.status, dict(found.headers), await found.read()
 
     return asyncio.run(run())
-
-
-def wait(until: Callable[[], Any], seconds: float = 120.0) -> None:
-    """Wait until a condition holds."""
-    ends = time.monotonic() + seconds
-    while not until():
-        assert time.monotonic() < ends, f'not so within {seconds} s'
-        time.sleep(0.01)

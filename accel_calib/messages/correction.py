@@ -43,7 +43,7 @@ from numpy.typing import NDArray
 
 from .one_reading import AtReading, OneReading, Triple
 from ..calibrate import Calibration, of_samples, thermal_stream
-from ..effects import Context, ThermalStream
+from ..effects import ThermalStream
 from ..errors import InputError
 from ..geometry import quaternion_of
 from ..logs import (
@@ -61,7 +61,7 @@ def output_scale(calibration: Calibration, gravity: float) -> float:
     return 1.0 if calibration.units.is_si else gravity / calibration.force_per_g
 
 
-def corrected(calibration: Calibration, doubles: Floats, context: Context = {},
+def corrected(calibration: Calibration, doubles: Floats, context: Mapping[str, NDArray[Any]] = {},
               scale: float = 1.0) -> Floats:
     """
     Return the corrected doubles of Imu messages, (n, 37).

@@ -9,8 +9,6 @@ the response. ``python test/faults/caller.py SEED COUNT [NODE]``.
 
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import time

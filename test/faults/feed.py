@@ -3,8 +3,6 @@
 
 """Poses in a store before a node starts, and messages while its services are called."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 
 """Inputs of fuzz.py: small sound files of every kind, and random tables, trees and messages."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 import copy
 from dataclasses import dataclass
@@ -247,8 +245,7 @@ def _change(rng: Rng, content: Any) -> None:
 
 def random_messages() -> Callable[[Rng], Files]:
     """Return the maker of sound bags with damaged messages, times and names of topics."""
-    made = [(topic, stamp, bytes(bags.STORE.serialize_cdr(each, bags.TOPICS[topic][1])))
-            for topic, stamp, each in bags.messages()]
+    made = bags.raw_messages()
     words = ('/imu', '', '/imu\x1b[31m', 'imu', '/' + 300 * 'a', '/temperature', '/ä')
 
     def make(rng: Rng) -> Files:

@@ -3,8 +3,6 @@
 
 """Processes that write to files: a pipe that nobody reads would stop them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 import subprocess
 import sys

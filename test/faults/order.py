@@ -15,8 +15,6 @@ files at the end decide.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 import math

@@ -9,8 +9,6 @@ could not be read. ``python test/faults/reader.py CALIBRATION``; end it with a s
 
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 import sys

@@ -9,8 +9,6 @@ of cases run whole from 2 on.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 import os
 from typing import TypeVar

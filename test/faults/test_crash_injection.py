@@ -3,8 +3,6 @@
 
 """Any change of a file may fail or be the last one: each file is the old or the complete new."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

@@ -3,8 +3,6 @@
 
 """A part of the seeded cases of fuzz.py: every file ends in a result or in one line."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 from pathlib import Path
 import struct
@@ -30,11 +28,15 @@ def test_a_damaged_file_ends_in_a_result_or_in_one_line(kind: str) -> None:
     assert {*found.values()} == {'read', 'refused'}
 
 
+def flight() -> bytes:
+    """Return a flight log of two sensors."""
+    pytest.importorskip('pymavlink')
+    return (inputs.LOGS / 'ardupilot' / 'two_imus.bin').read_bytes()
+
+
 def test_a_damaged_flight_log_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]
                                              ) -> None:
-    pytest.importorskip('pymavlink')
-    path, sound = tmp_path / 'log.bin', inputs.sound('bin')[0]
-    data = sound.content[sound.name]
+    path, data = tmp_path / 'log.bin', flight()
     path.write_bytes(data[:len(data) // 2] + b'damage' + data[len(data) // 2:])
     assert 'between messages left out' in ' '.join(read_log(path).notes)
     assert capfd.readouterr() == ('', '')
@@ -82,9 +84,7 @@ def test_a_cut_definition_of_a_ulog_ends(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_a_field_of_a_flight_log_may_state_any_type(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip('pymavlink')
-    sound = next(each for each in inputs.sound('bin') if each.name == 'two_imus.bin')
-    data = sound.content[sound.name]
+    data = flight()
     letters = data.index(b'TimeUS,I,GyrX') - 16
     count = data.index(b'\0', letters) - letters
     changed = iter(sample(
@@ -98,9 +98,7 @@ def test_a_field_of_a_flight_log_may_state_any_type(monkeypatch: pytest.MonkeyPa
 
 
 def test_a_message_of_a_flight_log_with_a_field_without_name_is_left_out(tmp_path: Path) -> None:
-    pytest.importorskip('pymavlink')
-    sound = next(each for each in inputs.sound('bin') if each.name == 'two_imus.bin')
-    data = sound.content[sound.name]
+    data = flight()
     at = data.index(b'TimeUS,I,GyrX')
     names = data[at:at + 64].replace(b'GyrX', b'', 1).ljust(64, b'\0')
     path = tmp_path / 'log.bin'

@@ -3,8 +3,6 @@
 
 """Services that four processes call at random while messages arrive."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import json
 from pathlib import Path

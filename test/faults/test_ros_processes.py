@@ -3,11 +3,8 @@
 
 """Nodes that are killed at random times, and two nodes on one store: nothing answered is lost."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 import json
-import os
 from pathlib import Path
 import re
 import signal
@@ -20,13 +17,13 @@ from accel_calib.stored import read_calibration
 from faults.feed import send_until, start_poses
 from faults.logged import log_to_files
 from faults.order import AFTER, Call, State
+from faults.sample import FACTOR
 from inside import CALIBRATOR, is_partial, spread_directions
 import numpy as np
 import pytest
 
 pytest.importorskip('rclpy')
 
-FACTOR = int(os.environ.get('ACCEL_CALIB_TRIALS', '1'))
 KILLS = 6 * FACTOR
 SECONDS = 6.0 * FACTOR
 READER = Path(__file__).with_name('reader.py')

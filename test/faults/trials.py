@@ -10,8 +10,6 @@ line of JSON per trial.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 import ctypes

@@ -3,8 +3,6 @@
 
 """The result of a golden case: the table of the cases is ``cases.yaml``."""
 
-from __future__ import annotations
-
 from contextlib import redirect_stderr, redirect_stdout
 import csv
 import io

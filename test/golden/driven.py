@@ -3,8 +3,6 @@
 
 """Golden results of what runs while samples arrive: sessions without ROS, and messages."""
 
-from __future__ import annotations
-
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import replace
 import struct

@@ -3,8 +3,6 @@
 
 """The figures of results that the JSON of the commands rounds or leaves out."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -3,8 +3,6 @@
 
 """The pose tables and recordings of the golden cases, made by seeds; each function writes one."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

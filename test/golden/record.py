@@ -11,8 +11,6 @@ weighted sum, which changes with every number.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
 import json

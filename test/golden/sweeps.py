@@ -3,8 +3,6 @@
 
 """Golden results of functions over grids of their arguments, where recordings show only points."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import product

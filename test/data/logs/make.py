@@ -9,8 +9,6 @@ compare a fit with them. `README.md` has the source of each layout.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import struct
