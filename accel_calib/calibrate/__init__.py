@@ -13,7 +13,7 @@ determine, and plans the next pose. `thermal` is for a still board whose tempera
 """
 
 from .calibration import (
-    Calibration, check_sensor, converted, FLEET, of_samples, Outside, outside, PRIOR, Quality,
+    Calibration, check_sensor, FLEET, of_samples, Outside, outside, PRIOR, Quality,
     Rejected, RejectedKind, SampleContext, STORED_METHODS, thermal_stream, USES_LIMIT,
     with_history, with_previous)
 from .fit import (
@@ -36,7 +36,7 @@ __all__ = ['FLEET', 'LARGEST_DILUTION', 'LARGEST_OFFSET_G', 'NORM_MODELS', 'OF_A
            'STORED_METHODS', 'USES_LIMIT', 'Calibration', 'Curve', 'FleetPrior', 'GyroBias',
            'NextPose', 'Outlook', 'Outside', 'Quality', 'Rejected', 'RejectedKind',
            'SampleContext', 'SampleNoise', 'Verification', 'angle_words', 'check_sensor',
-           'converted', 'curve_of', 'determines', 'deviations_g', 'dilution', 'directions_in',
+           'curve_of', 'determines', 'deviations_g', 'dilution', 'directions_in',
            'directions_of', 'error_left_in', 'errors_after', 'errors_before', 'fit_findings',
            'fit_partial', 'fit_poses', 'fit_unknown', 'fit_with_fleet', 'flat_direction',
            'free_parameters', 'gated', 'gyro_bias_of', 'identifiability', 'in_frame', 'in_g',
