@@ -576,8 +576,7 @@ def _vibration_range(calibration: Calibration) -> dict[str, tuple[float, float]]
             if variable_of(name) == 'std']
     if not ends:
         return {}
-    return {'std': (float(np.max([low for low, _ in ends])),
-                    float(np.min([high for _, high in ends])))}
+    return {'std': (float(np.max(ends, axis=0)[0]), float(np.min(ends, axis=0)[1]))}
 
 
 class SampleContext:
