@@ -567,8 +567,8 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
     _check_within(poses=(poses, 1, _MOST_ROWS), samples=(samples, 1, _MOST_ROWS),
                   noise=(noise, 0, LARGEST), seed=(seed, 0, math.inf))
     if recording:
-        _check_within(**{'poses * (dwell + turn) * rate': (
-            poses * (dwell + turn) * rate, 0, _MOST_ROWS)})
+        count = poses * (dwell + turn) * rate
+        _check_within(**{'poses * (dwell + turn) * rate': (count, 0, _MOST_ROWS)})
     known = units_of(units, gravity)
     # The attitude transforms from sensor to robot axes, ΔR from robot to sensor axes.
     rotation = mounting_of(np.radians(np.asarray(mounting, float)))

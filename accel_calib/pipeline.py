@@ -374,13 +374,8 @@ def is_partial(calibration: Calibration) -> bool:
 
 
 def _lie_in_cone(poses: Poses, units: Units) -> bool:
-    if units.is_native:
-        return False
-    try:
-        up = directions_of(poses, units)
-    except RefusedFitError:
-        return False
-    return len(up) >= FEWEST_IN_CONE and lies_in_cone(up)
+    return (not units.is_native and len(poses) >= FEWEST_IN_CONE
+            and lies_in_cone(directions_of(poses, units)))
 
 
 def _mounted_as(before: Calibration, calibration: Calibration) -> Calibration:

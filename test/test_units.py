@@ -10,7 +10,7 @@ import re
 from typing import Any
 
 import accel_calib as ac
-from accel_calib.calibrate import converted, fit_poses
+from accel_calib.calibrate import fit_poses
 from accel_calib.errors import InputError
 from accel_calib.logs import LogOptions, read_recording, write_table
 from accel_calib.stored import write_calibration
@@ -144,13 +144,13 @@ def test_compare_takes_calibrations_in_g_and_in_m_s2() -> None:
 
 def test_poses_are_converted_with_their_noise_and_known_forces() -> None:
     table = poses('g', reference=True, temperature=(20.0, 30.0))
-    found = converted(table, 'g', 'm/s2')
+    calibration = fit_poses(table, units_of('g'))
+    found = calibration.in_units('m/s2').poses
     assert found.units == 'm/s2'
     for key in ('reading', 'std', 'reference'):
         np.testing.assert_allclose(found[key], table[key] * GRAVITY)
     for key in ('count', 'temperature'):
         np.testing.assert_array_equal(found[key], table[key])
-    calibration = fit_poses(table, units_of('g'))
     assert calibration.name == '12'
     assert ac.verify(found, calibration).rms_after_mg == pytest.approx(
         ac.verify(table, calibration).rms_after_mg, rel=1e-9)

@@ -13,7 +13,7 @@ determine, and plans the next pose. `thermal` is for a still board whose tempera
 """
 
 from .calibration import (
-    Calibration, check_sensor, converted, FLEET, of_samples, Outside, outside, PRIOR, Quality,
+    Calibration, check_sensor, FLEET, of_samples, Outside, outside, PRIOR, Quality,
     Rejected, RejectedKind, SampleContext, STORED_METHODS, thermal_stream, USES_LIMIT,
     with_history, with_previous)
 from .fit import (
@@ -25,7 +25,7 @@ from .partial import fit_partial, fit_with_fleet, FleetPrior, mounting_only, pos
 from .pose_planning import (
     determines, dilution, directions_in, error_left_in, free_parameters, identifiability,
     LARGEST_DILUTION, lies_in_cone, next_pose, NextPose, NORM_MODELS, Outlook, outlook,
-    refuse_if_unfit)
+    refuse_if_unfit, stated_uncertainty)
 from .quality import (
     deviations_g, errors_after, errors_before, fit_findings, gated, in_g, LARGEST_OFFSET_G,
     OF_A_FIT, quality_of, record_of, uncertainty_g, Verification, verify)
@@ -36,14 +36,14 @@ __all__ = ['FLEET', 'LARGEST_DILUTION', 'LARGEST_OFFSET_G', 'NORM_MODELS', 'OF_A
            'STORED_METHODS', 'USES_LIMIT', 'Calibration', 'Curve', 'FleetPrior', 'GyroBias',
            'NextPose', 'Outlook', 'Outside', 'Quality', 'Rejected', 'RejectedKind',
            'SampleContext', 'SampleNoise', 'Verification', 'angle_words', 'check_sensor',
-           'converted', 'curve_of', 'determines', 'deviations_g', 'dilution', 'directions_in',
-           'directions_of', 'error_left_in', 'errors_after', 'errors_before', 'fit_findings',
-           'fit_partial', 'fit_poses', 'fit_unknown', 'fit_with_fleet', 'flat_direction',
-           'free_parameters', 'gated', 'gyro_bias_of', 'identifiability', 'in_frame', 'in_g',
-           'level', 'level_by_rows', 'lies_in_cone', 'mounting_figures', 'mounting_of',
-           'mounting_only', 'mounting_words', 'next_pose', 'of_samples', 'on_topics', 'only_norm',
-           'outlook', 'outside', 'posterior', 'quality_of', 'record_of', 'refuse_if_unfit',
-           'rejected_by', 'sample_noise_of', 'set_heading', 'sound_rows', 'sure_rows',
+           'curve_of', 'determines', 'deviations_g', 'dilution', 'directions_in', 'directions_of',
+           'error_left_in', 'errors_after', 'errors_before', 'fit_findings', 'fit_partial',
+           'fit_poses', 'fit_unknown', 'fit_with_fleet', 'flat_direction', 'free_parameters',
+           'gated', 'gyro_bias_of', 'identifiability', 'in_frame', 'in_g', 'level',
+           'level_by_rows', 'lies_in_cone', 'mounting_figures', 'mounting_of', 'mounting_only',
+           'mounting_words', 'next_pose', 'of_samples', 'on_topics', 'only_norm', 'outlook',
+           'outside', 'posterior', 'quality_of', 'record_of', 'refuse_if_unfit', 'rejected_by',
+           'sample_noise_of', 'set_heading', 'sound_rows', 'stated_uncertainty', 'sure_rows',
            'thermal_alone', 'thermal_stream', 'uncertainty_g', 'verify', 'with_curve',
            'with_given_mounting', 'with_history', 'with_previous', 'with_rest_noise',
            'without_curve']

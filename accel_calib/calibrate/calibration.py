@@ -275,10 +275,16 @@ class Calibration(Record):
         before, name = self.units, units.name if isinstance(units, Units) else units
         if name == before.name:
             return self
-        factor = _conversion(before.name, name)
+        one, other = units_of(before.name), units_of(name)
+        if one.is_native or other.is_native:
+            raise InputError(f'the calibration is for readings in {before.name}, but the readings '
+                             f'are in {name}, and the scale of native units is not known',
+                             f'use readings in {before.name}, or fit a calibration to poses in '
+                             f'{name}')
+        factor = other.per_g / one.per_g
         noise = self.noise and replace(self.noise, force=self.noise.force * factor)
         return replace(self, units=Units(name, before.per_g * factor), noise=noise,
-                       poses=converted(self.poses, before.name, name))
+                       poses=in_unit(self.poses, lambda values: values * factor))
 
     @property
     def offset_sd(self) -> Floats:
@@ -483,24 +489,6 @@ def with_previous(poses_g: Poses, force: Floats) -> Poses:
     return poses_g.with_columns(previous=previous)
 
 
-def _conversion(before: UnitName, after: UnitName) -> float:
-    """Return the factor from readings in one unit to readings in another, with standard g."""
-    if before == after:
-        return 1.0
-    one, other = units_of(before), units_of(after)
-    if one.is_native or other.is_native:
-        raise InputError(f'the calibration is for readings in {before}, but the readings are in '
-                         f'{after}, and the scale of native units is not known',
-                         f'use readings in {before}, or fit a calibration to poses in {after}')
-    return other.per_g / one.per_g
-
-
-def converted(table: _Known, before: UnitName, after: UnitName) -> _Known:
-    """Return a table with its readings in another unit; errors as in `Calibration.in_units`."""
-    factor = _conversion(before, after)
-    return replace(in_unit(table, lambda values: values * factor), units=after)
-
-
 def check_sensor(calibration: Calibration, sensor: str) -> None:
     """Raise StoredCalibrationError if a calibration is of another sensor; '' matches any."""
     if calibration.sensor and sensor and calibration.sensor != sensor:
@@ -588,8 +576,7 @@ def _vibration_range(calibration: Calibration) -> dict[str, tuple[float, float]]
             if variable_of(name) == 'std']
     if not ends:
         return {}
-    return {'std': (float(np.max([low for low, _ in ends])),
-                    float(np.min([high for _, high in ends])))}
+    return {'std': (float(np.max(ends, axis=0)[0]), float(np.min(ends, axis=0)[1]))}
 
 
 class SampleContext:

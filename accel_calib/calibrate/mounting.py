@@ -54,7 +54,7 @@ import scipy
 from .calibration import Calibration, with_history
 from .quality import in_g
 from ..effects import AXES, Context, Model, sensor_force
-from ..errors import InputError, RefusedFitError
+from ..errors import InputError
 from ..estimate import fit_12
 from ..finding import Finding, Level, without
 from ..geometry import angle_of, axes_of_signs, quaternion_of, rotation_from_rpy, rpy_of
@@ -370,10 +370,7 @@ def axes_of(reading: Floats, reference: Floats) -> Floats | None:
     scales = np.linalg.svd(reference - reference.mean(axis=0), compute_uv=False)
     if len(scales) < 3 or scales[2] < _LEAST_SPREAD * scales[0]:
         return None
-    try:
-        left, _, right = np.linalg.svd(fit_12(reading, reference)[0])
-    except RefusedFitError:
-        return None
+    left, _, right = np.linalg.svd(fit_12(reading, reference)[0])
     return left @ right
 
 

@@ -273,11 +273,7 @@ def posterior(values: Floats, covariance: Floats, fleet: FleetPrior
         spread = covariance[:count, :count] + candidate.prior.covariance
         evidence = candidate.log_probability - (
             away @ np.linalg.solve(spread, away) + np.linalg.slogdet(spread)[1]) / 2.0
-        if evidence > -np.inf:
-            found.append((evidence, spread, candidate.is_unlike))
-    if not found:
-        raise RefusedFitError('the fitted values are not finite, expected numbers',
-                              'check the poses for mistakes')
+        found.append((evidence, spread, candidate.is_unlike))
     _, spread, is_unlike = max(found, key=lambda part: part[0])
     gain = np.linalg.solve(spread, covariance[:count]).T
     left = covariance - gain @ covariance[:count]

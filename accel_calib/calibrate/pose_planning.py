@@ -449,7 +449,7 @@ def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
     poses = calibration.used_poses
     directions = directions_in(poses, calibration)
     noise = pose_noise(poses.noise, directions)
-    uncertainty = _uncertainty(calibration)
+    uncertainty = stated_uncertainty(calibration)
     planned = asked
     if asked in ('auto', ORIENTED):  # with wrong orientations model 12 became 10
         planned = ORIENTED if calibration.form.known_orientation else NORM_MODELS[-1]
@@ -462,7 +462,7 @@ def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
                    None if uncertainty is None else uncertainty * MG)
 
 
-def _uncertainty(calibration: Calibration) -> float | None:
+def stated_uncertainty(calibration: Calibration) -> float | None:
     """Return the stated uncertainty of the corrected force, RMS over the sphere [g]."""
     up, alone = OVER_THE_SPHERE, calibration.method == PRIOR and not calibration.form.effects
     per_g, known = calibration.force_per_g, calibration.typical_context(len(up))

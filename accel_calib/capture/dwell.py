@@ -324,13 +324,14 @@ class OngoingDwell:
         self.beside_slope = False
         self.orientation = orientation
 
-    def add(self, sums: Records, begin: Floats, end: Floats) -> None:
-        """Add consecutive chunks: (m,) sums, first and last stamps."""
-        if not len(sums):
+    def add(self, chunks: Records) -> None:
+        """Add consecutive chunks, of a `judged_type`."""
+        if not len(chunks):
             return
-        self.begin = self.begin if self.chunks else float(begin[0])
-        self.end = float(end[-1])
-        self.chunks += len(sums)
+        self.begin = self.begin if self.chunks else float(chunks['begin'][0])
+        self.end = float(chunks['end'][-1])
+        self.chunks += len(chunks)
+        sums = chunks['sums'].copy()
         while len(sums):
             room = (2 * CELLS - len(self.cells)) * self.size - len(self._partial)
             self._append(sums[:room])
@@ -453,16 +454,12 @@ class Tracker:
         done: list[OngoingDwell] = []
         while self._longest and self._dwell.chunks + len(chunks) >= self._longest:
             room = self._longest - self._dwell.chunks
-            self._append(chunks[:room])
+            self._dwell.add(chunks[:room])
             done.append(self._dwell)
             self._dwell = OngoingDwell(self._chunks, self.number)
             chunks = chunks[room:]
-        self._append(chunks)
+        self._dwell.add(chunks)
         return done
-
-    def _append(self, chunks: Records) -> None:
-        assert self._dwell is not None
-        self._dwell.add(chunks['sums'].copy(), chunks['begin'], chunks['end'])
 
     def _end(self) -> list[OngoingDwell]:
         found = self._finished()

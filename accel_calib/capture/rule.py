@@ -287,8 +287,7 @@ class Rule:
         at_rest = np.where(quiet, mean[:3], np.nan)
         low = np.fmin.accumulate(np.column_stack([self._lowest, at_rest]), axis=1)[:, 1:]
         high = np.fmax.accumulate(np.column_stack([self._highest, at_rest]), axis=1)[:, 1:]
-        if mean.shape[1]:
-            self._lowest, self._highest = low[:, -1], high[:, -1]
+        self._lowest, self._highest = low[:, -1], high[:, -1]
         return _half_range(low, high, noise[:3])
 
     def _learn(self, seen: Stretch, mean: Floats, step: Floats) -> Floats:

@@ -214,20 +214,15 @@ def strength_of(line: Line, spacing: float | Floats, white: Floats) -> Trend:
     size = line.length
     white = white + _TINY
     slope, weight = line.slope / spacing, 1.0 / white
-    square = over_axes(line.square * weight)
-    neighbours = over_axes(line.neighbours * weight)
+    square = np.sum(line.square * weight, axis=0)
+    neighbours = np.sum(line.neighbours * weight, axis=0)
     correlation = np.clip(neighbours / (square + _TINY) + 3.0 / size, 0.0, _CORRELATION_MAX)
     power = np.maximum(square / (3.0 * (size - 2)), 1.0)
     excess = power * (1.0 + correlation) / (1.0 - correlation)
     time_square = line.time_square * spacing**2
-    strength = over_axes(slope * slope * weight) * time_square / excess
-    error = np.sqrt(np.maximum(np.maximum(white[0], white[1]), white[2]) / time_square)
+    strength = np.sum(slope * slope * weight, axis=0) * time_square / excess
+    error = np.sqrt(np.max(white, axis=0) / time_square)
     return Trend(slope, strength, excess, error)
-
-
-def over_axes(values: Floats) -> Floats:
-    """Return the sums over the three axes of the reading."""
-    return np.asarray(values[0] + values[1] + values[2])
 
 
 def excess_of_means(centred: Floats, sizes: Floats, white: Floats) -> Floats:
@@ -332,14 +327,14 @@ def stretch(sums: Columns, level: Floats, length: int, size: int, spacing: float
     square = np.square(cells[:, length - 1:]).reshape(-1, 3, size).sum(axis=1)
     white += _DIGITS * square.repeat(3, axis=0)
     line = lines(cells, length)
-    scatter = over_axes(line.square) / length
+    scatter = np.sum(line.square, axis=0) / length
     line = line._replace(slope=_grouped(line.slope), square=_grouped(line.square),
                          neighbours=_grouped(line.neighbours))
     found = strength_of(line, spacing, _grouped(white))
     reading = Trend(found.slope[:, 0], *(part[0] for part in found[1:]))
     at_limit = sliding_sum(sums.at_limit[:, start:], length) / count
     return Stretch(reading, found.excess, variance, sliding_max(level[:3], inner), count, at_limit,
-                   cells[:3], scatter, over_axes(white))
+                   cells[:3], scatter, np.sum(white, axis=0))
 
 
 def _grouped(values: Floats) -> Floats:

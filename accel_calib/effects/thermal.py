@@ -88,18 +88,14 @@ def rate_of(time: Floats, temperature: Floats) -> Floats:
     """Return the (n,) rate of the temperature at poses [°C/s]; NaN where an input is NaN."""
     known = np.isfinite(time) & np.isfinite(temperature)
     rate = np.full(len(time), np.nan)
-    moments, place = np.unique(_merged(time[known]), return_inverse=True)
+    merged = np.round(time[known] / _SHORTEST) * _SHORTEST  # almost equal times become equal
+    moments, place = np.unique(merged, return_inverse=True)
     if len(moments) < 2:
         rate[known] = 0.0
         return rate
     mean = np.bincount(place, temperature[known]) / np.bincount(place)
     rate[known] = _smoothed_rate(moments, mean)[place]
     return rate
-
-
-def _merged(time: Floats) -> Floats:
-    """Return the times, with equal ones in place of almost equal ones."""
-    return np.round(time / _SHORTEST) * _SHORTEST
 
 
 def _smoothed_rate(time: Floats, temperature: Floats) -> Floats:

@@ -86,27 +86,24 @@ DIAGONAL = Form(np.array([0, 1, 2]), np.array([0, 1, 2]))
 SYMMETRIC = Form(np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2]))
 
 
-def centred(reading: Floats) -> tuple[Floats, Floats]:
-    """Return the (..., 3) mean, and the (..., 3, n) readings minus the mean."""
+def sphere_of(reading: Floats) -> tuple[Floats, Floats]:
+    """
+    Return centre (..., 3) and radius (...) of the sphere through (..., n, 3) readings.
+
+    With r the readings minus their mean, it solves the sums over the poses of
+    |r|² = 2 V·r + (W² - |V|²), times r and 1.
+
+    """
     transposed = reading.swapaxes(-1, -2)
     mean = transposed.sum(axis=-1) / reading.shape[-2]
-    return mean, transposed - mean[..., np.newaxis]
-
-
-def sphere_of(r: Floats) -> tuple[Floats, Floats]:
-    """
-    Return centre (..., 3) and radius (...) of the sphere through (..., 3, n) readings minus mean.
-
-    It solves the sums over the poses of |r|² = 2 V·r + (W² - |V|²), times r and 1.
-
-    """
+    r = transposed - mean[..., np.newaxis]
     second = r @ r.swapaxes(-1, -2)
     third = r @ np.sum(r * r, axis=-2)[..., np.newaxis]
     trace = np.trace(second, axis1=-2, axis2=-1)
     ridge = (_RIDGE * trace + 1e-300)[..., np.newaxis, np.newaxis] * _IDENTITY
     centre = np.linalg.solve(second + ridge, third)[..., 0] / 2.0
     squared = trace / r.shape[-1] + np.sum(centre * centre, axis=-1)
-    return centre, np.sqrt(squared + (squared == 0.0))
+    return mean + centre, np.sqrt(squared + (squared == 0.0))
 
 
 def quadric(reading: Floats, form: Form) -> tuple[Floats, Floats]:
@@ -116,12 +113,11 @@ def quadric(reading: Floats, form: Form) -> tuple[Floats, Floats]:
     Entries of A that are not in the form are zero. NaN where the quadric is no ellipsoid.
 
     """
-    mean, r = centred(reading)
-    centre, radius = sphere_of(r)
-    radius = radius[..., np.newaxis]
-    moments = _moments(form, (r - centre[..., np.newaxis]) / radius[..., np.newaxis])
-    mat_w, offset = _ellipsoid(form, np.linalg.eigh(moments)[1][..., 0])
-    return mat_w * radius[..., np.newaxis], mean + centre + offset * radius
+    centre, radius = sphere_of(reading)
+    scale = radius[..., np.newaxis, np.newaxis]
+    scaled = (reading - centre[..., np.newaxis, :]).swapaxes(-1, -2) / scale
+    mat_w, offset = _ellipsoid(form, np.linalg.eigh(_moments(form, scaled))[1][..., 0])
+    return mat_w * scale, centre + offset * scale[..., 0]
 
 
 def _moments(form: Form, r: Floats) -> Floats:
@@ -207,9 +203,8 @@ def closed_form(name: str, reading: Floats) -> tuple[Floats, Floats]:
 
 def fit_sphere(reading: Floats) -> tuple[Floats, Floats]:
     """Fit an offset and one gain (AN5286 eq. 10-14); arguments and result as `closed_form`."""
-    mean, r = centred(reading)
-    centre, radius = sphere_of(r)
-    return radius[..., np.newaxis, np.newaxis] * _IDENTITY, mean + centre
+    centre, radius = sphere_of(reading)
+    return radius[..., np.newaxis, np.newaxis] * _IDENTITY, centre
 
 
 def start_of(name: str, reading: Floats) -> Model:

@@ -438,12 +438,12 @@ def _bounds(start: Model, poses_g: Poses) -> tuple[Floats, Floats]:
             size = _largest_contribution(Model({name: values}), poses_g)
             most = effect.plausible_g / np.maximum(size, effect.plausible_g * _SMALLEST)
             limits[:, :len(most)] = -most, most
-            for k in fitted_places(effect, effect.split(values)[1]):
-                if effect.shapes is not None:
-                    tried = [shape[k] for shape in effect.shapes(poses_g.columns)
-                             if k in fitted_places(effect, shape)]
-                    limits[:, len(most) + k] = (min(tried, default=0.0) / _SHAPE_ROOM,
-                                                max(tried, default=np.inf) * _SHAPE_ROOM)
+            places = fitted_places(effect, effect.split(values)[1])
+            shapes = [*effect.shapes(poses_g.columns)] if effect.shapes and places else []
+            for k in places:
+                tried = [shape[k] for shape in shapes if k in fitted_places(effect, shape)]
+                limits[:, len(most) + k] = (min(tried, default=0.0) / _SHAPE_ROOM,
+                                            max(tried, default=np.inf) * _SHAPE_ROOM)
         lower.append(np.minimum(limits[0], values))
         upper.append(np.maximum(limits[1], values))
     return np.concatenate(lower), np.concatenate(upper)

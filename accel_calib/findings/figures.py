@@ -28,12 +28,13 @@ import scipy
 
 from ..calibrate import (
     Calibration, Curve, deviations_g, directions_in, error_left_in, free_parameters,
-    identifiability, next_pose, NextPose, Outlook, PRIOR, Quality, uncertainty_g, Verification)
+    identifiability, next_pose, NextPose, Outlook, PRIOR, Quality, stated_uncertainty,
+    uncertainty_g, Verification)
 from ..compare import NAMES
 from ..effects import AXES, effect_named, LADDER, Model, MODELS, predict, value_unit
 from ..estimate import pose_noise, sensing_axes, variance_factor
 from ..finding import Rating
-from ..geometry import OVER_THE_SPHERE, rms
+from ..geometry import rms
 from ..table import Floats
 from ..text import signed
 from ..units import MG
@@ -340,15 +341,9 @@ class Expected:
     @cached_property
     def stated_mg(self) -> float:
         """Return the stated uncertainty, RMS over the sphere [mg]; partial: over the poses."""
-        calibration = self.calibration
-        if not calibration.model.effects:
-            return 0.0
-        if self.is_vector and set(calibration.model.effects) <= set(LADDER):
-            spread = calibration.force_covariance(OVER_THE_SPHERE * calibration.force_per_g)
-            squares = np.trace(spread, axis1=1, axis2=2) / calibration.force_per_g ** 2
-            return float(np.sqrt(np.mean(squares))) * MG
-        up = self.directions if self.is_partial else OVER_THE_SPHERE
-        return rms(deviations_g(calibration, up)) * MG * math.sqrt(1.0 + 2.0 * self.is_vector)
+        if self.is_partial and self.calibration.model.effects:
+            return rms(deviations_g(self.calibration, self.directions)) * MG
+        return (stated_uncertainty(self.calibration) or 0.0) * MG
 
     @cached_property
     def worst_mg(self) -> float:
