@@ -18,7 +18,6 @@ first messages of the Imu, converts this time to that of the stamps.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 import re
@@ -47,12 +46,6 @@ _OF_TYPE = {TEMPERATURE: 'temperature', 'sensor_msgs/msg/BatteryState': 'supply_
 
 _ROWS = 65536
 """Smallest number of samples in a block of a recording."""
-
-_HELD_BACK = 8
-"""Largest number of blocks that wait for a later temperature."""
-
-_AROUND = 10
-"""Number of values that are kept before a block."""
 
 _PEEKED = 100
 """Number of messages at the beginning of a topic that show its clock and its unit."""
@@ -94,7 +87,7 @@ QUANTITIES = (
 
 @dataclass(frozen=True)
 class Track:
-    """Values of a quantity at increasing times [s]."""
+    """Finite values of a quantity, in order of time [s]."""
 
     time: Floats
     value: Floats
@@ -104,25 +97,6 @@ class Track:
         if not len(self.time):
             return np.full(len(time), np.nan)
         return np.interp(time, self.time, self.value)
-
-    def plus(self, time: Floats, value: Floats) -> Track:
-        """Return the track with the finite ones of these (k,) values added."""
-        known = np.isfinite(value)
-        times = np.concatenate([self.time, time[known]])
-        order = np.argsort(times, kind='stable')
-        return Track(times[order], np.concatenate([self.value, value[known]])[order])
-
-    def covers(self, samples: Recording) -> bool:
-        """Return whether the track reaches the end of these samples."""
-        return bool(len(self.time) and samples['time'][-1] <= self.time[-1])
-
-    def since(self, time: float) -> Track:
-        """Return the track without values long before a time."""
-        first = max(0, int(np.searchsorted(self.time, time)) - _AROUND)
-        return Track(self.time[first:], self.value[first:])
-
-
-_EMPTY = Track(np.zeros(0), np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -166,6 +140,14 @@ class ContextTopic:
         time = stamps if self.late is None else _received(block) + self.late
         return time, values * self.factor + self.summand
 
+    def track(self) -> Track:
+        """Return the values of the whole bag."""
+        blocks = [self.values(block) for block in self.bag.blocks(self.connections)]
+        time, value = np.hstack([np.zeros((2, 0)), *map(np.array, blocks)])
+        known = np.flatnonzero(np.isfinite(value))
+        order = known[np.argsort(time[known], kind='stable')]
+        return Track(time[order], value[order])
+
 
 def _received(block: Sequence[Received]) -> Floats:
     return np.array([stamp for _, stamp, _ in block]) * _NANO
@@ -196,9 +178,7 @@ class ContextTopics:
         """Return all values of the bag by column; raise InputError if there are none."""
         tracks = {}
         for topic in self.used:
-            track = _EMPTY
-            for block in topic.bag.blocks(topic.connections):
-                track = track.plus(*topic.values(block))
+            track = topic.track()
             if not len(track.time):
                 raise InputError(f'{topic.bag.path}: {topic.topic} has no finite number, expected '
                                  f'the {topic.quantity.words}', 'name another topic')
@@ -380,54 +360,19 @@ def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool, context: Con
     NaN, or is from another sensor is an InputError.
 
     """
-    tracks = {source.quantity.key: _EMPTY for source in context.used}
-    waiting: deque[Recording] = deque()
+    tracks = {source.quantity.key: source.track() for source in context.used}
     parts: list[Recording] = []
     before = 0
-    for imus, others in _blocks(bag, topic, context.used):
-        for source, block in zip(context.used, others, strict=True):
-            if block:
-                key = source.quantity.key
-                tracks[key] = tracks[key].plus(*source.values(block))
-        if imus:
-            _, columns, which = bag.imus(imus, topic, before, sensor, chosen=chosen)
-            rows = np.arange(before, before + len(imus)) + 1
-            samples = Recording(columns, rows, 'm/s2', sensor)
-            waiting.append(samples if np.all(which) else samples.take(which))
-            before += len(imus)
-        parts += _ready(waiting, tracks)
+    for block in bag.blocks(bag.connections(topic), BLOCK):
+        _, columns, which = bag.imus([raw for _, _, raw in block], topic, before, sensor,
+                                     chosen=chosen)
+        columns |= {key: track.at(columns['time']) for key, track in tracks.items()}
+        samples = Recording(columns, before + np.arange(len(block)) + 1, 'm/s2', sensor)
+        parts.append(samples if np.all(which) else samples.take(which))
+        before += len(block)
         if sum(map(len, parts)) >= _ROWS:
             yield concatenated(parts)
             parts = []
-    parts += [_with_context(part, tracks) for part in waiting]
     if parts:
         yield concatenated(parts)
     notes += bag.lost(topic, before)
-
-
-def _ready(waiting: deque[Recording], tracks: dict[str, Track]) -> list[Recording]:
-    """Return the blocks whose context is known, and discard context that is too old for others."""
-    parts = []
-    while waiting and (len(waiting) > _HELD_BACK
-                       or all(track.covers(waiting[0]) for track in tracks.values())):
-        parts.append(_with_context(waiting.popleft(), tracks))
-    if waiting:
-        for key, track in tracks.items():
-            tracks[key] = track.since(waiting[0]['time'][0])
-    return parts
-
-
-def _blocks(bag: Bag, topic: str, used: Sequence[ContextTopic]
-            ) -> Iterator[tuple[list[bytes], list[list[Received]]]]:
-    """Yield blocks of serialized Imu messages and of the other topics, in one pass."""
-    own = [{id(connection) for connection in source.connections} for source in used]
-    imu = {id(connection) for connection in bag.connections(topic)}
-    wanted = [c for c in bag.reader.connections if id(c) in imu.union(*own)]
-    for block in bag.blocks(wanted, BLOCK):
-        yield ([raw for connection, _, raw in block if id(connection) in imu],
-               [[message for message in block if id(message[0]) in ids] for ids in own])
-
-
-def _with_context(samples: Recording, tracks: dict[str, Track]) -> Recording:
-    columns = {key: track.at(samples['time']) for key, track in tracks.items()}
-    return samples.with_columns(**columns) if columns else samples
