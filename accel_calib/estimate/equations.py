@@ -61,6 +61,9 @@ from ..geometry import unit
 from ..table import Poses
 from ..units import Floats, Indices
 
+_BLOCK = 8192
+"""Number of poses per block; their equations fit in the cache."""
+
 USUAL_NOISE_G = 5e-4
 """Noise of a pose mean of a common MEMS sensor, assumed if it was not measured [g]."""
 
@@ -195,11 +198,11 @@ class _Kind(NamedTuple):
 
 @dataclass(frozen=True)
 class Measured:
-    """Poses in g by kind of orientation, and their noise; see `measured`."""
+    """Poses in g by kind of orientation, `alone` in blocks, and their noise; see `measured`."""
 
     known: _Kind
     shared: _Kind
-    alone: _Kind
+    alone: tuple[_Kind, ...]
     count: int
     noise_known: bool
 
@@ -220,7 +223,11 @@ def measured(poses_g: Poses) -> Measured:
         context = {key: values[which] for key, values in poses_g.columns.items()}
         return _Kind(which, group, context, reading[which], s[which])
 
-    return Measured(kind([known]), kind(shared), kind([alone]), len(s), noise is not None)
+    # The context of a pose can be that of the others, too: a low pass has a history.
+    size = _BLOCK if {*poses_g.columns} <= {*_OF_READING} else max(len(alone), 1)
+    return Measured(kind([known]), kind(shared), tuple(
+        kind([alone[first:first + size]]) for first in range(0, len(alone), size)),
+        len(s), noise is not None)
 
 
 @dataclass(frozen=True)
@@ -277,9 +284,13 @@ class Equations:
 
 def equations(model: Model, poses: Measured) -> Equations:
     """Set up the equations near a model with ΔR = I; NaN where a reading's force is not unique."""
-    parts = [of_kind(model, each) for of_kind, each in (
-        (_Known, poses.known), (_Shared, poses.shared), (_Alone, poses.alone)) if len(each.which)]
+    parts: list[_Known | _Shared | _Alone] = []
     force, scale = np.empty((poses.count, 3)), np.empty(poses.count)
+    if len(poses.known.which):
+        parts.append(_Known(model, poses.known))
+    if len(poses.shared.which):
+        parts.append(_Shared(model, poses.shared))
+    parts += [_Alone(model, block) for block in poses.alone]
     for part in parts:
         force[part.which], scale[part.which] = part.force, part.scale
     groups = poses.shared.group

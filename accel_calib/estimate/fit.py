@@ -62,6 +62,9 @@ _SINGULAR_STEP = 1e-6
 _SINGULAR_WITH_PRIOR = 1e-12
 """As `Point.singular`; a prior determines all combinations."""
 
+_BLOCK = 8192
+"""Number of equations that are reduced to a triangle at once."""
+
 _SINGULAR = 1e-3
 """Relative singular value below which a combination of values is not determined."""
 
@@ -207,9 +210,13 @@ class Fit:
 
     @cached_property
     def _triangle(self) -> tuple[Floats, Floats]:
-        """R of the QR decomposition of the scaled columns, at most (q, q); the scales."""
+        """(m, q) R of the QR decomposition of the scaled columns, block by block; the scales."""
         columns, size = _scaled(self.columns)
-        return np.asarray(np.linalg.qr(columns, mode='r')), size
+        found = columns[:0]
+        for first in range(0, len(columns), _BLOCK):
+            found = np.asarray(np.linalg.qr(
+                np.vstack([found, columns[first:first + _BLOCK]]), mode='r'))
+        return found, size
 
     @cached_property
     def undetermined(self) -> tuple[str, ...]:
