@@ -89,40 +89,37 @@ class _Reader:
     def __init__(self, events: Iterator[yaml.Event]) -> None:
         self._events = events
         self._keys: list[str] = []
-        self._depth = self._count = 0
+        self._count = 0
 
     def content(self) -> Any:
         """Return the content of the only document."""
         content = None
         for event in self._events:
             if isinstance(event, yaml.DocumentStartEvent):
-                content = self._value(next(self._events))
+                content = self._value(next(self._events), 0)
                 break
         for event in self._events:
             if isinstance(event, yaml.DocumentStartEvent):
                 raise self._refusal(event, 'a second document starts, expected one')
         return content
 
-    def _value(self, event: yaml.Event) -> Any:
-        """Return the value that starts with an event, after all checks."""
+    def _value(self, event: yaml.Event, depth: int) -> Any:
+        """Return the value that starts with an event below this number of levels."""
         self._check(event)
         if isinstance(event, yaml.ScalarEvent):
             return self._scalar(event) if event.implicit[0] else event.value
-        if self._depth == MOST_DEPTH:
+        if depth == MOST_DEPTH:
             raise self._refusal(event, f'it has more than {MOST_DEPTH} levels')
-        self._depth += 1
         is_mapping = isinstance(event, yaml.MappingStartEvent)
-        content = self._mapping() if is_mapping else self._list()
-        self._depth -= 1
-        return content
+        return self._mapping(depth + 1) if is_mapping else self._list(depth + 1)
 
-    def _list(self) -> list[Any]:
+    def _list(self, depth: int) -> list[Any]:
         content = []
         while not isinstance(event := next(self._events), yaml.SequenceEndEvent):
-            content.append(self._value(event))
+            content.append(self._value(event, depth))
         return content
 
-    def _mapping(self) -> dict[str, Any]:
+    def _mapping(self, depth: int) -> dict[str, Any]:
         content: dict[str, Any] = {}
         while not isinstance(event := next(self._events), yaml.MappingEndEvent):
             self._check(event)
@@ -132,7 +129,7 @@ class _Reader:
             if key in content:
                 raise self._refusal(event, f'the key {shown(key)} is stated twice, expected once')
             self._keys.append(key)
-            content[key] = self._value(next(self._events))
+            content[key] = self._value(next(self._events), depth)
             self._keys.pop()
         return content
 
