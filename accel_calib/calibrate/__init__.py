@@ -13,9 +13,9 @@ determine, and plans the next pose. `thermal` is for a still board whose tempera
 """
 
 from .calibration import (
-    Calibration, check_sensor, FLEET, of_samples, Outside, outside, PRIOR, Quality,
-    Rejected, RejectedKind, SampleContext, STORED_METHODS, thermal_stream, USES_LIMIT,
-    with_history, with_previous)
+    Calibration, check_sensor, FLEET, of_samples, Outside, outside, PRIOR, Quality, Rejected,
+    RejectedKind, SampleContext, STORED_METHODS, thermal_stream, USES_LIMIT, with_history,
+    with_previous)
 from .fit import (
     directions_of, fit_poses, fit_unknown, only_norm, rejected_by, sound_rows, sure_rows)
 from .mounting import (

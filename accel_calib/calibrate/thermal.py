@@ -388,10 +388,8 @@ def without_curve(curve: Curve, poses: Poses, units: Units) -> Poses:
         raise InputError('the poses have no temperature, expected one for each', 'record the '
                          'temperature with the poses, too, or name its column with --columns '
                          'temperature=NAME')
-    kept = {key: values for key, values in poses.columns.items()
-            if key not in ('reference', 'orientation')}
-    moved = _added(curve, poses)
-    return replace(poses, columns={**kept, 'reading': poses.reading - units.from_g(moved)})
+    moved = poses.reading - units.from_g(_added(curve, poses))
+    return poses.without_columns('reference', 'orientation').with_columns(reading=moved)
 
 
 def _added(curve: Curve, poses: Poses) -> Floats:

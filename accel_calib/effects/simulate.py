@@ -143,12 +143,10 @@ def simulate_recording(model: Model, directions: Floats, rng: np.random.Generato
     """
     force, rate = path(directions, rate_hz, dwell, turn)
     count = len(force)
-    columns = {'time': np.arange(count) / rate_hz, 'reference': force,
-               'std': np.full((count, 3), noise_g)}
+    columns = {'time': np.arange(count) / rate_hz, 'reference': force}
     if temperatures:
         columns['temperature'] = np.linspace(temperatures[0], temperatures[-1], count)
-    reading = predict(model, force, columns)
-    del columns['std']
+    reading = predict(model, force, {**columns, 'std': np.full((count, 3), noise_g)})
     columns['reading'] = reading + rng.normal(size=(count, 3)) * noise_g
     columns['rate'] = rate @ model.rotation.T + rng.normal(size=(count, 3)) * gyro_noise
     return Recording(columns, numbered(columns))

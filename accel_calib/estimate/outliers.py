@@ -291,7 +291,7 @@ def _fit(name: str, poses_g: Poses, kept: Indices) -> Fit | None:
 def _most(name: str, count: int) -> int:
     """Return the largest number of poses that can be left out."""
     free = len(parameter_names(MODELS[name].effects))
-    return min(int(LARGEST_SHARE * count), (count - free) // 2)
+    return _limit(count - free, count, 1)
 
 
 def _agrees(fit: Fit, kept: Indices, poses_g: Poses) -> NDArray[np.bool_]:
