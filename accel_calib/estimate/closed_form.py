@@ -66,7 +66,10 @@ _RIDGE = 1e-12
 _DISTANCES = 2 ** 16
 """Largest number of distances of poses from subsets that are held at once."""
 
-_IDENTITY = np.eye(3)
+_BLOCK = 8192
+"""Number of poses per block; their monomials fit in the cache."""
+
+_IDENTITY, _ONES, _COLUMN = np.eye(3), np.ones(3), np.ones((3, 1))
 
 
 @dataclass(frozen=True)
@@ -77,33 +80,53 @@ class Form:
     second: Indices
 
     @cached_property
-    def times(self) -> Floats:
-        """(k + 4,) array, how often each monomial, r and 1 occurs in the quadric."""
-        return np.append(np.where(self.first == self.second, 1.0, 2.0), np.ones(4))
+    def pairs(self) -> Indices:
+        """(2 k,) array, all i, then all j."""
+        return np.concatenate([self.first, self.second])
+
+    @cached_property
+    def twice(self) -> Floats:
+        """(k,) array, how often each monomial occurs in rᵀ A r."""
+        return np.where(self.first == self.second, 1.0, 2.0)
+
+    @cached_property
+    def linear(self) -> Floats:
+        """(3, 3 k) array, the part linear in r when the origin moves by c."""
+        return 2.0 * self.scatter.reshape(-1, 3, 3).transpose(1, 2, 0).reshape(3, -1)
+
+    @cached_property
+    def scatter(self) -> Floats:
+        """(k, 9) array, maps the coefficients to the entries of A."""
+        entries = np.zeros((len(self.twice), 3, 3))
+        each = np.arange(len(self.twice))
+        entries[each, self.first, self.second] = entries[each, self.second, self.first] = 1.0
+        return entries.reshape(-1, 9)
 
 
 DIAGONAL = Form(np.array([0, 1, 2]), np.array([0, 1, 2]))
 SYMMETRIC = Form(np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2]))
 
 
-def sphere_of(reading: Floats) -> tuple[Floats, Floats]:
-    """
-    Return centre (..., 3) and radius (...) of the sphere through (..., n, 3) readings.
-
-    With r the readings minus their mean, it solves the sums over the poses of
-    |r|² = 2 V·r + (W² - |V|²), times r and 1.
-
-    """
+def centred(reading: Floats) -> tuple[Floats, Floats]:
+    """Return the (..., 3) mean, and the (..., 3, n) readings minus the mean."""
     transposed = reading.swapaxes(-1, -2)
     mean = transposed.sum(axis=-1) / reading.shape[-2]
-    r = transposed - mean[..., np.newaxis]
-    second = r @ r.swapaxes(-1, -2)
-    third = r @ np.sum(r * r, axis=-2)[..., np.newaxis]
-    trace = np.trace(second, axis1=-2, axis2=-1)
+    return mean, transposed - mean[..., np.newaxis]
+
+
+def sphere_of(second: Floats, third: Floats, count: int) -> tuple[Floats, Floats]:
+    """
+    Return centre (..., 3) and radius (...) of the sphere through n readings r minus their mean.
+
+    It solves the sums over the poses of |r|² = 2 V·r + (W² - |V|²), times r and 1, from the sums
+    `second` of r rᵀ, (..., 3, 3), and `third` of |r|² r, (..., 3).
+
+    """
+    trace = second[..., 0, 0] + second[..., 1, 1] + second[..., 2, 2]
     ridge = (_RIDGE * trace + 1e-300)[..., np.newaxis, np.newaxis] * _IDENTITY
-    centre = np.linalg.solve(second + ridge, third)[..., 0] / 2.0
-    squared = trace / r.shape[-1] + np.sum(centre * centre, axis=-1)
-    return mean + centre, np.sqrt(squared + (squared == 0.0))
+    centre = np.linalg.solve(second + ridge, third[..., np.newaxis])[..., 0] / 2.0
+    squared = trace / count + (centre * centre) @ _ONES
+    return centre, np.sqrt(squared + (squared == 0.0))
 
 
 def quadric(reading: Floats, form: Form) -> tuple[Floats, Floats]:
@@ -113,34 +136,56 @@ def quadric(reading: Floats, form: Form) -> tuple[Floats, Floats]:
     Entries of A that are not in the form are zero. NaN where the quadric is no ellipsoid.
 
     """
-    centre, radius = sphere_of(reading)
-    scale = radius[..., np.newaxis, np.newaxis]
-    scaled = (reading - centre[..., np.newaxis, :]).swapaxes(-1, -2) / scale
-    mat_w, offset = _ellipsoid(form, np.linalg.eigh(_moments(form, scaled))[1][..., 0])
-    return mat_w * scale, centre + offset * scale[..., 0]
+    mean, r = centred(reading)
+    size = len(form.twice)
+    moments = _moments(form, r[..., :_BLOCK])
+    for start in range(_BLOCK, r.shape[-1], _BLOCK):
+        moments = moments + _moments(form, r[..., start:start + _BLOCK])
+    centre, radius = sphere_of(moments[..., size:-1, size:-1],
+                               _ONES @ moments[..., :3, size:-1], r.shape[-1])
+    radius = radius[..., np.newaxis]
+    change = _to_sphere(form, centre, radius)
+    beta = np.linalg.eigh(change.swapaxes(-1, -2) @ moments @ change)[1][..., 0]
+    mat_w, offset = _ellipsoid(form, beta)
+    return mat_w * radius[..., np.newaxis], mean + centre + offset * radius
 
 
 def _moments(form: Form, r: Floats) -> Floats:
-    """Return XᵀX, with monomials, r and 1 as in the quadric in a row of X; r is (..., 3, n)."""
-    size = len(form.first)
-    row = np.ones((*r.shape[:-2], size + 4, r.shape[-1]))
-    np.multiply(r[..., form.first, :], r[..., form.second, :], out=row[..., :size, :])
-    row[..., size:-1, :] = r
-    return row @ row.swapaxes(-1, -2) * np.multiply.outer(form.times, form.times)
+    """Sum the products of the monomials, r and 1 over the poses; r is (..., 3, n)."""
+    size = len(form.twice)
+    monomials = np.ones((*r.shape[:-2], size + 4, r.shape[-1]))
+    monomials[..., size:-1, :] = r
+    pairs = r[..., form.pairs, :]
+    np.multiply(pairs[..., :size, :], pairs[..., size:, :], out=monomials[..., :size, :])
+    return monomials @ monomials.swapaxes(-1, -2)
+
+
+def _to_sphere(form: Form, centre: Floats, radius: Floats) -> Floats:
+    """Return the matrix from monomials of r to those of (r - centre) / radius, times `twice`."""
+    size, lead = len(form.twice), centre.shape[:-1]
+    change = np.zeros((*lead, size + 4, size + 4))
+    diagonal = change.reshape(*lead, -1)[..., ::size + 5]
+    moved, twice = centre / -radius, form.twice / (radius * radius)
+    diagonal[..., :size] = twice
+    diagonal[..., size:] = 1.0 / radius
+    change[..., size:-1, :size] = ((moved / radius) @ form.linear).reshape(*lead, 3, size)
+    pairs = moved[..., form.pairs]
+    change[..., -1, :size] = form.twice * pairs[..., :size] * pairs[..., size:]
+    change[..., -1, size:-1] = moved
+    change[..., -1, -1] = 1.0
+    return change
 
 
 def _ellipsoid(form: Form, beta: Floats) -> tuple[Floats, Floats]:
     """Return W and V of the quadric with these coefficients; NaN where it is no ellipsoid."""
-    size = len(form.first)
-    mat_a = np.zeros((*beta.shape[:-1], 3, 3))
-    mat_a[..., form.first, form.second] = mat_a[..., form.second, form.first] = beta[..., :size]
+    size = len(form.twice)
+    mat_a = (beta[..., :size] @ form.scatter).reshape(*beta.shape[:-1], 3, 3)
     values, vectors = np.linalg.eigh(mat_a)
     sign = np.copysign(1.0, values[..., 1:2])  # AN5286: negate the whole vector
     with np.errstate(invalid='ignore', divide='ignore'):
         along = (beta[..., np.newaxis, size:-1] @ vectors)[..., 0, :] / (-2.0 * values)
         values = values * sign
-        field_squared = (np.sum(along * along * values, axis=-1, keepdims=True)
-                         - beta[..., -1:] * sign)  # B²
+        field_squared = (along * along * values) @ _COLUMN - beta[..., -1:] * sign  # B²
         gain = np.sqrt(field_squared / values)  # the middle value is positive: NaN where B² is not
         mat_w = (vectors * gain[..., np.newaxis, :]) @ vectors.swapaxes(-1, -2)
         return mat_w, (vectors @ along[..., np.newaxis])[..., 0]
@@ -203,8 +248,10 @@ def closed_form(name: str, reading: Floats) -> tuple[Floats, Floats]:
 
 def fit_sphere(reading: Floats) -> tuple[Floats, Floats]:
     """Fit an offset and one gain (AN5286 eq. 10-14); arguments and result as `closed_form`."""
-    centre, radius = sphere_of(reading)
-    return radius[..., np.newaxis, np.newaxis] * _IDENTITY, centre
+    mean, r = centred(reading)
+    third = (r @ np.sum(r * r, axis=-2)[..., np.newaxis])[..., 0]
+    centre, radius = sphere_of(r @ r.swapaxes(-1, -2), third, r.shape[-1])
+    return radius[..., np.newaxis, np.newaxis] * _IDENTITY, mean + centre
 
 
 def start_of(name: str, reading: Floats) -> Model:
