@@ -209,7 +209,7 @@ class Calibrator:
             self._node, ('sensor_msgs/msg/Imu', 'sensor_msgs/msg/Temperature'))
         self.session.mismatches = mismatches(self._node)
         self._context.look(self.session)
-        self.stream.flush()
+        self.stream.flush_if_due()
         self.session.tick()
         self._on_transforms()
         self._on_samples()

@@ -14,6 +14,7 @@ same way.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import groupby
 import math
 import operator
 from time import monotonic
@@ -251,6 +252,11 @@ class Stream:
         if self._motion.listeners and gravity is not None and output is self._calibrated:
             self._motion.publish(motion_of(corrected, rewriter.layout, gravity))
 
+    def flush_if_due(self) -> None:
+        """Pass the waiting messages to the session, unless the next message does it in time."""
+        if monotonic() >= self._due:
+            self.flush()
+
     def flush(self) -> None:
         """Pass the waiting messages to the session."""
         if self._waiting:
@@ -264,8 +270,9 @@ class Stream:
 
     def _around(self, contexts: Sequence[Mapping[str, float]]) -> Floats:
         """Return the columns of the context of each message, (n, k)."""
-        return np.array([[known.get(column, math.nan) for column in self._columns]
-                         for known in contexts])
+        runs = [(known, len([*same])) for known, same in groupby(contexts)]
+        values = [[known.get(column, math.nan) for column in self._columns] for known, _ in runs]
+        return np.repeat(values, [count for _, count in runs], axis=0)
 
 
 def _usual(data: bytes) -> bytes:
