@@ -213,14 +213,18 @@ class Calibrator:
         self.session.tick()
         self._on_transforms()
         self._on_samples()
+        if self._diagnostics.get_subscription_count():
+            self._show_diagnostics()
+        if self._page is not None:
+            self._page.show_state()
+
+    def _show_diagnostics(self) -> None:
         found = checks(self.session)
         array = DiagnosticArray(status=[
             self._status(worst(self.session, found), figures(self.session)),
             *map(self._status, found)])
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._diagnostics.publish(array)
-        if self._page is not None:
-            self._page.show_state()
 
     def _status(self, check: Check, values: Iterable[tuple[str, str]] = ()) -> DiagnosticStatus:
         return DiagnosticStatus(

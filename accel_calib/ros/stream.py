@@ -31,8 +31,7 @@ from .declare import published_by_others, SENSOR
 from ..calibrate import Calibration
 from ..errors import AccelCalibError, InputError
 from ..logs import (
-    ACCELERATION, IMU_DOUBLES, joined, Layout, layout_of, LITTLE_ENDIAN, NAME_AT, samples_of,
-    THREE)
+    ACCELERATION, joined_alike, Layout, layout_of, LITTLE_ENDIAN, NAME_AT, samples_of, THREE)
 from ..messages.correction import motion_of, output_frame, Rewriter
 from ..messages.one_reading import Triple
 from ..session import BATCH, CalibratorSettings, columns_of, context_topics, Session
@@ -145,7 +144,8 @@ class Stream:
         self._outputs = [Output(publisher) for publisher in publishers]
         self._calibrated, self._preview, self._motion = self._outputs
         self._layout = _NO_LAYOUT
-        self._waiting: list[tuple[bytes, Mapping[str, float]]] = []
+        self._waiting: list[bytes] = []
+        self._contexts: list[Mapping[str, float]] = []
         self._due = self._arrived = 0.0
         self._listened = False
         self._applied: Calibration | None = None
@@ -163,7 +163,7 @@ class Stream:
         """Return the newest reading, unless the session has it already."""
         if not self._waiting:
             return None
-        x, y, z = THREE.unpack_from(self._waiting[-1][0], self._layout.place(ACCELERATION))
+        x, y, z = THREE.unpack_from(self._waiting[-1], self._layout.place(ACCELERATION))
         return x, y, z
 
     def on_message(self, data: bytes) -> None:
@@ -185,7 +185,8 @@ class Stream:
             self._prepare()
         if self._listened:
             self._send(data)
-        self._waiting.append((data, session.around.values))
+        self._waiting.append(data)
+        self._contexts.append(session.around.values)
         self._arrived = now
         if due:
             self._due = now + BATCH
@@ -260,9 +261,9 @@ class Stream:
     def flush(self) -> None:
         """Pass the waiting messages to the session."""
         if self._waiting:
-            messages, contexts = zip(*self._waiting)
-            self._waiting = []
-            found = samples_of(joined(messages, IMU_DOUBLES, 'imu/data_raw'))
+            messages, self._waiting = self._waiting, []
+            contexts, self._contexts = self._contexts, []
+            found = samples_of(joined_alike(messages, self._layout))
             rows = np.column_stack([found['time'], found['reading'], found['rate'],
                                     self._around(contexts)])
             self._session.push(rows, self._arrived)
