@@ -3,8 +3,6 @@
 
 """The public functions, such as ``ac.fit`` after ``import accel_calib as ac``."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields, replace
 from functools import cached_property

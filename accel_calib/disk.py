@@ -10,8 +10,6 @@ are created exclusively. Only regular files are read, too: others can block with
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 import glob

@@ -9,8 +9,6 @@ what to do). If it is about a log, `read_as` says how the log was read.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 import errno

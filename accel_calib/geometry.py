@@ -3,8 +3,6 @@
 
 """Rotations as matrices, quaternions, roll, pitch and yaw; directions, and attitudes by name."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product

@@ -320,7 +320,8 @@ def range_of(table: Table, key: str) -> tuple[float, float]:
 def in_unit(table: _Self, convert: Callable[[Floats], Floats], *, native: bool = False) -> _Self:
     """Return a table in another unit; known forces beside native readings are in g."""
     keys = ('reading', 'std') if native else ('reading', 'std', 'reference')
-    return table.with_columns(**{key: convert(table[key]) for key in keys if key in table})
+    own = table.columns
+    return table.with_columns(**{key: convert(own[key]) for key in keys if key in own})
 
 
 def concatenated(parts: Sequence[_Self]) -> _Self:

@@ -3,8 +3,6 @@
 
 """Numbers, counts, dates, tables and results as text."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime, timezone
 from html import escape

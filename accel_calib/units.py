@@ -8,8 +8,6 @@ They stand below all folders, so that ``accel-calib fit --help`` does not load t
 
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, get_args, Literal

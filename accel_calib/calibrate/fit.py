@@ -23,8 +23,6 @@ then determine only the rotation of the axes, ΔR.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 

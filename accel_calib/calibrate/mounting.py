@@ -40,8 +40,6 @@ rotation by another angle. A rotation can be intended, a mirror image cannot.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import permutations, product

@@ -46,8 +46,6 @@ explained better by a larger variance factor, and are kept.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

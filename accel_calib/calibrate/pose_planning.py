@@ -36,8 +36,6 @@ reduces the error by less than `_LEAST_GAIN` and the dilution is below `_GOOD_DI
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache

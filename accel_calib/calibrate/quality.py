@@ -20,8 +20,6 @@ limit but that of common sensors, and its warning states it.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 

@@ -37,8 +37,6 @@ last coefficients that differ from 0 at `_LEVEL` (χ² over the axes).
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import comb

@@ -18,8 +18,6 @@ counted, because noise also reaches new extremes.
 
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace

@@ -15,8 +15,6 @@ is moved outwards by this distance.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain

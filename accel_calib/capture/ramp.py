@@ -23,8 +23,6 @@ A ramp is refused if it cannot show what temperature does:
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 

@@ -43,8 +43,6 @@ References
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 import math
 from typing import Any

@@ -3,8 +3,6 @@
 
 """``accel-calib verify``, ``compare``, ``history``, ``noise``: judge calibrations and sensors."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict

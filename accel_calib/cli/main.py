@@ -10,8 +10,6 @@ first imports are few, because Ctrl-C ends the program without words only after 
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 import os

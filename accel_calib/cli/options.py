@@ -9,8 +9,6 @@ fields; `accel_calib.cli.frame.given` has their values.
 
 """
 
-from __future__ import annotations
-
 import argparse
 import codecs
 from collections.abc import Mapping, Sequence

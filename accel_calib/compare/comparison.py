@@ -10,8 +10,6 @@ contain its effect.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timezone

@@ -28,8 +28,6 @@ succession without it, so that rests in orientations that hide it do not clear i
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import product

@@ -10,8 +10,6 @@ is any quantity that the catalogue does not know (`covariate_names`).
 
 """
 
-from __future__ import annotations
-
 from collections import ChainMap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace

@@ -3,8 +3,6 @@
 
 """The form of an effect: the sum of terms that `accel_calib.effects` describes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial

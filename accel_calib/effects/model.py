@@ -14,8 +14,6 @@ readings are in g; `accel_calib.units` converts them.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache

@@ -3,8 +3,6 @@
 
 """Effects of a user: their definition, and how a process comes to know them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial

@@ -9,8 +9,6 @@ levelled frame, a unit vector of specific force. Simulated noise is seeded.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

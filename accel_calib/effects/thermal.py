@@ -21,8 +21,6 @@ Times need not be sorted. A row without time or temperature is NaN, and the othe
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 import math
 from typing import Any, NamedTuple

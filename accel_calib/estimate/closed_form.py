@@ -43,8 +43,6 @@ in A' and b' stays on the sheet.
 
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations

@@ -11,8 +11,6 @@ does not show; `sensors.parquet` and the rows of the recordings have all of them
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
 from functools import partial

@@ -34,8 +34,6 @@ first message in order of preference whose samples are dense enough for the capt
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 import re

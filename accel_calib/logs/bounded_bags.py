@@ -20,8 +20,6 @@ SQLite (``-wal`` or ``-journal``). `rosbags` ignores it. SQLite joins both files
 
 """
 
-from __future__ import annotations
-
 from bz2 import BZ2Decompressor
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, ExitStack

@@ -10,8 +10,6 @@ the names cannot tell apart are an error, because a wrong choice would give a wr
 
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field

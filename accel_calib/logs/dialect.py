@@ -14,8 +14,6 @@ Dates are those of ISO 8601, ``2026-01-31T12:00:00.250Z``, with a blank for the 
 
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 import csv

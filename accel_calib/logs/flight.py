@@ -34,8 +34,6 @@ text form (``.log``) has the same messages, one per line.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 import io
 from itertools import chain

@@ -3,8 +3,6 @@
 
 """Binary formats of logs: their first bytes, and the errors of the libraries that read them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 import errno

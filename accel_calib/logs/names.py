@@ -21,8 +21,6 @@ depends on the sign. A flat pose does, and `LogFormat.note` names the frame for 
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches

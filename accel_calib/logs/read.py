@@ -11,8 +11,6 @@ Three kinds of comments are read, with values in JSON: ``# units: "m/s2"``,
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 import csv

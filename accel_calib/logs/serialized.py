@@ -16,8 +16,6 @@ endian if the second byte of the encapsulation is 1.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import struct

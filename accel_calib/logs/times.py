@@ -10,8 +10,6 @@ A counter of the clock can start again.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import math

@@ -16,8 +16,6 @@ curve rises over two octaves. Common parts need hours.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import product
 from typing import Any

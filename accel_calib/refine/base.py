@@ -32,8 +32,6 @@ capture includes it in the noise of its poses; in other tables it is missing, an
 
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

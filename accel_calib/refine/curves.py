@@ -32,8 +32,6 @@ set leaves.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 import math

@@ -26,8 +26,6 @@ only if each of its effects is significant beside the others. With a walk of the
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 

@@ -11,8 +11,6 @@ instant, the ends of the range of a column, or directions of the force.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise

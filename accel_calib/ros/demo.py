@@ -15,8 +15,6 @@ succeeds on a slow machine.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass

@@ -12,8 +12,6 @@ it.
 
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import cycle
 import math

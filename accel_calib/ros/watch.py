@@ -9,8 +9,6 @@ once per second. A longer silence therefore means that the node or the network i
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from time import monotonic

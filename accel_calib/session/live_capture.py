@@ -16,8 +16,6 @@ pose is marked as doubtful, and the fit leaves it out if possible.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass, replace
 from operator import is_

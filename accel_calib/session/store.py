@@ -15,8 +15,6 @@ It is held until it is released or the process ends.
 
 """
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import dataclass, replace
 import errno

@@ -17,8 +17,6 @@ smallest one after which u changes by less than the precision of a float.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial

@@ -10,8 +10,6 @@ checksum of the text before it; it reveals a file that was edited by hand.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields, replace
 import hashlib

@@ -28,8 +28,6 @@ ArduPilot [2]_, and the parameter file of QGroundControl [3]_.
 
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

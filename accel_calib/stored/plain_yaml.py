@@ -15,8 +15,6 @@ another type.
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 import math
 import re
