@@ -29,8 +29,8 @@ from accel_calib.logs import LogOptions
 from accel_calib.stored import read_calibration
 from accel_calib.table import Floats
 from inside import (
-    announce, CLOCK_OF_A_SOURCE, COMMAND, HEAD_OF_A_PORT, is_port, open_source,
-    PATIENCE_OF_A_PORT, read_log)
+    announce, CLOCK_OF_A_SOURCE, COMMAND, HEAD_OF_A_PORT, is_port, open_source, PATIENCE_OF_A_PORT,
+    read_log)
 from live_bench import TurnedSensor
 import numpy as np
 import pytest

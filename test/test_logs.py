@@ -17,8 +17,7 @@ from accel_calib.capture import capture
 from accel_calib.errors import InputError
 from accel_calib.logs import LogOptions, open_log
 from accel_calib.table import Poses, Recording
-from inside import (
-    meaning, model_with, read_log, simulate_recording, spread_directions, unit_of)
+from inside import meaning, model_with, read_log, simulate_recording, spread_directions, unit_of
 import numpy as np
 import pytest
 
