@@ -17,7 +17,7 @@ from functools import cache
 from pathlib import Path
 import re
 import sys
-from typing import Any, NoReturn
+from typing import Any, get_type_hints, NoReturn
 
 BAD_INPUT = 2
 """Exit status for invalid input."""
@@ -127,7 +127,7 @@ def _columns(text: str) -> dict[str, str]:
     return {ours.strip(): theirs.strip() for ours, _, theirs in pairs}
 
 
-_TYPES: dict[str, Any] = {'float': positive, 'float | None': positive, 'int | None': int}
+_TYPES: dict[Any, Any] = {float: positive, float | None: positive, int | None: int}
 """Types of options by those of the fields of records; others are text."""
 
 _SHARED: dict[str, dict[str, Any]] = {
@@ -161,10 +161,11 @@ def share(made: Any, *names: str) -> None:
 def add_fields(made: Any, record: Any, options: Mapping[str, Mapping[str, Any]],
                **usual: Any) -> None:
     """Add options for fields of a record to a parser or a group, with types and defaults."""
+    types = get_type_hints(record)
     for name, about in options.items():
-        field = record.__dataclass_fields__[name]
-        kind = ({'action': 'store_true'} if field.type == 'bool' else
-                {'default': field.default, 'type': _TYPES.get(field.type, utf8)})
+        kind = ({'action': 'store_true'} if types[name] is bool else
+                {'default': record.__dataclass_fields__[name].default,
+                 'type': _TYPES.get(types[name], utf8)})
         made.add_argument(f'--{name.replace("_", "-")}', **{**kind, **usual, **about})
 
 
