@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-import csv
 from dataclasses import dataclass
 import io
 from itertools import chain, islice
@@ -24,7 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from .dialect import is_clock, is_comment, is_number, IsHeader, Layout, layout_of, short
+from .dialect import is_clock, is_comment, is_number, IsHeader, Layout, layout_of, short, split
 from ..errors import InputError
 from ..table import Floats
 from ..text import counted
@@ -131,6 +130,7 @@ class TextTable:
         """Set the columns to read. Bad rows raise unless `skip_bad`; bad quantities are NaN."""
         self._numeric, self._text, self._dates = columns.numeric, columns.text, columns.dates
         self._needed = self._numeric[:len(self._numeric) - len(columns.quantities)]
+        self._spare = self._numeric[len(self._needed):]
         self._skip_bad = skip_bad
 
     @property
@@ -174,12 +174,23 @@ class TextTable:
         if values is None:
             good = self._good(rows_of, number, where)
             rows_of, number = [rows_of[k] for k in good], number[good]
-            values = self._by_cell(rows_of)
+            values = self._parsed(rows_of)
+        if values is None and self._spare:
+            self._numeric = self._needed
+            values = self._parsed(rows_of)
+        if values is not None and values.shape[1] < len(self._needed + self._spare):
+            values = np.hstack([values, self._spare_cells(rows_of)])
+        if values is None:
+            raise InputError(f'{self.layout.path} cannot be read, expected a CSV table',
+                             'check it for stray characters')
         texts = [[self.layout.dialect.cells(line)[k] for line in rows_of] for k in self._text]
         return Cells(values, texts, number)
 
     def _parsed(self, lines: list[str]) -> Floats | None:
-        """Return the numbers of rows, or None if a row has a fault, or there is none."""
+        """Return the numbers of rows, or None if a row has a fault."""
+        if not lines or not self._numeric:
+            sound = all(self._fault(line) is None for line in lines)
+            return np.zeros((len(lines), len(self._numeric))) if sound else None
         plain = self._plain(lines)
         cells = self.layout.dialect.cells
         if plain is None or any(not is_clock(cells(line)[k])
@@ -195,12 +206,14 @@ class TextTable:
             return None
         return values if len(values) == len(lines) and np.isfinite(values).all() else None
 
-    def _by_cell(self, lines: list[str]) -> Floats:
-        """Return the numbers of sound rows, cell by cell; NaN for another cell of a quantity."""
-        cells = map(self.layout.dialect.cells, lines)
-        texts = ([row[k].replace(',', '.') for k in self._numeric] for row in cells)
-        found = [[float(text) if is_number(text) else np.nan for text in row] for row in texts]
-        return np.array(found, float).reshape(len(lines), len(self._numeric))
+    def _spare_cells(self, lines: list[str]) -> Floats:
+        """Return the numbers of spare columns, cell by cell; NaN for another cell."""
+        found = np.full((len(lines), len(self._spare)), np.nan)
+        for row, line in zip(found, lines, strict=True):
+            cells = self.layout.dialect.cells(line)
+            texts = [cells[k].replace(',', '.') for k in self._spare]
+            row[:] = [float(text) if is_number(text) else np.nan for text in texts]
+        return found
 
     def _plain(self, lines: list[str]) -> tuple[list[str], str | None, Sequence[int]] | None:
         """Return lines for loadtxt with their delimiter and columns, or None if ragged."""
@@ -218,16 +231,23 @@ class TextTable:
 
     def _unquoted(self, lines: list[str]) -> tuple[list[str], str, Sequence[int]] | None:
         """Return lines without quotes, parted by tabs; or None if ragged."""
-        delimiter = self.layout.dialect.delimiter or ' '
-        try:
-            rows = [*csv.reader(lines, delimiter=delimiter, skipinitialspace=True)]
-        except csv.Error:
-            return None
-        cells = [[row[k] for k in self._numeric] for row in rows if len(row) == self.layout.width]
-        text = ''.join(chain.from_iterable(cells))
-        if len(cells) != len(lines) or '\t' in text or '\n' in text:
-            return None
-        return ['\t'.join(row) for row in cells], '\t', range(len(self._numeric))
+        delimiter, width = self.layout.dialect.delimiter, self.layout.width
+        between = f'"{delimiter}"'
+        stripped = [line.strip() for line in lines]
+        if all(line.count(between) == width - 1 and line.count('"') == 2 * width
+               and '\t' not in line and line[0] == line[-1] == '"' for line in stripped):
+            kept = [line[1:-1].replace(between, '\t') for line in stripped]
+            columns: Sequence[int] = self._numeric
+        else:
+            rows = [split(line, delimiter) for line in lines]
+            if any(len(row) != width for row in rows):
+                return None
+            cells = [[row[k] for k in self._numeric] for row in rows]
+            if any('\t' in cell or '\n' in cell for row in cells for cell in row):
+                return None
+            kept = ['\t'.join(row) for row in cells]
+            columns = list(range(len(self._numeric)))
+        return kept, '\t', columns
 
     def _without_cut(self, lines: list[str]) -> list[str]:
         """Return rows without a last one that is cut; note that it is left out."""
