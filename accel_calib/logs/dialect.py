@@ -62,6 +62,7 @@ _DECIMAL = re.compile(r'[-+]?\d*([.,])\d+(?:[eE][-+]?\d+)?', re.ASCII)
 _UNREADABLE = re.compile('[\x00-\x08\x0e-\x1a\x1c-\x1f\x7f\ufffd]')
 _UNREADABLE_SHARE = 0.3
 _SHOWN_CHARACTERS = 40
+_EXAMPLE = 'such as time,ax,ay,az and one row for each pose or sample'
 
 RATES_HZ = (1.0, 10_000.0)
 """Plausible numbers of samples per second."""
@@ -243,7 +244,9 @@ def layout_of(path: Path, head: Sequence[str], is_header: IsHeader, encoding: st
     finder = _Finder(head, is_header)
     found = finder.named() or finder.unnamed() or finder.narrow()
     if found is None:
-        raise _no_table(path, f'has no table of numbers in its first {counted(len(head), "line")}')
+        raise InputError(f'{path} has no table of numbers in its first '
+                         f'{counted(len(head), "line")}, expected a header line {_EXAMPLE}',
+                         'check that this is the intended file')
     start = finder.data_from(found)
     numbers = [k for k in finder.plain if k >= start]
     rate_hz = None if found.header else _rate_below_start(
@@ -275,12 +278,8 @@ def _check_text(path: Path, head: Sequence[str]) -> None:
         raise InputError(f'{path} is not a text file, expected a CSV table',
                          'use a CSV table or a bag')
     if all(line.isspace() or line[0] == '#' for line in head):
-        raise _no_table(path, 'is empty')
-
-
-def _no_table(path: Path, what: str) -> InputError:
-    return InputError(f'{path} {what}, expected a header line such as time,ax,ay,az and one row '
-                      'for each pose or sample', 'check that this is the intended file')
+        raise InputError(f'{path} is empty, expected a header line {_EXAMPLE}',
+                         'check that this is the intended file')
 
 
 @dataclass(frozen=True)
