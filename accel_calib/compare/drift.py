@@ -180,7 +180,7 @@ class RestError:
 @dataclass(frozen=True)
 class Drift:
     """
-    The state of the monitor: the last rests since a calibration, and the number of all.
+    The state of the monitor: a calibration, the last rests since then, and the number of all.
 
     `scatter` is the factor on the stated scatter of the rests. `change` is the lasting change,
     None if the sensor is unchanged, and `since` the number of the first rest with it, 1-based, or

@@ -22,9 +22,9 @@ from .read import (
     write_table)
 from .serialized import (
     ACCELERATION, ACCELERATION_COVARIANCE, ANGULAR_VELOCITY, ANGULAR_VELOCITY_COVARIANCE,
-    doubles_at, IMU_DOUBLES, joined, joined_alike, Layout, layout_of, layout_with, LITTLE_ENDIAN,
-    Messages, NAME_AT, NINE, ORIENTATION, ORIENTATION_COVARIANCE, put_doubles, renamed, samples_of,
-    STAMP, STAMP_AT, THREE)
+    doubles_at, IMU_DOUBLES, joined, Layout, layout_of, layout_with, LITTLE_ENDIAN, Messages,
+    NAME_AT, NINE, ORIENTATION, ORIENTATION_COVARIANCE, put_doubles, renamed, samples_of, STAMP,
+    STAMP_AT, THREE)
 
 __all__ = ['ACCELERATION', 'ACCELERATION_COVARIANCE', 'ANGULAR_VELOCITY',
            'ANGULAR_VELOCITY_COVARIANCE', 'ARDUPILOT_REFERENCE', 'DEGREE', 'IMU_DOUBLES',
@@ -32,6 +32,6 @@ __all__ = ['ACCELERATION', 'ACCELERATION_COVARIANCE', 'ANGULAR_VELOCITY',
            'PER_MILLION', 'STAMP', 'STAMP_AT', 'THREE', 'Bag', 'ByAxis', 'ContextTopics', 'Frame',
            'Layout', 'LineReader', 'LogOptions', 'Messages', 'OpenLog', 'Piped', 'Progress',
            'are_untimed_samples', 'context_of', 'damage_as_input_error', 'doubles_at', 'is_bag',
-           'joined', 'joined_alike', 'layout_of', 'layout_with', 'open_bag', 'open_log',
+           'joined', 'layout_of', 'layout_with', 'open_bag', 'open_log',
            'put_doubles', 'read_poses', 'read_recording', 'renamed', 'samples_of', 'write_blocks',
            'write_table']

@@ -167,14 +167,6 @@ def joined(raws: Sequence[bytes | memoryview], doubles: int, name: str, *, ros2:
     return Messages(data, start, stop, head, start + begin, swapped, ros2)
 
 
-def joined_alike(raws: Sequence[bytes], layout: Layout) -> Messages:
-    """Copy Imu messages of one layout into one buffer."""
-    rows = np.frombuffer(bytearray().join(raws), np.uint8).reshape(len(raws), layout.size)
-    start, head = np.arange(len(raws)) * layout.size, rows[:, :LETTERS_AT].copy().view('<u4')
-    return Messages(rows.ravel(), start, start + layout.size, head, start + layout.begin,
-                    np.zeros(len(raws), bool), ros2=True)
-
-
 def _check(sound: NDArray[np.bool_], size: Indices, name: str, before: int) -> None:
     if not np.all(sound):
         first = int(np.argmin(sound))

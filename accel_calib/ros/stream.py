@@ -31,7 +31,8 @@ from .declare import published_by_others, SENSOR
 from ..calibrate import Calibration
 from ..errors import AccelCalibError, InputError
 from ..logs import (
-    ACCELERATION, joined_alike, Layout, layout_of, LITTLE_ENDIAN, NAME_AT, samples_of, THREE)
+    ACCELERATION, IMU_DOUBLES, joined, Layout, layout_of, LITTLE_ENDIAN, NAME_AT, samples_of,
+    THREE)
 from ..messages.correction import motion_of, output_frame, Rewriter
 from ..messages.one_reading import Triple
 from ..session import BATCH, CalibratorSettings, columns_of, context_topics, Session
@@ -263,7 +264,7 @@ class Stream:
         if self._waiting:
             messages, self._waiting = self._waiting, []
             contexts, self._contexts = self._contexts, []
-            found = samples_of(joined_alike(messages, self._layout))
+            found = samples_of(joined(messages, IMU_DOUBLES, 'imu/data_raw'))
             rows = np.column_stack([found['time'], found['reading'], found['rate'],
                                     self._around(contexts)])
             self._session.push(rows, self._arrived)
