@@ -5,9 +5,9 @@
 Processing of Imu messages, from imu/data_raw to imu/data_calibrated, and of their context.
 
 Messages remain serialized. Each message is corrected and published at once. The session receives
-several messages as one array later, which is cheaper and does not delay a message. A message in
-another encoding (byte order) is serialized again in the usual encoding and then processed in the
-same way.
+several messages as one array later, which is cheaper. The array is made after one message and
+processed after the next, so that neither delays a message of a fast sensor. A message in another
+encoding (byte order) is serialized again in the usual encoding and then processed in the same way.
 
 """
 
@@ -40,6 +40,9 @@ from ..table import Floats
 
 if TYPE_CHECKING:
     from rclpy.node import Node
+
+_MANY = 30
+"""Number of messages from which their array is made and processed after different messages."""
 
 _NO_LAYOUT = Layout(b'', 0, -1)
 _NO_BIAS = np.zeros(3)
@@ -145,9 +148,11 @@ class Stream:
         self._outputs = [Output(publisher) for publisher in publishers]
         self._calibrated, self._preview, self._motion = self._outputs
         self._layout = _NO_LAYOUT
+        self._newest = b''
         self._waiting: list[bytes] = []
         self._contexts: list[Mapping[str, float]] = []
-        self._due = self._arrived = 0.0
+        self._rows: Floats | None = None
+        self._due = self._arrived = self._rows_arrived = 0.0
         self._listened = False
         self._applied: Calibration | None = None
         self._offered: Calibration | None = None
@@ -161,10 +166,10 @@ class Stream:
 
     @property
     def newest(self) -> Triple | None:
-        """Return the newest reading, unless the session has it already."""
-        if not self._waiting:
+        """Return the newest reading; None before the first one."""
+        if not self._newest:
             return None
-        x, y, z = THREE.unpack_from(self._waiting[-1], self._layout.place(ACCELERATION))
+        x, y, z = THREE.unpack_from(self._newest, self._layout.place(ACCELERATION))
         return x, y, z
 
     def on_message(self, data: bytes) -> None:
@@ -186,12 +191,18 @@ class Stream:
             self._prepare()
         if self._listened:
             self._send(data)
+        self._newest = data
         self._waiting.append(data)
         self._contexts.append(session.around.values)
         self._arrived = now
         if due:
             self._due = now + BATCH
-            self.flush()
+            if len(self._waiting) < _MANY:
+                self.flush()
+            else:
+                self._collect()
+        elif self._rows is not None:
+            self._pass_on()
 
     def _prepare(self) -> None:
         """Prepare the outputs."""
@@ -261,13 +272,25 @@ class Stream:
 
     def flush(self) -> None:
         """Pass the waiting messages to the session."""
+        self._collect()
+        self._pass_on()
+
+    def _collect(self) -> None:
+        """Make the array of the waiting messages, after that before it has been passed on."""
+        self._pass_on()
         if self._waiting:
             messages, self._waiting = self._waiting, []
             contexts, self._contexts = self._contexts, []
             found = samples_of(joined(messages, IMU_DOUBLES, 'imu/data_raw'))
-            rows = np.column_stack([found['time'], found['reading'], found['rate'],
-                                    self._around(contexts)])
-            self._session.push(rows, self._arrived)
+            self._rows = np.column_stack([found['time'], found['reading'], found['rate'],
+                                          self._around(contexts)])
+            self._rows_arrived = self._arrived
+
+    def _pass_on(self) -> None:
+        """Pass the array to the session."""
+        if self._rows is not None:
+            rows, self._rows = self._rows, None
+            self._session.push(rows, self._rows_arrived)
             self._on_events()
 
     def _around(self, contexts: Sequence[Mapping[str, float]]) -> Floats:
