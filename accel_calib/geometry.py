@@ -1,7 +1,13 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Rotations as matrices, quaternions, roll, pitch and yaw; directions, and attitudes by name."""
+"""
+Rotations as matrices, quaternions, roll, pitch and yaw; directions, and attitudes by name.
+
+Rotations are converted here, because the import of `scipy.spatial` takes 0.2 s and 25 MB: a node
+would load it between two messages.
+
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,7 +15,6 @@ from itertools import product
 import math
 
 import numpy as np
-import scipy
 
 from .table import Floats
 
@@ -23,7 +28,10 @@ def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Floats:
     It transforms from the axes of the rotated body to the fixed axes.
 
     """
-    return scipy.spatial.transform.Rotation.from_euler('xyz', [roll, pitch, yaw]).as_matrix()
+    (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
+    return np.array([[cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+                     [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+                     [-sp, cp * sr, cp * cr]])
 
 
 def rpy_of(rotation: Floats) -> tuple[float, float, float]:
@@ -41,15 +49,29 @@ def rpy_of(rotation: Floats) -> tuple[float, float, float]:
 
 
 def quaternion_of(rotation: Floats) -> tuple[float, float, float, float]:
-    """Return the unit quaternion (x, y, z, w) of a rotation matrix, with w >= 0."""
-    turn = scipy.spatial.transform.Rotation.from_matrix(rotation)
-    x, y, z, w = turn.as_quat(canonical=True).tolist()
+    """
+    Return the unit quaternion (x, y, z, w) of a rotation matrix, with w >= 0.
+
+    q qᵀ, which is linear in the matrix, is formed, and its largest column is normalised.
+
+    """
+    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
+    outer = np.array([[1 + a - e - i, b + d, c + g, h - f],
+                      [b + d, 1 - a + e - i, f + h, c - g],
+                      [c + g, f + h, 1 - a - e + i, d - b],
+                      [h - f, c - g, d - b, 1 + a + e + i]])
+    column = outer[:, int(np.argmax(np.diag(outer)))]
+    x, y, z, w = (column / np.linalg.norm(column) * (-1.0 if column[3] < 0.0 else 1.0)).tolist()
     return x, y, z, w
 
 
 def rotation_from_quaternion(quaternion: Sequence[float]) -> Floats:
     """Return the (3, 3) rotation matrix of a quaternion (x, y, z, w) of any length but 0."""
-    return scipy.spatial.transform.Rotation.from_quat(quaternion).as_matrix()
+    x, y, z, w = quaternion
+    return np.eye(3) + 2.0 / (x * x + y * y + z * z + w * w) * np.array(
+        [[-y * y - z * z, x * y - w * z, x * z + w * y],
+         [x * y + w * z, -x * x - z * z, y * z - w * x],
+         [x * z - w * y, y * z + w * x, -x * x - y * y]])
 
 
 def angle_of(rotation: Floats) -> float:

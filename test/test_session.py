@@ -24,7 +24,7 @@ from inside import (
     spread_directions, store_of, StreamStatistics, writing_advice)
 import numpy as np
 import pytest
-from shared import with_effects
+from shared import python, ROOT, with_effects
 
 GRAVITY = 9.80665
 UP, LEFT, FORWARD = [0, 0, 1], [0, 1, 0], [1, 0, 0]
@@ -182,6 +182,18 @@ def test_nothing_is_captured_from_a_sensor_that_fell_silent(stored: Stored, read
     driver.feed(rest[150:160])
     assert driver.ask('capture_pose').startswith('1 pose:')
     assert 'levelled by this pose' in driver.ask('set_level')
+
+
+def test_levelling_between_two_messages_imports_no_large_library(stored: Stored) -> None:
+    code = ('import sys; from driven import Driver, GRAVITY; import numpy as np; '
+            'driver = Driver(calibration_file=sys.argv[1]); '
+            'driver.feed(np.random.default_rng(1).normal((0.0, 0.0, GRAVITY), 0.01, (300, 3))); '
+            'before = {*sys.modules}; print(driver.ask("set_level")); '
+            'print({name.split(".")[0] for name in {*sys.modules} - before})')
+    words, imported = python('-c', code, stored(), PYTHONPATH=f'{ROOT}:{ROOT}/test'
+                             ).stdout.splitlines()
+    assert 'levelled by this pose' in words
+    assert imported == 'set()'
 
 
 def captured(driver: Driver) -> list[list[int]]:
