@@ -205,8 +205,10 @@ def test_results_whose_file_or_mark_is_lost_are_made_again(client: Any, tmp_path
     folder, store = write_fleet(tmp_path / 'in', 5, 1), Store(tmp_path / 'out')
     run(client, found_in(folder), QUICK, store)
     before = state_of(store.folder)
-    next(store.folder.rglob('data.parquet')).unlink()
-    next(store.folder.glob('done/*/*')).write_bytes(b'\xff' * 300)
+    first, *_, other = sorted((store.folder / 'calibrations').rglob('*.yaml'))
+    next(store.folder.glob(f'done/*/{first.stem}')).write_bytes(b'\xff' * 300)
+    other.unlink()
+    sorted(store.folder.rglob('data.parquet'))[1].unlink()
     run(client, found_in(folder), QUICK, store)
     assert state_of(store.folder) == before
 

@@ -4,7 +4,7 @@
 """Hidden effects are named and no others, on data of an independent generator."""
 
 from accel_calib.logs import read_poses
-from accel_calib.refine import refine
+from accel_calib.refine import refine, verdict_words
 from accel_calib.units import units_of
 import generator
 from inside import LARGEST_SAMPLE, model_with, simulate_poses, spread_directions
@@ -83,17 +83,26 @@ def test_a_form_outside_of_the_catalogue_is_not_named_after_its_nearest_effect(
     assert names(found) == ['empirical']
 
 
+@pytest.mark.parametrize('seed', range(3))
+def test_two_nonlinearities_with_directions_of_their_own_are_explained(seed, taken):
+    found = refine(taken([3, seed], {'quadratic': 10.0, 'cubic': 6.0}, poses=60)[0], MPS2)
+    assert names(found) == ['quadratic', 'cubic']
+    assert (found.verdict, found.one_curve) == ('explained', ())
+
+
 @pytest.mark.parametrize('effect', ['repeatability', 'quartic', 'quintic', 'dead_zone',
                                     'gain_temperature_steep', 'offset_temperature_knee',
                                     'wander_1f'])
 def test_a_gap_that_no_effect_explains_is_described_or_unexplained(effect, taken):
     found = refine(taken(3, {effect: 6.0}, poses=60)[0], MPS2, base='10')
     assert {*names(found)} - WITHOUT_NAME <= ALIKE.get(effect, set())
-    if (effect != 'wander_1f' or 'offset_wander' not in names(found)) and effect != 'quartic':
-        # At 1 g, quadratic and gain_asymmetry together imitate a quartic.
+    if effect != 'wander_1f' or 'offset_wander' not in names(found):
         assert found.verdict in ('described', 'unexplained')
+    if effect == 'quartic':  # at 1 g, quadratic and gain_asymmetry together imitate it
+        assert (found.undecided, found.one_curve) == (True, ('quadratic', 'gain_asymmetry'))
+        assert 'quadratic and gain_asymmetry are in the same proportion' in verdict_words(found)
     assert ('empirical' in names(found)) or found.verdict != 'described'
-    if found.verdict == 'unexplained':
+    if found.verdict == 'unexplained' and not found.undecided:
         assert any('gap remains' in line or 'repeat' in line for line in found.advice)
     for step in found.steps:  # each is significant beside the others
         assert step.p_value < 0.01

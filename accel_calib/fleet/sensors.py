@@ -128,7 +128,7 @@ class Store:
         for row in new:
             mark = self._mark(row['key'])
             mark.parent.mkdir(parents=True, exist_ok=True)
-            mark.write_text(name, encoding='utf-8')
+            mark.write_text(f'{name}\n{row.get("calibration", "")}', encoding='utf-8')
 
     def finish(self, name: str) -> None:
         """Remove the pending rows of a sensor that are in the data set."""
@@ -154,11 +154,12 @@ class Store:
         return moved
 
     def forget_lost(self) -> None:
-        """Remove the marks of results whose Parquet file is gone, so that they are made again."""
+        """Remove the marks of results of which a file is gone, so that they are made again."""
         known = {os.fsencode(each.parent.name.partition('=')[2])
                  for each in self.rows.glob(f'sensor=*/{_DATA}')}
         for mark in self.folder.glob('done/*/*'):
-            if mark.read_bytes() not in known:
+            name, _, calibration = mark.read_bytes().partition(b'\n')
+            if name not in known or not (self.folder / os.fsdecode(calibration)).exists():
                 mark.unlink()
 
     def replace_unread(self, rows: list[Row]) -> None:

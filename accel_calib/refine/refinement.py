@@ -28,8 +28,8 @@ from .plan import plan_poses, PosePlan
 from .search import Found, search
 from .state import fitted_state, is_noise, State
 from .steps import (
-    advice_for, beside_walk, not_testable, plain_name, Stage, Step, steps_of, untestable, Verdict,
-    verdict_of)
+    advice_for, beside_walk, not_testable, one_curve, plain_name, Stage, Step, steps_of,
+    untestable, Verdict, verdict_of)
 from ..calibrate import (
     Calibration, check_sensor, fit_findings, fit_poses, fit_with_fleet, FLEET, FleetPrior, gated,
     in_g, LARGEST_DILUTION, OF_A_FIT, only_norm, posterior, quality_of, record_of, refuse_if_unfit,
@@ -102,7 +102,10 @@ class Refinement(Record):
         Poses that separate the effects from their rivals soonest.
     undecided : bool
         Whether the rest is noise, but the poses do not show which effects explain the gap: one has
-        more than `MOST_RIVALS` rivals, or the poses do not determine the refined calibration.
+        more than `MOST_RIVALS` rivals, two may be `one_curve`, or the poses do not determine the
+        refined calibration.
+    one_curve : tuple of str
+        Two nonlinearities in the same proportion on each axis, as parts of one curve; or empty.
 
     """
 
@@ -121,6 +124,7 @@ class Refinement(Record):
     stages: tuple[Stage, ...]
     plan: PosePlan
     undecided: bool = False
+    one_curve: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         names = ' + '.join([self.calibration.name, *(step.effect for step in self.steps)])
@@ -143,10 +147,8 @@ def verdict_words(result: Refinement) -> str:
     words = _VERDICTS[result.verdict].format(
         'a slow change of the offset' if walks else 'an empirical curve')
     if result.undecided:
-        most = max(result.steps, key=lambda step: len(step.rivals))
-        why = result.refusal[0] if result.refusal else (
-            f'{len(most.rivals)} others explain it about as well as {most.effect}')
-        words = f'Not enough poses: they cannot tell what explains the gap, because {why}.'
+        words = ('Not enough poses: they cannot tell what explains the gap, because '
+                 f'{_why_undecided(result)}.')
     elif result.verdict == 'unexplained' and result.steps:
         words = ('A gap remains beyond the named effects, and no effect of the catalogue explains '
                  'it.')
@@ -154,6 +156,16 @@ def verdict_words(result: Refinement) -> str:
         words += (' The noise of the poses is not known (no std and count), so their scatter is '
                   'taken as the noise.')
     return words
+
+
+def _why_undecided(result: Refinement) -> str:
+    if result.refusal:
+        return result.refusal[0]
+    if result.one_curve:
+        return (f'{" and ".join(result.one_curve)} are in the same proportion on each axis, as '
+                'parts of one curve are')
+    most = max(result.steps, key=lambda step: len(step.rivals))
+    return f'{len(most.rivals)} others explain it about as well as {most.effect}'
 
 
 def residual_words(result: Refinement) -> str:
@@ -275,7 +287,7 @@ def _record(calibration: Calibration, found: Found, given: Given, sensor: str, d
     return Refinement(
         verdict, final.floor_mg, start.gap_mg(start.fit.residual),
         final.gap_mg(beside_walk(found)[0]), steps, outliers, missing, advice, refined, refusal,
-        final.poses_g, final.fit.equations.force, stages, plan, undecided)
+        final.poses_g, final.fit.equations.force, stages, plan, undecided, one_curve(final))
 
 
 def _rejected(found: Found, given: Given) -> tuple[Rejected, ...]:
