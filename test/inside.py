@@ -80,7 +80,7 @@ from accel_calib.refine.curves import (
     _grown as grown_curve, best_curve, Curve, Near, probabilities, Process, process_of,
     SIGNIFICANT, Walk, walk_beside)
 from accel_calib.refine.linear import (
-    _RARE as RARE, Block, LEVEL as REFINE_LEVEL, Linear, outside_of, products_of, Set)
+    _RARE as RARE, Block, LEVEL as REFINE_LEVEL, Linear, outside_of, Set)
 from accel_calib.refine.plan import _levels as levels_of, NOTHING as NOTHING_TO_PLAN
 from accel_calib.refine.search import (
     _is_better as is_better_than_walk, accepted, explored, search as search_effects, simpler)

@@ -33,6 +33,8 @@ capture includes it in the noise of its poses; in other tables it is missing, an
 """
 
 from dataclasses import dataclass, replace
+import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -275,8 +277,7 @@ def _alternating_step(poses_g: Poses) -> float | None:
     if not _FINEST_ALTERNATING_G < finest < coarsest or np.ptp(variance) == 0.0:
         return None
     tried = np.arange(1.0 / coarsest, 1.0 / finest, 1.0 / (_TRIALS_PER_PERIOD * reach))
-    agreement = np.array([-_correlation(np.cos(2.0 * np.pi * mean * each), variance)
-                          for each in tried])
+    agreement = -_correlations(mean, variance, tried)
     best = int(np.argmax(agreement))
     step = 1.0 / float(tried[best])
     different = sum(len(np.unique(np.round(4.0 * axis / step))) for axis in poses_g.reading.T)
@@ -284,10 +285,24 @@ def _alternating_step(poses_g: Poses) -> float | None:
     return step if agreement[best] > 0.0 and odds > np.log(len(tried)) + _SURE else None
 
 
-def _correlation(one: Floats, other: Floats) -> float:
-    """Return the correlation of two quantities; `numpy.corrcoef` takes several times as long."""
-    one, other = one - np.sum(one) / len(one), other - np.sum(other) / len(other)
-    return float(one @ other / np.sqrt((one @ one) * (other @ other)))
+def _correlations(mean: Floats, variance: Floats, tried: Floats) -> Floats:
+    """
+    Return the correlation of a variance with the cosine of a mean, at evenly spaced frequencies.
+
+    With exp(i (a + b)) = exp(i a) exp(i b), few exponentials are computed.
+
+    """
+    count, width = len(mean), math.isqrt(len(tried)) + 1
+    coarse = np.exp(2j * np.pi * np.outer(tried[::width], mean))
+    fine = np.exp(2j * np.pi * np.outer(tried[:width] - tried[0], mean))
+
+    def summed(one: Any, other: Any) -> Floats:
+        return np.asarray((one @ other.T).real.ravel()[:len(tried)])
+
+    cosines, squares = summed(coarse, fine), 0.5 * (count + summed(coarse ** 2, fine ** 2))
+    spread, away = squares - cosines ** 2 / count, variance - np.mean(variance)
+    return summed(coarse * away, fine) / np.sqrt(
+        np.maximum(spread, 1e-12 * count) * np.sum(away ** 2))
 
 
 def _steps(apart: Floats) -> Floats:

@@ -40,7 +40,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .base import causes
-from .linear import Block, held_out, LEVEL, Linear, outside_of, products_of, Set
+from .linear import Block, held_out, LEVEL, Linear, outside_of, Set
 from .state import candidates, linearised, State
 from ..effects import (
     CARRIERS, curve_pairs, Effect, effect_named, EFFECTS, empirical_name, empirical_parts, LADDER,
@@ -140,22 +140,20 @@ def _problems(plain: Linear, fit: Fit, family: _Family) -> Iterator[Linear]:
     model = Model({empirical_name(family.carrier, variable, modes):
                    np.concatenate([np.zeros(count), shape])})
     columns, sizes = outside_of(plain.onto, fit.equations.columns(model)[:, :count])
-    products = products_of(columns, plain.residual)
     for own, which in family.parts:
-        index = [*np.arange(len(sizes))[which], -1]
         names = [empirical_name(own, variable, (mode,)) for mode in modes]
         ends = np.cumsum([0, *(len(effect_named(each).parameters) for each in names)]).tolist()
         blocks = tuple(Block(each, shape, slice(*ends[k:k + 2]), effect, 0, k + 1.0)
                        for k, each in enumerate(names))
-        yield replace(plain, columns=columns[:, which], sizes=sizes[which], choice=0.0,
-                      products=products[np.ix_(index, index)], blocks=blocks)
+        yield replace(plain, every=np.vstack([columns[:, which].T, plain.residual]),
+                      sizes=sizes[which], choice=0.0, blocks=blocks)
 
 
 def _kept(problem: Linear, out: tuple[int, ...]) -> Linear:
     """Return the problem of the other poses, for its products alone."""
     nothing = Set.of(problem, (), out)
-    return replace(problem, products=problem.products - nothing.across.T @ nothing.across,
-                   base_rss=nothing.rss, dof=problem.dof - int(nothing.parameters))
+    return replace(problem, taken=nothing.across.T, base_rss=nothing.rss,
+                   dof=problem.dof - int(nothing.parameters))
 
 
 def _grown(problem: Linear) -> Set:
@@ -270,10 +268,9 @@ class Walk:
         """Return the equations whitened for the walk and the noise."""
         spread = 1.0 + self.ratio * self.process.values
         axes = self.process.axes
-        across = np.column_stack([axes.T @ linear.columns, axes.T @ linear.residual])
-        taken = np.sqrt(1.0 - 1.0 / spread)[:, np.newaxis] * across
+        across = axes.T @ linear.every.T
         return replace(linear, white=(axes, 1.0 - 1.0 / np.sqrt(spread), across),
-                       products=linear.products - taken.T @ taken,
+                       taken=across.T * np.sqrt(1.0 - 1.0 / spread),
                        penalty=float(np.sum(np.log(spread))) + _charge(linear))
 
     def residuals(self, chosen: Set) -> tuple[Floats, Floats]:

@@ -11,9 +11,10 @@ With the model of the base projected out, the equations are
 One block of columns belongs to one effect with one shape. A set is a choice of blocks, with
 poses that are left out; leaving a pose out is a further column, 1 at the pose and 0 elsewhere.
 To first order, the gain of a set is that of the joint fit of all its values. It depends only on
-the products of the columns with each other and with the residual. They are computed once. A set is
-then a part of their Cholesky factor, at a cost that does not depend on the number of poses, and
-the gains of all blocks beside a set are computed at once.
+the products of the columns with each other and with the residual. Those of the blocks that a
+search chooses are computed once, and the others never. A set is then a part of their Cholesky
+factor, at a cost that does not depend on the number of poses, and the gains of all blocks beside a
+set are computed at once.
 
 **Moderated variance.** The measured noise says λ = 1, and the residuals say what λ is. The noise
 is a prior worth ν = 4 degrees of freedom (Smyth 2004, with ν fixed). In F tests, the variance is
@@ -39,9 +40,10 @@ them costs, and the effects of the catalogue cost the same. Each pose that is le
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import groupby
 import math
 from typing import Any, NamedTuple
 
@@ -100,34 +102,43 @@ class Linear:
     """
     The equations of all poses near a model, with the base projected out.
 
-    The orthonormal columns `onto` (m, p) span the base. `residual` (m,) is that of the base, in
-    units of the noise, and `pose` (m,) is the index of the pose of each equation. `columns` (m, c)
-    are those of all blocks outside of the base, relative to their norms `sizes` (c,) before it was
-    projected out. `products` (c + 1, c + 1) are those of the columns and, last, of the residual
-    with each other, after whitening. `worth` is ν, 0 if the noise is not known. `dof` is N, the
-    number of independent equations minus that of values of the base. Scores are relative to
-    `base_rss`, the residual sum of squares of the base. `offset` (m, 3) are the columns of an
-    offset. `choice` is the cost of the choice of one effect among the candidates, and `penalty`
-    that of a walk, which is subtracted from all scores. `white` has (m, r) orthonormal directions
-    along which the equations are whitened, the (r,) part of each that is taken away, and their
-    (r, c + 1) products with the columns and the residual.
+    The orthonormal columns `onto` (m, p) span the base. `pose` (m,) is the index of the pose of
+    each equation. `every` (c + 1, m) has as rows the columns of all blocks outside of the base,
+    relative to their norms `sizes` (c,) before it was projected out, and last the residual of the
+    base, in units of the noise. `worth` is ν, 0 if the noise is not known. `dof` is N, the number
+    of independent equations minus that of values of the base. Scores are relative to `base_rss`,
+    the residual sum of squares of the base. `offset` (m, 3) are the columns of an offset. `choice`
+    is the cost of the choice of one effect among the candidates, and `penalty` that of a walk,
+    which is subtracted from all scores. The products of the rows of `taken` (c + 1, r) are
+    subtracted from those of `every`, after whitening or without some poses. `white` has (m, r)
+    orthonormal directions along which the equations are whitened, the (r,) part of each that is
+    taken away, and their (r, c + 1) products with the columns and the residual.
 
     """
 
     onto: Floats
-    residual: Floats
     pose: NDArray[np.intp]
     blocks: tuple[Block, ...]
-    columns: Floats
+    every: Floats
     sizes: Floats
-    products: Floats
     worth: float
     dof: int
     base_rss: float
     offset: Floats
     choice: float
     penalty: float = 0.0
+    taken: Floats | None = None
     white: tuple[Floats, Floats, Floats] | None = None
+
+    @property
+    def columns(self) -> Floats:
+        """Return the (m, c) columns of all blocks."""
+        return self.every[:-1].T
+
+    @property
+    def residual(self) -> Floats:
+        """Return the (m,) residual of the base."""
+        return np.asarray(self.every[-1])
 
     @cached_property
     def poses(self) -> int:
@@ -146,21 +157,56 @@ class Linear:
             numbers.setdefault(block.effect, []).append(number)
         return {effect: np.array(each) for effect, each in numbers.items()}
 
+    def _products(self, one: Any, other: Any) -> Floats:
+        """Return the products of two selections of the columns and the residual."""
+        found = self.every[one] @ self.every[other].T
+        return found if self.taken is None else found - self.taken[one] @ self.taken[other].T
+
+    @cached_property
+    def with_residual(self) -> Floats:
+        """Return the (c + 1,) products of the residual with the columns and itself."""
+        return self._products(slice(None), -1)
+
+    @cached_property
+    def _rows(self) -> dict[int, Floats]:
+        """Return the products of the blocks that were asked for so far."""
+        return {}
+
+    def rows_of_blocks(self, blocks: Sequence[int]) -> list[Floats]:
+        """Return the (w, c + 1) products of each block with all columns and the residual."""
+        new = [block for block in blocks if block not in self._rows]
+        if new:
+            parts = [self.blocks[block].columns for block in new]
+            ends = np.cumsum([part.stop - part.start for part in parts])
+            index = [column for part in parts for column in range(part.start, part.stop)]
+            self._rows.update(zip(new, np.split(self._products(index, slice(None)), ends[:-1])))
+        return [self._rows[block] for block in blocks]
+
     @cached_property
     def by_width(self) -> list[tuple[NDArray[np.intp], NDArray[np.intp], Floats]]:
         """Blocks of the same width: (k,) blocks, (k, w) columns, and (k, w, w) products."""
-        return list(self.grouped(np.arange(len(self.blocks))))
+        found: dict[int, list[tuple[Any, Any, Any]]] = {}
+        first = 0
+        for width, run in groupby(each.columns.stop - each.columns.start for each in self.blocks):
+            count, start = len(list(run)), self.blocks[first].columns.start
+            own = slice(start, start + count * width)
+            parts = self.every[own].reshape(count, width, -1)
+            products = parts @ parts.swapaxes(1, 2)
+            if self.taken is not None:
+                parts = self.taken[own].reshape(count, width, -1)
+                products -= parts @ parts.swapaxes(1, 2)
+            index = np.arange(own.start, own.stop).reshape(count, width)
+            found.setdefault(width, []).append((first + np.arange(count), index, products))
+            first += count
+        return [(np.concatenate(numbers), np.concatenate(index), np.concatenate(products))
+                for numbers, index, products in (zip(*parts) for parts in found.values())]
 
     def grouped(self, numbers: NDArray[np.intp]
                 ) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp], Floats]]:
-        """Yield some blocks, those of the same width together, as `by_width`."""
-        ends = np.array([(block.columns.start, block.columns.stop) for block in self.blocks],
-                        np.intp).reshape(-1, 2)[numbers]
-        widths = ends[:, 1] - ends[:, 0]
-        for width in np.unique(widths):
-            index = ends[widths == width, :1] + np.arange(width)
-            yield (numbers[widths == width], index,
-                   self.products[index[:, :, np.newaxis], index[:, np.newaxis, :]])
+        """Yield some blocks as `by_width`."""
+        for own, index, products in self.by_width:
+            which = np.isin(own, numbers)
+            yield own[which], index[which], products[which]
 
     def score(self, rss: Any, parameters: Any, charge: Any) -> Any:
         """Return the score of sets from their RSS, number of values and other charges."""
@@ -238,8 +284,7 @@ class Set:
     @staticmethod
     def _of_poses(linear: Linear, out: tuple[int, ...]) -> tuple[Floats, Floats]:
         rows = linear.rows_of(out)
-        own, across = linear.onto[rows], np.column_stack([linear.columns[rows],
-                                                          linear.residual[rows]])
+        own, across = linear.onto[rows], linear.every[:, rows].T.copy()
         left = np.eye(len(rows)) - own @ own.T
         if linear.white is not None:
             axes, loss, along = linear.white
@@ -253,7 +298,7 @@ class Set:
     def extended(self, block: int) -> Set:
         part = self.linear.blocks[block].columns
         along = self.across[:, part]
-        left = self.linear.products[part] - along.T @ self.across
+        left = self.linear.rows_of_blocks([block])[0] - along.T @ self.across
         size, axes = np.linalg.eigh(left[:, part])
         kept = is_seen(size)
         new = axes[:, kept] / np.sqrt(size[kept])
@@ -297,7 +342,7 @@ class Set:
     @cached_property
     def rss(self) -> float:
         gain = self.across[:, -1] @ self.across[:, -1]
-        return max(float(self.linear.products[-1, -1] - gain), 0.0)
+        return max(float(self.linear.with_residual[-1] - gain), 0.0)
 
     @cached_property
     def parameters(self) -> float:
@@ -338,7 +383,8 @@ class Set:
         if not self.blocks:
             return {}
         index, linear = self._index, self.linear
-        left, right = linear.products[index][:, index], linear.products[-1, index]
+        rows = np.concatenate(linear.rows_of_blocks(self.blocks))
+        left, right = rows[:, index], rows[:, -1]
         if self.out:
             across = self.across[:len(self.root)]
             left = left - across[:, index].T @ across[:, index]
@@ -367,7 +413,7 @@ class Set:
     def gains(self, effect: str = '') -> tuple[Floats, Floats]:
         """Return (b,) gains and ranks of the blocks beside the set; 0 for other effects."""
         linear, across = self.linear, self.across
-        along = linear.products[-1, :-1] - across[:, -1] @ across[:, :-1]
+        along = linear.with_residual[:-1] - across[:, -1] @ across[:, :-1]
         gain, rank = np.zeros(len(linear.blocks)), np.zeros(len(linear.blocks))
         groups = linear.grouped(linear.numbers_of[effect]) if effect else linear.by_width
         for numbers, index, products in groups:
@@ -443,16 +489,6 @@ def outside_of(onto: Floats, columns: Floats) -> tuple[Floats, Floats]:
     columns = columns / sizes
     columns -= onto @ (onto.T @ columns)
     return columns, np.where(sizes < np.inf, sizes, 1.0)
-
-
-def products_of(columns: Floats, residual: Floats) -> Floats:
-    """Return the products of (m, c) columns and, last, an (m,) residual, (c + 1, c + 1)."""
-    count = columns.shape[1]
-    found = np.empty((count + 1, count + 1))
-    np.matmul(columns.T, columns, out=found[:count, :count])
-    found[count, :count] = found[:count, count] = columns.T @ residual
-    found[count, count] = residual @ residual
-    return found
 
 
 def held_out(residual: Floats, own: Floats) -> Floats:

@@ -576,8 +576,9 @@ def _extended(before: Set) -> list[Set]:
         number = int(numbers[np.argmax(scores[numbers])])
         if scores[number] > -np.inf and not _is_barred(linear.blocks[number], before.entries):
             best[effect] = round(float(scores[number]), _DECIMALS), number
-    first = sorted(best.values(), key=lambda each: -each[0])[:_BRANCHES]
-    return [before.extended(number) for _, number in first]
+    first = [number for _, number in sorted(best.values(), key=lambda each: -each[0])[:_BRANCHES]]
+    linear.rows_of_blocks(first)  # at once, which is faster
+    return [before.extended(number) for number in first]
 
 
 def _is_barred(block: Block, present: Iterable[Block]) -> bool:

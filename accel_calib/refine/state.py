@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 import scipy
 
-from .linear import Block, held_out, is_seen, Linear, orthonormal, outside_of, products_of
+from .linear import Block, held_out, is_seen, Linear, orthonormal, outside_of
 from ..calibrate import with_history
 from ..effects import Context, Effect, effect_named, factors_of, included, kind_of, Model
 from ..estimate import Equations, estimate, Fit, NotConvergedError
@@ -114,10 +114,10 @@ def linearised(fit: Fit, base: tuple[str, ...], tried: Iterable[Candidate] = ())
         residual = residual + near.columns(further) @ _amplitudes(further)
     onto = orthonormal(near.columns(held)[:, held.fitted])
     residual = residual - onto @ (onto.T @ residual)
-    blocks, columns, sizes = _blocks(near, onto, fit.poses_g.columns, further, tuple(tried))
+    blocks, every, sizes = _blocks(near, onto, fit.poses_g.columns, further, tuple(tried))
+    every[-1] = residual
     kinds = len({kind_of(block.effect) for block in blocks})
-    return Linear(onto, residual, near.pose, blocks, columns, sizes,
-                  products_of(columns, residual), WORTH if near.noise_known else 0.0,
+    return Linear(onto, near.pose, blocks, every, sizes, WORTH if near.noise_known else 0.0,
                   near.count - onto.shape[1], float(residual @ residual), near.columns(_OFFSET),
                   2.0 * math.log(1.0 + kinds))
 
@@ -146,16 +146,18 @@ def _amplitudes(model: Model) -> Floats:
 
 def _blocks(near: Equations, onto: Floats, context: Context, present: Model,
             tried: Sequence[Candidate]) -> tuple[tuple[Block, ...], Floats, Floats]:
+    """Return the blocks of candidates, `every` of `Linear` without the residual, and `sizes`."""
     alike = Counter(kind_of(each.name) for each in tried)
     tried = [each.beside(present.values.get(each.name), context) for each in tried]
     widths = [len(each.shapes) * len(each.entry.parameters) for each in tried]
-    columns, sizes = np.empty((len(near.pose), sum(widths)), order='F'), np.empty(sum(widths))
+    every, sizes = np.empty((sum(widths) + 1, len(near.pose))), np.empty(sum(widths))
     blocks: list[Block] = []
     for each, start, width in zip(tried, np.cumsum([0, *widths]).tolist(), widths):
         own = slice(start, start + width)
-        columns[:, own], sizes[own] = outside_of(onto, near.columns_of(each.name, each.factors))
+        columns, sizes[own] = outside_of(onto, near.columns_of(each.name, each.factors))
+        every[own] = columns.T
         blocks += each.blocks(start, alike[kind_of(each.name)])
-    return tuple(blocks), columns, sizes
+    return tuple(blocks), every, sizes
 
 
 @dataclass(frozen=True)

@@ -148,8 +148,9 @@ def _ranks(chosen: Set) -> tuple[float, ...]:
 def _visible(linear: Linear) -> dict[str, float]:
     """Return the effect on the residuals of each candidate of typical size that shows."""
     found: dict[str, float] = {}
-    for block in linear.blocks:
-        own, sizes = linear.products[block.columns, block.columns], linear.sizes[block.columns]
+    for number, block in enumerate(linear.blocks):
+        (own,), sizes = linear.rows_of_blocks((number,)), linear.sizes[block.columns]
+        own = own[:, block.columns]
         if np.linalg.eigvalsh(own)[-1] > 0.02 ** 2:
             square = np.linalg.eigvalsh(own * np.outer(sizes, sizes))[-1]
             found[block.effect] = max(float(np.sqrt(square)) * block.entry.typical,
