@@ -34,6 +34,7 @@ set leaves.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import combinations
 import math
 from typing import NamedTuple
 
@@ -43,8 +44,8 @@ from .base import causes
 from .linear import Block, held_out, LEVEL, Linear, outside_of, Set
 from .state import candidates, linearised, State
 from ..effects import (
-    CARRIERS, curve_pairs, Effect, effect_named, EFFECTS, empirical_name, empirical_parts, LADDER,
-    Model, modes_of, WANDER)
+    AXES, CARRIERS, curve_pairs, Effect, effect_named, EFFECTS, empirical_name, empirical_parts,
+    LADDER, Model, modes_of, parameter_names, WANDER)
 from ..estimate import Fit, judge
 from ..table import Floats, Poses
 
@@ -63,6 +64,13 @@ _CLEARLY = 10.0
 
 _HELD_OUT = 0.9
 """Largest ratio of the held-out sum of squares with and without a curve."""
+
+_PROPORTION = 2.0
+"""Evidence for a proportion of two effects that makes them parts of one curve (Kass and Raftery
+1995: positive)."""
+
+_TURNS = np.linspace(0.0, np.pi, 1801)
+"""Angles at which a proportion of two effects is looked for; the middle one is a right angle."""
 
 
 class Curve(NamedTuple):
@@ -215,6 +223,34 @@ def nearest_effects(before: State) -> dict[str, float]:
             _, left = Set.of(linear, (int(number),)).spanned
             left_mg[effect] = before.gap_mg(left)
     return left_mg
+
+
+def one_curve(state: State) -> tuple[str, ...]:
+    """
+    Return two nonlinearities in the same proportion on each axis; empty: there are none.
+
+    They may be parts of one curve, because two causes have directions of their own. The density of
+    the weaker effect at such a proportion is compared with that of a direction that is uniform
+    over the sphere. With a and b the values by axis, relative to their lengths, the evidence is
+    2 log s - min χ²(t): χ²(t) is that of b cos t - a sin t, and s the smaller one of χ²(0°) and
+    χ²(90°).
+
+    """
+    names = parameter_names(state.model.effects)
+    bent = [name for name in state.model.effects if (effect := effect_named(name)).bends
+            and effect.parameters == AXES]
+    for pair in combinations(bent, 2):
+        own = [names.index(f'{name}.{axis}') for name in pair for axis in AXES]
+        values = state.model.vector[own]
+        weights = np.column_stack([-np.sin(_TURNS), np.cos(_TURNS)]) / np.linalg.norm(
+            values.reshape(2, 3), axis=1)
+        mix = np.kron(weights[:, np.newaxis], np.eye(3))
+        away = mix @ values
+        spread = mix @ state.fit.covariance[np.ix_(own, own)] @ mix.transpose(0, 2, 1)
+        chi2 = np.sum(away * np.linalg.solve(spread, away[..., np.newaxis])[..., 0], axis=1)
+        if 2.0 * np.log(min(chi2[0], chi2[len(chi2) // 2])) - np.min(chi2) > _PROPORTION:
+            return pair
+    return ()
 
 
 def steepest(variable: str, poses_g: Poses, share_mg: Floats) -> tuple[float, float] | None:

@@ -165,22 +165,23 @@ class Linear:
     @cached_property
     def with_residual(self) -> Floats:
         """Return the (c + 1,) products of the residual with the columns and itself."""
-        return self._products(slice(None), -1)
+        # By a dot product as `base_rss`: the score of the base is exactly 0.
+        return np.append(self._products(slice(-1), -1), self._products(-1, -1))
 
     @cached_property
-    def _rows(self) -> dict[int, Floats]:
+    def _made(self) -> dict[int, Floats]:
         """Return the products of the blocks that were asked for so far."""
         return {}
 
-    def rows_of_blocks(self, blocks: Sequence[int]) -> list[Floats]:
+    def products_with(self, blocks: Sequence[int]) -> list[Floats]:
         """Return the (w, c + 1) products of each block with all columns and the residual."""
-        new = [block for block in blocks if block not in self._rows]
+        new = [block for block in blocks if block not in self._made]
         if new:
             parts = [self.blocks[block].columns for block in new]
             ends = np.cumsum([part.stop - part.start for part in parts])
             index = [column for part in parts for column in range(part.start, part.stop)]
-            self._rows.update(zip(new, np.split(self._products(index, slice(None)), ends[:-1])))
-        return [self._rows[block] for block in blocks]
+            self._made.update(zip(new, np.split(self._products(index, slice(None)), ends[:-1])))
+        return [self._made[block] for block in blocks]
 
     @cached_property
     def by_width(self) -> list[tuple[NDArray[np.intp], NDArray[np.intp], Floats]]:
@@ -298,7 +299,7 @@ class Set:
     def extended(self, block: int) -> Set:
         part = self.linear.blocks[block].columns
         along = self.across[:, part]
-        left = self.linear.rows_of_blocks([block])[0] - along.T @ self.across
+        left = self.linear.products_with([block])[0] - along.T @ self.across
         size, axes = np.linalg.eigh(left[:, part])
         kept = is_seen(size)
         new = axes[:, kept] / np.sqrt(size[kept])
@@ -383,7 +384,7 @@ class Set:
         if not self.blocks:
             return {}
         index, linear = self._index, self.linear
-        rows = np.concatenate(linear.rows_of_blocks(self.blocks))
+        rows = np.concatenate(linear.products_with(self.blocks))
         left, right = rows[:, index], rows[:, -1]
         if self.out:
             across = self.across[:len(self.root)]

@@ -28,8 +28,8 @@ from .plan import plan_poses, PosePlan
 from .search import Found, search
 from .state import fitted_state, is_noise, State
 from .steps import (
-    advice_for, beside_walk, not_testable, one_curve, plain_name, Stage, Step, steps_of,
-    untestable, Verdict, verdict_of)
+    advice_for, beside_walk, not_testable, plain_name, Stage, Step, steps_of, untestable, Verdict,
+    verdict_of)
 from ..calibrate import (
     Calibration, check_sensor, fit_findings, fit_poses, fit_with_fleet, FLEET, FleetPrior, gated,
     in_g, LARGEST_DILUTION, OF_A_FIT, only_norm, posterior, quality_of, record_of, refuse_if_unfit,
@@ -287,7 +287,7 @@ def _record(calibration: Calibration, found: Found, given: Given, sensor: str, d
     return Refinement(
         verdict, final.floor_mg, start.gap_mg(start.fit.residual),
         final.gap_mg(beside_walk(found)[0]), steps, outliers, missing, advice, refined, refusal,
-        final.poses_g, final.fit.equations.force, stages, plan, undecided, one_curve(final))
+        final.poses_g, final.fit.equations.force, stages, plan, undecided, found.one_curve)
 
 
 def _rejected(found: Found, given: Given) -> tuple[Rejected, ...]:

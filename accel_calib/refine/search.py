@@ -28,13 +28,15 @@ only if each of its effects is significant beside the others. With a walk of the
 
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 import scipy
 
 from .base import causes, Clipped, off_grid, unclipped
-from .curves import best_curve, Curve, Near, Process, process_of, SIGNIFICANT, Walk, walk_beside
+from .curves import (
+    best_curve, Curve, Near, one_curve, Process, process_of, SIGNIFICANT, Walk, walk_beside)
 from .linear import Block, LEVEL, Linear, Set
 from .state import (
     beginning, Candidate, candidates, fitted_state, is_noise, linearised, State, with_effect,
@@ -103,6 +105,11 @@ class Found:
     clipped: Clipped | None = None
     grid_g: float | None = None
     with_clipped: State | None = None
+
+    @cached_property
+    def one_curve(self) -> tuple[str, ...]:
+        """Return two added effects that may be parts of one curve."""
+        return one_curve(self.final)
 
 
 def search(poses_g: Poses, base: Model, also: tuple[str, ...] = ()) -> Found:
@@ -540,7 +547,7 @@ def simpler(chosen: Set) -> list[Set]:
         for effect, own in fitted.items():
             others = less.instead(number for number in less.blocks
                                   if blocks[number].effect != effect)
-            if _is_barred(blocks[own[0]], others.entries):
+            if effect not in less.effects or _is_barred(blocks[own[0]], others.entries):
                 continue
             gain, _ = others.gains(effect)
             new = others.extended(max(own, key=lambda number: gain[number]))
@@ -577,7 +584,7 @@ def _extended(before: Set) -> list[Set]:
         if scores[number] > -np.inf and not _is_barred(linear.blocks[number], before.entries):
             best[effect] = round(float(scores[number]), _DECIMALS), number
     first = [number for _, number in sorted(best.values(), key=lambda each: -each[0])[:_BRANCHES]]
-    linear.rows_of_blocks(first)  # at once, which is faster
+    linear.products_with(first)  # at once, which is faster
     return [before.extended(number) for number in first]
 
 

@@ -118,7 +118,7 @@ def linearised(fit: Fit, base: tuple[str, ...], tried: Iterable[Candidate] = ())
     every[-1] = residual
     kinds = len({kind_of(block.effect) for block in blocks})
     return Linear(onto, near.pose, blocks, every, sizes, WORTH if near.noise_known else 0.0,
-                  near.count - onto.shape[1], float(residual @ residual), near.columns(_OFFSET),
+                  near.count - onto.shape[1], float(every[-1] @ every[-1]), near.columns(_OFFSET),
                   2.0 * math.log(1.0 + kinds))
 
 

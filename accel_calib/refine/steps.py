@@ -13,7 +13,7 @@ instant, the ends of the range of a column, or directions of the force.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import combinations, pairwise
+from itertools import pairwise
 import math
 from typing import Literal
 
@@ -24,9 +24,9 @@ from .linear import Set
 from .search import Found
 from .state import candidates, fitted_state, is_noise, linearised, State, visible, with_effect
 from ..effects import (
-    AXES, CHANGES, COVARIATES, effect_named, EFFECTS, EMPIRICAL, empirical_parts, included,
-    is_effect, kind_of, LADDER, Model, parameter_names, PROCESSES, TO_SEPARATE, unit_of,
-    value_unit, variable_of, variable_words, WANDER)
+    CHANGES, COVARIATES, effect_named, EFFECTS, EMPIRICAL, empirical_parts, included, is_effect,
+    kind_of, LADDER, Model, parameter_names, PROCESSES, TO_SEPARATE, unit_of, value_unit,
+    variable_of, variable_words, WANDER)
 from ..estimate import judge, kinds
 from ..geometry import ATTITUDES, axes_of_signs
 from ..table import column_of, Floats, Poses
@@ -35,13 +35,6 @@ from ..units import MG
 
 MOST_RIVALS = 3
 """Largest number of rivals of an effect that is called the explanation."""
-
-_PROPORTION = 2.0
-"""Evidence for a proportion of two effects that makes them parts of one curve (Kass and Raftery
-1995: positive)."""
-
-_TURNS = np.linspace(0.0, np.pi, 1801)
-"""Angles at which a proportion of two effects is looked for; the middle one is a right angle."""
 
 _LEAST_VISIBLE = 0.1
 """Smallest visible change of the residuals by an effect of typical size, relative to the noise."""
@@ -192,39 +185,11 @@ def verdict_of(found: Found, steps: Sequence[Step], *, refused: bool) -> tuple[V
     if found.final.fit.noise_known and not is_noise(float(residual @ residual), found.final.dof):
         return 'unexplained', False
     if steps and (refused or any(len(step.rivals) > MOST_RIVALS for step in steps)
-                  or one_curve(found.final)):
+                  or found.one_curve):
         return 'unexplained', True
     if found.curve is not None or found.walk is not None:
         return 'described', False
     return 'explained' if steps else 'no_gap', False
-
-
-def one_curve(state: State) -> tuple[str, ...]:
-    """
-    Return two nonlinearities in the same proportion on each axis; empty: there are none.
-
-    They may be parts of one curve, because two causes have directions of their own. The density of
-    the weaker effect at such a proportion is compared with that of a direction that is uniform
-    over the sphere. With a and b the values by axis, relative to their lengths, the evidence is
-    2 log s - min χ²(t): χ²(t) is that of b cos t - a sin t, and s the smaller one of χ²(0°) and
-    χ²(90°).
-
-    """
-    names = parameter_names(state.model.effects)
-    bent = [name for name in state.model.effects if (effect := effect_named(name)).bends
-            and effect.parameters == AXES]
-    for pair in combinations(bent, 2):
-        own = [names.index(f'{name}.{axis}') for name in pair for axis in AXES]
-        values = state.model.vector[own]
-        weights = np.column_stack([-np.sin(_TURNS), np.cos(_TURNS)]) / np.linalg.norm(
-            values.reshape(2, 3), axis=1)
-        mix = np.kron(weights[:, np.newaxis], np.eye(3))
-        away = mix @ values
-        spread = mix @ state.fit.covariance[np.ix_(own, own)] @ mix.transpose(0, 2, 1)
-        chi2 = np.sum(away * np.linalg.solve(spread, away[..., np.newaxis])[..., 0], axis=1)
-        if 2.0 * np.log(min(chi2[0], chi2[len(chi2) // 2])) - np.min(chi2) > _PROPORTION:
-            return pair
-    return ()
 
 
 def steps_of(found: Found, start: State, date: str, *, joint: bool
@@ -484,10 +449,9 @@ def advice_for(found: Found, steps: tuple[Step, ...], untestable: tuple[tuple[st
             lines.append(f'{step.effect} is {times * effect.typical:.2g} {effect.unit}, typical '
                          f'parts have about {effect.typical:.2g}: check that the sensor causes '
                          'it, and not the setup')
-    pair = one_curve(found.final)
-    if pair:
-        lines.append(f'{" and ".join(pair)} may be parts of one curve: take more poses in all '
-                     'directions, which show its form')
+    if found.one_curve:
+        lines.append(f'{" and ".join(found.one_curve)} may be parts of one curve: take '
+                     'more poses in all directions, which show its form')
     if left_out:
         were, them = ('was', 'it') if left_out == 1 else ('were', 'them')
         lines.append(f'{counted(left_out, "pose")} {were} left out; take {them} again')

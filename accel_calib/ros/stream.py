@@ -151,8 +151,8 @@ class Stream:
         self._newest = b''
         self._waiting: list[bytes] = []
         self._contexts: list[Mapping[str, float]] = []
-        self._rows: Floats | None = None
-        self._due = self._arrived = self._rows_arrived = 0.0
+        self._collected: tuple[Floats, float] | None = None  # and when the newest one arrived
+        self._due = self._arrived = 0.0
         self._listened = False
         self._applied: Calibration | None = None
         self._offered: Calibration | None = None
@@ -201,7 +201,7 @@ class Stream:
                 self.flush()
             else:
                 self._collect()
-        elif self._rows is not None:
+        elif self._collected is not None:
             self._pass_on()
 
     def _prepare(self) -> None:
@@ -282,15 +282,15 @@ class Stream:
             messages, self._waiting = self._waiting, []
             contexts, self._contexts = self._contexts, []
             found = samples_of(joined(messages, IMU_DOUBLES, 'imu/data_raw'))
-            self._rows = np.column_stack([found['time'], found['reading'], found['rate'],
-                                          self._around(contexts)])
-            self._rows_arrived = self._arrived
+            rows = np.column_stack([found['time'], found['reading'], found['rate'],
+                                    self._around(contexts)])
+            self._collected = rows, self._arrived
 
     def _pass_on(self) -> None:
         """Pass the array to the session."""
-        if self._rows is not None:
-            rows, self._rows = self._rows, None
-            self._session.push(rows, self._rows_arrived)
+        if self._collected is not None:
+            collected, self._collected = self._collected, None
+            self._session.push(*collected)
             self._on_events()
 
     def _around(self, contexts: Sequence[Mapping[str, float]]) -> Floats:

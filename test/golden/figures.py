@@ -149,7 +149,7 @@ def _visible(linear: Linear) -> dict[str, float]:
     """Return the effect on the residuals of each candidate of typical size that shows."""
     found: dict[str, float] = {}
     for number, block in enumerate(linear.blocks):
-        (own,), sizes = linear.rows_of_blocks((number,)), linear.sizes[block.columns]
+        (own,), sizes = linear.products_with((number,)), linear.sizes[block.columns]
         own = own[:, block.columns]
         if np.linalg.eigvalsh(own)[-1] > 0.02 ** 2:
             square = np.linalg.eigvalsh(own * np.outer(sizes, sizes))[-1]
