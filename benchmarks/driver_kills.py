@@ -160,6 +160,7 @@ class World:
                      'calibrator', '--ros-args', '-p', 'passthrough:=true'], cwd=folder,
                     stdout=log, stderr=log)
             return
+        target: Any
         target, given = {
             'driver': (clients.drive, (self.trial, self.sent, RATE)),
             'listener': (clients.listen, (self.heard, self.first, self.asked, self.answered)),

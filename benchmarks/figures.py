@@ -49,7 +49,7 @@ def table(lines: Sequence[Line]) -> str:
         (x.what, x.measured, x.asked, x.sets, words[x.met]) for x in lines))
 
 
-def markdown(heads: Sequence[str], rows: Iterable[Iterable[object]]) -> str:
+def markdown(heads: Sequence[object], rows: Iterable[Iterable[object]]) -> str:
     """Return a Markdown table."""
     lines = ['| ' + ' | '.join(map(str, row)) + ' |' for row in (heads, *rows)]
     return '\n'.join([lines[0], '|---' * len(heads) + '|', *lines[1:]])

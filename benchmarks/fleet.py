@@ -15,7 +15,7 @@ folder continues the first one::
 from __future__ import annotations
 
 import argparse
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager, ExitStack
@@ -297,7 +297,7 @@ def timed(spent: dict[str, float], stages: dict[str, tuple[Any, str]],
 
 def costs(found: Sequence[Input], options: Options, folder: Path) -> dict[str, float]:
     """Return the cost by stage in one process [ms of processor per recording]."""
-    spent: dict[str, float] = Counter()
+    spent: dict[str, float] = defaultdict(float)
     here = mock.patch.object(RUN.WorkerProcess, 'call_within',
                              lambda self, limit_s, function, *given: function(*given))
     with TemporaryDirectory(dir=folder) as out, here:
@@ -307,7 +307,7 @@ def costs(found: Sequence[Input], options: Options, folder: Path) -> dict[str, f
         with timed(spent, {
                 'all': (RUN, 'calibrate_recording'), 'hash': (RUN, 'content_hash'),
                 'read and capture': (ROWS, 'poses_of'), 'fit': (pipeline, 'fit_poses'),
-                'refine': (pipeline, 'refine'), 'rate': (pipeline, 'rate'),
+                'refine': (pipeline, '_refinement'), 'rate': (pipeline, 'rate'),
                 'fit for the prior': (ROWS, 'fit_poses'),
                 'write the calibration': (RUN, 'write_calibration'),
                 'write the row': (Store, 'add')}, time.process_time):
@@ -357,7 +357,7 @@ class Whole:
 
 def whole(found: Sequence[Input], options: Options, workers: int, folder: Path) -> Whole:
     """Calibrate all recordings, or those that are left."""
-    spent: dict[str, float] = Counter()
+    spent: dict[str, float] = defaultdict(float)
     with cluster(workers=workers) as client:
         client.wait_for_workers(workers)
         begin, program_s = time.perf_counter(), time.process_time()

@@ -65,7 +65,12 @@ def messages(turning: bool, rng: np.random.Generator) -> list[bytearray]:
 def ended() -> Any:
     """Return a function that returns whether standard input has ended."""
     over = threading.Event()
-    threading.Thread(target=lambda: (sys.stdin.read(), over.set()), daemon=True).start()
+
+    def wait() -> None:
+        sys.stdin.read()
+        over.set()
+
+    threading.Thread(target=wait, daemon=True).start()
     return over.is_set
 
 
@@ -80,7 +85,7 @@ def drive(rate: float, file: Path) -> None:
     stamp = struct.Struct('<iI').pack_into
     over, sent = ended(), array('q')
     warm_every = max(1, int((rate or 1e4) / 10.0))
-    period, due, now = NANO / (rate or np.inf), time.monotonic_ns(), 0
+    period, due, now = NANO / (rate or np.inf), float(time.monotonic_ns()), 0
     for made, seconds in itertools.cycle(stretches):
         until = time.monotonic_ns() + seconds * NANO
         while now < until and not over():

@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,7 +68,7 @@ class Trial:
                        heard=heard[(heard[:, 0] >= first) & (heard[:, 0] < last)])
 
     @property
-    def latency_us(self) -> NDArray[np.float64]:
+    def latency_us(self) -> NDArray[np.floating[Any]]:
         """Return the time of each message from driver to user [µs]."""
         return (self.heard[:, 1] - self.heard[:, 0]) * 1e-3
 

@@ -132,7 +132,7 @@ def main() -> None:
         print(*asyncio.run(watch(given.watch)))
         return
     command = ''.join(f'--{name} {getattr(given, name):g} ' for name in ('turns', 'seconds')
-                      if getattr(given, name) != parser.get_default(name))
+                      if getattr(given, name) != options.get_default(name))
     about = _ABOUT.format(command=command, machine=machine())
     made = table(lines(run(given.turns, given.seconds)))
     publish(f'# Figures of the live page\n\n{about}\n\n{made}\n', given.markdown)

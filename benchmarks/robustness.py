@@ -313,7 +313,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser(__doc__, sets=200, seed=1, jobs=2)
     options.add_argument('--only', choices=ROWS, action='append', help='only these; repeatable')
     given = options.parse_args(arguments)
-    lines = []
+    lines: list[Line] = []
     with multiprocessing.get_context('spawn').Pool(given.jobs) as pool:
         def run(one: Callable[[Job], Any], jobs: Sequence[Job]) -> list[Any]:
             return pool.map(one, jobs, chunksize=10)

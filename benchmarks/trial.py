@@ -12,6 +12,7 @@ itself; the memory is the largest that the process had, with all imports.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from itertools import islice
 import json
 from pathlib import Path
@@ -62,14 +63,17 @@ def trial(what: str, *arguments: object) -> dict[str, Any]:
 class Clock:
     """Wall clock and CPU, from the last start to the first stop after it."""
 
+    begin = end = (0.0, 0.0)
+    running = False
+
     def start(self) -> None:
         """Start."""
-        self.begin = time.perf_counter(), time.process_time()
-        self.end: tuple[float, float] | None = None
+        self.begin, self.running = (time.perf_counter(), time.process_time()), True
 
     def stop(self) -> None:
         """Stop, unless the work has stopped it."""
-        self.end = self.end or (time.perf_counter(), time.process_time())
+        if self.running:
+            self.end, self.running = (time.perf_counter(), time.process_time()), False
 
 
 CLOCK = Clock()
@@ -115,9 +119,9 @@ def table(csv: Path) -> dict[str, list[float]]:
     units = units_of('native')
     spent: dict[str, list[float]] = {'read': [], 'poses': [], 'fit': []}
     for _ in range(11):
-        recording = timed(spent['read'], lambda: read_recording(csv))
-        found = timed(spent['poses'], lambda recording=recording: capture(recording, units))
-        timed(spent['fit'], lambda found=found: fit_poses(found.poses, units, model='10'))
+        recording = timed(spent['read'], partial(read_recording, csv))
+        found = timed(spent['poses'], partial(capture, recording, units))
+        timed(spent['fit'], partial(fit_poses, found.poses, units, model='10'))
     return spent
 
 
@@ -130,7 +134,7 @@ def refined(csv: Path) -> str:
     return refine(given, MS2, base='10').verdict
 
 
-def timed(into: list[float], work: Callable[[], object]) -> object:
+def timed(into: list[float], work: Callable[[], Any]) -> Any:
     """Do work and append its duration [s]."""
     begin = time.perf_counter()
     result = work()

@@ -25,7 +25,7 @@ sys.path[:0] = [str(ROOT)]
 os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')
 
 from accel_calib.calibrate import Calibration, fit_poses  # noqa: E402
-from accel_calib.compare import compared, monitor, rest_errors  # noqa: E402
+from accel_calib.compare import compared, Drift, rest_errors  # noqa: E402
 from accel_calib.effects import Model, model_with, predict, simulate_poses  # noqa: E402
 from accel_calib.geometry import spread_directions  # noqa: E402
 from accel_calib.table import Floats  # noqa: E402
@@ -111,7 +111,7 @@ class Sensor:
         """Return after each rest whether a change is reported."""
         truth, calibration = made
         reading = predict(truth, up, {}) + shift + self.noise * rng.normal(size=up.shape)
-        state, reported = monitor(calibration), []
+        state, reported = Drift(calibration), []
         for rest in rest_errors(calibration, self.scattered(reading, rng),
                                 np.full(up.shape, self.noise), {}):
             state = compared(state, rest, LEAST)
