@@ -532,10 +532,11 @@ def explored(linear: Linear) -> list[Set]:
 
 def simpler(chosen: Set) -> list[Set]:
     """
-    Return sets with one effect less, in which another effect has the best searched shape.
+    Return sets with one effect less, in which an effect has the best searched shape beside them.
 
     Between the shapes that are tried, two effects may imitate one: an offset that changes with
-    temperature and with its rate is one that lags.
+    temperature and with its rate is one that lags. The effect may be the one that was left out,
+    which then has another shape.
 
     """
     blocks, fitted = chosen.linear.blocks, dict[str, list[int]]()
@@ -547,7 +548,7 @@ def simpler(chosen: Set) -> list[Set]:
         for effect, own in fitted.items():
             others = less.instead(number for number in less.blocks
                                   if blocks[number].effect != effect)
-            if effect not in less.effects or _is_barred(blocks[own[0]], others.entries):
+            if _is_barred(blocks[own[0]], others.entries):
                 continue
             gain, _ = others.gains(effect)
             new = others.extended(max(own, key=lambda number: gain[number]))
