@@ -10,7 +10,7 @@ from accel_calib.effects import EFFECTS
 from inside import (
     accepted, beginning, Block, candidates, Curve, explored, fitted_state, grown_curve,
     is_better_than_walk, Linear, linearised, Model, Near, outside_of, Process, process_of, RARE,
-    REFINE_LEVEL, Set, SIGNIFICANT, simpler, simulate_poses, Walk, walk_beside, WORTH)
+    REFINE_LEVEL, reshaped, Set, SIGNIFICANT, simulate_poses, Walk, walk_beside, WORTH)
 import numpy as np
 import pytest
 from scipy.optimize import brentq
@@ -214,7 +214,7 @@ def test_of_sets_that_are_almost_as_good_the_one_with_fewest_values_is_preferred
     assert next(accepted(sets_at(side))).effects == (preferred,)
 
 
-def test_a_simpler_set_has_all_other_effects_and_the_best_shape():
+def test_a_reshaped_set_has_all_other_effects_and_the_best_shape():
     time = np.arange(COUNT) * 30.0
     size, lag, turn = np.array([4e-4, -4e-4, 4e-4]), 240.0, time / 400.0
     poses = poses_of({}, time=time, temperature=25.0 + 10.0 * np.sin(turn))
@@ -223,7 +223,7 @@ def test_a_simpler_set_has_all_other_effects_and_the_best_shape():
     names = ('cross_coupling', 'offset_temperature', 'temperature_rate', 'quadratic')
     _, linear = problem_of(poses, *names)
     chosen = Set.of(linear, [int(linear.numbers_of[name][0]) for name in names])
-    found, = (each for each in simpler(chosen)
+    found, = (each for each in reshaped(chosen)
               if set(each.effects) == {*names} - {'temperature_rate'})
     shape, = (linear.blocks[each].shape for each in found.blocks
               if linear.blocks[each].effect == 'offset_temperature')

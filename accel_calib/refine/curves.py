@@ -24,6 +24,9 @@ the same columns as an offset. Its size is estimated by maximum likelihood: with
 out, the residual along the singular vectors of the modes has the variances s² (1 + λ Λ_i). With a
 fixed number of modes, the cost is linear in the number of poses.
 
+**Two names for one curve.** Two nonlinearities whose values by axis are in proportion may be parts
+of one curve outside of the catalogue (`one_curve`).
+
 **Rivals** are effects that would explain the data about as well as a named one. The probability of
 an effect against its rivals follows from the score of the set with each of them in its place,
 exp(c score / 2), all else being equal (Kass and Raftery 1995). The noise is estimated from the
@@ -227,7 +230,7 @@ def nearest_effects(before: State) -> dict[str, float]:
 
 def one_curve(state: State) -> tuple[str, ...]:
     """
-    Return two nonlinearities in the same proportion on each axis; empty: there are none.
+    Return two nonlinearities in the same proportion on each axis; empty if there are none.
 
     They may be parts of one curve, because two causes have directions of their own. The density of
     the weaker effect at such a proportion is compared with that of a direction that is uniform

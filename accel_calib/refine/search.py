@@ -108,7 +108,7 @@ class Found:
 
     @cached_property
     def one_curve(self) -> tuple[str, ...]:
-        """Return two added effects that may be parts of one curve."""
+        """Return two effects that may be parts of one curve; empty if there are none."""
         return one_curve(self.final)
 
 
@@ -359,13 +359,13 @@ def _significant(state: State, near: Near, trial: _Trial) -> tuple[State, Near]:
 
 
 def _best_fit(near: Near, state: State, trial: _Trial) -> tuple[Near, State | None]:
-    """Return the fit of a set, or of a simpler one whose fit has a better score."""
+    """Return the fit of a set, or of a reshaped one whose fit has a better score."""
     def score_of(chosen: Set, fitted: State) -> float:
         return float(near.plain.score(fitted.rss, chosen.parameters, chosen.charge))
 
     best, after = near, trial.fitted(near.chosen, state)
     most = -np.inf if after is None else score_of(near.chosen, after)
-    for other in sorted(simpler(near.chosen), key=lambda other: -other.score):
+    for other in sorted(reshaped(near.chosen), key=lambda other: -other.score):
         fitted = trial.fitted(other, state,
                               near.plain.rss_of(most, other.parameters, other.charge))
         if fitted is not None and score_of(other, fitted) > most:
@@ -501,7 +501,7 @@ _AS_GOOD = 2.0
 """Within this difference from the best score, the set with fewest values wins."""
 
 _NEARLY = 0.3
-"""Smallest share of the score of a set that a simpler set has before its shape is fitted."""
+"""Smallest share of the score of a set that a reshaped set has before its shape is fitted."""
 
 _DECIMALS = 6
 """Decimals of the scores that sets are sorted by: not the last bit of a processor decides, and
@@ -530,13 +530,13 @@ def explored(linear: Linear) -> list[Set]:
     return _distinct(visited)
 
 
-def simpler(chosen: Set) -> list[Set]:
+def reshaped(chosen: Set) -> list[Set]:
     """
-    Return sets with one effect less, in which an effect has the best searched shape beside them.
+    Return sets with one effect less and the best searched shape of another, or with its own.
 
     Between the shapes that are tried, two effects may imitate one: an offset that changes with
-    temperature and with its rate is one that lags. The effect may be the one that was left out,
-    which then has another shape.
+    temperature and with its rate is one that lags. An effect that was left out may also return
+    with the best shape beside the others.
 
     """
     blocks, fitted = chosen.linear.blocks, dict[str, list[int]]()
