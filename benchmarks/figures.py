@@ -73,10 +73,14 @@ def publish(page: str, path: Path | None) -> None:
 
 
 def commit() -> str:
-    """Return the short name of the commit, with ``-dirty`` if files have changed since."""
-    return subprocess.run(['git', 'describe', '--always', '--dirty', '--abbrev=7'],
-                          cwd=Path(__file__).parent, check=True, capture_output=True,
-                          text=True).stdout.strip()
+    """Return the short name of the commit, with ``-dirty`` if more than the pages has changed."""
+    def answer(*words: str) -> str:
+        return subprocess.run(['git', *words], cwd=Path(__file__).parent, check=True,
+                              capture_output=True, text=True).stdout.strip()
+
+    changed = answer('status', '--porcelain', '--untracked-files=no', '--', ':/',
+                     ':(top,exclude)docs/figures')
+    return answer('rev-parse', '--short=7', 'HEAD') + ('-dirty' if changed else '')
 
 
 def machine() -> str:
