@@ -133,7 +133,7 @@ def refinements(hidden: Sequence[Mapping[str, float]]) -> Iterator[Line]:
             yield Line(f'{what}: time [s]', f'{found["seconds"]:.1f}', '≤ 10', 1,
                        found['seconds'] <= 10.0)
             yield Line(f'{what}: largest memory, with imports [MB]', f'{found["megabytes"]:.0f}',
-                       '≤ 300', 1, found['megabytes'] <= 300.0)
+                       '≤ 200', 1, found['megabytes'] <= 200.0)
 
 
 def growth() -> tuple[Curves, list[Line]]:

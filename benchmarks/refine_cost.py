@@ -34,6 +34,9 @@ CASES = ('', 'offset_temperature', 'offset_wander', 'quadratic', 'ripple')
 LIMITS = {5_000: 10.0, 50_000: 100.0}
 """Asked: the longest time by the number of poses [s]."""
 
+MOST_MB = 200.0
+"""Asked: the largest memory [MB]."""
+
 SIZE = 3.0
 SAMPLES = 20
 
@@ -69,11 +72,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             with alone:
                 seconds, start, memory, result = alone.submit(
                     measured, hidden, poses, given.seed).result()
-            lines.append(Line(f'{poses:,} poses, {hidden or "nothing"} hidden: seconds '
-                              f'({result}; memory {start:.0f} → {memory:.0f} MB)',
-                              f'{seconds:.1f}', f'≤ {LIMITS[poses]:g}', 1,
-                              seconds <= LIMITS[poses]))
-            print(lines[-1].what, lines[-1].measured, file=sys.stderr, flush=True)
+            what = f'{poses:,} poses, {hidden or "nothing"} hidden'
+            lines += [
+                Line(f'{what}: seconds ({result})', f'{seconds:.1f}', f'≤ {LIMITS[poses]:g}', 1,
+                     seconds <= LIMITS[poses]),
+                Line(f'{what}: largest memory [MB] ({start:.0f} before)', f'{memory:.0f}',
+                     f'≤ {MOST_MB:g}', 1, memory <= MOST_MB)]
+            print(*lines[-2:], sep='\n', file=sys.stderr, flush=True)
     only = ''.join(f' --poses {poses}' for poses in given.poses or ())
     publish(f'# Cost of refine with many poses\n\nMade by `python benchmarks/refine_cost.py{only} '
             f'--markdown FILE` on {before}.\n\n{table(lines)}\n', given.markdown)
