@@ -700,3 +700,31 @@ def test_own_effects_are_known_to_all_workers_and_needed_later(client: Any, tmp_
                      store.folder / rows_of(store.folder)[0]['calibration'])
     assert without.returncode == 2
     assert "needs the effect 'band_of_fleet' of the user" in without.stderr
+
+
+TIMES = """
+import json
+from pathlib import Path
+
+from accel_calib.fleet import Options, recordings
+from fleet import costs, whole, write_sensor
+
+if __name__ == '__main__':
+    Path('in').mkdir()
+    for number in range(2):
+        write_sensor(Path('in'), number, 2, 1)
+    found, here = list(recordings(['in'])), Path.cwd()
+    spent = costs(found, Options(refined=True), here)
+    print(json.dumps({**spent, **whole(found, Options(refined=False), 1, here).after}))
+"""
+
+
+def test_the_benchmark_times_each_stage(tmp_path: Path) -> None:
+    (tmp_path / 'times.py').write_text(TIMES, encoding='utf-8')
+    benchmarks = Path(__file__).resolve().parents[1] / 'benchmarks'
+    ran = python('times.py', folder=tmp_path,
+                 PYTHONPATH=os.pathsep.join(map(str, (benchmarks.parent, benchmarks))))
+    assert ran.returncode == 0, ran.stderr
+    times = json.loads(ran.stdout)
+    stages = {'read and capture', 'fit', 'refine', 'rate', 'compare', 'page', 'typical values'}
+    assert stages <= {name for name, spent in times.items() if spent > 0.0}
