@@ -276,7 +276,7 @@ _LARGEST_RATIO = 1e3
 _LEAST_WHITE = 0.5
 """Smallest part of the measured variance that remains for the noise of the poses."""
 
-SIGNIFICANT = 10.0
+SIGNIFICANT = 8.0
 """Twice the logarithm of the likelihood ratio above which a walk is named."""
 
 

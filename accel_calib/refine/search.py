@@ -418,6 +418,11 @@ def _is_all_noise(chosen: Set) -> bool:
     return is_noise(chosen.rss, chosen.linear.dof - chosen.parameters)
 
 
+def _leaves_gap(chosen: Set) -> bool:
+    """Return whether the noise is known and does not explain the rest."""
+    return chosen.linear.worth > 0.0 and not _is_all_noise(chosen)
+
+
 def _at(linear: Linear, names: tuple[str, ...], out: tuple[int, ...], process: Process | None,
         poses_g: Poses) -> Near:
     """Return a set near its fit; its effects are in the order of their contribution."""
@@ -558,7 +563,12 @@ def reshaped(chosen: Set) -> list[Set]:
 
 
 def accepted(visited: Iterable[Set]) -> Iterator[Set]:
-    """Yield the sets of `explored` whose effects are significant, the preferred one first."""
+    """
+    Yield the sets of `explored` whose effects are significant, the preferred one first.
+
+    The set without effects is not preferred to a better one if it leaves more than the noise.
+
+    """
     left = list(visited)
     while left:
         near: list[Set] = []
@@ -570,8 +580,8 @@ def accepted(visited: Iterable[Set]) -> Iterator[Set]:
         if not near:
             return
         best = min(near, key=lambda chosen: (
-            chosen.parameters, any('new' in each.entry.needs for each in chosen.entries),
-            -chosen.score))
+            not chosen.blocks and _leaves_gap(chosen), chosen.parameters,
+            any('new' in each.entry.needs for each in chosen.entries), -chosen.score))
         yield best
         left = [chosen for chosen in left if chosen is not best]
 
