@@ -177,6 +177,23 @@ def stored():
     return model, fit_poses(poses, G, date='2026-11-02T00:00:00')
 
 
+@pytest.mark.parametrize('seed', [21, 37])
+def test_a_gain_that_few_attitudes_leave_open_is_not_named_as_an_effect(seed):
+    made = generator.simulate(np.random.default_rng(seed), {},
+                              generator.Setup(poses=64, repeats=8))
+    found = ac.refine(pd.DataFrame(made.columns))
+    assert found.verdict == 'unexplained'
+    assert set(names(found)) <= {'axis_gain', 'cross_axis'}
+
+
+def test_an_effect_that_shows_within_few_attitudes_is_named():
+    rng = np.random.default_rng(1)
+    attitudes = np.repeat(random_directions(8, rng), 8, axis=0)
+    hot = np.tile(np.linspace(15.0, 35.0, 8), 8)
+    found = refine(poses_of(with_effects(rng, **TCO), rng, attitudes, temperature=hot), G)
+    assert names(found) == ['offset_temperature']
+
+
 def test_the_gap_of_a_stored_calibration_is_that_of_the_file_and_another_sensor_is_told(stored):
     model, base = stored
     rng = np.random.default_rng(22)

@@ -323,13 +323,13 @@ def _check_covariance(covariance: Floats) -> None:
 def _check_gain(calibration: Calibration) -> None:
     mat_w, vec_v = calibration.model.linear_part
     gains = np.linalg.svd(mat_w, compute_uv=False)
-    if not np.linalg.det(mat_w) > 0.0 and not calibration.form.known_orientation:
-        raise RefusedFitError('the gain W is singular or a mirror image, expected det W > 0',
-                              _CHECK_POSES)
     if not GAINS[0] <= gains[-1] <= gains[0] <= GAINS[1]:
         raise RefusedFitError('the poses are not on an ellipsoid of an accelerometer: the gains '
                               f'are {gains[-1]:.3g} to {gains[0]:.3g}, expected {GAINS[0]:g} to '
                               f'{GAINS[1]:g}', f'check the units, or {_CHECK_POSES}')
+    if not np.linalg.det(mat_w) > 0.0 and not calibration.form.known_orientation:
+        raise RefusedFitError('the gain W is a mirror image, expected det W > 0',
+                              _CHECK_POSES)
     offset = float(np.linalg.norm(vec_v))
     if not calibration.units.is_native and not offset <= LARGEST_OFFSET_G:
         raise RefusedFitError(f'the zero-g offset is {offset:.3g} g, expected less than '

@@ -45,7 +45,7 @@ import numpy as np
 
 from .base import causes
 from .linear import Block, held_out, LEVEL, Linear, outside_of, Set
-from .state import candidates, linearised, State
+from .state import candidates, left_open, linearised, State
 from ..effects import (
     AXES, CARRIERS, curve_pairs, Effect, effect_named, EFFECTS, empirical_name, empirical_parts,
     LADDER, Model, modes_of, parameter_names, WANDER)
@@ -119,7 +119,7 @@ def best_curve(state: State, poses_g: Poses, out: tuple[int, ...], *, of_force: 
 
     """
     fit = judge(state.model, poses_g)
-    plain = linearised(fit, state.model.effects)
+    plain = linearised(fit, state.model.effects, beside=left_open(state))
     if plain.dof < _LEAST_DOF:
         return None
     families = list(_families(poses_g))

@@ -39,8 +39,8 @@ from .curves import (
     best_curve, Curve, Near, one_curve, Process, process_of, SIGNIFICANT, Walk, walk_beside)
 from .linear import Block, LEVEL, Linear, Set
 from .state import (
-    beginning, Candidate, candidates, fitted_state, is_noise, linearised, State, with_effect,
-    without)
+    beginning, Candidate, candidates, fitted_state, is_noise, left_open, linearised, State,
+    with_effect, without)
 from ..calibrate import with_previous
 from ..effects import (
     CHANGES, covariate_names, effect_named, EFFECTS, empirical_parts, fitted_places, included,
@@ -285,14 +285,21 @@ def _is_better(curve: Curve, near: Near) -> bool:
 
 @dataclass(frozen=True)
 class _Trial:
-    """All poses, the effects of a model that stay, and the effects that are tried beside them."""
+    """
+    All poses, the effects of a model that stay, and the effects that are tried beside them.
+
+    What is tried must also show beside the model `beside`.
+
+    """
 
     poses_g: Poses
     fixed: tuple[str, ...]
     tried: tuple[Candidate, ...]
+    beside: Model
 
     def near(self, state: State) -> Linear:
-        return linearised(judge(state.model, self.poses_g), self.fixed, self.tried)
+        return linearised(judge(state.model, self.poses_g), self.fixed, self.tried,
+                          self.beside)
 
     def fitted(self, chosen: Set, state: State, most: float = np.inf) -> State | None:
         """Return the fit of a set; None without a sound fit below `most`."""
@@ -308,7 +315,8 @@ def _settled(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterab
              walks: bool = True) -> tuple[State, Near]:
     """Search and fit in turn until the set remains; return the state, and the set near it."""
     trial = _Trial(poses_g, fixed,
-                   tuple(candidates((name for name in names if name not in fixed), poses_g)))
+                   tuple(candidates((name for name in names if name not in fixed), poses_g)),
+                   left_open(state) if walks else Model({}))
     settled: tuple[tuple[str, ...], tuple[int, ...], Process | None] | None = None
     begun = set(state.model.effects) <= set(fixed) and len(state.poses_g) == len(poses_g)
     seen = [_NOTHING] if begun else []
@@ -332,7 +340,15 @@ def _settled(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterab
     if settled is None and len(state.poses_g) < len(poses_g):  # the set has all poses
         state = _fitted_without(state, poses_g, ())
     near = _at(linear, *(settled or ((), (), None)), poses_g)
-    return _significant(state, near, trial)
+    while (fewer := _without_weak(near.chosen)) is not None:
+        after = trial.fitted(fewer, state)
+        if after is None:
+            break
+        place = fewer.effects, fewer.out, None if near.walk is None else near.walk.process
+        del near, linear, fewer  # before the next columns are made
+        state, linear = after, trial.near(after)
+        near = _at(linear, *place, poses_g)
+    return state, near
 
 
 def _is_predicted(near: Near, fitted: State) -> bool:
@@ -341,21 +357,10 @@ def _is_predicted(near: Near, fitted: State) -> bool:
     return fitted.dof > 0 and error < _EXACT * max(variance, 1.0)
 
 
-def _significant(state: State, near: Near, trial: _Trial) -> tuple[State, Near]:
-    """Remove the effects that are not significant near the fit, one by one."""
-    while True:
-        weak = [near.chosen.without(block) for block in near.chosen.blocks
-                if near.chosen.probability(block) > LEVEL]
-        if not weak:
-            break
-        fewer = max(weak, key=lambda fewer: fewer.score)
-        after = trial.fitted(fewer, state)
-        if after is None:
-            break
-        process = None if near.walk is None else near.walk.process
-        state, near = after, _at(trial.near(after), fewer.effects, fewer.out, process,
-                                 trial.poses_g)
-    return state, near
+def _without_weak(chosen: Set) -> Set | None:
+    """Return the best set with one effect less that is not significant; None if all are."""
+    return max((chosen.without(block) for block in chosen.blocks
+                if chosen.probability(block) > LEVEL), key=lambda fewer: fewer.score, default=None)
 
 
 def _best_fit(near: Near, state: State, trial: _Trial) -> tuple[Near, State | None]:

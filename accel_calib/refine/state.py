@@ -22,9 +22,11 @@ from numpy.typing import NDArray
 import scipy
 
 from .linear import Block, held_out, is_seen, Linear, orthonormal, outside_of
-from ..calibrate import with_history
-from ..effects import Context, Effect, effect_named, factors_of, included, kind_of, Model
-from ..estimate import Equations, estimate, Fit, NotConvergedError
+from ..calibrate import determines, NORM_MODELS, with_history
+from ..effects import (
+    Context, Effect, effect_named, factors_of, included, kind_of, linear_model, Model)
+from ..estimate import Equations, estimate, Fit, kinds, NotConvergedError
+from ..geometry import unit
 from ..table import Floats, Poses
 from ..units import MG
 
@@ -45,6 +47,7 @@ _CHI2_RATIO = 1.3
 """chi² per degree of freedom that still counts as noise: poses repeat worse than samples."""
 
 _OFFSET = Model({'offset': np.zeros(3)})
+_NOTHING = Model({})
 
 
 @dataclass(frozen=True)
@@ -104,15 +107,21 @@ def _shapes(effect: Effect, context: Context, poses: int) -> tuple[tuple[Floats,
     return shapes, max(len(shapes) / _SHAPES_ALIKE, 1.0)
 
 
-def linearised(fit: Fit, base: tuple[str, ...], tried: Iterable[Candidate] = ()) -> Linear:
-    """Return the linear problem at a fit, given the names of the base, and the candidates."""
+def linearised(fit: Fit, base: tuple[str, ...], tried: Iterable[Candidate] = (),
+               beside: Model = _NOTHING) -> Linear:
+    """
+    Return the linear problem at a fit, given the names of the base, and the candidates.
+
+    The columns of the model `beside` are projected out as those of the base.
+
+    """
     near, model = fit.equations, fit.model
     held = Model({name: values for name, values in model.values.items() if name in base})
     further = Model({name: values for name, values in model.values.items() if name not in base})
     residual = near.residual
     if further.values:
         residual = residual + near.columns(further) @ _amplitudes(further)
-    onto = orthonormal(near.columns(held)[:, held.fitted])
+    onto = orthonormal(np.hstack([near.columns(held)[:, held.fitted], near.columns(beside)]))
     residual = residual - onto @ (onto.T @ residual)
     blocks, every, sizes = _blocks(near, onto, fit.poses_g.columns, further, tuple(tried))
     every[-1] = residual
@@ -120,6 +129,20 @@ def linearised(fit: Fit, base: tuple[str, ...], tried: Iterable[Candidate] = ())
     return Linear(onto, near.pose, blocks, every, sizes, WORTH if near.noise_known else 0.0,
                   near.count - onto.shape[1], float(every[-1] @ every[-1]), near.columns(_OFFSET),
                   2.0 * math.log(1.0 + kinds))
+
+
+def left_open(state: State) -> Model:
+    """
+    Return the offset and gains beside which an effect must show: none if the poses determine them.
+
+    In few different attitudes, an effect could otherwise stand for a cross-axis gain that the
+    model lacks, and be wrong in other attitudes.
+
+    """
+    largest = NORM_MODELS[-1]
+    if len(kinds(state.poses_g)[0]) or determines(largest, unit(state.fit.equations.force)):
+        return _NOTHING
+    return linear_model(largest, np.eye(3), np.zeros(3))
 
 
 def visible(fit: Fit, tried: Iterable[Candidate]) -> dict[str, float]:
