@@ -217,15 +217,15 @@ _NEAREST = 2
 def nearest_effects(before: State) -> dict[str, float]:
     """Return the known effects that leave least of the residual, and what they leave [mg]."""
     names = tuple(name for name in EFFECTS if name not in before.model.values)
-    linear = linearised(before.fit, before.model.effects, candidates(names, before.poses_g))
-    gain, rank = Set.of(linear).gains()
-    left_mg: dict[str, float] = {}
-    for number in np.argsort(-gain):
-        effect = linear.blocks[number].effect
-        if rank[number] and effect not in left_mg and len(left_mg) < _NEAREST:
-            _, left = Set.of(linear, (int(number),)).spanned
-            left_mg[effect] = before.gap_mg(left)
-    return left_mg
+    best: list[tuple[float, str]] = []
+    for each in candidates(names, before.poses_g):  # one by one, which takes less memory
+        linear = linearised(before.fit, before.model.effects, (each,))
+        gain, rank = Set.of(linear).gains()
+        number = int(np.argmax(gain))
+        if rank[number]:
+            _, left = Set.of(linear, (number,)).spanned
+            best.append((before.gap_mg(left), each.name))
+    return {name: left_mg for left_mg, name in sorted(best)[:_NEAREST]}
 
 
 def one_curve(state: State) -> tuple[str, ...]:
