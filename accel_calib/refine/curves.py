@@ -217,15 +217,15 @@ _NEAREST = 2
 def nearest_effects(before: State) -> dict[str, float]:
     """Return the known effects that leave least of the residual, and what they leave [mg]."""
     names = tuple(name for name in EFFECTS if name not in before.model.values)
-    best: list[tuple[float, str]] = []
+    best: list[tuple[float, str, float]] = []
     for each in candidates(names, before.poses_g):  # one by one, which takes less memory
         linear = linearised(before.fit, before.model.effects, (each,))
         gain, rank = Set.of(linear).gains()
         number = int(np.argmax(gain))
         if rank[number]:
             _, left = Set.of(linear, (number,)).spanned
-            best.append((before.gap_mg(left), each.name))
-    return {name: left_mg for left_mg, name in sorted(best)[:_NEAREST]}
+            best.append((-gain[number], each.name, before.gap_mg(left)))
+    return {name: left_mg for _, name, left_mg in sorted(best)[:_NEAREST]}
 
 
 def one_curve(state: State) -> tuple[str, ...]:
