@@ -313,7 +313,12 @@ class _Trial:
 
 def _settled(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterable[str], *,
              walks: bool = True) -> tuple[State, Near]:
-    """Search and fit in turn until the set remains; return the state, and the set near it."""
+    """
+    Search and fit in turn until the set remains; return the state, and the set near it.
+
+    Without `walks`, the effects of the ladder are searched.
+
+    """
     trial = _Trial(poses_g, fixed,
                    tuple(candidates((name for name in names if name not in fixed), poses_g)),
                    left_open(state) if walks else Model({}))
