@@ -72,8 +72,8 @@ def test_the_truth_of_a_sample_is_found_without_options_and_with_its_format(name
     np.testing.assert_allclose(named.table['time'], log.table['time'], rtol=1e-12)
 
 
-@pytest.mark.parametrize(('name', 'advice'), zip(make.WITHOUT_GRAVITY, (
-    "record 'Acceleration with g'", 'use TotalAcceleration.csv')))
+@pytest.mark.parametrize(('name', 'advice'), list(zip(make.WITHOUT_GRAVITY, (
+    "record 'Acceleration with g'", 'use TotalAcceleration.csv'), strict=True)))
 def test_a_log_without_gravity_is_refused_and_the_maker_s_other_log_is_named(
         name: str, advice: str) -> None:
     with pytest.raises(InputError, match='gravity') as caught:
