@@ -90,6 +90,13 @@ def test_two_nonlinearities_with_directions_of_their_own_are_explained(seed, tak
     assert (found.verdict, found.one_curve) == ('explained', ())
 
 
+def test_a_curve_is_not_explained_by_the_one_part_of_it_that_is_named(taken):
+    found = refine(taken([3, 1], {'quartic': 3.0}, poses=60)[0], MPS2, base='10')
+    assert names(found) == ['quadratic']
+    assert (found.undecided, found.one_curve) == (True, ('quadratic', 'gain_asymmetry'))
+    assert 'beside quadratic, gain_asymmetry shows' in verdict_words(found)
+
+
 @pytest.mark.parametrize('effect', ['repeatability', 'quartic', 'quintic', 'dead_zone',
                                     'gain_temperature_steep', 'offset_temperature_knee',
                                     'wander_1f'])

@@ -35,7 +35,7 @@ set leaves.
 
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 import math
@@ -232,28 +232,52 @@ def one_curve(state: State) -> tuple[str, ...]:
     """
     Return two nonlinearities in the same proportion on each axis; empty if there are none.
 
-    They may be parts of one curve, because two causes have directions of their own. The density of
-    the weaker effect at such a proportion is compared with that of a direction that is uniform
-    over the sphere. With a and b the values by axis, relative to their lengths, the evidence is
-    2 log s - min χ²(t): χ²(t) is that of b cos t - a sin t, and s the smaller one of χ²(0°) and
-    χ²(90°).
+    They may be parts of one curve, because two causes have directions of their own. The second one
+    may be in the model, or only show beside it.
+
+    """
+    bent = [name for name, effect in EFFECTS.items() if effect.bends and effect.parameters == AXES]
+    named = [name for name in bent if name in state.model.values]
+    further = [name for name in bent if name not in named]
+    pairs = {(one, other): evidence for one in named for other, evidence in _in_proportion(
+        one, further, state)}
+    pairs |= {pair: _proportion(pair, state) for pair in combinations(named, 2)}
+    best = max(pairs, key=lambda pair: pairs[pair], default=())
+    return best if best and pairs[best] > _PROPORTION else ()
+
+
+def _proportion(pair: tuple[str, str], state: State) -> float:
+    """
+    Return the evidence for a proportion of two effects of a model.
+
+    The density of the weaker effect at such a proportion is compared with that of a direction that
+    is uniform over the sphere. With a and b the values by axis, relative to their lengths, the
+    evidence is 2 log s - min χ²(t): χ²(t) is that of b cos t - a sin t, and s the smaller one of
+    χ²(0°) and χ²(90°).
 
     """
     names = parameter_names(state.model.effects)
-    bent = [name for name in state.model.effects if (effect := effect_named(name)).bends
-            and effect.parameters == AXES]
-    for pair in combinations(bent, 2):
-        own = [names.index(f'{name}.{axis}') for name in pair for axis in AXES]
-        values = state.model.vector[own]
-        weights = np.column_stack([-np.sin(_TURNS), np.cos(_TURNS)]) / np.linalg.norm(
-            values.reshape(2, 3), axis=1)
-        mix = np.kron(weights[:, np.newaxis], np.eye(3))
-        away = mix @ values
-        spread = mix @ state.fit.covariance[np.ix_(own, own)] @ mix.transpose(0, 2, 1)
-        chi2 = np.sum(away * np.linalg.solve(spread, away[..., np.newaxis])[..., 0], axis=1)
-        if 2.0 * np.log(min(chi2[0], chi2[len(chi2) // 2])) - np.min(chi2) > _PROPORTION:
-            return pair
-    return ()
+    own = [names.index(f'{name}.{axis}') for name in pair for axis in AXES]
+    values = state.model.vector[own]
+    weights = np.column_stack([-np.sin(_TURNS), np.cos(_TURNS)]) / np.linalg.norm(
+        values.reshape(2, 3), axis=1)
+    mix = np.kron(weights[:, np.newaxis], np.eye(3))
+    away = mix @ values
+    spread = mix @ state.fit.covariance[np.ix_(own, own)] @ mix.transpose(0, 2, 1)
+    chi2 = np.sum(away * np.linalg.solve(spread, away[..., np.newaxis])[..., 0], axis=1)
+    return float(2.0 * np.log(min(chi2[0], chi2[len(chi2) // 2])) - np.min(chi2))
+
+
+def _in_proportion(name: str, further: Sequence[str], state: State
+                   ) -> Iterator[tuple[str, float]]:
+    """Yield effects that a model lacks, and the evidence for each in proportion to one it has."""
+    linear = linearised(state.fit, state.model.effects, candidates(further, state.poses_g))
+    values = state.model.values[name]
+    cost = math.log(max(linear.dof, 2)) + 2.0 * math.log(len(further) or 1)
+    for block in linear.blocks:
+        column = linear.columns[:, block.columns] @ (linear.sizes[block.columns] * values)
+        gain = (column @ linear.residual) ** 2 / max(float(column @ column), 1e-300)
+        yield block.effect, float(gain) / Set.of(linear).variance - cost
 
 
 def steepest(variable: str, poses_g: Poses, share_mg: Floats) -> tuple[float, float] | None:

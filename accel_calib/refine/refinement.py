@@ -106,6 +106,7 @@ class Refinement(Record):
         refined calibration.
     one_curve : tuple of str
         Two nonlinearities in the same proportion on each axis, as parts of one curve; or empty.
+        The second one may not be named, and only show beside the first.
 
     """
 
@@ -162,8 +163,12 @@ def _why_undecided(result: Refinement) -> str:
     if result.refusal:
         return result.refusal[0]
     if result.one_curve:
-        return (f'{" and ".join(result.one_curve)} are in the same proportion on each axis, as '
-                'parts of one curve are')
+        one, other = result.one_curve
+        if other not in {step.effect for step in result.steps}:
+            return (f'beside {one}, {other} shows in the same proportion on each axis, as parts '
+                    'of one curve do')
+        return (f'{one} and {other} are in the same proportion on each axis, as parts of one '
+                'curve are')
     most = max(result.steps, key=lambda step: len(step.rivals))
     return f'{len(most.rivals)} others explain it about as well as {most.effect}'
 
