@@ -328,8 +328,7 @@ def _check_gain(calibration: Calibration) -> None:
                               f'are {gains[-1]:.3g} to {gains[0]:.3g}, expected {GAINS[0]:g} to '
                               f'{GAINS[1]:g}', f'check the units, or {_CHECK_POSES}')
     if not np.linalg.det(mat_w) > 0.0 and not calibration.form.known_orientation:
-        raise RefusedFitError('the gain W is a mirror image, expected det W > 0',
-                              _CHECK_POSES)
+        raise RefusedFitError('the gain W is a mirror image, expected det W > 0', _CHECK_POSES)
     offset = float(np.linalg.norm(vec_v))
     if not calibration.units.is_native and not offset <= LARGEST_OFFSET_G:
         raise RefusedFitError(f'the zero-g offset is {offset:.3g} g, expected less than '

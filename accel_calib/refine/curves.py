@@ -25,7 +25,8 @@ out, the residual along the singular vectors of the modes has the variances s² 
 fixed number of modes, the cost is linear in the number of poses.
 
 **Two names for one curve.** Two nonlinearities whose values by axis are in proportion may be parts
-of one curve outside of the catalogue (`one_curve`).
+of one curve outside of the catalogue (`one_curve`). A second one that is too small for a value of
+each axis may still show with one value, in the proportion of the first.
 
 **Rivals** are effects that would explain the data about as well as a named one. The probability of
 an effect against its rivals follows from the score of the set with each of them in its place,
@@ -35,7 +36,7 @@ set leaves.
 
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 import math
@@ -236,14 +237,19 @@ def one_curve(state: State) -> tuple[str, ...]:
     may be in the model, or only show beside it.
 
     """
-    bent = [name for name, effect in EFFECTS.items() if effect.bends and effect.parameters == AXES]
-    named = [name for name in bent if name in state.model.values]
-    further = [name for name in bent if name not in named]
-    pairs = {(one, other): evidence for one in named for other, evidence in _in_proportion(
-        one, further, state)}
-    pairs |= {pair: _proportion(pair, state) for pair in combinations(named, 2)}
+    named = _by_axis(state.model.effects)
+    further = [name for name in _by_axis(EFFECTS) if name not in named]
+    pairs = {pair: _proportion(pair, state) for pair in combinations(named, 2)}
+    for name in named:
+        pairs |= {(name, other): score for other, score in _in_proportion(name, further, state)}
     best = max(pairs, key=lambda pair: pairs[pair], default=())
     return best if best and pairs[best] > _PROPORTION else ()
+
+
+def _by_axis(names: Iterable[str]) -> list[str]:
+    """Return the nonlinearities with one value for each axis."""
+    return [name for name in names if (effect := effect_named(name)).bends
+            and effect.parameters == AXES]
 
 
 def _proportion(pair: tuple[str, str], state: State) -> float:
@@ -270,14 +276,13 @@ def _proportion(pair: tuple[str, str], state: State) -> float:
 
 def _in_proportion(name: str, further: Sequence[str], state: State
                    ) -> Iterator[tuple[str, float]]:
-    """Yield effects that a model lacks, and the evidence for each in proportion to one it has."""
+    """Yield effects that a model lacks, and the score of each in proportion to one it has."""
     linear = linearised(state.fit, state.model.effects, candidates(further, state.poses_g))
-    values = state.model.values[name]
-    cost = math.log(max(linear.dof, 2)) + 2.0 * math.log(len(further) or 1)
     for block in linear.blocks:
-        column = linear.columns[:, block.columns] @ (linear.sizes[block.columns] * values)
+        column = linear.columns[:, block.columns] @ (
+            linear.sizes[block.columns] * state.model.values[name])
         gain = (column @ linear.residual) ** 2 / max(float(column @ column), 1e-300)
-        yield block.effect, float(gain) / Set.of(linear).variance - cost
+        yield block.effect, float(linear.score(linear.base_rss - gain, 1.0, linear.choice))
 
 
 def steepest(variable: str, poses_g: Poses, share_mg: Floats) -> tuple[float, float] | None:

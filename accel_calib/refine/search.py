@@ -161,7 +161,8 @@ def _search(poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
     """Search among the effects that are columns of the equations."""
     start = beginning(poses_g, base)
     poses_g = start.poses_g
-    begun, near = _settled(start, poses_g, base.effects, _visible(start, LADDER), walks=False)
+    begun, near = _settled(start, poses_g, base.effects, _visible(start, LADDER),
+                           of_ladder=True)
     ladder = near.names
     fixed = (*base.effects, *ladder)
     fixed = tuple(name for name in fixed if name not in included(fixed))
@@ -312,23 +313,23 @@ class _Trial:
 
 
 def _settled(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterable[str], *,
-             walks: bool = True) -> tuple[State, Near]:
+             of_ladder: bool = False) -> tuple[State, Near]:
     """
     Search and fit in turn until the set remains; return the state, and the set near it.
 
-    Without `walks`, the effects of the ladder are searched.
+    Effects `of_ladder` are searched without a walk, also where the poses leave gains open.
 
     """
     trial = _Trial(poses_g, fixed,
                    tuple(candidates((name for name in names if name not in fixed), poses_g)),
-                   left_open(state) if walks else Model({}))
+                   Model({}) if of_ladder else left_open(state))
     settled: tuple[tuple[str, ...], tuple[int, ...], Process | None] | None = None
     begun = set(state.model.effects) <= set(fixed) and len(state.poses_g) == len(poses_g)
     seen = [_NOTHING] if begun else []
     refused: set[frozenset[str]] = set()
     linear = trial.near(state)
     for _ in range(_ROUNDS):
-        near = _best_near(linear, poses_g, refused, walks=walks)
+        near = _best_near(linear, poses_g, refused, walks=not of_ladder)
         if near.key in seen:
             break
         near, after = _best_fit(near, state, trial)

@@ -47,7 +47,7 @@ _CHI2_RATIO = 1.3
 """chi² per degree of freedom that still counts as noise: poses repeat worse than samples."""
 
 _OFFSET = Model({'offset': np.zeros(3)})
-_NOTHING = Model({})
+_IDEAL = Model({})
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def _shapes(effect: Effect, context: Context, poses: int) -> tuple[tuple[Floats,
 
 
 def linearised(fit: Fit, base: tuple[str, ...], tried: Iterable[Candidate] = (),
-               beside: Model = _NOTHING) -> Linear:
+               beside: Model = _IDEAL) -> Linear:
     """
     Return the linear problem at a fit, given the names of the base, and the candidates.
 
@@ -141,7 +141,7 @@ def left_open(state: State) -> Model:
     """
     largest = NORM_MODELS[-1]
     if len(kinds(state.poses_g)[0]) or determines(largest, unit(state.fit.equations.force)):
-        return _NOTHING
+        return _IDEAL
     return linear_model(largest, np.eye(3), np.zeros(3))
 
 
