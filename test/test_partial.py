@@ -214,6 +214,17 @@ def test_the_gate_accepts_both_and_refuses_readings_that_no_sensor_has(make):
         gated(mirrored)
 
 
+@pytest.mark.parametrize(('gain', 'words'), [
+    ((-1.0, 1.0, 1.0), 'mirror image'), ((1e-9, 1.0, 1.0), 'not on an ellipsoid'),
+    ((-1e-9, 1.0, 1.0), 'not on an ellipsoid')])
+def test_the_gate_names_a_gain_out_of_range_before_its_sign(gain, words):
+    found = fit_poses(simulate_poses(Model({}), spread_directions(24), np.random.default_rng(1)),
+                      G, model='10')
+    values = {**found.model.values, 'axis_gain': np.array(gain) - 1.0}
+    with pytest.raises(RefusedFitError, match=words):
+        gated(replace(found, model=Model(values)))
+
+
 def test_a_partial_fit_is_better_than_none_and_refine_completes_it():
     model, poses = tilting(17)
     far = simulate_poses(model, spread_directions(24), np.random.default_rng(17))

@@ -69,6 +69,13 @@ def test_nothing_is_named_where_nothing_is_hidden(seed, poses, taken):
     assert (found.verdict, names(found)) == ('no_gap', [])
 
 
+@pytest.mark.parametrize(('effect', 'seed'), [
+    ('offset_drift', 5), ('cross_coupling', 4), ('gain_drift', 4), ('offset_wander', 2)])
+def test_a_small_effect_is_named_where_few_poses_leave_a_gap_without_it(effect, seed, taken):
+    found = refine(taken([1, seed], {effect: 1.5}, poses=24)[0], MPS2, base='10')
+    assert names(found) == [effect]
+
+
 def test_two_hidden_effects_are_both_named(taken):
     for seed, pair in ((0, ('quadratic', 'offset_temperature')),
                        (2, ('hysteresis', 'supply_ratio'))):
