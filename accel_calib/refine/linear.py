@@ -61,9 +61,6 @@ SEEN = 0.02
 LEVEL = 0.01
 """Probability that any effect is named if there is no hidden effect."""
 
-_DETERMINED = 1e-12
-"""Smallest square of a relative singular value of the columns of values that are determined."""
-
 _USUAL = 1.6
 """Standard deviation of the logarithm of the size of an effect relative to its typical size."""
 
@@ -95,6 +92,10 @@ class Block(NamedTuple):
     entry: Effect
     searched: int = 0
     tried: float = 1.0
+
+
+Group = tuple[NDArray[np.intp], NDArray[np.intp], Floats]
+"""Blocks of the same width, as in `Linear.by_width`."""
 
 
 @dataclass(frozen=True)
@@ -184,7 +185,7 @@ class Linear:
         return [self._made[block] for block in blocks]
 
     @cached_property
-    def by_width(self) -> list[tuple[NDArray[np.intp], NDArray[np.intp], Floats]]:
+    def by_width(self) -> list[Group]:
         """Blocks of the same width: (k,) blocks, (k, w) columns, and (k, w, w) products."""
         found: dict[int, list[tuple[Any, Any, Any]]] = {}
         first = 0
@@ -202,8 +203,7 @@ class Linear:
         return [(np.concatenate(numbers), np.concatenate(index), np.concatenate(products))
                 for numbers, index, products in (zip(*parts) for parts in found.values())]
 
-    def grouped(self, numbers: NDArray[np.intp]
-                ) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp], Floats]]:
+    def grouped(self, numbers: NDArray[np.intp]) -> Iterator[Group]:
         """Yield some blocks as `by_width`."""
         for own, index, products in self.by_width:
             which = np.isin(own, numbers)
@@ -383,14 +383,7 @@ class Set:
         """Return the (p,) values of the effect of each block."""
         if not self.blocks:
             return {}
-        index, linear = self._index, self.linear
-        rows = np.concatenate(linear.products_with(self.blocks))
-        left, right = rows[:, index], rows[:, -1]
-        if self.out:
-            across = self.across[:len(self.root)]
-            left = left - across[:, index].T @ across[:, index]
-            right = right - across[:, index].T @ across[:, -1]
-        values = np.linalg.lstsq(left, right, rcond=_DETERMINED)[0] / linear.sizes[index]
+        values = self.mix[len(self.root):] @ self.across[:, -1] / self.linear.sizes[self._index]
         ends = np.cumsum([each.columns.stop - each.columns.start for each in self.entries])
         return dict(zip(self.blocks, np.split(values, ends[:-1]), strict=True))
 
@@ -417,11 +410,29 @@ class Set:
         along = linear.with_residual[:-1] - across[:, -1] @ across[:, :-1]
         gain, rank = np.zeros(len(linear.blocks)), np.zeros(len(linear.blocks))
         groups = linear.grouped(linear.numbers_of[effect]) if effect else linear.by_width
-        for numbers, index, products in groups:
-            parts = np.moveaxis(across[:, index], 0, 2)
-            gain[numbers], rank[numbers] = _explained(
-                products - parts @ np.swapaxes(parts, 1, 2), along[index])
+        for numbers, index, left in self._beside(groups):
+            gain[numbers], rank[numbers] = _explained(left, along[index])
         return gain, rank
+
+    def _beside(self, groups: Iterable[Group]) -> Iterator[Group]:
+        """Yield blocks as `Linear.by_width`, with their products beside the set."""
+        for numbers, index, products in groups:
+            parts = np.moveaxis(self.across[:, index], 0, 2)
+            yield numbers, index, products - parts @ np.swapaxes(parts, 1, 2)
+
+    @property
+    def visible(self) -> dict[str, float]:
+        """Return what effects of typical size add to the residual, if they are seen at all."""
+        found: dict[str, float] = {}
+        for numbers, index, left in self._beside(self.linear.by_width):
+            sizes = self.linear.sizes[index]
+            squares = np.linalg.eigvalsh(left * sizes[:, np.newaxis] * sizes[:, :, np.newaxis])
+            seen = is_seen(np.linalg.eigvalsh(left)).any(axis=1)
+            for number, square in zip(numbers[seen].tolist(), squares[seen, -1].tolist()):
+                block = self.linear.blocks[number]
+                found[block.effect] = max(math.sqrt(square) * block.entry.typical,
+                                          found.get(block.effect, 0.0))
+        return found
 
     def best_of(self, effect: str) -> int:
         """Return the block of an effect with the largest gain in addition to the set."""

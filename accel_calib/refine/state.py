@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 import scipy
 
-from .linear import Block, held_out, is_seen, Linear, orthonormal, outside_of
+from .linear import Block, held_out, Linear, orthonormal, outside_of
 from ..calibrate import determines, NORM_MODELS, with_history
 from ..effects import (
     Context, Effect, effect_named, factors_of, included, kind_of, linear_model, Model)
@@ -143,21 +143,6 @@ def left_open(state: State) -> Model:
     if len(kinds(state.poses_g)[0]) or determines(largest, unit(state.fit.equations.force)):
         return _IDEAL
     return linear_model(largest, np.eye(3), np.zeros(3))
-
-
-def visible(fit: Fit, tried: Iterable[Candidate]) -> dict[str, float]:
-    """Return the effect on the residuals of candidates of typical size beside a fit, per noise."""
-    near, found = fit.equations, {}
-    onto = orthonormal(fit.columns)
-    for each in tried:
-        columns, sizes = outside_of(onto, near.columns_of(each.name, each.factors))
-        own = columns.reshape(len(columns), len(each.shapes), -1).swapaxes(0, 1)
-        sized = own * sizes.reshape(len(own), 1, -1)
-        seen = is_seen(np.linalg.eigvalsh(own.swapaxes(1, 2) @ own)).any(axis=1)
-        if np.any(seen):
-            squares = np.linalg.eigvalsh(sized.swapaxes(1, 2) @ sized)[seen, -1]
-            found[each.name] = math.sqrt(np.max(squares)) * each.entry.typical
-    return found
 
 
 def _amplitudes(model: Model) -> Floats:

@@ -22,7 +22,7 @@ import numpy as np
 from .curves import LEAST, nearest_effects, probabilities, steepest
 from .linear import Set
 from .search import Found
-from .state import candidates, fitted_state, is_noise, linearised, State, visible, with_effect
+from .state import candidates, fitted_state, is_noise, linearised, State, with_effect
 from ..effects import (
     CHANGES, COVARIATES, effect_named, EFFECTS, EMPIRICAL, empirical_parts, included, is_effect,
     kind_of, LADDER, Model, parameter_names, PROCESSES, TO_SEPARATE, unit_of, value_unit,
@@ -383,10 +383,8 @@ def _directions(force: Floats, share_mg: Floats) -> str:
 
 def untestable(found: Found, steps: Sequence[Step]) -> tuple[tuple[str, str], ...]:
     """Return the effects that the poses of a search cannot show, with the data to record."""
-    final = found.final
-    names = tuple(name for name in EFFECTS if name not in final.model.effects)
-    rivals = tuple(rival for step in steps for rival in step.rivals)
-    return not_testable(final.poses_g, visible(final.fit, candidates(names, final.poses_g)),
+    final, rivals = found.final, (rival for step in steps for rival in step.rivals)
+    return not_testable(final.poses_g, found.near.beside.visible,
                         (*final.model.effects, *rivals))
 
 
