@@ -55,7 +55,7 @@ def names(found):
     return [step.effect for step in found.steps]
 
 
-@pytest.mark.parametrize(('seed', 'is_refused'), [(0, True), (3, False)])
+@pytest.mark.parametrize(('seed', 'is_refused'), [(1, True), (3, False)])
 def test_a_temperature_that_is_not_recorded_leaves_no_absurd_offset(seed, is_refused):
     rng = np.random.default_rng(seed)
     time = np.arange(30) * 7.0

@@ -63,8 +63,11 @@ _LEAST_DOF = 30
 _PATIENCE = 2
 """Cosines without a better score after which no more are added; a wave needs several."""
 
-_CLEARLY = 10.0
+CLEARLY = 10.0
 """Smallest score of a curve."""
+
+_LEAST_OUTSIDE = 1e-9
+"""Added to the squares of modes outside of the base, so that their equations have a solution."""
 
 _HELD_OUT = 0.9
 """Largest ratio of the held-out sum of squares with and without a curve."""
@@ -110,10 +113,10 @@ class _Family(NamedTuple):
         return [(self.carrier, slice(None)), *(alone if len(parts) > 1 else ())]
 
 
-def best_curve(state: State, poses_g: Poses, out: tuple[int, ...], *, of_force: bool = False
-               ) -> Curve | None:
+def best_curve(state: State, poses_g: Poses, out: tuple[int, ...], *, least: float = CLEARLY,
+               of_force: bool = False) -> Curve | None:
     """
-    Return the best curve beside a model, or None.
+    Return the best curve beside a model, or None if its score is below `least`.
 
     `out` are the indices of the outliers; `of_force`: only curves over the force or its
     direction. The choice among all curves is paid for in either case.
@@ -123,16 +126,17 @@ def best_curve(state: State, poses_g: Poses, out: tuple[int, ...], *, of_force: 
     plain = linearised(fit, state.model.effects, beside=left_open(state))
     if plain.dof < _LEAST_DOF:
         return None
-    families = list(_families(poses_g))
-    tried, best = sum(len(family.parts) for family in families), None
+    families, best = list(_families(poses_g)), None
+    tried = sum(len(family.parts) for family in families)
+    most = least + 2.0 * math.log(tried)
     for family in families:
         if of_force and not family.effect.bends:
             continue
         for problem in _problems(plain, fit, family):
-            grown = _grown(_kept(problem, out))
-            if grown.blocks and (best is None or grown.score > best[0]):
-                best = grown.score, Set.of(problem, grown.blocks, out)
-    return None if best is None else _accepted(best[0] - 2.0 * math.log(tried), best[1], tried)
+            kept = _kept(problem, out)
+            if _bound(kept) > most and (grown := _grown(kept)).score > most:
+                best, most = Set.of(problem, grown.blocks, out), grown.score
+    return None if best is None else _accepted(most - 2.0 * math.log(tried), best, tried)
 
 
 def _families(poses_g: Poses) -> Iterator[_Family]:
@@ -168,6 +172,14 @@ def _kept(problem: Linear, out: tuple[int, ...]) -> Linear:
                    dof=problem.dof - int(nothing.parameters))
 
 
+def _bound(problem: Linear) -> float:
+    """Return a score that no set of the modes exceeds: that of all modes at the cost of one."""
+    products = np.concatenate(problem.products_with(range(len(problem.blocks))))
+    left, along = products[:, :-1], products[:, -1]
+    gain = along @ np.linalg.solve(left + _LEAST_OUTSIDE * np.eye(len(left)), along)
+    return float(problem.score(problem.base_rss - gain, 1.0, 0.0))
+
+
 def _grown(problem: Linear) -> Set:
     """Return the modes with the best score."""
     best = now = Set.of(problem)
@@ -191,7 +203,7 @@ def _accepted(score: float, chosen: Set, tried: int) -> Curve | None:
     nothing = chosen.instead(())
     p_value = min(1.0, chosen.chance(nothing) * tried * math.prod(
         each.tried for each in chosen.entries))
-    if p_value > LEVEL or score < _CLEARLY:
+    if p_value > LEVEL:
         return None
     if _held_out(chosen) > _HELD_OUT * _held_out(nothing):
         return None

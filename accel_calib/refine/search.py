@@ -36,7 +36,8 @@ import scipy
 
 from .base import causes, Clipped, off_grid, unclipped
 from .curves import (
-    best_curve, Curve, Near, one_curve, Process, process_of, SIGNIFICANT, Walk, walk_beside)
+    best_curve, CLEARLY, Curve, Near, one_curve, Process, process_of, SIGNIFICANT, Walk,
+    walk_beside)
 from .linear import Block, LEVEL, Linear, Set
 from .state import (
     beginning, Candidate, candidates, fitted_state, is_noise, left_open, linearised, State,
@@ -216,13 +217,13 @@ def _with_one_curve(found: Found, start: State, poses_g: Poses) -> Found | None:
     for what, better in _INSTEAD.items():
         names = [name for name in found.near.names
                  if (entry := effect_named(name)).family and entry.changes == what]
-        beside = _less(found, names)
-        curve = None if beside is None else best_curve(
-            beside.final, poses_g, beside.near.chosen.out, of_force=what == 'force')
-        if beside is None or curve is None:
+        if (beside := _less(found, names)) is None:
             continue
         gained = found.near.beside.score - beside.near.beside.score
-        if curve.score < gained + better - _SEVERAL * (len(names) - 1):
+        curve = best_curve(
+            beside.final, poses_g, beside.near.chosen.out, of_force=what == 'force',
+            least=max(gained + better - _SEVERAL * (len(names) - 1), CLEARLY))
+        if curve is None:
             continue
         described = _with_curve(beside, curve, start, poses_g)
         if described is not None and (described.final.is_noise or not found.final.is_noise):
@@ -504,13 +505,13 @@ def _walk(state: State, near: Near) -> Walk | None:
 _LARGEST = 5
 """Largest number of effects in a set."""
 
-_WIDTH = 6
+_WIDTH = 3
 """Number of sets that are extended."""
 
-_BRANCHES = 6
+_BRANCHES = 5
 """Number of effects by which a set is extended."""
 
-_TESTED = 12
+_TESTED = 5
 """Number of extended sets whose shapes and outliers are found again."""
 
 _AS_GOOD = 2.0
