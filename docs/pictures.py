@@ -346,12 +346,11 @@ def fleet_picture(folder: Path) -> None:
 
 def live_pictures(folder: Path) -> None:
     """Take pictures of the live page, on a phone in a turn and on a desk after a fit."""
-    from playwright.sync_api import expect, sync_playwright
+    from playwright.sync_api import expect
     sys.path[:0] = [str(HERE.parent / 'test')]
     import live_bench as bench
 
-    with sync_playwright() as playwright, bench.live_page(folder, speed=2.0) as live:
-        browser = bench.chromium(playwright)
+    with bench.chromium() as browser, bench.live_page(folder, speed=2.0) as live:
         viewers = bench.Viewers(browser)
         phone = viewers.visit(live.link, (360, 740))
         live.follow(phone, 5)
@@ -364,7 +363,6 @@ def live_pictures(folder: Path) -> None:
         desk.evaluate('scrollTo(0, 0)')
         desk.wait_for_timeout(5000.0)  # some corrected readings
         desk.screenshot(path=FOLDER / 'live_desk.png')
-        browser.close()
 
 
 def main() -> None:
