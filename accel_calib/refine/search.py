@@ -505,13 +505,13 @@ def _walk(state: State, near: Near) -> Walk | None:
 _LARGEST = 5
 """Largest number of effects in a set."""
 
-_WIDTH = 3
+_WIDTH = 4
 """Number of sets that are extended."""
 
 _BRANCHES = 5
 """Number of effects by which a set is extended."""
 
-_TESTED = 5
+_TESTED = 6
 """Number of extended sets whose shapes and outliers are found again."""
 
 _AS_GOOD = 2.0
