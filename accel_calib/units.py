@@ -9,7 +9,6 @@ They stand below all folders, so that ``accel-calib fit --help`` does not load t
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, get_args, Literal
 
 import numpy as np
@@ -66,12 +65,12 @@ class Units:
         if not self.per_g > 0.0:
             raise ValueError(f'per_g is {self.per_g}, expected a positive number')
 
-    @cached_property
+    @property
     def is_native(self) -> bool:
         """Whether the scale is not known, and a fit estimates it."""
         return is_native(self.name)
 
-    @cached_property
+    @property
     def is_si(self) -> bool:
         """Whether it is m/s², the unit of Imu messages."""
         return self.name == 'm/s2'

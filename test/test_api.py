@@ -3,7 +3,7 @@
 
 """The public face: what users have in hand is accepted, and results are as the docs state."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 import importlib
 from pathlib import Path
 import pickle
@@ -226,6 +226,13 @@ def test_records_are_shown_in_a_line_and_as_html_and_can_be_pickled(calibration,
         assert '\n' not in repr(record)
         assert record._repr_html_().startswith(('<table>', '<p>'))
         assert repr(pickle.loads(pickle.dumps(record))) == repr(record)
+
+
+def test_a_record_is_pickled_without_cached_values_which_another_thread_may_add(calibration):
+    assert len(calibration.used_poses)
+    assert 'used_poses' in vars(calibration)
+    again = pickle.loads(pickle.dumps(calibration))
+    assert vars(again).keys() == {each.name for each in fields(calibration)}
 
 
 @pytest.mark.parametrize(('call', 'message'), [
