@@ -8,9 +8,10 @@ import math
 
 from accel_calib.effects import EFFECTS
 from inside import (
-    accepted, beginning, Block, candidates, Curve, explored, fitted_state, grown_curve,
-    is_better_than_walk, Linear, linearised, Model, Near, outside_of, Process, process_of, RARE,
-    REFINE_LEVEL, reshaped, Set, SIGNIFICANT, simulate_poses, Walk, walk_beside, WORTH)
+    accepted, beginning, Block, bound_of_curves, candidates, Curve, explored, fitted_state,
+    grown_curve, is_better_than_walk, Linear, linearised, Model, Near, outside_of, Process,
+    process_of, RARE, REFINE_LEVEL, reshaped, Set, SIGNIFICANT, simulate_poses, Walk, walk_beside,
+    WORTH)
 import numpy as np
 import pytest
 from scipy.optimize import brentq
@@ -157,6 +158,19 @@ def test_a_curve_of_two_cosines_is_found_where_neither_alone_is_useful(count, co
                         side * axes[1] + slope * axes[2]]).T[:, :count]
     linear = by_hand(math.sqrt(200.0) * axes[count - 1], columns, NAMES[:count])
     assert set(grown_curve(linear).blocks) == cosines
+
+
+@pytest.mark.parametrize('count', [1, 2, 6])
+def test_no_curve_has_a_larger_score_than_its_bound(count):
+    rng = np.random.default_rng(count)
+    for _ in range(20):
+        columns = rng.normal(size=(40, count)) + 2.0 * rng.normal(size=(40, 1))  # correlated
+        columns /= np.linalg.norm(columns, axis=0)
+        residual = columns @ rng.normal(size=count) * 8.0 + rng.normal(size=40)
+        linear = by_hand(residual, columns, NAMES[:count])
+        best, bound = grown_curve(linear).score, max(bound_of_curves(linear), 0.0)
+        assert best <= bound + 1e-6
+        assert count > 1 or best == pytest.approx(bound, abs=1e-6)
 
 
 def test_noise_alone_is_significant_as_often_as_stated():
