@@ -10,7 +10,7 @@ import re
 import accel_calib as ac
 from accel_calib.calibrate import fit_poses, verify, with_history
 from accel_calib.errors import RefusedFitError
-from accel_calib.logs import write_table
+from accel_calib.logs import read_recording, write_table
 from accel_calib.refine import refine, verdict_words
 from accel_calib.stored import write_calibration
 from accel_calib.units import units_of
@@ -19,7 +19,7 @@ from inside import advice_for, Model, model_with, rotation_from_rpy, search_effe
 import numpy as np
 import pandas as pd
 import pytest
-from shared import random_directions, run, run_json, sensor
+from shared import data, random_directions, run, run_json, sensor
 
 G = units_of('g')
 WARM = np.array([6e-4, -4e-4, 5e-4])
@@ -405,3 +405,12 @@ def test_all_stages_of_a_refinement_have_the_same_poses():
     found = ac.refine(given, units='g')
     assert len(found.stages) == 2
     assert [len(stage.residual_mg) for stage in found.stages] == 2 * [len(found.poses_g)]
+
+
+def test_samples_of_a_board_that_hardly_turns_give_it_no_absurd_gain():
+    samples = read_recording(data('sensehat_lsm9ds1_temperature.csv'))
+    found = refine(ac.Poses(samples.columns, samples.row).take(np.arange(0, len(samples), 100)), G,
+                   base='ideal')
+    gains = np.linalg.svd(found.calibration.model.linear_part[0], compute_uv=False)
+    assert 0.5 < gains[-1] <= gains[0] < 2.0
+    assert np.linalg.norm(found.calibration.offset) < 0.3

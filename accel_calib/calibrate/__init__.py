@@ -27,8 +27,8 @@ from .pose_planning import (
     LARGEST_DILUTION, lies_in_cone, next_pose, NextPose, NORM_MODELS, Outlook, outlook,
     refuse_if_unfit, stated_uncertainty)
 from .quality import (
-    deviations_g, errors_after, errors_before, fit_findings, gated, in_g, LARGEST_OFFSET_G,
-    OF_A_FIT, quality_of, record_of, uncertainty_g, Verification, verify)
+    deviations_g, errors_after, errors_before, fit_findings, gated, has_usual_gains, in_g,
+    LARGEST_OFFSET_G, OF_A_FIT, quality_of, record_of, uncertainty_g, Verification, verify)
 from .rest_noise import gyro_bias_of, GyroBias, sample_noise_of, SampleNoise, with_rest_noise
 from .thermal import Curve, curve_of, thermal_alone, with_curve, without_curve
 
@@ -39,10 +39,11 @@ __all__ = ['FLEET', 'LARGEST_DILUTION', 'LARGEST_OFFSET_G', 'NORM_MODELS', 'OF_A
            'curve_of', 'determines', 'deviations_g', 'dilution', 'directions_in', 'directions_of',
            'error_left_in', 'errors_after', 'errors_before', 'fit_findings', 'fit_partial',
            'fit_poses', 'fit_unknown', 'fit_with_fleet', 'flat_direction', 'free_parameters',
-           'gated', 'gyro_bias_of', 'identifiability', 'in_frame', 'in_g', 'level',
-           'level_by_rows', 'lies_in_cone', 'mounting_figures', 'mounting_of', 'mounting_only',
-           'mounting_words', 'next_pose', 'of_samples', 'on_topics', 'only_norm', 'outlook',
-           'outside', 'posterior', 'quality_of', 'record_of', 'refuse_if_unfit', 'rejected_by',
+           'gated', 'gyro_bias_of', 'has_usual_gains', 'identifiability', 'in_frame', 'in_g',
+           'level', 'level_by_rows', 'lies_in_cone', 'mounting_figures', 'mounting_of',
+           'mounting_only', 'mounting_words', 'next_pose', 'of_samples', 'on_topics', 'only_norm',
+           'outlook', 'outside', 'posterior', 'quality_of', 'record_of', 'refuse_if_unfit',
+           'rejected_by',
            'sample_noise_of', 'set_heading', 'sound_rows', 'stated_uncertainty', 'sure_rows',
            'thermal_alone', 'thermal_stream', 'uncertainty_g', 'verify', 'with_curve',
            'with_given_mounting', 'with_history', 'with_previous', 'with_rest_noise',

@@ -42,7 +42,7 @@ from .linear import Block, LEVEL, Linear, Set
 from .state import (
     beginning, Candidate, candidates, fitted_state, is_noise, left_open, linearised, State,
     with_effect, without)
-from ..calibrate import with_previous
+from ..calibrate import has_usual_gains, with_previous
 from ..effects import (
     CHANGES, covariate_names, effect_named, EFFECTS, empirical_parts, fitted_places, included,
     LADDER, linear_values, Model, parameter_names, WANDER)
@@ -52,6 +52,10 @@ from ..table import Poses
 
 _ROUNDS = 4
 """Largest number of searches, each near the model of the one before."""
+
+_LADDER_ROUNDS = 20
+"""The same for effects of the ladder, whose fits are short: several fail if few attitudes do not
+determine them."""
 
 _WALK_ROUNDS = 2
 """Number of sets beside which a walk is estimated, each found beside the walk before."""
@@ -310,7 +314,9 @@ class _Trial:
             block = chosen.linear.blocks[number]
             model = with_effect(model, block.effect, np.concatenate([values, block.shape]))
         after = fitted_state(Model(model), without(self.poses_g, chosen.out), most)
-        return None if after is None or (chosen.blocks and after.fit.at_bound) else after
+        if after is None or not chosen.blocks:
+            return after
+        return None if after.fit.at_bound or not has_usual_gains(after.model) else after
 
 
 def _settled(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterable[str], *,
@@ -329,7 +335,7 @@ def _settled(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterab
     seen = [_NOTHING] if begun else []
     refused: set[frozenset[str]] = set()
     linear = trial.near(state)
-    for _ in range(_ROUNDS):
+    for _ in range(_LADDER_ROUNDS if of_ladder else _ROUNDS):
         near = _best_near(linear, poses_g, refused, walks=not of_ladder)
         if near.key in seen:
             break
