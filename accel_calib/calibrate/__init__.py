@@ -43,8 +43,7 @@ __all__ = ['FLEET', 'LARGEST_DILUTION', 'LARGEST_OFFSET_G', 'NORM_MODELS', 'OF_A
            'level', 'level_by_rows', 'lies_in_cone', 'mounting_figures', 'mounting_of',
            'mounting_only', 'mounting_words', 'next_pose', 'of_samples', 'on_topics', 'only_norm',
            'outlook', 'outside', 'posterior', 'quality_of', 'record_of', 'refuse_if_unfit',
-           'rejected_by',
-           'sample_noise_of', 'set_heading', 'sound_rows', 'stated_uncertainty', 'sure_rows',
-           'thermal_alone', 'thermal_stream', 'uncertainty_g', 'verify', 'with_curve',
+           'rejected_by', 'sample_noise_of', 'set_heading', 'sound_rows', 'stated_uncertainty',
+           'sure_rows', 'thermal_alone', 'thermal_stream', 'uncertainty_g', 'verify', 'with_curve',
            'with_given_mounting', 'with_history', 'with_previous', 'with_rest_noise',
            'without_curve']

@@ -322,16 +322,21 @@ def _check_covariance(covariance: Floats) -> None:
 
 def has_usual_gains(model: Model) -> bool:
     """Return whether the gains of a model are those of an accelerometer, in any direction."""
+    least, most = _range_of_gains(model)
+    return GAINS[0] <= least <= most <= GAINS[1]
+
+
+def _range_of_gains(model: Model) -> tuple[float, float]:
     gains = np.linalg.svd(model.linear_part[0], compute_uv=False)
-    return bool(GAINS[0] <= gains[-1] <= gains[0] <= GAINS[1])
+    return float(gains[-1]), float(gains[0])
 
 
 def _check_gain(calibration: Calibration) -> None:
     mat_w, vec_v = calibration.model.linear_part
     if not has_usual_gains(calibration.model):
-        gains = np.linalg.svd(mat_w, compute_uv=False)
+        least, most = _range_of_gains(calibration.model)
         raise RefusedFitError('the poses are not on an ellipsoid of an accelerometer: the gains '
-                              f'are {gains[-1]:.3g} to {gains[0]:.3g}, expected {GAINS[0]:g} to '
+                              f'are {least:.3g} to {most:.3g}, expected {GAINS[0]:g} to '
                               f'{GAINS[1]:g}', f'check the units, or {_CHECK_POSES}')
     if not np.linalg.det(mat_w) > 0.0 and not calibration.form.known_orientation:
         raise RefusedFitError('the gain W is a mirror image, expected det W > 0', _CHECK_POSES)
