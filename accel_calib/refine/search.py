@@ -322,7 +322,7 @@ class _Trial:
 def _settled(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterable[str], *,
              of_ladder: bool = False) -> tuple[State, Near]:
     """
-    Search and fit in turn until the set remains; return the state, and the set near it.
+    Search and fit in turn until a set is found again; return the state, and the set near it.
 
     Effects `of_ladder` are searched without a walk, also where the poses leave gains open.
 
@@ -339,11 +339,12 @@ def _settled(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterab
         near = _best_near(linear, poses_g, refused, walks=not of_ladder)
         if near.key in seen:
             break
+        asked = near.key
         near, after = _best_fit(near, state, trial)
         if after is None:
             refused.add(frozenset(near.names))
             continue
-        seen.append(near.key)
+        seen += asked, near.key
         process = None if near.walk is None else near.walk.process
         settled, predicted = (near.names, near.chosen.out, process), _is_predicted(near, after)
         del near, linear  # before the next columns are made
