@@ -229,18 +229,21 @@ class AtContext:
 
     def inverse_slope(self, u: Floats) -> Floats:
         """Return the inverse of `slope`, (n, 3, 3), or (3, 3) if it is the same for all poses."""
-        return np.linalg.inv(self.slope(u) if len(self.bend) else self.mat_w)
+        return np.linalg.inv(self.slope(u)) if len(self.bend) else self._inverse
+
+    @cached_property
+    def _inverse(self) -> Floats:
+        return np.linalg.inv(self.mat_w)
 
     def force(self, reading: Floats) -> Floats:
         """Return the (n, 3) force u for a reading [g]; NaN where the iteration diverges."""
-        inverse = np.linalg.inv(self.mat_w)
-        affine = times(inverse, reading - self.vec_v)
+        affine = times(self._inverse, reading - self.vec_v)
         if not len(self.bend):
             return affine
         u = affine
         for _ in range(LARGEST_ITERATIONS):
             before = u
-            u = affine - times(inverse, self._bend(u))
+            u = affine - times(self._inverse, self._bend(u))
             u[~(np.max(np.abs(u), axis=1) < LARGEST_FORCE_G)] = np.nan
             change = np.max(np.abs(u - before), axis=1)
             if not np.any(change > CONVERGED_G):
