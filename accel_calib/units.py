@@ -80,6 +80,11 @@ class Units:
         """How people write the unit: m/s², g or native."""
         return 'm/s²' if self.is_si else self.name
 
+    @property
+    def force_per_g(self) -> float:
+        """Corrected force per g: 1 for native readings, whose corrected force is in g."""
+        return 1.0 if self.is_native else self.per_g
+
     def to_g(self, reading: Floats) -> Floats:
         return reading / self.per_g
 

@@ -175,8 +175,9 @@ class Calibration(Record):
     noise: SampleNoise | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, 'poses', replace(
-            self.poses, units=self.units.name, sensor=self.sensor))
+        if (self.poses.units, self.poses.sensor) != (self.units.name, self.sensor):
+            object.__setattr__(self, 'poses', replace(
+                self.poses, units=self.units.name, sensor=self.sensor))
         size, stated = len(self.model.vector), self.model.stated
         covariance = self.covariance.copy()
         if covariance.shape == (np.sum(stated), np.sum(stated)):
@@ -218,10 +219,10 @@ class Calibration(Record):
         """Names of the values, in the order of `covariance`."""
         return parameter_names(self.model.effects)
 
-    @property
+    @cached_property
     def force_per_g(self) -> float:
-        """Corrected force per g: 1 for native readings, whose corrected force is in g."""
-        return 1.0 if self.units.is_native else self.units.per_g
+        """Corrected force per g, as `Units.force_per_g`."""
+        return self.units.force_per_g
 
     @property
     def offset(self) -> Floats:

@@ -403,7 +403,7 @@ def _with_reference(poses: Poses, units: Units) -> tuple[Poses, str]:
         raise RefusedFitError('the poses have no ref_x,ref_y,ref_z and are not the six faces, '
                               'but model 12 needs known orientations', 'add these columns, use '
                               'only the six faces (--rows), or use model 10')
-    force = faces_up * (1.0 if units.is_native else units.per_g)
+    force = faces_up * units.force_per_g
     return poses.with_columns(reference=force), 'the poses are the six faces'
 
 

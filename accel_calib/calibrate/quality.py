@@ -125,7 +125,7 @@ def quality_of(fit: Fit, units: Units, directions: Floats) -> Quality:
     held_out = _held_out(fit)
     return Quality(*_residuals(fit.model, fit.poses_g, units, vectors),
                    None if held_out is None else rms(held_out) * MG,
-                   noise_floor_mg(fit) if fit.noise_known else None,
+                   _noise_floor_mg(fit),
                    fit.chi2 / fit.dof if fit.noise_known and fit.dof > 0 else None,
                    coverage(directions))
 
@@ -148,8 +148,10 @@ def record_of(fit: Fit, poses: Poses, units: Units, directions: Floats, name: st
         poses, tuple(sorted(rejected, key=lambda pose: pose.row)), reason, noted)
 
 
-def noise_floor_mg(fit: Fit) -> float:
-    """Return the residual that noise causes after the fit absorbs a part of it [mg]."""
+def _noise_floor_mg(fit: Fit) -> float | None:
+    """Return the residual that measured noise causes after the fit absorbs a part of it [mg]."""
+    if not fit.noise_known:
+        return None
     data, scale = fit.by_pose, fit.equations.scale
     own = np.trace(data.own, axis1=1, axis2=2) - (data.columns.shape[1] - data.rows)
     return rms(scale * np.sqrt(np.maximum(own, 0.0))) * MG
@@ -341,7 +343,7 @@ def _check_gain(calibration: Calibration) -> None:
     if not np.linalg.det(mat_w) > 0.0 and not calibration.form.known_orientation:
         raise RefusedFitError('the gain W is a mirror image, expected det W > 0', _CHECK_POSES)
     offset = float(np.linalg.norm(vec_v))
-    if not calibration.units.is_native and not offset <= LARGEST_OFFSET_G:
+    if not (offset <= LARGEST_OFFSET_G or calibration.units.is_native):
         raise RefusedFitError(f'the zero-g offset is {offset:.3g} g, expected less than '
                               f'{LARGEST_OFFSET_G:g} g', _CHECK_POSES)
 

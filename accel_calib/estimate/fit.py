@@ -195,12 +195,16 @@ class Fit:
     @cached_property
     def variance(self) -> float:
         """Variance of a residual in units of the noise, moderated towards 1."""
-        return (belief_in(self.noise_known) + self.chi2) / self.variance_dof
+        return (self._belief + self.chi2) / self.variance_dof
 
     @cached_property
     def variance_dof(self) -> float:
         """Degrees of freedom of `variance`."""
-        return belief_in(self.noise_known) + self.dof
+        return self._belief + self.dof
+
+    @cached_property
+    def _belief(self) -> float:
+        return belief_in(self.noise_known)
 
     @cached_property
     def by_pose(self) -> ByPose:

@@ -270,8 +270,10 @@ def column(layout: Layout, theirs: str) -> Source:
 def _source(layout: Layout, index: int) -> Source:
     """Return a column with its unit, which can stand in a row below the header."""
     unit = meaning(layout.header[index]).unit if index < len(layout.header) else ''
-    below = layout.units_row[index].strip('()[]') if index < len(layout.units_row) else ''
-    return Source(index, layout.name(index), unit or (below if is_unit(below) else ''))
+    if not unit and index < len(layout.units_row):
+        below = layout.units_row[index].strip('()[]')
+        unit = below if is_unit(below) else ''
+    return Source(index, layout.name(index), unit)
 
 
 def _by_order(layout: Layout, found: Mapping[str, Source]) -> dict[str, Source]:
