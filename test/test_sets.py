@@ -131,7 +131,7 @@ def test_the_score_counts_values_shapes_choice_and_size():
     assert one.score == pytest.approx(expected(68.0, 1.0, 3.0 + 2.0 * math.log(5.0)))
     assert both.score == pytest.approx(expected(4.0, 2.0, 2.0 * (3.0 + 2.0 * math.log(5.0))))
     assert one.scores_beside[1] == pytest.approx(both.score)
-    assert [[fewer.blocks for fewer in each.fewer] for each in (one, both)] == [[], [(1,), (0,)]]
+    assert [both.without(block).blocks for block in both.blocks] == [(1,), (0,)]
     left_out = Set.of(linear, (), (0, 1))
     assert left_out.score == pytest.approx(
         expected(4.0, 2.0, 2.0 * (2.0 * math.log(40.0) + RARE)))

@@ -322,11 +322,6 @@ class Set:
         return self.instead(other for other in self.blocks if other != block)
 
     @property
-    def fewer(self) -> list[Set]:
-        """Return a set of several blocks without each of them."""
-        return [self.without(block) for block in self.blocks if len(self.blocks) > 1]
-
-    @property
     def with_outliers(self) -> list[Set]:
         """Return the set as it is, and with the outliers that it leaves, if they differ."""
         found, key = self.linear.outliers, frozenset(self.blocks)
@@ -410,29 +405,15 @@ class Set:
         along = linear.with_residual[:-1] - across[:, -1] @ across[:, :-1]
         gain, rank = np.zeros(len(linear.blocks)), np.zeros(len(linear.blocks))
         groups = linear.grouped(linear.numbers_of[effect]) if effect else linear.by_width
-        for numbers, index, left in self._beside(groups):
+        for numbers, index, left in self.beside(groups):
             gain[numbers], rank[numbers] = _explained(left, along[index])
         return gain, rank
 
-    def _beside(self, groups: Iterable[Group]) -> Iterator[Group]:
+    def beside(self, groups: Iterable[Group]) -> Iterator[Group]:
         """Yield blocks as `Linear.by_width`, with their products beside the set."""
         for numbers, index, products in groups:
             parts = np.moveaxis(self.across[:, index], 0, 2)
             yield numbers, index, products - parts @ np.swapaxes(parts, 1, 2)
-
-    @property
-    def visible(self) -> dict[str, float]:
-        """Return what effects of typical size add to the residual, if they are seen at all."""
-        found: dict[str, float] = {}
-        for numbers, index, left in self._beside(self.linear.by_width):
-            sizes = self.linear.sizes[index]
-            squares = np.linalg.eigvalsh(left * sizes[:, np.newaxis] * sizes[:, :, np.newaxis])
-            seen = is_seen(np.linalg.eigvalsh(left)).any(axis=1)
-            for number, square in zip(numbers[seen].tolist(), squares[seen, -1].tolist()):
-                block = self.linear.blocks[number]
-                found[block.effect] = max(math.sqrt(square) * block.entry.typical,
-                                          found.get(block.effect, 0.0))
-        return found
 
     def best_of(self, effect: str) -> int:
         """Return the block of an effect with the largest gain in addition to the set."""

@@ -546,12 +546,17 @@ def explored(linear: Linear) -> list[Set]:
         front = _distinct(each for new in larger for each in new.with_outliers)[:_WIDTH]
         if not front:
             break
-        visited += [*front, *(fewer for new in front[:3] for fewer in new.fewer)]
+        visited += [*front, *(fewer for new in front[:3] for fewer in _fewer(new))]
         idle = 0 if front[0].score > best else idle + 1
         best = max(best, front[0].score)
         if idle == _PATIENCE:
             break
     return _distinct(visited)
+
+
+def _fewer(chosen: Set) -> list[Set]:
+    """Return a set of several effects without each of them."""
+    return [chosen.without(block) for block in chosen.blocks if len(chosen.blocks) > 1]
 
 
 def reshaped(chosen: Set) -> list[Set]:
@@ -568,7 +573,7 @@ def reshaped(chosen: Set) -> list[Set]:
         if block.searched and fitted_places(block.entry, block.shape):
             fitted.setdefault(block.effect, []).append(number)
     sets = []
-    for less in chosen.fewer:
+    for less in _fewer(chosen):
         for effect, own in fitted.items():
             others = less.instead(number for number in less.blocks
                                   if blocks[number].effect != effect)

@@ -20,7 +20,7 @@ from typing import Literal
 import numpy as np
 
 from .curves import LEAST, nearest_effects, probabilities, steepest
-from .linear import Set
+from .linear import is_seen, Set
 from .search import Found
 from .state import candidates, fitted_state, is_noise, linearised, State, with_effect
 from ..effects import (
@@ -384,8 +384,22 @@ def _directions(force: Floats, share_mg: Floats) -> str:
 def untestable(found: Found, steps: Sequence[Step]) -> tuple[tuple[str, str], ...]:
     """Return the effects that the poses of a search cannot show, with the data to record."""
     final, rivals = found.final, (rival for step in steps for rival in step.rivals)
-    return not_testable(final.poses_g, found.near.beside.visible,
+    return not_testable(final.poses_g, _visible(found.near.beside),
                         (*final.model.effects, *rivals))
+
+
+def _visible(chosen: Set) -> dict[str, float]:
+    """Return what effects of typical size add to the residual, if they are seen at all."""
+    linear, found = chosen.linear, dict[str, float]()
+    for numbers, index, left in chosen.beside(linear.by_width):
+        sizes = linear.sizes[index]
+        squares = np.linalg.eigvalsh(left * sizes[:, np.newaxis] * sizes[:, :, np.newaxis])
+        seen = is_seen(np.linalg.eigvalsh(left)).any(axis=1)
+        for number, square in zip(numbers[seen].tolist(), squares[seen, -1].tolist()):
+            block = linear.blocks[number]
+            found[block.effect] = max(math.sqrt(square) * block.entry.typical,
+                                      found.get(block.effect, 0.0))
+    return found
 
 
 def not_testable(poses_g: Poses, testable: Mapping[str, float], present: tuple[str, ...]
