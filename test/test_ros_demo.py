@@ -6,12 +6,14 @@
 from dataclasses import replace
 import json
 from pathlib import Path
+from socket import AF_INET, SOCK_DGRAM, socket
 from typing import Any
 
+from accel_calib.errors import AccelCalibError
 from accel_calib.geometry import coverage
 from faults.sample import FACTOR
 from geometry_msgs.msg import Vector3Stamped
-from inside import DEMO_CHOICES, main
+from inside import DEMO_CHOICES, main, own_domain
 from inside_ros import SimulatedImu, SimulatorSettings
 import numpy as np
 import pytest
@@ -20,6 +22,19 @@ from std_srvs.srv import Trigger
 RATE = 50.0
 SETTINGS = SimulatorSettings(poses=40, mixed=True, dwell=0.4, turn=0.1, rate=RATE,
                              flat_last=False, temperature=[15.0, 35.0], temperature_period=5.0)
+
+
+# The ports of domains from 215 on are above those that Linux gives out.
+@pytest.mark.parametrize(('domain', 'port'), [(229, 2), (230, 10), (231, 12), (232, 28)])
+def test_a_domain_is_not_used_beside_a_node_that_is_left_over(
+        domain: int, port: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr('accel_calib.ros.run._DOMAINS', (domain,))
+    with socket(AF_INET, SOCK_DGRAM) as left_over:
+        left_over.bind(('127.0.0.1', 7400 + 250 * domain + port))
+        with pytest.raises(AccelCalibError, match='all in use'), own_domain():
+            pass
+    with own_domain() as number:
+        assert number == domain
 
 
 def test_temperature_swings_and_each_part_of_the_poses_is_spread() -> None:

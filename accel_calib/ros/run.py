@@ -169,6 +169,9 @@ def _refuse(line: str) -> int:
 
 _DOMAINS = range(1, 102)
 
+_PARTICIPANTS = 10
+"""Number of participants whose ports show that a domain is in use."""
+
 
 @contextmanager
 def own_domain() -> Iterator[int]:
@@ -177,18 +180,20 @@ def own_domain() -> Iterator[int]:
 
     Of the UDP ports of a domain, DDS does not use the third one. This process holds it, so that
     other processes with a domain of this function have another one. A domain in which somebody
-    else has a first participant is left out, too. AccelCalibError if all domains are in use.
+    else has a participant is left out, too: a node may be left over from a program that was
+    killed. AccelCalibError if all domains are in use.
 
     """
     for domain in random.SystemRandom().sample(_DOMAINS, len(_DOMAINS)):
         ports = 7400 + 250 * domain
-        with socket(AF_INET, SOCK_DGRAM) as held, socket(AF_INET, SOCK_DGRAM) as participant:
+        with socket(AF_INET, SOCK_DGRAM) as held:
             try:
                 held.bind(('127.0.0.1', ports + 2))
-                participant.bind(('', ports + 10))
+                for number in range(_PARTICIPANTS):
+                    with socket(AF_INET, SOCK_DGRAM) as participant:
+                        participant.bind(('', ports + 10 + 2 * number))
             except OSError:
                 continue
-            participant.close()
             yield domain
             return
     raise AccelCalibError('the DDS domains 1 to 101 are all in use',
