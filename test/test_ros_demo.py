@@ -26,14 +26,12 @@ SETTINGS = SimulatorSettings(poses=40, mixed=True, dwell=0.4, turn=0.1, rate=RAT
 
 # The ports of domains from 215 on are above those that Linux gives out.
 @pytest.mark.parametrize(('domain', 'port'), [(229, 2), (230, 10), (231, 12), (232, 28)])
-def test_a_domain_is_not_used_beside_a_node_that_is_left_over(
-        domain: int, port: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr('accel_calib.ros.run._DOMAINS', (domain,))
+def test_a_domain_is_not_used_beside_a_node_that_is_left_over(domain: int, port: int) -> None:
     with socket(AF_INET, SOCK_DGRAM) as left_over:
         left_over.bind(('127.0.0.1', 7400 + 250 * domain + port))
-        with pytest.raises(AccelCalibError, match='all in use'), own_domain():
+        with pytest.raises(AccelCalibError, match='all in use'), own_domain([domain]):
             pass
-    with own_domain() as number:
+    with own_domain([domain]) as number:
         assert number == domain
 
 

@@ -174,7 +174,7 @@ _PARTICIPANTS = 10
 
 
 @contextmanager
-def own_domain() -> Iterator[int]:
+def own_domain(domains: Sequence[int] = _DOMAINS) -> Iterator[int]:
     """
     Yield a DDS domain that nobody else on this machine uses.
 
@@ -184,7 +184,7 @@ def own_domain() -> Iterator[int]:
     killed. AccelCalibError if all domains are in use.
 
     """
-    for domain in random.SystemRandom().sample(_DOMAINS, len(_DOMAINS)):
+    for domain in random.SystemRandom().sample(domains, len(domains)):
         ports = 7400 + 250 * domain
         with socket(AF_INET, SOCK_DGRAM) as held:
             try:
@@ -196,7 +196,7 @@ def own_domain() -> Iterator[int]:
                 continue
             yield domain
             return
-    raise AccelCalibError('the DDS domains 1 to 101 are all in use',
+    raise AccelCalibError(f'the DDS domains {domains[0]} to {domains[-1]} are all in use',
                           'end demonstrations or tests that still run')
 
 
