@@ -10,7 +10,7 @@ import re
 import accel_calib as ac
 from accel_calib.calibrate import fit_poses, verify, with_history
 from accel_calib.errors import RefusedFitError
-from accel_calib.logs import read_recording, write_table
+from accel_calib.logs import read_poses, read_recording, write_table
 from accel_calib.refine import refine, verdict_words
 from accel_calib.stored import write_calibration
 from accel_calib.units import units_of
@@ -414,3 +414,16 @@ def test_samples_of_a_board_that_hardly_turns_give_it_no_absurd_gain():
     gains = np.linalg.svd(found.calibration.model.linear_part[0], compute_uv=False)
     assert 0.5 < gains[-1] <= gains[0] < 2.0
     assert np.linalg.norm(found.calibration.offset) < 0.3
+
+
+def test_an_effect_that_the_stored_fit_has_absorbed_is_found_beside_its_changes(tmp_path):
+    made = generator.simulate(np.random.default_rng(9), {'offset_temperature': 60.0},
+                              generator.Setup(poses=27))
+    generator.write_csv(tmp_path / 'poses.csv', made.columns)
+    poses = read_poses(tmp_path / 'poses.csv')
+    units = units_of('m/s2')
+    before = fit_poses(poses.take(np.arange(15)), units, model='10')
+    found = refine(poses, units, base=before)
+    assert found.verdict == 'explained'
+    assert {step.effect for step in found.steps} == {
+        'offset_temperature', 'offset', 'axis_gain', 'cross_axis'}

@@ -536,8 +536,15 @@ _PATIENCE = 2
 
 
 def explored(linear: Linear) -> list[Set]:
-    """Return the sets visited, the best score first."""
-    front = _distinct(Set.of(linear).with_outliers)
+    """
+    Return the sets visited, the best score first.
+
+    They start from no effect, and from all changes of V and W at once: if the stored fit has
+    absorbed an effect, only all of them beside it are better than few effects that imitate them.
+
+    """
+    front = _distinct(each for blocks in ((), _changes(linear))
+                      for each in Set.of(linear, blocks).with_outliers)
     visited = list(front)
     best, idle = max(chosen.score for chosen in front), 0
     for _ in range(_LARGEST):
@@ -552,6 +559,14 @@ def explored(linear: Linear) -> list[Set]:
         if idle == _PATIENCE:
             break
     return _distinct(visited)
+
+
+def _changes(linear: Linear) -> list[int]:
+    """Return the blocks of all changes of a stored calibration beside unknown orientations."""
+    names = [name for name in linear.numbers_of if name in CHANGES]
+    if any(CHANGES[name].known_orientation for name in names):
+        return []
+    return [int(linear.numbers_of[name][0]) for name in names if name not in included(names)]
 
 
 def _fewer(chosen: Set) -> list[Set]:
