@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 import re
-from typing import Any, cast, get_args, Literal, TypeVar
+from typing import Any, get_args, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,8 +114,8 @@ class Record:
     __hash__ = None  # type: ignore[assignment]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the values without cached properties, which another thread may be adding."""
-        return {each.name: getattr(self, each.name) for each in fields(cast(Any, self))}
+        """Return a copy of all values, to which another thread may be adding cached properties."""
+        return vars(self).copy()
 
 
 def _same_fields(one: Any, other: Any) -> bool:

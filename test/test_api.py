@@ -228,11 +228,18 @@ def test_records_are_shown_in_a_line_and_as_html_and_can_be_pickled(calibration,
         assert repr(pickle.loads(pickle.dumps(record))) == repr(record)
 
 
-def test_a_record_is_pickled_without_cached_values_which_another_thread_may_add(calibration):
-    assert len(calibration.used_poses)
-    assert 'used_poses' in vars(calibration)
-    again = pickle.loads(pickle.dumps(calibration))
-    assert vars(again).keys() == {each.name for each in fields(calibration)}
+def test_a_record_is_pickled_with_cached_values_while_another_thread_adds_one(poses):
+    class Late:
+        def __reduce__(self):
+            vars(record)['late'] = True
+            return str, ('arm',)
+
+    record = replace(poses, sensor=Late())
+    vars(record)['early'] = True
+    again = pickle.loads(pickle.dumps(record))
+    assert again.sensor == 'arm'
+    assert vars(record)['late']
+    assert vars(again).keys() == {'early', *(each.name for each in fields(poses))}
 
 
 @pytest.mark.parametrize(('call', 'message'), [
