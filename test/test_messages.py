@@ -13,6 +13,7 @@ from dataclasses import replace
 from itertools import product
 import math
 import os
+import pickle
 import struct
 
 from accel_calib.calibrate import fit_poses, of_samples, thermal_stream
@@ -30,7 +31,7 @@ from inside import (
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from shared import random_directions, sensor, with_effects
+from shared import python, random_directions, sensor, with_effects
 
 COUNT = int(os.environ.get('IMU_MESSAGES', '800'))
 COVARIANCES = ORIENTATION_COVARIANCE, ANGULAR_VELOCITY_COVARIANCE, ACCELERATION_COVARIANCE
@@ -338,6 +339,26 @@ def test_acting_temperature_is_limited_to_its_range_at_the_poses():
                             temperature=np.full(200, each))[-1] for each in (high, 90.0, 25.0)]
     np.testing.assert_allclose(at[0], at[1], atol=1e-6)
     assert np.max(np.abs(at[0] - at[2])) > 1e-3
+
+
+def test_what_the_worker_has_computed_is_not_computed_again_after_levelling(tmp_path):
+    calibration = calibration_of({'offset_temperature': [2e-3, -1e-3, 1e-3, 50.0, 1.0]})
+    count = len(calibration.poses)
+    calibration = replace(calibration, poses=calibration.poses.with_columns(
+        temperature=20.0 + np.arange(count), time=100.0 * np.arange(count)))
+    assert calibration.ranges
+    stored = tmp_path / 'calibration.pickle'
+    stored.write_bytes(pickle.dumps(calibration))
+    code = ('import pickle, sys; from pathlib import Path; import numpy as np; '
+            'from accel_calib.calibrate import level; '
+            'given = pickle.loads(Path(sys.argv[1]).read_bytes()); '
+            'context = dict.fromkeys(("time", "temperature", "temperature_of_offset"), '
+            'np.array([25.0])); '
+            'flat = np.array([0.1, 0.2, 9.8]); '
+            'levelled = level(given, flat, "ros", context); '
+            'print(levelled.correct(flat[np.newaxis], context), "scipy.linalg" in sys.modules)')
+    found = python('-c', code, stored)
+    assert found.stdout.endswith('False\n'), found.stderr
 
 
 def test_context_of_one_reading_is_limited_to_the_ranges():

@@ -40,7 +40,7 @@ rotation by another angle. A rotation can be intended, a mirror image cannot.
 
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import permutations, product
 import math
@@ -272,9 +272,8 @@ def level(calibration: Calibration, reading: Floats, frame: FrameName,
         rotation = with_heading_of(calibration.rotation, rotation)
     asked = kept and calibration.rotation[:, 2] @ rotation[:, 2] > _SAME_TILT
     doubts = () if asked else doubts_about_flat(rotation, frame)  # asked once
-    levelled = with_mounting(replace(calibration, frame=frame), rotation, 'flat_pose')
-    return replace(levelled, noted=(*levelled.noted, *doubts,
-                                    *(_ARBITRARY_HEADING,) * arbitrary))
+    return with_mounting(calibration, rotation, 'flat_pose', frame=frame,
+                         noted=(*doubts, *(_ARBITRARY_HEADING,) * arbitrary))
 
 
 def set_heading(calibration: Calibration, reading: Floats, context: Context | None = None
@@ -290,11 +289,20 @@ def set_heading(calibration: Calibration, reading: Floats, context: Context | No
                                                    calibration.frame))
 
 
-def with_mounting(calibration: Calibration, rotation: Floats, *known: str) -> Calibration:
-    """Return a calibration with another ΔR; heading and these kinds of findings are known."""
-    turned = replace(calibration, model=Model(calibration.model.values, rotation))
-    return replace(turned, noted=(*wiring(turned),
-                                  *without(turned.noted, 'wiring', 'heading', *known)))
+def with_mounting(calibration: Calibration, rotation: Floats, *known: str,
+                  frame: FrameName | None = None, noted: Iterable[Finding] = ()) -> Calibration:
+    """
+    Return a calibration with another ΔR, by default in the same frame.
+
+    Heading and the `known` kinds of findings are known, and the findings `noted` are added.
+
+    """
+    turned = replace(calibration, model=Model(calibration.model.values, rotation),
+                     frame=frame or calibration.frame)
+    found = replace(turned, noted=(
+        *wiring(turned), *without(turned.noted, 'wiring', 'heading', *known), *noted))
+    vars(found)['ranges'] = calibration.ranges  # so that the next message does not compute them
+    return found
 
 
 def with_given_mounting(calibration: Calibration, rotation: Floats) -> Calibration:
