@@ -539,12 +539,18 @@ def explored(linear: Linear) -> list[Set]:
     """
     Return the sets visited, the best score first.
 
-    They start from no effect, and from all changes of V and W at once: if the stored fit has
-    absorbed an effect, only all of them beside it are better than few effects that imitate them.
+    The search starts from no effect, and again from all changes of V and W at once: if a stored
+    fit has absorbed an effect, only all of them beside it are better than effects that imitate it.
 
     """
-    front = _distinct(each for blocks in ((), _changes(linear))
-                      for each in Set.of(linear, blocks).with_outliers)
+    names = [name for name in linear.numbers_of if name in CHANGES]
+    changes = [int(linear.numbers_of[name][0]) for name in names if name not in included(names)]
+    return _distinct([*_from(Set.of(linear)), *(_from(Set.of(linear, changes)) if changes else ())])
+
+
+def _from(start: Set) -> list[Set]:
+    """Return the sets visited when effects are added to a set, in any order."""
+    front = _distinct(start.with_outliers)
     visited = list(front)
     best, idle = max(chosen.score for chosen in front), 0
     for _ in range(_LARGEST):
@@ -558,15 +564,7 @@ def explored(linear: Linear) -> list[Set]:
         best = max(best, front[0].score)
         if idle == _PATIENCE:
             break
-    return _distinct(visited)
-
-
-def _changes(linear: Linear) -> list[int]:
-    """Return the blocks of all changes of a stored calibration beside unknown orientations."""
-    names = [name for name in linear.numbers_of if name in CHANGES]
-    if any(CHANGES[name].known_orientation for name in names):
-        return []
-    return [int(linear.numbers_of[name][0]) for name in names if name not in included(names)]
+    return visited
 
 
 def _fewer(chosen: Set) -> list[Set]:
