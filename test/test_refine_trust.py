@@ -427,3 +427,15 @@ def test_an_effect_that_the_stored_fit_has_absorbed_is_found_beside_its_changes(
     assert found.verdict == 'explained'
     assert {step.effect for step in found.steps} == {
         'offset_temperature', 'offset', 'axis_gain', 'cross_axis'}
+
+
+@pytest.mark.parametrize('seed', [0, 3, 6])
+def test_few_changes_are_found_although_all_changes_at_once_are_nearly_as_good(seed):
+    rng = np.random.default_rng([5, seed])
+    model = with_effects(rng)
+    base = fit_poses(poses_of(model, rng, 24), G, model='10')
+    # New poses alone show a cubic mostly as a gain.
+    changed = Model({**model.values, 'offset': model.values['offset'] + [0.02, -0.01, 0.03],
+                     'cubic': np.array([2e-3, -1e-3, 1e-3])})
+    found = refine(poses_of(changed, rng, 30), G, base=base)
+    assert (found.verdict, {*names(found)}) == ('explained', {'offset', 'axis_gain'})
