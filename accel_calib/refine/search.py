@@ -545,7 +545,8 @@ def explored(linear: Linear) -> list[Set]:
     """
     names = [name for name in linear.numbers_of if name in CHANGES]
     changes = [int(linear.numbers_of[name][0]) for name in names if name not in included(names)]
-    return _distinct([*_from(Set.of(linear)), *(_from(Set.of(linear, changes)) if changes else ())])
+    starts = {(), tuple(changes)}
+    return _distinct(found for start in starts for found in _from(Set.of(linear, start)))
 
 
 def _from(start: Set) -> list[Set]:
