@@ -166,7 +166,8 @@ def _behind(step: Floats, rise: Floats, lag: float, rate: Floats | None) -> Floa
     mean = np.divide(rise, step, out=np.zeros_like(rise), where=usable)
     first, last = np.nan_to_num(rate[:-1]), np.nan_to_num(rate[1:])
     odd, even = (first - last) / 2.0, (first + last) / 2.0 - mean
-    bent = odd * _moment(steps, (1.0, -2.0, 0.0)) + even * _moment(steps, (1.0, -6.0, 6.0))
+    m_0, m_1, m_2 = _moments(steps)
+    bent = odd * (m_0 - 2.0 * m_1) + even * (m_0 - 6.0 * m_1 + 6.0 * m_2)
     return behind + np.where(usable, step * bent, 0.0)
 
 
@@ -175,18 +176,16 @@ _SMALL = 3.0
 """Steps up to this many lags are integrated by Gauss-Legendre; 8 points give all digits."""
 
 
-def _moment(steps: Floats, polynomial: tuple[float, float, float]) -> Floats:
-    """Return ∫ p(s) exp(-(1 - s) x) ds from 0 to 1, for p of degree 2 and each x of steps."""
-    zero, one, two = polynomial
+def _moments(steps: Floats) -> Floats:
+    """Return ∫ s^k exp(-(1 - s) x) ds from 0 to 1, (3, n) for k = 0, 1, 2 and each x of steps."""
     s = (_NODES + 1.0) / 2.0
-    small = np.minimum(steps, _SMALL)[:, np.newaxis]
-    near = np.exp(-(1.0 - s) * small) @ ((zero + one * s + two * s * s) * _WEIGHTS / 2.0)
+    powers = s ** np.arange(3)[:, np.newaxis] * _WEIGHTS / 2.0
+    near = powers @ np.exp(-(1.0 - s)[:, np.newaxis] * np.minimum(steps, _SMALL))
     x = np.maximum(steps, _SMALL)
-    left = np.exp(-x)
-    m_0 = (1.0 - left) / x
+    m_0 = -np.expm1(-x) / x
     m_1 = (1.0 - m_0) / x
     m_2 = (1.0 - 2.0 * m_1) / x
-    return np.where(steps <= _SMALL, near, zero * m_0 + one * m_1 + two * m_2)
+    return np.where(steps <= _SMALL, near, [m_0, m_1, m_2])
 
 
 def _decayed(time: Floats, behind: Floats, lag: float, start: float) -> Floats:
