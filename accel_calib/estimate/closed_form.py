@@ -222,8 +222,11 @@ _MOST_SUBSETS = 400
 _SPARE = 3
 """Number of poses in a random subset beyond the free parameters."""
 
-_CONCENTRATIONS = 3
-"""Number of closed forms after each of which the nearest poses are selected again."""
+_ENOUGH = 300
+"""Number of poses, drawn at random, among which the subsets are compared first."""
+
+_CONCENTRATIONS = 2
+"""Number of further closed forms, after each of which the nearest poses are selected again."""
 
 _FACE_COSINE = np.cos(np.radians(20.0))
 """A reading within 20° of a sensor axis is one of the six faces."""
@@ -266,15 +269,20 @@ def agreeing(name: str, poses_g: Poses, most: int) -> Indices:
     reading = poses_g.reading
     noise = believable(poses_g.noise)
     noise = np.ones_like(reading) if noise is None else noise
-    nearest = _subsets(count, most, len(parameter_names(MODELS[name].effects)))
-    at_once = max(_DISTANCES // count, 1)
-    for _ in range(_CONCENTRATIONS):
+    some = everyone = np.arange(count)
+    if count > _ENOUGH:
+        some = np.sort(np.random.default_rng(count).choice(count, _ENOUGH, replace=False))
+    nearest = some[_subsets(len(some), max(most * len(some) // count, 1),
+                            len(parameter_names(MODELS[name].effects)))]
+    for tried in (some, *[everyone] * _CONCENTRATIONS):
         best: list[tuple[float, Indices]] = []
+        kept, at_once = len(tried) - most * len(tried) // count, max(_DISTANCES // len(tried), 1)
         for first in range(0, len(nearest), at_once):
-            squared = _squared_distances(name, reading, nearest[first:first + at_once], noise)
-            inside = np.argpartition(squared, count - most - 1, axis=1)[:, :count - most]
+            squared = _squared_distances(name, reading, nearest[first:first + at_once], tried,
+                                         noise)
+            inside = np.argpartition(squared, kept - 1, axis=1)[:, :kept]
             trimmed = np.take_along_axis(squared, inside, axis=1).sum(axis=1)
-            best = sorted([*best, *zip(trimmed.tolist(), inside)], key=itemgetter(0))[:10]
+            best = sorted([*best, *zip(trimmed.tolist(), tried[inside])], key=itemgetter(0))[:10]
         nearest = np.array([inside for _, inside in best])
     return np.sort(nearest[0])
 
@@ -293,17 +301,17 @@ def _subsets(count: int, most: int, free: int) -> Indices:
         :, :size] for part in parts])
 
 
-def _squared_distances(name: str, reading: Floats, subsets: Indices, noise: Floats
-                       ) -> Floats:
-    """Return the (s, n) squared distances of all poses from the closed form of each subset."""
+def _squared_distances(name: str, reading: Floats, subsets: Indices, tried: Indices,
+                       noise: Floats) -> Floats:
+    """Return the (s, t) squared distances of tried poses from the closed form of each subset."""
     with np.errstate(all='ignore'):  # some subsets are not on an ellipsoid, or are in a plane
         mat_w, vec_v = closed_form(name, reading[subsets])
         sound = np.isfinite(mat_w).all(axis=(1, 2)) & (np.abs(np.linalg.det(mat_w)) > 0.0)
         inverse = np.linalg.inv(np.where(sound[:, np.newaxis, np.newaxis], mat_w, np.eye(3)))
-        u = (reading - vec_v[:, np.newaxis]) @ np.swapaxes(inverse, 1, 2)
+        u = (reading[tried] - vec_v[:, np.newaxis]) @ np.swapaxes(inverse, 1, 2)
         length = np.linalg.norm(u, axis=2)
         along = (u / length[:, :, np.newaxis]) @ inverse
-        squared = (length - 1.0) ** 2 / np.sum((along * noise) ** 2, axis=2)
+        squared = (length - 1.0) ** 2 / np.sum((along * noise[tried]) ** 2, axis=2)
     return np.where(sound[:, np.newaxis] & np.isfinite(squared), squared, np.inf)
 
 
