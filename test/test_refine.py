@@ -145,16 +145,17 @@ def test_effects_that_explain_a_small_part_of_a_gap_are_removed(unknown_mg, name
     assert names(found) == named
 
 
-def test_a_step_is_found_among_more_instants_than_are_tried():
+@pytest.mark.parametrize(('count', 'place'), [(300, 114), (3000, 1234)])
+def test_a_step_is_found_among_more_instants_than_are_tried(count, place):
     rng = np.random.default_rng(0)
-    time = 12.0 * np.arange(300)
-    model = model_with({'offset_step': [0.003, -0.002, 0.004, 1370.0]})
-    poses = simulate_poses(model, random_directions(300, rng), rng, noise_g=5e-4,
+    time = 12.0 * np.arange(count)
+    model = model_with({'offset_step': [0.006, -0.004, 0.008, time[place] + 2.0]})
+    poses = simulate_poses(model, random_directions(count, rng), rng, noise_g=5e-4,
                            context={'time': time})
     found = refine(poses, G, base='10')
     assert names(found) == ['offset_step']
-    instant = found.steps[-1].parameters['instant']
-    assert time[114] < instant <= time[115]
+    assert time[place] < found.steps[-1].parameters['instant'] <= time[place + 1]
+    assert not found.calibration.rejected
 
 
 def test_knocked_poses_are_found_and_nothing_is_named(taken):

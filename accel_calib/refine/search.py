@@ -26,6 +26,8 @@ only if each of its effects is significant beside the others. With a walk of the
 
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -307,6 +309,14 @@ class _Trial:
         return linearised(judge(state.model, self.poses_g), self.fixed, self.tried,
                           self.beside)
 
+    def finer(self, chosen: Set) -> _Trial | None:
+        """Return the trial with further shapes beside those of a set; None if there are none."""
+        shapes = {block.effect: block.shape for block in chosen.entries}
+        tried = tuple(each.finer(shapes.get(each.name), self.poses_g.columns)
+                      for each in self.tried)
+        same = all(new is old for new, old in zip(tried, self.tried, strict=True))
+        return None if same else replace(self, tried=tried)
+
     def fitted(self, chosen: Set, state: State, most: float = np.inf) -> State | None:
         """Return the fit of a set; None without a sound fit below `most`."""
         model = {name: part for name, part in state.model.values.items() if name in self.fixed}
@@ -337,6 +347,10 @@ def _settled(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterab
     linear = trial.near(state)
     for _ in range(_LADDER_ROUNDS if of_ladder else _ROUNDS):
         near = _best_near(linear, poses_g, refused, walks=not of_ladder)
+        while (finer := trial.finer(near.chosen)) is not None:
+            del near, linear  # before the next columns are made
+            trial, linear = finer, finer.near(state)
+            near = _best_near(linear, poses_g, refused, walks=not of_ladder)
         if near.key in seen:
             break
         asked = near.key

@@ -33,11 +33,8 @@ from ..units import MG
 WORTH = 4.0
 """ν, degrees of freedom that the measured noise counts as."""
 
-_SHAPES_AT_ONCE = 250
-"""If there are more shapes, only evenly spread shapes are tried."""
-
-_MANY_POSES, _FEW_SHAPES = 1000, 60
-"""The same for more poses than this."""
+_SHAPES_AT_ONCE = 60
+"""If there are more shapes, evenly spread ones are tried first, then those beside the best."""
 
 _SHAPES_ALIKE = 3.0
 """Number of neighbouring shapes that count as one independent trial."""
@@ -53,16 +50,29 @@ _IDEAL = Model({})
 @dataclass(frozen=True)
 class Candidate:
     """
-    An effect to try with each of its (s,) `shapes`, which count as `tried` independent ones.
+    An effect to try with each of some shapes, which count as `tried` independent ones.
 
-    `factors` (shapes, t or 1, n) are those of its terms at the poses, with any model.
+    `every` are its shapes, `places` the indices of those to try, increasing, and `factors`
+    (places, t or 1, n) those of its terms at the poses, with any model.
 
     """
 
     name: str
-    shapes: tuple[Floats, ...]
+    every: tuple[Floats, ...]
+    places: tuple[int, ...]
     tried: float
     factors: Floats
+
+    @classmethod
+    def of(cls, name: str, every: tuple[Floats, ...], places: Iterable[int], context: Context
+           ) -> Candidate:
+        places = tuple(places)
+        return cls(name, every, places, max(len(places) / _SHAPES_ALIKE, 1.0),
+                   factors_of(name, [every[place] for place in places], context))
+
+    @property
+    def shapes(self) -> tuple[Floats, ...]:
+        return tuple(self.every[place] for place in self.places)
 
     @property
     def entry(self) -> Effect:
@@ -73,8 +83,21 @@ class Candidate:
         if present is None or len(self.shapes) < 2:
             return self
         shape = self.entry.split(present)[1]
-        return replace(self, shapes=(*self.shapes, shape), factors=np.concatenate(
-            [self.factors, factors_of(self.name, [shape], context)]))
+        return replace(self, every=(*self.every, shape), places=(*self.places, len(self.every)),
+                       factors=np.concatenate(
+                           [self.factors, factors_of(self.name, [shape], context)]))
+
+    def finer(self, chosen: Floats | None, context: Context) -> Candidate:
+        """Return the candidate with those shapes, too, that lie beside a chosen one."""
+        at = next((place for place in self.places
+                   if chosen is not None and np.array_equal(self.every[place], chosen)), None)
+        if at is None or len(self.places) == len(self.every):
+            return self
+        around = self.places.index(at)
+        first, *_, last = (-1, *self.places, len(self.every))[around:around + 3]
+        further = _spread([place for place in range(first + 1, last) if place != at])
+        return Candidate.of(self.name, self.every, sorted((*self.places, *further)), context
+                            ) if further else self
 
     def blocks(self, start: int, alike: int) -> Iterator[Block]:
         """Yield a block for each shape, from a column on; `alike` candidates are of one kind."""
@@ -92,19 +115,14 @@ def candidates(names: Iterable[str], poses_g: Poses) -> Iterator[Candidate]:
     for name in names:
         effect = effect_named(name)
         if effect.output is None and all(key in context for key in effect.needs):
-            shapes, tried = _shapes(effect, context, len(poses_g))
-            if shapes:
-                yield Candidate(name, shapes, tried, factors_of(name, shapes, context))
+            every = (np.zeros(0),) if effect.shapes is None else tuple(effect.shapes(context))
+            if every:
+                yield Candidate.of(name, every, _spread(range(len(every))), context)
 
 
-def _shapes(effect: Effect, context: Context, poses: int) -> tuple[tuple[Floats, ...], float]:
-    """Return the shapes of an effect to try, and the number that they count as."""
-    if effect.shapes is None:
-        return (np.zeros(0),), 1.0
-    shapes = tuple(effect.shapes(context))
-    most = _SHAPES_AT_ONCE if poses <= _MANY_POSES else _FEW_SHAPES
-    shapes = shapes[::-(-len(shapes) // most)] if len(shapes) > most else shapes
-    return shapes, max(len(shapes) / _SHAPES_ALIKE, 1.0)
+def _spread(places: Sequence[int]) -> Sequence[int]:
+    """Return at most `_SHAPES_AT_ONCE` evenly spread places."""
+    return places[::max(-(-len(places) // _SHAPES_AT_ONCE), 1)]
 
 
 def linearised(fit: Fit, base: tuple[str, ...], tried: Iterable[Candidate] = (),
