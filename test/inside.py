@@ -77,10 +77,10 @@ from accel_calib.pipeline import (
 from accel_calib.refine import base as refine_base
 from accel_calib.refine.base import clipped, grid_step, off_grid, sampled, unclipped
 from accel_calib.refine.curves import (
-    _bound as bound_of_curves, _grown as grown_curve, best_curve, Curve, Near, probabilities,
+    _grown as grown_curve, _rss_beside as rss_beside, best_curve, Curve, Near, probabilities,
     Process, process_of, SIGNIFICANT, Walk, walk_beside)
 from accel_calib.refine.linear import (
-    _RARE as RARE, Block, LEVEL as REFINE_LEVEL, Linear, outside_of, Set)
+    _RARE as RARE, Block, LEVEL as REFINE_LEVEL, Linear, outside_of, Set, with_outliers)
 from accel_calib.refine.plan import _levels as levels_of, NOTHING as NOTHING_TO_PLAN
 from accel_calib.refine.search import (
     _is_better as is_better_than_walk, accepted, explored, reshaped, search as search_effects)

@@ -8,10 +8,10 @@ import math
 
 from accel_calib.effects import EFFECTS
 from inside import (
-    accepted, beginning, Block, bound_of_curves, candidates, Curve, explored, fitted_state,
-    grown_curve, is_better_than_walk, Linear, linearised, Model, Near, outside_of, Process,
-    process_of, RARE, REFINE_LEVEL, reshaped, Set, SIGNIFICANT, simulate_poses, Walk, walk_beside,
-    WORTH)
+    accepted, beginning, Block, candidates, Curve, explored, fitted_state, grown_curve,
+    is_better_than_walk, Linear, linearised, Model, Near, outside_of, Process, process_of, RARE,
+    REFINE_LEVEL, reshaped, rss_beside, Set, SIGNIFICANT, simulate_poses, Walk, walk_beside,
+    with_outliers, WORTH)
 import numpy as np
 import pytest
 from scipy.optimize import brentq
@@ -157,7 +157,7 @@ def test_a_curve_of_two_cosines_is_found_where_neither_alone_is_useful(count, co
     columns = np.array([axes[0], side * axes[0] + slope * axes[1],
                         side * axes[1] + slope * axes[2]]).T[:, :count]
     linear = by_hand(math.sqrt(200.0) * axes[count - 1], columns, NAMES[:count])
-    assert set(grown_curve(linear).blocks) == cosines
+    assert set(grown_curve(linear, 0.0, 0.0).blocks) == cosines
 
 
 @pytest.mark.parametrize('count', [1, 2, 6])
@@ -168,7 +168,10 @@ def test_no_curve_has_a_larger_score_than_its_bound(count):
         columns /= np.linalg.norm(columns, axis=0)
         residual = columns @ rng.normal(size=count) * 8.0 + rng.normal(size=40)
         linear = by_hand(residual, columns, NAMES[:count])
-        best, bound = grown_curve(linear).score, max(bound_of_curves(linear), 0.0)
+        least_rss = rss_beside(linear, slice(None))
+        best = grown_curve(linear, least_rss, 0.0).score
+        assert best == grown_curve(linear, 0.0, 0.0).score
+        bound = max(linear.score(least_rss, 1.0, 0.0), 0.0)
         assert best <= bound + 1e-6
         assert count > 1 or best == pytest.approx(bound, abs=1e-6)
 
@@ -211,7 +214,7 @@ def test_effects_and_knocked_poses_are_found_and_nothing_in_noise(hidden, knocke
         np.testing.assert_allclose(found, true[:3], atol=0.15 * max(true[:3]))
     if not hidden:
         assert best.score == 0.0
-        assert [each.out for each in Set.of(linear).with_outliers] == [()]
+        assert [each.out for each in with_outliers([Set.of(linear)])] == [()]
 
 
 @pytest.mark.parametrize(('better', 'preferred'), [(1.9, 'quadratic'), (2.1, 'cubic')])

@@ -17,7 +17,6 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .form import (
     ALL_AXES, AXES, by_axis, Context, CROSS, CUBE, DEGREES, Effect, Factor, FORCE, matrix_terms,
@@ -354,8 +353,7 @@ def _empirical(name: str) -> Effect:
     curve = partial(Effect, words, 'empirical curve', names, 'g', 0.001, 0.5, terms)
     if of_force:
         return curve(family='force')
-    each_mode = np.repeat(modes, len(carried))
-    return curve(factor=partial(_cosines, variable, each_mode), needs=(variable,),
+    return curve(factor=partial(_cosines, variable, modes, len(carried)), needs=(variable,),
                  shape=('low', 'high'), shapes=partial(_ends, variable))
 
 
@@ -383,12 +381,12 @@ def _ends(variable: str, context: Context) -> Iterator[Floats]:
         yield np.array([np.min(known), np.max(known)])
 
 
-def _cosines(variable: str, modes: NDArray[np.intp], context: Mapping[str, Any], shape: Floats
-             ) -> Any:
-    """Return the cosine of each term, (t, n)."""
+def _cosines(variable: str, modes: tuple[int, ...], terms: int, context: Mapping[str, Any],
+             shape: Floats) -> Any:
+    """Return the cosine of each term, (t, n), with several terms of each mode."""
     values = _variable(variable, context)
     share = np.clip((values - shape[0]) / max(shape[1] - shape[0], 1e-300), 0.0, 1.0)
-    return np.cos(np.pi * np.multiply.outer(modes, share))
+    return np.repeat(np.cos(np.pi * np.multiply.outer(modes, share)), terms, axis=0)
 
 
 COVARIATES = {'offset_covariate': ('offset', ONE, 'g/unit'),

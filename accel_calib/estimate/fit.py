@@ -97,30 +97,30 @@ class ByPose:
     prior: Floats | None = None
 
     @cached_property
-    def spread(self) -> Floats:
-        """(q, q) array, (JᵀJ)⁻¹."""
-        flat = self.flat
+    def _root(self) -> Floats:
+        """(q, q) array, whose square with its transpose is (JᵀJ)⁻¹."""
+        flat = self.columns.reshape(self.residual.size, self.columns.shape[2])
         normal = flat.T @ flat
         if self.prior is not None:
             normal = normal + self.prior.T @ self.prior
-        return np.linalg.pinv(normal, hermitian=True)
+        scales, axes = np.linalg.eigh(normal)
+        seen = scales > 1e-15 * scales[-1:]
+        return np.asarray(axes / np.sqrt(np.where(seen, scales, np.inf)))
 
-    @property
-    def downhill(self) -> Floats:
-        """(q,) array, Jᵀ times the residuals."""
-        return self.flat.T @ self.residual.ravel()
+    @cached_property
+    def spread(self) -> Floats:
+        """(q, q) array, (JᵀJ)⁻¹."""
+        return self._root @ self._root.T
 
-    @property
-    def flat(self) -> Floats:
-        """(n k, q) array, the derivative with one row per equation."""
-        return self.columns.reshape(self.residual.size, self.columns.shape[2])
+    @cached_property
+    def basis(self) -> Floats:
+        """(n, k, q) array, orthonormal columns that span the derivative, without a prior."""
+        return self.columns @ self._root
 
     @cached_property
     def own(self) -> Floats:
         """(n, k, k) array, I - leverage of each pose."""
-        onto = (self.flat @ self.spread).reshape(self.columns.shape)
-        leverage = np.einsum('nkq,nlq->nkl', onto, self.columns)
-        return np.asarray(np.eye(self.columns.shape[1]) - leverage)
+        return np.asarray(np.eye(self.columns.shape[1]) - self.basis @ self.basis.swapaxes(1, 2))
 
 
 def by_pose(residual: Floats, columns: Floats, pose: Indices,

@@ -35,8 +35,9 @@ deviations.
 
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -45,7 +46,7 @@ import scipy
 
 from .closed_form import agreeing, start_of
 from .equations import belief_beside, belief_in
-from .fit import ByPose, estimate, Fit, judge, NotConvergedError
+from .fit import estimate, Fit, judge, NotConvergedError
 from ..effects import MODELS, parameter_names
 from ..table import Poses
 from ..units import Floats, Indices
@@ -58,6 +59,9 @@ LARGEST_SHARE = 0.25
 
 _LEAST_OWN = 1e-6
 """1 - leverage below this: this pose alone determines a parameter, and cannot be tested."""
+
+_LEAST_RELATIVE = 1e-15
+"""Smallest variance of a residual relative to the largest one of a pose, against division by 0."""
 
 _MANY = 200
 
@@ -89,27 +93,33 @@ _ALONE = 1e-9
 """1 - leverage below this: the pose alone determines a parameter."""
 
 
-def outliers_among(data: ByPose, dof: int, total: int, *, noise_known: bool) -> Indices:
+def outliers_among(residual: Floats, basis: Floats, rows: Indices, dof: Sequence[int], total: int,
+                   *, noise_known: bool) -> list[Indices]:
     """
-    Return the indices of the outliers among poses, given their equations at a fit.
+    Return the indices of the outliers among poses beside each of several fits.
 
-    They are at most `LARGEST_SHARE` of all poses, and at most so many that the other equations
-    identify them. `dof` is as in `variance_factor`; `total` includes the poses left out before.
+    `residual` (f, n, k) are the residuals of each fit by pose, as in `ByPose`, and `basis`
+    (f, n, k, q) orthonormal columns that span its derivative. Outliers are at most
+    `LARGEST_SHARE` of all poses, and at most so many that the other equations identify them. `dof`
+    (f,) are as in `variance_factor`; `total` includes the poses left out before.
 
     """
-    rows = int(data.rows.max())
-    out = total - len(data.rows)
-    limit = _limit(dof + rows * out, total, rows) - out
-    if limit <= 0:
-        return np.zeros(0, np.intp)
-    if len(data.rows) > _MANY:
-        return _far_out(data, dof, limit, belief_in(noise_known))
-    order = _removed_in_turn(data, dof, limit)
-    count = order.extreme(belief_in(noise_known))
-    if count:
-        left = dof - int(np.sum(order.rows[:count]))
-        count = order.extreme(belief_beside(left, order.rss[count], noise_known))
-    return np.sort(order.pose[:count])
+    most, out = int(rows.max()), total - len(rows)
+    limits = [_limit(each + most * out, total, most) - out for each in dof]
+    if max(limits) <= 0:
+        return [np.zeros(0, np.intp)] * len(dof)
+    own = np.eye(residual.shape[2]) - basis @ basis.swapaxes(2, 3)
+    if len(rows) > _MANY:
+        belief = belief_in(noise_known)
+        return [_far_out(_squared(residual[k], own[k]) / rows, rows, dof[k], limit, belief)
+                for k, limit in enumerate(limits)]
+    flat = basis.reshape(len(basis), residual[0].size, -1)
+    beside = residual.reshape(len(flat), -1, 1)
+    residual = (beside - flat @ (flat.swapaxes(1, 2) @ beside)).reshape(residual.shape)
+    pose, size = _removed_in_turn(residual, basis, own, rows, max(limits))
+    whole = np.sum(residual ** 2, axis=(1, 2))
+    return [_Removed(pose[k, :limit], rows[pose[k, :limit]], size[k, :limit], float(whole[k]),
+                     dof[k], len(rows)).outliers(noise_known) for k, limit in enumerate(limits)]
 
 
 def _limit(spare: int, total: int, rows: int) -> int:
@@ -122,22 +132,34 @@ class _Removed:
     """
     Poses removed in turn: the (k,) index `pose` and number of equations `rows` of each.
 
-    `size` (k,) is its squared residual against the others, in units of its variance; `rss`
-    (k + 1,) the sum of squared residuals before each removal, and at the end; `dof` and `count`
-    belong to the start.
+    `size` (k,) is its squared residual against the others, in units of its variance; `whole`, the
+    sum of squared residuals, `dof` and `count` belong to the start.
 
     """
 
     pose: Indices
     rows: Indices
     size: Floats
-    rss: Floats
+    whole: float
     dof: int
     count: int
 
-    def extreme(self, belief: float) -> int:
+    @cached_property
+    def rss(self) -> Floats:
+        """(k + 1,) array, sum of squared residuals before each removal, and at the end."""
+        return np.maximum(self.whole - np.cumsum([0.0, *self.size]), 0.0)
+
+    def outliers(self, noise_known: bool) -> Indices:
+        """Return the indices of the poses that are outliers."""
+        count = self._extreme(belief_in(noise_known))
+        if count:
+            left = self.dof - int(np.sum(self.rows[:count]))
+            count = self._extreme(belief_beside(left, self.rss[count], noise_known))
+        return np.sort(self.pose[:count])
+
+    def _extreme(self, belief: float) -> int:
         """Return how many of the removed poses are outliers."""
-        removed = np.concatenate([[0], np.cumsum(self.rows)])
+        removed = np.cumsum([0, *self.rows])
         dof = np.maximum(belief + self.dof - removed[1:], 1e-9)
         others = np.maximum(belief + self.rss[:-1] - self.size, 1e-300) / dof
         chance = beyond(self.size / self.rows / others, self.rows, dof)
@@ -150,56 +172,68 @@ def beyond(ratio: Floats, rows: Indices, dof: Floats | float) -> Floats:
     return scipy.special.fdtrc(rows, np.maximum(dof, 1.0), ratio)
 
 
-def _removed_in_turn(data: ByPose, dof: int, most: int) -> _Removed:
-    """Remove the most extreme pose repeatedly, and update the fit to first order."""
-    flat, (count, rows) = data.flat, data.residual.shape
-    onto = flat @ data.spread
-    residual, left = data.residual.ravel() - onto @ data.downhill, np.ones(count, bool)
-    own = data.own.copy()
-    removed, solved = np.empty((2, len(flat), most * rows))  # columns of I - leverage
-    poses, sizes = [], []
-    rss = [float(residual @ residual)]
-    for k in range(0, most * rows, rows):
-        size = _squared(own, residual.reshape(count, rows))
-        at = int(np.argmax(np.where(left, size / data.rows, -1.0)))
-        poses.append(at)
-        sizes.append(float(size[at]))
-        rss.append(max(rss[-1] - sizes[-1], 0.0))
-        part, now = slice(rows * at, rows * at + rows), slice(k, k + rows)
-        column = -onto @ flat[part].T - removed[:, :k] @ solved[part, :k].T
-        column[part] += np.eye(rows)
-        inverse = 1.0 / own[at] if rows == 1 and own[at] > 0.0 else np.linalg.pinv(own[at])
-        removed[:, now], solved[:, now] = column, column @ inverse
-        residual = residual - solved[:, now] @ residual[part]
-        own -= (solved[:, now].reshape(count, rows, rows)
-                @ np.swapaxes(column.reshape(count, rows, rows), 1, 2))
-        left[at] = False
-    return _Removed(np.array(poses, np.intp), data.rows[poses], np.array(sizes), np.array(rss),
-                    dof, len(left))
+def _removed_in_turn(residual: Floats, basis: Floats, own: Floats, rows: Indices, most: int
+                     ) -> tuple[Indices, Floats]:
+    """
+    Remove the most extreme pose repeatedly, and update each fit to first order.
+
+    `own` (f, n, k, k) is I - leverage of each pose. Return the (f, most) indices of the poses, and
+    their squared residuals against the others.
+
+    """
+    (fits, count, width), now = residual.shape, basis.shape[-1]
+    each, one = np.arange(fits), np.eye(width)
+    taken = np.empty((fits, now + most * width, count, width))  # orthonormal directions
+    taken[:, :now] = np.moveaxis(basis, -1, 1)
+    weight = np.repeat(1.0 / rows[np.newaxis], fits, axis=0)  # 0 for the poses removed
+    pose, size = np.empty((fits, most), np.intp), np.empty((fits, most))
+    for k in range(most):
+        squared = _squared(residual, own)
+        at = (squared * weight).argmax(axis=1)
+        pose[:, k], size[:, k], weight[each, at] = at, squared[each, at], 0.0
+        before = taken[:, :now]
+        new = -(before[each, :, at].swapaxes(1, 2) @ before.reshape(fits, now, count * width))
+        new.reshape(fits, width, count, width)[each, :, at] += one
+        root = _inverse_root(own[each, at])
+        new = root @ new
+        towards = root @ residual[each, at][..., np.newaxis]
+        residual = residual - (towards.swapaxes(1, 2) @ new).reshape(residual.shape)
+        parts = new.reshape(fits, width, count, width)
+        own = own - np.einsum('frnk,frnl->fnkl', parts, parts)
+        taken[:, now:now + width] = parts
+        now += width
+    return pose, size
 
 
-def _squared(own: Floats, residual: Floats) -> Floats:
-    """Return the squared residual of each pose against the others; 0 if it cannot be tested."""
-    if residual.shape[1] == 1:
-        alone = own[:, 0, 0]
-        return np.where(alone > _LEAST_OWN,
-                        residual[:, 0] ** 2 / np.maximum(alone, _LEAST_OWN), 0.0)
+def _inverse_root(own: Floats) -> Floats:
+    """Return (..., k, k) matrices whose squares, transposed by themselves, are the inverses."""
+    if own.shape[-1] == 1:
+        return 1.0 / np.sqrt(np.where(own > 0.0, own, np.inf))
     size, axes = np.linalg.eigh(own)
-    along = (np.swapaxes(axes, 1, 2) @ residual[:, :, np.newaxis])[:, :, 0]
-    testable = size > _LEAST_OWN
-    squares = np.where(testable, along ** 2 / np.where(testable, size, 1.0), 0.0)
-    return np.sum(squares, axis=1)
+    scale = np.sqrt(np.where(size > _LEAST_RELATIVE * size[..., -1:], size, np.inf))
+    return (axes / scale[..., np.newaxis, :]).swapaxes(-1, -2)
 
 
-def _far_out(data: ByPose, dof: int, limit: int, belief: float) -> Indices:
+def _squared(residual: Floats, own: Floats) -> Floats:
+    """Return the squared residual of each pose against the others; 0 if it cannot be tested."""
+    if own.shape[-1] == 1:
+        size, along = own[..., 0], residual
+    else:
+        size, axes = np.linalg.eigh(own)
+        along = np.sum(axes * residual[..., np.newaxis], axis=-2)
+    return np.sum(along ** 2 / np.where(size > _LEAST_OWN, size, np.inf), axis=-1)
+
+
+def _far_out(size: Floats, rows: Indices, dof: int, limit: int, belief: float) -> Indices:
     """Return the outliers among many poses, all at once, relative to the median."""
-    size = _squared(data.own, data.residual) / data.rows
-    usual = np.where(data.rows == 1, _MEDIAN_OF_CHI2[1], _MEDIAN_OF_CHI2[3]) / data.rows
+    usual = np.where(rows == 1, _MEDIAN_OF_CHI2[1], _MEDIAN_OF_CHI2[3]) / rows
     scale = float(np.median(size / usual))
     size = size * (belief + dof) / (belief + scale * dof)
-    extreme = beyond(size, data.rows, belief + dof) < LEVEL / len(size)
-    largest = np.argsort(-size, kind='stable')[:limit]
-    return np.sort(largest[extreme[largest]])
+    each_kind = np.arange(1, int(rows.max()) + 1)
+    least = scipy.special.fdtri(each_kind, max(belief + dof, 1.0), 1.0 - LEVEL / len(size))
+    extreme = np.flatnonzero(size > least[rows - 1])
+    largest = np.argsort(-size[extreme], kind='stable')[:max(limit, 0)]
+    return np.sort(extreme[largest])
 
 
 def fit_norm(name: str, poses_g: Poses) -> tuple[Fit, Indices]:
@@ -229,7 +263,9 @@ def fit_norm(name: str, poses_g: Poses) -> tuple[Fit, Indices]:
 
 def outliers(fit: Fit, total: int) -> Indices:
     """Return the outliers among the poses of a fit; `total` as in `outliers_among`."""
-    return outliers_among(fit.by_pose, fit.dof, total, noise_known=fit.noise_known)
+    data = fit.by_pose
+    return outliers_among(data.residual[np.newaxis], data.basis[np.newaxis], data.rows, [fit.dof],
+                          total, noise_known=fit.noise_known)[0]
 
 
 def _grossest_first(fit: Fit, kept: Indices, poses_g: Poses) -> Indices:

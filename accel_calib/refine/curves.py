@@ -45,11 +45,11 @@ from typing import NamedTuple
 import numpy as np
 
 from .base import causes
-from .linear import Block, held_out, LEVEL, Linear, outside_of, Set
+from .linear import Block, held_out, LEVEL, Linear, outside_of, Set, with_outliers
 from .state import candidates, left_open, linearised, State
 from ..effects import (
     AXES, CARRIERS, curve_pairs, Effect, effect_named, EFFECTS, empirical_name, empirical_parts,
-    LADDER, Model, modes_of, parameter_names, WANDER)
+    factors_of, LADDER, Model, modes_of, parameter_names, WANDER)
 from ..estimate import Fit, judge
 from ..table import Floats, Poses
 
@@ -132,10 +132,15 @@ def best_curve(state: State, poses_g: Poses, out: tuple[int, ...], *, least: flo
     for family in families:
         if of_force and not family.effect.bends:
             continue
-        for problem in _problems(plain, fit, family):
-            kept = _kept(problem, out)
-            if _bound(kept) > most and (grown := _grown(kept)).score > most:
-                best, most = Set.of(problem, grown.blocks, out), grown.score
+        whole = _whole(plain, fit, family)
+        kept = _kept(whole, out)
+        for part, which in family.parts:
+            least_rss = _rss_beside(kept, which)
+            if kept.score(least_rss, 1.0, 0.0) > most:
+                problem = _of_part(whole, family, part, which)
+                grown = _grown(_kept(problem, out), least_rss, most)
+                if grown.score > most:
+                    best, most = Set.of(problem, grown.blocks, out), grown.score
     return None if best is None else _accepted(most - 2.0 * math.log(tried), best, tried)
 
 
@@ -149,20 +154,31 @@ def _families(poses_g: Poses) -> Iterator[_Family]:
             yield from (_Family(carrier, variable, effect, shape) for shape in shapes)
 
 
-def _problems(plain: Linear, fit: Fit, family: _Family) -> Iterator[Linear]:
-    """Yield the problem with the modes of a carrier as candidates, and of each of its parts."""
-    _, variable, effect, shape = family
-    count, modes = len(effect.parameters), modes_of(variable)
-    model = Model({empirical_name(family.carrier, variable, modes):
-                   np.concatenate([np.zeros(count), shape])})
-    columns, sizes = outside_of(plain.onto, fit.equations.columns(model)[:, :count])
-    for own, which in family.parts:
-        names = [empirical_name(own, variable, (mode,)) for mode in modes]
-        ends = np.cumsum([0, *(len(effect_named(each).parameters) for each in names)]).tolist()
-        blocks = tuple(Block(each, shape, slice(*ends[k:k + 2]), effect, 0, k + 1.0)
-                       for k, each in enumerate(names))
-        yield replace(plain, every=np.vstack([columns[:, which].T, plain.residual]),
-                      sizes=sizes[which], choice=0.0, blocks=blocks)
+def _whole(plain: Linear, fit: Fit, family: _Family) -> Linear:
+    """Return the problem with all modes of a carrier as one candidate."""
+    carrier, variable, effect, shape = family
+    modes, count = modes_of(variable), len(effect.parameters)
+    name, one = (empirical_name(carrier, variable, each) for each in (modes, modes[:1]))
+    if effect.factor is None:
+        columns = fit.equations.columns(Model({name: np.zeros(count)}))
+    else:
+        factors = factors_of(name, [shape], fit.poses_g.columns)[0]
+        each_mode = factors[::len(effect_named(one).terms), np.newaxis]
+        columns = fit.equations.columns_of(one, each_mode)
+    columns, sizes = outside_of(plain.onto, columns)
+    return replace(plain, every=np.vstack([columns.T, plain.residual]), sizes=sizes, choice=0.0,
+                   blocks=(Block(name, shape, slice(0, count), effect),))
+
+
+def _of_part(whole: Linear, family: _Family, part: str, which: slice) -> Linear:
+    """Return the problem with each mode of a carrier, or of its part, as a candidate."""
+    modes = modes_of(family.variable)
+    names = [empirical_name(part, family.variable, (mode,)) for mode in modes]
+    ends = np.cumsum([0, *(len(effect_named(each).parameters) for each in names)]).tolist()
+    blocks = tuple(Block(each, family.shape, slice(*ends[k:k + 2]), family.effect, 0, k + 1.0)
+                   for k, each in enumerate(names))
+    return replace(whole, every=np.vstack([whole.every[:-1][which], whole.residual]),
+                   sizes=whole.sizes[which], blocks=blocks)
 
 
 def _kept(problem: Linear, out: tuple[int, ...]) -> Linear:
@@ -172,18 +188,20 @@ def _kept(problem: Linear, out: tuple[int, ...]) -> Linear:
                    dof=problem.dof - int(nothing.parameters))
 
 
-def _bound(problem: Linear) -> float:
-    """Return a score that no set of the modes exceeds: that of all modes at the cost of one."""
-    products = np.concatenate(problem.products_with(range(len(problem.blocks))))
-    left, along = products[:, :-1], products[:, -1]
+def _rss_beside(problem: Linear, which: slice) -> float:
+    """Return the RSS beside some columns, which no set of them falls below."""
+    products = np.concatenate(problem.products_with(range(len(problem.blocks))))[which]
+    left, along = products[:, :-1][:, which], products[:, -1]
     gain = along @ np.linalg.solve(left + _LEAST_OUTSIDE * np.eye(len(left)), along)
-    return float(problem.score(problem.base_rss - gain, 1.0, 0.0))
+    return float(problem.base_rss - gain)
 
 
-def _grown(problem: Linear) -> Set:
-    """Return the modes with the best score."""
+def _grown(problem: Linear, least_rss: float, least: float) -> Set:
+    """Return the modes with the best score, or any if no score can exceed `least`."""
     best = now = Set.of(problem)
     for _ in range(min(_MOST_MODES, len(problem.blocks))):
+        if problem.score(least_rss, now.parameters + 1.0, 0.0) <= max(best.score, least):
+            break
         scores = now.scores_beside
         scores[list(now.blocks)] = -np.inf
         now = now.extended(int(np.argmax(scores)))
@@ -199,7 +217,7 @@ def _grown(problem: Linear) -> Set:
 def _accepted(score: float, chosen: Set, tried: int) -> Curve | None:
     """Return a curve, or None if it is not significant or poses held out do not agree."""
     # The outliers are found again: without the curve, good poses may have looked like outliers.
-    chosen = max(chosen.with_outliers, key=lambda either: either.score)
+    chosen = max(with_outliers([chosen]), key=lambda either: either.score)
     nothing = chosen.instead(())
     p_value = min(1.0, chosen.chance(nothing) * tried * math.prod(
         each.tried for each in chosen.entries))
@@ -367,9 +385,9 @@ class Walk:
         return residual, held_out(residual, own)
 
 
-def process_of(linear: Linear, poses: Poses) -> Process | None:
+def process_of(linear: Linear, poses: Poses | None) -> Process | None:
     """Return the modes of a walk; None if the times are not known."""
-    if 'time' not in poses:
+    if poses is None or 'time' not in poses:
         return None
     time = poses['time']
     known = np.isfinite(time)
@@ -381,11 +399,14 @@ def process_of(linear: Linear, poses: Poses) -> Process | None:
     shapes = (waves / number)[linear.pose]
     modes = (linear.offset[:, :, np.newaxis] * shapes[:, np.newaxis]).reshape(len(shapes), -1)
     modes -= linear.onto @ (linear.onto.T @ modes)
-    values, vectors = np.linalg.eigh(modes.T @ modes)
+    wide = len(modes) < modes.shape[1]
+    values, vectors = np.linalg.eigh(modes @ modes.T if wide else modes.T @ modes)
     kept = values > 1e-10 * values[-1]
     if not np.any(kept):
         return None
-    return Process(modes @ (vectors[:, kept] / np.sqrt(values[kept])), values[kept] / values[-1])
+    axes = vectors[:, kept]
+    return Process(axes if wide else modes @ (axes / np.sqrt(values[kept])),
+                   values[kept] / values[-1])
 
 
 def walk_beside(chosen: Set, process: Process) -> Walk:

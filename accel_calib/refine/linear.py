@@ -40,10 +40,10 @@ them costs, and the effects of the catalogue cost the same. Each pose that is le
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import groupby
+from itertools import accumulate, groupby
 import math
 from typing import Any, NamedTuple
 
@@ -203,11 +203,13 @@ class Linear:
         return [(np.concatenate(numbers), np.concatenate(index), np.concatenate(products))
                 for numbers, index, products in (zip(*parts) for parts in found.values())]
 
-    def grouped(self, numbers: NDArray[np.intp]) -> Iterator[Group]:
-        """Yield some blocks as `by_width`."""
+    def of_effect(self, effect: str) -> Iterator[Group]:
+        """Yield the blocks of an effect, which are consecutive, as `by_width`."""
+        numbers = self.numbers_of[effect]
         for own, index, products in self.by_width:
-            which = np.isin(own, numbers)
-            yield own[which], index[which], products[which]
+            first, end = np.searchsorted(own, (numbers[0], numbers[-1] + 1))
+            if first < end:
+                yield own[first:end], index[first:end], products[first:end]
 
     def score(self, rss: Any, parameters: Any, charge: Any) -> Any:
         """Return the score of sets from their RSS, number of values and other charges."""
@@ -307,8 +309,8 @@ class Set:
         mix = np.zeros((rows + len(left), count + new.shape[1]))
         mix[:rows, :count], mix[:rows, count:] = self.mix, -self.mix @ (along @ new)
         mix[rows:, count:] = new
-        return replace(self, blocks=(*self.blocks, block), mix=mix,
-                       across=np.concatenate([self.across, new.T @ left]))
+        return Set(self.linear, (*self.blocks, block), self.out, self.root,
+                   np.concatenate([self.across, new.T @ left]), mix)
 
     def instead(self, blocks: Iterable[int]) -> Set:
         """Return the set of other blocks, with the same poses left out."""
@@ -320,20 +322,6 @@ class Set:
 
     def without(self, block: int) -> Set:
         return self.instead(other for other in self.blocks if other != block)
-
-    @property
-    def with_outliers(self) -> list[Set]:
-        """Return the set as it is, and with the outliers that it leaves, if they differ."""
-        found, key = self.linear.outliers, frozenset(self.blocks)
-        if key not in found:
-            whole = Set.of(self.linear, self.blocks) if self.out else self
-            linear, (onto, residual) = self.linear, whole.spanned
-            found[key] = tuple(outliers_among(
-                by_pose(residual, np.hstack([linear.onto, onto]), linear.pose),
-                linear.dof - int(whole.parameters), linear.poses, noise_known=linear.worth > 0.0
-            ).tolist())
-        out = found[key]
-        return [self] if out == self.out else [self, Set.of(self.linear, self.blocks, out)]
 
     @cached_property
     def rss(self) -> float:
@@ -354,11 +342,12 @@ class Set:
     @cached_property
     def unusual(self) -> float:
         """Return the penalty for effects that are far larger than in common sensors."""
-        penalty = 0.0
-        for block, values in self.values.items():
-            size = float(np.max(np.abs(values))) / self.linear.blocks[block].entry.typical
-            penalty += min((max(math.log(max(size, 1e-300)), 0.0) / _USUAL) ** 2, _MOST_UNUSUAL)
-        return penalty
+        if not self.blocks:
+            return 0.0
+        largest = np.maximum.reduceat(np.abs(self._values), self._starts)
+        typical = [each.entry.typical for each in self.entries]
+        away = np.log(np.maximum(largest / typical, 1.0)) / _USUAL
+        return float(np.sum(np.minimum(away ** 2, _MOST_UNUSUAL)))
 
     @cached_property
     def score(self) -> float:
@@ -378,9 +367,18 @@ class Set:
         """Return the (p,) values of the effect of each block."""
         if not self.blocks:
             return {}
-        values = self.mix[len(self.root):] @ self.across[:, -1] / self.linear.sizes[self._index]
-        ends = np.cumsum([each.columns.stop - each.columns.start for each in self.entries])
-        return dict(zip(self.blocks, np.split(values, ends[:-1]), strict=True))
+        return dict(zip(self.blocks, np.split(self._values, self._starts[1:]), strict=True))
+
+    @property
+    def _values(self) -> Floats:
+        """Return the values of all effects."""
+        return self.mix[len(self.root):] @ self.across[:, -1] / self.linear.sizes[self._index]
+
+    @property
+    def _starts(self) -> list[int]:
+        """Return the place of the first value of each effect."""
+        return [0, *accumulate(each.columns.stop - each.columns.start
+                               for each in self.entries[:-1])]
 
     @property
     def _index(self) -> list[int]:
@@ -404,7 +402,7 @@ class Set:
         linear, across = self.linear, self.across
         along = linear.with_residual[:-1] - across[:, -1] @ across[:, :-1]
         gain, rank = np.zeros(len(linear.blocks)), np.zeros(len(linear.blocks))
-        groups = linear.grouped(linear.numbers_of[effect]) if effect else linear.by_width
+        groups = linear.of_effect(effect) if effect else linear.by_width
         for numbers, index, left in self.beside(groups):
             gain[numbers], rank[numbers] = _explained(left, along[index])
         return gain, rank
@@ -453,6 +451,37 @@ class Set:
         return float(scipy.special.fdtrc(added, self.left, ratio))
 
 
+def with_outliers(sets: Iterable[Set]) -> Iterator[Set]:
+    """Yield each set as it is, and with the outliers that it leaves, if they differ."""
+    sets = list(sets)
+    _find_outliers({frozenset(chosen.blocks): chosen for chosen in sets
+                    if frozenset(chosen.blocks) not in chosen.linear.outliers}.values())
+    for chosen in sets:
+        yield chosen
+        out = chosen.linear.outliers[frozenset(chosen.blocks)]
+        if out != chosen.out:
+            yield Set.of(chosen.linear, chosen.blocks, out)
+
+
+def _find_outliers(sets: Collection[Set]) -> None:
+    """Find the outliers that sets of the same problem leave, at once, which is faster."""
+    if not sets:
+        return
+    whole = [Set.of(chosen.linear, chosen.blocks) if chosen.out else chosen for chosen in sets]
+    linear, spanned = whole[0].linear, [chosen.spanned for chosen in whole]
+    parts = [by_pose(residual, np.hstack([linear.onto, onto]), linear.pose)
+             for onto, residual in spanned]
+    basis = np.zeros((len(parts), *parts[0].residual.shape,
+                      max(part.columns.shape[2] for part in parts)))
+    for own, part in zip(basis, parts, strict=True):
+        own[:, :, :part.columns.shape[2]] = part.columns
+    found = outliers_among(np.stack([part.residual for part in parts]), basis, parts[0].rows,
+                           [linear.dof - int(chosen.parameters) for chosen in whole],
+                           linear.poses, noise_known=linear.worth > 0.0)
+    linear.outliers.update((frozenset(chosen.blocks), tuple(out.tolist()))
+                           for chosen, out in zip(whole, found, strict=True))
+
+
 def _explained(products: Floats, along: Floats) -> tuple[Floats, Floats]:
     """Return what k blocks explain, and their ranks, from their products (k, w, w) and (k, w)."""
     width, size = along.shape[1], np.trace(products, axis1=1, axis2=2)
@@ -463,6 +492,8 @@ def _explained(products: Floats, along: Floats) -> tuple[Floats, Floats]:
     gain, rank = np.zeros(len(size)), np.full(len(size), width)
     solved = np.linalg.solve(products[whole], along[whole][:, :, np.newaxis])[:, :, 0]
     gain[whole] = np.sum(along[whole] * solved, axis=1)
+    if np.all(whole):
+        return gain, rank
     squares, axes = np.linalg.eigh(products[~whole])
     kept = is_seen(squares)
     towards = (along[~whole][:, np.newaxis] @ axes)[:, 0]
@@ -479,9 +510,9 @@ def is_seen(squares: Floats) -> NDArray[np.bool_]:
 def outside_of(onto: Floats, columns: Floats) -> tuple[Floats, Floats]:
     """Return (m, c) columns of norm 1 with a base projected out, and their (c,) norms before."""
     sizes = _norms(columns)
-    columns = columns / sizes
-    columns -= onto @ (onto.T @ columns)
-    return columns, np.where(sizes < np.inf, sizes, 1.0)
+    rows = columns.T / sizes[:, np.newaxis]
+    rows -= (rows @ onto) @ onto.T
+    return rows.T, np.where(sizes < np.inf, sizes, 1.0)
 
 
 def held_out(residual: Floats, own: Floats) -> Floats:

@@ -40,7 +40,7 @@ from .base import causes, Clipped, off_grid, unclipped
 from .curves import (
     best_curve, CLEARLY, Curve, Near, one_curve, Process, process_of, SIGNIFICANT, Walk,
     walk_beside)
-from .linear import Block, LEVEL, Linear, Set
+from .linear import Block, LEVEL, Linear, Set, with_outliers
 from .state import (
     beginning, Candidate, candidates, fitted_state, is_noise, left_open, linearised, State,
     with_effect, without)
@@ -344,13 +344,14 @@ def _settled(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterab
     begun = set(state.model.effects) <= set(fixed) and len(state.poses_g) == len(poses_g)
     seen = [_NOTHING] if begun else []
     refused: set[frozenset[str]] = set()
+    timed = None if of_ladder else poses_g
     linear = trial.near(state)
     for _ in range(_LADDER_ROUNDS if of_ladder else _ROUNDS):
-        near = _best_near(linear, poses_g, refused, walks=not of_ladder)
+        near = _best_near(linear, timed, refused)
         while (finer := trial.finer(near.chosen)) is not None:
             del near, linear  # before the next columns are made
             trial, linear = finer, finer.near(state)
-            near = _best_near(linear, poses_g, refused, walks=not of_ladder)
+            near = _best_near(linear, timed, refused)
         if near.key in seen:
             break
         asked = near.key
@@ -367,7 +368,7 @@ def _settled(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterab
             break
     if settled is None and len(state.poses_g) < len(poses_g):  # the set has all poses
         state = _fitted_without(state, poses_g, ())
-    near = _at(linear, *(settled or ((), (), None)), poses_g)
+    near = _at(linear, *(settled or ((), (), None)), timed)
     while (fewer := _without_weak(near.chosen)) is not None:
         after = trial.fitted(fewer, state)
         if after is None:
@@ -375,7 +376,7 @@ def _settled(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterab
         place = fewer.effects, fewer.out, None if near.walk is None else near.walk.process
         del near, linear, fewer  # before the next columns are made
         state, linear = after, trial.near(after)
-        near = _at(linear, *place, poses_g)
+        near = _at(linear, *place, timed)
     return state, near
 
 
@@ -406,14 +407,13 @@ def _best_fit(near: Near, state: State, trial: _Trial) -> tuple[Near, State | No
     return best, after
 
 
-def _best_near(linear: Linear, poses_g: Poses, refused: set[frozenset[str]], *, walks: bool
-               ) -> Near:
-    """Return the best set near a model, with or without a walk."""
+def _best_near(linear: Linear, poses_g: Poses | None, refused: set[frozenset[str]]) -> Near:
+    """Return the best set near a model, with or without a walk at the times of poses."""
     def best_of(problem: Linear) -> Set:
         return next((chosen for chosen in accepted(explored(problem))
                      if frozenset(chosen.effects) not in refused), Set.of(problem))
 
-    process = process_of(linear, poses_g) if walks else None
+    process = process_of(linear, poses_g)
     best = Near(best_of(linear), linear, None, process)
     if process is None or (linear.worth and not any(_in_time(best))
                            and _is_all_noise(best.chosen)):
@@ -457,7 +457,7 @@ def _leaves_gap(chosen: Set) -> bool:
 
 
 def _at(linear: Linear, names: tuple[str, ...], out: tuple[int, ...], process: Process | None,
-        poses_g: Poses) -> Near:
+        poses_g: Poses | None) -> Near:
     """Return a set near its fit; its effects are in the order of their contribution."""
     blocks = [int(linear.numbers_of[name][-1]) for name in names]
     plain = Set.of(linear, blocks, out)
@@ -565,13 +565,12 @@ def explored(linear: Linear) -> list[Set]:
 
 def _from(start: Set) -> list[Set]:
     """Return the sets visited when effects are added to a set, in any order."""
-    front = _distinct(start.with_outliers)
+    front = _distinct(with_outliers([start]))
     visited = list(front)
     best, idle = max(chosen.score for chosen in front), 0
     for _ in range(_LARGEST):
-        larger = _distinct(new for before in front for new in _extended(before))
-        larger = [_with_best_shapes(new) for new in larger[:_TESTED]]
-        front = _distinct(each for new in larger for each in new.with_outliers)[:_WIDTH]
+        tested = (_with_best_shapes(new) for new in _larger(front))
+        front = _distinct(with_outliers(tested))[:_WIDTH]
         if not front:
             break
         visited += [*front, *(fewer for new in front[:3] for fewer in _fewer(new))]
@@ -638,17 +637,29 @@ def accepted(visited: Iterable[Set]) -> Iterator[Set]:
         left = [chosen for chosen in left if chosen is not best]
 
 
-def _extended(before: Set) -> list[Set]:
-    """Return the set with one more effect, for the effects with the best scores."""
+def _larger(front: list[Set]) -> list[Set]:
+    """Return the best sets with one effect more than those of a front."""
+    likely = sorted((each for before in front for each in _branches(before)),
+                    key=lambda each: -each[0])
+    front[0].linear.products_with([number for _, _, number in likely[:_TESTED]])  # at once: fast
+    best: list[Set] = []
+    for most, before, number in likely:
+        if len(best) == _TESTED and best[-1].score > most:
+            break
+        best = _distinct([*best, before.extended(number)])[:_TESTED]
+    return best
+
+
+def _branches(before: Set) -> Iterator[tuple[float, Set, int]]:
+    """Yield a set with the block of one more effect, and the largest score that they can have."""
     linear, scores = before.linear, before.scores_beside
     best: dict[str, tuple[float, int]] = {}
     for effect, numbers in linear.numbers_of.items():
         number = int(numbers[np.argmax(scores[numbers])])
         if scores[number] > -np.inf and not _is_barred(linear.blocks[number], before.entries):
             best[effect] = round(float(scores[number]), _DECIMALS), number
-    first = [number for _, number in sorted(best.values(), key=lambda each: -each[0])[:_BRANCHES]]
-    linear.products_with(first)  # at once, which is faster
-    return [before.extended(number) for number in first]
+    for score, number in sorted(best.values(), key=lambda each: -each[0])[:_BRANCHES]:
+        yield score + before.unusual, before, number
 
 
 def _is_barred(block: Block, present: Iterable[Block]) -> bool:
