@@ -38,7 +38,7 @@ Made by `{command} --markdown FILE`, on sets of an independent generator
 (`test/generator.py`). The size of an effect is the RMS of its part in |a| that the base cannot
 absorb, over the noise of a pose mean. Look-alikes are quadratic, gain_asymmetry and
 cross_coupling; also cubic and odd_quadratic. Fresh errors are those of other poses of the same
-sensor."""
+sensor. Shares have their exact interval for 95 % (Clopper and Pearson)."""
 
 
 def by_effect(outcomes: Sequence[Outcome]) -> str:

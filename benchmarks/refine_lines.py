@@ -11,6 +11,7 @@ from figures import Line
 import numpy as np
 from refine_case import CARRIER, Outcome, SHOWS
 from refine_rows import ALONE, GROUPS, LOOK_ALIKE, LOST, NOTHING
+from scipy.stats import binomtest
 
 WORSE = 1.05
 """Ratio of fresh errors, refined over base, above which the refinement does harm."""
@@ -20,10 +21,13 @@ Check = tuple[str, Callable[[Outcome], bool], float | None, float | None]
 
 
 def share(outcomes: Sequence[Outcome], good: Callable[[Outcome], bool]) -> tuple[float, str]:
-    """Return the share of good outcomes, and the share as text with the count."""
+    """Return the share of good outcomes, and as text with the count and its interval [%]."""
     count = sum(map(good, outcomes))
-    part = count / len(outcomes) if outcomes else float('nan')
-    return part, f'{100.0 * part:.1f} % ({count}/{len(outcomes)})'
+    if not outcomes:
+        return float('nan'), 'no set'
+    part, limits = count / len(outcomes), binomtest(count, len(outcomes)).proportion_ci()
+    return part, (f'{100.0 * part:.1f} % ({count}/{len(outcomes)}; {100.0 * limits.low:.1f} to '
+                  f'{100.0 * limits.high:.1f})')
 
 
 def line(what: str, outcomes: Sequence[Outcome], good: Callable[[Outcome], bool],
