@@ -11,8 +11,8 @@ import accel_calib as ac
 from accel_calib.calibrate import fit_poses, in_g, outlook, verify
 from accel_calib.errors import RefusedFitError
 from accel_calib.estimate import (
-    estimate, lower_triangular, NotConvergedError, originals, Point, sensing_axes, solve, start_of,
-    variance_factor)
+    estimate, lower_triangular, NotConvergedError, originals, outliers_among, Point, sensing_axes,
+    solve, start_of, variance_factor)
 from accel_calib.finding import has
 from accel_calib.geometry import ATTITUDES
 from accel_calib.table import numbered, Poses
@@ -293,6 +293,27 @@ def test_the_poses_that_agree_best_are_those_that_are_not_knocked(name):
     poses = simulated(19, 24, *MODELS[name].effects)[1]
     poses.reading[:4] *= np.array([[0.9], [0.95], [1.05], [1.1]])
     assert list(agreeing(name, poses, 4)) == list(range(4, 24))
+
+
+def test_the_poses_that_agree_best_are_found_among_many():
+    poses = simulated(19, 1000, *MODELS['10'].effects)[1]
+    poses.reading[:240] *= np.linspace(0.6, 0.95, 240)[:, np.newaxis]
+    assert list(agreeing('10', poses, 240)) == list(range(240, 1000))
+
+
+@pytest.mark.parametrize(('poses', 'rows'), [(40, 1), (40, 3), (300, 1)])
+def test_several_fits_together_have_the_outliers_of_each_alone(poses, rows):
+    rng = np.random.default_rng(poses + rows)
+    knocked = [(), (3,), (7, 11, 30), (3, 20)]
+    basis = np.array([np.linalg.qr(rng.normal(size=(poses * rows, 8)))[0] for _ in knocked])
+    residual = rng.normal(size=(len(knocked), poses * rows, 1))
+    for own, out in zip(residual.reshape(-1, poses, rows), knocked, strict=True):
+        own[list(out)] += 12.0
+    residual -= basis @ (basis.swapaxes(1, 2) @ residual)
+    residual, basis = (each.reshape(len(knocked), poses, rows, -1) for each in (residual, basis))
+    found = outliers_among(residual[..., 0], basis, np.full(poses, rows),
+                           [poses * rows - 8] * len(knocked), poses, noise_known=True)
+    assert [tuple(out.tolist()) for out in found] == knocked
 
 
 @pytest.mark.parametrize(('seed', 'wrong'), [(25, 4), (253, 11)])

@@ -197,7 +197,13 @@ def _rss_beside(problem: Linear, which: slice) -> float:
 
 
 def _grown(problem: Linear, least_rss: float, least: float) -> Set:
-    """Return the modes with the best score, or any if no score can exceed `least`."""
+    """
+    Return the modes with the best score.
+
+    No set of them has an RSS below `least_rss`. If no score can exceed `least`, the set is not the
+    best one.
+
+    """
     best = now = Set.of(problem)
     for _ in range(min(_MOST_MODES, len(problem.blocks))):
         if problem.score(least_rss, now.parameters + 1.0, 0.0) <= max(best.score, least):
@@ -385,9 +391,9 @@ class Walk:
         return residual, held_out(residual, own)
 
 
-def process_of(linear: Linear, poses: Poses | None) -> Process | None:
+def process_of(linear: Linear, poses: Poses) -> Process | None:
     """Return the modes of a walk; None if the times are not known."""
-    if poses is None or 'time' not in poses:
+    if 'time' not in poses:
         return None
     time = poses['time']
     known = np.isfinite(time)

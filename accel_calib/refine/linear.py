@@ -452,7 +452,7 @@ class Set:
 
 
 def with_outliers(sets: Iterable[Set]) -> Iterator[Set]:
-    """Yield each set as it is, and with the outliers that it leaves, if they differ."""
+    """Yield sets of one problem as they are, and with the outliers that each leaves, if others."""
     sets = list(sets)
     _find_outliers({frozenset(chosen.blocks): chosen for chosen in sets
                     if frozenset(chosen.blocks) not in chosen.linear.outliers}.values())
@@ -464,7 +464,7 @@ def with_outliers(sets: Iterable[Set]) -> Iterator[Set]:
 
 
 def _find_outliers(sets: Collection[Set]) -> None:
-    """Find the outliers that sets of the same problem leave, at once, which is faster."""
+    """Find the outliers that sets of one problem leave, at once, which is faster."""
     if not sets:
         return
     whole = [Set.of(chosen.linear, chosen.blocks) if chosen.out else chosen for chosen in sets]

@@ -296,7 +296,7 @@ class _Trial:
     """
     All poses, the effects of a model that stay, and the effects that are tried beside them.
 
-    What is tried must also show beside the model `beside`.
+    What is tried must also show beside the model `beside`. `walks`: a walk is tried, too.
 
     """
 
@@ -304,6 +304,11 @@ class _Trial:
     fixed: tuple[str, ...]
     tried: tuple[Candidate, ...]
     beside: Model
+    walks: bool
+
+    def process(self, linear: Linear) -> Process | None:
+        """Return the modes of a walk; None if the times are not known, or no walk is tried."""
+        return process_of(linear, self.poses_g) if self.walks else None
 
     def near(self, state: State) -> Linear:
         return linearised(judge(state.model, self.poses_g), self.fixed, self.tried,
@@ -339,19 +344,18 @@ def _settled(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterab
     """
     trial = _Trial(poses_g, fixed,
                    tuple(candidates((name for name in names if name not in fixed), poses_g)),
-                   Model({}) if of_ladder else left_open(state))
+                   Model({}) if of_ladder else left_open(state), walks=not of_ladder)
     settled: tuple[tuple[str, ...], tuple[int, ...], Process | None] | None = None
     begun = set(state.model.effects) <= set(fixed) and len(state.poses_g) == len(poses_g)
     seen = [_NOTHING] if begun else []
     refused: set[frozenset[str]] = set()
-    timed = None if of_ladder else poses_g
     linear = trial.near(state)
     for _ in range(_LADDER_ROUNDS if of_ladder else _ROUNDS):
-        near = _best_near(linear, timed, refused)
+        near = _best_near(linear, trial, refused)
         while (finer := trial.finer(near.chosen)) is not None:
             del near, linear  # before the next columns are made
             trial, linear = finer, finer.near(state)
-            near = _best_near(linear, timed, refused)
+            near = _best_near(linear, trial, refused)
         if near.key in seen:
             break
         asked = near.key
@@ -368,7 +372,7 @@ def _settled(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterab
             break
     if settled is None and len(state.poses_g) < len(poses_g):  # the set has all poses
         state = _fitted_without(state, poses_g, ())
-    near = _at(linear, *(settled or ((), (), None)), timed)
+    near = _at(linear, *(settled or ((), (), None)), trial)
     while (fewer := _without_weak(near.chosen)) is not None:
         after = trial.fitted(fewer, state)
         if after is None:
@@ -376,7 +380,7 @@ def _settled(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterab
         place = fewer.effects, fewer.out, None if near.walk is None else near.walk.process
         del near, linear, fewer  # before the next columns are made
         state, linear = after, trial.near(after)
-        near = _at(linear, *place, timed)
+        near = _at(linear, *place, trial)
     return state, near
 
 
@@ -407,13 +411,13 @@ def _best_fit(near: Near, state: State, trial: _Trial) -> tuple[Near, State | No
     return best, after
 
 
-def _best_near(linear: Linear, poses_g: Poses | None, refused: set[frozenset[str]]) -> Near:
-    """Return the best set near a model, with or without a walk at the times of poses."""
+def _best_near(linear: Linear, trial: _Trial, refused: set[frozenset[str]]) -> Near:
+    """Return the best set near a model, with or without a walk."""
     def best_of(problem: Linear) -> Set:
         return next((chosen for chosen in accepted(explored(problem))
                      if frozenset(chosen.effects) not in refused), Set.of(problem))
 
-    process = process_of(linear, poses_g)
+    process = trial.process(linear)
     best = Near(best_of(linear), linear, None, process)
     if process is None or (linear.worth and not any(_in_time(best))
                            and _is_all_noise(best.chosen)):
@@ -457,14 +461,14 @@ def _leaves_gap(chosen: Set) -> bool:
 
 
 def _at(linear: Linear, names: tuple[str, ...], out: tuple[int, ...], process: Process | None,
-        poses_g: Poses | None) -> Near:
+        trial: _Trial) -> Near:
     """Return a set near its fit; its effects are in the order of their contribution."""
     blocks = [int(linear.numbers_of[name][-1]) for name in names]
     plain = Set.of(linear, blocks, out)
     walk = None if process is None else walk_beside(plain, process)
     whole = plain if walk is None else plain.within(walk.whitened(linear))
     blocks.sort(key=lambda block: -whole.without(block).rss)
-    return Near(whole.instead(blocks), linear, walk, process_of(linear, poses_g))
+    return Near(whole.instead(blocks), linear, walk, trial.process(linear))
 
 
 def _fitted_without(state: State, poses_g: Poses, out: tuple[int, ...]) -> State:
