@@ -388,8 +388,8 @@ def _measured(rng: np.random.Generator, setup: Setup, around: Around, traits: Tr
 
 def _named(name: str, values: Floats, traits: Traits) -> dict[str, float]:
     """Return the values of an effect with the names and units of the catalogue."""
-    if name == 'supply_ratio':  # W u is about its mean gain times u
-        parts = np.array([np.trace(traits.gain) / 3.0, *traits.offset]) * values[0]
+    if name == 'supply_ratio':
+        parts = np.array([1.0, *traits.offset]) * values[0]
         return dict(zip(('gain', 'x', 'y', 'z'), parts.tolist(), strict=True))
     names = {'cross_coupling': tuple(f'{"xyz"[i]}_{"xyz"[i]}{"xyz"[j]}' for i, j in PAIRS),
              'saturation': ('limit',), 'quantisation': ('step',),

@@ -5,7 +5,8 @@
 
 from accel_calib.effects import EFFECTS
 from accel_calib.errors import InputError
-from inside import correct, linear_model, Model, parse_effect, predict, rotation_from_rpy
+from inside import (
+    correct, linear_model, Model, parse_effect, predict, rotation_from_rpy, with_vector)
 import numpy as np
 import pytest
 from shared import context_of, random_directions, values_of
@@ -37,6 +38,29 @@ def test_basis_and_slope_are_the_derivatives_by_the_values_and_by_the_force(name
                for axis in np.eye(3)]
     np.testing.assert_allclose(Model({name: values}).at(context).slope(force),
                                np.stack(numeric, axis=2), atol=1e-7)
+
+
+def test_a_ratiometric_output_scales_all_gains_and_the_basis_is_its_derivative(rng):
+    force, context = random_directions(40, rng), context_of(rng, 40)
+    alone = dict(map(parse_effect, ('offset=0.1,0.2,-0.1', 'axis_gain=0.03,-0.02,0.01',
+                                    'cross_axis=0.01,0.02,0.03', 'quadratic=0.02')))
+    change = (context['supply_voltage'] / 3.3 - 1.0)[:, np.newaxis]
+    whole = Model({**alone, **dict([parse_effect('supply_ratio=0.9,0.1,0,0')])})
+    linear, bend = (Model({name: part for name, part in alone.items() if (name == 'quadratic') is
+                           bends}) for bends in (False, True))
+    gained = predict(linear, force, {}) - alone['offset']
+    expected = (alone['offset'] + gained * (1.0 + 0.9 * change) + [0.1, 0.0, 0.0] * change
+                + predict(bend, force, {}) - force)
+    np.testing.assert_allclose(predict(whole, force, context), expected, atol=1e-14)
+    np.testing.assert_allclose(correct(whole, expected, context), force, atol=1e-12)
+    lagging = Model({**whole.values, 'gain_temperature': np.array([1e-3, 0.0, 2e-3, 40.0, 0.0])})
+    vector, basis = lagging.vector, lagging.basis(force, context).full
+    for k in np.flatnonzero(lagging.fitted):
+        step = 1e-4 * max(abs(vector[k]), 1.0) * (np.arange(len(vector)) == k)
+        slope = (predict(with_vector(lagging.effects, vector + step), force, context)
+                 - predict(with_vector(lagging.effects, vector - step), force, context))
+        np.testing.assert_allclose(basis[:, :, k], slope / (2 * step[k]), atol=1e-9)
+        assert np.any(np.abs(slope) > 0)
 
 
 def test_a_covariate_changes_the_offset_from_its_zero_on():

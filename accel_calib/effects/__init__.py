@@ -18,7 +18,8 @@ over the parameters k_p, with u the specific force in the sensor axes. The facto
 the context, and the monomial only on the force. With the context fixed, a term with monomial 1
 belongs to the offset V and a term with monomial u_j to the gain W. The other terms are nonlinear
 in the force; they are called bending terms. The constants in which an effect is not linear, such
-as a time constant, are its shape.
+as a time constant, are its shape. The gain of a ratiometric output, `supply_ratio`, scales the
+gains of the other effects, too: it adds k · factor · W u in place of k · factor · u.
 
 A temperature effect can have a lag [s]. With ``of_sensor`` 0 the die lags: the temperature that
 acts is a low pass of the recorded one. With ``of_sensor`` 1 the temperature sensor lags: the

@@ -207,7 +207,7 @@ EFFECTS: dict[str, Effect] = {
         needs=('time', 'temperature'), over=('temperature_rate',)),
     'supply_ratio': Effect(
         'offset and gain in proportion to the supply', 'ratiometric output', ('gain', *AXES),
-        'g/g', 1.0, 1.0, _SUPPLY, _supply_change, ('supply_voltage',)),
+        'g/g', 1.0, 1.0, _SUPPLY, _supply_change, ('supply_voltage',), scales=True),
     'offset_drift': _in_time(
         'offset that drifts with time', 'bias drift', AXES, 'g/h', 0.0005, terms=by_axis(ONE),
         factor=_since, needs=('time',), shape=('start',), shapes=_from_start),

@@ -206,6 +206,8 @@ class Effect:
         cannot be corrected.
     own : bool
         Whether a user has defined the effect (`OwnEffect`).
+    scales : bool
+        Whether its first parameter scales the gains of the other effects, too: W k in place of k.
 
     """
 
@@ -230,6 +232,7 @@ class Effect:
     repeatable_g: float = np.inf
     output: Callable[[Floats, Floats], Floats] | None = None
     own: bool = False
+    scales: bool = False
 
     @cached_property
     def values(self) -> tuple[str, ...]:

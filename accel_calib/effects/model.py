@@ -68,11 +68,16 @@ class Terms:
         return self.parts[-1].stop if self.parts else 0
 
     @cached_property
+    def monomial(self) -> Indices:
+        """(t,) array, the index of each term in `MONOMIALS`."""
+        return np.array(self.monomials, np.intp)[self.place]
+
+    @cached_property
     def to_affine(self) -> Floats:
         """(12, t) array that sums the affine terms into V and, row by row, W - I."""
-        monomial = np.array(self.monomials, np.intp)[self.place]
-        slot = np.where(monomial == ONE, self.axis, 3 + 3 * self.axis + monomial - FORCE)
-        return _sums(np.where(monomial < AFFINE, slot, -1), 12)
+        slot = np.where(self.monomial == ONE, self.axis,
+                        3 + 3 * self.axis + self.monomial - FORCE)
+        return _sums(np.where(self.monomial < AFFINE, slot, -1), 12)
 
     @cached_property
     def to_value(self) -> Floats:
@@ -82,12 +87,21 @@ class Terms:
     @cached_property
     def bending(self) -> Indices:
         """(b,) array, the terms that bend with the force."""
-        return np.flatnonzero(np.array(self.monomials, np.intp)[self.place] >= AFFINE)
+        return np.flatnonzero(self.monomial >= AFFINE)
 
     @cached_property
     def bends_to_axis(self) -> Floats:
         """(3, b) array that sums the bending terms by axis."""
         return _sums(self.axis[self.bending], 3)
+
+    @cached_property
+    def scaling(self) -> tuple[int, int, Indices] | None:
+        """Index of a term that scales gains, of its value, and (g,) of the terms it scales."""
+        for effect, part, rows in zip(self.effects, self.parts, self.rows, strict=True):
+            if effect.scales:
+                gains = np.flatnonzero((self.monomial >= FORCE) & (self.monomial < AFFINE))
+                return rows.start, part.start, gains[(gains < rows.start) | (gains >= rows.stop)]
+        return None
 
     @cached_property
     def fixed(self) -> bool:
@@ -163,13 +177,15 @@ def _sums(index: Indices, size: int) -> Floats:
 @dataclass(frozen=True)
 class Basis:
     """
-    Derivative of the reading: (t, n) terms, the axis of each, and (p, t) sums by value.
+    Derivative of the reading: (t, n) terms, and (p, t) sums by value.
 
-    The terms of s shapes of an effect are (s, t, n). The p values of each shape follow each other.
+    Each term has its `place` in the monomials of the model and the `axis` of the reading. The
+    terms of s shapes of an effect are (s, t, n). The p values of each shape follow each other.
 
     """
 
     terms: Floats
+    place: Indices
     axis: Indices
     to_value: Floats
 
@@ -368,7 +384,21 @@ class Model(Record):
         return self._without_context if self.terms.fixed else self._at(self._factors(context))
 
     def _factors(self, context: Context) -> Floats:
-        """Return the (t, n) factors of the terms; a factor is 0 where its context is NaN."""
+        """Return the (t, n) factors of the terms."""
+        alone = self._alone(context)
+        return alone if self.terms.scaling is None else alone * self._scales(alone)
+
+    def _scales(self, alone: Floats) -> Floats:
+        """Return by what another effect scales the terms, (t, n), or (t, 1) if none does."""
+        if self.terms.scaling is None:
+            return np.ones((len(alone), 1))
+        term, value, scaled = self.terms.scaling
+        found = np.ones_like(alone)
+        found[scaled] += self.vector[value] * alone[term]
+        return found
+
+    def _alone(self, context: Context) -> Floats:
+        """Return the (t, n) factors of each effect alone; 0 where its context is NaN."""
         check_context(self, context)
         count = len(np.asarray(context[self.needs[0]])) if self.needs else 1
         found = np.ones((len(self.terms.weight), count))
@@ -403,26 +433,31 @@ class Model(Record):
         """Return the same from the (t, n) terms for values and factors of 1."""
         terms = self.terms
         if terms.fixed:
-            return Basis(plain, terms.axis, terms.to_value)
-        found: list[Floats] = [plain * self._factors(context)]
-        axes, sums = [terms.axis], [terms.to_value]
-        for rows, which, value in self._by_shape(plain, context):
-            found.append(rows)
-            axes.append(terms.axis[which])
-            sums.append(_sums(np.full(len(rows), value), terms.size))
-        return Basis(np.concatenate(found), np.concatenate(axes), np.hstack(sums))
+            return Basis(plain, terms.place, terms.axis, terms.to_value)
+        alone = self._alone(context)
+        scales = self._scales(alone)
+        found, every, sums = [plain * (alone * scales)], np.arange(len(alone)), [terms.to_value]
+        which = [every]
+        for rows, factors, value in self._further(alone, scales, context):
+            values = self.vector[terms.value[rows]]
+            found.append(plain[rows] * values[:, np.newaxis] * factors)
+            which.append(every[rows])
+            sums.append(_sums(np.full(len(values), value), terms.size))
+        each = np.concatenate(which)
+        return Basis(np.concatenate(found), terms.place[each], terms.axis[each], np.hstack(sums))
 
-    def _by_shape(self, plain: Floats, context: Context
-                  ) -> Iterator[tuple[Floats, slice, int]]:
-        """Yield the derivative by each fitted shape constant: rows, their terms, the value."""
+    def _further(self, alone: Floats, scales: Floats, context: Context
+                 ) -> Iterator[tuple[slice | Indices, Floats, int]]:
+        """Yield terms whose factors a value changes: terms, derivative of the factors, value."""
         terms = self.terms
-        for part, which, (effect, shape) in zip(terms.parts, terms.rows, self._by_effect):
-            values = self.vector[terms.value[which]][:, np.newaxis]
-            if effect.factor is not None and np.any(values):
+        for part, rows, (effect, shape) in zip(terms.parts, terms.rows, self._by_effect):
+            if effect.factor is not None and np.any(self.vector[terms.value[rows]]):
                 for place in fitted_places(effect, shape):
-                    change = difference(effect.factor, context, shape, place)
-                    yield (plain[which] * values * np.nan_to_num(change), which,
-                           part.stop - len(shape) + place)
+                    change = np.nan_to_num(difference(effect.factor, context, shape, place))
+                    yield rows, change * scales[rows], part.stop - len(shape) + place
+        if terms.scaling is not None:
+            term, value, scaled = terms.scaling
+            yield scaled, alone[scaled] * alone[term], value
 
 
 @dataclass(frozen=True)
@@ -438,8 +473,8 @@ class EachShape:
 
     def basis_of(self, plain: Floats, context: Context) -> Basis:
         """Return the derivative of the reading by the parameters; see `Model.basis_of`."""
-        parameters = len(self.terms.effects[0].parameters)
-        return Basis(plain * self.factors, self.terms.axis, self.terms.to_value[:parameters])
+        terms, parameters = self.terms, len(self.terms.effects[0].parameters)
+        return Basis(plain * self.factors, terms.place, terms.axis, terms.to_value[:parameters])
 
 
 def factors_of(name: str, shapes: Iterable[Floats], context: Context) -> Floats:

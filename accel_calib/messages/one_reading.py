@@ -22,8 +22,8 @@ import numpy as np
 
 from ..calibrate import Calibration
 from ..effects import (
-    AFFINE, check_context, CONVERGED_G, difference, Effect, fitted_places, FORCE, LARGEST_FORCE_G,
-    LARGEST_ITERATIONS, MONOMIALS, ONE, too_large)
+    AFFINE, check_context, CONVERGED_G, Effect, FORCE, LARGEST_FORCE_G, LARGEST_ITERATIONS,
+    MONOMIALS, ONE, too_large)
 from ..table import Floats
 
 Triple = tuple[float, float, float]
@@ -68,6 +68,7 @@ class OneReading:
                 self._varying.append((effect, shape.tolist(), terms))
             else:
                 self._add(terms, None, self._fixed, self._bends)
+        self._varying.sort(key=lambda each: each[0].scales)
 
     def _add(self, terms: list[_Term], factor: Any, affine: list[float], bends: list[_Bend]
              ) -> None:
@@ -94,7 +95,10 @@ class OneReading:
                                  for key, (low, high) in ranges.items() if key in known}}
         affine, bends = list(self._fixed), list(self._bends)
         for effect, shape, terms in self._varying:
-            self._add(terms, _factor(effect, known, shape), affine, bends)
+            factor = _factor(effect, known, shape)
+            if effect.scales:  # all other gains are there
+                affine[3:] = [part * (1.0 + terms[0][2] * factor) for part in affine[3:]]
+            self._add(terms, factor, affine, bends)
         return AtReading(self, affine, bends, known)
 
     @cached_property
@@ -102,24 +106,10 @@ class OneReading:
         return AtReading(self, self._fixed, self._bends, {})
 
     @cached_property
-    def _spread_rows(self) -> tuple[Floats, Floats]:
-        """Return the (m, t) monomial of each term, and its (t, 3 p) part of the root."""
-        model = self._calibration.model
+    def _root(self) -> Floats:
+        """Return a (p, p) root of the covariance."""
         variances, axes = np.linalg.eigh(self._calibration.covariance)
-        root = axes * np.sqrt(np.maximum(variances, 0.0))
-        rows, monomials, start = [], [], 0
-        for effect, values in zip(model.terms.effects, model.values.values(), strict=True):
-            shapes = [start + len(effect.parameters) + place
-                      for place in fitted_places(effect, effect.split(values)[1])]
-            for own in (None, *shapes):
-                for term in effect.terms:
-                    at = start + term.parameter if own is None else own
-                    size = 1.0 if own is None else values[term.parameter]
-                    rows.append(np.kron(np.eye(3)[term.axis], term.weight * size * root[at]))
-                    monomials.append(term.monomial)
-            start += len(effect.values)
-        which = np.equal.outer(self.monomials, monomials).astype(float)
-        return which, np.array(rows).reshape(len(rows), 3 * len(root))
+        return np.asarray(axes * np.sqrt(np.maximum(variances, 0.0)))
 
     @property
     def monomials(self) -> tuple[int, ...]:
@@ -129,18 +119,14 @@ class OneReading:
 
     def spread_basis(self, known: Known) -> Floats:
         """Return the (m, 3 p) basis of each monomial times a root of the covariance."""
-        factors: list[float] = []
         model = self._calibration.model
-        for effect, values in zip(model.terms.effects, model.values.values(), strict=True):
-            count, shape = len(effect.terms), effect.split(values)[1]
-            factor = _factor(effect, known, shape.tolist())
-            factors += factor if isinstance(factor, list) else [factor] * count
-            for place in fitted_places(effect, shape):
-                if effect.factor is not None:
-                    change = difference(effect.factor, known, shape, place)
-                    factors += np.broadcast_to(change, count).tolist()
-        which, rows = self._spread_rows
-        return np.asarray((which * factors) @ rows)
+        context = {key: np.asarray(value, float)[np.newaxis] for key, value in known.items()}
+        basis = model.basis_of(model.terms.weight[:, np.newaxis], context)
+        monomials, axes = np.take(model.terms.monomials, basis.place), np.arange(3)
+        which = np.equal.outer(self.monomials, monomials)[:, np.newaxis] & np.equal.outer(
+            axes, basis.axis)
+        rows = basis.terms * (basis.to_value.T @ self._root)
+        return (which @ rows).reshape(len(which), -1)
 
 
 def _factor(effect: Effect, known: Known, shape: Any) -> Any:
