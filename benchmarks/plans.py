@@ -100,7 +100,8 @@ def with_pose(made: Simulated, columns: Mapping[str, Floats], wanted: Wanted,
     shaking = rng.normal(size=(1, 3, setup.samples)) * sigma[:, :, np.newaxis]
     temperature = np.array([wanted.temperature])
     around = Around(wanted.up[np.newaxis], np.array([wanted.elapsed]), temperature, temperature,
-                    np.array([_SUPPLY]), rng.normal(size=(1, 3)) * 0.002, shaking, sigma)
+                    np.zeros(1), np.array([_SUPPLY]), rng.normal(size=(1, 3)) * 0.002, shaking,
+                    sigma)
     reading = plain_reading(around, made.traits)
     for name, values in made.values.items():
         reading = reading + basis_of(name, around, made.traits) @ values

@@ -185,7 +185,7 @@ def again(rng: np.random.Generator, before: Simulated) -> Simulated:
     quiet = ratio if 'quantisation' in before.values else 1.0
     spread = float(np.std(before.around.supply) / np.std(fresh.supply))
     around = replace(fresh, elapsed=before.around.elapsed, temperature=before.around.temperature,
-                     recorded=before.around.recorded,
+                     recorded=before.around.recorded, warming=before.around.warming,
                      supply=NOMINAL_SUPPLY + spread * (fresh.supply - NOMINAL_SUPPLY),
                      shaking=quiet * fresh.shaking, sigma=quiet * fresh.sigma)
     traits = replace(before.traits, scatter=rng.normal(size=(setup.poses, 3)))
@@ -209,14 +209,14 @@ def _around(rng: np.random.Generator, setup: Setup, turning: bool) -> Around:
     elapsed = np.cumsum(rng.uniform(10.0, 60.0, n))
     elapsed = elapsed - elapsed[0]
     course = _temperature(rng, elapsed / elapsed[-1], setup.temperature == 'rising')
-    temperature, recorded = _lagging(course, elapsed, setup.lag)
+    temperature, recorded, warming = _lagging(course, elapsed, setup.lag)
     supply = rng.uniform(3.0, 3.6, n)
     turning = turning or (bool(rng.integers(2)) and setup.rates == 'any')
     real = unit(rng.normal(size=(n, 3))) * rng.uniform(1.0, 5.0, (n, 1))
     rate = rng.normal(size=(n, 3)) * 0.002 + real * turning
     sigma = setup.noise_mg * 1e-3 * setup.shaking ** rng.uniform(size=(n, 3))
-    return Around(force, elapsed, temperature, recorded, supply, rate, _shaking(rng, setup, sigma),
-                  sigma)
+    return Around(force, elapsed, temperature, recorded, warming, supply, rate,
+                  _shaking(rng, setup, sigma), sigma)
 
 
 def _shaking(rng: np.random.Generator, setup: Setup, sigma: Floats) -> Floats:
@@ -258,18 +258,29 @@ def _temperature(rng: np.random.Generator, share: Floats, rising: bool
     return rise if rising else lambda at: 10.0 + 30.0 * (wave(at) - least) / (most - least)
 
 
+_MOMENT = 0.1
+"""Time over which the rate of the temperature is taken [s]."""
+
+
 def _lagging(course: Callable[[Floats], Floats], elapsed: Floats, lag: float
-             ) -> tuple[Floats, Floats]:
-    """Return the temperatures of the sensing element and of the thermometer at the poses [°C]."""
+             ) -> tuple[Floats, Floats, Floats]:
+    """
+    Return temperatures at the poses [°C], and the rate of the first of them [°C/s].
+
+    The first one is that of the sensing element, the second one that of the thermometer.
+
+    """
     span = elapsed[-1]
     if lag == 0.0:
         temperature = course(elapsed / span)
-        return temperature, temperature
+        after, before = (course((elapsed + side * _MOMENT) / span) for side in (0.5, -0.5))
+        return temperature, temperature, (after - before) / _MOMENT
     times = np.arange(0.0, span + 1.0)  # one second apart
     ahead = course(times / span)
     behind = low_passed(ahead, abs(lag))
-    leading, following = (np.interp(elapsed, times, each) for each in (ahead, behind))
-    return (leading, following) if lag > 0.0 else (following, leading)
+    own, other = (ahead, behind) if lag > 0.0 else (behind, ahead)
+    return (np.interp(elapsed, times, own), np.interp(elapsed, times, other),
+            np.interp(elapsed, times, np.gradient(own)))
 
 
 def low_passed(series: Floats, constant: float) -> Floats:

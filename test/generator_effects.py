@@ -53,6 +53,8 @@ class Around:
         Time since the first pose [s].
     temperature, recorded : (n,) array
         Temperature of the sensing element, and of the thermometer [°C].
+    warming : (n,) array
+        Rate of the temperature of the sensing element [°C/s].
     supply : (n,) array
         Supply [V].
     rate : (n, 3) array
@@ -68,6 +70,7 @@ class Around:
     elapsed: Floats
     temperature: Floats
     recorded: Floats
+    warming: Floats
     supply: Floats
     rate: Floats
     shaking: Floats
@@ -204,7 +207,7 @@ EFFECTS: dict[str, Callable[[Around, Traits], Floats] | None] = {
     'lever_arm': _centripetal,
     'saturation': None,
     'quantisation': None,
-    'temperature_rate': _same(lambda a, t: np.gradient(a.temperature, a.elapsed)),
+    'temperature_rate': _same(lambda a, t: a.warming),
     'offset_temperature_quadratic': _same(lambda a, t: _warm(a) ** 2),
     'gain_drift': _of_gain(lambda a, t: a.elapsed),
     'gain_step': _of_gain(lambda a, t: np.where(a.elapsed > t.gain_instant, 1.0, 0.0)),
