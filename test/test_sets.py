@@ -231,6 +231,19 @@ def test_of_sets_that_are_almost_as_good_the_one_with_fewest_values_is_preferred
     assert next(accepted(sets_at(side))).effects == (preferred,)
 
 
+@pytest.mark.parametrize(('noise', 'size', 'probability', 'is_accepted'), [
+    (1.0, 7.0, 0.04, True), (1.0, 7.0, 0.06, False),  # explains all of a gap
+    (1.25, 7.0, 0.04, False), (1.25, 7.0, 0.009, True),  # leaves more than the noise
+    (1.0, 3.0, 0.04, False), (1.0, 3.0, 0.009, True)])  # there is no gap
+def test_an_effect_that_explains_all_of_a_gap_needs_less(noise, size, probability, is_accepted):
+    residual = np.array([size, *np.full(39, noise)])
+    alone = Set.of(by_hand(residual, np.eye(40)[:, :1], ['quadratic']), (0,))
+    tried = probability / alone.probability(0)
+    chosen = Set.of(by_hand(residual, np.eye(40)[:, :1], ['quadratic'], tried=tried), (0,))
+    assert chosen.probability(0) == pytest.approx(probability)
+    assert list(accepted([chosen])) == [chosen] * is_accepted
+
+
 def test_a_reshaped_set_has_all_other_effects_and_the_best_shape():
     time = np.arange(COUNT) * 30.0
     size, lag, turn = np.array([4e-4, -4e-4, 4e-4]), 240.0, time / 400.0
