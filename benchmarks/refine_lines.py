@@ -142,7 +142,7 @@ _TITLES = {
     'flicker': '1/f noise of the offset', 'large': 'two effects',
     'columns': 'one effect of an unknown column', 'noise_columns': 'nothing hidden'}
 
-_RIGHT = {'faint': (0.85, 0.97), 'few': (0.65, 0.85), 'three': (0.9, 0.975, 0.975),
+_RIGHT = {'faint': (0.88, 0.97), 'few': (0.65, 0.85), 'three': (0.9, 0.975, 0.975),
           'knocked_and_one': (0.95, 0.93, 0.9, 0.6), 'curved': (0.95,), 'chamber': (0.9,),
           'sign': (0.95,), 'large': (0.995,), 'two': (0.95,), 'rising': (0.95,),
           'columns': (0.95, 0.95)}
