@@ -83,6 +83,13 @@ def test_two_hidden_effects_are_both_named(taken):
         assert sorted(names(found)) == sorted(pair)
 
 
+@pytest.mark.parametrize('seed', range(3))
+def test_a_supply_that_scales_gains_that_differ_leaves_no_gap(seed, taken):
+    hidden = {'supply_ratio': 100.0, 'vibration_rectification': 3.0}
+    found = refine(taken([5, seed], hidden, poses=60, noise_mg=1.0)[0], MPS2, base='10')
+    assert (sorted(names(found)), found.verdict) == (sorted(hidden), 'explained')
+
+
 @pytest.mark.parametrize(('effect', 'poses'), [('quintic', 60), ('oblique_hinge', 200)])
 def test_a_form_outside_of_the_catalogue_is_not_named_after_its_nearest_effect(
         effect, poses, taken):

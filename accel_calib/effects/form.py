@@ -207,7 +207,7 @@ class Effect:
     own : bool
         Whether a user has defined the effect (`OwnEffect`).
     scales : bool
-        Whether its first parameter scales the gains of the other effects, too: W k in place of k.
+        Whether its first parameter k scales the gains of the other effects, too: it adds k W u.
 
     """
 

@@ -14,18 +14,18 @@ readings are in g; `accel_calib.units` converts them.
 
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from itertools import accumulate
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .catalogue import effect_named, EFFECTS, is_effect, PROCESSES
-from .form import AFFINE, Context, difference, Effect, fitted_places, FORCE, MONOMIALS, ONE
+from .form import AFFINE, Context, difference, Effect, Factor, fitted_places, FORCE, MONOMIALS, ONE
 from .thermal import Lag
 from ..errors import InputError
 from ..geometry import unit
@@ -275,6 +275,28 @@ def times(matrix: Floats, vectors: Floats) -> Floats:
     return (matrix @ vectors[:, :, np.newaxis])[:, :, 0]
 
 
+class _Change(NamedTuple):
+    """
+    A value that changes the factors of the terms `rows`: at a `place` of the shape of a factor.
+
+    Without a `factor`, it scales them by the term at `place`.
+
+    """
+
+    rows: slice | Indices
+    value: int
+    factor: Factor | None
+    shape: Floats
+    place: int
+
+    def of_factors(self, alone: Floats, scales: Floats, context: Context) -> Floats:
+        """Return the derivative of the factors by the value; arguments from `Model`."""
+        if self.factor is None:
+            return alone[self.rows] * alone[self.place]
+        change = difference(self.factor, context, self.shape, self.place)
+        return np.nan_to_num(change) * scales[self.rows]
+
+
 @dataclass(frozen=True, eq=False)
 class Model(Record):
     """
@@ -431,33 +453,38 @@ class Model(Record):
 
     def basis_of(self, plain: Floats, context: Context) -> Basis:
         """Return the same from the (t, n) terms for values and factors of 1."""
-        terms = self.terms
-        if terms.fixed:
-            return Basis(plain, terms.place, terms.axis, terms.to_value)
+        if self.terms.fixed:
+            return replace(self.rows, terms=plain)
         alone = self._alone(context)
         scales = self._scales(alone)
-        found, every, sums = [plain * (alone * scales)], np.arange(len(alone)), [terms.to_value]
-        which = [every]
-        for rows, factors, value in self._further(alone, scales, context):
-            values = self.vector[terms.value[rows]]
-            found.append(plain[rows] * values[:, np.newaxis] * factors)
-            which.append(every[rows])
-            sums.append(_sums(np.full(len(values), value), terms.size))
-        each = np.concatenate(which)
-        return Basis(np.concatenate(found), terms.place[each], terms.axis[each], np.hstack(sums))
+        found = [plain * (alone * scales)]
+        for each in self._changes:
+            values = self.vector[self.terms.value[each.rows]][:, np.newaxis]
+            found.append(plain[each.rows] * values * each.of_factors(alone, scales, context))
+        return replace(self.rows, terms=np.concatenate(found))
 
-    def _further(self, alone: Floats, scales: Floats, context: Context
-                 ) -> Iterator[tuple[slice | Indices, Floats, int]]:
-        """Yield terms whose factors a value changes: terms, derivative of the factors, value."""
+    @cached_property
+    def rows(self) -> Basis:
+        """Return the basis for values, factors and forces of 1: which term has which value."""
+        terms, every = self.terms, np.arange(len(self.terms.weight))
+        which = np.concatenate([every, *(every[each.rows] for each in self._changes)])
+        value = np.concatenate([terms.value, *(np.full(len(every[each.rows]), each.value)
+                                               for each in self._changes)])
+        return Basis(terms.weight[which, np.newaxis], terms.place[which], terms.axis[which],
+                     _sums(value, terms.size))
+
+    @cached_property
+    def _changes(self) -> tuple[_Change, ...]:
+        """Values that change factors: fitted shape constants, and a gain that scales others."""
         terms = self.terms
-        for part, rows, (effect, shape) in zip(terms.parts, terms.rows, self._by_effect):
-            if effect.factor is not None and np.any(self.vector[terms.value[rows]]):
-                for place in fitted_places(effect, shape):
-                    change = np.nan_to_num(difference(effect.factor, context, shape, place))
-                    yield rows, change * scales[rows], part.stop - len(shape) + place
+        found = [_Change(rows, part.stop - len(shape) + place, effect.factor, shape, place)
+                 for part, rows, (effect, shape) in zip(terms.parts, terms.rows, self._by_effect)
+                 if effect.factor is not None and np.any(self.vector[terms.value[rows]])
+                 for place in fitted_places(effect, shape)]
         if terms.scaling is not None:
             term, value, scaled = terms.scaling
-            yield scaled, alone[scaled] * alone[term], value
+            found.append(_Change(scaled, value, None, np.zeros(0), term))
+        return tuple(found)
 
 
 @dataclass(frozen=True)

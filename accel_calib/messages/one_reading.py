@@ -106,10 +106,15 @@ class OneReading:
         return AtReading(self, self._fixed, self._bends, {})
 
     @cached_property
-    def _root(self) -> Floats:
-        """Return a (p, p) root of the covariance."""
-        variances, axes = np.linalg.eigh(self._calibration.covariance)
-        return np.asarray(axes * np.sqrt(np.maximum(variances, 0.0)))
+    def _spread_rows(self) -> tuple[Floats, Floats]:
+        """Return the (m, t) monomial of each row of the basis, and its (t, 3 p) part of a root."""
+        model, covariance = self._calibration.model, self._calibration.covariance
+        variances, axes = np.linalg.eigh(covariance)
+        root = model.rows.to_value.T @ (axes * np.sqrt(np.maximum(variances, 0.0)))
+        of_axis = np.eye(3)[model.rows.axis][:, :, np.newaxis]
+        monomials = np.take(model.terms.monomials, model.rows.place)
+        return (np.equal.outer(self.monomials, monomials).astype(float),
+                (of_axis * root[:, np.newaxis]).reshape(len(root), -1))
 
     @property
     def monomials(self) -> tuple[int, ...]:
@@ -122,11 +127,8 @@ class OneReading:
         model = self._calibration.model
         context = {key: np.asarray(value, float)[np.newaxis] for key, value in known.items()}
         basis = model.basis_of(model.terms.weight[:, np.newaxis], context)
-        monomials, axes = np.take(model.terms.monomials, basis.place), np.arange(3)
-        which = np.equal.outer(self.monomials, monomials)[:, np.newaxis] & np.equal.outer(
-            axes, basis.axis)
-        rows = basis.terms * (basis.to_value.T @ self._root)
-        return (which @ rows).reshape(len(which), -1)
+        which, rows = self._spread_rows
+        return np.asarray((which * basis.terms[:, 0]) @ rows)
 
 
 def _factor(effect: Effect, known: Known, shape: Any) -> Any:
