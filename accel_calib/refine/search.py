@@ -77,9 +77,8 @@ _SEVERAL = 10.0
 likely than several that act at once (Kass and Raftery 1995: very strong)."""
 
 _LEVEL_OF_GAP = 0.05
-"""`LEVEL` of an effect that explains all of a gap. With 0.01, 87 % of the effects of 1.5 times the
-noise are named in 24 poses, and not 90 %; but if the noise is twice the stated one and nothing is
-hidden, 4 % of such sets end with a name, and not 5 %."""
+"""`LEVEL` of an effect that explains all of a gap. A larger one names more of the small effects of
+few poses, and more where nothing is hidden and the noise is understated."""
 
 _JUST_NOISE = 0.1
 """Probability of a larger sum of squares, above which the rest is just the measured noise."""
