@@ -321,6 +321,20 @@ def test_a_swing_of_what_is_not_recorded_is_not_explained_by_several_slow_effect
     assert (found.verdict, names(found)) == ('described', ['empirical'])
 
 
+@pytest.mark.parametrize(('seed', 'effects'), [
+    *((seed, {}) for seed in (6, 12, 13, 18, 20, 21)), *((seed, TCO) for seed in (8, 13, 20))])
+def test_what_is_not_recorded_is_not_taken_for_a_temperature_that_resembles_it(seed, effects):
+    rng = np.random.default_rng([284, seed])
+    share = np.linspace(0.0, 1.0, 100)
+    waves = 2.0 * np.pi * np.outer(share, rng.uniform(1.5, 5.0, 3)) + rng.uniform(0.0, 6.0, 3)
+    poses = poses_of(with_effects(rng, **effects), rng, 100, time=3000.0 * share,
+                     temperature=25.0 + 5.0 * np.sum(np.sin(waves), axis=1))
+    swing = np.sin(2.0 * np.pi * share / rng.uniform(0.1, 0.3) + rng.uniform(0.0, 6.0))
+    found = refine(plus(poses, 0.004 * np.outer(swing, random_directions(1, rng)[0])), G)
+    assert found.verdict in ('described', 'unexplained')
+    assert {*names(found)} - {'empirical', 'offset_wander'} == {*effects}
+
+
 @pytest.mark.parametrize('seed', range(2))
 @pytest.mark.parametrize('degrees', [0.3, 2.0])
 def test_a_turned_mount_is_named_where_the_orientation_is_known_beside_gains(seed, degrees):

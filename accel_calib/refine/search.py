@@ -11,7 +11,8 @@ The search for missing effects.
 3. All values are fitted again, without the outliers, and the equations are set up near the new
    model. Steps 2 and 3 are repeated until the set remains the same.
 4. If the named effects explain only a small part of the residual above the noise, they are
-   removed: the residual then has a cause outside of the catalogue.
+   removed: the residual then has a cause outside of the catalogue. Beside a gap or a walk, an
+   effect is also removed if its quantity explains more when it is shifted in time.
 5. If a gap remains, or a walk, `.curves` looks for an empirical curve; a walk is added if it is
    the better description.
 
@@ -46,11 +47,11 @@ from .state import (
     with_effect, without)
 from ..calibrate import has_usual_gains, with_previous
 from ..effects import (
-    CHANGES, covariate_names, effect_named, EFFECTS, empirical_parts, fitted_places, included,
-    LADDER, linear_values, Model, parameter_names, WANDER)
+    CHANGES, covariate_names, effect_named, EFFECTS, empirical_parts, factors_of, fitted_places,
+    included, LADDER, linear_values, Model, parameter_names, WANDER)
 from ..estimate import judge, kinds
 from ..geometry import unit
-from ..table import Poses
+from ..table import Floats, Poses
 
 _ROUNDS = 4
 """Largest number of searches, each near the model of the one before."""
@@ -82,6 +83,12 @@ few poses, and more where nothing is hidden and the noise is understated."""
 
 _JUST_NOISE = 0.1
 """Probability of a larger sum of squares, above which the rest is just the measured noise."""
+
+_ALIKE = 0.5
+"""Largest correlation of a quantity with itself, shifted in time, that makes it another one."""
+
+_SHIFTS = 100
+"""Largest number of shifts in time."""
 
 _EXACT = 0.05
 """Largest error of a predicted sum of squares, in variances, after which a search ends."""
@@ -198,7 +205,42 @@ def _search(poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
     first = _fitted_without(start, poses_g, out) if out else start
     found = Found(first, state, added, np.array(out, np.intp), near, _walk(state, near),
                   taken_back=taken_back)
-    return _described(found, start, poses_g)
+    chance = [name for name in near.names if _is_coincidence(found, name)]
+    return _described(_less(found, chance) or found, start, poses_g)
+
+
+def _is_coincidence(found: Found, name: str) -> bool:
+    """
+    Return whether an effect beside a gap or a walk explains less than the same at other times.
+
+    What is not recorded resembles other quantities that change slowly, by chance. The quantity of
+    the effect is therefore shifted in time, from the end to the beginning. A true cause explains
+    more than all shifts in which it has hardly any correlation with itself.
+
+    """
+    state, values, entry = found.final, found.final.model.values, effect_named(name)
+    if entry.factor is None or name not in values or (found.walk is None and state.is_noise):
+        return False
+    shape = entry.split(values[name])[1]
+    factor, = factors_of(name, [shape], state.poses_g.columns)
+    factors = _at_other_times(factor, state.poses_g)
+    if len(factors) < 2:
+        return False
+    shifted = Candidate(name, (shape,) * len(factors), tuple(range(len(factors))), 1.0, factors)
+    linear = linearised(state.fit, tuple(each for each in values if each != name), (shifted,))
+    *others, own = Set.of(linear).gains()[0]
+    return bool(max(others) > own)
+
+
+def _at_other_times(factor: Floats, poses_g: Poses) -> Floats:
+    """Return a (t or 1, n) factor with each shift in time that makes it another, (s, …)."""
+    count = len(poses_g)
+    order = np.argsort(poses_g['time']) if 'time' in poses_g else np.arange(count)
+    away = factor[:, order] - np.mean(factor, axis=1, keepdims=True)
+    moved = np.array([np.roll(away, shift, axis=1) for shift in
+                      np.unique(np.linspace(1, count - 1, _SHIFTS).astype(int))])
+    alike = np.abs(np.sum(moved * away, axis=(1, 2))) > _ALIKE * np.sum(away ** 2)
+    return moved[~alike][:, :, np.argsort(order)]
 
 
 def _described(found: Found, start: State, poses_g: Poses) -> Found:
