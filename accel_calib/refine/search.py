@@ -205,8 +205,10 @@ def _search(poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
     first = _fitted_without(start, poses_g, out) if out else start
     found = Found(first, state, added, np.array(out, np.intp), near, _walk(state, near),
                   taken_back=taken_back)
-    chance = [name for name in near.names if _is_coincidence(found, name)]
-    return _described(_less(found, chance) or found, start, poses_g)
+    chance = tuple(name for name in near.names if _is_coincidence(found, name))
+    fewer = _less(found, chance)
+    found = found if fewer is None else replace(fewer, taken_back=chance)
+    return _described(found, start, poses_g)
 
 
 def _is_coincidence(found: Found, name: str) -> bool:
@@ -305,11 +307,13 @@ def _less(found: Found, names: Collection[str]) -> Found | None:
     state = fitted_state(Model(values), found.final.poses_g) if names else None
     if state is None:
         return None
-    chosen = found.near.chosen
+    chosen = found.near.beside
     blocks = [block for block, name in zip(chosen.blocks, chosen.effects, strict=True)
               if name not in names]
-    return replace(found, final=state, near=replace(found.near, chosen=chosen.instead(blocks)),
-                   added=tuple(name for name in found.added if name not in names))
+    near = replace(found.near, walk=None, chosen=chosen.instead(blocks))
+    fewer = replace(found, final=state, near=near, walk=None,
+                    added=tuple(name for name in found.added if name not in (*names, WANDER)))
+    return fewer if found.walk is None else _walking(fewer) or fewer
 
 
 def _alone(curve: Curve, found: Found, poses_g: Poses) -> Found | None:
