@@ -83,7 +83,8 @@ from accel_calib.refine.linear import (
     _RARE as RARE, Block, LEVEL as REFINE_LEVEL, Linear, outside_of, Set, with_outliers)
 from accel_calib.refine.plan import _levels as levels_of, NOTHING as NOTHING_TO_PLAN
 from accel_calib.refine.search import (
-    _is_better as is_better_than_walk, accepted, explored, reshaped, search as search_effects)
+    _is_better as is_better_than_walk, _less as less, accepted, explored, reshaped,
+    search as search_effects)
 from accel_calib.refine.state import beginning, candidates, fitted_state, linearised, WORTH
 from accel_calib.refine.steps import advice_for
 from accel_calib.report.page import axis_figures, snippets

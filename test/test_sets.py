@@ -9,9 +9,9 @@ import math
 from accel_calib.effects import EFFECTS
 from inside import (
     accepted, beginning, Block, candidates, Curve, explored, fitted_state, grown_curve,
-    is_better_than_walk, Linear, linearised, Model, Near, outside_of, Process, process_of, RARE,
-    REFINE_LEVEL, reshaped, rss_beside, Set, SIGNIFICANT, simulate_poses, Walk, walk_beside,
-    with_outliers, WORTH)
+    is_better_than_walk, less, Linear, linearised, Model, Near, outside_of, Process, process_of,
+    RARE, REFINE_LEVEL, reshaped, rss_beside, search_effects, Set, SIGNIFICANT, simulate_poses,
+    Walk, walk_beside, with_outliers, WORTH)
 import numpy as np
 import pytest
 from scipy.optimize import brentq
@@ -334,6 +334,23 @@ def test_a_walk_is_likely_where_the_offset_walks_and_not_in_noise():
         likely.append(walk_beside(Set.of(linear), process_of(linear, poses)).likelihood_ratio)
     assert likely[0] > 3.0 * SIGNIFICANT
     assert likely[1] < 0.5 * SIGNIFICANT
+
+
+@pytest.mark.parametrize(('seed', 'stays'), [(5, True), (3, False)])
+def test_a_walk_is_estimated_anew_beside_fewer_effects(seed, stays):
+    steps = np.random.default_rng(seed).normal(size=(COUNT, 3))
+    poses = poses_of({'offset_temperature': [3e-3, -2e-3, 2e-3]}, seed=seed)
+    poses = poses.with_columns(reading=poses.reading + np.cumsum(steps * 2e-3, axis=0))
+    found = search_effects(poses, Model({name: np.zeros(3) for name in BASE}))
+    assert found.added == ('offset_temperature', 'offset_wander')
+    fewer = less(found, ['offset_temperature'])
+    final = fewer.final.linear
+    anew = walk_beside(Set.of(final), process_of(final, fewer.final.poses_g))
+    assert (anew.likelihood_ratio > SIGNIFICANT) == stays
+    assert fewer.added == (('offset_wander',) if stays else ())
+    assert (fewer.walk and fewer.walk.ratio) == (anew.ratio if stays else None)
+    assert (fewer.near.chosen.linear.white is not None) == stays
+    assert fewer.near.chosen.score < found.near.chosen.score
 
 
 @pytest.mark.parametrize(('size', 'least', 'most'), [(5.0, 5.0, 150.0), (100.0, 1e3, 1e3)])
