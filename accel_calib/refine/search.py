@@ -85,10 +85,10 @@ _JUST_NOISE = 0.1
 """Probability of a larger sum of squares, above which the rest is just the measured noise."""
 
 _ALIKE = 0.5
-"""Largest correlation of a quantity with itself, shifted in time, that makes it another one."""
+"""Correlation of a quantity with itself, shifted in time, below which it counts as another one."""
 
 _SHIFTS = 100
-"""Largest number of shifts in time."""
+"""Largest number of shifts in time with which an effect is compared."""
 
 _EXACT = 0.05
 """Largest error of a predicted sum of squares, in variances, after which a search ends."""
@@ -109,9 +109,9 @@ class Found:
     added effects, in order, with `WANDER` last if the rest is a random walk of the offset;
     `outliers` (d,) are the indices of the outliers. `near` has the equations near the final
     model, and `walk` is beside the final model at the poses kept. `taken_back` are effects that
-    were removed because they did not explain enough. Poses at the limit of the sensor are left
-    out: they are `clipped`, and `with_clipped` is the base fitted to all poses. `grid_g` is the
-    step of the grid of the readings [g], if it is relevant.
+    were removed because they explain too little, or no more than by chance. Poses at the limit of
+    the sensor are left out: they are `clipped`, and `with_clipped` is the base fitted to all
+    poses. `grid_g` is the step of the grid of the readings [g], if it is relevant.
 
     """
 
@@ -213,11 +213,11 @@ def _search(poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
 
 def _is_coincidence(found: Found, name: str) -> bool:
     """
-    Return whether an effect beside a gap or a walk explains less than the same at other times.
+    Return whether an effect beside a gap or a walk explains less than its quantity, shifted.
 
-    What is not recorded resembles other quantities that change slowly, by chance. The quantity of
-    the effect is therefore shifted in time, from the end to the beginning. A true cause explains
-    more than all shifts in which it has hardly any correlation with itself.
+    By chance, what is not recorded resembles another quantity that changes slowly. The quantity of
+    the effect is therefore shifted cyclically in time. A true cause explains more than each shift
+    that is hardly correlated with it.
 
     """
     state, values, entry = found.final, found.final.model.values, effect_named(name)
@@ -235,7 +235,7 @@ def _is_coincidence(found: Found, name: str) -> bool:
 
 
 def _at_other_times(factor: Floats, poses_g: Poses) -> Floats:
-    """Return a (t or 1, n) factor with each shift in time that makes it another, (s, …)."""
+    """Return s cyclic shifts of a (t or 1, n) factor that hardly correlate with it, (s, …)."""
     count = len(poses_g)
     order = np.argsort(poses_g['time']) if 'time' in poses_g else np.arange(count)
     away = factor[:, order] - np.mean(factor, axis=1, keepdims=True)
@@ -302,7 +302,12 @@ def _with_curve(found: Found, curve: Curve, start: State, poses_g: Poses) -> Fou
 
 
 def _less(found: Found, names: Collection[str]) -> Found | None:
-    """Return what was found without some effects; None if the fit without them fails."""
+    """
+    Return what was found without some effects, with a walk estimated anew.
+
+    None if there are no such effects, or if the fit without them fails.
+
+    """
     values = {name: part for name, part in found.final.model.values.items() if name not in names}
     state = fitted_state(Model(values), found.final.poses_g) if names else None
     if state is None:
