@@ -218,6 +218,19 @@ def test_a_stalled_fit_has_converged_if_its_step_is_small_beside_one_degree_of_f
         stalled(np.sqrt(1.2e-5))
 
 
+def test_a_fit_ends_at_a_kink_where_no_step_lowers_the_cost():
+    tried = []
+
+    def point_at(values):  # |x| has no slope of 0 at its minimum, so steps go too far
+        tried.append(values)
+        kink = np.abs(values) + 1.0
+        return Point(np.append(10.0, 0.01 * kink), np.array([[0.0], -0.01 * np.sign(values)]))
+
+    values, _ = solve(point_at, np.full(1, 0.3), np.full(1, -np.inf), np.full(1, np.inf))
+    assert values == 0.3
+    assert len(tried) == 3
+
+
 def test_a_fit_without_any_residual_has_converged():
     zero = Point(np.zeros(3), np.eye(3)[:, :1])
     assert solve(lambda values: zero, np.ones(1), np.zeros(1), np.full(1, 2.0)) == (1.0, zero)

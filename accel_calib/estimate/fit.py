@@ -48,7 +48,7 @@ _NEAR = 1e-12
 """The fit has converged when a full step lowers the cost by less than this part."""
 
 _NEAR_ENOUGH = 1e-5
-"""If rounding prevents this, the fit accepts this part of the cost per degree of freedom."""
+"""If rounding or a kink prevents this, this part of the cost per degree of freedom is accepted."""
 
 _ROUNDING = 1e-20
 """Decreases of the cost below this are rounding errors [noise²]."""
@@ -342,13 +342,19 @@ def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upp
         if tried.cost < now.cost:
             values, now, damping = moved, tried, damping / 10.0
             damping = 0.0 if damping < first else damping
+        elif damping > 0.0 and _is_near(now, fall):  # a kink, or rounding
+            break
         else:
             damping = max(10.0 * damping, first)
-    _, fall = _step(now, _free(values, now, lower, upper), 0.0)
-    spare = max(len(now.residual) - len(values), 1)
-    if not fall <= _NEAR_ENOUGH * now.cost / spare + _ROUNDING:
+    if not _is_near(now, _step(now, _free(values, now, lower, upper), 0.0)[1]):
         raise NotConvergedError
     return values, now
+
+
+def _is_near(now: Point, fall: float) -> bool:
+    """Return whether the predicted fall of the cost is negligible beside the noise."""
+    spare = max(len(now.residual) - len(now.downhill), 1)
+    return fall <= _NEAR_ENOUGH * now.cost / spare + _ROUNDING
 
 
 def _free(values: Floats, now: Point, lower: Floats, upper: Floats) -> NDArray[np.bool_]:
