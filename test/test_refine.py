@@ -83,6 +83,12 @@ def test_two_hidden_effects_are_both_named(taken):
         assert sorted(names(found)) == sorted(pair)
 
 
+def test_the_last_step_leaves_what_the_calibration_leaves(taken):
+    found = refine(taken(2, {'hysteresis': 30.0}, poses=60)[0], MPS2, base='10')
+    assert names(found) == ['hysteresis']
+    assert found.steps[-1].gap_after_mg == pytest.approx(found.remaining_gap_mg, rel=1e-6)
+
+
 @pytest.mark.parametrize('seed', range(3))
 def test_a_supply_that_scales_gains_that_differ_leaves_no_gap(seed, taken):
     hidden = {'supply_ratio': 100.0, 'vibration_rectification': 3.0}

@@ -27,7 +27,7 @@ from ..effects import (
     CHANGES, COVARIATES, effect_named, EFFECTS, EMPIRICAL, empirical_parts, included, is_effect,
     kind_of, LADDER, Model, parameter_names, PROCESSES, TO_SEPARATE, unit_of, value_unit,
     variable_of, variable_words, WANDER)
-from ..estimate import judge, kinds
+from ..estimate import kinds
 from ..geometry import ATTITUDES, axes_of_signs
 from ..table import column_of, Floats, Poses
 from ..text import counted, listed, with_sd
@@ -216,14 +216,14 @@ def steps_of(found: Found, start: State, date: str, *, joint: bool
 def _sequence(found: Found, start: State) -> list[State]:
     """Return the initial state and the state after each added effect."""
     states, values = [start], dict(found.base.model.values)
-    for name in found.added:
-        if name != WANDER:
-            own = found.final.model.values.get(name)
-            values = with_effect(values, name, np.zeros(len(effect_named(name).values))
-                                 if own is None else own)
-            states.append(fitted_state(Model(values), found.base.poses_g) or states[-1])
-    if len(states) > 1:
-        states[-1] = State(judge(found.final.model, states[-1].poses_g))
+    names = [name for name in found.added if name != WANDER]
+    for name in names[:-1]:
+        own = found.final.model.values.get(name)
+        values = with_effect(values, name, np.zeros(len(effect_named(name).values))
+                             if own is None else own)
+        states.append(fitted_state(Model(values), found.final.poses_g) or states[-1])
+    if names:
+        states.append(found.final)
     return states if found.added[-1:] != (WANDER,) else [*states, states[-1]]
 
 
