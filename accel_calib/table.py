@@ -75,6 +75,8 @@ COLUMNS: dict[str, Column] = {
     'label': Column(('label',), '', 'free text'),
     'doubtful': Column(('doubtful',), '',
                        '1: the sensor may have moved, according to later rests'),
+    'scatter': Column(('scatter_x', 'scatter_y', 'scatter_z'), 'unit of the reading',
+                      'standard deviation of a pose beyond the noise of its mean', made=True),
     'new': Column(('new',), '', '1 for poses taken since a stored calibration, 0 for its own',
                   made=True),
 }
@@ -298,7 +300,8 @@ class Poses(Table):
         """(n, 3) array, standard deviation of each mean in the unit of the reading, if known."""
         if 'std' not in self or 'count' not in self:
             return None
-        return self['std'] / np.sqrt(self['count'])[:, np.newaxis]
+        noise: Floats = self['std'] / np.sqrt(self['count'])[:, np.newaxis]
+        return np.hypot(noise, self['scatter']) if 'scatter' in self else noise
 
     def as_recording(self) -> Recording:
         """Return the rows as samples; they have times."""

@@ -145,7 +145,10 @@ GROUPS: dict[str, tuple[Group, ...]] = {
         _fixed('heavy tails', {}, Setup(heavy=True)),
         _fixed('heavy tails, 24 poses', {}, Setup(poses=24, heavy=True)),
         _fixed('rows of one orientation in a row', {}, Setup(poses=24, repeats=3),
-               Setup(poses=64, repeats=8), Setup(repeats=5), base='auto')),
+               Setup(poses=64, repeats=8), Setup(repeats=5), base='auto'),
+        *(_fixed(f'scatter of {size:g} times the noise, which differs 30 times, {poses} poses',
+                 {'repeatability': size}, Setup(poses=poses, shaking=30.0))
+          for poses in (60, 24) for size in (1.5, 5.0))),
     'flicker': tuple(_fixed(f'{poses} poses, size {size:g}', {'wander_1f': size},
                             Setup(poses=poses)) for poses in (60, 200) for size in (3.0, 8.0)),
     'large': (_drawn('60 poses, sizes 100 and 3', (100.0, 3.0), Setup(noise_mg=1.0), BIG),),

@@ -11,8 +11,8 @@ import accel_calib as ac
 from accel_calib.calibrate import fit_poses, in_g, outlook, verify
 from accel_calib.errors import RefusedFitError
 from accel_calib.estimate import (
-    estimate, lower_triangular, NotConvergedError, originals, outliers_among, Point, sensing_axes,
-    solve, start_of, variance_factor)
+    estimate, judge, lower_triangular, NotConvergedError, originals, outliers_among, Point,
+    scatter_of, sensing_axes, solve, start_of, variance_factor)
 from accel_calib.finding import has
 from accel_calib.geometry import ATTITUDES
 from accel_calib.table import numbered, Poses
@@ -93,6 +93,46 @@ def test_noisy_poses_have_less_weight():
     weighted, equal = (np.linalg.norm(fit_poses(each, G, model='10').model.vector - model.vector)
                        for each in (noisy, noisy.without_columns('std')))
     assert weighted < 0.5 * equal
+
+
+def scattering(seed, scatter_g):
+    """Return a sensor and 60 poses whose noise differs, and which scatter beyond it."""
+    rng = np.random.default_rng(seed)
+    model, noise = sensor(rng), 1.4e-4 * np.exp(0.8 * rng.normal(size=(60, 1)))
+    poses = simulate_poses(model, random_directions(60, rng), rng, noise_g=1e-9)
+    error = np.hypot(noise, scatter_g) * rng.normal(size=(60, 3))
+    return model, poses.with_columns(reading=poses.reading + error,
+                                     std=np.repeat(10.0 * noise, 3, axis=1))
+
+
+def test_poses_that_scatter_alike_have_weights_alike_and_true_deviations():
+    pulls, lost = [], 0
+    for seed in range(20):
+        model, poses = scattering(seed, 7e-4)
+        fit = fit_poses(poses, G, model='10')
+        pulls.append((fit.model.vector - model.vector) / np.sqrt(np.diag(fit.covariance)))
+        lost += len(fit.rejected)
+        assert fit.quality.chi2_per_dof > 4.0  # of the noise as stated
+        assert 'beyond_noise' in [each.kind for each in fit.noted]
+    assert np.std(pulls) == pytest.approx(1.0, abs=0.2)
+    assert lost == 0
+
+
+def test_a_scatter_is_estimated_where_the_noise_differs():
+    sizes = [scatter_of(judge(model, poses)).size_g
+             for model, poses in map(scattering, range(10), [7e-4] * 10)]
+    assert np.mean(sizes) == pytest.approx(7e-4, rel=0.1)
+    model, poses = scattering(0, 0.0)
+    assert not scatter_of(judge(model, poses)).shows
+
+
+def test_knocked_poses_are_left_out_beside_a_scatter():
+    for seed in range(5):
+        poses = scattering(seed, 7e-4)[1]
+        knocked = poses.reading.copy()
+        knocked[[7, 30, 51]] *= 1.02
+        fit = fit_poses(poses.with_columns(reading=knocked), G, model='10')
+        assert [each.row for each in fit.rejected] == [8, 31, 52]
 
 
 def test_unknown_noise_is_estimated_from_the_residuals():

@@ -158,6 +158,16 @@ def test_structure_that_is_not_understood_remains_a_gap(structure):
     assert any('no structure' in line for line in advice_for(found, (), (), 0, unexplained=True))
 
 
+def test_poses_that_scatter_alike_hide_nothing_though_their_noise_differs():
+    found = []
+    for seed in range(8):
+        made = generator.simulate(np.random.default_rng([6, seed]), {'repeatability': 5.0},
+                                  generator.Setup(shaking=30.0))
+        found.append(ac.refine(pd.DataFrame(made.columns), base='10'))
+    assert {each.verdict for each in found} == {'unexplained'}
+    assert sum(bool(each.steps) for each in found) <= 1  # by chance; more in benchmarks/refine.py
+
+
 @pytest.mark.parametrize('poses', [24, 12])
 def test_successive_rows_of_one_orientation_show_no_hysteresis(poses):
     for seed in range(2):

@@ -38,9 +38,9 @@ from .quality import finished, fit_findings, in_g, LARGEST_OFFSET_G, record_of, 
 from ..effects import length_rows, linear_model, Model, MODELS, sensor_force, with_vector
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import (
-    closed_form, covariance_with, estimate, faces, Fit, fit_12, fit_norm, fit_sphere, judge,
-    lower_triangular, NotConvergedError, originals, outliers, Point, pose_noise, rivals, solve,
-    start_of, TIES)
+    beside_scatter, closed_form, covariance_with, estimate, faces, Fit, fit_12, fit_norm,
+    fit_sphere, judge, lower_triangular, NotConvergedError, originals, outliers, Point, pose_noise,
+    rivals, solve, start_of, stated, TIES)
 from ..finding import Finding
 from ..geometry import rms, unit
 from ..table import check_units, Poses
@@ -217,6 +217,8 @@ def _by_norm(poses: Poses, units: Units, model: str, method: Method) -> tuple[Ca
         largest = list(dilutions)[-1]
         fits[largest], among = _fit_norm(largest, poses_g.take(kept))
         kept = kept[among]
+        if 'scatter' in fits[largest].poses_g:
+            poses_g = beside_scatter(poses_g, fits[largest].poses_g['scatter'][0, 0])
     left, used = poses_g.take(kept), directions[kept]
     noise = pose_noise(left.noise, used)
     if len(kept) < len(poses_g):
@@ -227,6 +229,7 @@ def _by_norm(poses: Poses, units: Units, model: str, method: Method) -> tuple[Ca
     inside[kept] = True
     fit, out = fits[name], first[~inside[first]]
     unlike = rivals(fit, kept, out, poses_g, lambda others: _estimated(name, others))
+    fit = stated(fit)
     return record_of(
         fit, poses, units, used, name, method, covariance=covariance_with(fit, unlike),
         rejected=rejected_by(fit.model, poses_g.take(~inside[original])), reason=reason,

@@ -25,7 +25,7 @@ given, because it determines the weight of the prior.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -157,6 +157,8 @@ class Fit:
         Residuals and columns of the prior, in units of the noise; None without a prior.
     factor : float or None
         Known variance factor; None: from the residuals.
+    beside : Fit or None
+        The same beside a scatter of the poses, whose covariance it has.
 
     """
 
@@ -168,6 +170,7 @@ class Fit:
     at_bound: bool = False
     prior: Point | None = None
     factor: float | None = None
+    beside: Fit | None = None
 
     @cached_property
     def residual(self) -> Floats:
@@ -237,6 +240,8 @@ class Fit:
     @cached_property
     def covariance(self) -> Floats:
         """(p, p) array, covariance of ``model.vector`` [g²]; 0 for values that are not fitted."""
+        if self.beside is not None:
+            return self.beside.covariance
         columns, size = self._triangle
         if self.prior is not None:
             columns, size = _scaled(np.vstack([columns * size, self.prior.columns]))
@@ -269,6 +274,14 @@ def judge(model: Model, poses_g: Poses, ties: Floats | None = None) -> Fit:
     ties = free_of(model) if ties is None else ties
     near = equations(model, measured(poses_g))
     return Fit(model, poses_g, near, near.columns(model) @ ties, ties)
+
+
+def stated(fit: Fit) -> Fit:
+    """Return a fit beside a scatter as one with the measured noise, except its covariance."""
+    if 'scatter' not in fit.poses_g:
+        return fit
+    measured_g = fit.poses_g.without_columns('scatter')
+    return replace(judge(fit.model, measured_g, fit.ties), at_bound=fit.at_bound, beside=fit)
 
 
 class NotConvergedError(RefusedFitError):

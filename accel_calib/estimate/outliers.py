@@ -28,6 +28,10 @@ over the poses that are kept, with their noise s. The noise counts as f degrees 
 is a row whose hypothesis is at least `LEVEL` times as probable as that of the row left out. The
 covariance of a fit with rivals includes the difference to the fit of each rival.
 
+**Scatter.** Poses that repeat worse than their samples are no outliers. A scatter that all poses
+have (`.scatter`) is taken instead of some of the outliers if its likelihood is larger, with each
+outlier a mistake of up to 0.1 g of 2 % of the poses.
+
 **Unchecked rows.** A pose with a leverage near 1 pulls the fit towards itself, so that its mistake
 does not show. The largest mistake that the test for outliers does not find is
 δ s / √(1 - leverage) (internal reliability, Baarda 1968), with δ the limit of the test in standard
@@ -38,6 +42,7 @@ deviations.
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -47,6 +52,7 @@ import scipy
 from .closed_form import agreeing, start_of
 from .equations import belief_beside, belief_in
 from .fit import estimate, Fit, judge, NotConvergedError
+from .scatter import beside_scatter, Scatter, scatter_of
 from ..effects import MODELS, parameter_names
 from ..table import Poses
 from ..units import Floats, Indices
@@ -82,6 +88,12 @@ choice among subsets makes small differences look significant, so a smaller rati
 _EXPLAINED = 0.25
 """Smallest part of the residuals by the mistake of one row that a mistake of another row explains
 to first order; other rows are no rivals."""
+
+_OF_OUTLIER = 2.0 * math.log(0.1 / 0.02 / math.sqrt(2.0 * math.pi))
+"""Deviance of an outlier: a mistake of up to 0.1 g, of 2 % of the poses."""
+
+_ALIKE = 0.2
+"""Relative change of a scatter after which it is found."""
 
 _LARGEST_LOG = 100.0
 """Largest logarithm of odds, against overflow."""
@@ -241,9 +253,40 @@ def fit_norm(name: str, poses_g: Poses) -> tuple[Fit, Indices]:
     Fit model 4, 7 or 10 to poses in g of unknown orientation, without the outliers.
 
     Return the fit and the (k,) indices of the poses used. The poses are at least as many as free
-    parameters. Raise `NotConvergedError` if they are not on an ellipsoid.
+    parameters. If they scatter beyond their noise, those of the fit have the column ``scatter``.
+    Raise `NotConvergedError` if they are not on an ellipsoid.
 
     """
+    found = _fit_norm(name, poses_g)
+    without, out = scatter_of(found[0]), len(poses_g) - len(found[1])
+    if not without.size_g or not (without.shows or out):
+        return found
+    least, first = without.without + _OF_OUTLIER * out, found
+    everyone = np.arange(len(poses_g))
+    for fit, kept in (first, (_fit(name, poses_g, everyone), everyone))[:2 if out else 1]:
+        if fit is None:
+            continue
+        beside, scatter = _beside_scatter(name, poses_g, fit, kept)
+        deviance = scatter.deviance + _OF_OUTLIER * (len(poses_g) - len(beside[1]))
+        if scatter.shows and deviance < least:
+            found, least = beside, deviance
+    return found
+
+
+def _beside_scatter(name: str, poses_g: Poses, fit: Fit, kept: Indices
+                    ) -> tuple[tuple[Fit, Indices], Scatter]:
+    """Fit poses and their scatter in turn, from that beside a fit, and without the outliers."""
+    scatter, size = scatter_of(fit), 0.0
+    for _ in range(_ROUNDS):
+        if abs(scatter.size_g - size) <= _ALIKE * size:
+            break
+        size = scatter.size_g
+        fit, kept = _fit_norm(name, beside_scatter(poses_g, size))
+        scatter = scatter_of(judge(fit.model, poses_g.take(kept)))
+    return (fit, kept), scatter
+
+
+def _fit_norm(name: str, poses_g: Poses) -> tuple[Fit, Indices]:
     everyone = np.arange(len(poses_g))
     direct = _without_outliers(name, poses_g, everyone)
     if direct is not None and direct[0].chi2 <= _SUSPICIOUS * max(direct[0].dof, 1):

@@ -15,6 +15,8 @@ The search for missing effects.
    effect is also removed if its quantity explains more when it is shifted in time.
 5. If a gap remains, or a walk, `.curves` looks for an empirical curve; a walk is added if it is
    the better description.
+6. If a scatter that all poses have (`accel_calib.estimate.scatter`) is as good an explanation as
+   what was found, the search is repeated with it as part of the noise.
 
 A set is kept only if its fit converged, the cost decreased and its values are plausible.
 
@@ -49,7 +51,7 @@ from ..calibrate import has_usual_gains, with_previous
 from ..effects import (
     CHANGES, covariate_names, effect_named, EFFECTS, empirical_parts, factors_of, fitted_places,
     included, LADDER, linear_values, Model, parameter_names, WANDER)
-from ..estimate import judge, kinds
+from ..estimate import beside_scatter, judge, kinds, scatter_of, stated
 from ..geometry import unit
 from ..table import Floats, Poses
 
@@ -92,6 +94,9 @@ _SHIFTS = 100
 
 _EXACT = 0.05
 """Largest error of a predicted sum of squares, in variances, after which a search ends."""
+
+_LESS = 0.8
+"""A scatter is tried again if less than this part of it is left."""
 
 _LEAST_SHARE = 0.6
 """Part of the residual above the noise that the named effects must explain."""
@@ -146,7 +151,11 @@ def search(poses_g: Poses, base: Model, also: tuple[str, ...] = ()) -> Found:
         everyone = np.delete(everyone, clip.poses)
         poses_g = poses_g.take(everyone)
     poses_g, grid = off_grid(poses_g, base)
-    found = _with_own_noise(_search(poses_g, base, also), poses_g, base, also)
+    found = _search(poses_g, base, also)
+    for again in (_with_own_noise, _with_scatter):
+        found = again(found, poses_g, base, also)
+    if found.walk is None:
+        found = replace(found, base=_weighted(found.base), final=_weighted(found.final))
     return replace(found, outliers=everyone[found.outliers], clipped=clip, grid_g=grid,
                    with_clipped=whole)
 
@@ -156,8 +165,7 @@ def _with_own_noise(found: Found, poses_g: Poses, base: Model, also: tuple[str, 
     Search again if new poses, or those of a stored calibration, are noisier than stated.
 
     A walk or a curve could otherwise describe that one of them scatters more. The factors of the
-    noise are those of the residuals beside the named effects; the result is stated with the
-    measured noise.
+    noise are those of the residuals beside the named effects.
 
     """
     if 'new' not in poses_g or not found.near.plain.worth or not (found.walk or found.curve):
@@ -171,11 +179,54 @@ def _with_own_noise(found: Found, poses_g: Poses, base: Model, also: tuple[str, 
         factor[group] = max(np.sum(residual[rows] ** 2) / max(np.sum(own[rows]), 1.0), 1.0)
     if np.ptp(factor) == 0.0:
         return found
-    scaled = poses_g.with_columns(std=poses_g['std'] * np.sqrt(factor)[:, np.newaxis])
-    again = _search(scaled, base, also)
-    kept = without(poses_g, again.outliers)
-    return replace(again, base=State(judge(again.base.model, kept)),
-                   final=State(judge(again.final.model, kept)))
+    noise = poses_g['std'] / np.sqrt(poses_g['count'])[:, np.newaxis]
+    scatter = noise * np.sqrt(factor - 1.0)[:, np.newaxis]
+    return _beside(poses_g.with_columns(scatter=scatter), base, also)
+
+
+def _with_scatter(found: Found, poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
+    """
+    Search again if poses that scatter alike are as good an explanation as what was found.
+
+    If their noise differs, the quiet ones have too much weight, and effects fit their scatter.
+
+    """
+    if not found.added or 'new' in poses_g:
+        return found
+    scatter, largest = scatter_of(found.base.fit), np.inf
+    if _gained(found) > scatter.evidence:
+        return found
+    while scatter.shows and scatter.size_g < _LESS * largest:
+        largest = scatter.size_g
+        found = _beside(beside_scatter(poses_g, largest), base, also)
+        if not found.added:
+            break
+        scatter = scatter_of(found.final.fit)
+    return found
+
+
+def _weighted(state: State) -> State:
+    """Return a state fitted beside the scatter of its poses, if it shows."""
+    scatter, poses_g = scatter_of(state.fit), state.poses_g
+    if not scatter.shows:
+        return state
+    found = fitted_state(state.model, beside_scatter(poses_g, scatter.size_g))
+    return state if found is None else State(stated(found.fit))
+
+
+def _gained(found: Found) -> float:
+    """Return the score of what was added, relative to nothing beside the same outliers."""
+    near = found.near
+    added = near.beside.score if near.walk is None else near.walk.score
+    curve = 0.0 if found.curve is None else found.curve.score
+    return added + curve - near.beside.instead(()).score
+
+
+def _beside(poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
+    """Search in poses with a scatter, and state the result without it."""
+    found = _search(poses_g, base, also)
+    first, final = (State(stated(state.fit)) for state in (found.base, found.final))
+    return replace(found, base=first, final=final, walk=_walk(final, found.near))
 
 
 def _search(poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
