@@ -88,6 +88,8 @@ class Case:
         True specific force of each pose [g].
     shows_mg : (n,) array
         Change of |force| by a knock; 0 if the pose was not knocked.
+    noise : (n,) array
+        True standard deviation of each pose, by axis, with its scatter [g].
 
     """
 
@@ -95,6 +97,7 @@ class Case:
     poses: Poses
     force: Floats
     shows_mg: Floats
+    noise: Floats
 
 
 def draw_sensor(rng: np.random.Generator, kind: str) -> Sensor:
@@ -122,7 +125,7 @@ def unit(vectors: Floats) -> Floats:
 
 
 def draw(rng: np.random.Generator, count: int, kind: str = '10', *, noise: Floats | float = NOISE,
-         stated: float = 1.0, force: Floats | None = None) -> Case:
+         scatter: float = 0.0, stated: float = 1.0, force: Floats | None = None) -> Case:
     """
     Draw a sensor and its poses.
 
@@ -136,6 +139,8 @@ def draw(rng: np.random.Generator, count: int, kind: str = '10', *, noise: Float
         Number of parameters of the sensor.
     noise : float or (count,) array
         Standard deviation of a pose mean, by axis [g].
+    scatter : float
+        Standard deviation of a pose beyond this noise, which its samples do not show [g].
     stated : float
         Ratio of the noise that the poses state to their real noise.
     force : (count, 3) array, optional
@@ -145,11 +150,12 @@ def draw(rng: np.random.Generator, count: int, kind: str = '10', *, noise: Float
     sensor = draw_sensor(rng, kind)
     force = spread(count, rng) if force is None else force
     each = np.broadcast_to(np.asarray(noise, float), (count,))[:, np.newaxis]
+    true = np.hypot(each, scatter)
     measured = np.sqrt(rng.chisquare(SAMPLES - 1, size=(count, 3)) / (SAMPLES - 1))
-    columns = {'reading': sensor.reading(force) + each * rng.normal(size=(count, 3)),
+    columns = {'reading': sensor.reading(force) + true * rng.normal(size=(count, 3)),
                'std': stated * each * np.sqrt(SAMPLES) * measured,
                'count': np.full(count, float(SAMPLES))}
-    return Case(sensor, Poses(columns, numbered(columns)), force, np.zeros(count))
+    return Case(sensor, Poses(columns, numbered(columns)), force, np.zeros(count), true[:, 0])
 
 
 def knock(case: Case, rng: np.random.Generator, count: int, size: float = 0.05) -> Case:
