@@ -118,6 +118,13 @@ def test_poses_that_scatter_alike_have_weights_alike_and_true_deviations():
     assert lost == 0
 
 
+def test_models_9_and_10_of_poses_that_scatter_have_the_same_deviations():
+    poses = scattering(0, 7e-4)[1]
+    deviations = [np.sqrt(np.diag(fit_poses(poses, G, model=name).covariance)[:3])
+                  for name in ('9', '10')]
+    assert deviations[0] == pytest.approx(deviations[1], rel=0.02)
+
+
 def test_a_scatter_is_estimated_where_the_noise_differs():
     sizes = [scatter_of(judge(model, poses)).size_g
              for model, poses in map(scattering, range(10), [7e-4] * 10)]

@@ -275,17 +275,18 @@ def _fit_norm(name: str, poses_g: Poses) -> tuple[Fit, Indices]:
         raise RefusedFitError(
             f'the {len(poses_g)} poses are not on an ellipsoid, but model {name} needs one',
             f'{TAKE_ALL_SIDES}, and hold it still in each') from None
-    return _in_own_axes(name, fit, poses_g.take(kept)), kept
+    return _in_own_axes(name, fit), kept
 
 
 def _estimated(name: str, poses_g: Poses) -> Fit:
-    return _in_own_axes(name, estimate(start_of(MODELS[name].norm, poses_g.reading), poses_g),
-                        poses_g)
+    return _in_own_axes(name, estimate(start_of(MODELS[name].norm, poses_g.reading), poses_g))
 
 
-def _in_own_axes(name: str, fit: Fit, poses_g: Poses) -> Fit:
+def _in_own_axes(name: str, fit: Fit) -> Fit:
     """Return a fit in the axes of its model: those of model 9 are fixed to the sensing axes."""
-    return _in_sensing_axes(fit.model.linear_part, poses_g) if MODELS[name].sensing_axes else fit
+    if not MODELS[name].sensing_axes:
+        return fit
+    return _in_sensing_axes(fit.model.linear_part, fit.poses_g)
 
 
 def _in_sensing_axes(linear_part: tuple[Floats, Floats], poses_g: Poses) -> Fit:
