@@ -210,17 +210,19 @@ class State:
     @property
     def residual(self) -> Floats:
         """(m,) array, residuals of the equations with all values fitted."""
-        return self.linear.residual
+        return self.linear.residual if self.fit.beside is None else self.fit.residual
 
-    @property
+    @cached_property
     def rss(self) -> float:
         """Sum of squared residuals."""
-        return self.linear.base_rss
+        return float(self.residual @ self.residual)
 
     @property
     def held_out(self) -> Floats:
         """(m,) array, each residual if its own equation is left out of the fit (PRESS)."""
-        return held_out(self.residual, 1.0 - np.sum(self.linear.onto ** 2, axis=1))
+        beside = self.fit.beside
+        linear = self.linear if beside is None else linearised(beside, self.model.effects)
+        return held_out(self.residual, 1.0 - np.sum(linear.onto ** 2, axis=1))
 
     @property
     def dof(self) -> int:
