@@ -257,32 +257,33 @@ def fit_norm(name: str, poses_g: Poses) -> tuple[Fit, Indices]:
     Raise `NotConvergedError` if they are not on an ellipsoid.
 
     """
-    found = _fit_norm(name, poses_g)
-    without, out = scatter_of(found[0]), len(poses_g) - len(found[1])
-    if not without.size_g or not (without.shows or out):
+    found, everyone = _fit_norm(name, poses_g), np.arange(len(poses_g))
+    first, out = scatter_of(found[0]), len(everyone) - len(found[1])
+    if not first.size_g or not (first.shows or out):
         return found
-    least, first = without.without + _OF_OUTLIER * out, found
-    everyone = np.arange(len(poses_g))
-    for fit, kept in (first, (_fit(name, poses_g, everyone), everyone))[:2 if out else 1]:
-        if fit is None:
+    least = first.without + _OF_OUTLIER * out
+    for kept in (found[1], everyone) if out else (everyone,):
+        try:
+            other, scatter = _beside_scatter(name, poses_g, kept)
+        except NotConvergedError:
             continue
-        beside, scatter = _beside_scatter(name, poses_g, fit, kept)
-        deviance = scatter.deviance + _OF_OUTLIER * (len(poses_g) - len(beside[1]))
+        deviance = scatter.deviance + _OF_OUTLIER * (len(everyone) - len(other[1]))
         if scatter.shows and deviance < least:
-            found, least = beside, deviance
+            found, least = other, deviance
     return found
 
 
-def _beside_scatter(name: str, poses_g: Poses, fit: Fit, kept: Indices
+def _beside_scatter(name: str, poses_g: Poses, kept: Indices
                     ) -> tuple[tuple[Fit, Indices], Scatter]:
-    """Fit poses and their scatter in turn, from that beside a fit, and without the outliers."""
-    scatter, size = scatter_of(fit), 0.0
+    """Fit poses without the outliers, and their scatter, in turn; at first to those kept."""
+    now = poses_g.take(kept)
+    fit, size = estimate(start_of(name, now.reading), now), 0.0
     for _ in range(_ROUNDS):
+        scatter = scatter_of(fit if not size else judge(fit.model, poses_g.take(kept)))
         if abs(scatter.size_g - size) <= _ALIKE * size:
             break
         size = scatter.size_g
         fit, kept = _fit_norm(name, beside_scatter(poses_g, size))
-        scatter = scatter_of(judge(fit.model, poses_g.take(kept)))
     return (fit, kept), scatter
 
 
