@@ -21,7 +21,6 @@ the noise is less probable.
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 
 from .fit import Fit
 from ..table import Poses
@@ -36,11 +35,11 @@ _LEAST_DOF = 8
 _USUAL = 3.0
 """Scale of the prior of τ, relative to the median noise."""
 
-_RANGE = 7.0
-_STEP = 0.02
-"""Range of log τ around the logarithm of the median noise, and its largest error."""
+_TRIED = np.arange(-7.0, 7.1, 0.25)
+"""Logarithms of τ that are tried, relative to the median noise. Between them, the deviance is
+nearly a parabola."""
 
-_ENOUGH = 2000
+_ENOUGH = 1000
 """Number of equations from which τ is estimated; more are not needed."""
 
 
@@ -79,37 +78,42 @@ def scatter_of(fit: Fit) -> Scatter:
     count = len(sigma) - columns.shape[1]
     if not fit.noise_known or count < _LEAST_DOF:
         return Scatter(0.0, 0.0, 0.0)
-    equations = _Weighted(fit.residual[few] * sigma, np.linalg.qr(columns)[0], sigma ** 2)
-    size, squares = equations.beside(0.0)
-    factor = max(squares / count, 1.0)
-    without = size + count * float(np.log(factor)) + squares / factor
     middle = float(np.median(sigma))
+    more = np.append(0.0, (middle * np.exp(_TRIED)) ** 2)
+    size, squares = _deviances(fit.residual[few] * sigma, np.linalg.qr(columns)[0],
+                               sigma ** 2 + more[:, np.newaxis])
+    factor = max(float(squares[0]) / count, 1.0)
+    without = float(size[0] + count * np.log(factor) + squares[0] / factor)
     if factor == 1.0:
         return Scatter(0.0, without, without)
-
-    def deviance(log: float) -> float:
-        ratio = float(np.exp(log))
-        prior = 2.0 * float(np.log1p((ratio / _USUAL) ** 2))
-        return sum(equations.beside((middle * ratio) ** 2)) + prior
-
-    found = scipy.optimize.minimize_scalar(deviance, bounds=(-_RANGE, _RANGE),
-                                           options={'xatol': _STEP})
-    return Scatter(middle * float(np.exp(found.x)), float(found.fun), without)
+    prior = 2.0 * np.log1p((np.exp(_TRIED) / _USUAL) ** 2)
+    log, least = _lowest(size[1:] + squares[1:] + prior)
+    return Scatter(middle * float(np.exp(log)), least, without)
 
 
-class _Weighted(NamedTuple):
-    """Residuals (m,) [g], an orthonormal basis (m, q) of the derivatives, and variances (m,)."""
+def _deviances(residual: Floats, onto: Floats, variance: Floats) -> tuple[Floats, Floats]:
+    """
+    Return the (r,) logarithms of the determinants, and weighted squares, of the module.
 
-    residual: Floats
-    onto: Floats
-    variance: Floats
+    `residual` (m,) and the orthonormal basis `onto` (m, q) of the derivatives are in g, and
+    `variance` is (r, m).
 
-    def beside(self, more: float) -> tuple[float, float]:
-        """Return the determinants and the weighted squares of the module for more variance."""
-        variance = self.variance + more
-        weight = 1.0 / np.sqrt(variance)
-        basis, triangle = np.linalg.qr(self.onto * weight[:, np.newaxis])
-        left = self.residual * weight
-        left = left - basis @ (basis.T @ left)
-        size = np.sum(np.log(variance)) + 2.0 * np.sum(np.log(np.abs(np.diag(triangle))))
-        return float(size), float(left @ left)
+    """
+    weight, count = 1.0 / variance, onto.shape[1]
+    products = (onto[:, :, np.newaxis] * onto[:, np.newaxis]).reshape(len(onto), count ** 2)
+    normal = (weight @ products).reshape(len(weight), count, count)
+    side = (residual * weight) @ onto
+    explained = np.sum(side * np.linalg.solve(normal, side[..., np.newaxis])[..., 0], axis=1)
+    return (np.sum(np.log(variance), axis=1) + np.linalg.slogdet(normal)[1],
+            weight @ residual ** 2 - explained)
+
+
+def _lowest(deviance: Floats) -> tuple[float, float]:
+    """Return where in `_TRIED` a deviance is lowest, and its value there."""
+    at = int(np.clip(np.argmin(deviance), 1, len(deviance) - 2))
+    before, here, after = deviance[at - 1:at + 2]
+    slope, bend = (after - before) / 2.0, max(before - 2.0 * here + after, 1e-12)
+    shift = float(np.clip(-slope / bend, -1.0, 1.0))
+    step = float(_TRIED[1] - _TRIED[0])
+    return (float(_TRIED[at]) + shift * step,
+            float(here + slope * shift + bend * shift ** 2 / 2.0))
