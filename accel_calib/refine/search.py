@@ -154,8 +154,7 @@ def search(poses_g: Poses, base: Model, also: tuple[str, ...] = ()) -> Found:
     found = _search(poses_g, base, also)
     for again in (_with_own_noise, _with_scatter):
         found = again(found, poses_g, base, also)
-    if found.walk is None:
-        found = replace(found, base=_weighted(found.base), final=_weighted(found.final))
+    found = replace(found, base=_weighted(found.base), final=_weighted(found.final))
     return replace(found, outliers=everyone[found.outliers], clipped=clip, grid_g=grid,
                    with_clipped=whole)
 
