@@ -75,8 +75,9 @@ COLUMNS: dict[str, Column] = {
     'label': Column(('label',), '', 'free text'),
     'doubtful': Column(('doubtful',), '',
                        '1: the sensor may have moved, according to later rests'),
-    'scatter': Column(('scatter_x', 'scatter_y', 'scatter_z'), 'unit of the reading',
-                      'standard deviation of a pose beyond the noise of its mean', made=True),
+    'own_scatter': Column(('own_scatter_x', 'own_scatter_y', 'own_scatter_z'),
+                          'unit of the reading', 'standard deviation of a pose beyond the noise '
+                          'of its mean', made=True),
     'new': Column(('new',), '', '1 for poses taken since a stored calibration, 0 for its own',
                   made=True),
 }
@@ -301,7 +302,7 @@ class Poses(Table):
         if 'std' not in self or 'count' not in self:
             return None
         noise: Floats = self['std'] / np.sqrt(self['count'])[:, np.newaxis]
-        return np.hypot(noise, self['scatter']) if 'scatter' in self else noise
+        return np.hypot(noise, self['own_scatter']) if 'own_scatter' in self else noise
 
     def as_recording(self) -> Recording:
         """Return the rows as samples; they have times."""

@@ -217,8 +217,8 @@ def _by_norm(poses: Poses, units: Units, model: str, method: Method) -> tuple[Ca
         largest = list(dilutions)[-1]
         fits[largest], among = _fit_norm(largest, poses_g.take(kept))
         kept = kept[among]
-        if 'scatter' in fits[largest].poses_g:
-            poses_g = beside_scatter(poses_g, fits[largest].poses_g['scatter'][0, 0])
+        if 'own_scatter' in fits[largest].poses_g:
+            poses_g = beside_scatter(poses_g, fits[largest].poses_g['own_scatter'][0, 0])
     left, used = poses_g.take(kept), directions[kept]
     noise = pose_noise(left.noise, used)
     if len(kept) < len(poses_g):

@@ -278,9 +278,9 @@ def judge(model: Model, poses_g: Poses, ties: Floats | None = None) -> Fit:
 
 def stated(fit: Fit) -> Fit:
     """Return a fit beside a scatter as one with the measured noise, except its covariance."""
-    if 'scatter' not in fit.poses_g:
+    if 'own_scatter' not in fit.poses_g:
         return fit
-    measured_g = fit.poses_g.without_columns('scatter')
+    measured_g = fit.poses_g.without_columns('own_scatter')
     return replace(judge(fit.model, measured_g, fit.ties), at_bound=fit.at_bound, beside=fit)
 
 

@@ -253,7 +253,7 @@ def fit_norm(name: str, poses_g: Poses) -> tuple[Fit, Indices]:
     Fit model 4, 7 or 10 to poses in g of unknown orientation, without the outliers.
 
     Return the fit and the (k,) indices of the poses used. The poses are at least as many as free
-    parameters. If they scatter beyond their noise, those of the fit have the column ``scatter``.
+    parameters. If they scatter beyond their noise, those of the fit state it (``own_scatter``).
     Raise `NotConvergedError` if they are not on an ellipsoid.
 
     """

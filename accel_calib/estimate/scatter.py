@@ -67,7 +67,7 @@ class Scatter(NamedTuple):
 
 def beside_scatter(poses_g: Poses, size_g: float) -> Poses:
     """Return poses with a scatter [g] in addition to their noise."""
-    return poses_g.with_columns(scatter=np.full(poses_g.reading.shape, size_g))
+    return poses_g.with_columns(own_scatter=np.full(poses_g.reading.shape, size_g))
 
 
 def scatter_of(fit: Fit) -> Scatter:

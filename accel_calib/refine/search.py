@@ -180,7 +180,7 @@ def _with_own_noise(found: Found, poses_g: Poses, base: Model, also: tuple[str, 
         return found
     noise = poses_g['std'] / np.sqrt(poses_g['count'])[:, np.newaxis]
     scatter = noise * np.sqrt(factor - 1.0)[:, np.newaxis]
-    return _beside(poses_g.with_columns(scatter=scatter), base, also)
+    return _beside(poses_g.with_columns(own_scatter=scatter), base, also)
 
 
 def _with_scatter(found: Found, poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
