@@ -34,7 +34,7 @@ from accel_calib.cli.options import in_one_line
 from accel_calib.cli.output import Output, shown
 from accel_calib.compare import NAMES as PARAMETER_NAMES, rotation_free
 from accel_calib.compare.agreement import (
-    on_one_scale, outlier, p_values, Runs, Scatter, scatter_of)
+    on_one_scale, outlier, p_values, Repeatability, repeatability_of, Runs)
 from accel_calib.compare.drift import change, is_over, MEMORY as DRIFT_MEMORY
 from accel_calib.disk import check_regular, previous
 from accel_calib.effects import (
@@ -76,6 +76,7 @@ from accel_calib.pipeline import (
     thermally_calibrated)
 from accel_calib.refine import base as refine_base
 from accel_calib.refine.base import clipped, grid_step, off_grid, sampled, unclipped
+from accel_calib.refine.beam import accepted, explored, reshaped
 from accel_calib.refine.curves import (
     _grown as grown_curve, _rss_beside as rss_beside, best_curve, Curve, Near, probabilities,
     Process, process_of, SIGNIFICANT, Walk, walk_beside)
@@ -83,8 +84,7 @@ from accel_calib.refine.linear import (
     _RARE as RARE, Block, LEVEL as REFINE_LEVEL, Linear, outside_of, Set, with_outliers)
 from accel_calib.refine.plan import _levels as levels_of, NOTHING as NOTHING_TO_PLAN
 from accel_calib.refine.search import (
-    _is_better as is_better_than_walk, _less as less, accepted, explored, reshaped,
-    search as search_effects)
+    _is_better as is_better_than_walk, _less as less, search as search_effects)
 from accel_calib.refine.state import beginning, candidates, fitted_state, linearised, WORTH
 from accel_calib.refine.steps import advice_for
 from accel_calib.report.page import axis_figures, snippets

@@ -167,7 +167,7 @@ class CommonScale:
 
 
 @dataclass(frozen=True)
-class Scatter:
+class Repeatability:
     """
     How well the poses of a calibration repeat.
 
@@ -184,7 +184,7 @@ class Scatter:
     belief: float
 
 
-def on_one_scale(runs: Sequence[Scatter]) -> CommonScale:
+def on_one_scale(runs: Sequence[Repeatability]) -> CommonScale:
     """Return the covariances of calibrations of one sensor on a common scale."""
     factors, noisier, dofs = np.ones(len(runs)), [], []
     for measured in (True, False):  # without measured noise, chi² has no unit
@@ -199,7 +199,7 @@ def on_one_scale(runs: Sequence[Scatter]) -> CommonScale:
     return CommonScale(scaled, min(dofs, default=np.inf), tuple(sorted(noisier)))
 
 
-def _pooled(runs: Sequence[Scatter]) -> tuple[float, float, list[int]]:
+def _pooled(runs: Sequence[Repeatability]) -> tuple[float, float, list[int]]:
     """Pool runs; return the scale, its degrees of freedom, and the noisier runs."""
     pool, worse = [run for run in runs if run.dof == 0], []
     for k in sorted((k for k, run in enumerate(runs) if run.dof > 0),
@@ -213,7 +213,7 @@ def _pooled(runs: Sequence[Scatter]) -> tuple[float, float, list[int]]:
     return (*_scale(pool), worse)
 
 
-def _scale(pool: Sequence[Scatter]) -> tuple[float, float]:
+def _scale(pool: Sequence[Repeatability]) -> tuple[float, float]:
     """Return the scale of these runs and its degrees of freedom; 1 and 0 if there are none."""
     chi2, dof = sum(run.chi2 for run in pool), sum(run.dof for run in pool)
     belief = sum(run.belief for run in pool)
@@ -222,15 +222,15 @@ def _scale(pool: Sequence[Scatter]) -> tuple[float, float]:
     return ((belief + chi2) / (belief + dof) if belief + dof > 0 else 1.0), belief + dof
 
 
-def scatter_of(calibration: Calibration) -> Scatter:
+def repeatability_of(calibration: Calibration) -> Repeatability:
     """Return how well the poses of a calibration repeat."""
     fit = _fit_of(calibration)
     free = int(np.linalg.matrix_rank(fit.columns))
     # Over its own poses, the variances of a fit sum to the number of free parameters.
     total = float(np.einsum('mp,pq,mq->', fit.columns, calibration.covariance, fit.columns))
     belief = fit.variance_dof - fit.dof if fit.noise_known else 0.0
-    return Scatter(calibration.covariance, fit.chi2, fit.equations.count - free,
-                   total / free if free else 0.0, belief)
+    return Repeatability(calibration.covariance, fit.chi2, fit.equations.count - free,
+                         total / free if free else 0.0, belief)
 
 
 def _fit_of(calibration: Calibration) -> Fit:
@@ -249,13 +249,13 @@ class Comparable:
     A calibration prepared for comparisons with others of its sensor.
 
     `sure` is the fit of the largest model of the sensor to the same poses, or the calibration
-    itself, and `scatter` is how well the poses of `sure` repeat.
+    itself, and `repeatability` that of the poses of `sure`.
 
     """
 
     calibration: Calibration
     sure: Calibration
-    scatter: Scatter
+    repeatability: Repeatability
 
 
 def comparable(calibrations: Sequence[Calibration]) -> tuple[Comparable, ...]:
@@ -264,7 +264,7 @@ def comparable(calibrations: Sequence[Calibration]) -> tuple[Comparable, ...]:
     names = {run.form.norm for run in calibrations}
     largest = max(names.intersection(NORM_MODELS), key=NORM_MODELS.index, default=NORM_MODELS[0])
     every = [(run, _fitted_with(largest, run)) for run in calibrations]
-    return tuple(Comparable(run, sure, scatter_of(sure)) for run, sure in every)
+    return tuple(Comparable(run, sure, repeatability_of(sure)) for run, sure in every)
 
 
 def _refuse_if_unlike(calibrations: Sequence[Calibration]) -> None:

@@ -241,7 +241,7 @@ def compare(calibrations: Sequence[Calibration]) -> Comparison:
 
 def compare_runs(given: Sequence[Comparable]) -> Comparison:
     """Test whether calibrations that were prepared together agree, two or more of them."""
-    scaled = on_one_scale([run.scatter for run in given])
+    scaled = on_one_scale([run.repeatability for run in given])
     prepared = _prepared(given, scaled.covariances)
     names = tuple(dict.fromkeys(name for run in prepared for name in run.free.names))
     values = np.array([_into(names, run.free, run.free.values) for run in prepared])

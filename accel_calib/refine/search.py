@@ -6,8 +6,8 @@ The search for missing effects.
 
 1. The effects of the ladder (offset, gain, gain by axis, cross-axis) that the base lacks are
    added.
-2. A beam search finds the set of effects, outliers and a random walk of the offset with the best
-   score, in the equations near the model.
+2. A beam search (`.beam`) finds the set of effects, outliers and a random walk of the offset with
+   the best score, in the equations near the model.
 3. All values are fitted again, without the outliers, and the equations are set up near the new
    model. Steps 2 and 3 are repeated until the set remains the same.
 4. If the named effects explain only a small part of the residual above the noise, they are
@@ -20,18 +20,11 @@ The search for missing effects.
 
 A set is kept only if its fit converged, the cost decreased and its values are plausible.
 
-**Beam search.** It keeps the best few sets by the score of `.linear`, and extends each by one
-effect at a time. After each extension the shapes are chosen again, and the outliers are found
-again among all poses, with and without the earlier ones. So a pair may be found of which neither
-effect is visible alone, and an effect is not judged by poses that were knocked. A set is accepted
-only if each of its effects is significant beside the others. With a walk of the offset
-(`.curves`), the search is repeated with equations whitened for it, and the score includes it.
-
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -40,17 +33,18 @@ from numpy.typing import NDArray
 import scipy
 
 from .base import causes, Clipped, off_grid, unclipped
+from .beam import accepted, explored, is_all_noise, is_significant, reshaped
 from .curves import (
     best_curve, CLEARLY, Curve, Near, one_curve, Process, process_of, SIGNIFICANT, Walk,
     walk_beside)
-from .linear import Block, LEVEL, Linear, Set, with_outliers
+from .linear import LEVEL, Linear, Set
 from .state import (
-    beginning, Candidate, candidates, fitted_state, is_noise, left_open, linearised, State,
-    with_effect, without)
+    beginning, Candidate, candidates, fitted_state, left_open, linearised, State, with_effect,
+    without)
 from ..calibrate import has_usual_gains, with_previous
 from ..effects import (
-    CHANGES, covariate_names, effect_named, EFFECTS, empirical_parts, factors_of, fitted_places,
-    included, LADDER, linear_values, Model, parameter_names, WANDER)
+    CHANGES, covariate_names, effect_named, EFFECTS, empirical_parts, factors_of, included, LADDER,
+    linear_values, Model, parameter_names, WANDER)
 from ..estimate import beside_scatter, judge, kinds, scatter_of, stated
 from ..geometry import unit
 from ..table import Floats, Poses
@@ -78,13 +72,6 @@ positive, very strong). One over what changes slowly begins with half a wave, al
 _SEVERAL = 10.0
 """Each further effect of the same kind must raise the score by this: one unknown cause is more
 likely than several that act at once (Kass and Raftery 1995: very strong)."""
-
-_LEVEL_OF_GAP = 0.05
-"""`LEVEL` of an effect that explains all of a gap. A larger one names more of the small effects of
-few poses, and more where nothing is hidden and the noise is understated."""
-
-_JUST_NOISE = 0.1
-"""Probability of a larger sum of squares, above which the rest is just the measured noise."""
 
 _ALIKE = 0.5
 """Correlation of a quantity with itself, shifted in time, below which it counts as another one."""
@@ -501,21 +488,8 @@ def _is_predicted(near: Near, fitted: State) -> bool:
 def _without_weak(chosen: Set) -> Set | None:
     """Return the best set with one effect less that is not significant; None if all are."""
     return max((chosen.without(block) for block in chosen.blocks
-                if not _is_significant(chosen, block)),
+                if not is_significant(chosen, block)),
                key=lambda fewer: fewer.score, default=None)
-
-
-def _is_significant(chosen: Set, block: int) -> bool:
-    """
-    Return whether noise alone hardly makes an effect this good beside the others of a set.
-
-    An effect that leaves just the measured noise, where the others leave more, needs less.
-
-    """
-    left = chosen.linear.dof - chosen.parameters
-    fills_gap = (scipy.special.chdtrc(left, chosen.rss) > _JUST_NOISE
-                 and _leaves_gap(chosen.without(block)))
-    return chosen.probability(block) < (_LEVEL_OF_GAP if fills_gap else LEVEL)
 
 
 def _best_fit(near: Near, state: State, trial: _Trial) -> tuple[Near, State | None]:
@@ -542,7 +516,7 @@ def _best_near(linear: Linear, trial: _Trial, refused: set[frozenset[str]]) -> N
     process = trial.process(linear)
     best = Near(best_of(linear), linear, None, process)
     if process is None or (linear.worth and not any(_in_time(best))
-                           and _is_all_noise(best.chosen)):
+                           and is_all_noise(best.chosen)):
         return best
     return _with_walk(best, process, best_of)
 
@@ -558,7 +532,7 @@ def _with_walk(best: Near, process: Process, best_of: Callable[[Linear], Set]) -
         beside = best_of(walk.whitened(linear)).within(linear)
         tried.append(beside)
     most = best.chosen.score
-    if all(_in_time(best)) and not _is_all_noise(best.chosen):
+    if all(_in_time(best)) and not is_all_noise(best.chosen):
         most -= _TREND  # what changes with time only, and not as known, wanders
     for beside in tried:
         walk = walk_beside(beside, process)
@@ -571,15 +545,6 @@ def _with_walk(best: Near, process: Process, best_of: Callable[[Linear], Set]) -
 def _in_time(near: Near) -> list[bool]:
     """Return which of the chosen effects change with time."""
     return ['time' in each.entry.needs for each in near.chosen.entries]
-
-
-def _is_all_noise(chosen: Set) -> bool:
-    return is_noise(chosen.rss, chosen.linear.dof - chosen.parameters)
-
-
-def _leaves_gap(chosen: Set) -> bool:
-    """Return whether the noise is known and does not explain the rest."""
-    return chosen.linear.worth > 0.0 and not _is_all_noise(chosen)
 
 
 def _at(linear: Linear, names: tuple[str, ...], out: tuple[int, ...], process: Process | None,
@@ -645,172 +610,3 @@ def _of_a_turn(state: State) -> set[str]:
 def _walk(state: State, near: Near) -> Walk | None:
     process = None if near.walk is None else process_of(state.linear, state.poses_g)
     return None if process is None else walk_beside(Set.of(state.linear), process)
-
-
-# ----------------------------------------------------------------------------- the beam
-
-_LARGEST = 5
-"""Largest number of effects in a set."""
-
-_WIDTH = 4
-"""Number of sets that are extended."""
-
-_BRANCHES = 5
-"""Number of effects by which a set is extended."""
-
-_TESTED = 6
-"""Number of extended sets whose shapes and outliers are found again."""
-
-_AS_GOOD = 2.0
-"""Within this difference from the best score, the set with fewest values wins."""
-
-_NEARLY = 0.3
-"""Smallest share of the score of a set that a reshaped set has before its shape is fitted."""
-
-_DECIMALS = 6
-"""Decimals of the scores that sets are sorted by: not the last bit of a processor decides, and
-equal scores keep their order."""
-
-_PATIENCE = 2
-"""The search ends if the best score has not risen for this number of extensions."""
-
-
-def explored(linear: Linear) -> list[Set]:
-    """
-    Return the sets visited, the best score first.
-
-    The search starts from no effect, and again from all changes of V and W at once: if a stored
-    fit has absorbed an effect, only all of them beside it are better than effects that imitate it.
-
-    """
-    names = [name for name in linear.numbers_of if name in CHANGES]
-    changes = [int(linear.numbers_of[name][0]) for name in names if name not in included(names)]
-    starts = {(), tuple(changes)}
-    return _distinct(found for start in starts for found in _from(Set.of(linear, start)))
-
-
-def _from(start: Set) -> list[Set]:
-    """Return the sets visited when effects are added to a set, in any order."""
-    front = _distinct(with_outliers([start]))
-    visited = list(front)
-    best, idle = max(chosen.score for chosen in front), 0
-    for _ in range(_LARGEST):
-        tested = (_with_best_shapes(new) for new in _larger(front))
-        front = _distinct(with_outliers(tested))[:_WIDTH]
-        if not front:
-            break
-        visited += [*front, *(fewer for new in front[:3] for fewer in _fewer(new))]
-        idle = 0 if front[0].score > best else idle + 1
-        best = max(best, front[0].score)
-        if idle == _PATIENCE:
-            break
-    return visited
-
-
-def _fewer(chosen: Set) -> list[Set]:
-    """Return a set of several effects without each of them."""
-    return [chosen.without(block) for block in chosen.blocks if len(chosen.blocks) > 1]
-
-
-def reshaped(chosen: Set) -> list[Set]:
-    """
-    Return sets with one effect less and the best searched shape of another, or with its own.
-
-    Between the shapes that are tried, two effects may imitate one: an offset that changes with
-    temperature and with its rate is one that lags. An effect that was left out may also return
-    with the best shape beside the others.
-
-    """
-    blocks, fitted = chosen.linear.blocks, dict[str, list[int]]()
-    for number, block in enumerate(blocks):
-        if block.searched and fitted_places(block.entry, block.shape):
-            fitted.setdefault(block.effect, []).append(number)
-    sets = []
-    for less in _fewer(chosen):
-        for effect, own in fitted.items():
-            others = less.instead(number for number in less.blocks
-                                  if blocks[number].effect != effect)
-            if _is_barred(blocks[own[0]], others.entries):
-                continue
-            gain, _ = others.gains(effect)
-            new = others.extended(max(own, key=lambda number: gain[number]))
-            if new.score > _NEARLY * chosen.score:
-                sets.append(new)
-    return sets
-
-
-def accepted(visited: Iterable[Set]) -> Iterator[Set]:
-    """
-    Yield the sets of `explored` whose effects are significant, the preferred one first.
-
-    The set without effects is not preferred to a better one if it leaves more than the noise.
-
-    """
-    left = list(visited)
-    while left:
-        near: list[Set] = []
-        for chosen in left:
-            if near and chosen.score < near[0].score - _AS_GOOD:
-                break
-            if all(_is_significant(chosen, block) for block in chosen.blocks):
-                near.append(chosen)
-        if not near:
-            return
-        best = min(near, key=lambda chosen: (
-            not chosen.blocks and _leaves_gap(chosen), chosen.parameters,
-            any('new' in each.entry.needs for each in chosen.entries), -chosen.score))
-        yield best
-        left = [chosen for chosen in left if chosen is not best]
-
-
-def _larger(front: list[Set]) -> list[Set]:
-    """Return the best sets with one effect more than those of a front."""
-    likely = sorted((each for before in front for each in _branches(before)),
-                    key=lambda each: -each[0])
-    front[0].linear.products_with([number for _, _, number in likely[:_TESTED]])  # at once: fast
-    best: list[Set] = []
-    for most, before, number in likely:
-        if len(best) == _TESTED and best[-1].score > most:
-            break
-        best = _distinct([*best, before.extended(number)])[:_TESTED]
-    return best
-
-
-def _branches(before: Set) -> Iterator[tuple[float, Set, int]]:
-    """Yield a set with the block of one more effect, and the largest score that they can have."""
-    linear, scores = before.linear, before.scores_beside
-    best: dict[str, tuple[float, int]] = {}
-    for effect, numbers in linear.numbers_of.items():
-        number = int(numbers[np.argmax(scores[numbers])])
-        if scores[number] > -np.inf and not _is_barred(linear.blocks[number], before.entries):
-            best[effect] = round(float(scores[number]), _DECIMALS), number
-    for score, number in sorted(best.values(), key=lambda each: -each[0])[:_BRANCHES]:
-        yield score + before.unusual, before, number
-
-
-def _is_barred(block: Block, present: Iterable[Block]) -> bool:
-    """Return whether one of the effects present is that of a block, contains it or is in it."""
-    return any(block.effect == other.effect or block.effect in other.entry.includes
-               or other.effect in block.entry.includes for other in present)
-
-
-def _with_best_shapes(chosen: Set) -> Set:
-    """Choose the shape of each effect again, with the others as they are."""
-    for place, number in enumerate(chosen.blocks[:-1]):
-        effect = chosen.effects[place]
-        if len(chosen.linear.numbers_of[effect]) == 1:
-            continue
-        before, after = chosen.blocks[:place], chosen.blocks[place + 1:]
-        best = chosen.instead((*before, *after)).best_of(effect)
-        if best != number:
-            new = chosen.instead((*before, best, *after))
-            chosen = max(chosen, new, key=lambda either: either.score)
-    return chosen
-
-
-def _distinct(sets: Iterable[Set]) -> list[Set]:
-    """Return the best set of each list of names and outliers, the best score first."""
-    best: dict[tuple[frozenset[str], tuple[int, ...]], Set] = {}
-    for chosen in sorted(sets, key=lambda chosen: -round(chosen.score, _DECIMALS)):
-        best.setdefault((frozenset(chosen.effects), chosen.out), chosen)
-    return list(best.values())

@@ -17,8 +17,8 @@ from accel_calib.refine import refine
 from accel_calib.table import Poses
 from accel_calib.units import Units
 from inside import (
-    carried, kinds, Linear, Model, probabilities, rotation_free, scatter_of, search_effects, Set,
-    spread_directions, unseen_mistakes)
+    carried, kinds, Linear, Model, probabilities, repeatability_of, rotation_free, search_effects,
+    Set, spread_directions, unseen_mistakes)
 import numpy as np
 
 UP = spread_directions(4)
@@ -72,7 +72,8 @@ def of_calibration(calibration: Calibration) -> dict[str, Any]:
         'spread': attempt(lambda: spread(calibration.force_covariance(force, known))),
         'free': free if isinstance(free, Exception) else {
             **those(free, 'values axes'), 'slope': np.linalg.norm(free.slope, axis=1)},
-        'scatter': those(scatter_of(calibration), 'chi2 dof stated belief') if effects else '',
+        'scatter': (those(repeatability_of(calibration), 'chi2 dof stated belief')
+                    if effects else ''),
         'repeats': Drift(calibration).repeats ** 0.5, 'outside': outside(calibration, wide),
         'partial': carried(calibration) if calibration.method == 'prior' and effects else ''}
 

@@ -25,7 +25,7 @@ from golden.figures import attempt, of_expected, of_fit, those
 from inside import (
     axes_of, believable, change, distinct, doubts_about_flat, equations, fault_of, is_over,
     measured, missing_poses, Model, mounting, mounting_figures, on_one_scale, originals, outlier,
-    p_values, posterior, refuse_if_unfit, rounding_left, Runs, sampled, Scatter, shape_words,
+    p_values, posterior, refuse_if_unfit, Repeatability, rounding_left, Runs, sampled, shape_words,
     sound_rows, spread_directions, unit, unseen, with_heading, without_knocked)
 import numpy as np
 
@@ -355,7 +355,7 @@ def comparisons() -> Any:
         return [made.squared, made.least, made.p_value, p_values(made), outlier(made)]
 
     def scaled(chi2s: Any, dofs: Any, beliefs: Any) -> Any:
-        found = on_one_scale([Scatter(np.eye(1), *each) for each in zip(
+        found = on_one_scale([Repeatability(np.eye(1), *each) for each in zip(
             chi2s, dofs, (1.2, 0.8, 0.0), beliefs, strict=True)])
         return [np.ravel(found.covariances), found.dof, found.noisier]
 
