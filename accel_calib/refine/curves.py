@@ -69,8 +69,9 @@ CLEARLY = 10.0
 _LEAST_OUTSIDE = 1e-9
 """Added to the squares of modes outside of the base, so that their equations have a solution."""
 
-_HELD_OUT = 0.9
-"""Largest ratio of the held-out sum of squares with and without a curve."""
+_HELD_OUT = 0.7
+"""Smallest part of the held-out squares above the noise that a curve explains. Chance also finds a
+curve of some quantity for an offset that wanders, which explains less."""
 
 _PROPORTION = 2.0
 """Evidence for a proportion of two effects that makes them parts of one curve (Kass and Raftery
@@ -229,7 +230,7 @@ def _accepted(score: float, chosen: Set, tried: int) -> Curve | None:
         each.tried for each in chosen.entries))
     if p_value > LEVEL:
         return None
-    if _held_out(chosen) > _HELD_OUT * _held_out(nothing):
+    if _held_out(chosen) > (1.0 - _HELD_OUT) * _held_out(nothing):
         return None
     blocks, first = sorted(chosen.blocks), chosen.entries[0]
     carrier, variable, _ = empirical_parts(first.effect)
@@ -240,11 +241,17 @@ def _accepted(score: float, chosen: Set, tried: int) -> Curve | None:
 
 
 def _held_out(chosen: Set) -> float:
-    """Return the sum of squares of the residuals, each predicted from the other equations."""
+    """
+    Return the sum of squares of the residuals, each predicted from the other equations.
+
+    It is without what the noise makes of it, if the noise is known.
+
+    """
     onto, residual = chosen.spanned
     own = 1.0 - np.sum(chosen.linear.onto ** 2, axis=1) - np.sum(onto ** 2, axis=1)
     kept = own > 1e-6  # not the outliers
-    return float(np.sum(held_out(residual[kept], own[kept]) ** 2))
+    squares = held_out(residual[kept], own[kept]) ** 2
+    return float(np.sum(squares - (1.0 / own[kept] if chosen.linear.worth else 0.0)))
 
 
 _NEAREST = 2

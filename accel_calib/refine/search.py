@@ -326,10 +326,10 @@ def _with_one_curve(found: Found, start: State, poses_g: Poses) -> Found | None:
 
 
 def _with_curve(found: Found, curve: Curve, start: State, poses_g: Poses) -> Found | None:
-    """Return what was found, with a curve; None if its fit fails or does not explain enough."""
+    """Return what was found, with a curve; None if its fit fails."""
     after = fitted_state(Model({**found.final.model.values, curve.name: curve.values}),
                          without(poses_g, curve.out))
-    if after is None or after.fit.at_bound or not _explains(found.final, after):
+    if after is None or after.fit.at_bound:
         return None
     out = np.array(curve.out, np.intp)
     return replace(found, base=_fitted_without(start, poses_g, curve.out), final=after, walk=None,
