@@ -54,6 +54,23 @@ def test_runs_of_one_sensor_agree_also_with_models_of_other_axes(models, sets, m
     assert alarms <= 0.1 * sets
 
 
+@pytest.mark.parametrize('differs', [0.0, 1.0])
+def test_runs_whose_poses_repeat_worse_than_their_samples_agree(differs):
+    alarms = 0
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        model, runs = sensor(rng), []
+        for _ in range(2):
+            noise = 1e-4 * np.exp(differs * rng.normal(size=(20, 1)))
+            poses = simulate_poses(model, attitudes(rng, 20), rng, noise_g=1e-9)
+            error = np.hypot(noise, 5e-4) * rng.normal(size=(20, 3))
+            poses = poses.with_columns(reading=poses.reading + error,
+                                       std=np.repeat(10.0 * noise, 3, axis=1))
+            runs.append(fit_poses(poses, G, model='10'))
+        alarms += not compare(runs).agree
+    assert alarms <= 3
+
+
 def test_the_spread_of_twenty_runs_matches_their_uncertainty():
     rng = np.random.default_rng(1001)
     found = compare(runs_of(sensor(rng), rng, 20, 24))

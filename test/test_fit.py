@@ -95,12 +95,12 @@ def test_noisy_poses_have_less_weight():
     assert weighted < 0.5 * equal
 
 
-def scattering(seed, scatter_g):
-    """Return a sensor and 60 poses whose noise differs, and which scatter beyond it."""
+def scattering(seed, scatter_g, count=60, differs=0.8):
+    """Return a sensor and poses whose noise differs, and which scatter beyond it."""
     rng = np.random.default_rng(seed)
-    model, noise = sensor(rng), 1.4e-4 * np.exp(0.8 * rng.normal(size=(60, 1)))
-    poses = simulate_poses(model, random_directions(60, rng), rng, noise_g=1e-9)
-    error = np.hypot(noise, scatter_g) * rng.normal(size=(60, 3))
+    model, noise = sensor(rng), 1.4e-4 * np.exp(differs * rng.normal(size=(count, 1)))
+    poses = simulate_poses(model, random_directions(count, rng), rng, noise_g=1e-9)
+    error = np.hypot(noise, scatter_g) * rng.normal(size=(count, 3))
     return model, poses.with_columns(reading=poses.reading + error,
                                      std=np.repeat(10.0 * noise, 3, axis=1))
 
@@ -116,6 +116,12 @@ def test_poses_that_scatter_alike_have_weights_alike_and_true_deviations():
         assert 'beyond_noise' in [each.kind for each in fit.noted]
     assert np.std(pulls) == pytest.approx(1.0, abs=0.2)
     assert lost == 0
+
+
+def test_few_poses_that_scatter_alike_are_no_outliers():
+    lost = [len(fit_poses(scattering(seed, 7e-4, 14, differs)[1], G, model='10').rejected)
+            for seed in range(20) for differs in (0.0, 0.8)]
+    assert sum(lost) <= 10
 
 
 def test_models_9_and_10_of_poses_that_scatter_have_the_same_deviations():

@@ -20,7 +20,8 @@ from all runs together,
 
 where the measured noise of the runs counts as b degrees of freedom (for each run as in
 `accel_calib.estimate.fit.Fit.variance`), unless the residuals contradict it. A run whose poses
-repeat significantly worse than those of the others keeps its own scale.
+repeat significantly worse than those of the others keeps its own scale, and so does one whose
+covariance was estimated beside a scatter (`accel_calib.estimate.scatter`).
 
 A smaller model assumes that the omitted effects are exactly zero, but `auto` omits effects that
 are hidden in the noise. The uncertainty of such a run is therefore that of the largest model of
@@ -54,7 +55,7 @@ import scipy
 from ..calibrate import Calibration, fit_unknown, in_g, NORM_MODELS, with_history
 from ..effects import Context, effect_named, Model, reading_of
 from ..errors import InputError, RefusedFitError
-from ..estimate import Fit, judge
+from ..estimate import Fit, judge, scatter_of
 from ..table import Floats
 from ..text import counted
 from ..units import STANDARD_GRAVITY
@@ -171,8 +172,9 @@ class Repeatability:
     """
     How well the poses of a calibration repeat.
 
-    `covariance` is (p, p), as stated for ``model.vector`` [g²], and `stated` is its factor. `chi2`
-    is the sum of the squared residuals over their variances. The measured noise counts as `belief`
+    `covariance` is (p, p), as stated for ``model.vector`` [g²], and `stated` is its factor on that
+    of the measured noise; 0 if it is no factor, but the covariance beside a scatter. `chi2` is the
+    sum of the squared residuals over their variances. The measured noise counts as `belief`
     degrees of freedom; 0 if it is not known.
 
     """
@@ -230,7 +232,7 @@ def repeatability_of(calibration: Calibration) -> Repeatability:
     total = float(np.einsum('mp,pq,mq->', fit.columns, calibration.covariance, fit.columns))
     belief = fit.variance_dof - fit.dof if fit.noise_known else 0.0
     return Repeatability(calibration.covariance, fit.chi2, fit.equations.count - free,
-                         total / free if free else 0.0, belief)
+                         0.0 if not free or scatter_of(fit).shows else total / free, belief)
 
 
 def _fit_of(calibration: Calibration) -> Fit:

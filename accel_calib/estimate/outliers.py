@@ -28,9 +28,11 @@ over the poses that are kept, with their noise s. The noise counts as f degrees 
 is a row whose hypothesis is at least `LEVEL` times as probable as that of the row left out. The
 covariance of a fit with rivals includes the difference to the fit of each rival.
 
-**Scatter.** Poses that repeat worse than their samples are no outliers. A scatter that all poses
-have (`.scatter`) is taken instead of some of the outliers if its likelihood is larger, with each
-outlier a mistake of up to 0.1 g of 2 % of the poses.
+**Scatter.** Poses that repeat worse than their samples are no outliers. Few poses hardly tell a
+mistake of one from a scatter of all, but a test with the measured noise finds a mistake in both
+cases. With each outlier a mistake of up to 0.1 g of 2 % of the poses, outliers are only left out
+if the likelihood of a scatter of all poses (`.scatter`), or of a factor on their noise, is not far
+larger.
 
 **Unchecked rows.** A pose with a leverage near 1 pulls the fit towards itself, so that its mistake
 does not show. The largest mistake that the test for outliers does not find is
@@ -52,7 +54,7 @@ import scipy
 from .closed_form import agreeing, start_of
 from .equations import belief_beside, belief_in
 from .fit import estimate, Fit, judge, NotConvergedError
-from .scatter import beside_scatter, Scatter, scatter_of
+from .scatter import beside_scatter, scatter_of
 from ..effects import MODELS, parameter_names
 from ..table import Poses
 from ..units import Floats, Indices
@@ -91,6 +93,10 @@ to first order; other rows are no rivals."""
 
 _OF_OUTLIER = 2.0 * math.log(0.1 / 0.02 / math.sqrt(2.0 * math.pi))
 """Deviance of an outlier: a mistake of up to 0.1 g, of 2 % of the poses."""
+
+_STRONG = 6.0
+"""Smallest evidence for a scatter of all poses, against outliers (Kass and Raftery 1995:
+strong)."""
 
 _ALIKE = 0.2
 """Relative change of a scatter after which it is found."""
@@ -258,33 +264,34 @@ def fit_norm(name: str, poses_g: Poses) -> tuple[Fit, Indices]:
 
     """
     found, everyone = _fit_norm(name, poses_g), np.arange(len(poses_g))
-    first, out = scatter_of(found[0]), len(everyone) - len(found[1])
-    if not first.size_g or not (first.shows or out):
+    if not found[0].noise_known:
         return found
-    least = first.without + _OF_OUTLIER * out
-    for kept in (found[1], everyone) if out else (everyone,):
-        try:
-            other, scatter = _beside_scatter(name, poses_g, kept)
-        except NotConvergedError:
-            continue
-        deviance = scatter.deviance + _OF_OUTLIER * (len(everyone) - len(other[1]))
-        if scatter.shows and deviance < least:
-            found, least = other, deviance
-    return found
+    best, least = _with_scatter(name, poses_g, *found)
+    if len(found[1]) < len(poses_g) and (fit := _fit(name, poses_g, everyone)) is not None:
+        whole, deviance = _with_scatter(name, poses_g, fit, everyone)
+        if deviance < least - _STRONG:
+            return whole
+    return best
 
 
-def _beside_scatter(name: str, poses_g: Poses, kept: Indices
-                    ) -> tuple[tuple[Fit, Indices], Scatter]:
-    """Fit poses without the outliers, and their scatter, in turn; at first to those kept."""
-    now = poses_g.take(kept)
-    fit, size = estimate(start_of(name, now.reading), now), 0.0
+def _with_scatter(name: str, poses_g: Poses, fit: Fit, kept: Indices
+                  ) -> tuple[tuple[Fit, Indices], float]:
+    """Return a fit, or that beside the scatter of its poses if it is better, and its deviance."""
+    scatter = scatter_of(fit)
+    best, least = (fit, kept), scatter.without + _OF_OUTLIER * (len(poses_g) - len(kept))
     for _ in range(_ROUNDS):
-        scatter = scatter_of(fit if not size else judge(fit.model, poses_g.take(kept)))
+        if not scatter.shows:
+            return best, least
+        size = scatter.size_g
+        try:
+            fit, kept = _fit_norm(name, beside_scatter(poses_g, size))
+        except NotConvergedError:
+            return best, least
+        scatter = scatter_of(judge(fit.model, poses_g.take(kept)))
         if abs(scatter.size_g - size) <= _ALIKE * size:
             break
-        size = scatter.size_g
-        fit, kept = _fit_norm(name, beside_scatter(poses_g, size))
-    return (fit, kept), scatter
+    deviance = scatter.deviance + _OF_OUTLIER * (len(poses_g) - len(kept))
+    return ((fit, kept), deviance) if scatter.shows and deviance < least else (best, least)
 
 
 def _fit_norm(name: str, poses_g: Poses) -> tuple[Fit, Indices]:

@@ -13,8 +13,8 @@ derivatives by the values [g], and W the inverse of the variances, twice its neg
 
     log |W⁻¹| + log |BᵀWB| + min_k (e - B k)ᵀW (e - B k)
 
-λ is at least 1, and τ has the prior of Cauchy (Gelman 2006): a scatter of more than a few times
-the noise is less probable.
+λ is at least 1. τ relative to the median noise, and √(λ - 1), have the prior of Cauchy (Gelman
+2006): a scatter of more than a few times the noise is less probable.
 
 """
 
@@ -26,18 +26,15 @@ from .fit import Fit
 from ..table import Poses
 from ..units import Floats
 
-_CLEARLY = 4.0
-"""Smallest evidence for a scatter: odds of 7 to 1 (Kass and Raftery 1995: positive)."""
-
-_LEAST_DOF = 8
-"""Degrees of freedom below which a scatter and a mistake in one pose look alike."""
+_CLEARLY = 2.0
+"""Smallest evidence for a scatter (Kass and Raftery 1995: positive)."""
 
 _USUAL = 3.0
-"""Scale of the prior of τ, relative to the median noise."""
+"""Scale of the prior of τ, relative to the median noise, and of √(λ - 1)."""
 
 _TRIED = np.arange(-7.0, 7.1, 0.25)
-"""Logarithms of τ that are tried, relative to the median noise. Between them, the deviance is
-nearly a parabola."""
+"""Logarithms of τ relative to the median noise, and of √(λ - 1), that are tried. Between them, the
+deviance is nearly a parabola."""
 
 _ENOUGH = 1000
 """Number of equations from which τ is estimated; more are not needed."""
@@ -76,19 +73,20 @@ def scatter_of(fit: Fit) -> Scatter:
     sigma = fit.equations.scale[fit.equations.pose[few]]
     columns = fit.columns[few] * sigma[:, np.newaxis]
     count = len(sigma) - columns.shape[1]
-    if not fit.noise_known or count < _LEAST_DOF:
+    if not fit.noise_known or count < 1:
         return Scatter(0.0, 0.0, 0.0)
     middle = float(np.median(sigma))
     more = np.append(0.0, (middle * np.exp(_TRIED)) ** 2)
     size, squares = _deviances(fit.residual[few] * sigma, np.linalg.qr(columns)[0],
                                sigma ** 2 + more[:, np.newaxis])
-    factor = max(float(squares[0]) / count, 1.0)
-    without = float(size[0] + count * np.log(factor) + squares[0] / factor)
-    if factor == 1.0:
-        return Scatter(0.0, without, without)
+    nothing = float(size[0] + squares[0])
+    if squares[0] <= count:
+        return Scatter(0.0, nothing, nothing)
     prior = 2.0 * np.log1p((np.exp(_TRIED) / _USUAL) ** 2)
+    factor = 1.0 + np.exp(2.0 * _TRIED)
+    without = _lowest(size[0] + count * np.log(factor) + squares[0] / factor + prior)[1]
     log, least = _lowest(size[1:] + squares[1:] + prior)
-    return Scatter(middle * float(np.exp(log)), least, without)
+    return Scatter(middle * float(np.exp(log)), least, min(nothing, without))
 
 
 def _deviances(residual: Floats, onto: Floats, variance: Floats) -> tuple[Floats, Floats]:
