@@ -99,7 +99,8 @@ def scattering(seed, scatter_g, count=60, differs=0.8):
     """Return a sensor and poses whose noise differs, and which scatter beyond it."""
     rng = np.random.default_rng(seed)
     model, noise = sensor(rng), 1.4e-4 * np.exp(differs * rng.normal(size=(count, 1)))
-    poses = simulate_poses(model, random_directions(count, rng), rng, noise_g=1e-9)
+    up = random_directions(count, rng)
+    poses = simulate_poses(model, up, rng, noise_g=1e-9, context={'reference': up})
     error = np.hypot(noise, scatter_g) * rng.normal(size=(count, 3))
     return model, poses.with_columns(reading=poses.reading + error,
                                      std=np.repeat(10.0 * noise, 3, axis=1))
@@ -122,6 +123,19 @@ def test_few_poses_that_scatter_alike_are_no_outliers():
     lost = [len(fit_poses(scattering(seed, 7e-4, 14, differs)[1], G, model='10').rejected)
             for seed in range(20) for differs in (0.0, 0.8)]
     assert sum(lost) <= 10
+
+
+def test_poses_of_known_orientation_that_scatter_alike_have_true_deviations():
+    inside, lost = [], 0
+    for seed in range(20):
+        model, poses = scattering(seed, 7e-4, 20)
+        fit = fit_poses(poses, G, model='12')
+        lost += len(fit.rejected)
+        if fit.name == '12':
+            away = fit.model.linear_part[0] - model.linear_part[0]
+            inside.append(np.abs(np.diag(away)) < 1.96 * np.diag(fit.gain_sd))
+    assert np.mean(inside) > 0.85
+    assert lost <= 2
 
 
 def test_models_9_and_10_of_poses_that_scatter_have_the_same_deviations():

@@ -38,9 +38,9 @@ from .quality import finished, fit_findings, in_g, LARGEST_OFFSET_G, record_of, 
 from ..effects import length_rows, linear_model, Model, MODELS, sensor_force, with_vector
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import (
-    beside_scatter, closed_form, covariance_with, estimate, faces, Fit, fit_12, fit_norm,
-    fit_sphere, judge, lower_triangular, NotConvergedError, originals, outliers, Point, pose_noise,
-    rivals, solve, start_of, stated, TIES)
+    closed_form, covariance_with, estimate, faces, Fit, fit_12, fit_norm, fit_sphere, judge,
+    lower_triangular, NotConvergedError, originals, outliers, Point, pose_noise, rivals,
+    scattered_or_without, solve, start_of, stated, TIES, with_scatter_of)
 from ..finding import Finding
 from ..geometry import rms, unit
 from ..table import check_units, Poses
@@ -217,8 +217,7 @@ def _by_norm(poses: Poses, units: Units, model: str, method: Method) -> tuple[Ca
         largest = list(dilutions)[-1]
         fits[largest], among = _fit_norm(largest, poses_g.take(kept))
         kept = kept[among]
-        if 'own_scatter' in fits[largest].poses_g:
-            poses_g = beside_scatter(poses_g, fits[largest].poses_g['own_scatter'][0, 0])
+        poses_g = with_scatter_of(fits[largest], poses_g)
     left, used = poses_g.take(kept), directions[kept]
     noise = pose_noise(left.noise, used)
     if len(kept) < len(poses_g):
@@ -366,36 +365,48 @@ def fit_known(poses: Poses, units: Units, method: Method) -> Calibration:
         mat_x = fit_12(poses.reading, poses['reference'])[0]
         units = Units('native', float(np.cbrt(abs(np.linalg.det(mat_x)))))
     refuse_if_unfit(ORIENTED, unit(poses['reference']))
-    poses_g = in_g(poses, units)
-    fit, rejected = _without_outliers(poses_g, method)
-    out = np.isin(poses.row, [pose.row for pose in rejected])
-    unlike = rivals(fit, np.flatnonzero(~out), np.flatnonzero(out), poses_g,
-                    lambda others: estimate(fit.model, others))
+    poses_g, everyone = in_g(poses, units), np.arange(len(poses))
+    if method == 'algebraic':
+        plain = {key: poses_g[key] for key in ('reading', 'reference')}
+        fit, kept = _oriented(Poses(plain, poses_g.row)), everyone
+    else:
+        fit, kept = scattered_or_without(poses_g, _without_outliers, _oriented)
+    poses_g = with_scatter_of(fit, poses_g)
+    out = np.delete(everyone, kept)
+    unlike = rivals(fit, kept, out, poses_g, lambda others: estimate(fit.model, others))
+    fit = stated(fit)
     return record_of(
         fit, poses, units, unit(fit.poses_g['reference']), ORIENTED, method,
-        covariance=covariance_with(fit, unlike), rejected=rejected, reason=reason,
+        covariance=covariance_with(fit, unlike), rejected=_far_from(fit, poses_g.take(out)),
+        reason=reason,
         noted=(*rival_findings(unlike, poses.row), *fit_findings(fit, 0.0), *_placement(fit)))
 
 
-def _without_outliers(poses_g: Poses, method: Method) -> tuple[Fit, tuple[Rejected, ...]]:
-    """Fit model 12, without outliers if the other poses determine the model."""
-    kept = ('reading', 'reference') if method == 'algebraic' else tuple(poses_g.columns)
-    poses_g = Poses({key: poses_g[key] for key in kept if key in poses_g}, poses_g.row)
-    effects = MODELS[ORIENTED].effects
-    rejected: tuple[Rejected, ...] = ()
-    fit = estimate(with_vector(effects, np.zeros(12)), poses_g)
-    while method == 'ml':
-        out = outliers(fit, len(poses_g))
-        left = fit.poses_g.take(np.delete(np.arange(len(fit.poses_g)), out))
-        if not len(out) or not determines(ORIENTED, unit(left['reference'])):
+def _oriented(poses_g: Poses) -> Fit:
+    """Fit model 12."""
+    return estimate(with_vector(MODELS[ORIENTED].effects, np.zeros(12)), poses_g)
+
+
+def _without_outliers(poses_g: Poses) -> tuple[Fit, Indices]:
+    """Fit model 12 without the outliers, if the other poses determine it."""
+    fit, kept = _oriented(poses_g), np.arange(len(poses_g))
+    while len(out := outliers(fit, len(poses_g))):
+        left = np.delete(kept, out)
+        if not determines(ORIENTED, unit(poses_g.take(left)['reference'])):
             break
-        off = fit.equations.of_poses(fit.residual)[out] * MG
-        rejected = (*rejected, *(
-            Rejected(int(row), f'outlier: the reading differs by {error:.2f} mg from the fit of '
-                     'the other poses', 'outlier')
-            for row, error in zip(fit.poses_g.row[out], off, strict=True)))
-        fit = estimate(fit.model, left)
-    return fit, rejected
+        fit, kept = estimate(fit.model, poses_g.take(left)), left
+    return fit, kept
+
+
+def _far_from(fit: Fit, poses_g: Poses) -> tuple[Rejected, ...]:
+    """Return outliers with their distance from a fit."""
+    if not len(poses_g):
+        return ()
+    judged = judge(fit.model, poses_g)
+    away = judged.equations.of_poses(judged.residual) * MG
+    return tuple(Rejected(int(row), f'outlier: the reading differs by {error:.2f} mg from the fit '
+                          'of the other poses', 'outlier')
+                 for row, error in zip(poses_g.row, away, strict=True))
 
 
 def _with_reference(poses: Poses, units: Units) -> tuple[Poses, str]:

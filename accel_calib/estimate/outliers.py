@@ -91,8 +91,11 @@ _EXPLAINED = 0.25
 """Smallest part of the residuals by the mistake of one row that a mistake of another row explains
 to first order; other rows are no rivals."""
 
-_OF_OUTLIER = 2.0 * math.log(0.1 / 0.02 / math.sqrt(2.0 * math.pi))
-"""Deviance of an outlier: a mistake of up to 0.1 g, of 2 % of the poses."""
+_KNOCKED = 0.02
+"""Part of the poses that are outliers."""
+
+_LARGEST_G = 0.1
+"""Size of the mistake of an outlier in each of its equations [g]."""
 
 _STRONG = 6.0
 """Smallest evidence for a scatter of all poses, against outliers (Kass and Raftery 1995:
@@ -258,40 +261,75 @@ def fit_norm(name: str, poses_g: Poses) -> tuple[Fit, Indices]:
     """
     Fit model 4, 7 or 10 to poses in g of unknown orientation, without the outliers.
 
-    Return the fit and the (k,) indices of the poses used. The poses are at least as many as free
-    parameters. If they scatter beyond their noise, those of the fit state it (``own_scatter``).
-    Raise `NotConvergedError` if they are not on an ellipsoid.
+    Return as `scattered_or_without`. The poses are at least as many as free parameters. Raise
+    `NotConvergedError` if they are not on an ellipsoid.
 
     """
-    found, everyone = _fit_norm(name, poses_g), np.arange(len(poses_g))
+    return scattered_or_without(
+        poses_g, lambda poses: _fit_norm(name, poses),
+        lambda poses: estimate(start_of(name, poses.reading), poses))
+
+
+def scattered_or_without(poses_g: Poses, without: Callable[[Poses], tuple[Fit, Indices]],
+                         whole: Callable[[Poses], Fit]) -> tuple[Fit, Indices]:
+    """
+    Fit poses in g without the outliers, or beside a scatter that all of them have.
+
+    Parameters
+    ----------
+    poses_g : Poses
+        All poses, with the same number of equations each.
+    without : callable
+        Fits poses without the outliers; returns the fit and the indices of the poses used.
+    whole : callable
+        Fits all poses. Both may raise `NotConvergedError`.
+
+    Returns
+    -------
+    Fit and (k,) array of int
+        The fit, and the indices of the poses used. If they scatter beyond their noise, those of
+        the fit state it (``own_scatter``).
+
+    """
+    found, everyone = without(poses_g), np.arange(len(poses_g))
     if not found[0].noise_known:
         return found
-    best, least = _with_scatter(name, poses_g, *found)
-    if len(found[1]) < len(poses_g) and (fit := _fit(name, poses_g, everyone)) is not None:
-        whole, deviance = _with_scatter(name, poses_g, fit, everyone)
-        if deviance < least - _STRONG:
-            return whole
-    return best
+    best, least = _with_scatter(poses_g, without, *found)
+    if len(found[1]) == len(poses_g):
+        return best
+    try:
+        fit = whole(poses_g)
+    except NotConvergedError:
+        return best
+    of_all, deviance = _with_scatter(poses_g, without, fit, everyone)
+    return of_all if deviance < least - _STRONG else best
 
 
-def _with_scatter(name: str, poses_g: Poses, fit: Fit, kept: Indices
-                  ) -> tuple[tuple[Fit, Indices], float]:
+def _with_scatter(poses_g: Poses, without: Callable[[Poses], tuple[Fit, Indices]], fit: Fit,
+                  kept: Indices) -> tuple[tuple[Fit, Indices], float]:
     """Return a fit, or that beside the scatter of its poses if it is better, and its deviance."""
     scatter = scatter_of(fit)
-    best, least = (fit, kept), scatter.without + _OF_OUTLIER * (len(poses_g) - len(kept))
+    best, least = (fit, kept), scatter.without + _of_outliers(fit, len(poses_g) - len(kept))
     for _ in range(_ROUNDS):
         if not scatter.shows:
             return best, least
         size = scatter.size_g
         try:
-            fit, kept = _fit_norm(name, beside_scatter(poses_g, size))
+            fit, kept = without(beside_scatter(poses_g, size))
         except NotConvergedError:
             return best, least
         scatter = scatter_of(judge(fit.model, poses_g.take(kept)))
         if abs(scatter.size_g - size) <= _ALIKE * size:
             break
-    deviance = scatter.deviance + _OF_OUTLIER * (len(poses_g) - len(kept))
+    deviance = scatter.deviance + _of_outliers(fit, len(poses_g) - len(kept))
     return ((fit, kept), deviance) if scatter.shows and deviance < least else (best, least)
+
+
+def _of_outliers(fit: Fit, count: int) -> float:
+    """Return the deviance of a number of outliers beside a fit."""
+    each = math.log(_KNOCKED) + int(fit.by_pose.rows[0]) * math.log(
+        math.sqrt(2.0 * math.pi) / _LARGEST_G)
+    return -2.0 * count * each
 
 
 def _fit_norm(name: str, poses_g: Poses) -> tuple[Fit, Indices]:

@@ -67,6 +67,13 @@ def beside_scatter(poses_g: Poses, size_g: float) -> Poses:
     return poses_g.with_columns(own_scatter=np.full(poses_g.reading.shape, size_g))
 
 
+def with_scatter_of(fit: Fit, poses_g: Poses) -> Poses:
+    """Return poses with the scatter that those of a fit state; unchanged if they state none."""
+    if 'own_scatter' not in fit.poses_g:
+        return poses_g
+    return beside_scatter(poses_g, float(fit.poses_g['own_scatter'][0, 0]))
+
+
 def scatter_of(fit: Fit) -> Scatter:
     """Return the scatter of the poses of a fit; none if their noise is not known."""
     few = slice(None, None, -(-len(fit.residual) // _ENOUGH))
