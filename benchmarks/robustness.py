@@ -10,9 +10,9 @@ of |a| on fresh directions, the median over the sets. Poor geometry has its own 
 [geometry](geometry.md).
 
 Limits: 12 poses leave three residuals. Without a stated noise these must show the noise and a
-knocked pose at once. If the stated noise is too small, the pose that looks worst may be left out,
-and the others then look quiet. Model 7 fits 6 poses of a sensor of 10 parameters exactly, so that
-nothing shows the cross-axis gains that it lacks.
+knocked pose at once. Poses that scatter have a variance in common, but so few do not show it, and
+those with little noise have too much weight. Model 7 fits 6 poses of a sensor of 10 parameters
+exactly, so that nothing shows the cross-axis gains that it lacks.
 
 """
 
@@ -47,8 +47,9 @@ _SHOWS_MG = 2.0
 """Change of |force| from which a knock must be detected [mg]."""
 
 _QUIET = 5.0
-_SCATTER = f'scatter of {_QUIET:g} times the noise, which differs (e-fold)'
 """Ratio of the scatter of poses to the noise that their samples show."""
+
+_SCATTER = f'scatter of {_QUIET:g} times the noise, which differs (e-fold)'
 
 RATE = 100.0
 """Samples per second of a recording."""
@@ -136,7 +137,7 @@ def of_intervals(job: Job) -> tuple[Floats, Floats]:
     if model == '12':
         case = replace(case, poses=case.poses.with_columns(reference=case.force))
     found = fitted(without_noise(case) if noise == 'not given' else case, model)
-    if found is None:
+    if found is None or found.name != model:  # refused, or the orientations are not used
         return np.zeros(0), np.zeros(0)
     values = case.sensor.values(model)
     deviation = np.sqrt(np.diag(found.covariance))
@@ -262,6 +263,7 @@ def intervals(run: Run, sets: int, seed: int) -> Iterator[Line]:
             for count in (12, 36)]
     rows += [('10', '10', count, noise) for count in (12, 36, 100)
              for noise in ('differs', 'not given', 'understated', 'scatter')]
+    rows += [('12', '12', count, 'scatter') for count in (12, 36)]
     words = {'measured': '', 'differs': ', noise that differs by pose (e-fold)',
              'not given': ', noise not given',
              'understated': ', a third of the noise stated', 'scatter': f', {_SCATTER}'}
