@@ -211,6 +211,7 @@ def test_a_curve_that_leaves_most_of_the_gap_is_not_added():
     along = poses.reading / np.linalg.norm(poses.reading, axis=1, keepdims=True)
     unknown = np.random.default_rng(5).normal(size=(COUNT, 1)) * 2e-3 * along
     poses = poses.with_columns(reading=poses.reading + unknown)
+    assert best_curve(base_of(poses), poses, ()) is not None
     found = refine(poses, G, base='10')
     assert (found.verdict, found.steps) == ('unexplained', ())
 

@@ -372,5 +372,5 @@ def test_a_curve_over_time_must_be_clearly_better_than_a_walk(variable, score, b
     linear = by_hand(rng.normal(size=20), np.eye(20)[:, :1], ['supply_ratio'])
     nothing = Set.of(linear)
     walk = Walk(random_walk(20, 4, 1.0, rng)[0].process, 1.0, nothing.score + 20.0, 50.0)
-    curve = Curve(f'empirical-offset-{variable}-1', np.zeros(5), score, (), 0.0)
+    curve = Curve(f'empirical-offset-{variable}-1', np.zeros(5), score, (), 0.0, 1.0)
     assert is_better_than_walk(curve, Near(nothing, linear, walk, None)) == better

@@ -11,8 +11,7 @@ of a few cosines over the range of the variable (`accel_calib.effects.empirical_
 spherical harmonics of a few degrees over the direction of the force, which are the forms of
 nonlinearities along oblique axes. For each carrier and variable, the cosines or degrees are added
 in the order of their gain while the score of `.linear` rises; each costs its values and 2 log k
-for the choice of the k-th. The best curve is accepted if it is significant, and if poses held out
-agree.
+for the choice of the k-th. The best curve is taken if it is significant.
 
 **Wander.** The effect `offset_wander` is an offset that changes slowly. It is a random process,
 expanded in its Karhunen-Loève modes
@@ -69,10 +68,6 @@ CLEARLY = 10.0
 _LEAST_OUTSIDE = 1e-9
 """Added to the squares of modes outside of the base, so that their equations have a solution."""
 
-_HELD_OUT = 0.7
-"""Smallest part of the held-out squares above the noise that a curve explains. Chance also finds a
-curve of some quantity for an offset that wanders, which explains less."""
-
 _PROPORTION = 2.0
 """Evidence for a proportion of two effects that makes them parts of one curve (Kass and Raftery
 1995: positive)."""
@@ -86,7 +81,8 @@ class Curve(NamedTuple):
     A curve beside a model, and the indices of the outliers beside it.
 
     Its (p,) values include the range of the variable. The score is relative to no curve, and the
-    p-value is the probability that noise alone makes one of all curves this good.
+    p-value is the probability that noise alone makes one of all curves this good. `explained` is
+    the part of the squares above the noise, of poses held out, that it explains.
 
     """
 
@@ -95,6 +91,7 @@ class Curve(NamedTuple):
     score: float
     out: tuple[int, ...]
     p_value: float
+    explained: float
 
 
 class _Family(NamedTuple):
@@ -222,7 +219,7 @@ def _grown(problem: Linear, least_rss: float, least: float) -> Set:
 
 
 def _accepted(score: float, chosen: Set, tried: int) -> Curve | None:
-    """Return a curve, or None if it is not significant or poses held out do not agree."""
+    """Return a curve, or None if it is not significant."""
     # The outliers are found again: without the curve, good poses may have looked like outliers.
     chosen = max(with_outliers([chosen]), key=lambda either: either.score)
     nothing = chosen.instead(())
@@ -230,14 +227,13 @@ def _accepted(score: float, chosen: Set, tried: int) -> Curve | None:
         each.tried for each in chosen.entries))
     if p_value > LEVEL:
         return None
-    if _held_out(chosen) > (1.0 - _HELD_OUT) * _held_out(nothing):
-        return None
     blocks, first = sorted(chosen.blocks), chosen.entries[0]
     carrier, variable, _ = empirical_parts(first.effect)
     modes = [empirical_parts(chosen.linear.blocks[block].effect)[2][0] for block in blocks]
     name = empirical_name(carrier, variable, modes)
     values = np.concatenate([*(chosen.values[block] for block in blocks), first.shape])
-    return Curve(name, values, score, chosen.out, p_value)
+    explained = 1.0 - _held_out(chosen) / max(_held_out(nothing), 1e-300)
+    return Curve(name, values, score, chosen.out, p_value, explained)
 
 
 def _held_out(chosen: Set) -> float:

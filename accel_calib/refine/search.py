@@ -88,6 +88,10 @@ _LESS = 0.8
 _LEAST_SHARE = 0.6
 """Part of the residual above the noise that the named effects must explain."""
 
+_HELD_OUT = 0.7
+"""Part of the squares above the noise that a curve must explain in poses held out. Chance also
+finds a curve over some quantity for an offset that wanders, which explains less."""
+
 _NOTHING: tuple[frozenset[str], tuple[int, ...], bool] = (frozenset(), (), False)
 """The key of a choice without effects, outliers and a walk."""
 
@@ -326,7 +330,9 @@ def _with_one_curve(found: Found, start: State, poses_g: Poses) -> Found | None:
 
 
 def _with_curve(found: Found, curve: Curve, start: State, poses_g: Poses) -> Found | None:
-    """Return what was found, with a curve; None if its fit fails."""
+    """Return what was found, with a curve; None if its fit fails or poses held out disagree."""
+    if curve.explained < _HELD_OUT:
+        return None
     after = fitted_state(Model({**found.final.model.values, curve.name: curve.values}),
                          without(poses_g, curve.out))
     if after is None or after.fit.at_bound:
