@@ -162,6 +162,16 @@ def test_knocked_poses_are_left_out_beside_a_scatter():
         assert [each.row for each in fit.rejected] == [8, 31, 52]
 
 
+@pytest.mark.parametrize('seed', range(12))
+def test_a_few_knocked_poses_among_many_are_left_out(seed):
+    rng = np.random.default_rng(seed)
+    poses = simulate_poses(sensor(rng), random_directions(2500, rng), rng)
+    knocked, rows = poses.reading.copy(), rng.choice(2500, 3, replace=False)
+    knocked[rows] *= 1.02
+    fit = fit_poses(poses.with_columns(reading=knocked), G, model='10')
+    assert set(rows + 1) <= {each.row for each in fit.rejected}
+
+
 def test_unknown_noise_is_estimated_from_the_residuals():
     poses = simulated(9, 60)[1]
     known = fit_poses(poses, G, model='10')

@@ -39,8 +39,8 @@ from ..effects import length_rows, linear_model, Model, MODELS, sensor_force, wi
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import (
     closed_form, covariance_with, estimate, faces, Fit, fit_12, fit_norm, fit_sphere, judge,
-    lower_triangular, NotConvergedError, originals, outliers, Point, pose_noise, rivals,
-    scattered_or_without, solve, start_of, stated, TIES, with_scatter_of)
+    lower_triangular, NotConvergedError, originals, outliers, outliers_or_scatter, Point,
+    pose_noise, rivals, solve, start_of, stated, TIES, with_scatter_of)
 from ..finding import Finding
 from ..geometry import rms, unit
 from ..table import check_units, Poses
@@ -368,28 +368,28 @@ def fit_known(poses: Poses, units: Units, method: Method) -> Calibration:
     poses_g, everyone = in_g(poses, units), np.arange(len(poses))
     if method == 'algebraic':
         plain = {key: poses_g[key] for key in ('reading', 'reference')}
-        fit, kept = _oriented(Poses(plain, poses_g.row)), everyone
+        fit, kept = _fit_oriented(Poses(plain, poses_g.row)), everyone
     else:
-        fit, kept = scattered_or_without(poses_g, _without_outliers, _oriented)
+        fit, kept = outliers_or_scatter(poses_g, _without_outliers, _fit_oriented)
     poses_g = with_scatter_of(fit, poses_g)
     out = np.delete(everyone, kept)
     unlike = rivals(fit, kept, out, poses_g, lambda others: estimate(fit.model, others))
     fit = stated(fit)
     return record_of(
         fit, poses, units, unit(fit.poses_g['reference']), ORIENTED, method,
-        covariance=covariance_with(fit, unlike), rejected=_far_from(fit, poses_g.take(out)),
+        covariance=covariance_with(fit, unlike), rejected=_rejected_known(fit, poses_g.take(out)),
         reason=reason,
         noted=(*rival_findings(unlike, poses.row), *fit_findings(fit, 0.0), *_placement(fit)))
 
 
-def _oriented(poses_g: Poses) -> Fit:
+def _fit_oriented(poses_g: Poses) -> Fit:
     """Fit model 12."""
     return estimate(with_vector(MODELS[ORIENTED].effects, np.zeros(12)), poses_g)
 
 
 def _without_outliers(poses_g: Poses) -> tuple[Fit, Indices]:
     """Fit model 12 without the outliers, if the other poses determine it."""
-    fit, kept = _oriented(poses_g), np.arange(len(poses_g))
+    fit, kept = _fit_oriented(poses_g), np.arange(len(poses_g))
     while len(out := outliers(fit, len(poses_g))):
         left = np.delete(kept, out)
         if not determines(ORIENTED, unit(poses_g.take(left)['reference'])):
@@ -398,8 +398,8 @@ def _without_outliers(poses_g: Poses) -> tuple[Fit, Indices]:
     return fit, kept
 
 
-def _far_from(fit: Fit, poses_g: Poses) -> tuple[Rejected, ...]:
-    """Return outliers with their distance from a fit."""
+def _rejected_known(fit: Fit, poses_g: Poses) -> tuple[Rejected, ...]:
+    """Return outliers of known orientation with their distance from a fit."""
     if not len(poses_g):
         return ()
     judged = judge(fit.model, poses_g)

@@ -54,7 +54,7 @@ import scipy
 from .closed_form import agreeing, start_of
 from .equations import belief_beside, belief_in
 from .fit import estimate, Fit, judge, NotConvergedError
-from .scatter import beside_scatter, scatter_of
+from .scatter import beside_scatter, enough, scatter_of
 from ..effects import MODELS, parameter_names
 from ..table import Poses
 from ..units import Floats, Indices
@@ -261,17 +261,17 @@ def fit_norm(name: str, poses_g: Poses) -> tuple[Fit, Indices]:
     """
     Fit model 4, 7 or 10 to poses in g of unknown orientation, without the outliers.
 
-    Return as `scattered_or_without`. The poses are at least as many as free parameters. Raise
+    Return as `outliers_or_scatter`. The poses are at least as many as free parameters. Raise
     `NotConvergedError` if they are not on an ellipsoid.
 
     """
-    return scattered_or_without(
+    return outliers_or_scatter(
         poses_g, lambda poses: _fit_norm(name, poses),
         lambda poses: estimate(start_of(name, poses.reading), poses))
 
 
-def scattered_or_without(poses_g: Poses, without: Callable[[Poses], tuple[Fit, Indices]],
-                         whole: Callable[[Poses], Fit]) -> tuple[Fit, Indices]:
+def outliers_or_scatter(poses_g: Poses, without: Callable[[Poses], tuple[Fit, Indices]],
+                        whole: Callable[[Poses], Fit]) -> tuple[Fit, Indices]:
     """
     Fit poses in g without the outliers, or beside a scatter that all of them have.
 
@@ -308,8 +308,9 @@ def scattered_or_without(poses_g: Poses, without: Callable[[Poses], tuple[Fit, I
 def _with_scatter(poses_g: Poses, without: Callable[[Poses], tuple[Fit, Indices]], fit: Fit,
                   kept: Indices) -> tuple[tuple[Fit, Indices], float]:
     """Return a fit, or that beside the scatter of its poses if it is better, and its deviance."""
-    scatter = scatter_of(fit)
-    best, least = (fit, kept), scatter.without + _of_outliers(fit, len(poses_g) - len(kept))
+    few = enough(len(poses_g))
+    scatter = scatter_of(fit, few[kept])
+    best, least = (fit, kept), scatter.without + _of_outliers(fit, kept, few)
     for _ in range(_ROUNDS):
         if not scatter.shows:
             return best, least
@@ -318,18 +319,18 @@ def _with_scatter(poses_g: Poses, without: Callable[[Poses], tuple[Fit, Indices]
             fit, kept = without(beside_scatter(poses_g, size))
         except NotConvergedError:
             return best, least
-        scatter = scatter_of(judge(fit.model, poses_g.take(kept)))
+        scatter = scatter_of(judge(fit.model, poses_g.take(kept)), few[kept])
         if abs(scatter.size_g - size) <= _ALIKE * size:
             break
-    deviance = scatter.deviance + _of_outliers(fit, len(poses_g) - len(kept))
+    deviance = scatter.deviance + _of_outliers(fit, kept, few)
     return ((fit, kept), deviance) if scatter.shows and deviance < least else (best, least)
 
 
-def _of_outliers(fit: Fit, count: int) -> float:
-    """Return the deviance of a number of outliers beside a fit."""
+def _of_outliers(fit: Fit, kept: Indices, few: NDArray[np.bool_]) -> float:
+    """Return the deviance of the outliers among few poses: those that a fit does not keep."""
     each = math.log(_KNOCKED) + int(fit.by_pose.rows[0]) * math.log(
         math.sqrt(2.0 * math.pi) / _LARGEST_G)
-    return -2.0 * count * each
+    return -2.0 * each * (np.count_nonzero(few) - np.count_nonzero(few[kept]))
 
 
 def _fit_norm(name: str, poses_g: Poses) -> tuple[Fit, Indices]:

@@ -21,6 +21,7 @@ derivatives by the values [g], and W the inverse of the variances, twice its neg
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .fit import Fit
 from ..table import Poses
@@ -37,7 +38,7 @@ _TRIED = np.arange(-7.0, 7.1, 0.25)
 deviance is nearly a parabola."""
 
 _ENOUGH = 1000
-"""Number of equations from which τ is estimated; more are not needed."""
+"""Number of poses from which τ is estimated; more are not needed."""
 
 
 class Scatter(NamedTuple):
@@ -74,9 +75,20 @@ def with_scatter_of(fit: Fit, poses_g: Poses) -> Poses:
     return beside_scatter(poses_g, float(fit.poses_g['own_scatter'][0, 0]))
 
 
-def scatter_of(fit: Fit) -> Scatter:
-    """Return the scatter of the poses of a fit; none if their noise is not known."""
-    few = slice(None, None, -(-len(fit.residual) // _ENOUGH))
+def enough(count: int) -> NDArray[np.bool_]:
+    """Return which of `count` poses suffice for a scatter."""
+    return np.arange(count) % max(-(-count // _ENOUGH), 1) == 0
+
+
+def scatter_of(fit: Fit, among: NDArray[np.bool_] | None = None) -> Scatter:
+    """
+    Return the scatter of the poses of a fit; none if their noise is not known.
+
+    It is estimated from the poses `among` them, (n,); fits are only compared by the same poses.
+
+    """
+    among = enough(len(fit.poses_g)) if among is None else among
+    few = among[fit.equations.pose]
     sigma = fit.equations.scale[fit.equations.pose[few]]
     columns = fit.columns[few] * sigma[:, np.newaxis]
     count = len(sigma) - columns.shape[1]
