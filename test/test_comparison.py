@@ -14,8 +14,8 @@ from accel_calib.logs import read_recording
 from accel_calib.table import Floats, Poses
 from accel_calib.units import units_of
 from inside import (
-    DRIFT_MEMORY, model_with, PARAMETER_NAMES, predict, rotation_free, rotation_from_rpy, Runs,
-    simulate_poses, spread_directions, unit, with_vector)
+    DRIFT_MEMORY, model_with, on_one_scale, PARAMETER_NAMES, predict, repeatability_of,
+    rotation_free, rotation_from_rpy, Runs, simulate_poses, spread_directions, unit, with_vector)
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
@@ -54,21 +54,31 @@ def test_runs_of_one_sensor_agree_also_with_models_of_other_axes(models, sets, m
     assert alarms <= 0.1 * sets
 
 
-@pytest.mark.parametrize('differs', [0.0, 1.0])
-def test_runs_whose_poses_repeat_worse_than_their_samples_agree(differs):
-    alarms = 0
-    for seed in range(30):
-        rng = np.random.default_rng(seed)
-        model, runs = sensor(rng), []
-        for _ in range(2):
-            noise = 1e-4 * np.exp(differs * rng.normal(size=(20, 1)))
-            poses = simulate_poses(model, attitudes(rng, 20), rng, noise_g=1e-9)
-            error = np.hypot(noise, 5e-4) * rng.normal(size=(20, 3))
-            poses = poses.with_columns(reading=poses.reading + error,
-                                       std=np.repeat(10.0 * noise, 3, axis=1))
-            runs.append(fit_poses(poses, G, model='10'))
-        alarms += not compare(runs).agree
+def scattering_runs(seed, count, differs):
+    """Return two runs whose poses scatter by 5 times their noise, which differs."""
+    rng = np.random.default_rng(seed)
+    model, runs = sensor(rng), []
+    for _ in range(2):
+        noise = 1e-4 * np.exp(differs * rng.normal(size=(count, 1)))
+        poses = simulate_poses(model, attitudes(rng, count), rng, noise_g=1e-9)
+        error = np.hypot(noise, 5e-4) * rng.normal(size=(count, 3))
+        poses = poses.with_columns(reading=poses.reading + error,
+                                   std=np.repeat(10.0 * noise, 3, axis=1))
+        runs.append(fit_poses(poses, G, model='10'))
+    return runs
+
+
+@pytest.mark.parametrize(('count', 'differs'), [(14, 0.0), (20, 1.0)])
+def test_runs_whose_poses_repeat_worse_than_their_samples_agree(count, differs):
+    alarms = sum(not compare(scattering_runs(seed, count, differs)).agree for seed in range(30))
     assert alarms <= 3
+
+
+def test_a_covariance_beside_a_scatter_keeps_its_own_scale():
+    runs = scattering_runs(0, 40, 1.0)
+    scaled = on_one_scale([repeatability_of(run) for run in runs]).covariances
+    for run, covariance in zip(runs, scaled, strict=True):
+        np.testing.assert_array_equal(covariance, run.covariance)
 
 
 def test_the_spread_of_twenty_runs_matches_their_uncertainty():

@@ -158,9 +158,10 @@ def _with_own_noise(found: Found, poses_g: Poses, base: Model, also: tuple[str, 
     noise are those of the residuals beside the named effects.
 
     """
-    if 'new' not in poses_g or not found.near.plain.worth or not (found.walk or found.curve):
+    near, noise = found.near, poses_g.noise
+    if noise is None or 'new' not in poses_g or not near.plain.worth or not (
+            found.walk or found.curve):
         return found
-    near = found.near
     onto, residual = near.beside.spanned
     own = 1.0 - np.sum(near.plain.onto ** 2, axis=1) - np.sum(onto ** 2, axis=1)
     new, factor = poses_g['new'] > 0.0, np.ones(len(poses_g))
@@ -169,7 +170,6 @@ def _with_own_noise(found: Found, poses_g: Poses, base: Model, also: tuple[str, 
         factor[group] = max(np.sum(residual[rows] ** 2) / max(np.sum(own[rows]), 1.0), 1.0)
     if np.ptp(factor) == 0.0:
         return found
-    noise = poses_g['std'] / np.sqrt(poses_g['count'])[:, np.newaxis]
     scatter = noise * np.sqrt(factor - 1.0)[:, np.newaxis]
     return _beside(poses_g.with_columns(own_scatter=scatter), base, also)
 

@@ -72,8 +72,8 @@ def of_calibration(calibration: Calibration) -> dict[str, Any]:
         'spread': attempt(lambda: spread(calibration.force_covariance(force, known))),
         'free': free if isinstance(free, Exception) else {
             **those(free, 'values axes'), 'slope': np.linalg.norm(free.slope, axis=1)},
-        'scatter': (those(repeatability_of(calibration), 'chi2 dof stated belief')
-                    if effects else ''),
+        'repeatability': (those(repeatability_of(calibration), 'chi2 dof stated belief')
+                          if effects else ''),
         'repeats': Drift(calibration).repeats ** 0.5, 'outside': outside(calibration, wide),
         'partial': carried(calibration) if calibration.method == 'prior' and effects else ''}
 
