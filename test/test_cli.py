@@ -10,7 +10,8 @@ import sys
 
 from accel_calib.capture import CaptureSettings
 from accel_calib.stored import read_calibration
-from inside import COMMAND, COMMANDS, main, parser, rotation_from_rpy, spread_directions
+from inside import (
+    CALIBRATOR, COMMAND, COMMANDS, main, parser, rotation_from_rpy, spread_directions)
 import numpy as np
 import pytest
 from shared import python, refused, ROOT, run, run_json, shell
@@ -254,6 +255,20 @@ def test_only_what_is_used_is_imported(arguments, without, poses):
     assert ('noise floor' in done.stdout) is (arguments[0] == 'fit')
     assert not set(without) & set(done.stderr.split())
     assert main.__module__ in done.stderr.split()
+
+
+@pytest.mark.parametrize('command', [[*COMMAND, 'fit', 'poses.csv'], CALIBRATOR])
+@pytest.mark.parametrize(('given', 'threads'), [('', 1), ('2', 2)])
+def test_numpy_is_imported_with_one_thread_unless_another_number_is_set(command, given, threads):
+    code = ('import os, runpy, sys\n'
+            f'if not {given!r}:\n    del os.environ["OPENBLAS_NUM_THREADS"]\n'
+            'class Seen:\n'
+            '    def find_spec(self, name, *rest):\n'
+            '        if name == "numpy":\n'
+            '            os._exit(int(os.environ.get("OPENBLAS_NUM_THREADS", "9")))\n'
+            f'sys.meta_path.insert(0, Seen())\nsys.argv = {[*command[1:]]!r}\n'
+            f'runpy.run_module({command[1]!r}, run_name="__main__")')
+    assert python('-c', code, OPENBLAS_NUM_THREADS=given).returncode == threads
 
 
 def test_files_of_the_current_folder_are_never_run(tmp_path):

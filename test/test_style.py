@@ -15,9 +15,9 @@ ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / 'accel_calib'
 
 LAYERS = (
-    'errors text units < disk finding table < geometry < effects < logs < capture estimate '
-    '< calibrate < refine < compare noise < findings < stored < pipeline < messages < report '
-    '< api session < fleet live < ros < cli')
+    'errors one_thread text units < disk finding table < geometry < effects < logs '
+    '< capture estimate < calibrate < refine < compare noise < findings < stored < pipeline '
+    '< messages < report < api session < fleet live < ros < cli')
 """Parts of the package, lowest first. Each part imports only from lower parts and itself."""
 
 RANKS = {part: rank for rank, layer in enumerate(LAYERS.split('<')) for part in layer.split()}

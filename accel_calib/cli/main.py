@@ -34,7 +34,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with _leaving():
         from .commands import parser
         from ..errors import AccelCalibError, crash_words, system_error
+        from ..one_thread import use_one_thread
 
+        use_one_thread()
         _open_streams()
         if '_ARGCOMPLETE' in os.environ:
             _complete()

@@ -35,6 +35,7 @@ from threading import Thread
 from typing import TYPE_CHECKING
 
 from ..errors import AccelCalibError, NEEDS_ROS
+from ..one_thread import use_one_thread
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -81,6 +82,7 @@ def run(node: str, args: Sequence[str] | None = None) -> int:
     program name; by default that of the process.
 
     """
+    use_one_thread()
     came, written = os.pipe()
     os.set_blocking(written, False)
     signal.set_wakeup_fd(written, warn_on_full_buffer=False)

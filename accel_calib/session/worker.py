@@ -52,6 +52,7 @@ from .store import writing_advice
 from ..calibrate import NextPose
 from ..effects import know_code, KNOWN_CODE
 from ..errors import AccelCalibError, InputError
+from ..one_thread import ONE_THREAD
 from ..table import Floats
 
 if TYPE_CHECKING:
@@ -65,11 +66,8 @@ _PATIENCE = 10.0
 _IDLE = 'idle'
 """Command line argument for a process that runs only while the processor is idle."""
 
-_ENVIRONMENT = {
-    **dict.fromkeys(('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'), '1'),
-    'MALLOC_TRIM_THRESHOLD_': '131072'}
-"""Arrays are small, so more threads would only wait. A set threshold is not adapted by glibc, so
-that freed arrays do not stay in the process."""
+_ENVIRONMENT = {**ONE_THREAD, 'MALLOC_TRIM_THRESHOLD_': '131072'}
+"""A set threshold is not adapted by glibc, so that freed arrays do not stay in the process."""
 
 _IMPORTED = ('accel_calib.refine', 'scipy.linalg', 'scipy.special')
 """Modules imported at the start, so that the first fit is as fast as later ones."""
