@@ -11,8 +11,8 @@ import accel_calib as ac
 from accel_calib.calibrate import fit_poses, in_g, outlook, verify
 from accel_calib.errors import RefusedFitError
 from accel_calib.estimate import (
-    estimate, judge, lower_triangular, NotConvergedError, originals, outliers_among, Point,
-    scatter_of, sensing_axes, solve, start_of, variance_factor)
+    estimate, fit_norm, judge, lower_triangular, NotConvergedError, originals, outliers_among,
+    Point, scatter_of, sensing_axes, solve, start_of, variance_factor)
 from accel_calib.finding import has
 from accel_calib.geometry import ATTITUDES
 from accel_calib.table import numbered, Poses
@@ -117,6 +117,14 @@ def test_poses_that_scatter_alike_have_weights_alike_and_true_deviations():
         assert 'beyond_noise' in [each.kind for each in fit.noted]
     assert np.std(pulls) == pytest.approx(1.0, abs=0.2)
     assert lost == 0
+
+
+@pytest.mark.parametrize('seed', range(8))
+def test_the_scatter_of_a_fit_is_that_of_its_residuals(seed):
+    poses = scattering(seed, 4.2e-4, 100, 1.0)[1]
+    fit, kept = fit_norm('10', poses)
+    size_g = scatter_of(judge(fit.model, poses.take(kept))).size_g
+    assert fit.poses_g['own_scatter'] == pytest.approx(size_g, rel=0.02)
 
 
 def test_few_poses_that_scatter_alike_are_no_outliers():

@@ -101,7 +101,7 @@ _STRONG = 6.0
 """Smallest evidence for a scatter of all poses, against outliers (Kass and Raftery 1995:
 strong)."""
 
-_ALIKE = 0.2
+_ALIKE = 0.02
 """Relative change of a scatter after which it is found."""
 
 _LARGEST_LOG = 100.0
