@@ -123,11 +123,8 @@ class Terms:
         With a `direction`, (n, 3), return their derivative along this direction of the force.
 
         """
-        monomials = self.monomials_at(u)
-        if direction is not None:
-            for k, index in enumerate(self.monomials):
-                monomials[k] = sum(part * along for part, along in zip(
-                    MONOMIALS[index].gradient(*u.T), direction.T) if np.ndim(part) or part)
+        monomials = self.monomials_at(u) if direction is None else np.einsum(
+            'kin,ni->kn', self.gradients_at(u), direction)
         return monomials[self.place] * self.weight[:, np.newaxis]
 
     def along(self, rows: Floats, u: Floats, direction: Floats | None = None) -> Floats:

@@ -485,9 +485,11 @@ def _find_outliers(sets: Collection[Set]) -> None:
 def _explained(products: Floats, along: Floats) -> tuple[Floats, Floats]:
     """Return what k blocks explain, and their ranks, from their products (k, w, w) and (k, w)."""
     width, size = along.shape[1], np.trace(products, axis1=1, axis2=2)
+    if width == 1:
+        seen = size > SEEN ** 2
+        return along[:, 0] ** 2 * seen / np.where(seen, size, 1.0), seen.astype(float)
     # No eigenvalue is below this, as the others are at most `size` together.
-    least = np.linalg.det(products) * (max(width - 1, 1) / np.maximum(size, SEEN ** 2)) ** (
-        width - 1)
+    least = np.linalg.det(products) * ((width - 1) / np.maximum(size, SEEN ** 2)) ** (width - 1)
     whole = least > SEEN ** 2 * np.maximum(size, 1.0)
     gain, rank = np.zeros(len(size)), np.full(len(size), width)
     solved = np.linalg.solve(products[whole], along[whole][:, :, np.newaxis])[:, :, 0]
