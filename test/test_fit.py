@@ -298,9 +298,9 @@ def stalled(slope):
 
 
 def test_a_stalled_fit_has_converged_if_its_step_is_small_beside_one_degree_of_freedom():
-    assert stalled(np.sqrt(0.9e-5))[0] == 0.0
+    assert stalled(np.sqrt(0.9e-3))[0] == 0.0
     with pytest.raises(NotConvergedError):
-        stalled(np.sqrt(1.2e-5))
+        stalled(np.sqrt(1.2e-3))
 
 
 def test_a_fit_ends_at_a_kink_where_no_step_lowers_the_cost():

@@ -47,8 +47,9 @@ _LARGEST_DAMPING = 1e9
 _NEAR = 1e-12
 """The fit has converged when a full step lowers the cost by less than this part."""
 
-_NEAR_ENOUGH = 1e-5
-"""If rounding or a kink prevents this, this part of the cost per degree of freedom is accepted."""
+_NEAR_ENOUGH = 1e-3
+"""If rounding or a kink prevents this, this part of the cost per degree of freedom is accepted: a
+change of the values by 0.03 standard deviations."""
 
 _ROUNDING = 1e-20
 """Decreases of the cost below this are rounding errors [noise²]."""
