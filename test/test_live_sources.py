@@ -44,11 +44,13 @@ READINGS = [0.02, -0.01, 1.0] + 0.001 * np.random.default_rng(1).normal(size=(40
 """Readings of a sensor that lies flat [g]."""
 
 
-def paced(line: Callable[[int], str]) -> Iterator[str]:
-    """Yield lines at the rate of the samples."""
+def paced(line: Callable[[int], str], late: tuple[float, float] = (0.0, 0.0)) -> Iterator[str]:
+    """Yield lines at the rate of the samples; those due from one time to another at the other."""
     begin = time.monotonic()
     for k in range(len(READINGS)):
-        while time.monotonic() < begin + k / RATE_HZ:
+        due = k / RATE_HZ
+        due = late[1] if late[0] < due < late[1] else due
+        while time.monotonic() < begin + due:
             time.sleep(0.002)
             yield ''
         yield line(k)
@@ -113,14 +115,20 @@ def test_boot_messages_garbled_lines_and_impossible_numbers_are_skipped() -> Non
     assert np.sum(np.diff(found[:, 0]) > 0.0051) >= 3
 
 
-def test_lines_without_times_get_the_measured_or_the_stated_rate(
-        monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lines_without_times_get_the_stated_rate() -> None:
     read_as, found = received(lambda k: f'{numbers(k)}\n', 150, rate=100.0)
     assert '100 Hz (stated)' in read_as
     np.testing.assert_allclose(np.diff(found[:, 0]), 0.01)
+
+
+@pytest.mark.parametrize('late', [(0.0, 0.0), (0.0, 0.6), (1.5, 2.5)])
+def test_a_rate_is_measured_also_if_lines_are_late(
+        late: tuple[float, float], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(*HEAD_OF_A_PORT, 2.0)
-    read_as, found = received(lambda k: f'{numbers(k)}\n', 450)
-    assert '(measured)' in read_as
+    with (board(paced(lambda k: f'{numbers(k)}\n', late)) as port,
+          open_source(port, LogOptions()) as source):
+        found = samples(source.blocks, 450)
+    assert '(measured)' in source.read_as
     assert np.mean(np.diff(found[:, 0])) == pytest.approx(1.0 / RATE_HZ, rel=0.1)
 
 

@@ -222,6 +222,7 @@ def _understood(name: str, lines: Iterator[list[str]], options: LogOptions, baud
                 ) -> LineReader:
     """Return the reader of the lines, as soon as the first ones are understood."""
     head: list[str] = []
+    arrived: list[tuple[int, float]] = []
     begin = tried = time.monotonic()
     problem = InputError(f'{name} sends no lines, expected one line for each sample',
                          'check the sensor and its program')
@@ -230,16 +231,31 @@ def _understood(name: str, lines: Iterator[list[str]], options: LogOptions, baud
         if new and not head:
             begin = tried = now
         head += new
-        if now - tried >= _HEAD_S and len(head) >= _HEAD_LINES:
+        if new:
+            arrived.append((len(head), now))
+        if now - tried >= _HEAD_S and len(head) >= _HEAD_LINES and len(arrived) > 1:
             tried = now
             try:
-                return LineReader(name, head, now - begin, options)
+                return LineReader(name, head, len(head) * _interval(arrived), options)
             except InputError as err:
                 problem = err
         if now - begin > _PATIENCE_S:
             break
     raise InputError(problem.message, f'{problem.advice}; check the baud rate {baud}, too '
                      '(--baud)')
+
+
+def _interval(arrived: list[tuple[int, float]]) -> float:
+    """
+    Return the time per line, from the numbers of lines that had arrived at two or more times [s].
+
+    It is the median between times half of the list apart (Theil 1950): neither a backlog at the
+    start nor lines that are late at the end change it much.
+
+    """
+    count, seconds = np.array(arrived).T
+    half = len(arrived) // 2
+    return float(np.median((seconds[half:] - seconds[:-half]) / (count[half:] - count[:-half])))
 
 
 def _arriving(reader: LineReader, lines: Iterator[list[str]]) -> Iterator[Floats]:
