@@ -121,11 +121,15 @@ def test_lines_without_times_get_the_stated_rate() -> None:
     np.testing.assert_allclose(np.diff(found[:, 0]), 0.01)
 
 
-@pytest.mark.parametrize('late', [(0.0, 0.0), (0.0, 0.6), (1.5, 2.5)])
-def test_a_rate_is_measured_also_if_lines_are_late(
-        late: tuple[float, float], monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(('boots', 'late'), [
+    (0, (0.0, 0.0)), (0, (0.0, 0.6)), (0, (1.5, 2.5)), (100, (0.0, 0.0))])
+def test_a_rate_is_measured_also_if_lines_are_late_or_follow_a_boot(
+        boots: int, late: tuple[float, float], monkeypatch: pytest.MonkeyPatch) -> None:
+    def line(k: int) -> str:
+        return ('rst:0x1, boot\r\n' * boots if k == 0 else '') + f'{numbers(k)}\n'
+
     monkeypatch.setattr(*HEAD_OF_A_PORT, 2.0)
-    with (board(paced(lambda k: f'{numbers(k)}\n', late)) as port,
+    with (board(paced(line, late)) as port,
           open_source(port, LogOptions()) as source):
         found = samples(source.blocks, 450)
     assert '(measured)' in source.read_as

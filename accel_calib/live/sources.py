@@ -236,7 +236,7 @@ def _understood(name: str, lines: Iterator[list[str]], options: LogOptions, baud
         if now - tried >= _HEAD_S and len(head) >= _HEAD_LINES and len(arrived) > 1:
             tried = now
             try:
-                return LineReader(name, head, len(head) * _interval(arrived), options)
+                return LineReader(name, head, _interval(arrived), options)
             except InputError as err:
                 problem = err
         if now - begin > _PATIENCE_S:
@@ -247,10 +247,10 @@ def _understood(name: str, lines: Iterator[list[str]], options: LogOptions, baud
 
 def _interval(arrived: list[tuple[int, float]]) -> float:
     """
-    Return the time per line, from the numbers of lines that had arrived at two or more times [s].
+    Return the time from line to line [s], from the number of lines at two or more times [s].
 
-    It is the median between times half of the list apart (Theil 1950): neither a backlog at the
-    start nor lines that are late at the end change it much.
+    It is the median of the slopes between times half of the list apart (Theil 1950), which neither
+    a backlog at the start nor lines that are late at the end change much.
 
     """
     count, seconds = np.array(arrived).T

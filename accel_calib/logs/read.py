@@ -309,14 +309,15 @@ class LineReader:
     """
     Samples of lines that are read as the lines of a text log are.
 
-    Dialect, columns and units are recognised from the `head`, the first complete lines, which
-    arrived within some `seconds`; `first` are their samples. `name` is that of the port. A line
-    that cannot be read is skipped, because a serial port can lose characters. Raise InputError if
-    the lines have no accelerometer, contradict the options, or hold no gravity.
+    Dialect, columns and units are recognised from the `head`, the first complete lines; `first`
+    are their samples, and `interval` is the time from one line to the next [s]. `name` is that of
+    the port. A line that cannot be read is skipped, because a serial port can lose characters.
+    Raise InputError if the lines have no accelerometer, contradict the options, or hold no
+    gravity.
 
     """
 
-    def __init__(self, name: str, head: Sequence[str], seconds: float, options: LogOptions
+    def __init__(self, name: str, head: Sequence[str], interval: float, options: LogOptions
                  ) -> None:
         lines = _ended(head)
         layout = layout_of(Path(name), lines, lambda cells: is_log_header(cells, options), 'utf-8')
@@ -329,7 +330,7 @@ class LineReader:
             raise InputError(f'{name} sends no row of numbers, expected one line for each sample',
                              'check the format of the lines')
         timed = 'time' in columns.sources
-        rate_hz = options.rate or len(first.row) / seconds
+        rate_hz = options.rate or len(first.row) / (len(lines) - layout.start) / interval
         self._quantities = decided(columns, first, options if timed else
                                    replace(options, rate=rate_hz))
         self.units = self._quantities.units
