@@ -18,4 +18,5 @@ ONE_THREAD = dict.fromkeys(('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_
 
 def use_one_thread() -> None:
     """Set the variables that are not set yet. Call it before numpy is imported."""
-    os.environ.update({**ONE_THREAD, **os.environ})
+    for name, count in ONE_THREAD.items():
+        os.environ.setdefault(name, count)
