@@ -63,6 +63,7 @@ def _ran(command: str) -> Any:
     errors = io.StringIO()
     with redirect_stdout(io.StringIO()), redirect_stderr(errors):
         status = main(arguments)
+    assert 'internal error' not in errors.getvalue(), errors.getvalue()
     written = sorted(path for path in Path().iterdir()
                      if before.get(path) != path.stat().st_mtime_ns)
     return {'status': status, 'errors': errors.getvalue() if status == 2 else '',
@@ -78,11 +79,22 @@ def _content(path: Path) -> Any:
     if path.suffix == '.json':
         return json.loads(text)
     if path.suffix == '.yaml':
-        return {key: each for key, each in yaml.safe_load(text).items()
-                if key not in ('date', 'package_version', 'checksum', 'poses')}
+        return _of_yaml(yaml.safe_load(text))
     if path.suffix == '.html':
+        text = re.sub(r'(?s)<section>\n<h2>What these data cannot show.*?</section>', '', text)
         text = re.sub(r'(?s)<(svg|script|style).*?</\1>|<[^>]*>', '\n', text)
     return [line.strip() for line in text.splitlines() if line.strip()]
+
+
+def _of_yaml(stored: dict[str, Any]) -> dict[str, Any]:
+    """Return what a file states, with the covariance in the order of the names of its values."""
+    found = {key: each for key, each in stored.items()
+             if key not in ('date', 'package_version', 'checksum', 'poses')}
+    if 'covariance' in found and 'effects' in found:
+        order = np.argsort([f'{effect}.{name}' for effect, parts in found['effects'].items()
+                            for name in parts if name not in ('what', 'unit')])
+        found['covariance'] = np.array(found['covariance'])[np.ix_(order, order)]
+    return found
 
 
 def _column(values: tuple[str, ...]) -> Any:

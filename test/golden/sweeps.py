@@ -13,7 +13,7 @@ from accel_calib.calibrate import (
     Calibration, dilution, error_left_in, fit_poses, FleetPrior, gated, gyro_bias_of,
     identifiability, level, lies_in_cone, next_pose, Rejected, set_heading, with_given_mounting)
 from accel_calib.compare import compare
-from accel_calib.effects import CHANGES, effect_named, EFFECTS, MONOMIALS, PROCESSES
+from accel_calib.effects import CHANGES, effect_named, EFFECTS, is_effect, MONOMIALS, OF_RAMPS, PROCESSES
 from accel_calib.estimate import estimate, Prior, variance_factor
 from accel_calib.finding import Finding, LEVELS
 from accel_calib.findings import Expected, LIMITS, rate
@@ -186,11 +186,13 @@ def mountings() -> Any:
 def catalogue() -> Any:
     """Return the effects, their shapes, and what each adds to readings."""
     force = spread_directions(24) * np.linspace(0.4, 1.4, 24)[:, np.newaxis]
-    names = [f'empirical-{each}' for each in (
+    curves = [f'empirical-{each}' for each in (
         'offset-time-1-3', 'gain.z-temperature-2', 'cross_axis-std-1-2', 'force-supply_voltage-1',
         'offset.y-force-1-4', 'offset-force-2', 'gain-temperature_rate-1-2', 'offset-time',
         'gain.x-time-25', 'gain.x-time-24', 'gain-force-1', 'offset.w-time-1', 'offset-time-2-1',
         'offset-time-0')]
+    known = {name: is_effect(name) for name in curves}
+    names = filter(known.get, curves)
 
     def of(name: str) -> Any:
         effect = effect_named(name)
@@ -205,12 +207,14 @@ def catalogue() -> Any:
             model = Model({} if not effect.terms else {name: values})
             found.append([(model.at(CONTEXT).reading(force) - force)[::6], model.lags, np.sum(
                 np.abs(model.basis(force, CONTEXT).full), axis=(0, 1)),
-                np.sum(model.at(CONTEXT).slope(force[::9]), axis=2)])
+                model.at(CONTEXT).slope(force)[::9].sum(axis=2)])
         return found
 
     values = [[(float(each.value(x, 0.5, -0.2)), *map(float, each.gradient(x, 0.5, -0.2)))
                for x in (-1.2, -1.0, -0.3, 0.0, 0.7, 1.3)] for each in MONOMIALS[:25]]
-    return [_grid(of, (*EFFECTS, *PROCESSES, *CHANGES, *names)), values]
+    bare = ac.refine(ac.simulate(SENSOR, poses=24, units='g')).not_testable
+    return [_grid(of, (*EFFECTS, *OF_RAMPS, *PROCESSES, *CHANGES, *names)), values, known,
+            [f'{effect}: {needs}' for effect, needs in bare]]
 
 
 def gyro() -> Any:
