@@ -115,6 +115,29 @@ def test_boot_messages_garbled_lines_and_impossible_numbers_are_skipped() -> Non
     assert np.sum(np.diff(found[:, 0]) > 0.0051) >= 3
 
 
+@pytest.mark.parametrize(('timed', 'seed'), [(True, 0), (True, 2), (False, 0)])
+def test_times_never_run_backwards_though_characters_are_lost(timed: bool, seed: int) -> None:
+    rng = np.random.default_rng([20, seed])
+
+    def line(k: int) -> str:
+        text = f'{5 * k + 1000},{numbers(k)}\n' if timed else f'{numbers(k)}\n'
+        cut = int(rng.integers(len(text) - 1))
+        return text if k < 100 or k % 9 else text[:cut] + text[cut + int(rng.integers(1, 9)):]
+
+    columns = {'columns': {'time': '1', 'ax': '2', 'ay': '3', 'az': '4'}} if timed else {}
+    times = received(line, 400, **columns)[1][:, 0]
+    assert np.all(np.diff(times) >= 0.0)
+    assert np.ptp(times) == pytest.approx(len(times) / RATE_HZ, rel=0.1) or not timed
+
+
+def test_samples_of_a_board_that_starts_again_are_kept() -> None:
+    found = received(lambda k: f'{5 * k - 1500 * (k >= 300)},{numbers(k)}\n', 500, columns={
+        'time': '1', 'ax': '2', 'ay': '3', 'az': '4'})[1]
+    assert np.sum(np.diff(found[:, 0]) < 0.0) == 1
+    assert abs(np.diff(found[:, 0])).sum() == pytest.approx(
+        1.495 + 0.005 * (len(found) - 2))
+
+
 def test_lines_without_times_get_the_stated_rate() -> None:
     read_as, found = received(lambda k: f'{numbers(k)}\n', 150, rate=100.0)
     assert '100 Hz (stated)' in read_as

@@ -109,7 +109,7 @@ def open_source(name: str, options: LogOptions, *, baud: int = 115200, speed: fl
         with closing(_Port(name, baud)) as port:
             reader = _understood(name, port.lines(), options, baud)
             yield Source(name, '', reader.units, reader.read_as,
-                         _arriving(reader, port.lines()), lambda: port.problem)
+                         _in_order(_arriving(reader, port.lines())), lambda: port.problem)
         return
     with open_log(Path(name), options) as log:
         yield Source(name, log.sensor, log.units, log.read_as, _played(log.blocks, speed))
@@ -263,6 +263,23 @@ def _arriving(reader: LineReader, lines: Iterator[list[str]]) -> Iterator[Floats
         yield _rows(reader.first)
     for new in lines:
         yield from _rows_of(reader, new) if new else (np.empty((0, 9)),)
+
+
+def _in_order(blocks: Iterator[Floats]) -> Iterator[Floats]:
+    """
+    Leave out single samples whose time is not between those before and after.
+
+    Lost characters make such times. If a board starts again, its times stay smaller, and all
+    samples are kept. The last sample waits for the next one.
+
+    """
+    held = np.full((1, 9), np.nan)  # a sample that was yielded, and the one that waits
+    for block in blocks:
+        rows = np.concatenate([held, block])
+        before, time, after = rows[:-2, 0], rows[1:-1, 0], rows[2:, 0]
+        is_wrong = (before <= after) & ((time < before) | (time > after))
+        yield rows[1:-1][~is_wrong]
+        held = rows[-2:]
 
 
 def _rows_of(reader: LineReader, lines: list[str]) -> Iterator[Floats]:
