@@ -14,7 +14,7 @@ processes are left out, and the share that is killed is a lower bound.
 """
 
 import ast
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -38,12 +38,12 @@ import coverage
 from figures import markdown, parser, publish
 
 ROOT = Path(__file__).resolve().parent.parent
-FOLDERS = ('calibrate', 'capture', 'compare', 'effects', 'estimate', 'findings',
-           'messages', 'refine')
+FOLDERS = ('calibrate', 'capture', 'compare', 'effects', 'estimate', 'findings', 'logs',
+           'messages', 'refine', 'session', 'stored')
 KINDS = re.compile(r'core/Replace(BinaryOperator|ComparisonOperator|UnaryOperator|AndWithOr'
                    r'|OrWithAnd)')
 ELSEWHERE = re.compile(
-    r'test_(ros|live|fleet|docs|launch|packaging|dependencies|bombs|store_damage)')
+    r'test_(ros|live_(page|server|sources)|fleet|docs|launch|packaging|dependencies|bombs)')
 LIMIT_S = 300
 """Time after which a test counts as failed: a mutant may never end."""
 
@@ -105,7 +105,7 @@ def mutant(place: Place, draw: random.Random) -> Mutant:
 
 
 def sample(count: int, seed: int) -> list[Mutant]:
-    """Draw mutants of the nine folders."""
+    """Draw mutants of the folders."""
     draw = random.Random(seed)
     files = sorted(str(path.relative_to(ROOT)) for folder in FOLDERS
                    for path in (ROOT / 'accel_calib' / folder).rglob('*.py'))
@@ -200,15 +200,22 @@ def main() -> None:
             finally:
                 copies.put(where)
 
-        rows = []
+        rows, folders, survived = [], Counter[str](), Counter[str]()
         with ThreadPoolExecutor(workers) as pool:
             for done, (given, killed) in enumerate(zip(drawn, pool.map(tried, drawn)), 1):
+                folder_of = given.file.split('/')[1]
+                folders[folder_of] += 1
                 if not killed:
+                    survived[folder_of] += 1
                     rows.append((given.file, given.line, given.words))
                     print(done, *rows[-1], flush=True)
-    killed_share = 1.0 - len(rows) / len(drawn)
-    words = (f'{len(drawn)} mutants, seed {options.seed}: {killed_share:.1%} killed')
-    publish(f'{words}\n\n{markdown(("file", "line", "survives"), rows)}', options.markdown)
+    shares = [(each, count, f'{1.0 - survived[each] / count:.0%}')
+              for each, count in sorted(folders.items())]
+    words = (f'{len(drawn)} mutants, seed {options.seed}: '
+             f'{1.0 - len(rows) / len(drawn):.1%} killed')
+    publish('\n\n'.join((
+        words, markdown(('folder', 'mutants', 'killed'), shares),
+        markdown(('file', 'line', 'survives'), rows))), options.markdown)
 
 
 if __name__ == '__main__':

@@ -3,15 +3,15 @@
 
 """Helpers of several tests: recordings, sensors, commands, waits, and tasks of a session."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 import json
 import os
 from pathlib import Path
 import re
-import shlex
 import subprocess
 import sys
+from tempfile import TemporaryFile
 import time
 from typing import Any
 
@@ -125,13 +125,48 @@ def python(*arguments: object, folder: Path | None = None, **environment: str
         check=False, timeout=300, env={**os.environ, 'PYTHONPATH': str(ROOT), **environment})
 
 
-def shell(line: str, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run a line of bash in a folder, with the command ``accel-calib`` of this tree."""
-    program = shlex.join([sys.executable, *COMMAND])
-    return subprocess.run(
-        ['bash', '-euc', f'accel-calib() {{ {program} "$@"; }}; {line}'], cwd=folder,
-        capture_output=True, text=True, check=False,
-        env={**os.environ, 'PYTHONPATH': str(ROOT), **environment})
+def forked(*arguments: object, folder: Path, terminal: int | None = None,
+           closed: Sequence[int] = (), **environment: str) -> subprocess.CompletedProcess[str]:
+    """
+    Run a command in a copy of this process, whose imports are done, and return what it did.
+
+    Standard input is empty. `terminal` is the descriptor of a terminal for the output and the
+    errors, and `closed` are the numbers of closed streams.
+
+    """
+    with open(os.devnull) as empty, TemporaryFile('w+') as out, TemporaryFile('w+') as errors:
+        streams = [empty.fileno(), *((out.fileno(), errors.fileno()) if terminal is None else
+                                     (terminal, terminal))]
+        child = os.fork()
+        if not child:
+            try:
+                os.chdir(folder)
+                os.environ.update(environment)
+                for number, stream in enumerate(streams):
+                    os.dup2(stream, number)
+                for number in closed:
+                    os.close(number)
+                sys.stdin, sys.stdout, sys.stderr = (
+                    None if number in closed else open(number, mode, closefd=False)
+                    for number, mode in enumerate('rww'))
+                status = _status_of(arguments)
+                for stream in (sys.stdout, sys.stderr):
+                    if stream is not None:
+                        stream.flush()
+                os._exit(status)
+            finally:
+                os._exit(70)
+        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        printed = [(each.seek(0), each.read())[1] for each in (out, errors)]
+    return subprocess.CompletedProcess(arguments, status, *printed)
+
+
+def _status_of(arguments: Sequence[object]) -> int:
+    sys.argv = ['accel-calib', *map(str, arguments)]
+    try:
+        return main()
+    except SystemExit as ended:
+        return int(ended.code or 0)
 
 
 def run_snippets(page: str, printed: Callable[[str], bool] = bool) -> dict[str, Any]:

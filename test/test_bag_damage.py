@@ -185,8 +185,8 @@ def test_a_long_name_of_a_sensor_is_not_shown_whole(tmp_path: Path) -> None:
     assert len(str(caught.value)) < 3000
 
 
-@pytest.mark.parametrize('size_kb', [8, 24])
-@pytest.mark.parametrize('name', ['out', 'out.db3', 'out.mcap', 'out.bag'])
+@pytest.mark.parametrize(('name', 'size_kb'), [
+    ('out', 8), ('out', 24), ('out.db3', 24), ('out.mcap', 8), ('out.bag', 24)])
 def test_a_copy_on_a_full_disk_is_one_line_and_nothing_stored(
         name: str, size_kb: int, tmp_path: Path) -> None:
     write_calibration(tmp_path / 'c.yaml', a_calibration())

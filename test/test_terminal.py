@@ -3,6 +3,8 @@
 
 """Text on terminals of any width and encoding, wrong arguments, and ``accel-calib watch``."""
 
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 import io
 import json
@@ -10,6 +12,7 @@ import math
 import os
 from pathlib import Path
 import pty
+import shlex
 import subprocess
 import sys
 from typing import Any
@@ -22,9 +25,7 @@ from inside import (
 import numpy as np
 import pytest
 from rich.console import Console
-from shared import python, ROOT, run, run_json, shell
-
-RUN = [sys.executable, *COMMAND]
+from shared import forked, python, ROOT, run, run_json
 
 
 @pytest.fixture
@@ -63,11 +64,12 @@ def test_output_fits_the_width(columns, poses, printed, tmp_path):
 
 
 @pytest.mark.parametrize('encoding', ['ascii', 'cp1252'])
-def test_output_of_an_old_encoding_has_replacements(encoding, poses, tmp_path):
-    done = subprocess.run([*RUN, 'fit', str(poses), '-o', str(tmp_path / 'c.yaml')],
-                          capture_output=True, check=True,
-                          env={**os.environ, 'PYTHONIOENCODING': encoding})
-    text = done.stdout.decode(encoding)
+def test_output_of_an_old_encoding_has_replacements(encoding, poses, tmp_path, monkeypatch):
+    written = io.BytesIO()
+    monkeypatch.setattr(sys, 'stdout', io.TextIOWrapper(written, encoding))
+    assert run('fit', poses, '-o', tmp_path / 'c.yaml') == 0
+    sys.stdout.flush()
+    text = written.getvalue().decode(encoding)
     assert ('+-' if encoding == 'ascii' else '±') in text
     assert '?' not in text
 
@@ -108,30 +110,28 @@ def test_progress_shows_on_a_terminal_from_the_start(tmp_path):
     reading = np.random.default_rng(3).normal((0.1, 0.2, 9.8), 0.02, (count, 3))
     np.savetxt(path, np.column_stack([np.arange(count) / 100.0, reading]), fmt='%.4f',
                delimiter=',', header='time,ax,ay,az', comments='')
-    status, shown_text = on_a_terminal(['capture', path, '-o', tmp_path / 'p.csv'])
+    status, shown_text = on_a_terminal('capture', path, '-o', tmp_path / 'p.csv')
     assert status == 0
     assert 'samples' in shown_text
 
 
-def on_a_terminal(arguments, **environment):
+def on_a_terminal(*arguments, **environment):
     """Return the exit status of a command, and its text on a terminal."""
     ours, theirs = pty.openpty()
-    plain = {name: value for name, value in os.environ.items() if name != 'NO_COLOR'}
-    process = subprocess.Popen([*RUN, *map(str, arguments)], stdout=theirs, stderr=theirs,
-                               env={**plain, 'TERM': 'xterm', **environment})
-    os.close(theirs)
+    with ThreadPoolExecutor(1) as reader, open(ours, 'rb', 0) as terminal:
+        text = reader.submit(_all_of, terminal)
+        status = forked(*arguments, folder=Path(), terminal=theirs, TERM='xterm',
+                        **environment).returncode
+        os.close(theirs)
+        return status, text.result().decode()
+
+
+def _all_of(terminal):
     text = b''
-    while part := _read(ours):
-        text += part
-    os.close(ours)
-    return process.wait(), text.decode()
-
-
-def _read(terminal):
-    try:
-        return os.read(terminal, 1 << 16)
-    except OSError:  # the last process has closed it
-        return b''
+    with suppress(OSError):  # the last process has closed it
+        while part := terminal.read(1 << 16):
+            text += part
+    return text
 
 
 @pytest.fixture
@@ -143,19 +143,22 @@ def worse(poses, tmp_path):
     return stored, other
 
 
-def test_the_verdict_has_a_colour_on_a_terminal_only(poses, worse):
-    stored, other = worse
-    for arguments, verdict, colour in ((['fit', poses], 'GOOD', 32),
-                                       (['verify', other, '-c', stored], 'BAD', 31),
-                                       (['fit', poses, poses], 'GOOD', 32)):
-        _, text = on_a_terminal(arguments)
-        assert f'\x1b[1;{colour}m{verdict}\x1b[0m' in text
-        _, plain = on_a_terminal(arguments, NO_COLOR='1')
-        assert verdict in plain
-        assert f'{colour}m' not in plain
-        no_terminal = python(*COMMAND, *arguments)
-        assert verdict in no_terminal.stdout
-        assert '\x1b' not in no_terminal.stdout + no_terminal.stderr
+@pytest.mark.parametrize(('line', 'verdict', 'colour'), [
+    ('fit poses.csv', 'GOOD', 32), ('verify other.csv -c c.yaml', 'BAD', 31),
+    ('fit poses.csv poses.csv', 'GOOD', 32)])
+def test_the_verdict_has_a_colour_on_a_terminal_only(line, verdict, colour, worse, capsys,
+                                                     monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv('NO_COLOR', raising=False)
+    assert f'\x1b[1;{colour}m{verdict}\x1b[0m' in on_a_terminal(*line.split())[1]
+    _, plain = on_a_terminal(*line.split(), NO_COLOR='1')
+    assert verdict in plain
+    assert f'{colour}m' not in plain
+    capsys.readouterr()
+    run(*line.split())
+    no_terminal = ''.join(capsys.readouterr())
+    assert verdict in no_terminal
+    assert '\x1b' not in no_terminal
 
 
 def test_verify_says_why_it_ends_with_1(poses, worse, capsys, monkeypatch):
@@ -174,34 +177,58 @@ def test_verify_says_why_it_ends_with_1(poses, worse, capsys, monkeypatch):
 
 
 def piped(line, folder):
-    """Return what a line of the shell prints; each command ends with status 0."""
-    done = shell(line, folder, COLUMNS='200')
+    """Run a line of bash with ``accel-calib``, which ends with status 0."""
+    program = shlex.join([sys.executable, *COMMAND])
+    done = subprocess.run(
+        ['bash', '-euc', f'accel-calib() {{ {program} "$@"; }}; {line}'],
+        cwd=folder, capture_output=True, text=True, check=False,
+        env={**os.environ, 'PYTHONPATH': str(ROOT)})
     assert done.returncode == 0, done.stderr
     return done
 
 
-def test_logs_and_tables_go_through_pipes(tmp_path):
-    simulate = 'accel-calib simulate -o - --recording --poses 14 --effect offset=0.02,-0.01,0.03'
+SIMULATE = ('simulate', '--recording', '--poses', '14', '--effect', 'offset=0.02,-0.01,0.03', '-o')
+
+
+@pytest.fixture(scope='module')
+def files(tmp_path_factory):
+    """Return a folder with a recording, its poses and their calibration."""
+    folder = tmp_path_factory.mktemp('files')
+    assert run(*SIMULATE, folder / 'r.csv') == 0
+    assert run('capture', folder / 'r.csv', '-o', folder / 'p.csv') == 0
+    assert run('fit', folder / 'p.csv', '-o', folder / 'stored.yaml') == 0
+    return folder
+
+
+def test_a_log_goes_through_pipes(files, tmp_path):
+    simulate = f'accel-calib {shlex.join(SIMULATE)} -'
     piped(f'{simulate} | accel-calib capture - -o - | accel-calib fit - -o piped.yaml', tmp_path)
-    piped(f'{simulate} >r.csv; accel-calib capture r.csv -o p.csv; '
-          'accel-calib fit p.csv -o stored.yaml', tmp_path)
-    one, other = (ac.load(tmp_path / name) for name in ('piped.yaml', 'stored.yaml'))
-    assert one == other
-    assert 'standard input' in piped('accel-calib verify - -c stored.yaml <p.csv', tmp_path).stdout
-    shown_on = piped('accel-calib calibrate - -o - <r.csv >made.yaml', tmp_path)
-    assert 'GOOD' in shown_on.stderr
-    assert ac.load(tmp_path / 'made.yaml').rating.name == 'GOOD'
-    assert 'accel-calib calibrate -' in shown_on.stderr
-    assert not (tmp_path / '-.html').exists()
-    table = piped('accel-calib apply - -c stored.yaml -o - <r.csv', tmp_path)
-    assert table.stdout.startswith('# units: "m/s2"\n')
-    assert 'corrected' in table.stderr
+    assert ac.load(tmp_path / 'piped.yaml') == ac.load(files / 'stored.yaml')
+
+
+def test_logs_and_tables_go_through_standard_streams(files, capsys, monkeypatch):
+    def streamed(line, file):
+        """Return what a command prints whose standard input is a file."""
+        with (files / file).open() as opened:
+            monkeypatch.setattr(sys, 'stdin', opened)
+            assert run(*line.split()) == 0
+        return capsys.readouterr()
+
+    monkeypatch.chdir(files)
+    monkeypatch.setenv('COLUMNS', '200')
+    assert 'standard input' in streamed('verify - -c stored.yaml', 'p.csv').out
+    calibrated = streamed('calibrate - -o -', 'r.csv')
+    assert 'accel-calib calibrate -' in calibrated.err
+    (files / 'made.yaml').write_text(calibrated.out, encoding='utf-8')
+    assert ac.load('made.yaml').rating.name == 'GOOD'
+    assert not Path('-.html').exists()
+    table = streamed('apply - -c stored.yaml -o -', 'r.csv')
+    assert table.out.startswith('# units: "m/s2"\n')
+    assert 'corrected' in table.err
     for line in ('export FILE --to imucal -o -', 'verify p.csv -c FILE'):
-        texts = {piped(f'accel-calib {line.replace("FILE", name)} <stored.yaml', tmp_path).stdout
-                 for name in ('-', 'stored.yaml')}
-        assert len(texts) == 1
-    line = 'accel-calib fit - --json - <p.csv'
-    assert json.loads(piped(line, tmp_path).stdout)['file'] == 'standard input'
+        assert len({streamed(line.replace('FILE', name), 'stored.yaml').out
+                    for name in ('-', 'stored.yaml')}) == 1
+    assert json.loads(streamed('fit - --json -', 'p.csv').out)['file'] == 'standard input'
 
 
 def test_a_reader_that_leaves_early_gets_no_error(tmp_path):
@@ -217,7 +244,7 @@ def test_a_reader_that_leaves_early_gets_no_error(tmp_path):
     ('fit -', 'standard input is empty'), ('fleet r.csv -o -', '-o is -, expected a folder')])
 def test_what_cannot_go_through_a_pipe_is_refused(line, message, tmp_path):
     (tmp_path / 'r.csv').write_text('time,ax,ay,az\n0,0,0,9.8\n', encoding='utf-8')
-    done = shell(f'accel-calib {line} </dev/null', tmp_path)
+    done = forked(*line.split(), folder=tmp_path)
     assert done.returncode == 2
     assert message in done.stderr
     assert done.stderr.count('\n') == 1
