@@ -192,7 +192,14 @@ class _Port:
     def _read(self) -> bytes:
         """Return the bytes that have arrived; after a loss, try to open the port again."""
         if self._port is None:
-            self._try_again()
+            time.sleep(_WAIT_S)
+            if time.monotonic() - self._tried >= _AGAIN_S:
+                self._tried, self.problem = time.monotonic(), ''
+                try:
+                    self._open()
+                except InputError as err:
+                    self.problem = (f'{err.message}: connect the sensor again; the page continues '
+                                    'when it is back, and the poses are kept')
             return b''
         try:
             found: bytes = self._port.read(self._port.in_waiting or 1)
@@ -203,19 +210,6 @@ class _Port:
                             'again; the page continues when it is back, and the poses are kept')
             return b''
         return found
-
-    def _try_again(self) -> None:
-        time.sleep(_WAIT_S)
-        if time.monotonic() - self._tried < _AGAIN_S:
-            return
-        self._tried = time.monotonic()
-        try:
-            self._open()
-        except InputError as err:
-            self.problem = (f'{err.message}: connect the sensor again; the page continues when '
-                            'it is back, and the poses are kept')
-        else:
-            self.problem = ''
 
 
 def _understood(name: str, lines: Iterator[list[str]], options: LogOptions, baud: int

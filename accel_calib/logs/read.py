@@ -339,11 +339,6 @@ class LineReader:
         self.read_as = ', '.join(filter(None, (self._quantities.read_as, rate)))
         self.first = self._recording(first)
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Return what is not used, and what was skipped so far."""
-        return (*self._table.notes, *self._quantities.all_notes)
-
     def samples(self, lines: Sequence[str]) -> Recording | None:
         """Return the samples of the next complete lines; None if there are none."""
         return self._recording(self._table.read(_ended(lines)))
