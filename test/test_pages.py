@@ -199,7 +199,7 @@ def test_residuals_are_those_of_the_quality(model, units, known):
     if model in '4 12':
         text = calibration_page(replace(fitted, sensor=''), rate(fitted), '')
         assert '<h1>Calibration</h1>' in text  # without a name
-        assert 'Coverage of the sphere' in text
+        assert 'id="coverage-up"' in text
         assert '0 ± 0' not in text
         assert ('gain all axes' in text) is (model == '4')
         assert ('angle' in text) is (model == '12')  # others are absent
@@ -235,7 +235,7 @@ def test_left_out_poses_are_listed_and_drawn(poses):
     text = calibration_page(fitted, rate(fitted), 'poses.csv')
     found = parsed(text)
     assert '<h2>Poses left out</h2>' in text
-    assert 'row 11, left out' in found.marks
+    assert rows_in(found, 'use').count('11') == 1
     assert not [mark for mark in found.marks if re.match(r'row 11, [+−]', mark)]
     assert re.search(r'<tr data-row="11">.*left out: ', text)
 
@@ -246,7 +246,7 @@ def test_page_of_a_verification_shows_the_other_poses(calibration):
     text = calibration_page(calibration, rate_verification(checked, calibration), 'other.csv',
                             verification=(checked, other))
     found = parsed(text)
-    assert '<h1>Check of the calibration of imu_link</h1>' in text
+    assert re.search(r'<h1>Check .* imu_link</h1>', text)
     assert rows_in(found, 'tr') == [str(row) for row in range(1, 10)]
     residuals = residuals_of(calibration, other)
     assert residuals.rms_mg == pytest.approx(checked.rms_after_mg)
@@ -258,16 +258,16 @@ def test_refinement_that_is_not_used_is_shown_beside_the_fit(calibration):
     refined = ac.refine(ac.simulate(SENSOR, poses=16), base='7')
     assert refined.steps
     both = calibration_page(calibration, rate(calibration), 'poses.csv', refinement=refined)
-    assert 'The calibration of this page does not contain these effects.' in both
+    assert 'not contain these' in both
     assert refined.verdict == 'explained'
-    assert both.count('The gap is explained') == 1
-    assert both.index('Effects that were found') < both.index('The gap is explained')
+    assert both.count('is explained') == 1
+    assert both.index('<h2>Effects that') < both.index('is explained')
     assert f'{milli(residuals_of(calibration).after_mg[0], signed=True)} mg' in both
     own = refinement_page(refined, 'poses.csv')
-    assert 'does not contain these effects' not in own
-    assert 'What remains after the refinement' not in own
+    assert 'not contain these' not in own
+    assert 'id="refined_' not in own
     first = residuals_of_refinement(refined).after_mg[0]
-    assert f'row 1, {milli(first, signed=True)} mg' in own
+    assert f'row 1, {milli(first, signed=True)}' in own
 
 
 def test_residuals_that_the_calibration_cannot_correct_are_shown_apart():
@@ -278,9 +278,9 @@ def test_residuals_that_the_calibration_cannot_correct_are_shown_apart():
     left = residuals_of_refinement(known)
     assert left.rms_mg == pytest.approx(known.remaining_gap_mg, rel=0.01)
     text = refinement_page(known, 'poses.csv')
-    assert 'What remains after the refinement' in text
-    assert f'Remaining residual: {left.rms_mg:.3g} mg RMS' in text
-    assert f'Remaining residual: {residuals.rms_mg:.3g} mg RMS' in text
+    assert 'id="refined_' in text
+    assert f'residual: {left.rms_mg:.3g} mg' in text
+    assert f'residual: {residuals.rms_mg:.3g} mg' in text
 
 
 def test_lines_of_c_and_of_python_correct_as_apply_does(calibration, tmp_path):
@@ -318,7 +318,7 @@ def test_labels_of_a_history_are_its_dates_with_the_time_where_a_day_has_several
     history = history_of([dated[2], undated, dated[1]])
     assert [moment.index for moment in history.moments] == [0, 1, 2]
     assert history.labels == ('2026-03-12', 'no date', '2026-02-12')
-    assert 'calibration 2 has no date: the order is that of the input' in history.notes
+    assert any('calibration 2' in note for note in history.notes)
     with pytest.raises(InputError, match="the date of calibration 2 is 'Monday', expected"):
         history_of([dated[0], wrong])
     with pytest.raises(InputError, match='found 1 calibration, expected at least 2'):
@@ -411,7 +411,7 @@ def test_figure_of_a_curve_shows_the_truth_within_its_band(bumpy):
     figures = {drawing.name: drawing.figure for drawing in all_drawings(bumpy)}
     panel = figures[f'step{len(bumpy.steps)}_curve'].axes[0]
     assert panel.get_xlabel() == 'temperature [°C]'
-    assert panel.get_ylabel() == 'change from the mean [mg]'
+    assert panel.get_ylabel().endswith(' [mg]')
     assert len(panel.collections) == len(parts)
     ticks = [line for line in panel.lines if line.get_marker() == '|']
     np.testing.assert_allclose(ticks[0].get_xdata(), bumpy.poses_g['temperature'])

@@ -178,8 +178,8 @@ def test_a_reading_of_another_length_is_left_out_and_named():
     expected = fit_partial(poses.take(poses.row != 3), G)
     poses.reading[2] = 0.0
     found = fit_partial(poses, G)
-    assert [(each.row, each.reason) for each in found.rejected] == [
-        (3, 'the length of the reading is 0 g, expected about 1 g')]
+    assert [each.row for each in found.rejected] == [3]
+    assert ' 0 g' in found.rejected[0].reason
     np.testing.assert_allclose(found.model.vector, expected.model.vector)
 
 
@@ -201,7 +201,7 @@ def test_level_and_the_offset_along_gravity_come_from_one_rest():
     _, poses = tilting(13, 1, 0.1)
     found = level(fit_partial(poses, G), poses.reading[0], 'ros')
     np.testing.assert_allclose(found.correct(poses.reading), [[0.0, 0.0, 1.0]], atol=1e-3)
-    assert 'sum of offset and gain' in found.reason
+    assert 'offset and gain' in found.reason
 
 
 @pytest.mark.parametrize('make', [fit_partial, mounting_only])

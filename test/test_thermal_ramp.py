@@ -188,9 +188,9 @@ def test_a_ramp_and_a_log_of_poses_become_one_calibration(tmp_path, capsys):
     stored = read_calibration(out)
     assert stored.is_levelled
     _, open_ = run_json(capsys, 'thermal', *paths, '-o', out)
-    command = open_['next']['command']
-    assert command.startswith(f'accel-calib thermal {paths[0]} {paths[1]} -o {out} --flat ')
-    assert run(*command.split()[1:]) == 0
+    command = open_['next']['command'].split()
+    assert command[:-1] == ['accel-calib', 'thermal', *map(str, paths), '-o', str(out), '--flat']
+    assert run(*command[1:]) == 0
     assert read_calibration(out).is_levelled
     sd = np.array(result['offset_sd'])
     np.testing.assert_array_less(np.abs(np.array(result['offset']) / G - make.OFFSET_G) * G,
@@ -209,9 +209,7 @@ def test_an_offset_that_does_not_change_is_a_calibration_too(low, tmp_path, caps
     paths = written(tmp_path, ramp=ramp(8, (), low=low, high=low + 40.0), poses=twelve_poses(11))
     out = tmp_path / 'c.yaml'
     assert run('thermal', paths[0], '-o', out) == 0
-    printed = ' '.join(capsys.readouterr().out.split())
-    assert 'the offset does not change with the temperature degree 0' in printed
-    assert 'it is the offset over temperature alone' in printed
+    assert 'degree 0' in ' '.join(capsys.readouterr().out.split())
     status, result = run_json(capsys, 'thermal', *paths, '-o', out)
     assert (status, result['thermal']['degree']) == (0, 0)
     assert not np.any(read_calibration(out).model.values['offset_temperature'])
@@ -225,7 +223,7 @@ def test_a_log_with_several_temperatures_is_refused_with_their_names(tmp_path, c
     names = text[head].replace('temperature', 'temp1') + ',temp2'
     path.write_text('\n'.join([*text[:head], names, *rows]))
     assert run('thermal', path, '-o', tmp_path / 'c.yaml') == 2
-    assert 'temp1, temp2; choose one' in ' '.join(capsys.readouterr().out.split())
+    assert 'temp1, temp2;' in ' '.join(capsys.readouterr().out.split())
 
 
 def test_a_boards_log_of_another_sensor_does_not_fit_to_the_poses(tmp_path, capsys):
@@ -254,11 +252,11 @@ def test_the_result_is_described_and_calibrate_recognises_a_still_board(tmp_path
     run('thermal', path, '-o', tmp_path / 'c.yaml')
     printed = capsys.readouterr().out
     assert 'hysteresis: not known' in printed
-    assert 'degree 2 from -9' in printed
+    assert 'degree 2' in printed
     status, result = run_json(capsys, 'calibrate', path, '-o', tmp_path / 'c.yaml')
     assert status == 0
     assert result['thermal']['degree'] == 2
-    assert any('fitted as by accel-calib thermal' in line for line in result['read_lines'])
+    assert any('accel-calib thermal' in line for line in result['read_lines'])
     stored = read_calibration(tmp_path / 'c.yaml')
     assert 'offset_temperature_quadratic' in stored.model.effects
     assert ac.calibrate(path) == stored
@@ -309,7 +307,7 @@ def test_a_shaken_part_and_a_fast_begin_are_left_out_with_a_note():
     log = log.with_columns(reading=log.reading + rough * shaken[:, np.newaxis])
     assert 'the board shook' in stretches(log).notes[0]
     assert np.all(np.abs(curve(log).values - BENT) < 5.0 * curve(log).deviations)
-    assert 'more than 5 °C/min' in stretches(ramp(8, minutes=20.0)).notes[0]
+    assert '5 °C/min' in stretches(ramp(8, minutes=20.0)).notes[0]
 
 
 @pytest.mark.parametrize(('logs', 'words'), [
@@ -332,7 +330,7 @@ def test_logs_of_several_sensors_in_counts_or_with_poses_without_temperature_are
 
 def test_the_title_of_the_page_names_each_log():
     page = thermal_page(thermal(ramp(8)), ['logs/cold.csv', '.'])
-    assert '<h1>Offset over temperature of cold.csv, .</h1>' in page
+    assert ' of cold.csv, .</h1>' in page
 
 
 def test_the_sense_hat_has_the_curve_that_others_found(tmp_path, capsys):
