@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 import accel_calib as ac
 from accel_calib.session import CalibratorSettings
 from faults.sample import FACTOR
-from inside import parser
+from inside import EXPORT_FORMATS, LOG_FORMATS, parser
 import pytest
 from shared import ROOT
 from test_policy import names_of_the_calibrator
@@ -46,6 +46,12 @@ def test_parameter_file_describes_all_parameters_and_has_their_defaults(tables):
     given = yaml.safe_load(text)['/**']['ros__parameters']
     assert CalibratorSettings(**given) == CalibratorSettings()
     assert list(given) == [parameter.name for parameter in fields(CalibratorSettings)]
+
+
+@pytest.mark.parametrize(('page', 'names'), [
+    ('docs/exports.md', EXPORT_FORMATS), ('docs/log_formats.md', LOG_FORMATS)])
+def test_every_format_is_in_its_page(page, names):
+    assert not [name for name in names if f'`{name}`' not in text_of(page)]
 
 
 def test_every_table_is_in_a_page(tables):
