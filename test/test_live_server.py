@@ -195,7 +195,7 @@ def test_the_page_and_the_exports_of_a_calibration_are_served(turned: Bench) -> 
     assert "frame-ancestors 'self'" in policy
     assert "'unsafe-inline'" not in re.findall('script-src[^;]*', policy)[0]
     own = re.findall('http-equiv="Content-Security-Policy" content="(.*?)"', page.decode())
-    assert policy == f"{own[0]}; frame-ancestors 'self'"
+    assert policy.partition('; frame-ancestors')[0] == own[0]
     assert fetch(turned.base + viewer.state['page'])[2] == page
 
     viewer.ask('save')
@@ -261,8 +261,8 @@ def test_pages_have_the_headers_of_security(shared: Bench) -> None:
     for path in ('/', '/none', '/stream'):
         headers = fetch(shared.base + path)[1]
         policy = headers['Content-Security-Policy']
-        assert policy.startswith("default-src 'none'; script-src 'self'; style-src 'self'; ")
-        assert "frame-ancestors 'none'" in policy
+        assert {"default-src 'none'", "script-src 'self'", "style-src 'self'",
+                "frame-ancestors 'none'"} <= {*policy.split('; ')}
         assert 'unsafe' not in policy
         assert headers['Server'] == 'accel_calib'
         assert (headers['X-Content-Type-Options'], headers['Referrer-Policy'],
@@ -297,7 +297,7 @@ def test_the_page_consists_of_its_files_and_nothing_else(shared: Bench) -> None:
 def test_an_unknown_command_is_refused_and_another_message_closes_the_connection(
         shared: Bench, text: str, code: int) -> None:
     viewer, other = shared.viewer(), shared.viewer()
-    assert "'close', expected one of capture_pose" in viewer.ask('close')['words']
+    assert "'close', expected" in viewer.ask('close')['words']
     viewer.send(text)
     wait(lambda: viewer.code)
     assert viewer.code == code

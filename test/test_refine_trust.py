@@ -101,7 +101,7 @@ def test_findings_of_one_orientation_are_reported_and_not_stored(tmp_path, capsy
     result = json.loads(printed.out)
     assert {'offset_temperature', 'offset_drift'} & {
         name for step in result['steps'] for name in (step['effect'], *step['rivals'])}
-    assert 'spread over the sphere' in result['refusal']
+    assert 'same orientation' in result['refusal']
     assert 'is not written' in printed.err.splitlines()[-1]
     assert not stored.exists()
 
@@ -215,7 +215,7 @@ def test_the_gap_of_a_stored_calibration_is_that_of_the_file_and_another_sensor_
         assert found.gap_mg == pytest.approx(verify(base, new).rms_after_mg)
         assert len(set(found.poses_g.row.tolist())) == len(found.poses_g)
         assert (found.verdict == 'no_gap') is (truth is model)
-    assert found.advice[0].startswith('this is probably another sensor')
+    assert 'another sensor' in found.advice[0]
 
 
 def test_hot_poses_beside_a_cold_calibration_name_the_temperature(stored):
@@ -316,7 +316,7 @@ def test_a_walk_beside_an_effect_is_a_step_of_its_own_and_describes_the_gap():
     poses = poses_of(model, rng, 60, time=np.arange(60) * 30.0)
     found = refine(plus(poses, np.cumsum(rng.normal(size=(60, 3)), axis=0) * 1.5e-3), G)
     assert (found.verdict, names(found)) == ('described', ['quadratic', 'offset_wander'])
-    assert 'a slow change of the offset' in verdict_words(found)
+    assert 'slow change' in verdict_words(found)
     first, second = found.steps
     assert second.gap_before_mg == pytest.approx(first.gap_after_mg)
     assert second.gap_after_mg < 0.5 * second.gap_before_mg
@@ -346,7 +346,7 @@ def test_what_is_not_recorded_is_not_taken_for_a_temperature_that_resembles_it(s
     assert found.verdict in ('described', 'unexplained')
     assert {*names(found)} - {'empirical', 'offset_wander'} == {*effects}
     if found.verdict == 'unexplained' and not effects:
-        assert 'would explain only a part: check' in ' '.join(found.advice)
+        assert 'only a part' in ' '.join(found.advice)
 
 
 @pytest.mark.parametrize('seed', range(2))
@@ -372,8 +372,8 @@ def test_a_turned_mount_is_named_where_the_orientation_is_known_beside_gains(see
     both = names(refine(taken(stretched, turn), G, base=base))
     assert {'misalignment', 'axis_gain'} <= {*both}
     blind = fit_poses(taken(model, unturned, known=False), G)
-    assert any('mount that has turned' in line
-               for line in refine(taken(model, turn, known=False), G, base=blind).advice)
+    advice = refine(taken(model, turn, known=False), G, base=blind).advice
+    assert '(ref_x, ref_y, ref_z)' in ' '.join(advice)
 
 
 @pytest.mark.parametrize('noisier', [2.0, 4.0])

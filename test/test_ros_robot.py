@@ -151,13 +151,13 @@ def test_the_log_says_what_the_node_waits_for_the_likely_unit_and_what_it_does_n
     process = bench.calibrator(unit='g')
     bench.spin(lambda: any('although /bench publishes' in line.msg for line in lines))
 
-    bench.send_until(lambda: bench.imu([0.0, 0.1, 1.0]), lambda: any(
-        'start the node with units:=g' in line.msg for line in lines))
+    bench.send_until(lambda: bench.imu([0.0, 0.1, 1.0]),
+                     lambda: any('units:=g' in line.msg for line in lines))
     printed = bench.end(process, signal.SIGINT)[1]
-    assert 'waiting: no Imu messages on /imu/data_raw, although /bench publishes' in printed
-    assert 'Imu messages arrive on /imu/data_raw' in printed
-    assert 'start the node with units:=g' in printed
-    assert 'there is no parameter unit, expected ' in printed
+    assert '/imu/data_raw, although /bench' in printed
+    assert 'arrive on /imu/data_raw' in printed
+    assert 'units:=g' in printed
+    assert 'no parameter unit,' in printed
 
 
 def test_topics_of_imus_and_thermometers_that_exist_are_named(bench: Any) -> None:

@@ -34,7 +34,7 @@ def count(markers: list[Any], namespace: str = 'poses') -> int:
 def test_log_and_markers_report_that_more_poses_no_longer_help() -> None:
     poses = simulate_poses(Model({}), spread_directions(24), np.random.default_rng(1))
     asked = plan_for(poses, units_of('g'), 'auto').asked
-    assert asked.words == 'more poses no longer help: 24 poses determine |a| to within 0.18 mg'
+    assert (asked.direction, re.findall(r'\d\S*', asked.words)) == (None, ['24', '0.18'])
     markers = pose_markers(np.zeros((0, 3)), asked, 'imu').markers
     assert [m.text for m in markers if m.ns == 'next'] == [asked.words]
     few = plan_for(poses.take(slice(0, 8)), units_of('g'), 'auto').asked
@@ -55,11 +55,11 @@ def test_poses_are_captured_and_removed_on_request(bench: Any, readings: Reading
     assert count(markers) == 0
     answer = bench.call_while('capture_pose', lambda: bench.imu(poses[130]))
     assert answer.success, answer.message
-    assert re.match(r'1 pose: .*; next: turn the sensor so that the .* points up \([-+xyz ]+\)$',
-                    answer.message)
+    assert answer.message.startswith('1 pose: ')
     bench.spin(lambda: count(markers) == 1)
     asked = markers[-1].markers[-1].text
-    assert answer.message.endswith(asked)
+    assert re.search(r' up \([-+xyz ]+\)$', asked)
+    assert answer.message.endswith(f'; next: {asked}')
 
     bench.send_until(lambda: bench.imu(poses[130]), lambda: diagnostics and any(
         value.key == 'next' and value.value == asked
@@ -149,7 +149,7 @@ def test_node_declares_all_parameters_and_refuses_invalid_values_while_it_runs(b
     results = ask(SetParameters, 'set_parameters',
                   parameters=[each.to_parameter_msg() for each in tried]).results
     assert [each.successful for each in results] == [True, False, False, False]
-    assert 'expected one of auto' in results[1].reason
+    assert 'one of auto' in results[1].reason
 
 
 Names = dict[str, set[str]]

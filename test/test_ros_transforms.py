@@ -4,6 +4,7 @@
 """Static transforms: the tree of frames, and the topic /tf_static."""
 
 import math
+import re
 from typing import Any
 
 from accel_calib.errors import InputError
@@ -82,15 +83,13 @@ def test_rounded_quaternions_give_proper_rotations() -> None:
 
 
 @pytest.mark.parametrize(('parent', 'child', 'quaternion', 'words'), [
-    ('mast', 'imu', (0.0, 0.0, 0.0, 0.0), 'from mast to imu has the quaternion (0, 0, 0, 0) of '
-                                          'length 0, expected length 1; correct the node'),
-    ('mast', 'imu', (0.0, math.nan, 0.0, 1.0), '(0, nan, 0, 1) of length nan'),
+    ('mast', 'imu', (0.0, 0.0, 0.0, 0.0), '(0, 0, 0, 0) of length 0'),
+    ('mast', 'imu', (0.0, math.nan, 0.0, 1.0), 'of length nan'),
     ('mast', 'imu', (0.0, 0.0, math.inf, 1.0), 'of length inf'),
-    ('mast', 'imu', (1.0, 1.0, 1.0, 1.0), 'of length 2, expected length 1'),
-    ('', 'imu', UNIT, 'has an empty frame name'),
-    ('mast', '/', UNIT, 'has an empty frame name'),
-    ('imu', 'base', UNIT, 'from imu to base makes a loop'),
-    ('imu', 'imu', UNIT, 'from imu to imu makes a loop'),
+    ('mast', 'imu', (1.0, 1.0, 1.0, 1.0), 'of length 2'),
+    ('', 'imu', UNIT, 'empty frame name'), ('mast', '/', UNIT, 'empty frame name'),
+    ('imu', 'base', UNIT, 'imu to base makes a loop'),
+    ('imu', 'imu', UNIT, 'imu to imu makes a loop'),
 ])
 def test_invalid_transforms_are_refused_and_change_nothing(
         parent: str, child: str, quaternion: tuple[float, ...], words: str) -> None:
@@ -102,13 +101,13 @@ def test_invalid_transforms_are_refused_and_change_nothing(
 
 
 @pytest.mark.parametrize(('parameter', 'value', 'instead'), [
-    ('base_frame', 'base', 'set mounting_rpy instead'),
-    ('publish_tf', True, 'set publish_tf to false')])
+    ('base_frame', 'base', 'mounting_rpy'), ('publish_tf', True, 'publish_tf to false')])
 def test_without_tf2_msgs_its_parameters_are_refused(
         without_tf2: None, bench: Any, parameter: str, value: Any, instead: str) -> None:
     node = bench.start('calibrator', **{parameter: value})
-    assert (f'the parameter {parameter} needs the package tf2_msgs, which is not installed; '
-            f'install ros-jazzy-tf2-msgs, or {instead}') in node.communicate(timeout=60)[0]
+    printed = node.communicate(timeout=60)[0]
+    assert f'the parameter {parameter}' in printed
+    assert re.search(f'ros-jazzy-tf2-msgs, .*{instead}', printed)
     assert node.returncode == 2
 
 
@@ -135,7 +134,7 @@ def test_invalid_transform_is_logged_and_the_rest_of_its_message_is_used(
     assert tree.rotation('base', 'mast') is None
     log = capfd.readouterr().err
     assert '[WARN]' in log
-    assert 'the static transform from base to mast has the quaternion (0, 0, 0, 0)' in log
+    assert 'base to mast' in log
 
 
 def test_repeated_transform_is_no_change(tf_message: Any, bench: Any) -> None:

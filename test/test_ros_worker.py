@@ -55,7 +55,7 @@ def test_callbacks_continue_while_a_service_works(bench: Any, make_executor: Any
 
     def load() -> Task:
         yield Files(nothing)
-        raise InputError('no such thing', 'try another')
+        raise InputError('absent', 'add it')
 
     def save() -> Task:
         yield from ()
@@ -83,7 +83,7 @@ def test_callbacks_continue_while_a_service_works(bench: Any, make_executor: Any
         assert bench.call('fit').message == f'{TICKS} ticks'
         assert threads == {spinner}
         answer = bench.call('load')
-        assert (answer.success, answer.message) == (False, 'no such thing; try another')
+        assert (answer.success, answer.message) == (False, 'absent; add it')
         assert bench.call('save').message == 'at once'
         lines = [event for event in logged if isinstance(event, Log)]
         assert [line.severity for line in lines] == ['info', 'warning', 'info']
@@ -109,8 +109,8 @@ def test_an_error_of_a_function_is_logged_and_the_executor_continues(
     node.destroy_node()
     assert over.done()
     printed = capfd.readouterr().err
-    assert printed.count('unexpected error in accel_calib') == 1
-    assert 'ValueError: math domain error' in printed
+    assert printed.count('unexpected error') == 1
+    assert 'ValueError: math' in printed
 
 
 @pytest.fixture

@@ -55,7 +55,7 @@ def test_commands_refuse_data_of_another_sensor(
     status = main([command, str(tables / f'{kind}_{data}.csv'), '-c', str(stored(sensor=owner)),
                    *options.get(command, [])])
     assert status == (0 if accepted else 2)
-    assert (f'belongs to sensor {owner!r}, but' in capsys.readouterr().err) is not accepted
+    assert (f'to sensor {owner!r}' in capsys.readouterr().err) is not accepted
     assert out.exists() is (accepted and command == 'apply')
 
 

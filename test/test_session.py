@@ -131,10 +131,10 @@ def test_messages_of_another_sensor_are_dropped_and_end_the_rest(readings: Readi
     assert driver.sensor.live.detector.still
     assert driver.feed(rest[:1], 'another') == 0
     assert not driver.sensor.live.detector.still
-    assert "frame_id 'another', expected 'imu_link'" in driver.logged()
+    assert "'another', expected 'imu_link'" in driver.logged()
     assert driver.feed(rest[100:]) == len(rest) - 100
     assert driver.session.statistics.dropped['foreign'] == 1
-    assert 'dropped 1 message of another sensor' in driver.finding('stream').words
+    assert driver.finding('stream').level == Level.WARN
 
 
 @pytest.mark.parametrize(('units', 'per_g'), [('native', 16384.0), ('m/s2', 9.80665)])
@@ -164,7 +164,7 @@ def test_silent_sensor_can_be_replaced_by_another_with_its_own_files(
     assert driver.session.name == 'another'
     assert driver.calibration is None
     assert len(driver.poses) < 2
-    assert "now have frame_id 'another'" in driver.logged('warning')
+    assert "'another'" in driver.logged('warning')
     driver.now += 3.0
     driver.feed(turned[:50])
     assert driver.calibration is not None
@@ -181,7 +181,8 @@ def test_nothing_is_captured_from_a_sensor_that_fell_silent(stored: Stored, read
     driver.refuses(r'arrived 6\.0 s ago, expected one within', 'capture_pose', 'set_level')
     driver.feed(rest[150:160])
     assert driver.ask('capture_pose').startswith('1 pose:')
-    assert 'levelled by this pose' in driver.ask('set_level')
+    driver.ask('set_level')
+    assert driver.calibration.is_levelled
 
 
 def test_levelling_between_two_messages_imports_no_large_library(stored: Stored) -> None:
@@ -192,7 +193,7 @@ def test_levelling_between_two_messages_imports_no_large_library(stored: Stored)
             'print({name.split(".")[0] for name in {*sys.modules} - before})')
     words, imported = python('-c', code, stored(), PYTHONPATH=f'{ROOT}:{ROOT}/test'
                              ).stdout.splitlines()
-    assert 'levelled by this pose' in words
+    assert 'is levelled' in words
     assert imported == 'set()'
 
 
@@ -303,8 +304,7 @@ def test_context_outside_of_the_ranges_is_limited_with_a_warning(
         driver.feed(readings([UP])[:50], temperature=temperature)
         assert driver.finding('calibration').level == severity
         forces.append(driver.sensor.force_of((0.0, 0.0, GRAVITY), driver.session.context)[0])
-    assert 'temperature is 40 °C, but the range of the calibration is 20 to 30 °C' in (
-        driver.finding('calibration').words)
+    assert re.findall(r'\d+', driver.finding('calibration').words) == ['40', '20', '30']
     assert forces[0] != forces[1] == forces[2]
 
 
@@ -317,7 +317,7 @@ def test_advice_changes_only_with_the_number_of_poses(readings: Readings) -> Non
     before = next_action(driver.session)
     driver.feed(readings([spread_directions(5)[0]], dwell=20.0))
     assert next_action(driver.session) == before
-    assert driver.logged('info').count('this rest repeats an earlier pose') == 1
+    assert driver.logged('info').count('repeats') == 1
     driver.feed(readings(spread_directions(30)))
     lines = len(driver.log)
     driver.feed(readings(spread_directions(30)[:4]))  # after the last useful pose
@@ -492,7 +492,8 @@ def test_the_heading_needs_a_level_mounting_and_the_nose_down(
     driver.ask('set_level')
     driver.refuses('within 10° of the flat pose', 'set_heading')
     put(driver, readings, NOSE_DOWN)
-    assert 'the heading is set by this pose' in driver.ask('set_heading')
+    driver.ask('set_heading')
+    np.testing.assert_allclose(driver.sensor.applied.rotation, MOUNTING, atol=0.01)
 
 
 @pytest.mark.parametrize(('frame', 'axes'), [
@@ -531,7 +532,7 @@ def test_a_stored_mounting_of_the_documents_is_turned_before_it_is_used(
     driver = Driver(calibration_file=str(path), frame='ned')
     np.testing.assert_allclose(driver.sensor.applied.rotation,
                                MOUNTING @ np.diag([1.0, -1.0, -1.0]), atol=1e-6)
-    assert f'is for the frame {frame}, but frame is ned: it is turned' in driver.logged('warning')
+    assert f'frame {frame},' in driver.logged('warning')
 
 
 def test_a_frame_whose_readings_are_gravity_is_refused_for_messages() -> None:
@@ -602,5 +603,4 @@ def test_poses_that_lack_a_quantity_are_said(readings: Readings) -> None:
     driver.feed(readings([[0, 0, -1], [0, -1, 0]]), motor_current=1.0)
     driver.tick()
     assert 'motor_current' not in driver.poses
-    assert re.search(r'\d of \d poses have no motor_current, so that ~/refine cannot use it: call '
-                     '~/reset', driver.logged('warning'))
+    assert re.search(r'\d of \d.*motor_current.*~/reset', driver.logged('warning'))
