@@ -83,7 +83,7 @@ def _no_gap(outcome: Outcome) -> bool:
 
 
 def _described(outcome: Outcome) -> bool:
-    return outcome.verdict == 'described'
+    return outcome.verdict in ('described', 'drifts')
 
 
 def _another_name(outcome: Outcome) -> bool:
@@ -107,9 +107,9 @@ def honest(outcome: Outcome) -> bool:
     truths = {pair for name in outcome.case.hidden for pair in CARRIER[name]}
     if outcome.names == ('offset_wander',):
         return ('offset', 'time') in truths or bool(set(LOST) & set(outcome.case.hidden))
-    if outcome.verdict == 'described' and not truths and not outcome.case.setup.dropped:
+    if _described(outcome) and not truths and not outcome.case.setup.dropped:
         return False
-    return (outcome.verdict in ('described', 'unexplained')
+    return ((_described(outcome) or outcome.verdict == 'unexplained')
             and all(truths & set(CARRIER[name]) for name in outcome.names))
 
 

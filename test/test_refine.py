@@ -3,8 +3,10 @@
 
 """Hidden effects are named and no others, on data of an independent generator."""
 
+import re
+
 from accel_calib.logs import read_poses
-from accel_calib.refine import refine, verdict_words
+from accel_calib.refine import refine, values_of, verdict_words
 from accel_calib.units import units_of
 import generator
 from inside import LARGEST_SAMPLE, model_with, simulate_poses, spread_directions
@@ -48,11 +50,12 @@ def test_each_hidden_effect_is_named_with_its_values(effect, taken):
     found = refine(poses, MPS2, base='10')
     assert names(found) == [effect]
     step = next(step for step in found.steps if step.effect == effect)
-    assert found.verdict == ('described' if effect == 'offset_wander' else 'explained')
+    assert found.verdict == ('drifts' if effect == 'offset_wander' else 'explained')
     if effect != 'quantisation':  # a grid cannot be corrected
         assert step.gap_after_mg < 0.6 * step.gap_before_mg
         assert step.held_out_after_mg < 0.7 * step.held_out_before_mg
-        assert found.remaining_gap_mg < 1.5 * found.noise_floor_mg
+        assert (found.remaining_gap_mg < 1.5 * found.noise_floor_mg) is (
+            effect != 'offset_wander')  # no calibration corrects it
     assert step.p_value < 0.005
     assert any(letter.isdigit() for letter in step.where)
     truth, calibration = made.truth[effect], found.calibration
@@ -61,6 +64,33 @@ def test_each_hidden_effect_is_named_with_its_values(effect, taken):
         if owner == effect and part in truth and part != 'instant':
             deviation = np.sqrt(calibration.covariance[k, k])
             assert abs(calibration.model.vector[k] - truth[part]) < 4.0 * deviation, name
+
+
+@pytest.mark.parametrize('effect', ['offset_step', 'gain_step'])
+@pytest.mark.parametrize('seed', range(3))
+def test_the_instant_in_words_is_that_of_the_final_model(effect, seed, taken):
+    poses, made = taken([31, seed], {effect: 6.0, 'quadratic': 5.0}, poses=40)
+    found = refine(poses, MPS2, base='10')
+    step = next(step for step in found.steps if step.effect == effect)
+    words = re.fullmatch(r'between (\S+) and (\S+) s \(rows (\d+) and (\d+)\)', step.where)
+    (low, high), rows = map(float, words.groups()[:2]), [int(row) for row in words.groups()[2:]]
+    assert low <= step.parameters['instant'] <= high
+    np.testing.assert_allclose(poses['time'][np.subtract(rows, 1)], (low, high), rtol=1e-5)
+
+
+def test_steps_state_the_values_and_deviations_of_the_final_model(taken):
+    poses, _ = taken([32, 1], {'offset_temperature': 6.0, 'quadratic': 5.0}, poses=60)
+    found = refine(poses, MPS2, base='10')
+    assert len(found.steps) == 2
+    deviations = dict(zip(found.calibration.parameters,
+                          np.sqrt(np.diag(found.calibration.covariance))))
+    for step in found.steps:
+        values = found.calibration.model.values[step.effect][:3]
+        assert [step.parameters[axis] for axis in 'xyz'] == values.tolist()
+        assert [step.parameters_sd[axis] for axis in 'xyz'] == pytest.approx(
+            [deviations[f'{step.effect}.{axis}'] for axis in 'xyz'])
+        shown = dict(values_of(step))
+        assert all('±' in shown[axis] for axis in 'xyz')
 
 
 @pytest.mark.parametrize(('seed', 'poses'), [(0, 24), (1, 24), (0, 60)])

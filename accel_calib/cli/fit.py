@@ -288,7 +288,7 @@ def several_refine(results: Sequence[dict[str, Any]]) -> Iterator[str]:
 
 def _steps_table(result: Refinement) -> Table:
     """Return a table of the steps."""
-    from ..refine import base_words, chance
+    from ..refine import base_words, chance, values_of
 
     table = Table(title=f'From {base_words(result)}: residuals in mg, held out in brackets',
                   show_lines=True)
@@ -298,8 +298,9 @@ def _steps_table(result: Refinement) -> Table:
     for number, step in enumerate(result.steps, 1):
         gap = (f'{short(step.gap_before_mg)} -> {short(step.gap_after_mg)}\n'
                f'({short(step.held_out_before_mg)} -> {short(step.held_out_after_mg)})')
-        lines = [f'{number}. {step.effect}', effect_named(step.name).words, step.where,
-                 f'rivals: {", ".join(step.likely_rivals) or "none"}']
+        values = ', '.join(f'{name} {value}' for name, value in values_of(step))
+        lines = [f'{number}. {step.effect}', effect_named(step.name).words,
+                 *filter(None, [values]), step.where, f'rivals: {", ".join(step.likely_rivals) or "none"}']
         table.add_row('\n'.join(lines), gap, chance(step.p_value))
     return table
 

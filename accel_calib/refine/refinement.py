@@ -28,14 +28,14 @@ from .plan import plan_poses, PosePlan
 from .search import Found, search
 from .state import fitted_state, is_noise, State
 from .steps import (
-    advice_for, beside_walk, not_testable, plain_name, Stage, Step, steps_of, untestable, Verdict,
+    advice_for, not_testable, plain_name, Stage, Step, steps_of, untestable, Verdict,
     verdict_of)
 from ..calibrate import (
     Calibration, check_sensor, fit_findings, fit_poses, fit_with_fleet, FLEET, FleetPrior, gated,
     in_g, LARGEST_DILUTION, OF_A_FIT, only_norm, posterior, quality_of, record_of, refuse_if_unfit,
     Rejected, rejected_by, sound_rows, sure_rows, uncertainty_g, with_history, with_rest_noise)
 from ..effects import (
-    CHANGES, included, Model, MODELS, parameter_names, PROCESSES, WANDER, with_vector)
+    CHANGES, included, Model, MODELS, parameter_names, PROCESSES, with_vector)
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import fit_sphere, judge, NotConvergedError, outliers, variance_factor
 from ..finding import Finding, without as without_kinds
@@ -59,8 +59,10 @@ _ORIENTATION = ('reference', 'orientation')
 _VERDICTS = {
     'no_gap': 'No gap beyond the noise: these poses support no further effect.',
     'explained': 'The gap is explained: only noise remains beyond the named effects.',
-    'described': 'The gap is described, not explained: only noise remains beyond {}, but its '
-                 'cause is not known.',
+    'described': 'The gap is described, not explained: only noise remains beyond an empirical '
+                 'curve, but its cause is not known.',
+    'drifts': 'The offset drifts: only noise remains beside a slow change of the offset, which no '
+              'calibration corrects.',
     'unexplained': 'A gap remains that no effect of the catalogue explains.',
 }
 
@@ -72,14 +74,15 @@ class Refinement(Record):
 
     Parameters
     ----------
-    verdict : {'no_gap', 'explained', 'described', 'unexplained'}
+    verdict : {'no_gap', 'explained', 'described', 'drifts', 'unexplained'}
         No gap beyond the noise; the effects are named and the rest is noise; the rest is noise
-        only with an empirical curve or a slow change of the offset; or a gap remains, or it is
-        not known what explains it (`undecided`).
+        only with an empirical curve, or only beside a slow change of the offset; or a gap
+        remains, or it is not known what explains it (`undecided`).
     noise_floor_mg : float or None
         Expected residual of a correct model [mg]; None if the noise is not known.
     gap_mg, remaining_gap_mg : float
-        Residual of the base and of the refined model [mg].
+        Residual of the base and of the refined model [mg], without a walk, which the calibration
+        does not contain.
     steps : tuple of Step
         The added effects, in order.
     disturbed_poses : tuple of int
@@ -144,9 +147,7 @@ class Refinement(Record):
 
 
 def verdict_words(result: Refinement) -> str:
-    walks = any(step.effect == WANDER for step in result.steps)
-    words = _VERDICTS[result.verdict].format(
-        'a slow change of the offset' if walks else 'an empirical curve')
+    words = _VERDICTS[result.verdict]
     if result.undecided:
         words = ('Not enough poses: they cannot tell what explains the gap, because '
                  f'{_why_undecided(result)}.')
@@ -291,7 +292,7 @@ def _record(calibration: Calibration, found: Found, given: Given, sensor: str, d
               *plan.advice)
     return Refinement(
         verdict, final.floor_mg, start.gap_mg(start.fit.residual),
-        final.gap_mg(beside_walk(found)[0]), steps, outliers, missing, advice, refined, refusal,
+        final.gap_mg(final.residual), steps, outliers, missing, advice, refined, refusal,
         final.poses_g, final.fit.equations.force, stages, plan, undecided, found.one_curve)
 
 
@@ -547,4 +548,5 @@ def _determined(refined: Calibration, final: State) -> tuple[Calibration, tuple[
                          f'is up to {dilution:.3g} times that of a pose, expected less than '
                          f'{LARGEST_DILUTION:.0f} times',
                          TAKE_ALL_SIDES)
-    return replace(refined, noted=(*refined.noted, *fit_findings(fit, dilution))), ()
+    own = without_kinds(fit_findings(fit, dilution), 'beyond_noise')  # the verdict states it
+    return replace(refined, noted=(*refined.noted, *own)), ()

@@ -245,6 +245,11 @@ class State:
         """Return the (n,) residuals of poses from (m,) residuals of the equations [mg]."""
         return self.fit.equations.of_poses(residual) * MG
 
+    def contribution_mg(self, name: str) -> Floats:
+        """Return the (n,) contributions of an effect of the model to the poses [mg]."""
+        alone = Model({name: self.model.values[name]})
+        return self.mg_of_poses(self.fit.equations.columns(alone) @ _amplitudes(alone))
+
     @property
     def floor_mg(self) -> float | None:
         """Return the residual expected of a correct model [mg]; None if the noise is unknown."""

@@ -4,7 +4,8 @@
 """
 The steps of a refinement from what a search found, and advice.
 
-**Where.** Each step states where simulation and measurement disagree without the effect: an
+**One model.** A step has the residuals without and with its effect. All else that is stated of it
+is of the final model: values, deviations, rivals, probabilities, and where it acts, which is an
 instant, the ends of the range of a column, or directions of the force.
 
 **Not testable.** Effects that the poses cannot show, and the data to record for them.
@@ -30,7 +31,7 @@ from ..effects import (
 from ..estimate import kinds
 from ..geometry import ATTITUDES, axes_of_signs
 from ..table import column_of, Floats, Poses
-from ..text import counted, listed, with_sd
+from ..text import counted, listed, with_minus, with_sd
 from ..units import MG
 
 MOST_RIVALS = 3
@@ -56,7 +57,7 @@ _APART = 0.05
 
 _LEAST_P = 1e-16
 
-Verdict = Literal['no_gap', 'explained', 'described', 'unexplained']
+Verdict = Literal['no_gap', 'explained', 'described', 'drifts', 'unexplained']
 
 
 @dataclass(frozen=True)
@@ -156,14 +157,14 @@ def percent(probability: float) -> str:
 
 
 def values_of(step: Step) -> list[tuple[str, str]]:
-    """Return name and text of each value of a step; values in g are given in mg."""
-    effect = effect_named(step.name)
-    values = []
+    """Return name and text of each value of a step, ± its deviation; values in g are in mg."""
+    parameters, values = effect_named(step.name).parameters, []
     for name, value in step.parameters.items():
         unit_name, scale = value_unit(step.name, name)
-        words = (f'{value * scale:+.3g} {unit_name}'.replace('-', '−')
-                 if name in effect.parameters else f'{value:.5g} {unit_name}'.rstrip())
-        values.append((name, words))
+        sd = step.parameters_sd.get(name, 0.0)
+        words = with_sd(value * scale, sd * scale) if sd else f'{value * scale:.5g}'
+        sign = '+' if name in parameters and value >= 0.0 else ''
+        values.append((name, with_minus(f'{sign}{words} {unit_name}'.rstrip())))
     return values
 
 
@@ -187,7 +188,9 @@ def verdict_of(found: Found, steps: Sequence[Step], *, refused: bool) -> tuple[V
     if steps and (refused or any(len(step.rivals) > MOST_RIVALS for step in steps)
                   or found.one_curve):
         return 'unexplained', True
-    if found.curve is not None or found.walk is not None:
+    if found.walk is not None:
+        return 'drifts', False
+    if found.curve is not None:
         return 'described', False
     return 'explained' if steps else 'no_gap', False
 
@@ -208,7 +211,7 @@ def steps_of(found: Found, start: State, date: str, *, joint: bool
     names = ('base', *(step.effect for step in steps))
     at = (*states[:1] * len(of_output), *states)  # limit and grid leave the residuals
     return steps, tuple(
-        Stage(name, state.mg_of_poses(beside_walk(found)[0] if name == WANDER
+        Stage(name, state.mg_of_poses(beside_walk(found)[1] if name == WANDER
                                       else state.fit.residual))
         for name, state in zip(names, at, strict=True))
 
@@ -239,10 +242,10 @@ def _step(name: str, states: tuple[State, State], found: Found, date: str, *, un
     first_held_out = first if unseen else before.held_out
     if name == WANDER:
         first, first_held_out = before.residual, before.held_out
-        last, held_out = beside_walk(found)
-    effect, words = effect_named(name), _where(name, before, last)
-    values = after.model.values.get(name, np.zeros(len(effect.values)))
-    deviations = _deviations(name, after)
+        last = held_out = beside_walk(found)[1]  # it follows the poses: what it predicts counts
+    effect, words = effect_named(name), _where(name, before, found)
+    values = found.final.model.values.get(name, np.zeros(len(effect.values)))
+    deviations = _deviations(name, found.final)
     if name in CHANGES:
         words = f'{_change(name, values, [*deviations.values()], date)}; {words}'
     shown = effect.shown(values)
@@ -250,7 +253,7 @@ def _step(name: str, states: tuple[State, State], found: Found, date: str, *, un
                 {part: deviations[part] for part in shown if deviations.get(part)},
                 before.gap_mg(first), after.gap_mg(last),
                 before.gap_mg(first_held_out), after.gap_mg(held_out),
-                _p_value(name, before, found), words, plain_name(name))
+                _p_value(name, found), words, plain_name(name))
 
 
 def _chances(name: str, found: Found, *, usual: bool) -> dict[str, float]:
@@ -262,15 +265,17 @@ def _chances(name: str, found: Found, *, usual: bool) -> dict[str, float]:
     return chances
 
 
-def _p_value(name: str, before: State, found: Found) -> float:
-    near = found.near
+def _p_value(name: str, found: Found) -> float:
+    near, final = found.near, found.final
     if name == WANDER:
         return math.exp(-found.walk.likelihood_ratio / 2.0) if found.walk else 1.0
     if found.curve is not None and name == found.curve.name:
         return found.curve.p_value
     if name in near.names:
         return near.chosen.probability(near.block_of(name))
-    linear = linearised(before.fit, before.model.effects, candidates(LADDER, before.poses_g))
+    others = tuple(other for other in final.model.effects if other != name)
+    names = [other for other in LADDER if other not in others]
+    linear = linearised(final.fit, others, candidates(names, final.poses_g))
     own = [number for number, block in enumerate(linear.blocks) if block.effect == name]
     return Set.of(linear, own).probability(own[0]) if own else 1.0
 
@@ -329,30 +334,30 @@ def _deviations(name: str, state: State) -> dict[str, float]:
             if name in state.model.values}
 
 
-def _where(name: str, before: State, after: Floats) -> str:
-    """Return where an effect explains the disagreement, given the residuals with it."""
-    share_mg = before.mg_of_poses(before.fit.residual - after)
+def _where(name: str, before: State, found: Found) -> str:
+    """Return where an effect acts, by its values in the final model."""
+    final, effect = found.final, effect_named(name)
+    poses_g = final.poses_g
+    share_mg = (final.contribution_mg(name) if name in final.model.values else
+                final.mg_of_poses(final.residual - beside_walk(found)[0]))
     if kind_of(name) == EMPIRICAL:
         return _curve(name, before, share_mg)
-    if name == 'offset_step':
-        return _instant(before.poses_g, share_mg)
-    column = next((key for key in effect_named(name).needs
-                   if key in before.poses_g and key not in ('new', 'previous')), None)
+    if 'instant' in effect.shape:
+        return _instant(final.model.values[name][effect.values.index('instant')], poses_g)
+    column = next((key for key in effect.needs
+                   if key in poses_g and key not in ('new', 'previous')), None)
     if column is None:
-        return _directions(before.fit.equations.force, share_mg)
-    return _range(column, before.poses_g[column], share_mg)
+        return _directions(final.fit.equations.force, share_mg)
+    return _range(column, poses_g[column], share_mg)
 
 
-def _instant(poses_g: Poses, share_mg: Floats) -> str:
-    """Return a text about the instant of the largest change between successive poses."""
-    order = np.argsort(poses_g['time'], kind='stable')
-    order = order[:int(np.sum(np.isfinite(poses_g['time'])))]
-    time, rows, moved = poses_g['time'][order], poses_g.row[order], share_mg[order]
-    count = np.arange(1, len(moved))
-    sums = np.cumsum(moved ** 2)[:-1]
-    at = int(np.argmax(np.abs(sums / count - (np.sum(moved ** 2) - sums) / (len(moved) - count))))
-    return (f'between {time[at]:.6g} and {time[at + 1]:.6g} s (rows {rows[at]} and '
-            f'{rows[at + 1]})')
+def _instant(instant: float, poses_g: Poses) -> str:
+    """Return a text about the poses before and after an instant."""
+    time = poses_g['time']
+    before, after = (int(np.nanargmin(np.where(part, np.abs(time - instant), np.nan)))
+                     for part in (time < instant, time >= instant))
+    return (f'between {time[before]:.6g} and {time[after]:.6g} s (rows {poses_g.row[before]} and '
+            f'{poses_g.row[after]})')
 
 
 def _range(column: str, values: Floats, share_mg: Floats) -> str:

@@ -465,7 +465,8 @@ def _verdict(refinement: Refinement) -> str:
                                       else '') for step in refinement.steps]
     found, verb = ' and '.join(names), 's' if len(names) == 1 else ''
     return {'no_gap': 'no gap beyond the noise', 'explained': f'{found} explain{verb} the gap',
-            'described': f'{found} describe{verb} the gap'}.get(
+            'described': f'{found} describe{verb} the gap',
+            'drifts': 'the offset drifts'}.get(
         refinement.verdict, f'a gap remains beyond {found}' if names else 'a gap remains that no '
         'effect explains')
 
