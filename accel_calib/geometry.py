@@ -15,6 +15,7 @@ from itertools import product
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .table import Floats
 
@@ -137,13 +138,22 @@ def coverage(directions: Floats) -> float:
     return 1.0 - len(uncovered(directions)) / _COVERAGE_DIRECTIONS
 
 
+def orientations_of(directions: Floats) -> NDArray[np.intp]:
+    """Return the (n,) number of the orientation of (n, 3) unit vectors; others are 5° apart."""
+    first, found = np.zeros_like(directions), np.zeros(len(directions), np.intp)
+    count = 0
+    for k, direction in enumerate(directions):
+        near = np.flatnonzero(first[:count] @ direction >= _SAME)
+        if len(near):
+            found[k] = near[0]
+        else:
+            first[count], found[k], count = direction, count, count + 1
+    return found
+
+
 def distinct(directions: Floats) -> int:
     """Return the number of directions at least 5° apart, for (n, 3) unit vectors."""
-    kept: list[Floats] = []
-    for direction in directions:
-        if all(direction @ other < _SAME for other in kept):
-            kept.append(direction)
-    return len(kept)
+    return len(np.unique(orientations_of(directions)))
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from inside import (
     accepted, beginning, Block, candidates, Curve, explored, fitted_state, grown_curve,
     is_better_than_walk, less, Linear, linearised, Model, Near, outside_of, Process, process_of,
     RARE, REFINE_LEVEL, reshaped, rss_beside, search_effects, Set, SIGNIFICANT, simulate_poses,
-    Walk, walk_beside, with_outliers, WORTH)
+    spread_directions, Walk, walk_beside, with_outliers, WORTH)
 import numpy as np
 import pytest
 from scipy.optimize import brentq
@@ -300,7 +300,9 @@ def test_a_pose_left_out_beside_a_walk_is_as_if_it_were_not_there():
 
 
 @pytest.mark.parametrize('chosen', [(), (0,)])
-def test_a_held_out_residual_beside_a_walk_is_predicted_by_the_other_poses(chosen):
+@pytest.mark.parametrize('repeats', [1, 3])
+def test_a_held_out_residual_beside_a_walk_is_predicted_by_the_other_orientations(
+        chosen, repeats):
     rng, ratio = np.random.default_rng(6), 30.0
     base, axes = np.split(np.linalg.qr(rng.normal(size=(15, 5)))[0], [1], axis=1)
     process = Process(axes, 1.0 / np.arange(1, 5) ** 2)
@@ -308,7 +310,8 @@ def test_a_held_out_residual_beside_a_walk_is_predicted_by_the_other_poses(chose
     both = rng.normal(size=(15, 2))
     residual, column = np.split(both - base @ (base.T @ both), 2, axis=1)
     linear = replace(by_hand(residual[:, 0], column, ['supply_ratio']), onto=base)
-    left, held_out = Walk(process, ratio, 0.0, 0.0).residuals(Set.of(linear, chosen))
+    left, held_out = Walk(process, ratio, 0.0, 0.0).residuals(
+        Set.of(linear, chosen), np.tile(spread_directions(15 // repeats), (repeats, 1)))
     design = np.column_stack([base, column[:, :len(chosen)]])
 
     def beside(rows):
@@ -318,7 +321,7 @@ def test_a_held_out_residual_beside_a_walk_is_predicted_by_the_other_poses(chose
             normal @ design[rows], normal @ residual[rows, 0])
 
     for k in range(15):
-        others = np.delete(np.arange(15), k)
+        others = np.flatnonzero((np.arange(15) - k) % (15 // repeats))
         own, row = beside(others), variance[k, others]
         expected = own[k] - row @ np.linalg.solve(variance[np.ix_(others, others)], own[others])
         assert held_out[k] == pytest.approx(expected)

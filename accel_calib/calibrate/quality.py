@@ -31,7 +31,7 @@ from .pose_planning import WEAK_DILUTION
 from .rest_noise import with_rest_noise
 from ..effects import correct, LADDER, length_rows, Model, sensor_force
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
-from ..estimate import believable, Fit, judge, Rival, unseen_mistakes
+from ..estimate import believable, Fit, judge, left_out, Rival, unseen_mistakes
 from ..finding import Finding, without
 from ..geometry import coverage, OVER_THE_SPHERE, rms, unit
 from ..table import Floats, in_unit, Poses
@@ -39,7 +39,7 @@ from ..text import listed
 from ..units import MG, Units
 
 _LEAST_OWN = 1e-9
-"""1 - leverage below this: the pose alone determines a parameter."""
+"""Below this part that other orientations check, one alone determines a parameter."""
 
 LARGEST_OFFSET_G = 1.0
 """Largest zero-g offset of a working accelerometer [g]; not checked for native units."""
@@ -177,21 +177,23 @@ def errors_after(model: Model, poses_g: Poses, *, vectors: bool) -> Floats:
 
 def _held_out(fit: Fit) -> Floats | None:
     """
-    Return the (n,) errors of each pose under a fit of the others, or None if they need it [g].
+    Return the (n,) errors of poses under a fit of other orientations [g].
 
-    With H the hat matrix, they are (I - H_ii)⁻¹ times the residuals (PRESS, Allen 1974).
+    None if the fit needs an orientation.
 
     """
     data = fit.by_pose
-    if np.any(np.linalg.svd(data.own, compute_uv=False) < _LEAST_OWN):
+    count, rows = data.residual.shape
+    found, checked = left_out(data.residual.ravel(), data.basis.reshape(count * rows, -1),
+                              np.repeat(np.arange(count), rows), fit.equations.force, _LEAST_OWN)
+    if checked < _LEAST_OWN:
         return None
-    left_out = np.linalg.solve(data.own, data.residual[:, :, np.newaxis])[:, :, 0]
+    found = found.reshape(count, rows)
     if 'reference' in fit.poses_g:  # differences of readings; W⁻¹ converts them to forces
         noise = believable(fit.poses_g.noise)
-        scaled = left_out * (fit.equations.scale[:, np.newaxis] if noise is None else noise)
-        left_out = scaled @ np.linalg.inv(fit.model.linear_part[0]).T
-        return np.linalg.norm(left_out, axis=1)
-    return np.linalg.norm(left_out, axis=1) * fit.equations.scale
+        scaled = found * (fit.equations.scale[:, np.newaxis] if noise is None else noise)
+        return np.linalg.norm(scaled @ np.linalg.inv(fit.model.linear_part[0]).T, axis=1)
+    return np.linalg.norm(found, axis=1) * fit.equations.scale
 
 
 _UNSEEN_G = 0.01

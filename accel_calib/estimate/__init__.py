@@ -14,7 +14,8 @@ than their samples. `closed_form` computes start values.
 from .closed_form import (
     closed_form, faces, fit_12, fit_sphere, lower_triangular, sensing_axes, start_of, TIES)
 from .equations import believable, Equations, kinds, originals, pose_noise, variance_factor
-from .fit import by_pose, estimate, Fit, judge, NotConvergedError, Point, Prior, solve, stated
+from .fit import (
+    by_pose, estimate, Fit, judge, left_out, NotConvergedError, Point, Prior, solve, stated)
 from .outliers import (
     covariance_with, fit_norm, LARGEST_SHARE, outliers, outliers_among, outliers_or_scatter, Rival,
     rivals, unseen_mistakes)
@@ -22,7 +23,7 @@ from .scatter import beside_scatter, scatter_of, with_scatter_of
 
 __all__ = ['LARGEST_SHARE', 'TIES', 'Equations', 'Fit', 'NotConvergedError', 'Point', 'Prior',
            'Rival', 'believable', 'beside_scatter', 'by_pose', 'closed_form', 'covariance_with',
-           'estimate', 'faces', 'fit_12', 'fit_norm', 'fit_sphere', 'judge', 'kinds',
+           'estimate', 'faces', 'fit_12', 'fit_norm', 'fit_sphere', 'judge', 'kinds', 'left_out',
            'lower_triangular', 'originals', 'outliers', 'outliers_among', 'outliers_or_scatter',
            'pose_noise', 'rivals', 'scatter_of', 'sensing_axes', 'solve', 'start_of', 'stated',
            'unseen_mistakes', 'variance_factor', 'with_scatter_of']

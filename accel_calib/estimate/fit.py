@@ -36,7 +36,7 @@ from .closed_form import along_quadrics
 from .equations import belief_in, Equations, equations, measured, variance_factor
 from ..effects import CHANGES, fitted_places, LADDER, Model, parameter_names, with_vector
 from ..errors import RefusedFitError
-from ..geometry import unit
+from ..geometry import orientations_of, unit
 from ..table import Poses
 from ..units import Floats, Indices
 
@@ -122,6 +122,29 @@ class ByPose:
     def own(self) -> Floats:
         """(n, k, k) array, I - leverage of each pose."""
         return np.asarray(np.eye(self.columns.shape[1]) - self.basis @ self.basis.swapaxes(1, 2))
+
+
+def left_out(residual: Floats, basis: Floats, pose: Indices, force: Floats, least: float
+             ) -> tuple[Floats, float]:
+    """
+    Return residuals under a fit of the other orientations, and how much of each these check.
+
+    With H the hat matrix of the orthonormal (m, q) `basis`, the (m,) residuals g of an orientation
+    are (I - H_gg)⁻¹ times those of the whole fit (PRESS, Allen 1974). Repeats of an orientation
+    would predict each other. If the (n, 3) `force` has one orientation alone, its poses are left
+    out one by one. The second result is the smallest eigenvalue of all I - H_gg, 0 if the fit
+    needs an orientation; smaller ones than `least` are replaced by it.
+
+    """
+    fold = orientations_of(unit(force))
+    fold = (fold if np.ptp(fold) else np.arange(len(fold)))[pose]
+    found, smallest = np.empty_like(residual), 1.0
+    order = np.argsort(fold, kind='stable')
+    for rows in np.split(order, np.flatnonzero(np.diff(fold[order])) + 1):
+        size, axes = np.linalg.eigh(np.eye(len(rows)) - basis[rows] @ basis[rows].T)
+        smallest = min(smallest, float(size[0]))
+        found[rows] = axes @ ((axes.T @ residual[rows]) / np.maximum(size, least))
+    return found, smallest
 
 
 def by_pose(residual: Floats, columns: Floats, pose: Indices,

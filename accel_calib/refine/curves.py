@@ -44,12 +44,13 @@ from typing import NamedTuple
 import numpy as np
 
 from .base import causes
-from .linear import Block, held_out, LEVEL, Linear, outside_of, Set, with_outliers
+from .linear import (
+    Block, held_out, LEAST_OWN, LEVEL, Linear, outside_of, Set, with_outliers)
 from .state import candidates, left_open, linearised, State
 from ..effects import (
     AXES, CARRIERS, curve_pairs, Effect, effect_named, EFFECTS, empirical_name, empirical_parts,
     factors_of, LADDER, Model, modes_of, parameter_names, WANDER)
-from ..estimate import Fit, judge
+from ..estimate import Fit, judge, left_out
 from ..table import Floats, Poses
 
 _MOST_MODES = 10
@@ -380,18 +381,16 @@ class Walk:
                        taken=across.T * np.sqrt(1.0 - 1.0 / spread),
                        penalty=float(np.sum(np.log(spread))) + _charge(linear))
 
-    def residuals(self, chosen: Set) -> tuple[Floats, Floats]:
-        """Return the residual without the walk, and the same with each equation held out."""
+    def residuals(self, chosen: Set, force: Floats) -> tuple[Floats, Floats]:
+        """Return the residual without the walk, and the same with each orientation held out."""
         spread = 1.0 + self.ratio * self.process.values
         onto, residual = chosen.spanned
         left = self.process.axes - onto @ (onto.T @ self.process.axes)
         precision = np.diag(1.0 / np.maximum(spread - 1.0, 1e-12)) + left.T @ left
-        smooth = np.linalg.solve(precision, left.T)
-        residual = residual - left @ (smooth @ residual)
-        # Without its own equation each residual is P z over the diagonal of P.
-        own = (1.0 - np.sum(chosen.linear.onto ** 2, axis=1) - np.sum(onto ** 2, axis=1)
-               - np.sum(left * smooth.T, axis=1))
-        return residual, held_out(residual, own)
+        smooth = np.linalg.solve(np.linalg.cholesky(precision), left.T).T
+        residual = residual - smooth @ (smooth.T @ residual)
+        basis = np.hstack([chosen.linear.onto, onto, smooth])
+        return residual, left_out(residual, basis, chosen.linear.pose, force, LEAST_OWN)[0]
 
 
 def process_of(linear: Linear, poses: Poses) -> Process | None:

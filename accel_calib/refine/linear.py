@@ -79,7 +79,7 @@ _ALONE = 1e-12
 _LEAST_NORM = 1e-100
 """Norm below which a column counts as zero: products of smaller numbers underflow."""
 
-_LEAST_OWN = 0.02
+LEAST_OWN = 0.02
 """Smallest 1 - leverage; below it, an equation alone determines a value."""
 
 
@@ -519,7 +519,7 @@ def outside_of(onto: Floats, columns: Floats) -> tuple[Floats, Floats]:
 
 def held_out(residual: Floats, own: Floats) -> Floats:
     """Return (m,) residuals without their own equation (PRESS), from (m,) 1 - leverage `own`."""
-    return residual / np.maximum(own, _LEAST_OWN)
+    return residual / np.maximum(own, LEAST_OWN)
 
 
 def orthonormal(columns: Floats) -> Floats:

@@ -21,11 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 import scipy
 
-from .linear import Block, held_out, Linear, orthonormal, outside_of
+from .linear import Block, LEAST_OWN, Linear, orthonormal, outside_of
 from ..calibrate import determines, NORM_MODELS, with_history
 from ..effects import (
     Context, Effect, effect_named, factors_of, included, kind_of, linear_model, Model)
-from ..estimate import Equations, estimate, Fit, kinds, NotConvergedError
+from ..estimate import Equations, estimate, Fit, kinds, left_out, NotConvergedError
 from ..geometry import unit
 from ..table import Floats, Poses
 from ..units import MG
@@ -219,10 +219,11 @@ class State:
 
     @property
     def held_out(self) -> Floats:
-        """(m,) array, each residual if its own equation is left out of the fit (PRESS)."""
+        """(m,) array, each residual if its orientation is left out of the fit."""
         beside = self.fit.beside
         linear = self.linear if beside is None else linearised(beside, self.model.effects)
-        return held_out(self.residual, 1.0 - np.sum(linear.onto ** 2, axis=1))
+        return left_out(self.residual, linear.onto, linear.pose, self.fit.equations.force,
+                        LEAST_OWN)[0]
 
     @property
     def dof(self) -> int:

@@ -306,7 +306,7 @@ def beside_walk(found: Found) -> tuple[Floats, Floats]:
     final = found.final
     if found.walk is None:
         return final.residual, final.held_out
-    return found.walk.residuals(Set.of(final.linear))
+    return found.walk.residuals(Set.of(final.linear), final.fit.equations.force)
 
 
 def _curve(name: str, before: State, share_mg: Floats) -> str:
