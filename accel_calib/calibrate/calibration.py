@@ -78,8 +78,8 @@ class Quality:
     max_before_percent, max_after_percent : float
         Largest error without and with the calibration [% of 1 g].
     held_out_rms_mg : float or None
-        Residual if each pose is predicted from a fit of the others [mg]; None if the others do not
-        determine the model.
+        Residual if each pose is predicted from a fit of other orientations [mg]; None if they do
+        not determine the model.
     noise_floor_mg : float or None
         Expected residual of a correct model [mg]; None if the noise is not known.
     chi2_per_dof : float or None

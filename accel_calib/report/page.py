@@ -59,7 +59,7 @@ STORED = 'calibration.yaml'
 _HOW_TO_READ = (
     'The residual is the RMS of |corrected| − 1 g over the poses, or of the vector error if the '
     'orientation is known or shared. The noise floor is the expected residual of a correct model.',
-    'Of new poses (held out): each pose is predicted from a fit of the others.',
+    'Of new poses (held out): each pose is predicted from a fit of other orientations.',
     'Maps have equal areas and show each hemisphere from above its pole: the direction of up in '
     'the sensor axes. A hollow square is a pose that was left out.')
 _HOW_TO_READ_THERMAL = (
