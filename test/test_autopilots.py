@@ -232,13 +232,13 @@ def test_an_older_px4_with_other_numbers_of_rotations_is_not_undone(raw, tmp_pat
         assert (not read_log(path).table.autopilot.corrected) is known
 
 
-def thermal_ardupilot(warm: Any) -> Any:
-    """Return the polynomial of ArduPilot with the parameters `THERMAL` [m/s²]."""
+def thermal_ardupilot(warm: Any, zero: float = 28.0) -> Any:
+    """Return the polynomial of ArduPilot with the parameters `THERMAL` [m/s²]; 0 at a value."""
     def at(value: Any) -> Any:
         change = np.atleast_1d(np.clip(value, 20.0, 40.0) - 35.0)[:, np.newaxis]
         return (change * [3000.0, -2000.0, 1000.0] + change ** 2 * [50.0, 0.0, -70.0]) * 1e-6
 
-    return at(warm) - at(28.0)
+    return at(warm) - at(zero)
 
 
 THERMAL = {'INS_TCAL1_ENABLE': 1.0, 'INS_TCAL1_TMIN': 20.0, 'INS_TCAL1_TMAX': 40.0,
@@ -246,9 +246,13 @@ THERMAL = {'INS_TCAL1_ENABLE': 1.0, 'INS_TCAL1_TMIN': 20.0, 'INS_TCAL1_TMAX': 40
            **three('INS_TCAL1_ACC2_', '', [50.0, 0.0, -70.0])}
 
 
-def test_an_old_thermal_calibration_of_ardupilot_is_undone_and_replaced(raw, tmp_path):
-    path = ardupilot_log(tmp_path / 'log.bin', logged(raw, named('YAW_45'), thermal_ardupilot),
-                         {**old_ardupilot(1), **THERMAL})
+@pytest.mark.parametrize('zero', [28.0, -300.0])
+def test_an_old_thermal_calibration_of_ardupilot_is_undone_and_replaced(zero, raw, tmp_path):
+    old = {**old_ardupilot(1), **THERMAL}
+    if zero < 0.0:
+        del old['INS_ACC1_CALTEMP']  # the default of the firmware is -300
+    path = ardupilot_log(tmp_path / 'log.bin', logged(
+        raw, named('YAW_45'), lambda warm: thermal_ardupilot(warm, zero)), old)
     undone(path, raw)
     made = calibrated(path)
     check_exported(made, 'ardupilot', raw, tmp_path)

@@ -122,16 +122,17 @@ def test_rotation_free_parameters_are_those_of_any_axes():
     np.testing.assert_allclose(np.sqrt(np.diag(spread[1])[:3]), ten.offset_sd, rtol=1e-6)
 
 
-def test_slope_of_the_rotation_free_parameters_is_their_derivative():
+@pytest.mark.parametrize('per_g', [1.0, 4.0])
+def test_slope_of_the_rotation_free_parameters_is_their_derivative(per_g):
     rng = np.random.default_rng(4)
     directions = spread_directions(12)
     poses = simulate_poses(sensor(rng, 'offset', 'axis_gain', 'cross_axis', 'misalignment'),
                            directions, rng, context={'reference': directions})
     run = fit_poses(poses, G)
-    free = rotation_free(run, {}, 1.0)
+    free = rotation_free(run, {}, per_g)
     for step, column in zip(1e-6 * np.eye(len(run.model.vector)), free.slope.T, strict=True):
         moved = replace(run, model=with_vector(run.model.effects, run.model.vector + step))
-        change = (rotation_free(moved, {}, 1.0).values - free.values) / 1e-6
+        change = (rotation_free(moved, {}, per_g).values - free.values) / 1e-6
         np.testing.assert_allclose(change, column, atol=1e-5)
 
 

@@ -258,6 +258,11 @@ def test_a_container_without_a_table_to_read_is_refused_with_what_to_do(
         read_log(write(tmp_path, content))
 
 
+def test_an_archive_with_names_beyond_ascii_needs_no_password(tmp_path: Path) -> None:
+    text = 'time,ax,ay,az\n' + ''.join(f'{k / 50},0,{k % 2},9.8\n' for k in range(60))
+    assert len(read_log(zipped(tmp_path, {'acc_für_x': text})).table) == 60
+
+
 def test_an_export_without_gravity_is_refused_with_what_to_record(tmp_path: Path) -> None:
     tables, _ = tables_of('phyphox')
     del tables['Accelerometer']

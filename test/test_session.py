@@ -346,6 +346,8 @@ def test_automatic_fits_wait_a_minute_and_keep_a_calibration_that_agrees(
     driver.tick(60.0)
     assert driver.sensor.fitted_poses > 12  # a fit has been made, and agrees
     assert driver.calibration is first
+    driver.session.poses_changed(ended=False)
+    assert not driver.sensor.auto_fit_waits  # the same poses
     assert len(list(home.glob('*.before*'))) == 1
 
 
@@ -373,6 +375,14 @@ def statistics_of(*batches: Any, pause: float = 0.3) -> StreamStatistics:
         rows[:, 0], rows[:, 1:4] = stamps, 1.0
         found.add(rows, now)
     return found
+
+
+@pytest.mark.parametrize(('length', 'unit'), [(1.0, 'g'), (16384.0, 'native'), (9.8, '')])
+def test_readings_in_another_unit_name_it(length: float, unit: str) -> None:
+    driver = Driver()
+    driver.feed(np.full((50, 3), [0.0, 0.0, length]))
+    words = driver.finding('stream').words
+    assert words.endswith(f'units:={unit}') if unit else 'units' not in words
 
 
 def test_rate_and_faults_of_the_stamps_follow_the_last_seconds() -> None:

@@ -243,6 +243,7 @@ def test_the_result_is_described_and_calibrate_recognises_a_still_board(tmp_path
         'reference_c', 'range_c', 'degree', 'coefficients', 'coefficients_sd', 'band_mg',
         'change_mg', 'residual_mg', 'held_out_mg', 'hysteresis_mg', 'lag_s'}
     assert (thermal['hysteresis_mg'], thermal['lag_s']) == (None, None)
+    assert result['noise_floor_mg'] > 0.0
     assert {axis: len(values) for axis, values in thermal['coefficients'].items()} == {
         'x': 2, 'y': 2, 'z': 2}
     assert thermal['coefficients']['x'][0] == pytest.approx(0.5, abs=0.05)
