@@ -147,7 +147,7 @@ def forked(*arguments: object, folder: Path, terminal: int | None = None,
                 for number in closed:
                     os.close(number)
                 sys.stdin, sys.stdout, sys.stderr = (
-                    None if number in closed else open(number, mode, closefd=False)
+                    None if number in closed else os.fdopen(number, mode, closefd=False)
                     for number, mode in enumerate('rww'))
                 status = _status_of(arguments)
                 for stream in (sys.stdout, sys.stderr):

@@ -69,7 +69,7 @@ def test_each_hidden_effect_is_named_with_its_values(effect, taken):
 @pytest.mark.parametrize('effect', ['offset_step', 'gain_step'])
 @pytest.mark.parametrize('seed', range(3))
 def test_the_instant_in_words_is_that_of_the_final_model(effect, seed, taken):
-    poses, made = taken([31, seed], {effect: 6.0, 'quadratic': 5.0}, poses=40)
+    poses, _ = taken([31, seed], {effect: 6.0, 'quadratic': 5.0}, poses=40)
     found = refine(poses, MPS2, base='10')
     step = next(step for step in found.steps if step.effect == effect)
     words = re.fullmatch(r'between (\S+) and (\S+) s \(rows (\d+) and (\d+)\)', step.where)

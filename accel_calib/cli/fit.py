@@ -298,10 +298,10 @@ def _steps_table(result: Refinement) -> Table:
     for number, step in enumerate(result.steps, 1):
         gap = (f'{short(step.gap_before_mg)} -> {short(step.gap_after_mg)}\n'
                f'({short(step.held_out_before_mg)} -> {short(step.held_out_after_mg)})')
-        values = ', '.join(f'{name} {value}' for name, value in values_of(step))
         lines = [f'{number}. {step.effect}', effect_named(step.name).words,
-                 *filter(None, [values]), step.where, f'rivals: {", ".join(step.likely_rivals) or "none"}']
-        table.add_row('\n'.join(lines), gap, chance(step.p_value))
+                 ', '.join(f'{name} {value}' for name, value in values_of(step)), step.where,
+                 f'rivals: {", ".join(step.likely_rivals) or "none"}']
+        table.add_row('\n'.join(filter(None, lines)), gap, chance(step.p_value))
     return table
 
 

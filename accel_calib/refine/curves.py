@@ -44,8 +44,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .base import causes
-from .linear import (
-    Block, held_out, LEAST_OWN, LEVEL, Linear, outside_of, Set, with_outliers)
+from .linear import Block, held_out, LEAST_OWN, LEVEL, Linear, outside_of, Set, with_outliers
 from .state import candidates, left_open, linearised, State
 from ..effects import (
     AXES, CARRIERS, curve_pairs, Effect, effect_named, EFFECTS, empirical_name, empirical_parts,

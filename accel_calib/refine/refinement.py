@@ -28,14 +28,12 @@ from .plan import plan_poses, PosePlan
 from .search import Found, search
 from .state import fitted_state, is_noise, State
 from .steps import (
-    advice_for, not_testable, plain_name, Stage, Step, steps_of, untestable, Verdict,
-    verdict_of)
+    advice_for, not_testable, plain_name, Stage, Step, steps_of, untestable, Verdict, verdict_of)
 from ..calibrate import (
     Calibration, check_sensor, fit_findings, fit_poses, fit_with_fleet, FLEET, FleetPrior, gated,
     in_g, LARGEST_DILUTION, OF_A_FIT, only_norm, posterior, quality_of, record_of, refuse_if_unfit,
     Rejected, rejected_by, sound_rows, sure_rows, uncertainty_g, with_history, with_rest_noise)
-from ..effects import (
-    CHANGES, included, Model, MODELS, parameter_names, PROCESSES, with_vector)
+from ..effects import CHANGES, included, Model, MODELS, parameter_names, PROCESSES, with_vector
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import fit_sphere, judge, NotConvergedError, outliers, variance_factor
 from ..finding import Finding, without as without_kinds

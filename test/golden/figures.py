@@ -134,7 +134,8 @@ def searched(poses: Poses, units: Units, base: str) -> dict[str, Any]:
         'states': [those(each, 'rss dof floor_mg is_noise residual held_out')
                    for each in (found.base, found.final)],
         'chosen': {**those(chosen, 'out rss parameters'), 'charge': chosen.charge - price,
-                   'score': chosen.score + price + walk, 'names': near.names, 'ranks': _ranks(chosen),
+                   'score': chosen.score + price + walk, 'names': near.names,
+                   'ranks': _ranks(chosen),
                    'shapes': [linear.blocks[k].shape for k in chosen.blocks]},
         'linear': {**those(linear, 'worth dof base_rss poses'), 'visible': _visible(linear),
                    'penalty': linear.penalty - walk,
