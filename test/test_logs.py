@@ -517,9 +517,12 @@ def test_samples_without_times_need_their_rate(reads: Reads) -> None:
 def untimed(kind: str, count: int) -> tuple[str, np.ndarray]:
     """Return the header and the rows of a table without times."""
     rng, ups = np.random.default_rng(2), spread_directions(count)
+    lean, turn = np.linspace(-1.4, 1.4, count), np.linspace(0.0, 19.0, count)
     return {
         'poses': lambda: ('ax,ay,az', ac.simulate({}, poses=count).reading),
         'spread': lambda: ('ax,ay,az', G * ups),
+        'slowly turned': lambda: ('ax,ay,az', G * np.column_stack(
+            [np.cos(lean) * np.cos(turn), np.cos(lean) * np.sin(turn), np.sin(lean)])),
         'marked': lambda: ('ax,ay,az,orientation', np.column_stack([G * ups, np.arange(count)])),
         'with rates': lambda: ('Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z', np.column_stack(
             [G * ups, rng.normal(size=(count, 3))])),
@@ -536,7 +539,7 @@ def test_many_poses_without_times_are_poses(kind: str, count: int, reads: Reads)
 
 @pytest.mark.parametrize(('kind', 'count'), [
     ('with rates', 300), ('with rates', 953), ('of one direction', 300),
-    ('of one direction', 953), ('moving', 900), ('spread', 1500)])
+    ('of one direction', 953), ('moving', 900), ('spread', 1500), ('slowly turned', 400)])
 def test_rows_that_no_person_poses_are_not_taken_for_poses(kind: str, count: int, reads: Reads
                                                            ) -> None:
     with pytest.raises(InputError, match='look like samples'):

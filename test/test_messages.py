@@ -102,6 +102,15 @@ def fields_of(count=6):
     return fields
 
 
+def test_a_message_is_corrected_for_the_context_of_its_time(calibration):
+    warm = with_effects(calibration, {'offset_temperature': [1e-3, -2e-3, 3e-3]})
+    data = message(fields_of(1)[0])
+    at = rewriter_of(data, warm)
+    forces = [doubles_of(at(data, {'temperature': each}))[-12:-9] for each in (20.0, 45.0, 20.0)]
+    assert np.all(np.abs(forces[1] - forces[0]) > 0.1)
+    np.testing.assert_array_equal(forces[2], forces[0])
+
+
 def test_with_a_mounting_all_fields_are_in_one_frame(levelled):
     fields, rotation = fields_of(), levelled.model.rotation
     found = corrected(levelled, fields)

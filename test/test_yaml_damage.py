@@ -56,6 +56,7 @@ BOMBS: dict[str, tuple[str, str]] = {
     'date': (f'{FIRST}date: 2001-99-99\n', "at date, line 2, the value is '2001-99-99'"),
     'octal': (f'{FIRST}x: 010\n', "the value is '010', expected a decimal number"),
     'minutes': (f'{FIRST}x: 1:30\n', "the value is '1:30', expected a decimal number"),
+    'underscore': (f'{FIRST}x: 1_0.5\n', "the value is '1_0.5', expected a decimal number"),
     'huge': (f'{FIRST}version: 1{400 * "0"}\n', "its version is '1000"),
     'large': (f'{FIRST}version: {30 * "9"}\n', "the value is '9999"),
     'escape': (f'{FIRST}version: "\\e[31m"\n', r"version is '\\x1b\[31m'"),

@@ -375,7 +375,7 @@ def comparisons() -> Any:
             (9.0, 12.0, 8.0), (9.0, 90.0, 8.0), (2.0, 0.0, 400.0), (30.0, 25.0, 28.0)), (
             (9, 10, 8), (1, 0, 3)), ((8.0, 8.0, 8.0), (8.0, 0.0, 0.0))),
         [those(Runs(each, np.zeros((2, 3, 3)), 5.0), 'squared p_value') for each in (
-            np.zeros((2, 3)), np.eye(2, 3) * 1e-3)]]
+            np.zeros((2, 3)), np.eye(2, 3) * 1e-3, np.eye(2, 3))]]
 
 
 def priors() -> Any:
