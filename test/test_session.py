@@ -149,8 +149,11 @@ def test_sensor_that_tumbles_from_the_first_second_is_not_still_until_it_rests(
         driver.feed(block)
         shown.append(state.progress(driver.session).still)
     assert not any(shown)
-    driver.feed((np.array([0.6, 0.0, 0.8]) + noise[:150]) * per_g)
-    assert state.progress(driver.session).still
+    for direction in (*spread_directions(5), np.array([0.6, 0.0, 0.8])):
+        driver.feed((direction + noise[:150]) * per_g)
+    now = state.progress(driver.session)
+    assert now.still
+    np.testing.assert_allclose(now.up, (0.6, 0.0, 0.8), atol=0.1)
 
 
 def test_silent_sensor_can_be_replaced_by_another_with_its_own_files(
