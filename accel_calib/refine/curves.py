@@ -44,7 +44,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .base import causes
-from .linear import Block, held_out, LEAST_OWN, LEVEL, Linear, outside_of, Set, with_outliers
+from .linear import Block, LEAST_OWN, LEVEL, Linear, outside_of, Set, with_outliers
 from .state import candidates, left_open, linearised, State
 from ..effects import (
     AXES, CARRIERS, curve_pairs, Effect, effect_named, EFFECTS, empirical_name, empirical_parts,
@@ -238,7 +238,7 @@ def _accepted(score: float, chosen: Set, tried: int) -> Curve | None:
 
 def _held_out(chosen: Set) -> float:
     """
-    Return the sum of squares of the residuals, each predicted from the other equations.
+    Return the sum of squares of the residuals, each predicted from the other equations (PRESS).
 
     It is without what the noise makes of it, if the noise is known.
 
@@ -246,7 +246,7 @@ def _held_out(chosen: Set) -> float:
     onto, residual = chosen.spanned
     own = 1.0 - np.sum(chosen.linear.onto ** 2, axis=1) - np.sum(onto ** 2, axis=1)
     kept = own > 1e-6  # not the outliers
-    squares = held_out(residual[kept], own[kept]) ** 2
+    squares = (residual[kept] / np.maximum(own[kept], LEAST_OWN)) ** 2
     return float(np.sum(squares - (1.0 / own[kept] if chosen.linear.worth else 0.0)))
 
 

@@ -517,11 +517,6 @@ def outside_of(onto: Floats, columns: Floats) -> tuple[Floats, Floats]:
     return rows.T, np.where(sizes < np.inf, sizes, 1.0)
 
 
-def held_out(residual: Floats, own: Floats) -> Floats:
-    """Return (m,) residuals without their own equation (PRESS), from (m,) 1 - leverage `own`."""
-    return residual / np.maximum(own, LEAST_OWN)
-
-
 def orthonormal(columns: Floats) -> Floats:
     """Return orthonormal columns with the span of others."""
     if not columns.shape[1]:

@@ -245,12 +245,14 @@ def _step(name: str, states: tuple[State, State], found: Found, date: str, *, un
         last = held_out = beside_walk(found)[1]  # it follows the poses: what it predicts counts
     effect, words = effect_named(name), _where(name, before, found)
     values = found.final.model.values.get(name, np.zeros(len(effect.values)))
-    deviations = _deviations(name, found.final)
+    spread = dict(zip(parameter_names(found.final.model.effects),
+                      np.sqrt(np.diag(found.final.fit.covariance)).tolist(), strict=True))
+    deviations = {part: spread.get(f'{name}.{part}', 0.0) for part in effect.values}
     if name in CHANGES:
         words = f'{_change(name, values, [*deviations.values()], date)}; {words}'
     shown = effect.shown(values)
     return Step(kind_of(shown_name(name)), rivals, chances, by_data, shown,
-                {part: deviations[part] for part in shown if deviations.get(part)},
+                {part: deviations[part] for part in shown if deviations[part]},
                 before.gap_mg(first), after.gap_mg(last),
                 before.gap_mg(first_held_out), after.gap_mg(held_out),
                 _p_value(name, found), words, plain_name(name))
@@ -324,14 +326,6 @@ def _curve(name: str, before: State, share_mg: Floats) -> str:
                for effect, left in nearest_effects(before).items()]
     return words + (f'; no known effect has this form, the nearest are {", ".join(nearest)}'
                     if nearest else '')
-
-
-def _deviations(name: str, state: State) -> dict[str, float]:
-    """Return the standard deviations of the values of an effect of a model; empty without it."""
-    names = parameter_names(state.model.effects)
-    spread = np.sqrt(np.diag(state.fit.covariance)).tolist()
-    return {part: spread[names.index(f'{name}.{part}')] for part in effect_named(name).values
-            if name in state.model.values}
 
 
 def _where(name: str, before: State, found: Found) -> str:
