@@ -18,7 +18,7 @@ from inside import (
     rotation_from_rpy, simulate_poses, spread_directions, terms_of)
 import numpy as np
 import pytest
-from shared import refused, run
+from shared import refused, rms, run
 import yaml
 
 AFFINE = {'offset': [0.03, -0.02, 0.04], 'axis_gain': [0.012, -0.015, 0.008],
@@ -448,6 +448,9 @@ def test_the_mounting_is_a_loss_where_a_format_does_not_hold_it():
     for to in ('px4', 'ardupilot', 'betaflight'):
         made = export(levelled, to)
         assert any('rotation of 3.00' in line for line in made.losses)
+        moved = rms(spread_directions(500) @ levelled.rotation - spread_directions(500), axis=0)
+        mounting, = (each.leaves_mg for each in made.details if each.effect == 'mounting')
+        assert mounting == pytest.approx(1e3 * np.linalg.norm(moved), rel=0.01)
         assert made.leaves_mg == pytest.approx(export(sensor_with(BY_AXIS), to).leaves_mg)
     for to in ('c', 'imu_calib', 'imucal', 'json'):
         assert export(levelled, to).losses == ()
