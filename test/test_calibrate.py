@@ -5,6 +5,7 @@
 
 import json
 
+import accel_calib as ac
 from accel_calib.stored import read_calibration
 from inside import are_samples
 import numpy as np
@@ -106,6 +107,14 @@ def test_real_logs_become_good_calibrations_without_an_option(name, tmp_path, ca
 def test_samples_are_distinguished_from_poses(step, rows, count, samples):
     columns = {'time': np.arange(rows) * step, 'reading': np.ones((rows, 3)), **count}
     assert are_samples(columns) == samples
+
+
+@pytest.mark.parametrize(('per_g', 'unit'), [(1000.0, 'g'), (1024.0, 'native')])
+def test_whole_numbers_are_mg_only_where_1_g_is_about_1000(per_g, unit, tmp_path):
+    made = ac.simulate({}, recording=True, poses=10, units='g')
+    np.savetxt(tmp_path / 'log.csv', np.column_stack([made['time'], np.round(
+        per_g * made.reading)]), delimiter=',', header='time,ax,ay,az', comments='')
+    assert ac.capture(tmp_path / 'log.csv').units == unit
 
 
 @pytest.mark.parametrize(('size_kb', 'status', 'left'), [(64, 0, ['c.yaml']), (4, 2, [])])
