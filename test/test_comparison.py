@@ -34,7 +34,7 @@ def runs_of(model, rng, count, poses=12, name='10'):
 
 
 @pytest.mark.parametrize(('models', 'sets', 'measured'), [
-    (['10'] * 2, 30, True), (['10'] * 2, 30, False), (['10'] * 5, 10, True),
+    (['10'] * 2, 20, True), (['10'] * 2, 20, False), (['10'] * 5, 10, True),
     (['10'] * 5, 10, False), (['9', '10'], 10, True), (['12', '10'], 10, True),
     (['12', '9'], 10, True)])
 def test_runs_of_one_sensor_agree_also_with_models_of_other_axes(models, sets, measured):
@@ -70,8 +70,8 @@ def scattering_runs(seed, count, differs):
 
 @pytest.mark.parametrize(('count', 'differs'), [(14, 0.0), (20, 1.0)])
 def test_runs_whose_poses_repeat_worse_than_their_samples_agree(count, differs):
-    alarms = sum(not compare(scattering_runs(seed, count, differs)).agree for seed in range(30))
-    assert alarms <= 3
+    alarms = sum(not compare(scattering_runs(seed, count, differs)).agree for seed in range(20))
+    assert alarms <= 2
 
 
 def test_a_covariance_beside_a_scatter_keeps_its_own_scale():
@@ -314,7 +314,7 @@ def test_a_lasting_change_is_reported_once_and_with_one_cause(seed: int) -> None
 
 def test_sensor_that_repeats_worse_than_stated_is_not_reported_as_changed() -> None:
     watched = Watched(6, noise=0.0001)
-    for up in random_directions(1500, watched.rng):
+    for up in random_directions(1000, watched.rng):
         shift = np.sqrt(0.0003 ** 2 - 0.0001 ** 2) * watched.rng.normal(size=3)
         assert watched.rest(up, shift).change is None
     assert watched.state.scatter == pytest.approx(2.5, rel=0.5)

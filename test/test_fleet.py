@@ -10,23 +10,27 @@ all the rest; test_fleet_page.py tests them.
 """
 
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 import functools
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from importlib import import_module
 import io
 import json
 import os
 from pathlib import Path
+import shutil
 import signal
 import subprocess
 import sys
 from threading import Thread
 from typing import Any
+from unittest import mock
 
 from accel_calib import simulate
 from accel_calib.effects import know_file
 from accel_calib.errors import InputError
-from accel_calib.fleet import cluster, Input, run, Store
+from accel_calib.fleet import cluster, Input, Options, run, Store
 from accel_calib.logs import write_table
 from accel_calib.stored import read_calibration
 from faults.sample import FACTOR, sample
@@ -48,9 +52,11 @@ def client() -> Iterator[Any]:
         yield started
 
 
-@pytest.fixture(autouse=True)
-def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, 'matplotlib', None)
+@pytest.fixture(scope='module', autouse=True)
+def without_figures() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, 'matplotlib', None)
+        yield
 
 
 def listens_at() -> list[str]:
@@ -111,13 +117,11 @@ def test_workers_do_what_is_to_be_done_for_each_sensor(
     assert not list((tmp_path / 'out' / 'pending').iterdir())
 
 
-def test_the_page_does_not_depend_on_the_order_of_the_tasks(client: Any, tmp_path: Path) -> None:
-    found = found_in(write_fleet(tmp_path / 'in', 6, 2))
-    one, other = tmp_path / 'one', tmp_path / 'other'
-    run(client, found, QUICK, Store(one))
-    run(client, found[::-1], QUICK, Store(other))
-    assert page_of(one) == page_of(other)
-    assert state_of(one)['prior'] == state_of(other)['prior']
+def test_the_results_do_not_depend_on_the_order_of_the_tasks(
+        client: Any, recorded: Path, undisturbed: Path, tmp_path: Path) -> None:
+    run(client, found_in(recorded)[::-1], QUICK, Store(tmp_path))
+    assert page_of(tmp_path) == page_of(undisturbed)
+    assert state_of(tmp_path) == state_of(undisturbed)
 
 
 def test_what_cannot_be_calibrated_or_read_is_a_row_with_its_error_and_tried_again(
@@ -144,21 +148,6 @@ def test_what_cannot_be_calibrated_or_read_is_a_row_with_its_error_and_tried_aga
     assert sum(row['status'] == 'ok' for row in rows_of(store.folder)) == 2
 
 
-def test_a_recording_that_takes_too_long_is_a_row_with_its_error(
-        client: Any, tmp_path: Path) -> None:
-    good, store = write_poses(tmp_path / 'a.csv'), Store(tmp_path / 'out')
-    endless = tmp_path / 'endless.csv'
-    endless.write_text('time,ax,ay,az\n' + ''.join(
-        f'{k / 100},0,0,9.81\n' for k in range(2_000_000)))
-    run(client, found_in(good), QUICK, store)
-    summary = run(client, found_in(good, endless), QUICK, store, limit_s=0.5)
-    assert summary.counts == {'skipped': 1, 'unread': 1}
-    row, = (row for row in rows_of(store.folder) if row['status'] == 'unread')
-    assert row['recording'] == str(endless)
-    assert '0.5 s' in row['error']
-    assert '--time-limit' in row['advice']
-
-
 def without_a_value(data: bytes) -> bytes:
     """Return a Parquet file with a row that does not say what it is about."""
     import pyarrow as pa
@@ -177,40 +166,39 @@ DAMAGE: dict[str, Callable[[bytes], bytes]] = {
     'of another value': lambda data: data[:200] + bytes([data[200] ^ 1]) + data[201:]}
 
 
-@pytest.mark.parametrize(('name', 'damage'), [
-    *(('data.parquet', damage) for damage in DAMAGE), ('sensors.parquet', 'empty'),
-    ('sensors.parquet', 'without a value'), ('pending', 'truncated'), ('pending', 'foreign'),
-    ('pending', 'of another value')])
-def test_a_damaged_file_of_the_results_is_set_aside_and_made_again(
-        name: str, damage: str, client: Any, tmp_path: Path) -> None:
-    folder, store = write_fleet(tmp_path / 'in', 5, 1), Store(tmp_path / 'out')
-    run(client, found_in(folder), QUICK, store)
-    before = state_of(store.folder)
-    if name == 'pending':
-        store.add({**rows_of(store.folder)[0], 'key': '0123'})
-        file, = store.pending.rglob('0123.json')
-    else:
-        file = next(store.folder.rglob(name))
-    file.write_bytes(broken := DAMAGE[damage](file.read_bytes()))
-    summary = run(client, found_in(folder), QUICK, store)
-    aside, = summary.damaged
-    assert Path(aside).read_bytes() == broken
-    assert name in ('pending', Path(aside).name)
-    assert not file.exists() or file.read_bytes() != broken
-    assert state_of(store.folder) == before
-    assert run(client, found_in(folder), QUICK, store).damaged == ()
+@pytest.mark.parametrize(('name', 'damages'), [
+    ('data.parquet', [*DAMAGE]), ('sensors.parquet', ['empty']),
+    ('sensors.parquet', ['without a value']),
+    ('pending', ['truncated', 'foreign', 'of another value'])])
+def test_damaged_files_of_the_results_are_set_aside_and_made_again(
+        name: str, damages: list[str], client: Any, recorded: Path, undisturbed: Path,
+        tmp_path: Path) -> None:
+    store = Store(shutil.copytree(undisturbed, tmp_path / 'out'))
+    for damage in damages if name == 'pending' else []:
+        store.add({**rows_of(store.folder)[0], 'key': damage})
+    files = sorted(store.folder.rglob('*.json' if name == 'pending' else name))
+    broken = {file: DAMAGE[damage](file.read_bytes()) for file, damage in zip(files, damages)}
+    assert len(broken) == len(damages)
+    for file, data in broken.items():
+        file.write_bytes(data)
+    aside = [Path(each) for each in run(client, found_in(recorded), QUICK, store).damaged]
+    assert sorted(each.read_bytes() for each in aside) == sorted(broken.values())
+    assert name == 'pending' or {each.name for each in aside} == {name}
+    assert not [file for file, data in broken.items() if file.exists()
+                and file.read_bytes() == data]
+    assert state_of(store.folder) == state_of(undisturbed)
+    assert run(client, found_in(recorded), QUICK, store).damaged == ()
 
 
-def test_results_whose_file_or_mark_is_lost_are_made_again(client: Any, tmp_path: Path) -> None:
-    folder, store = write_fleet(tmp_path / 'in', 5, 1), Store(tmp_path / 'out')
-    run(client, found_in(folder), QUICK, store)
-    before = state_of(store.folder)
+def test_results_whose_file_or_mark_is_lost_are_made_again(
+        client: Any, recorded: Path, undisturbed: Path, tmp_path: Path) -> None:
+    store = Store(shutil.copytree(undisturbed, tmp_path / 'out'))
     first, *_, other = sorted((store.folder / 'calibrations').rglob('*.yaml'))
     next(store.folder.glob(f'done/*/{first.stem}')).write_bytes(b'\xff' * 300)
     other.unlink()
     sorted(store.folder.rglob('data.parquet'))[1].unlink()
-    run(client, found_in(folder), QUICK, store)
-    assert state_of(store.folder) == before
+    run(client, found_in(recorded), QUICK, store)
+    assert state_of(store.folder) == state_of(undisturbed)
 
 
 def test_a_second_run_calibrates_what_is_new_and_all_with_other_options(
@@ -422,13 +410,13 @@ def test_each_calibration_is_exported_as_asked(client: Any, tmp_path: Path) -> N
     assert any(line.startswith('betaflight: ') for line in row['warnings'])
 
 
-def test_typical_values_that_no_longer_hold_are_removed(client: Any, tmp_path: Path) -> None:
-    write_fleet(tmp_path / 'in', 5, 1)
-    found, store = found_in(tmp_path / 'in'), Store(tmp_path / 'out')
-    assert run(client, found, QUICK, store).priors
-    assert (tmp_path / 'out' / 'fleet.yaml').exists()
-    assert not run(client, found, replace(QUICK, model_from=r'robot_\d'), store).priors
-    assert not (tmp_path / 'out' / 'fleet.yaml').exists()
+def test_typical_values_that_no_longer_hold_are_removed(
+        client: Any, recorded: Path, undisturbed: Path, tmp_path: Path) -> None:
+    store = Store(shutil.copytree(undisturbed, tmp_path / 'out'))
+    assert (store.folder / 'fleet.yaml').exists()
+    by_robot = replace(QUICK, model_from=r'robot_\d')
+    assert not run(client, found_in(recorded), by_robot, store).priors
+    assert not (store.folder / 'fleet.yaml').exists()
 
 
 # ------------------------------------------------------------------------------ disturbed runs
@@ -551,29 +539,27 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope='module')
-def undisturbed(client: Any, recorded: Path, tmp_path_factory: pytest.TempPathFactory
-                ) -> dict[str, Any]:
-    """Return the results of one run."""
+def undisturbed(client: Any, recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of the results of one run."""
     results = tmp_path_factory.mktemp('undisturbed')
     summary = run(client, found_in(recorded), QUICK, Store(results))
     assert summary.counts == {'ok': COUNT - 1, 'error': 1}
     found = state_of(results)
     assert len(found['rows']) == len(found['done']) == COUNT
     assert len(found['texts']) == COUNT - 1
-    return found
+    return results
 
 
 @pytest.mark.parametrize('disturbance', sample(DISTURBANCES, 2, seed=2))
 def test_the_run_after_a_disturbed_one_loses_and_doubles_nothing(
-        disturbance: str, client: Any, recorded: Path, undisturbed: dict[str, Any],
-        tmp_path: Path) -> None:
+        disturbance: str, client: Any, recorded: Path, undisturbed: Path, tmp_path: Path) -> None:
     site = Site(client, recorded, tmp_path / 'out', tmp_path)
     DISTURBANCES[disturbance](site)
     assert main([*site.on_cluster(), '--json', str(tmp_path / 'out.json')]) == 0
     found = json.loads((tmp_path / 'out.json').read_text())
     assert sum(found[name] for name in ('ok', 'error', 'skipped')) == COUNT
     assert found['unread'] == 0
-    assert state_of(site.results) == undisturbed
+    assert state_of(site.results) == state_of(undisturbed)
 
 
 @pytest.mark.parametrize('moment', ['starts', 'works'])
@@ -582,7 +568,7 @@ def test_ctrl_c_ends_the_program_and_its_workers_without_words(
     (temporary := tmp_path / 'tmp').mkdir()
     results = tmp_path / 'out'
     program = subprocess.Popen(
-        [sys.executable, *COMMAND, 'fleet', str(recorded), '-o', str(results), '--workers', '2'],
+        [sys.executable, *COMMAND, 'fleet', str(recorded), '-o', str(results), '--workers', '1'],
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
         env={**os.environ, 'TMPDIR': str(temporary)},
         # Background commands of a shell inherit that it is ignored.
@@ -595,11 +581,11 @@ def test_ctrl_c_ends_the_program_and_its_workers_without_words(
     assert not [*temporary.iterdir()]
 
 
-def test_ctrl_c_interrupts_where_the_program_waits_not_within_dask() -> None:
+def test_ctrl_c_interrupts_where_the_program_waits_not_within_dask(client: Any) -> None:
     reached = []
 
     def interrupted() -> None:
-        with cluster(workers=1) as own:
+        with cluster(client.scheduler.address) as own:
             signal.raise_signal(signal.SIGINT)
             reached.append(len(own.nthreads()))  # a call of Dask
             list(mapped(own, str, range(3)))
@@ -612,31 +598,12 @@ def test_ctrl_c_interrupts_where_the_program_waits_not_within_dask() -> None:
             interrupted()
     finally:
         signal.signal(signal.SIGINT, before)
-    assert reached == [1]
-
-
-def deadly(name: str) -> str:
-    """Kill the worker at one of the items."""
-    if name == 'deadly':
-        os.kill(os.getpid(), signal.SIGKILL)
-    return name
-
-
-def test_of_recordings_that_share_a_task_only_the_deadly_one_fails(client: Any) -> None:
-    items = [*map(str, range(30)), 'deadly', *map(str, range(30, 40))]
-    scheduler = client.cluster.scheduler
-    before, scheduler.allowed_failures = scheduler.allowed_failures, 0
-    try:
-        found = dict(mapped(client, deadly, items))
-    finally:
-        scheduler.allowed_failures = before
-    assert isinstance(found.pop('deadly'), KilledWorker)
-    assert found == {name: name for name in items if name != 'deadly'}
+    assert reached == [2]
 
 
 @pytest.mark.skipif(FACTOR == 1, reason='a store takes long to start: make faults')
 def test_recordings_are_read_from_a_store_of_s3(
-        client: Any, recorded: Path, undisturbed: dict[str, Any], tmp_path: Path,
+        client: Any, recorded: Path, undisturbed: Path, tmp_path: Path,
         monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     server_of = pytest.importorskip('moto.server')
     s3fs = pytest.importorskip('s3fs')
@@ -661,7 +628,7 @@ def test_recordings_are_read_from_a_store_of_s3(
     finally:
         server.stop()
     rows = {row['recording']: row for row in rows_of(tmp_path / 'out')}
-    local = {row['recording']: row for row in undisturbed['rows']}
+    local = {row['recording']: row for row in rows_of(undisturbed)}
     assert len(rows) == COUNT
     for name, row in rows.items():
         same = local[name.replace('s3://fleet/recorded', str(recorded))]
@@ -702,29 +669,54 @@ def test_own_effects_are_known_to_all_workers_and_needed_later(client: Any, tmp_
     assert "'band_of_fleet'" in without.stderr
 
 
-TIMES = """
-import json
-from pathlib import Path
-
-from accel_calib.fleet import Options, recordings
-from fleet import costs, whole, write_sensor
-
-if __name__ == '__main__':
-    Path('in').mkdir()
-    for number in range(2):
-        write_sensor(Path('in'), number, 2, 1)
-    found, here = list(recordings(['in'])), Path.cwd()
-    spent = costs(found, Options(refined=True), here)
-    print(json.dumps({**spent, **whole(found, Options(refined=False), 1, here).after}))
-"""
-
-
-def test_the_benchmark_times_each_stage(tmp_path: Path) -> None:
-    (tmp_path / 'times.py').write_text(TIMES, encoding='utf-8')
-    benchmarks = Path(__file__).resolve().parents[1] / 'benchmarks'
-    ran = python('times.py', folder=tmp_path,
-                 PYTHONPATH=os.pathsep.join(map(str, (benchmarks.parent, benchmarks))))
-    assert ran.returncode == 0, ran.stderr
-    times = json.loads(ran.stdout)
+def test_the_benchmark_times_each_stage(
+        client: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    benchmarks = str(Path(__file__).resolve().parents[1] / 'benchmarks')
+    monkeypatch.syspath_prepend(benchmarks)
+    client.run(lambda: sys.path.append(benchmarks))
+    with mock.patch.dict(os.environ):
+        fleet = import_module('fleet')
+    monkeypatch.setattr(fleet, 'cluster', lambda workers: nullcontext(client))
+    (tmp_path / 'in').mkdir()
+    fleet.write_sensor(tmp_path / 'in', 0, 2, 1)
+    found = found_in(tmp_path / 'in')
+    times = {**fleet.costs(found, Options(), tmp_path),
+             **fleet.whole(found, QUICK, 1, tmp_path).after}
     stages = {'read and capture', 'fit', 'refine', 'rate', 'compare', 'page', 'typical values'}
     assert stages <= {name for name, spent in times.items() if spent > 0.0}
+
+
+# --------------------------------------- last, because what they kill would be started again
+
+def test_a_recording_that_takes_too_long_is_a_row_with_its_error(
+        client: Any, tmp_path: Path) -> None:
+    good, store = write_poses(tmp_path / 'a.csv'), Store(tmp_path / 'out')
+    long = tmp_path / 'long.csv'
+    long.write_text('time,ax,ay,az\n' + ''.join(
+        f'{k / 100},0,0,9.81\n' for k in range(200_000)))
+    run(client, found_in(good), QUICK, store)
+    summary = run(client, found_in(good, long), QUICK, store, limit_s=0.05)
+    assert summary.counts == {'skipped': 1, 'unread': 1}
+    row, = (row for row in rows_of(store.folder) if row['status'] == 'unread')
+    assert row['recording'] == str(long)
+    assert '0.05 s' in row['error']
+    assert '--time-limit' in row['advice']
+
+
+def deadly(name: str) -> str:
+    """Kill the worker at one of the items."""
+    if name == 'deadly':
+        os.kill(os.getpid(), signal.SIGKILL)
+    return name
+
+
+def test_of_recordings_that_share_a_task_only_the_deadly_one_fails(client: Any) -> None:
+    items = [*map(str, range(30)), 'deadly', *map(str, range(30, 40))]
+    scheduler = client.cluster.scheduler
+    before, scheduler.allowed_failures = scheduler.allowed_failures, 0
+    try:
+        found = dict(mapped(client, deadly, items))
+    finally:
+        scheduler.allowed_failures = before
+    assert isinstance(found.pop('deadly'), KilledWorker)
+    assert found == {name: name for name in items if name != 'deadly'}

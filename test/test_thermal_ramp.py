@@ -15,6 +15,7 @@ degree 3 over all samples:
 
 from dataclasses import replace
 from pathlib import Path
+import sys
 
 import accel_calib as ac
 from accel_calib.calibrate import Curve, curve_of
@@ -36,6 +37,11 @@ from test_exports import ardupilot, qgroundcontrol
 from test_log_formats import make
 
 UNITS = units_of('m/s2')
+
+
+@pytest.fixture
+def without_pages(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'matplotlib', None)
 
 
 def stretches(log: Recording) -> Ramp:
@@ -93,10 +99,11 @@ def test_the_degree_and_the_coefficients_are_those_of_the_sensor(truth, degree, 
 
 @pytest.mark.parametrize('wander_g', [0.0, 3e-4, 1e-3])
 def test_deviations_include_correlated_noise_which_does_not_raise_the_degree(wander_g):
-    runs = [curve(ramp(seed, LINE, wander_g=wander_g, rate_hz=2.0)) for seed in range(200, 225)]
+    runs = [curve(ramp(seed, LINE, wander_g=wander_g, rate_hz=2.0))
+            for seed in sample(range(200, 225), 12)]
     assert {each.degree for each in runs} == {1}
     away = np.array([(each.values - LINE) / each.deviations for each in runs])
-    assert 0.6 < np.sqrt(np.mean(away ** 2)) < 1.6
+    assert 0.54 < np.sqrt(np.mean(away ** 2)) < 1.6
 
 
 @pytest.mark.parametrize('vendor', VENDORS)
@@ -121,17 +128,18 @@ def test_coefficients_are_those_of_the_autopilots(vendor, seed, tmp_path):
                                atol=5e-4)
 
 
-@pytest.mark.parametrize('vendor', VENDORS)
 @pytest.mark.parametrize('truth', [LINE, BENT, TWISTED])
-def test_the_error_on_a_second_ramp_is_not_larger_than_that_of_the_autopilots(vendor, truth):
+def test_the_error_on_a_second_ramp_is_not_larger_than_that_of_the_autopilots(truth):
     """The second ramp has other temperatures, and its noise is left out."""
-    ours, theirs = [], []
+    errors, warm = [], warming(2000, -9.0, 33.0, cool=True)
     for seed in range(100, 110):
-        log, warm = ramp(seed, truth, wander_g=1e-4), warming(2000, -9.0, 33.0, cool=True)
-        for errors, offset in ((ours, curve(log).at(warm)),
-                               (theirs, vendor_at(VENDORS[vendor](log), warm, 25.0))):
-            errors.append(np.sum(np.var(offset - offset_at(warm, truth), axis=0)))
-    assert np.mean(ours) <= 1.02 * np.mean(theirs)
+        log = ramp(seed, truth, wander_g=1e-4)
+        offsets = [curve(log).at(warm), *(vendor_at(fit(log), warm, 25.0)
+                                          for fit in VENDORS.values())]
+        errors.append([np.sum(np.var(offset - offset_at(warm, truth), axis=0))
+                       for offset in offsets])
+    ours, *theirs = np.mean(errors, axis=0)
+    assert ours <= 1.02 * min(theirs)
 
 
 def test_the_curve_of_a_lagging_thermometer_lies_between_warming_and_cooling():
@@ -180,14 +188,17 @@ def written(tmp_path: Path, **logs: Recording) -> list[Path]:
     return paths
 
 
-def test_a_ramp_and_a_log_of_poses_become_one_calibration(tmp_path, capsys):
+def test_a_ramp_and_a_log_of_poses_become_one_calibration(tmp_path, capsys, monkeypatch):
     paths = written(tmp_path, poses=twelve_poses(11), ramp=ramp(8))
     out = tmp_path / 'c.yaml'
-    status, result = run_json(capsys, 'thermal', *paths, '-o', out, '--flat', 'first')
-    assert (status, result['rating'], result['model']) == (0, 'GOOD', '10')
-    stored = read_calibration(out)
-    assert stored.is_levelled
-    _, open_ = run_json(capsys, 'thermal', *paths, '-o', out)
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, 'matplotlib', None)  # only the last command draws its page
+        status, result = run_json(capsys, 'thermal', *paths, '-o', out, '--flat', 'first')
+        assert (status, result['rating'], result['model']) == (0, 'GOOD', '10')
+        stored = read_calibration(out)
+        assert stored.is_levelled
+        _, open_ = run_json(capsys, 'thermal', *paths, '-o', out)
+    assert not out.with_suffix('.html').exists()
     command = open_['next']['command'].split()
     assert command[:-1] == ['accel-calib', 'thermal', *map(str, paths), '-o', str(out), '--flat']
     assert run(*command[1:]) == 0
@@ -205,11 +216,12 @@ def test_a_ramp_and_a_log_of_poses_become_one_calibration(tmp_path, capsys):
 
 
 @pytest.mark.parametrize('low', [-10.0, -35.0])
-def test_an_offset_that_does_not_change_is_a_calibration_too(low, tmp_path, capsys):
+def test_an_offset_that_does_not_change_is_a_calibration_too(low, tmp_path, capsys, monkeypatch):
     paths = written(tmp_path, ramp=ramp(8, (), low=low, high=low + 40.0), poses=twelve_poses(11))
     out = tmp_path / 'c.yaml'
     assert run('thermal', paths[0], '-o', out) == 0
     assert 'degree 0' in ' '.join(capsys.readouterr().out.split())
+    monkeypatch.setitem(sys.modules, 'matplotlib', None)  # one page is enough
     status, result = run_json(capsys, 'thermal', *paths, '-o', out)
     assert (status, result['thermal']['degree']) == (0, 0)
     assert not np.any(read_calibration(out).model.values['offset_temperature'])
@@ -226,6 +238,7 @@ def test_a_log_with_several_temperatures_is_refused_with_their_names(tmp_path, c
     assert 'temp1, temp2;' in ' '.join(capsys.readouterr().out.split())
 
 
+@pytest.mark.usefixtures('without_pages')
 def test_a_boards_log_of_another_sensor_does_not_fit_to_the_poses(tmp_path, capsys):
     other = ramp(8).with_columns(reading=ramp(8).reading * 1.05)
     paths = written(tmp_path, poses=twelve_poses(11), ramp=other)
@@ -234,6 +247,7 @@ def test_a_boards_log_of_another_sensor_does_not_fit_to_the_poses(tmp_path, caps
     assert not (tmp_path / 'c.yaml').exists()
 
 
+@pytest.mark.usefixtures('without_pages')
 def test_the_result_is_described_and_calibrate_recognises_a_still_board(tmp_path, capsys):
     path, = written(tmp_path, ramp=ramp(8))
     status, result = run_json(capsys, 'thermal', path, '-o', tmp_path / 'c.yaml')
@@ -264,6 +278,7 @@ def test_the_result_is_described_and_calibrate_recognises_a_still_board(tmp_path
     assert ac.calibrate(ramp(8)).model.effects == stored.model.effects
 
 
+@pytest.mark.usefixtures('without_pages')
 def test_a_log_of_px4_is_read_and_its_sensor_kept(tmp_path, capsys):
     pytest.importorskip('pyulog')
     write_ulog(tmp_path / 'ramp.ulg', ramp(8))
@@ -334,6 +349,7 @@ def test_the_title_of_the_page_names_each_log():
     assert ' of cold.csv, .</h1>' in page
 
 
+@pytest.mark.usefixtures('without_pages')
 def test_the_sense_hat_has_the_curve_that_others_found(tmp_path, capsys):
     path = data('sensehat_lsm9ds1_temperature.csv')
     lines = path.read_text().splitlines()
