@@ -208,12 +208,12 @@ def main() -> None:
                 folders[folder_of] += 1
                 if not killed:
                     survived[folder_of] += 1
-                    rows.append((given.file, given.line, given.words))
+                    rows.append((given.file, given.line, given.words.replace('|', '\\|')))
                     print(done, *rows[-1], flush=True)
     shares = [(each, count, f'{1.0 - survived[each] / count:.0%}')
               for each, count in sorted(folders.items())]
-    words = (f'{len(drawn)} mutants, seed {options.seed}: '
-             f'{1.0 - len(rows) / len(drawn):.1%} killed')
+    words = ('# Mutants\n\nThe share of wrong operators that tests in their own process find, by folder; '
+             f'{len(drawn)} mutants, seed {options.seed}: {1.0 - len(rows) / len(drawn):.1%} killed')
     publish('\n\n'.join((
         words, markdown(('folder', 'mutants', 'killed'), shares),
         markdown(('file', 'line', 'survives'), rows))), options.markdown)
