@@ -212,8 +212,9 @@ def main() -> None:
                     print(done, *rows[-1], flush=True)
     shares = [(each, count, f'{1.0 - survived[each] / count:.0%}')
               for each, count in sorted(folders.items())]
-    words = ('# Mutants\n\nThe share of wrong operators that tests in their own process find, by folder; '
-             f'{len(drawn)} mutants, seed {options.seed}: {1.0 - len(rows) / len(drawn):.1%} killed')
+    words = ('# Mutants\n\nThe share of wrong operators that tests in their own process find, by '
+             f'folder; {len(drawn)} mutants, seed {options.seed}: '
+             f'{1.0 - len(rows) / len(drawn):.1%} killed')
     publish('\n\n'.join((
         words, markdown(('folder', 'mutants', 'killed'), shares),
         markdown(('file', 'line', 'survives'), rows))), options.markdown)
