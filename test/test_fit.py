@@ -251,7 +251,8 @@ def test_one_misplaced_pose_is_named_and_does_not_rotate_the_axes():
 
 def test_well_placed_orientations_are_used_and_model_12_needs_them():
     for seed, noise_g in product(range(10), (0.0003, 0.003, 0.03)):
-        assert fit_poses(placed(seed, 0.0, noise_g=noise_g)[1], G).name == '12'
+        fit = fit_poses(placed(seed, 0.0, noise_g=noise_g)[1], G)
+        assert (fit.name, has(fit.noted, 'placement')) == ('12', False)
     with pytest.raises(RefusedFitError, match='needs known orientations'):
         fit_poses(simulated(15, 20)[1], G, model='12')
 
@@ -394,7 +395,9 @@ def test_clean_poses_are_kept_even_if_their_noise_is_underestimated(count, state
 def test_all_knocked_poses_are_left_out_but_at_most_a_quarter(count):
     poses = knocked(7, count, count // 5)
     assert left_out(poses) == set(poses.row[:count // 5].tolist())
-    assert len(left_out(knocked(8, count, 2 * count // 5))) <= count // 4
+    changed = knocked(8, count, 0)
+    changed.reading[::3] += [0.1, 0.0, 0.0]  # a third agrees with another offset
+    assert len(left_out(changed)) <= count // 4
 
 
 @pytest.mark.parametrize('name', ['4', '7', '10'])

@@ -79,6 +79,8 @@ def test_rest_counts_before_it_ends_and_its_final_average_replaces_it(readings: 
     changes = push_all(live, readings(FACES, dwell=2.0))
     assert len(live.book.poses()) == 3
     assert sum(len(change.ended) for change in changes) >= 1
+    starts = [change.rest.start for change in changes if change.rest]
+    assert starts == sorted(starts)  # an end that is known late is not that of the last rest
     assert np.all(np.diff(live.book.poses()['time']) > 1.5)
 
 

@@ -380,7 +380,7 @@ def test_columns_unit_and_rate_are_said_also_where_gravity_is_lacking(
 def test_a_bad_date_is_an_error_with_its_line_or_is_skipped(reads: Reads) -> None:
     reading = samples()['reading']
     dates = [f'2026-01-01T12:{k // 6000:02d}:{k / 100 % 60:05.2f}' for k in range(len(reading))]
-    for bad in ('2026-13-45T99:00', 'yesterday'):
+    for bad in ('2026-13-45T12:00', '2026-01-01T12:61', 'yesterday'):
         dates[99] = bad
         with pytest.raises(InputError, match=f'row 100.*{bad}'):
             reads('time,accX,accY,accZ', dates, reading)

@@ -356,14 +356,16 @@ def test_a_walk_is_estimated_anew_beside_fewer_effects(seed, stays):
     assert fewer.near.chosen.score < found.near.chosen.score
 
 
-@pytest.mark.parametrize(('size', 'least', 'most'), [(5.0, 5.0, 150.0), (100.0, 1e3, 1e3)])
-def test_the_variance_of_a_walk_is_bounded_where_the_noise_is_not_known(size, least, most):
+@pytest.mark.parametrize(('size', 'worth', 'values', 'least', 'most'), [
+    (5.0, 0.0, 0, 5.0, 150.0), (100.0, 0.0, 0, 1e3, 1e3), (30.0, WORTH, 30, 1e3, 5e3)])
+def test_the_variance_of_a_walk_is_bounded_by_the_noise_or_where_that_is_not_known(
+        size, worth, values, least, most):
     rng = np.random.default_rng(3)
     process = random_walk(60, 6, 1.0, rng)[0].process
     along = np.sqrt(process.values) * rng.normal(size=6) * size
-    linear = by_hand(process.axes @ along + rng.normal(size=60), np.eye(60)[:, :1],
-                     ['supply_ratio'], worth=0.0)
-    ratio = walk_beside(Set.of(linear), process).ratio
+    linear = by_hand(process.axes @ along + rng.normal(size=60), np.eye(60)[:, :30],
+                     ['supply_ratio'] * 30, worth=worth)
+    ratio = walk_beside(Set.of(linear, range(values)), process).ratio
     assert least * (1.0 - 1e-9) <= ratio <= most * (1.0 + 1e-9)
 
 

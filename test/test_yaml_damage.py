@@ -206,7 +206,7 @@ DAMAGE = [
     ('reading:\n', 'reading:\n  - [0.0, 0.0, x]\n', "reading has shape|reading contains 'x'"),
     ('offset: {', 'offset: {x: 1e200, ', 'stated twice'),
     ('rejected: []', 'rejected: [1]', 'rejected contains 1, expected names'),
-    ('  bias: [', '  bias: [2.0, 0.0, 0.0]\n  was: [', 'below 1 in magnitude'),
+    ('  bias: [', '  bias: [1.0, 0.0, 0.0]\n  was: [', 'below 1 in magnitude'),
     ('  bias: [', '  bias: [.nan, 0.0, 0.0]\n  was: [', 'bias contains a number that is not'),
     ('  sd: [', '  sd: [-0.1, 0.0, 0.0]\n  was: [', 'expected 0 or more'),
     ('  rests: 24', '  rests: 0', 'has 0 rests, expected at least 1'),
