@@ -21,6 +21,7 @@ import numpy as np
 import openpyxl
 import pytest
 import scipy.io
+from test_log_formats import LOGS
 from test_logs import check, rows_of, samples, text_of
 
 PHYPHOX = '"Time (s)","Acceleration x (m/s^2)","Acceleration y (m/s^2)","Acceleration z (m/s^2)"'
@@ -93,51 +94,6 @@ def excel(path: Path, tables: Mapping[str, list[list[Any]]]) -> Path:
     return path
 
 
-def old_excel(path: Path, tables: Mapping[str, list[list[Any]]]) -> Path:
-    """Write an ``.xls`` file: BIFF8 records in the stream Workbook of a compound file."""
-    def record(kind: int, data: bytes) -> bytes:
-        return struct.pack('<HH', kind, len(data)) + data
-
-    def cell(row: int, column: int, value: Any) -> bytes:
-        at = struct.pack('<HHH', row, column, 0)
-        if isinstance(value, str):
-            return record(0x204, at + struct.pack('<HB', len(value), 0) + value.encode('latin-1'))
-        return record(0x203, at + struct.pack('<d', value))
-
-    begin = struct.pack('<HHHHII', 0x600, 5, 0, 1997, 0, 0x600)
-    sheets = [record(0x809, begin[:2] + b'\x10\0' + begin[4:]) + b''.join(
-        cell(i, j, value) for i, row in enumerate(rows) for j, value in enumerate(row))
-        + record(0x0A, b'') for rows in tables.values()]
-    head = record(0x809, begin)
-    names = [name.encode('latin-1') for name in tables]
-    starts = len(head) + sum(12 + len(name) for name in names) + 4
-    for name, sheet in zip(names, sheets, strict=True):
-        head += record(0x85, struct.pack('<IHBB', starts, 0, len(name), 0) + name)
-        starts += len(sheet)
-    stream = (head + record(0x0A, b'') + b''.join(sheets)).ljust(4096, b'\0')
-    count = -(-len(stream) // 512)
-    tables_needed = -(-(count + 1) // 127)  # of 128 sector numbers each, their own among them
-    chain = [*range(1, count), 0xFFFFFFFE, 0xFFFFFFFE, *[0xFFFFFFFD] * tables_needed]
-    chain += [0xFFFFFFFF] * (128 * tables_needed - len(chain))
-
-    def entry(name: str, kind: int, child: int, start: int, size: int) -> bytes:
-        spelled = f'{name}\0'.encode('utf-16-le')
-        return (spelled.ljust(64, b'\0') + struct.pack('<HBBIII', len(spelled), kind, 1,
-                                                       *[0xFFFFFFFF] * 2, child)
-                + bytes(36) + struct.pack('<III', start, size, 0))
-
-    folder = (entry('Root Entry', 5, 1, 0xFFFFFFFE, 0)
-              + entry('Workbook', 2, 0xFFFFFFFF, 0, len(stream)) + bytes(256))
-    numbers = [count + 1 + k for k in range(tables_needed)]
-    top = (b'\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1' + bytes(16) + struct.pack(
-        '<HHHHHHIIIIIIIII', 0x3E, 3, 0xFFFE, 9, 6, 0, 0, 0, tables_needed, count, 0, 4096,
-        0xFFFFFFFE, 0, 0xFFFFFFFE) + struct.pack('<I', 0)
-        + struct.pack('<109I', *numbers, *[0xFFFFFFFF] * (109 - tables_needed)))
-    path.write_bytes(top + stream.ljust(512 * count, b'\0') + folder
-                     + struct.pack(f'<{128 * tables_needed}I', *chain))
-    return path
-
-
 PACKED = {'zip': zipfile.ZIP_DEFLATED, 'bz2 zip': zipfile.ZIP_BZIP2, 'lzma zip': zipfile.ZIP_LZMA}
 
 
@@ -148,11 +104,10 @@ def written(kind: str, folder: Path, tables: Tables) -> Path:
         return stored(folder, tables)
     sheets = {name.replace('/', ' '): rows_in(text) for name, text in tables.items()
               if name not in ('meta/device', 'Metadata')}
-    return (excel(folder / 'log.xlsx', sheets) if kind == 'xlsx' else
-            old_excel(folder / 'log.xls', sheets))
+    return excel(folder / 'log.xlsx', sheets)
 
 
-@pytest.mark.parametrize('kind', ['zip', 'stored zip', 'xlsx', 'xls'])
+@pytest.mark.parametrize('kind', ['zip', 'stored zip', 'xlsx'])
 @pytest.mark.parametrize('maker', ['phyphox', 'sensor-logger'])
 def test_the_table_of_the_accelerometer_in_an_export_is_read_and_named(
         maker: str, kind: str, tmp_path: Path) -> None:
@@ -346,6 +301,8 @@ def test_the_damage_of_a_sheet_is_stated_although_there_are_others(tmp_path: Pat
 def test_a_damaged_container_ends_in_a_result_or_a_refusal(kind: str, tmp_path: Path) -> None:
     tables, reading = tables_of('phyphox')
     path = (matlab(tmp_path, {'acc': reading[:300], 'gyr': reading[:300]}) if kind == 'mat' else
+            raw(tmp_path, ('log.xls', (LOGS / 'phyphox' / 'export.xls').read_bytes()))
+            if kind == 'xls' else
             written(kind, tmp_path, {name: '\n'.join(text.splitlines()[:300])
                                      for name, text in tables.items()}))
     sound = path.read_bytes()

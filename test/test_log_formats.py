@@ -53,7 +53,7 @@ def check(recording: Recording, units: Any, name: str) -> Calibration:
 
 @pytest.mark.parametrize('name', make.TRUTHS)
 def test_the_truth_of_a_sample_is_found_without_options_and_with_its_format(name: str) -> None:
-    for end, library in (('.ulg', 'pyulog'), ('.bin', 'pymavlink')):
+    for end, library in (('.ulg', 'pyulog'), ('.bin', 'pymavlink'), ('.xls', 'xlrd')):
         if name.endswith(end):
             pytest.importorskip(library)
     log = read_log(LOGS / name)

@@ -222,6 +222,7 @@ TRUTHS: dict[str, Truth] = {
     **{f'phyphox/{name}.csv': _SI for name in (
         'comma_point', 'tab_point', 'semicolon_point', 'tab_comma', 'semicolon_comma')},
     'phyphox/simple/Accelerometer.csv': _SI,
+    'phyphox/export.xls': _SI,
     'sensor-logger/android/TotalAcceleration.csv': _SI,
     'sensor-logger/ios/AccelerometerUncalibrated.csv': truth('g', sign=-1.0),
     'matlab/acceleration.csv': _SI,
