@@ -31,7 +31,7 @@ from inside import (
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from shared import python, random_directions, sensor, with_effects
+from shared import python, random_directions, sensor, values_of, with_effects
 
 COUNT = int(os.environ.get('IMU_MESSAGES', '800'))
 COVARIANCES = ORIENTATION_COVARIANCE, ANGULAR_VELOCITY_COVARIANCE, ACCELERATION_COVARIANCE
@@ -298,16 +298,6 @@ OTHERS = [name for name, effect in EFFECTS.items() if not effect.linear]
 KNOWN = {'temperature': 31.0, 'supply_voltage': 3.1, 'time': 4000.0, 'rate': (1.0, -2.0, 0.5),
          'std': (0.01, 0.02, 0.03), 'previous': (0.0, 0.6, -0.8)}
 OWN = [4e-8, 1e-8, -1e-8, 1e-8, 5e-8, 2e-8, -1e-8, 2e-8, 6e-8]
-SHAPES = {'start': 1000.0, 'tau': 1800.0, 'instant': 3000.0, 'lag': 0.0, 'of_sensor': 0.0,
-          'form': 0.0}
-SIZES = {'g/h': 1.0, 'm': 0.1, 'g': 0.01, '1/°C': 1e-3, 'g/°C': 1e-3}
-
-
-def values_of(*names):
-    """Return random values of effects."""
-    rng, effects = np.random.default_rng(1), {name: EFFECTS[name] for name in names}
-    return {name: [*rng.normal(size=len(effect.parameters)) * SIZES.get(effect.unit, 0.003),
-                   *(SHAPES[part] for part in effect.shape)] for name, effect in effects.items()}
 
 
 def several(seed):
@@ -320,9 +310,11 @@ def several(seed):
     *(((name,), 'm/s2', 1.0, True) for name in OTHERS),
     *((several(seed), 'g', 9.80665, True) for seed in range(5))])
 def test_one_reading_and_its_covariance_are_corrected_as_arrays_are(names, unit, scale, turned):
-    calibration = calibration_of(values_of(*names), unit=unit, turned=turned)
+    rng = np.random.default_rng(5)
+    values = {name: values_of(name, rng.normal(size=18)) for name in names}
+    calibration = calibration_of(values, unit=unit, turned=turned)
     here = OneReading(calibration, scale).at(KNOWN)
-    known, rng = {key: np.array([value]) for key, value in KNOWN.items()}, np.random.default_rng(5)
+    known = {key: np.array([value]) for key, value in KNOWN.items()}
     for reading in random_directions(20, rng) * rng.uniform(0.1, 3.0, (20, 1)):
         reading = calibration.units.from_g(reading)
         force = calibration.correct(reading[np.newaxis], known)
