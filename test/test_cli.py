@@ -83,16 +83,6 @@ def test_several_tables_return_a_list_in_their_order(tmp_path, capsys):
     assert set(results[1]) == {'file', 'error', 'advice'}
 
 
-def test_a_refused_fit_says_what_to_do_in_json_and_in_one_line(poses, capsys):
-    assert run('fit', poses, '--rows', '1:5', '--model', '10', '--json', '-') == 2
-    printed = capsys.readouterr()
-    result = json.loads(printed.out)
-    assert set(result) == {'error', 'advice'}
-    assert 'turn the sensor so that' in result['advice']
-    assert printed.err.startswith('accel-calib fit: 5 poses, expected at least 9 poses')
-    assert printed.err.count('\n') == 1
-
-
 @pytest.mark.parametrize(('command', 'kind'), [
     ('fit', 'poses'), ('refine', 'poses'), ('calibrate', 'poses'), ('fit', 'recording'),
     ('refine', 'recording'), ('calibrate', 'recording'), ('verify', 'recording')])

@@ -10,11 +10,9 @@ all the rest; test_fleet_page.py tests them.
 """
 
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 import functools
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
-from importlib import import_module
 import io
 import json
 import os
@@ -25,12 +23,11 @@ import subprocess
 import sys
 from threading import Thread
 from typing import Any
-from unittest import mock
 
 from accel_calib import simulate
 from accel_calib.effects import know_file
 from accel_calib.errors import InputError
-from accel_calib.fleet import cluster, Input, Options, run, Store
+from accel_calib.fleet import cluster, Input, run, Store
 from accel_calib.logs import write_table
 from accel_calib.stored import read_calibration
 from faults.sample import FACTOR, sample
@@ -73,20 +70,6 @@ def test_a_cluster_of_this_machine_is_not_reached_from_others(client: Any) -> No
     assert client.dashboard_link.startswith('http://127.0.0.1:')
 
 
-def test_each_recording_becomes_a_row_and_a_calibration(client: Any, tmp_path: Path) -> None:
-    write_fleet(tmp_path / 'in', 2, 2)
-    summary = run(client, found_in(tmp_path / 'in'), QUICK, Store(tmp_path / 'out'))
-    rows = rows_of(tmp_path / 'out')
-    assert summary.counts == {'ok': 4}
-    assert len(rows) == 4
-    for row in rows:
-        robot = int(row['sensor'].removeprefix('robot_').removesuffix('/imu_link'))
-        assert abs(row['offset.x'] - 0.010 - 0.001 * robot) < 5.0 * row['offset.x.sd'] < 0.002
-        stored = read_calibration(tmp_path / 'out' / row['calibration'])
-        assert stored.offset[0] == pytest.approx(row['offset.x'], abs=1e-12)
-        assert stored.date == row['date'] == f'{Path(row["recording"]).stem}T00:00:00+00:00'
-
-
 def test_recordings_without_a_name_are_said_to_need_one(client: Any, tmp_path: Path) -> None:
     for k in range(3):
         write_poses(tmp_path / 'in' / f'board{k}.csv', OFFSET, seed=k, sensor='')
@@ -101,7 +84,7 @@ def test_recordings_without_a_name_are_said_to_need_one(client: Any, tmp_path: P
     assert 'unnamed' not in {each.kind for each in summary.rating.findings}
 
 
-def test_workers_do_what_is_to_be_done_for_each_sensor(
+def test_each_recording_becomes_a_row_and_a_calibration_on_the_workers(
         client: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_fleet(tmp_path / 'in', 6, 2)
     (tmp_path / 'in' / 'bad.csv').write_text('nothing of use\n')
@@ -115,6 +98,12 @@ def test_workers_do_what_is_to_be_done_for_each_sensor(
     assert 'bad.csv has no' in page
     assert '6 sensors' in page
     assert not list((tmp_path / 'out' / 'pending').iterdir())
+    for row in (each for each in rows_of(tmp_path / 'out') if each['status'] == 'ok'):
+        robot = int(row['sensor'].removeprefix('robot_').removesuffix('/imu_link'))
+        assert abs(row['offset.x'] - 0.010 - 0.001 * robot) < 5.0 * row['offset.x.sd'] < 0.002
+        stored = read_calibration(tmp_path / 'out' / row['calibration'])
+        assert stored.offset[0] == pytest.approx(row['offset.x'], abs=1e-12)
+        assert stored.date == row['date'] == f'{Path(row["recording"]).stem}T00:00:00+00:00'
 
 
 def test_the_results_do_not_depend_on_the_order_of_the_tasks(
@@ -667,23 +656,6 @@ def test_own_effects_are_known_to_all_workers_and_needed_later(client: Any, tmp_
                      store.folder / rows_of(store.folder)[0]['calibration'])
     assert without.returncode == 2
     assert "'band_of_fleet'" in without.stderr
-
-
-def test_the_benchmark_times_each_stage(
-        client: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    benchmarks = str(Path(__file__).resolve().parents[1] / 'benchmarks')
-    monkeypatch.syspath_prepend(benchmarks)
-    client.run(lambda: sys.path.append(benchmarks))
-    with mock.patch.dict(os.environ):
-        fleet = import_module('fleet')
-    monkeypatch.setattr(fleet, 'cluster', lambda workers: nullcontext(client))
-    (tmp_path / 'in').mkdir()
-    fleet.write_sensor(tmp_path / 'in', 0, 2, 1)
-    found = found_in(tmp_path / 'in')
-    times = {**fleet.costs(found, Options(), tmp_path),
-             **fleet.whole(found, QUICK, 1, tmp_path).after}
-    stages = {'read and capture', 'fit', 'refine', 'rate', 'compare', 'page', 'typical values'}
-    assert stages <= {name for name, spent in times.items() if spent > 0.0}
 
 
 # --------------------------------------- last, because what they kill would be started again

@@ -5,12 +5,8 @@
 
 import importlib
 import os
-from pathlib import Path
 import re
 import runpy
-import shutil
-import subprocess
-import sys
 from typing import Any
 from xml.etree import ElementTree
 
@@ -158,18 +154,3 @@ def test_scripts_run_the_function_of_the_entry_point(name: str, setup_py: dict[s
     if '.ros.' in module:
         pytest.importorskip('rclpy')
     assert callable(getattr(importlib.import_module(module), function))
-
-
-def test_command_in_the_path_is_that_of_ros2_run(
-        tmp_path: Path, setup_py: dict[str, Any]) -> None:
-    for folder, paths in setup_py['data_files']:
-        if folder in ('bin', 'lib/accel_calib'):
-            (tmp_path / folder).mkdir(parents=True)
-            for path in paths:
-                shutil.copy(ROOT / path, tmp_path / folder)
-    (tmp_path / 'bin' / 'python3').symlink_to(sys.executable)
-    done = subprocess.run(
-        [tmp_path / 'bin' / 'accel-calib', '--version'], cwd=tmp_path, capture_output=True,
-        text=True, timeout=60, check=False, env={**os.environ, 'PYTHONPATH': str(ROOT)})
-    assert done.returncode == 0, done.stderr
-    assert accel_calib.__version__ in done.stdout

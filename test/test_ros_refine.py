@@ -5,7 +5,6 @@
 
 from collections.abc import Callable
 from pathlib import Path
-import re
 import signal
 from typing import Any
 
@@ -17,7 +16,7 @@ from inside_ros import force_of
 import numpy as np
 import pytest
 from sensor_msgs.msg import BatteryState, FluidPressure, Imu, Temperature
-from shared import run_snippets, with_effects
+from shared import with_effects
 from std_msgs.msg import Float32, Float64
 
 Readings = Callable[..., Any]
@@ -94,37 +93,6 @@ def test_an_own_effect_is_named_corrected_and_needed_by_the_node(
     printed = wrong.communicate(timeout=60.0)[0]
     assert wrong.returncode == 2, printed
     assert 'also is /nowhere/own.py,' in printed
-
-
-@pytest.mark.parametrize(('name', 'of_current', 'parameters'), [
-    ('motor', lambda current: current, {}), ('field', np.abs, {'also': 'motor_field.py'})])
-def test_the_examples_of_the_page_are_corrected_live(
-        bench: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, of_current: Any,
-        parameters: Any) -> None:
-    monkeypatch.chdir(tmp_path)
-    shown: list[str] = []
-    held_out = run_snippets('docs/refine.md', lambda text: not shown.append(text))['poses'](
-        2, of_current)
-    corrected = bench.listen(Imu, 'imu/data_calibrated')
-    publisher = bench.node.create_publisher(Float64, '/motor/current', 10)
-    bench.calibrator(calibration_file=tmp_path / f'{name}.yaml',
-                     context=['motor_current:=/motor/current'],
-                     **{key: tmp_path / value for key, value in parameters.items()})
-    calibration, errors = read_calibration(tmp_path / f'{name}.yaml'), []
-    bench.exchange(corrected, lambda: bench.imu(held_out.reading[0]))
-    for reading, current in zip(held_out.reading, held_out['motor_current'], strict=True):
-        expected = calibration.apply(reading, motor_current=current)
-
-        def as_offline(reading: Any = reading, current: float = current,
-                       expected: Any = expected) -> bool:
-            publisher.publish(Float64(data=float(current)))
-            force = force_of(bench.echo([bench.imu(reading)], corrected)[-1])
-            return np.allclose(force, expected, rtol=0.0, atol=1e-9)
-
-        bench.spin(as_offline)
-        errors.append(1e3 * (np.linalg.norm(expected) / 9.80665 - 1.0))
-    stated = re.findall(r'refine: (\S+) mg held out', shown[name == 'field'])[-1]
-    assert f'{np.sqrt(np.mean(np.square(errors))):.2f}' == stated
 
 
 TOPICS = {'supply_voltage [V]': ('battery', BatteryState, 12.25),

@@ -128,19 +128,6 @@ def test_node_is_found_by_its_name_or_what_is_there_is_named(bench: Any) -> None
         assert words in found[1]
 
 
-def test_reader_of_the_pipe_may_end(bench: Any) -> None:
-    node = bench.calibrator()
-    with subprocess.Popen([sys.executable, *WATCH], env=bench._environment, text=True,
-                          stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        assert process.stdout is not None
-        assert process.stderr is not None
-        assert process.stdout.readline()
-        process.stdout.close()
-        bench.end(node, signal.SIGINT)  # so that there is another line to write
-        assert process.wait(60) == 141  # as SIGPIPE ends a program
-        assert process.stderr.read() == ''
-
-
 DIRECTIONS = spread_directions(12)
 
 

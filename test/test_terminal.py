@@ -232,8 +232,8 @@ def test_logs_and_tables_go_through_standard_streams(files, capsys, monkeypatch)
 
 
 def test_a_reader_that_leaves_early_gets_no_error(tmp_path):
-    done = piped('accel-calib simulate -o - --poses 20000 | head -1', tmp_path)
-    assert done.stdout == '# units: "m/s2"\n'
+    done = piped('accel-calib simulate -o - --poses 20000 | head -1; echo $PIPESTATUS', tmp_path)
+    assert done.stdout == '# units: "m/s2"\n141\n'  # as SIGPIPE ends a program
     assert 'Broken' not in done.stderr
 
 
