@@ -4,7 +4,6 @@
 """Few poses are fitted with the typical values of a fleet."""
 
 from dataclasses import replace
-import json
 from pathlib import Path
 import sys
 from typing import Any
@@ -17,11 +16,11 @@ from accel_calib.stored import read_calibration, read_prior, write_calibration, 
 from accel_calib.table import Floats, Poses
 from accel_calib.units import Units
 from inside import (
-    estimated, main, Model, MODELS, priors_of, simulate_poses, spread_directions, typical_of, unit,
+    estimated, Model, MODELS, priors_of, simulate_poses, spread_directions, typical_of, unit,
     with_vector)
 import numpy as np
 import pytest
-from shared import error_mg, rms
+from shared import error_mg, refused, rms, run_json
 
 IN_G = Units('g', 1.0)
 MEAN = np.array([0.010, -0.015, 0.030, 0.010, 0.012, -0.020, 0.004, 0.000, -0.003])
@@ -163,28 +162,24 @@ def test_a_refinement_with_the_fleet_finds_an_effect_beyond_it(fleet: FleetPrior
 
 
 def test_the_command_line_refines_with_the_file_of_the_fleet(
-        fleet: FleetPrior, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        fleet: FleetPrior, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+        capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setitem(sys.modules, 'matplotlib', None)  # no pages
     rng = np.random.default_rng(11)
     write_priors(tmp_path / 'fleet.yaml', {name: replace(fleet, model=name) for name in 'AB'})
     for count, effects in ((6, []), (16, ['quadratic'])):
         table, out = tmp_path / f'{count}.csv', tmp_path / f'{count}.yaml'
         write_table(table, poses_of(bent(a_sensor(rng)), count, rng))
-        arguments = ['refine', str(table), '--units', 'g', '--prior', str(tmp_path / 'fleet.yaml')]
-        assert main([*arguments, '--json', str(tmp_path / 'r.json')]) == 2  # which model?
-        assert ' A, B, ' in json.loads((tmp_path / 'r.json').read_text())['error']
-        assert main([*arguments, '--sensor-model', 'B', '-o', str(out), '--json',
-                     str(tmp_path / 'r.json')]) == 0
-        assert main(['fit', *arguments[1:], '--sensor-model', 'B', '--model', '4']) == 2
-        found = json.loads((tmp_path / 'r.json').read_text())
-        assert [step['effect'] for step in found['steps']] == effects
+        given = table, '--units', 'g', '--prior', tmp_path / 'fleet.yaml'
+        of_b = *given, '--sensor-model', 'B'
+        assert ' A, B, ' in refused(capsys, 'refine', *given)
+        status, found = run_json(capsys, 'refine', *of_b, '-o', out)
+        assert (status, [step['effect'] for step in found['steps']]) == (0, effects)
+        refused(capsys, 'fit', *of_b, '--model', '4')
         stored = read_calibration(out)
         assert stored.method == 'fleet'
         assert stored.reason.endswith(' of model B')
-        arguments[0] = 'calibrate'
-        main([*arguments, '--sensor-model', 'B', '-o', str(out), '--keep-bad', '--json',
-              str(tmp_path / 'c.json')])
-        found = json.loads((tmp_path / 'c.json').read_text())
+        found = run_json(capsys, 'calibrate', *of_b, '-o', out, '--keep-bad')[1]
         assert read_calibration(out).method == 'fleet'
         assert ('quadratic' in found['refined']) is bool(effects)
         assert ('at least 9' in found['refined']) is not bool(effects)

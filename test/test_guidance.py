@@ -129,15 +129,11 @@ def test_a_mounting_alone_is_reported(command: str) -> None:
     assert not driver.logged('error')
 
 
-def degrees_from_flat(up: Any) -> float:
-    return float(np.degrees(np.arccos(np.clip(up[2], -1.0, 1.0))))
-
-
 @pytest.mark.parametrize(('reach', 'command'), [(10.0, 'fit'), (0.5, 'calibrate_at_rest')])
 def test_a_robot_that_cannot_be_turned_over_is_offered_what_its_poses_carry(
         reach: float, command: str) -> None:
     driver = Driver()
-    person = Person(driver, healthy, can_reach=lambda up: degrees_from_flat(up) <= reach)
+    person = Person(driver, healthy, can_reach=lambda up: up[2] >= np.cos(np.radians(reach)))
     tilt = np.sin(np.radians(reach - 0.1))
     for x, y in ((tilt, 0.0), (-tilt, 0.0), (0.0, tilt), (0.0, -tilt)):
         person.rest([x, y, np.sqrt(1.0 - tilt ** 2)])

@@ -207,12 +207,16 @@ def test_the_text_log_has_the_numbers_of_the_binary_log() -> None:
         np.testing.assert_allclose(text.recording[key], values, rtol=1e-6, atol=1e-9)
 
 
-def test_garbage_within_an_ardupilot_log_is_passed_over(tmp_path: Path) -> None:
+def test_garbage_within_an_ardupilot_log_is_passed_over_and_noted(
+        tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     whole = (LOGS / 'ardupilot/raw_acc.bin').read_bytes()
     start = whole.index(b'\xa3\x95\x65', 20_000)
     path = in_file(tmp_path, whole[:start] + b'\x00\x17\xff' * 9 + whole[start:])
-    np.testing.assert_array_equal(ardupilot(path).recording.reading[:, 2],
+    log = ardupilot(path)
+    assert ' left out' in ' '.join(log.notes)
+    np.testing.assert_array_equal(log.recording.reading[:, 2],
                                   ardupilot('raw_acc.bin').recording.reading[:, 2])
+    assert capfd.readouterr() == ('', '')
 
 
 def test_the_messages_of_older_ardupilot_logs_are_read(tmp_path: Path) -> None:

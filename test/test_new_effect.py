@@ -152,6 +152,8 @@ def test_an_own_effect_is_simulated_named_stored_and_needed(tmp_path, capsys):
     assert (status, step['effect']) == (0, 'dead_band')
     np.testing.assert_allclose([step['parameters'][axis] for axis in AXES],
                                [0.01, -0.008, 0.006], atol=1e-3)
+    without = run_json(capsys, 'refine', poses)[1]  # in the same process
+    assert 'dead_band' not in [step['effect'] for step in without['steps']]
 
     def verified(*more):
         done = python(*COMMAND, 'verify', poses, '-c', stored, *more)
@@ -166,18 +168,6 @@ def test_an_own_effect_is_simulated_named_stored_and_needed(tmp_path, capsys):
     status, (line,) = verified('--also', own)
     assert status == 2
     assert 'another definition' in line
-
-
-def test_an_own_effect_of_a_column_is_named_in_python():
-    field = ac.Effect('field_of_motor', 'offset by the field of the motor', typical=1e-4,
-                      unit='g/A²', variable='motor_current', change=np.square)
-    rng = np.random.default_rng(12)
-    current = rng.uniform(-10.0, 10.0, 60)
-    poses = still(rng, 60, np.outer(current ** 2, [1e-4, -5e-5, 8e-5]), motor_current=current)
-    found = ac.refine(poses, units='g', also=[field])
-    assert [step.effect for step in found.steps] == ['field_of_motor']
-    assert found.verdict == 'explained'
-    assert 'field_of_motor' not in [step.effect for step in ac.refine(poses, units='g').steps]
 
 
 @pytest.mark.parametrize(('wrong', 'message'), [

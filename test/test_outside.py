@@ -9,11 +9,11 @@ import tracemalloc
 from accel_calib.calibrate import fit_poses, of_samples, outside, SampleContext
 from accel_calib.effects import empirical_name
 from accel_calib.logs import read_recording, write_blocks, write_table
-from accel_calib.session import CalibratorSettings, Log, Session
 from accel_calib.stored import write_calibration
 from accel_calib.table import numbered, Recording
 from accel_calib.units import units_of
 from bag_files import write_bag
+from driven import Driver
 from inside import (
     model_with, ROWS_OF_A_TEXT, simulate_poses, simulate_recording, spread_directions)
 import numpy as np
@@ -106,21 +106,14 @@ def test_session_logs_once_for_each_leaving(tmp_path, monkeypatch):
     monkeypatch.setenv('ROS_HOME', str(tmp_path))
     path = tmp_path / 'calibration.yaml'
     write_calibration(path, calibrated({**TCO, 'temperature_rate': np.array([0.0, 0.02, 0.0])}))
-    now = 0.0
-    session = Session(CalibratorSettings(calibration_file=str(path)), '/imu/data_raw', lambda: now)
-    assert session.accepts('imu')
-    rows = np.full((1, 9), np.nan)
-    rows[:, 1:4] = 0.0, 0.0, 9.81
-    told = []
-    for k, warm in enumerate([25.0, 35.0, 36.0, 37.0, 29.0, 29.0, 36.0]):
-        rows[:, 0], rows[:, 7] = 1000.0 + 3000.0 * k, warm
-        session.around.take('temperature', warm)
-        session.push(rows, now)
-        session.events.clear()
-        now += 61.0
-        session.tick()
-        told.append([event.words for event in session.events if isinstance(event, Log)
-                     and event.words.startswith('temperature has left')])
+    driver, told = Driver(calibration_file=str(path)), []
+    for warm in (25.0, 35.0, 36.0, 37.0, 29.0, 29.0, 36.0):
+        driver.feed([[0.0, 0.0, 9.81]], temperature=warm)
+        driver.log.clear()
+        driver.stamp += 3000.0
+        driver.tick(61.0)
+        told.append([line.words for line in driver.log
+                     if line.words.startswith('temperature has left')])
     assert [len(each) for each in told] == [0, 1, 0, 0, 0, 0, 1]
     assert ' 20 to 30 ' in told[1][0]
     assert ' 35 °C' in told[1][0]
