@@ -188,18 +188,3 @@ def test_messages_in_another_encoding_are_corrected_and_unusable_ones_dropped_an
         bench.spin(lambda words=words: any(words in array.status[0].message
                                            for array in diagnostics))
     assert diagnostics[-1].status[0].level == DiagnosticStatus.WARN
-
-
-def test_messages_reach_the_session_even_if_nobody_listens(bench: Any, stored: Stored) -> None:
-    diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
-    bench.calibrator(calibration_file=stored())
-    bench.node.destroy_subscription(next(
-        each for each in bench.node.subscriptions if each.topic == 'imu/data_calibrated'))
-
-    def counted() -> bool:
-        bench.send(bench.imu([0.1, 0.2, 9.8]))
-        values = {value.key: value.value for value in diagnostics[-1].status[0].values
-                  } if diagnostics else {}
-        return values.get('messages', '0') != '0'
-
-    bench.spin(counted)
