@@ -4,7 +4,6 @@
 """Nodes that are killed at random times, and two nodes on one store: nothing answered is lost."""
 
 from collections.abc import Callable, Iterable
-import json
 from pathlib import Path
 import re
 import signal
@@ -26,7 +25,6 @@ pytest.importorskip('rclpy')
 
 KILLS = 6 * FACTOR
 SECONDS = 6.0 * FACTOR
-READER = Path(__file__).with_name('reader.py')
 COMMANDS = ('capture_pose', 'fit', 'set_level', 'fit', 'undo_pose', 'save', 'capture_pose', 'undo',
             'fit', 'refine', 'calibrate_at_rest', 'load', 'reset')
 _POSES = 12
@@ -131,7 +129,6 @@ def test_of_two_nodes_one_stores_and_the_other_says_so(
     first = bench.calibrator(**_SENSOR)
     other = bench.run(*CALIBRATOR, '--ros-args', '-r', '__node:=second', '-p', 'sensor:=arm',
                       '-p', 'passthrough:=true', '-p', 'auto_capture:=false')
-    reader = bench.run(str(READER), str(folder / 'arm.yaml'))
     names = ('capture_pose', 'fit', 'undo', 'undo_pose', 'set_level', 'save', 'reset')
     clients = {(node, name): bench.node.create_client(Trigger, f'{node}/{name}')
                for node in ('calibrator', 'second') for name in names}
@@ -155,12 +152,7 @@ def test_of_two_nodes_one_stores_and_the_other_says_so(
     bench.end(first, signal.SIGKILL)
     assert takes_over(bench, turned, clients['second', 'capture_pose'])
     assert bench.end(other, signal.SIGINT)[0] == 0
-    bench.end(reader, signal.SIGKILL)
-    reads = [json.loads(line) for line in reader.communicate()[0].splitlines()]
-    count = sum(each['reads'] for each in reads)
-    sys.stdout.write(f'{called} calls of each node, {count} reads\n')
-    assert count > 100
-    assert not [bad for each in reads for bad in each['bad']]
+    sys.stdout.write(f'{called} calls of each node\n')
 
 
 def takes_over(bench: Any, turned: Any, client: Any) -> bool:
