@@ -142,12 +142,9 @@ MISSING_FILES = [
     ('fit', 'poses.csv', '-o', 'new.yaml', '--json', '.'), ('calibrate', 'poses.csv', '-o', ''),
     ('capture', 'poses.csv', '-o', 'circle'), ('calibrate', 'poses.csv', '-o', 'circle'),
     ('apply', 'poses.csv', '-c', 'calibration.yaml', '-o', 'circle'), ('fit', 'circle'),
-    ('simulate', '-o', 'no_folder/x.csv'),
     ('capture', 'poses.csv', '-o', 'x.csv'), ('verify', 'poses.csv', '-c', 'poses.csv'),
-    ('noise', 'poses.csv'),
-    ('fit', 'poses.csv', '--model', '12'), ('fit', '.'),
-    ('refine', 'poses.csv', '-o', 'no_folder/c.yaml'), ('refine', 'poses.csv', '--rows', '1:3'),
-    ('refine', 'poses.csv', '--report', 'no_folder/r.html'),
+    ('noise', 'poses.csv'), ('fit', 'poses.csv', '--model', '12'), ('fit', '.'),
+    ('refine', 'poses.csv', '--rows', '1:3'), ('refine', 'poses.csv', '--report', 'none/r.html'),
     ('refine', 'poses.csv', '--base', '12'), ('report', 'missing.csv', '-o', 'r.html'),
     ('report', 'poses.csv', '-o', 'no_folder/r.html'),
 ])
@@ -224,13 +221,6 @@ def test_every_command_has_help_with_an_example(command, capsys):
     with pytest.raises(SystemExit, match='0'):
         main([command, '--help'])
     assert f'example:\n  accel-calib {command}' in capsys.readouterr().out
-
-
-def test_wrong_arguments_exit_with_2(capsys):
-    for arguments in (['fly'], ['fit'], ['fit', 'x', '--gravity', '-1'], ['fit', 'x\0'],
-                      ['fit', 'x', '-o', 'c\0.yaml']):
-        with pytest.raises(SystemExit, match='2'):
-            main(arguments)
 
 
 @pytest.mark.parametrize(('arguments', 'without'), [

@@ -96,7 +96,8 @@ def test_control_characters_are_escaped():
     ('fit x.csv --modle 4', '(did you mean --model?)'),
     ('refine x.csv --bsae 4', '(did you mean --base?)'),
     ('fit x --units m/s', '(did you mean m/s2?)'),
-    ('fit x.csv --gravity -3', 'expected a positive number; see accel-calib fit --help')])
+    ('fit x.csv --gravity -3', 'expected a positive number; see accel-calib fit --help'),
+    ('fit', 'the following arguments are required: '), ('fit x\0', 'has the character NUL')])
 def test_a_misspelt_name_gets_a_suggestion_in_one_line_and_a_wrong_value_none(line, said, capsys):
     with pytest.raises(SystemExit, match='2'):
         main(line.split())
