@@ -43,7 +43,7 @@ _BRANCHES = 5
 _TESTED = 6
 """Number of extended sets whose shapes and outliers are found again."""
 
-_AS_GOOD = 2.0
+AS_GOOD = 2.0
 """Within this difference from the best score, the set with fewest values wins."""
 
 _NEARLY = 0.3
@@ -132,7 +132,7 @@ def accepted(visited: Iterable[Set]) -> Iterator[Set]:
     while left:
         near: list[Set] = []
         for chosen in left:
-            if near and chosen.score < near[0].score - _AS_GOOD:
+            if near and chosen.score < near[0].score - AS_GOOD:
                 break
             if all(is_significant(chosen, block) for block in chosen.blocks):
                 near.append(chosen)

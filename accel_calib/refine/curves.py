@@ -29,14 +29,14 @@ each axis may still show with one value, in the proportion of the first.
 
 **Rivals** are effects that would explain the data about as well as a named one. The probability of
 an effect against its rivals follows from the score of the set with each of them in its place,
-exp(c score / 2), all else being equal (Kass and Raftery 1995). The noise is estimated from the
-same equations, so differences are less certain: c is the share of the degrees of freedom that the
-set leaves.
+exp(c score / 2), all else being equal (Kass and Raftery 1995), with the preference of the search
+for fewer values (`AS_GOOD` of `.beam`). The noise is estimated from the same equations, so
+differences are less certain: c is the share of the degrees of freedom that the set leaves.
 
 """
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 import math
 from typing import NamedTuple
@@ -44,6 +44,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .base import causes
+from .beam import AS_GOOD
 from .linear import Block, LEAST_OWN, LEVEL, Linear, outside_of, Set, with_outliers
 from .state import candidates, left_open, linearised, State
 from ..effects import (
@@ -472,7 +473,8 @@ class Near:
     What was chosen in the equations of all poses near a model.
 
     The equations of `chosen` are whitened if there is a `walk`; those of `plain` are not. If no
-    walk is tried, `process` is None.
+    walk is tried, `process` is None. `fitted` are the scores of other effects in the place of one,
+    by both names, where their own fit is not as good as these equations predict.
 
     """
 
@@ -480,6 +482,7 @@ class Near:
     plain: Linear
     walk: Walk | None
     process: Process | None
+    fitted: Mapping[tuple[str, str], float] = field(default_factory=dict)
 
     @property
     def beside(self) -> Set:
@@ -497,6 +500,12 @@ class Near:
     def without(self, name: str) -> Set:
         """Return what was chosen, without an effect."""
         return self.chosen.without(self.block_of(name))
+
+    def score_above(self, base_rss: float) -> float:
+        """Return the score relative to a base that leaves this sum of squares."""
+        worth = self.plain.worth
+        return self.chosen.score + (worth + self.plain.dof) * math.log(
+            (worth + base_rss + 1e-300) / (worth + self.plain.base_rss + 1e-300))
 
     @property
     def key(self) -> tuple[frozenset[str], tuple[int, ...], bool]:
@@ -536,8 +545,10 @@ def _scores(name: str, near: Near, least: float, *, usual: bool) -> dict[str, fl
         if (likely > least and effect not in near.names
                 and (effect in LADDER or name not in LADDER)):
             larger = others.extended(number)
-            score = larger.score + back * larger.unusual
+            score = larger.score + back * larger.unusual - AS_GOOD * float(
+                np.sign(larger.parameters - near.chosen.parameters))
             scores[effect] = max(score, scores.get(effect, -np.inf))
     if name != WANDER and near.walk is None and near.process is not None:
         scores[WANDER] = walk_beside(others, near.process).score + back * others.unusual
-    return scores
+    return {other: min(score, near.fitted.get((name, other), score))
+            for other, score in scores.items()}

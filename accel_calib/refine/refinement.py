@@ -51,6 +51,10 @@ _ROUNDS = 6
 _NAMED = 4
 """Largest number of undetermined values that are named."""
 
+_LEAST_CHECKS = 4
+"""Smallest number of equations beyond values with which a refinement is used. With fewer, of 12
+simulated poses, a wrong effect explains as much as the true one, and new poses read worse."""
+
 _BASE = '10'
 _ORIENTATION = ('reference', 'orientation')
 
@@ -524,6 +528,12 @@ def refined_calibration(base: Calibration, final: State, added: tuple[str, ...],
         quality=quality_of(at_poses, base.units, unit(at_poses.equations.force)), poses=poses,
         rejected=rejected, noted=(*given.notes, *findings), method='ml',
         reason=f'{base.reason}; refined: {names or "nothing added"}')
+    if len(model.vector) > len(base.model.vector) and (
+            final.dof < _LEAST_CHECKS or refined.quality.held_out_rms_mg is None):
+        return refined, (
+            f'{counted(len(final.poses_g), "pose")} check {counted(len(model.vector), "value")} '
+            f'too little to add effects, expected at least {_LEAST_CHECKS} more than values',
+            'take 24 poses or more, or use the result of fit')
     try:
         return _determined(gated(with_rest_noise(refined, given.poses)), final)
     except RefusedFitError as refused:

@@ -15,7 +15,9 @@ The search for missing effects.
    effect is also removed if its quantity explains more when it is shifted in time.
 5. If a gap remains, or a walk, `.curves` looks for an empirical curve; a walk is added if it is
    the better description.
-6. If a scatter that all poses have (`accel_calib.estimate.scatter`) is as good an explanation as
+6. In the final model, an effect is removed if it is not significant or does not lower the held-out
+   residual, and gives way to one that is more probable in its place.
+7. If a scatter that all poses have (`accel_calib.estimate.scatter`) is as good an explanation as
    what was found, the search is repeated with it as part of the noise.
 
 A set is kept only if its fit converged, the cost decreased and its values are plausible.
@@ -35,8 +37,8 @@ import scipy
 from .base import causes, Clipped, off_grid, unclipped
 from .beam import accepted, explored, is_all_noise, is_significant, reshaped
 from .curves import (
-    best_curve, CLEARLY, Curve, Near, one_curve, Process, process_of, SIGNIFICANT, Walk,
-    walk_beside)
+    best_curve, CLEARLY, Curve, Near, one_curve, probabilities, Process, process_of, SIGNIFICANT,
+    Walk, walk_beside)
 from .linear import LEVEL, Linear, Set
 from .state import (
     beginning, Candidate, candidates, fitted_state, left_open, linearised, State, with_effect,
@@ -104,10 +106,10 @@ class Found:
     `base` and `final` are the states before and after it, with the same poses. `added` are the
     added effects, in order, with `WANDER` last if the rest is a random walk of the offset;
     `outliers` (d,) are the indices of the outliers. `near` has the equations near the final
-    model, and `walk` is beside the final model at the poses kept. `taken_back` are effects that
-    were removed because they explain too little, or no more than by chance. Poses at the limit of
-    the sensor are left out: they are `clipped`, and `with_clipped` is the base fitted to all
-    poses. `grid_g` is the step of the grid of the readings [g], if it is relevant.
+    model, with what was tried in `trial`; `walk` is beside it at the poses kept. `taken_back` are
+    effects that were removed because they explain too little, or no more than by chance. Poses at
+    the limit of the sensor are left out: they are `clipped`, and `with_clipped` is the base fitted
+    to all poses. `grid_g` is the step of the grid of the readings [g], if it is relevant.
 
     """
 
@@ -116,6 +118,7 @@ class Found:
     added: tuple[str, ...]
     outliers: NDArray[np.intp]
     near: Near
+    trial: _Trial
     walk: Walk | None = None
     curve: Curve | None = None
     taken_back: tuple[str, ...] = ()
@@ -223,33 +226,126 @@ def _search(poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
     """Search among the effects that are columns of the equations."""
     start = beginning(poses_g, base)
     poses_g = start.poses_g
-    begun, near = _settled(start, poses_g, base.effects, _visible(start, LADDER),
-                           of_ladder=True)
+    begun, near, _ = _settled(start, poses_g, base.effects, _visible(start, LADDER),
+                              of_ladder=True)
     ladder = near.names
     fixed = (*base.effects, *ladder)
     fixed = tuple(name for name in fixed if name not in included(fixed))
     names = (*_visible(begun, LADDER), *(name for name in EFFECTS if name not in LADDER),
              *also, *covariate_names(causes(poses_g)), *_visible(begun, CHANGES))
-    state, near = _settled(begun, poses_g, fixed, names)
+    state, near, trial = _settled(begun, poses_g, fixed, names)
     if 'hysteresis' in near.names:  # a large one has distorted the directions
         force = judge(state.model, poses_g).equations.force
         poses_g = with_previous(poses_g, unit(force))
-        state, near = _settled(State(judge(state.model, poses_g)), poses_g, fixed, names)
+        state, near, trial = _settled(State(judge(state.model, poses_g)), poses_g, fixed, names)
     begun = _fitted_without(begun, poses_g, near.chosen.out)
     taken_back: tuple[str, ...] = ()
     if near.names and near.walk is None and not _explains(begun, state):
         taken_back, state = near.names, begun
         near = replace(near, chosen=near.chosen.instead(()))
-    out, walks = near.chosen.out, () if near.walk is None else (WANDER,)
-    there = {*state.model.values, *included(state.model.values), WANDER} - _of_a_turn(state)
-    added = tuple(name for name in (*ladder, *near.names, *walks) if name in there)
+    out = near.chosen.out
     first = _fitted_without(start, poses_g, out) if out else start
-    found = Found(first, state, added, np.array(out, np.intp), near, _walk(state, near),
-                  taken_back=taken_back)
+    found = Found(first, state, _added(ladder, state, near), np.array(out, np.intp), near, trial,
+                  _walk(state, near), taken_back=taken_back)
     chance = tuple(name for name in near.names if _is_coincidence(found, name))
     fewer = _less(found, chance)
     found = found if fewer is None else replace(fewer, taken_back=chance)
-    return _described(found, start, poses_g)
+    found = _described(found, start, poses_g)
+    state, near = _consistent(found, ladder)
+    return replace(found, final=state, near=near, walk=_walk(state, near),
+                   added=_added(ladder, state, near, found.curve))
+
+
+def _added(ladder: tuple[str, ...], state: State, near: Near, curve: Curve | None = None
+           ) -> tuple[str, ...]:
+    """Return the names of the effects that a model has beyond its base, in order."""
+    there = {*state.model.values, *included(state.model.values), WANDER} - _of_a_turn(state)
+    names = (*ladder, *near.names, *(() if curve is None else (curve.name,)),
+             *(() if near.walk is None else (WANDER,)))
+    return tuple(name for name in names if name in there)
+
+
+def _consistent(found: Found, ladder: tuple[str, ...]) -> tuple[State, Near]:
+    """
+    Return the final model in which each effect is sound, and the set near it.
+
+    An effect is removed if it is not significant, or if the held-out residual is as small without
+    it. It gives way to another one that is more probable in its place and whose fit is better.
+    Those of the ladder are removed if they are not significant beside what was found later.
+
+    """
+    state, near, trial = found.final, found.near, found.trial
+    for name in (name for name in ladder[::-1] if name in state.model.values):
+        values = {other: part for other, part in state.model.values.items() if other != name}
+        values.update((other, part) for other, part in found.base.model.values.items()
+                      if other not in (*values, *included(values)))
+        fewer = fitted_state(Model(values), state.poses_g)
+        if fewer is not None and not (is_significant(*of_ladder(state, name))
+                                      and _lowers(state, fewer)):
+            state = fewer
+    fixed = tuple(name for name in state.model.values if name not in near.names)
+    if {*fixed} != {*trial.fixed}:
+        trial = replace(trial, fixed=fixed)
+        near = _at(trial.near(state), near.names, near.chosen.out,
+                   None if near.walk is None else near.process, trial)
+    while (doubt := _doubtful(state, near)) is not None:
+        after, new = _exchanged(state, near, *doubt, trial)
+        score = -np.inf if new is None else new.score_above(near.plain.base_rss)
+        if after is None or new is None or (doubt[1] and score <= near.chosen.score):
+            near = replace(near, fitted={**near.fitted, doubt: score})
+        else:
+            state, near = after, new
+    return state, near
+
+
+def of_ladder(state: State, name: str) -> tuple[Set, int]:
+    """Return the set of an effect of the ladder beside all others of a model, and its block."""
+    others = tuple(other for other in state.model.effects if other != name)
+    names = [other for other in LADDER if other not in others]
+    linear = linearised(state.fit, others, candidates(names, state.poses_g))
+    block, = (number for number, block in enumerate(linear.blocks) if block.effect == name)
+    return Set.of(linear, (block,)), block
+
+
+def _doubtful(state: State, near: Near) -> tuple[str, str] | None:
+    """Return an effect that is not sound, and the one for its place, or '' to remove it."""
+    for name in near.names[::-1]:  # the smallest contribution first
+        if (name, '') in near.fitted:
+            continue
+        fewer = fitted_state(Model({other: values for other, values in state.model.values.items()
+                                    if other != name}), state.poses_g)
+        if not is_significant(near.chosen, near.block_of(name)) or (
+                fewer is not None and near.walk is None and not _lowers(state, fewer)):
+            return name, ''
+    for name in (*near.names, *(() if near.walk is None else (WANDER,))):
+        other = next(iter(probabilities(name, near)))
+        if other != name:
+            return name, other
+    return None
+
+
+def _lowers(state: State, fewer: State) -> bool:
+    """Return whether the held-out residual of a model is below that of one with less effects."""
+    return state.gap_mg(state.held_out) < fewer.gap_mg(fewer.held_out)
+
+
+def _exchanged(state: State, near: Near, name: str, other: str, trial: _Trial
+               ) -> tuple[State | None, Near | None]:
+    """Return the fit with another effect, if any, in the place of one, and the set near it."""
+    chosen = near.beside.instead(block for block in near.chosen.blocks
+                                 if near.plain.blocks[block].effect != name)
+    if other and other != WANDER:
+        chosen = chosen.extended(chosen.best_of(other))
+    after = trial.fitted(chosen, state)
+    if after is None:
+        return None, None
+    walks = other == WANDER or near.walk is not None
+    new = _at(trial.near(after), chosen.effects, chosen.out, near.process if walks else None,
+              trial)
+    if new.walk is not None and new.walk.likelihood_ratio < SIGNIFICANT:
+        new = replace(new, walk=None, chosen=new.beside)
+        return after, None if other == WANDER else new
+    return after, new
 
 
 def _is_coincidence(found: Found, name: str) -> bool:
@@ -295,9 +391,6 @@ def _described(found: Found, start: State, poses_g: Poses) -> Found:
     curve = best_curve(found.final, poses_g, found.near.chosen.out)
     if curve is None:
         return found
-    alone = _alone(curve, found, poses_g)
-    if alone is not None:
-        return _described(alone, start, poses_g)
     walking = _walking(found)
     if walking is not None and not _is_better(curve, walking.near):
         return walking
@@ -364,16 +457,6 @@ def _less(found: Found, names: Collection[str]) -> Found | None:
     return fewer if found.walk is None else _walking(fewer) or fewer
 
 
-def _alone(curve: Curve, found: Found, poses_g: Poses) -> Found | None:
-    """Return what was found without the effects of the variable of a curve that replaces them."""
-    variable = empirical_parts(curve.name)[1]
-    entries = {name: effect_named(name) for name in found.near.names}
-    fewer = _less(found, [name for name, entry in entries.items()
-                          if (entry.over or entry.needs) == (variable,)])
-    instead = None if fewer is None else best_curve(fewer.final, poses_g, found.near.chosen.out)
-    return fewer if instead and empirical_parts(instead.name)[1] == variable else None
-
-
 def _walking(found: Found) -> Found | None:
     """Return what was found, with a walk; None if a walk is not significant."""
     near = found.near
@@ -436,9 +519,11 @@ class _Trial:
 
 
 def _settled(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterable[str], *,
-             of_ladder: bool = False) -> tuple[State, Near]:
+             of_ladder: bool = False) -> tuple[State, Near, _Trial]:
     """
-    Search and fit in turn until a set is found again; return the state, and the set near it.
+    Search and fit in turn until a set is found again.
+
+    Return the state, the set near it, and what was tried.
 
     Effects `of_ladder` are searched without a walk, also where the poses leave gains open.
 
@@ -473,29 +558,13 @@ def _settled(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterab
             break
     if settled is None and len(state.poses_g) < len(poses_g):  # the set has all poses
         state = _fitted_without(state, poses_g, ())
-    near = _at(linear, *(settled or ((), (), None)), trial)
-    while (fewer := _without_weak(near.chosen)) is not None:
-        after = trial.fitted(fewer, state)
-        if after is None:
-            break
-        place = fewer.effects, fewer.out, None if near.walk is None else near.walk.process
-        del near, linear, fewer  # before the next columns are made
-        state, linear = after, trial.near(after)
-        near = _at(linear, *place, trial)
-    return state, near
+    return state, _at(linear, *(settled or ((), (), None)), trial), trial
 
 
 def _is_predicted(near: Near, fitted: State) -> bool:
     """Return whether the equations were linear enough: near the fit, the same would be found."""
     error, variance = abs(near.beside.rss - fitted.rss), fitted.rss / max(fitted.dof, 1)
     return fitted.dof > 0 and error < _EXACT * max(variance, 1.0)
-
-
-def _without_weak(chosen: Set) -> Set | None:
-    """Return the best set with one effect less that is not significant; None if all are."""
-    return max((chosen.without(block) for block in chosen.blocks
-                if not is_significant(chosen, block)),
-               key=lambda fewer: fewer.score, default=None)
 
 
 def _best_fit(near: Near, state: State, trial: _Trial) -> tuple[Near, State | None]:

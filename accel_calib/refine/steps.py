@@ -22,12 +22,12 @@ import numpy as np
 
 from .curves import LEAST, nearest_effects, probabilities, steepest
 from .linear import is_seen, Set
-from .search import Found
-from .state import candidates, fitted_state, is_noise, linearised, State, with_effect
+from .search import Found, of_ladder
+from .state import fitted_state, is_noise, State, with_effect
 from ..effects import (
     CHANGES, COVARIATES, effect_named, EFFECTS, EMPIRICAL, empirical_parts, included, is_effect,
-    kind_of, LADDER, Model, parameter_names, PROCESSES, TO_SEPARATE, unit_of, value_unit,
-    variable_of, variable_words, WANDER)
+    kind_of, Model, parameter_names, PROCESSES, TO_SEPARATE, unit_of, value_unit, variable_of,
+    variable_words, WANDER)
 from ..estimate import kinds
 from ..geometry import ATTITUDES, axes_of_signs
 from ..table import column_of, Floats, Poses
@@ -275,11 +275,8 @@ def _p_value(name: str, found: Found) -> float:
         return found.curve.p_value
     if name in near.names:
         return near.chosen.probability(near.block_of(name))
-    others = tuple(other for other in final.model.effects if other != name)
-    names = [other for other in LADDER if other not in others]
-    linear = linearised(final.fit, others, candidates(names, final.poses_g))
-    own = [number for number, block in enumerate(linear.blocks) if block.effect == name]
-    return Set.of(linear, own).probability(own[0]) if own else 1.0
+    chosen, block = of_ladder(final, name)
+    return chosen.probability(block)
 
 
 def _output_steps(found: Found) -> list[Step]:
