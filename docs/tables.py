@@ -23,7 +23,7 @@ from textwrap import wrap
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parent), str(HERE)]
 
-from accel_calib.effects import EFFECTS, OF_RAMPS  # noqa: E402
+from accel_calib.effects import EFFECTS  # noqa: E402
 from accel_calib.finding import KINDS, STEPS  # noqa: E402
 from accel_calib.findings import LIMITS  # noqa: E402
 from accel_calib.logs.names import UNITS, WORDS  # noqa: E402
@@ -48,7 +48,7 @@ def effects() -> Iterator[str]:
     """Yield the catalogue of effects."""
     yield '| name | what | term | values | unit | common size | needs |'
     yield '|---|---|---|---|---|---|---|'
-    for name, effect in {**EFFECTS, **OF_RAMPS}.items():
+    for name, effect in EFFECTS.items():
         needs = ', '.join(part for key in effect.needs for part in COLUMNS[key].names)
         values = ', '.join(effect.values)
         yield (f'| `{name}` | {effect.words} | {effect.term} | {values} | {effect.unit} | '

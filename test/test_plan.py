@@ -100,7 +100,7 @@ def test_voltages_of_a_plan_are_the_ends_and_the_middle_of_those_of_the_poses():
     rng = np.random.default_rng(0)
     time = np.arange(24) * 60.0
     supply = 3.2 + 0.2 * (time / time[-1] + 0.1 * rng.normal(size=24))
-    poses = simulated(rng, noise_g=0.005, supply_ratio=[0.002, 0.04, -0.04, 0.04],
+    poses = simulated(rng, noise_g=0.004, supply_ratio=[0.002, 0.04, -0.04, 0.04],
                       context={'time': time, 'supply_voltage': supply})
     planned = refine(poses, G, base='10').plan.poses
     low, high = np.min(supply), np.max(supply)
@@ -127,7 +127,9 @@ def test_the_poses_of_the_plan_name_the_hidden_effect():
     before = refine(poses, G, base='10')
     planned = np.array([pose.up for pose in before.plan.poses])
     assert len(planned)
-    more = simulated(rng, np.repeat(planned, 40, axis=0), **hidden)
+    taken = np.repeat(planned, 40, axis=0)
+    taken = taken + 0.2 * rng.normal(size=taken.shape)  # by hand
+    more = simulated(rng, taken / np.linalg.norm(taken, axis=1, keepdims=True), **hidden)
     joined = replace(poses, columns={key: np.concatenate([poses[key], more[key]])
                                      for key in poses.columns},
                      row=np.arange(1, len(poses) + len(more) + 1))

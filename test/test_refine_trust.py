@@ -432,8 +432,8 @@ def test_all_stages_of_a_refinement_have_the_same_poses():
     given = pd.DataFrame(TILTED, columns=['ax', 'ay', 'az']).assign(
         std_x=0.002, std_y=0.002, std_z=0.002, count=100)
     found = ac.refine(given, units='g')
-    assert len(found.stages) == 2
-    assert [len(stage.residual_mg) for stage in found.stages] == 2 * [len(found.poses_g)]
+    assert ([len(stage.residual_mg) for stage in found.stages]
+            == (1 + len(found.steps)) * [len(found.poses_g)])
 
 
 def test_samples_of_a_board_that_hardly_turns_give_it_no_absurd_gain():

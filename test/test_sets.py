@@ -193,7 +193,8 @@ def test_two_effects_are_found_where_neither_alone_is_significant():
     slope = np.polyfit(time / 3600.0, warm, 1)[0]  # the drift hides the effect of temperature
     size = 0.002 * np.array([1.0, -1.0, 1.0])
     hidden = {'offset_temperature': size, 'offset_drift': [*(-slope * size), 0.0]}
-    _, linear = problem_of(poses_of(hidden, time=time, temperature=warm), *EFFECTS)
+    _, linear = problem_of(  # a cubic beside a warm-up imitates both
+        poses_of(hidden, time=time, temperature=warm), *{*EFFECTS} - {'offset_temperature_cubic'})
     for block, each in enumerate(linear.blocks):
         if each.effect in hidden:
             assert Set.of(linear, (block,)).probability(block) > REFINE_LEVEL

@@ -33,8 +33,8 @@ are those of IEEE 1293 (model equation of a linear accelerometer) and of data sh
 from .catalogue import (
     CARRIERS, CHANGES, covariate_names, COVARIATES, curve_pairs, curve_unit, effect_named, EFFECTS,
     EMPIRICAL, empirical_name, empirical_parts, included, is_effect, kind_of, LADDER, modes_of,
-    NOMINAL_SUPPLY, OF_RAMPS, OFFSET_POWERS, parameter_names, PROCESSES, REFERENCE_TEMPERATURE,
-    unit_of, value_unit, variable_of, variable_words, VARIABLES, WANDER)
+    NOMINAL_SUPPLY, OFFSET_POWERS, parameter_names, PROCESSES, REFERENCE_TEMPERATURE, unit_of,
+    value_unit, variable_of, variable_words, VARIABLES, WANDER)
 from .form import (
     AFFINE, AXES, by_axis, Context, CUBE, difference, Effect, fitted_places, FORCE, MODES,
     MONOMIALS, ODD_SQUARE, ONE, PRODUCT, SIZE, SQUARE, TO_SEPARATE, WAVE, ZONAL, ZONES)
@@ -49,7 +49,7 @@ from .thermal import acting_temperature, rate_at, ThermalStream
 __all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CHANGES', 'CONVERGED_G', 'COVARIATES', 'CUBE', 'EFFECTS',
            'EMPIRICAL', 'FORCE', 'KNOWN_CODE', 'LADDER', 'LARGEST_FORCE_G', 'LARGEST_ITERATIONS',
            'MODELS', 'MODES', 'MONOMIALS', 'NOMINAL_SUPPLY', 'ODD_SQUARE', 'OFFSET_POWERS',
-           'OF_RAMPS', 'ONE', 'PROCESSES', 'PRODUCT', 'REFERENCE_TEMPERATURE', 'SIZE', 'SQUARE',
+           'ONE', 'PROCESSES', 'PRODUCT', 'REFERENCE_TEMPERATURE', 'SIZE', 'SQUARE',
            'TO_SEPARATE', 'VARIABLES', 'WANDER', 'WAVE', 'ZONAL', 'ZONES', 'AtContext', 'Context',
            'EachShape', 'Effect', 'Model', 'ModelForm', 'OwnEffect', 'ThermalStream',
            'acting_temperature', 'by_axis', 'check_context', 'correct', 'covariate_names',

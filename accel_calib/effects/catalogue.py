@@ -196,6 +196,9 @@ EFFECTS: dict[str, Effect] = {
     'offset_temperature_quadratic': _in_time(
         'offset that changes with the square of temperature', 'second-order TCO', AXES, 'g/°C²',
         1e-5, terms=by_axis(ONE), factor=_warming_to(2), needs=('temperature',)),
+    'offset_temperature_cubic': _in_time(
+        'offset that changes with the cube of temperature', 'third-order TCO', AXES, 'g/°C³',
+        1e-7, terms=by_axis(ONE), factor=_warming_to(3), needs=('temperature',)),
     'gain_temperature': _in_time(
         'gain that changes with temperature', 'sensitivity temperature coefficient TCS', AXES,
         '1/°C', 0.0003, terms=by_axis(FORCE), factor=_lagged_warming('temperature_of_gain'),
@@ -241,13 +244,6 @@ EFFECTS: dict[str, Effect] = {
                            output=_on_grid),
 }
 """All effects that are functions of the force and the context."""
-
-OF_RAMPS: dict[str, Effect] = {
-    'offset_temperature_cubic': _in_time(
-        'offset that changes with the cube of temperature', 'third-order TCO', AXES, 'g/°C³',
-        1e-7, terms=by_axis(ONE), factor=_warming_to(3), needs=('temperature',))}
-"""Effects that only the ramp of a still board shows (`accel_calib.calibrate.thermal`). Still poses
-are too few to distinguish them, so that `accel_calib.refine` does not try them."""
 
 OFFSET_POWERS = ('offset', 'offset_temperature', 'offset_temperature_quadratic',
                  'offset_temperature_cubic')
@@ -469,7 +465,7 @@ def is_effect(name: str) -> bool:
 @cache
 def effect_named(name: str) -> Effect:
     """Return the effect with this name: of the catalogue, own, a covariate, or a curve."""
-    known = ChainMap(EFFECTS, OF_RAMPS, PROCESSES, CHANGES, OWN)
+    known = ChainMap(EFFECTS, PROCESSES, CHANGES, OWN)
     if name in known:
         return known[name]
     return _covariate(name) if kind_of(name) in COVARIATES else _empirical(name)

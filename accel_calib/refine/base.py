@@ -60,6 +60,11 @@ _GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 _QUIET = 0.7
 """Largest scatter of clipped samples, relative to the smallest scatter away from the limit."""
 
+_STILL = 0.2
+_LEAST_PILED = 2
+"""Smallest number of readings at the ends of axes whose samples scatter less; one whose samples
+scatter less than `_STILL` of the others counts twice."""
+
 _REACH = 2.0
 """Distance from the limit, in standard deviations, within which samples reach it."""
 
@@ -200,9 +205,11 @@ def clipped(poses_g: Poses) -> Clipped | None:
     away = ~np.any(near, axis=0)
     usual = np.min(std, axis=0, initial=np.inf, where=away)
     usual[np.isinf(usual)] = 0.0  # all poses are near the ends of an axis
-    ends = np.any(near & (std < _QUIET * usual), axis=1)
-    if not np.any(ends):
+    quiet = near & (std < _QUIET * usual)
+    # Samples pile up at a limit, which is that of all axes; one pose may be quiet by chance.
+    if np.sum(quiet) + np.sum(near & (std < _STILL * usual)) < _LEAST_PILED:
         return None
+    ends = np.any(quiet, axis=1)
     limit = float(np.max(np.abs(extremes[ends])))
     at_limit = np.any(near & ends[:, np.newaxis], axis=0) | (np.abs(reading) > limit - reach)
     return Clipped(limit, np.flatnonzero(np.any(at_limit, axis=1)))

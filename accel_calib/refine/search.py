@@ -391,6 +391,9 @@ def _described(found: Found, start: State, poses_g: Poses) -> Found:
     curve = best_curve(found.final, poses_g, found.near.chosen.out)
     if curve is None:
         return found
+    alone = _alone(curve, found, poses_g)
+    if alone is not None:
+        return _described(alone, start, poses_g)
     walking = _walking(found)
     if walking is not None and not _is_better(curve, walking.near):
         return walking
@@ -455,6 +458,16 @@ def _less(found: Found, names: Collection[str]) -> Found | None:
     fewer = replace(found, final=state, near=near, walk=None,
                     added=tuple(name for name in found.added if name not in (*names, WANDER)))
     return fewer if found.walk is None else _walking(fewer) or fewer
+
+
+def _alone(curve: Curve, found: Found, poses_g: Poses) -> Found | None:
+    """Return what was found without the effects of the variable of a curve that replaces them."""
+    variable = empirical_parts(curve.name)[1]
+    entries = {name: effect_named(name) for name in found.near.names}
+    fewer = _less(found, [name for name, entry in entries.items()
+                          if (entry.over or entry.needs) == (variable,)])
+    instead = None if fewer is None else best_curve(fewer.final, poses_g, found.near.chosen.out)
+    return fewer if instead and empirical_parts(instead.name)[1] == variable else None
 
 
 def _walking(found: Found) -> Found | None:

@@ -13,8 +13,7 @@ from accel_calib.calibrate import (
     Calibration, dilution, error_left_in, fit_poses, FleetPrior, gated, gyro_bias_of,
     identifiability, level, lies_in_cone, next_pose, Rejected, set_heading, with_given_mounting)
 from accel_calib.compare import compare
-from accel_calib.effects import (
-    CHANGES, effect_named, EFFECTS, is_effect, MONOMIALS, OF_RAMPS, PROCESSES)
+from accel_calib.effects import CHANGES, effect_named, EFFECTS, is_effect, MONOMIALS, PROCESSES
 from accel_calib.estimate import estimate, Prior, variance_factor
 from accel_calib.finding import Finding, LEVELS
 from accel_calib.findings import Expected, LIMITS, rate
@@ -214,7 +213,7 @@ def catalogue() -> Any:
     values = [[(float(each.value(x, 0.5, -0.2)), *map(float, each.gradient(x, 0.5, -0.2)))
                for x in (-1.2, -1.0, -0.3, 0.0, 0.7, 1.3)] for each in MONOMIALS[:25]]
     bare = ac.refine(ac.simulate(SENSOR, poses=24, units='g')).not_testable
-    return [_grid(of, (*EFFECTS, *OF_RAMPS, *PROCESSES, *CHANGES, *names)), values, known,
+    return [_grid(of, (*EFFECTS, *PROCESSES, *CHANGES, *names)), values, known,
             [f'{effect}: {needs}' for effect, needs in bare]]
 
 
