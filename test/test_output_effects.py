@@ -65,6 +65,13 @@ def test_counts_around_an_offset_are_clipped_at_different_limits():
     assert set(np.flatnonzero(at_limit)) <= set(clip.poses)
 
 
+def test_one_quiet_pose_at_the_end_of_an_axis_is_no_limit():
+    poses = found(simulated(3), G)
+    quiet, at_end = np.ones((len(poses), 1)), int(np.argmax(poses.reading[:, 2]))
+    quiet[at_end] = 0.6 * np.min(poses['std']) / np.max(poses['std'][at_end])
+    assert clipped(poses.with_columns(std=poses['std'] * quiet)) is None
+
+
 def test_clipped_poses_are_left_out_although_the_base_misfits_the_others_too():
     poses = found(limited(simulated(3), -0.93, 0.93), G)
     too_small = Model({'offset': np.zeros(3)})

@@ -15,13 +15,16 @@ from accel_calib.refine import refine, verdict_words
 from accel_calib.stored import write_calibration
 from accel_calib.units import units_of
 import generator
-from inside import advice_for, Model, model_with, rotation_from_rpy, search_effects, simulate_poses
+from inside import (
+    advice_for, Model, model_with, rotation_from_rpy, search_effects, simulate_poses,
+    spread_directions)
 import numpy as np
 import pandas as pd
 import pytest
 from shared import data, random_directions, run, run_json, sensor
 
 G = units_of('g')
+OFFSET = np.array([0.02, -0.01, 0.03])
 WARM = np.array([6e-4, -4e-4, 5e-4])
 TCO = {'offset_temperature': WARM}
 
@@ -434,6 +437,32 @@ def test_all_stages_of_a_refinement_have_the_same_poses():
     found = ac.refine(given, units='g')
     assert ([len(stage.residual_mg) for stage in found.stages]
             == (1 + len(found.steps)) * [len(found.poses_g)])
+
+
+@pytest.mark.parametrize(('hidden', 'size', 'poses', 'seed'), [
+    ('cubic', 5.0, 16, (9, 1013, 1, 0)), ('offset_drift', 5.0, 16, (9, 1013, 8, 1)),
+    ('cross_coupling', 1.5, 24, (8, 12, 4, 0)), ('temperature_rate', 3.0, 16, (8, 13, 17, 0)),
+    ('offset_wander', 3.0, 60, (9, 0, 10, 0))])
+def test_each_step_is_the_most_probable_of_its_list_and_lowers_the_held_out_residual(
+        hidden, size, poses, seed, tmp_path):
+    made = generator.simulate(np.random.default_rng(seed), {hidden: size},
+                              generator.Setup(poses=poses))
+    generator.write_csv(tmp_path / 'poses.csv', made.columns)
+    for step in refine(read_poses(tmp_path / 'poses.csv'), units_of('m/s2'), base='10').steps:
+        assert next(iter(step.probabilities)) == step.effect
+        assert step.p_value < 0.05
+        assert step.held_out_after_mg < step.held_out_before_mg
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_effects_of_twelve_poses_are_named_and_not_used(seed):
+    rng = np.random.default_rng(seed)
+    poses = simulate_poses(model_with({'offset': OFFSET, 'offset_temperature': 4.0 * WARM}),
+                           spread_directions(12), rng, noise_g=0.001,
+                           context={'temperature': rng.uniform(15.0, 35.0, 12)})
+    found = refine(poses, G, base='7')
+    assert len(names(found)) == 1 and found.verdict == 'unexplained'
+    assert found.refusal and found.undecided
 
 
 def test_samples_of_a_board_that_hardly_turns_give_it_no_absurd_gain():
