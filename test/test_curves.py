@@ -10,7 +10,7 @@ from accel_calib.effects import (
     CARRIERS, effect_named, EMPIRICAL, empirical_name, empirical_parts, is_effect, kind_of, MODES,
     modes_of, VARIABLES)
 from accel_calib.findings import rate
-from accel_calib.refine import refine
+from accel_calib.refine import formula_of, refine
 from accel_calib.report import calibration_page
 from accel_calib.units import units_of
 from inside import (
@@ -225,3 +225,26 @@ def test_a_calibration_with_a_curve_is_stored_and_read_with_all_digits(described
     at = {'temperature': np.array([5.0, 20.0, 28.0, 60.0])}
     reading = np.tile([0.1, 0.2, 0.97], (4, 1))
     np.testing.assert_array_equal(found.correct(reading, at), calibration.correct(reading, at))
+
+
+@pytest.mark.parametrize(('form', 'curve'), [
+    ('', lambda s: 3.0 * s - 1.0), ('', lambda s: 4.0 * s ** 2),
+    ('exp', lambda s: np.exp(-9.0 * s)), ('pow', lambda s: s ** 0.5),
+    ('sin', lambda s: np.sin(9.0 * s + 1.0)),
+    ('cos', lambda s: np.abs(np.sin(8.0 * s)))])
+def test_the_formula_of_a_curve_has_its_form_and_its_values(form, curve):
+    share = (np.arange(200) + 0.5) / 200
+    waves = np.cos(np.pi * np.outer(np.arange(1, 11), share))
+    sizes = np.linalg.lstsq(waves.T, curve(share) - np.mean(curve(share)), rcond=None)[0]
+    scales = np.array([0.002, -0.001, 0.003])
+    values = np.concatenate([np.outer(sizes, scales).ravel(), [12.0, 40.0]])
+    words = formula_of('empirical-offset-temperature-1-2-3-4-5-6-7-8-9-10', values, 0.0 * values)
+    assert words.endswith('t = temperature - 12, from 0 to 28 °C')
+    assert {*re.findall(r'[a-z]+(?=\()', words)} == {form} - {''}
+    expressions = re.findall(r'[xyz] = (.*?)(?=, [yz] = |; t)', words)
+    t = 28.0 * share
+    for expression, scale in zip(expressions, scales, strict=True):
+        true = 1e3 * scale * (sizes @ waves)
+        found = eval(expression, {'pow': np.power, 'exp': np.exp, 'sin': np.sin, 'cos': np.cos,
+                                  't': t})
+        assert np.sqrt(np.mean((found - true) ** 2)) <= 0.041 * np.ptp(true)

@@ -461,8 +461,8 @@ def test_effects_of_twelve_poses_are_named_and_not_used(seed):
                            spread_directions(12), rng, noise_g=0.001,
                            context={'temperature': rng.uniform(15.0, 35.0, 12)})
     found = refine(poses, G, base='7')
-    assert len(names(found)) == 1 and found.verdict == 'unexplained'
-    assert found.refusal and found.undecided
+    assert (len(names(found)), found.verdict) == (1, 'unexplained')
+    assert (bool(found.refusal), found.undecided) == (True, True)
 
 
 def test_samples_of_a_board_that_hardly_turns_give_it_no_absurd_gain():

@@ -299,8 +299,8 @@ def _steps_table(result: Refinement) -> Table:
         gap = (f'{short(step.gap_before_mg)} -> {short(step.gap_after_mg)}\n'
                f'({short(step.held_out_before_mg)} -> {short(step.held_out_after_mg)})')
         lines = [f'{number}. {step.effect}', effect_named(step.name).words,
-                 ', '.join(f'{name} {value}' for name, value in values_of(step)), step.where,
-                 f'rivals: {", ".join(step.likely_rivals) or "none"}']
+                 ', '.join(f'{name} {value}'.lstrip() for name, value in values_of(step)),
+                 step.where, f'rivals: {", ".join(step.likely_rivals) or "none"}']
         table.add_row('\n'.join(filter(None, lines)), gap, chance(step.p_value))
     return table
 

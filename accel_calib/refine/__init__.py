@@ -10,14 +10,16 @@ the catalogue as columns of its equations. `linear` scores sets of these columns
 `beam` searches for the best sets near a model, and `search` repeats this and the fit in turn.
 `curves` contains causes without a known form: a random walk of the offset, and an empirical curve;
 beside them it computes the probability of each effect and of its rivals. `steps` describes what
-was found, and `plan` chooses the poses that separate effects from their rivals.
+was found, `formula` states curves, and `plan` chooses the poses that separate effects from their
+rivals.
 
 """
 
+from .formula import formula_of
 from .plan import PlannedPose, PosePlan
 from .refinement import base_words, refine, Refinement, refitted, residual_words, verdict_words
 from .steps import chance, shown_name, Stage, Step, times_typical, values_of
 
 __all__ = ['PlannedPose', 'PosePlan', 'Refinement', 'Stage', 'Step', 'base_words', 'chance',
-           'refine', 'refitted', 'residual_words', 'shown_name', 'times_typical', 'values_of',
-           'verdict_words']
+           'formula_of', 'refine', 'refitted', 'residual_words', 'shown_name', 'times_typical',
+           'values_of', 'verdict_words']

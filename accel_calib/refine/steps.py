@@ -21,6 +21,7 @@ from typing import Literal
 import numpy as np
 
 from .curves import LEAST, nearest_effects, probabilities, steepest
+from .formula import formula_of
 from .linear import is_seen, Set
 from .search import Found, of_ladder
 from .state import fitted_state, is_noise, State, with_effect
@@ -92,6 +93,8 @@ class Step:
         Name in the model, by which `accel_calib.effects.effect_named` finds the effect.
     variable : str
         Quantity that a covariate or a curve is a function of; empty for other effects.
+    formula : str
+        Formula of an empirical curve, in C and Python (`.formula`); empty for other effects.
 
     """
 
@@ -108,6 +111,7 @@ class Step:
     p_value: float
     where: str
     name: str
+    formula: str = ''
     variable: str = field(init=False)
 
     def __post_init__(self) -> None:
@@ -157,7 +161,14 @@ def percent(probability: float) -> str:
 
 
 def values_of(step: Step) -> list[tuple[str, str]]:
-    """Return name and text of each value of a step, ± its deviation; values in g are in mg."""
+    """
+    Return name and text of each value of a step, ± its deviation; values in g are in mg.
+
+    A curve that has a formula is stated by that.
+
+    """
+    if step.formula:
+        return [('', step.formula)]
     parameters, values = effect_named(step.name).parameters, []
     for name, value in step.parameters.items():
         unit_name, scale = value_unit(step.name, name)
@@ -255,7 +266,9 @@ def _step(name: str, states: tuple[State, State], found: Found, date: str, *, un
                 {part: deviations[part] for part in shown if deviations[part]},
                 before.gap_mg(first), after.gap_mg(last),
                 before.gap_mg(first_held_out), after.gap_mg(held_out),
-                _p_value(name, found), words, plain_name(name))
+                _p_value(name, found), words, plain_name(name),
+                formula_of(name, values, np.array([*deviations.values()]))
+                if kind_of(name) == EMPIRICAL else '')
 
 
 def _chances(name: str, found: Found, *, usual: bool) -> dict[str, float]:

@@ -72,8 +72,9 @@ def search_sections(result: Refinement, residuals: Residuals, *, used: bool) -> 
 def _step(result: Refinement, number: int, step: Step) -> str:
     """Return the section of a step, from 1."""
     shown = values_of(step)
-    table = scroll_table(f'Values of step {number}', [name for name, _ in shown],
-                         [[value for _, value in shown]] if shown else [])
+    table = paragraph(step.formula) if step.formula else scroll_table(
+        f'Values of step {number}', [name for name, _ in shown],
+        [[value for _, value in shown]] if shown else [])
     curve = figures([of_curve(result, number - 1)], 'wide') if _is_drawn(step) else ''
     title = f'{number}. {effect_named(step.name).words.capitalize()}'
     return section(title, f'<p>{_story(step)}</p>\n', table,

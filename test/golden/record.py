@@ -73,7 +73,7 @@ def plain(value: Any) -> Any:
     if isinstance(value, Mapping) or hasattr(value, '_asdict'):
         items = value if isinstance(value, Mapping) else value._asdict()
         return {str(key): plain(max(each, LEAST_P) if key == 'p_value' else each)
-                for key, each in items.items() if key != 'not_testable'}
+                for key, each in items.items() if key not in ('not_testable', 'formula')}
     listed = [plain(each) for each in value]
     return _of_array(np.array(listed, float)) if _is_numeric(listed) else listed
 

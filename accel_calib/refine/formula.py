@@ -1,0 +1,123 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Formulas of empirical curves, for a paper or for firmware.
+
+A curve is a sum of cosines. Its formula is the best of the first of these groups whose error, RMS
+over the range, is below `_EXACT` of the size of the curve, or half of its standard deviation: a
+line; a parabola, an exponential, a power; a polynomial of degree 3, a sine; polynomials of degree
+4, 5, 6; the cosines themselves. The constant of a form is that of all axes. Expressions are valid
+in C and in Python.
+
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+
+import numpy as np
+
+from ..effects import CARRIERS, curve_unit, empirical_parts, MODES, variable_words
+from ..table import column_of, Floats
+from ..units import MG
+
+_EXACT = 0.04
+"""Largest error of a form, RMS, relative to the difference of the extremes of the curve."""
+
+_CONSTANTS = np.geomspace(0.05, 5.0, 93)
+"""Constants of a form that are tried, relative to the range of the variable, or as a power."""
+
+_WAVES = np.arange(0.5, MODES + 1.0, 0.025)
+"""Half waves of a sine that are tried in the range of the variable."""
+
+_COUNT = 201
+
+_Form = tuple[Floats, Callable[[Sequence[float]], str]]
+"""The (k, g) functions of a form, and the expression of their k factors."""
+
+
+def formula_of(name: str, values: Floats, spread: Floats) -> str:
+    """
+    Return the formula of an empirical curve; empty for one over the direction of the force.
+
+    `spread` are the standard deviations of the values.
+
+    """
+    carrier, variable, modes = empirical_parts(name)
+    if variable == 'direction':
+        return ''
+    whole, _, part = carrier.partition('.')
+    names = (part,) if part else CARRIERS[whole]
+    low, high = (-1.0, 1.0) if variable == 'force' else values[-2:].tolist()
+    share = np.linspace(0.0, 1.0, _COUNT)
+    waves = np.cos(np.pi * np.multiply.outer(np.array(modes), share))
+    factors, deviations = (each[:len(names) * len(modes)].reshape(len(modes), len(names)).T * MG
+                           for each in (values, spread))
+    curves = factors @ waves
+    most = 1e-12 + np.maximum(_EXACT * np.max(np.ptp(curves, axis=1)),
+                      0.5 * np.sqrt(np.mean(deviations ** 2 @ waves ** 2, axis=1)))
+    expression = _of_waves(modes, high - low)
+    for group in _forms(share, high - low):
+        fits = [np.linalg.lstsq(functions.T, curves.T, rcond=None)[0].T for functions, _ in group]
+        errors = [np.max(np.sqrt(np.mean((fit @ functions - curves) ** 2, axis=1)) / most)
+                  for fit, (functions, _) in zip(fits, group, strict=True)]
+        best = int(np.argmin(errors))
+        if errors[best] <= 1.0:
+            factors, expression = fits[best], group[best][1]
+            break
+    unit = column_of(variable).unit if variable != 'force' else 'g'
+    each = ', '.join(f'{own} = {expression(row)}'
+                     for own, row in zip(names, factors.tolist(), strict=True))
+    return (f'{whole.replace("_", "-")} [m{curve_unit(name)}]: {each}; t = '
+            f'{variable_words(variable)} {_signed(-low)}, from 0 to {high - low:.6g} {unit}'
+            ).rstrip()
+
+
+def _forms(share: Floats, span: float) -> Iterator[list[_Form]]:
+    """Yield groups of forms with the same number of constants, over shares of a span."""
+    one = np.ones_like(share)
+    yield [_polynomial(share, 1, span)]
+    yield [_polynomial(share, 2, span),
+           *((np.stack([one, np.exp(sign * share / shape)]),
+              partial(_one_term, f'exp({words}/{shape * span:.5g})'))
+             for shape in _CONSTANTS.tolist() for sign, words in ((-1.0, '-t'), (1.0, 't'))),
+           *((np.stack([one, share ** power]),
+              partial(_one_term, f'pow(t/{span:.5g}, {power:.5g})'))
+             for power in _CONSTANTS.tolist())]
+    angles = [(np.pi * waves, np.pi * waves * share) for waves in _WAVES.tolist()]
+    yield [_polynomial(share, 3, span),
+           *((np.stack([one, np.sin(angle), np.cos(angle)]), partial(_sine, rate / span))
+             for rate, angle in angles)]
+    for degree in (4, 5, 6):
+        yield [_polynomial(share, degree, span)]
+
+
+def _polynomial(share: Floats, degree: int, span: float) -> _Form:
+    def expression(row: Sequence[float]) -> str:
+        words = f'{row[-1] / span ** degree:.5g}'
+        for power in range(degree - 1, -1, -1):
+            words = f'{row[power] / span ** power:.5g} + t*({words})'
+        return words
+
+    return np.vander(share, degree + 1, increasing=True).T, expression
+
+
+def _one_term(term: str, row: Sequence[float]) -> str:
+    return f'{row[0]:.5g} {_signed(row[1])}*{term}'
+
+
+def _sine(rate: float, row: Sequence[float]) -> str:
+    size, angle = float(np.hypot(row[1], row[2])), float(np.arctan2(row[2], row[1]))
+    return f'{row[0]:.5g} {_signed(size)}*sin({rate:.5g}*t {_signed(angle)})'
+
+
+def _of_waves(modes: Sequence[int], span: float) -> Callable[[Sequence[float]], str]:
+    def expression(row: Sequence[float]) -> str:
+        return ' '.join(f'{_signed(value)}*cos({np.pi * mode / span:.6g}*t)'
+                        for mode, value in zip(modes, row, strict=True))
+
+    return expression
+
+
+def _signed(value: float) -> str:
+    return f'{"-" if value < 0.0 else "+"} {abs(value):.5g}'
