@@ -8,7 +8,7 @@ import json
 import shlex
 
 import accel_calib as ac
-from accel_calib.calibrate import fit_partial, fit_poses, level, mounting_only
+from accel_calib.calibrate import fit_partial, fit_poses, level, mounting_only, Rejected
 from accel_calib.finding import Finding, KINDS, NextStep, ranked, without
 from accel_calib.findings import (
     Expected, figures_of, GOOD_MG, rate, rate_comparison, rate_refinement, rate_verification)
@@ -163,6 +163,19 @@ def test_a_model_without_cross_axis_is_usable_if_the_poses_do_not_determine_it()
     rating = rate(ac.fit(simulated(directions=up / np.linalg.norm(up, axis=1, keepdims=True))))
     assert rating.name == 'USABLE'
     assert 'model 7 omits' in rating.reason
+
+
+@pytest.mark.parametrize(('kind', 'figures', 'outliers'), [
+    ('held_out', {'held_out_rms_mg': 31.0}, ()),
+    ('far_off', {'rms_after_mg': 12.0, 'noise_floor_mg': 0.3}, (3,)),
+    ('too_exact', {'rms_after_mg': 0.0, 'noise_floor_mg': 0.3}, ())])
+def test_a_figure_that_no_useful_calibration_has_makes_it_bad(kind, figures, outliers):
+    calibration = ac.fit(simulated())
+    rating = rate(replace(
+        calibration, quality=replace(calibration.quality, **figures),
+        rejected=tuple(Rejected(row, 'outlier', 'outlier') for row in outliers)))
+    assert rating.name == 'BAD'
+    assert kind in [each.kind for each in rating.findings if each.level == 'BAD']
 
 
 def test_half_of_the_sphere_is_not_good_because_nothing_checks_the_model_in_the_other():

@@ -38,8 +38,9 @@ from ..table import Floats, in_unit, Poses
 from ..text import listed
 from ..units import MG, Units
 
-_LEAST_OWN = 1e-9
-"""Below this part that other orientations check, one alone determines a parameter."""
+_LEAST_OWN = 1e-4
+"""Below this part that other orientations check, one alone determines a parameter, and its error
+under a fit of the others is only their noise, enlarged ten thousand times."""
 
 LARGEST_OFFSET_G = 1.0
 """Largest zero-g offset of a working accelerometer [g]; not checked for native units."""

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .figures import (
-    BAD_ERROR, BOUND, CHANGED, COVERED, degrees, depends_on, Expected, GOOD_ERROR, HIDDEN,
-    LEFT_OUT, MATTERS, mg, NEAR_FLAT, number, PER_OUTLIER, SPAN, TILT, TO_CHECK, without_noise,
-    WORST_ERROR)
+    BAD_ERROR, BOUND, CHANGED, COVERED, degrees, depends_on, Expected, FAR_OFF, GOOD_ERROR, HIDDEN,
+    LEFT_OUT, MATTERS, mg, NEAR_FLAT, number, PER_OUTLIER, SPAN, TILT, TO_CHECK, TOO_EXACT,
+    without_noise, WORST_ERROR)
 from ..calibrate import Calibration, directions_in, flat_direction, Verification
 from ..compare import LEVEL
 from ..effects import EMPIRICAL, kind_of, WANDER
@@ -79,9 +79,9 @@ def findings_of(expected: Expected, refinement: Refinement | None) -> tuple[Find
     """Return what is worth knowing about a calibration, that which decides its rating first."""
     named = [*_beyond_noise(expected, refinement), *_not_corrected(expected)]
     error = expected.inexact_mg if named else expected.error_mg
-    own = [*_refused(expected, refinement), *_too_large(expected, refinement), *_limited(expected),
-           *_checked(expected), *named, *_inexact(expected, error, refinement),
-           *_left_out(expected)]
+    own = [*_refused(expected, refinement), *_too_large(expected, refinement),
+           *_impossible(expected, refinement), *_limited(expected), *_checked(expected), *named,
+           *_inexact(expected, error, refinement), *_left_out(expected)]
     kinds = {each.kind for each in own}
     return ranked((*own, *without(expected.calibration.noted, *kinds)))
 
@@ -106,6 +106,28 @@ def _too_large(expected: Expected, refinement: Refinement | None) -> Iterator[Fi
         yield Finding('no_gain', f'the error in new orientations is {mg(own)}, and {mg(before)} '
                       'without the calibration', remedy.text,
                       'BAD' if own > WORST_ERROR.value else 'USABLE', step=remedy.kind)
+
+
+def _impossible(expected: Expected, refinement: Refinement | None) -> Iterator[Finding]:
+    """Yield a finding for each figure of the first line that no useful calibration has."""
+    quality, remedy = expected.quality, _remedy(expected, refinement)
+    held_out, noise = quality.held_out_rms_mg, quality.noise_floor_mg
+    if held_out is not None and held_out > BAD_ERROR.value and not expected.is_partial:
+        yield Finding('held_out', f'orientations that the fit has not seen are wrong by '
+                      f'{mg(held_out)}, expected at most {mg(BAD_ERROR.value)}', remedy.text,
+                      'BAD', step=remedy.kind)
+    if noise is None or expected.dof < TO_CHECK.value or not expected.calibration.model.effects:
+        return
+    rows = tuple(each.row for each in expected.calibration.rejected if each.kind == 'outlier')
+    if rows and quality.rms_after_mg > FAR_OFF.value * noise:
+        yield Finding('far_off', f'the residual is {quality.rms_after_mg / noise:.0f} times the '
+                      f'noise beside {counted(len(rows), "outlier")}: the model does not hold, '
+                      f'expected at most {FAR_OFF.value:.0f} times', remedy.text, 'BAD', rows,
+                      step=remedy.kind)
+    elif quality.rms_after_mg * TOO_EXACT.value < noise:
+        yield Finding('too_exact', f'the residual is {mg(quality.rms_after_mg)}, far '
+                      f'below the noise of {mg(noise)}: these readings are computed, not measured',
+                      'take the readings of the sensor itself', 'BAD')
 
 
 def _limited(expected: Expected) -> Iterator[Finding]:
