@@ -133,14 +133,17 @@ def calibration_page(calibration: Calibration, rating: Rating, source: str, *,
     title = f'{what} of {name}' if name else what
     about = [source, f'sensor {calibration.sensor}' if calibration.sensor else '',
              f'fitted {calibration.date}' if calibration.date else '']
-    body = [_key_numbers(calibration, residuals, checked), values_section(calibration),
+    searched = [] if refinement is None else [*search_sections(
+        refinement, residuals, used=used is not None)]
+    first = refinement is not None and bool(refinement.steps)
+    body = [_key_numbers(calibration, residuals, checked), *(searched if first else ()),
+            values_section(calibration),
             _covered(calibration, residuals, plan=refinement is None and checked is None),
             section('Before and after', figures([of_before_after(
                 residuals, (checked or calibration.quality).noise_floor_mg)], 'wide')),
             *_remarks(calibration, residuals, used),
             section('What remains', figures(of_remainder(residuals))),
-            *([] if refinement is None else search_sections(
-                refinement, residuals, used=used is not None)),
+            *(() if first else searched),
             _pose_table(residuals, calibration),
             '' if used is not None and used.refusal else section('Use it', *(
                 block(title, text) for title, text in snippets(calibration, stored))),
