@@ -30,7 +30,7 @@ os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')  # each process
 from figures import markdown, parser, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 from refine_case import CARRIER, Case, Outcome, run  # noqa: E402
-from refine_lines import lines_of  # noqa: E402
+from refine_lines import lines_of, said_lines  # noqa: E402
 from refine_rows import cases_of, ROWS  # noqa: E402
 
 _ABOUT = """\
@@ -130,6 +130,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if outcomes:
             lines += lines_of(row, outcomes)
             print(f'{row}: {len(outcomes)} sets', file=sys.stderr, flush=True)
+    lines += said_lines(everything)
     command = (f'python benchmarks/refine.py --sets {given.sets} --jobs {given.jobs} --seed '
                f'{given.seed}' + ''.join(f' --only {row}' for row in given.only or ())
                + (f' --hidden {given.hidden}' if given.hidden else ''))

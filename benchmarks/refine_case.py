@@ -184,6 +184,9 @@ class Outcome:
         The lag of `offset_temperature` [s]; None if it has none.
     seconds : float
         Duration of the refinement [s].
+    said : tuple of (bool, bool, bool)
+        Of each step: whether the named effect is the most probable of its list, whether the
+        held-out residual falls, and whether the instant in its words is that of its values.
     error : str
         The traceback of the exception.
 
@@ -200,6 +203,7 @@ class Outcome:
     where: tuple[str, ...]
     lag: float | None
     seconds: float
+    said: tuple[tuple[bool, bool, bool], ...] = ()
     error: str = ''
 
     @property
@@ -262,10 +266,21 @@ def run(case: Case) -> Outcome:
                        _deviations(refined.calibration, made),
                        _held_out(case, fresh, made, other), fresh,
                        tuple(step.where for step in refined.steps if step.effect == EMPIRICAL),
-                       _lag(refined), seconds)
+                       _lag(refined), seconds, tuple(map(_said, refined.steps)))
     except Exception:
         return Outcome(case, 'error', (), frozenset(), knocked, (), None, None, (), None,
-                       time.perf_counter() - started, traceback.format_exc())
+                       time.perf_counter() - started, error=traceback.format_exc())
+
+
+def _said(step: Any) -> tuple[bool, bool, bool]:
+    """Return whether a step says what was found, as `Outcome.said`."""
+    instant = step.parameters.get('instant')
+    words = re.search(r'between (\S+) and (\S+) s', step.where)
+    on_output = step.effect in ON_OUTPUT
+    return (next(iter(step.probabilities)) == step.effect,
+            on_output or step.held_out_after_mg < step.held_out_before_mg,
+            instant is None or (words is not None
+                                and float(words[1]) <= instant <= float(words[2])))
 
 
 def _with_columns(poses: Poses, case: Case, salt: int) -> Poses:

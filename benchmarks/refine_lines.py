@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+import math
 
 from figures import Line
 import numpy as np
@@ -142,7 +143,7 @@ _TITLES = {
     'flicker': '1/f noise of the offset', 'large': 'two effects',
     'columns': 'one effect of an unknown column', 'noise_columns': 'nothing hidden'}
 
-_RIGHT = {'faint': (0.88, 0.97), 'few': (0.65, 0.85), 'three': (0.9, 0.975, 0.975),
+_RIGHT = {'faint': (0.88, 0.97), 'few': (0.65, 0.85, None), 'three': (0.9, 0.975, 0.975),
           'knocked_and_one': (0.95, 0.93, 0.9, 0.6), 'curved': (0.95,), 'chamber': (0.9,),
           'sign': (0.95,), 'large': (0.995,), 'two': (0.95,), 'rising': (0.95,),
           'columns': (0.95, 0.95)}
@@ -237,6 +238,26 @@ def fresh_lines(what: str, outcomes: Sequence[Outcome], most: float | None = Non
              f'{np.percentile(refined / noise, 95.0):.2f})',
              '' if most is None else f'≤ {most:g}', len(each),
              None if most is None else over <= most)]
+
+
+def said_lines(outcomes: Sequence[Outcome]) -> list[Line]:
+    """Return the lines about what steps say, of all rows."""
+    lines = []
+    for place, what in enumerate(('the named effect is the most probable of its list',
+                                  'the held-out residual falls',
+                                  'the instant in words is that of the values')):
+        good = [each[place] for o in outcomes for each in o.said]
+        lines.append(Line(f'steps: {what}', f'{sum(good)} of {len(good)}', '100 %', len(good),
+                          all(good)))
+    off = np.abs([value for o in outcomes if right(o) for value in o.deviations])
+    inside = 100.0 * float(np.mean(off < 1.96)) if len(off) else math.nan
+    lines.append(Line('values of right names: 95 % intervals hold the truth',
+                      f'{inside:.1f} % of {len(off)}', '93 to 97 %', len(off),
+                      93.0 <= inside <= 97.0))
+    for poses in (12, 24, 60):
+        lines += fresh_lines(f'{poses} poses, all rows', [
+            o for o in outcomes if o.case.setup.poses == poses])[:1]
+    return lines
 
 
 def _seconds(what: str, outcomes: Sequence[Outcome], most: float | None = None) -> Line:

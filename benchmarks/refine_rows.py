@@ -126,7 +126,8 @@ GROUPS: dict[str, tuple[Group, ...]] = {
     'knocked': (Group('', lambda rng: [({}, Setup(knocked=3))] * 3),),
     'small': (_each(tuple(name for name in CATALOGUE if name not in ON_OUTPUT), SMALL),),
     'faint': tuple(_each(CATALOGUE, size, Setup(poses=24)) for size in (1.5, 2.0)),
-    'few': tuple(_each(CATALOGUE, size, Setup(poses=16)) for size in (3.0, 5.0)),
+    'few': (*(_each(CATALOGUE, size, Setup(poses=16)) for size in (3.0, 5.0)),
+            replace(_each(CATALOGUE, 8.0, Setup(poses=12)), base='auto')),
     'three': (_drawn('60 poses, size 3', (3.0,) * 3), _drawn('60 poses, size 5', (5.0,) * 3),
               _drawn('100 poses, size 3', (3.0,) * 3, Setup(poses=100))),
     'knocked_and_one': (
