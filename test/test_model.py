@@ -95,7 +95,8 @@ def test_effects_by_hand():
         'warm_up=1,2,3,100,7200': (np.exp(-1), 2 * np.exp(-1), 3 * np.exp(-1)),
         'offset_step=1,2,3,7300': (1, 2, 3), 'vibration_rectification=1': (0.01, 0.04, 0.09),
         'hysteresis=1': (0.6, 0.0, -0.8), 'temperature_rate=1,2,3': (0.01, 0.02, 0.03),
-        'offset_temperature_quadratic=1': (100, 100, 100), 'gain_drift=1,2,3,100': (1, -8, 18),
+        'offset_temperature_quadratic=1': (100, 100, 100),
+        'offset_temperature_cubic=1': (1000, 1000, 1000), 'gain_drift=1,2,3,100': (1, -8, 18),
         'gain_step=1,2,3,7300': (0.5, -4, 9), 'lever_arm=0.980665,0,9.80665': (-0.4, 0, 0),
     }
     assert {case.partition('=')[0] for case in cases} == set(ADDED)

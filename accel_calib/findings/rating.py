@@ -36,6 +36,10 @@ if TYPE_CHECKING:
     from ..refine import Refinement
 
 _REFINE = NextStep('refine', 'run refine to find the missing effect')
+_MANY_OUT = 0.1
+"""Share of outliers beside which a residual far above the noise makes a fit BAD; a hidden effect
+and one knocked pose have such a residual, too."""
+
 _CHECK = NextStep('poses', 'check what differs between the poses, clamp the sensor, and take the '
                   'poses again')
 
@@ -119,7 +123,8 @@ def _impossible(expected: Expected, refinement: Refinement | None) -> Iterator[F
     if noise is None or expected.dof < TO_CHECK.value or not expected.calibration.model.effects:
         return
     rows = tuple(each.row for each in expected.calibration.rejected if each.kind == 'outlier')
-    if rows and quality.rms_after_mg > FAR_OFF.value * noise:
+    many = len(rows) > _MANY_OUT * len(expected.calibration.poses)
+    if many and quality.rms_after_mg > FAR_OFF.value * noise:
         yield Finding('far_off', f'the residual is {quality.rms_after_mg / noise:.0f} times the '
                       f'noise beside {counted(len(rows), "outlier")}: the model does not hold, '
                       f'expected at most {FAR_OFF.value:.0f} times', remedy.text, 'BAD', rows,
