@@ -54,8 +54,8 @@ def formula_of(name: str, values: Floats, spread: Floats) -> str:
     factors, deviations = (each[:len(names) * len(modes)].reshape(len(modes), len(names)).T * MG
                            for each in (values, spread))
     curves = factors @ waves
-    most = 1e-12 + np.maximum(_EXACT * np.max(np.ptp(curves, axis=1)),
-                      0.5 * np.sqrt(np.mean(deviations ** 2 @ waves ** 2, axis=1)))
+    noise = np.sqrt(np.mean(deviations ** 2 @ waves ** 2, axis=1))
+    most = np.maximum(_EXACT * np.max(np.ptp(curves, axis=1)), 0.5 * noise) + 1e-12
     expression = _of_waves(modes, high - low)
     for group in _forms(share, high - low):
         fits = [np.linalg.lstsq(functions.T, curves.T, rcond=None)[0].T for functions, _ in group]
