@@ -314,10 +314,11 @@ def _lag(refined: Any) -> float | None:
 
 
 def _fresh(case: Case, poses: Poses, refined: Any, other: Simulated) -> Fresh:
-    """Return the residuals that the base and the refined calibration leave in fresh poses."""
+    """Return what the base, and the refinement unless it is refused, leave in fresh poses."""
     base = fit_poses(poses, units_of('m/s2'), model=case.base)
     fresh = _with_columns(poses_of(other), case, 3)
-    return Fresh(verify(base, fresh).rms_after_mg, verify(refined.calibration, fresh).rms_after_mg,
+    used = base if refined.refusal else refined.calibration
+    return Fresh(verify(base, fresh).rms_after_mg, verify(used, fresh).rms_after_mg,
                  float(np.sqrt(np.mean(other.noise ** 2)) * 1e3))
 
 

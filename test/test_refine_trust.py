@@ -423,14 +423,15 @@ def test_the_change_of_each_axis_is_stated_with_its_own_uncertainty_and_date(cou
 
 @pytest.mark.parametrize(('hidden', 'size', 'poses', 'seed'), [
     ('cubic', 5.0, 16, (9, 1013, 1, 0)), ('offset_drift', 5.0, 16, (9, 1013, 8, 1)),
-    ('cross_coupling', 1.5, 24, (8, 12, 4, 0)), ('temperature_rate', 3.0, 16, (8, 13, 17, 0)),
-    ('offset_wander', 3.0, 60, (9, 0, 10, 0))])
+    ('temperature_rate', 3.0, 16, (8, 13, 17, 0)), ('offset_wander', 3.0, 60, (9, 0, 10, 0))])
 def test_each_step_is_the_most_probable_of_its_list_and_lowers_the_held_out_residual(
         hidden, size, poses, seed, tmp_path):
     made = generator.simulate(np.random.default_rng(seed), {hidden: size},
                               generator.Setup(poses=poses))
     generator.write_csv(tmp_path / 'poses.csv', made.columns)
-    for step in refine(read_poses(tmp_path / 'poses.csv'), units_of('m/s2'), base='10').steps:
+    found = refine(read_poses(tmp_path / 'poses.csv'), units_of('m/s2'), base='10')
+    assert found.steps
+    for step in found.steps:
         assert next(iter(step.probabilities)) == step.effect
         assert step.p_value < 0.05
         assert step.held_out_after_mg < step.held_out_before_mg

@@ -18,8 +18,8 @@ import numpy as np
 
 from .figures import (
     BAD_ERROR, BOUND, CHANGED, COVERED, degrees, depends_on, Expected, FAR_OFF, GOOD_ERROR, HIDDEN,
-    LEFT_OUT, MATTERS, mg, NEAR_FLAT, number, PER_OUTLIER, SPAN, TILT, TO_CHECK, TOO_EXACT,
-    without_noise, WORST_ERROR)
+    LEFT_OUT, MANY_OUT, MATTERS, mg, NEAR_FLAT, number, PER_OUTLIER, SPAN, TILT, TO_CHECK,
+    TOO_EXACT, without_noise, WORST_ERROR)
 from ..calibrate import Calibration, directions_in, flat_direction, Verification
 from ..compare import LEVEL
 from ..effects import EMPIRICAL, kind_of, WANDER
@@ -36,10 +36,6 @@ if TYPE_CHECKING:
     from ..refine import Refinement
 
 _REFINE = NextStep('refine', 'run refine to find the missing effect')
-_MANY_OUT = 0.1
-"""Share of outliers beside which a residual far above the noise makes a fit BAD; a hidden effect
-and one knocked pose have such a residual, too."""
-
 _CHECK = NextStep('poses', 'check what differs between the poses, clamp the sensor, and take the '
                   'poses again')
 
@@ -84,8 +80,9 @@ def findings_of(expected: Expected, refinement: Refinement | None) -> tuple[Find
     named = [*_beyond_noise(expected, refinement), *_not_corrected(expected)]
     error = expected.inexact_mg if named else expected.error_mg
     own = [*_refused(expected, refinement), *_too_large(expected, refinement),
-           *_impossible(expected, refinement), *_limited(expected), *_checked(expected), *named,
-           *_inexact(expected, error, refinement), *_left_out(expected)]
+           *_figures_beyond_limits(expected, refinement), *_limited(expected),
+           *_checked(expected), *named, *_inexact(expected, error, refinement),
+           *_left_out(expected)]
     kinds = {each.kind for each in own}
     return ranked((*own, *without(expected.calibration.noted, *kinds)))
 
@@ -112,18 +109,18 @@ def _too_large(expected: Expected, refinement: Refinement | None) -> Iterator[Fi
                       'BAD' if own > WORST_ERROR.value else 'USABLE', step=remedy.kind)
 
 
-def _impossible(expected: Expected, refinement: Refinement | None) -> Iterator[Finding]:
+def _figures_beyond_limits(expected: Expected, refinement: Refinement | None) -> Iterator[Finding]:
     """Yield a finding for each figure of the first line that no useful calibration has."""
     quality, remedy = expected.quality, _remedy(expected, refinement)
     held_out, noise = quality.held_out_rms_mg, quality.noise_floor_mg
     if held_out is not None and held_out > BAD_ERROR.value and not expected.is_partial:
-        yield Finding('held_out', f'orientations that the fit has not seen are wrong by '
+        yield Finding('held_out', 'orientations that the fit has not seen are wrong by '
                       f'{mg(held_out)}, expected at most {mg(BAD_ERROR.value)}', remedy.text,
                       'BAD', step=remedy.kind)
     if noise is None or expected.dof < TO_CHECK.value or not expected.calibration.model.effects:
         return
     rows = tuple(each.row for each in expected.calibration.rejected if each.kind == 'outlier')
-    many = len(rows) > _MANY_OUT * len(expected.calibration.poses)
+    many = 100.0 * len(rows) > MANY_OUT.value * len(expected.calibration.poses)
     if many and quality.rms_after_mg > FAR_OFF.value * noise:
         yield Finding('far_off', f'the residual is {quality.rms_after_mg / noise:.0f} times the '
                       f'noise beside {counted(len(rows), "outlier")}: the model does not hold, '

@@ -17,8 +17,8 @@ from functools import partial
 
 import numpy as np
 
-from ..effects import CARRIERS, curve_unit, empirical_parts, MODES, variable_words
-from ..table import column_of, Floats
+from ..effects import CARRIERS, curve_unit, empirical_parts, MODES, unit_of, variable_words
+from ..table import Floats
 from ..units import MG
 
 _EXACT = 0.04
@@ -40,7 +40,8 @@ def formula_of(name: str, values: Floats, spread: Floats) -> str:
     """
     Return the formula of an empirical curve; empty for one over the direction of the force.
 
-    `spread` are the standard deviations of the values.
+    `values` (p,) are those of the curve in a model [g, or 1 for a gain], `spread` (p,) their
+    standard deviations. The formula is in mg or mg/g, and readings are in g in its variable.
 
     """
     carrier, variable, modes = empirical_parts(name)
@@ -65,12 +66,12 @@ def formula_of(name: str, values: Floats, spread: Floats) -> str:
         if errors[best] <= 1.0:
             factors, expression = fits[best], group[best][1]
             break
-    unit = column_of(variable).unit if variable != 'force' else 'g'
+    unit = 'g' if variable == 'force' else unit_of(variable)
     each = ', '.join(f'{own} = {expression(row)}'
                      for own, row in zip(names, factors.tolist(), strict=True))
     return (f'{whole.replace("_", "-")} [m{curve_unit(name)}]: {each}; t = '
-            f'{variable_words(variable)} {_signed(-low)}, from 0 to {high - low:.6g} {unit}'
-            ).rstrip()
+            f'{variable_words(variable)}{f" {_signed(-low)}" if low else ""}, from 0 to '
+            f'{high - low:.6g} {unit}').rstrip()
 
 
 def _forms(share: Floats, span: float) -> Iterator[list[_Form]]:

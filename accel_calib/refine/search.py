@@ -26,7 +26,7 @@ A set is kept only if its fit converged, the cost decreased and its values are p
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -35,34 +35,18 @@ from numpy.typing import NDArray
 import scipy
 
 from .base import causes, Clipped, off_grid, unclipped
-from .beam import accepted, explored, is_all_noise, is_significant, reshaped
 from .curves import (
-    best_curve, CLEARLY, Curve, Near, one_curve, probabilities, Process, process_of, SIGNIFICANT,
-    Walk, walk_beside)
-from .linear import LEVEL, Linear, Set
-from .state import (
-    beginning, Candidate, candidates, fitted_state, left_open, linearised, State, with_effect,
-    without)
-from ..calibrate import has_usual_gains, with_previous
+    best_curve, CLEARLY, Curve, Near, one_curve, process_of, SIGNIFICANT, Walk, walk_beside)
+from .linear import LEVEL, Set
+from .settle import fit_without, make_sound, settle, Trial
+from .state import beginning, Candidate, fitted_state, linearised, State, without
+from ..calibrate import with_previous
 from ..effects import (
     CHANGES, covariate_names, effect_named, EFFECTS, empirical_parts, factors_of, included, LADDER,
     linear_values, Model, parameter_names, WANDER)
 from ..estimate import beside_scatter, judge, kinds, scatter_of, stated
 from ..geometry import unit
 from ..table import Floats, Poses
-
-_ROUNDS = 4
-"""Largest number of searches, each near the model of the one before."""
-
-_LADDER_ROUNDS = 20
-"""The same for effects of the ladder, whose fits are short: several fail if few attitudes do not
-determine them."""
-
-_WALK_ROUNDS = 2
-"""Number of sets beside which a walk is estimated, each found beside the walk before."""
-
-_TREND = 15.0
-"""A walk may have a score lower by this, if the other effects change with time and leave a gap."""
 
 _TIMED = 30.0
 """A curve over time must have a score better than a walk by this."""
@@ -81,9 +65,6 @@ _ALIKE = 0.5
 _SHIFTS = 100
 """Largest number of shifts in time with which an effect is compared."""
 
-_EXACT = 0.05
-"""Largest error of a predicted sum of squares, in variances, after which a search ends."""
-
 _LESS = 0.8
 """A scatter is tried again if less than this part of it is left."""
 
@@ -93,9 +74,6 @@ _LEAST_SHARE = 0.6
 _HELD_OUT = 0.7
 """Part of the squares above the noise that a curve must explain in poses held out. Chance also
 finds a curve over some quantity for an offset that wanders, which explains less."""
-
-_NOTHING: tuple[frozenset[str], tuple[int, ...], bool] = (frozenset(), (), False)
-"""The key of a choice without effects, outliers and a walk."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +96,7 @@ class Found:
     added: tuple[str, ...]
     outliers: NDArray[np.intp]
     near: Near
-    trial: _Trial
+    trial: Trial
     walk: Walk | None = None
     curve: Curve | None = None
     taken_back: tuple[str, ...] = ()
@@ -226,32 +204,31 @@ def _search(poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
     """Search among the effects that are columns of the equations."""
     start = beginning(poses_g, base)
     poses_g = start.poses_g
-    begun, near, _ = _settled(start, poses_g, base.effects, _visible(start, LADDER),
-                              of_ladder=True)
+    begun, near, _ = settle(start, poses_g, base.effects, _visible(start, LADDER), of_ladder=True)
     ladder = near.names
     fixed = (*base.effects, *ladder)
     fixed = tuple(name for name in fixed if name not in included(fixed))
     names = (*_visible(begun, LADDER), *(name for name in EFFECTS if name not in LADDER),
              *also, *covariate_names(causes(poses_g)), *_visible(begun, CHANGES))
-    state, near, trial = _settled(begun, poses_g, fixed, names)
+    state, near, trial = settle(begun, poses_g, fixed, names)
     if 'hysteresis' in near.names:  # a large one has distorted the directions
         force = judge(state.model, poses_g).equations.force
         poses_g = with_previous(poses_g, unit(force))
-        state, near, trial = _settled(State(judge(state.model, poses_g)), poses_g, fixed, names)
-    begun = _fitted_without(begun, poses_g, near.chosen.out)
+        state, near, trial = settle(State(judge(state.model, poses_g)), poses_g, fixed, names)
+    begun = fit_without(begun, poses_g, near.chosen.out)
     taken_back: tuple[str, ...] = ()
     if near.names and near.walk is None and not _explains(begun, state):
         taken_back, state = near.names, begun
         near = replace(near, chosen=near.chosen.instead(()))
     out = near.chosen.out
-    first = _fitted_without(start, poses_g, out) if out else start
+    first = fit_without(start, poses_g, out) if out else start
     found = Found(first, state, _added(ladder, state, near), np.array(out, np.intp), near, trial,
                   _walk(state, near), taken_back=taken_back)
     chance = tuple(name for name in near.names if _is_coincidence(found, name))
     fewer = _less(found, chance)
     found = found if fewer is None else replace(fewer, taken_back=chance)
     found = _described(found, start, poses_g)
-    state, near = _consistent(found, ladder)
+    state, near = make_sound(found.final, found.near, found.trial, found.base.model, ladder)
     return replace(found, final=state, near=near, walk=_walk(state, near),
                    added=_added(ladder, state, near, found.curve))
 
@@ -263,89 +240,6 @@ def _added(ladder: tuple[str, ...], state: State, near: Near, curve: Curve | Non
     names = (*ladder, *near.names, *(() if curve is None else (curve.name,)),
              *(() if near.walk is None else (WANDER,)))
     return tuple(name for name in names if name in there)
-
-
-def _consistent(found: Found, ladder: tuple[str, ...]) -> tuple[State, Near]:
-    """
-    Return the final model in which each effect is sound, and the set near it.
-
-    An effect is removed if it is not significant, or if the held-out residual is as small without
-    it. It gives way to another one that is more probable in its place and whose fit is better.
-    Those of the ladder are removed if they are not significant beside what was found later.
-
-    """
-    state, near, trial = found.final, found.near, found.trial
-    for name in (name for name in ladder[::-1] if name in state.model.values):
-        values = {other: part for other, part in state.model.values.items() if other != name}
-        values.update((other, part) for other, part in found.base.model.values.items()
-                      if other not in (*values, *included(values)))
-        fewer = fitted_state(Model(values), state.poses_g)
-        if fewer is not None and not (is_significant(*of_ladder(state, name))
-                                      and _lowers(state, fewer)):
-            state = fewer
-    fixed = tuple(name for name in state.model.values if name not in near.names)
-    if {*fixed} != {*trial.fixed}:
-        trial = replace(trial, fixed=fixed)
-        near = _at(trial.near(state), near.names, near.chosen.out,
-                   None if near.walk is None else near.process, trial)
-    while (doubt := _doubtful(state, near)) is not None:
-        after, new = _exchanged(state, near, *doubt, trial)
-        score = -np.inf if new is None else new.score_above(near.plain.base_rss)
-        if after is None or new is None or (doubt[1] and score <= near.chosen.score):
-            near = replace(near, fitted={**near.fitted, doubt: score})
-        else:
-            state, near = after, new
-    return state, near
-
-
-def of_ladder(state: State, name: str) -> tuple[Set, int]:
-    """Return the set of an effect of the ladder beside all others of a model, and its block."""
-    others = tuple(other for other in state.model.effects if other != name)
-    names = [other for other in LADDER if other not in others]
-    linear = linearised(state.fit, others, candidates(names, state.poses_g))
-    block, = (number for number, block in enumerate(linear.blocks) if block.effect == name)
-    return Set.of(linear, (block,)), block
-
-
-def _doubtful(state: State, near: Near) -> tuple[str, str] | None:
-    """Return an effect that is not sound, and the one for its place, or '' to remove it."""
-    for name in near.names[::-1]:  # the smallest contribution first
-        if (name, '') in near.fitted:
-            continue
-        fewer = fitted_state(Model({other: values for other, values in state.model.values.items()
-                                    if other != name}), state.poses_g)
-        if not is_significant(near.chosen, near.block_of(name)) or (
-                fewer is not None and near.walk is None and not _lowers(state, fewer)):
-            return name, ''
-    for name in (*near.names, *(() if near.walk is None else (WANDER,))):
-        other = next(iter(probabilities(name, near)))
-        if other != name:
-            return name, other
-    return None
-
-
-def _lowers(state: State, fewer: State) -> bool:
-    """Return whether the held-out residual of a model is below that of one with less effects."""
-    return state.gap_mg(state.held_out) < fewer.gap_mg(fewer.held_out)
-
-
-def _exchanged(state: State, near: Near, name: str, other: str, trial: _Trial
-               ) -> tuple[State | None, Near | None]:
-    """Return the fit with another effect, if any, in the place of one, and the set near it."""
-    chosen = near.beside.instead(block for block in near.chosen.blocks
-                                 if near.plain.blocks[block].effect != name)
-    if other and other != WANDER:
-        chosen = chosen.extended(chosen.best_of(other))
-    after = trial.fitted(chosen, state)
-    if after is None:
-        return None, None
-    walks = other == WANDER or near.walk is not None
-    new = _at(trial.near(after), chosen.effects, chosen.out, near.process if walks else None,
-              trial)
-    if new.walk is not None and new.walk.likelihood_ratio < SIGNIFICANT:
-        new = replace(new, walk=None, chosen=new.beside)
-        return after, None if other == WANDER else new
-    return after, new
 
 
 def _is_coincidence(found: Found, name: str) -> bool:
@@ -434,7 +328,7 @@ def _with_curve(found: Found, curve: Curve, start: State, poses_g: Poses) -> Fou
     if after is None or after.fit.at_bound:
         return None
     out = np.array(curve.out, np.intp)
-    return replace(found, base=_fitted_without(start, poses_g, curve.out), final=after, walk=None,
+    return replace(found, base=fit_without(start, poses_g, curve.out), final=after, walk=None,
                    near=replace(found.near, walk=None, chosen=found.near.beside), outliers=out,
                    curve=curve,
                    added=(*(name for name in found.added if name != WANDER), curve.name))
@@ -486,170 +380,6 @@ def _is_better(curve: Curve, near: Near) -> bool:
     """Return whether a curve is better than a walk; one over time must be clearly better."""
     walk = 0.0 if near.walk is None else near.walk.score - near.beside.score
     return curve.score > walk + (_TIMED if empirical_parts(curve.name)[1] == 'time' else 0.0)
-
-
-@dataclass(frozen=True)
-class _Trial:
-    """
-    All poses, the effects of a model that stay, and the effects that are tried beside them.
-
-    What is tried must also show beside the model `beside`. `walks`: a walk is tried, too.
-
-    """
-
-    poses_g: Poses
-    fixed: tuple[str, ...]
-    tried: tuple[Candidate, ...]
-    beside: Model
-    walks: bool
-
-    def process(self, linear: Linear) -> Process | None:
-        """Return the modes of a walk; None if the times are not known, or no walk is tried."""
-        return process_of(linear, self.poses_g) if self.walks else None
-
-    def near(self, state: State) -> Linear:
-        return linearised(judge(state.model, self.poses_g), self.fixed, self.tried,
-                          self.beside)
-
-    def finer(self, chosen: Set) -> _Trial | None:
-        """Return the trial with further shapes beside those of a set; None if there are none."""
-        shapes = {block.effect: block.shape for block in chosen.entries}
-        tried = tuple(each.finer(shapes.get(each.name), self.poses_g.columns)
-                      for each in self.tried)
-        same = all(new is old for new, old in zip(tried, self.tried, strict=True))
-        return None if same else replace(self, tried=tried)
-
-    def fitted(self, chosen: Set, state: State, most: float = np.inf) -> State | None:
-        """Return the fit of a set; None without a sound fit below `most`."""
-        model = {name: part for name, part in state.model.values.items() if name in self.fixed}
-        for number, values in chosen.values.items():
-            block = chosen.linear.blocks[number]
-            model = with_effect(model, block.effect, np.concatenate([values, block.shape]))
-        after = fitted_state(Model(model), without(self.poses_g, chosen.out), most)
-        if after is None or not chosen.blocks:
-            return after
-        return None if after.fit.at_bound or not has_usual_gains(after.model) else after
-
-
-def _settled(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterable[str], *,
-             of_ladder: bool = False) -> tuple[State, Near, _Trial]:
-    """
-    Search and fit in turn until a set is found again.
-
-    Return the state, the set near it, and what was tried.
-
-    Effects `of_ladder` are searched without a walk, also where the poses leave gains open.
-
-    """
-    trial = _Trial(poses_g, fixed,
-                   tuple(candidates((name for name in names if name not in fixed), poses_g)),
-                   Model({}) if of_ladder else left_open(state), walks=not of_ladder)
-    settled: tuple[tuple[str, ...], tuple[int, ...], Process | None] | None = None
-    begun = set(state.model.effects) <= set(fixed) and len(state.poses_g) == len(poses_g)
-    seen = [_NOTHING] if begun else []
-    refused: set[frozenset[str]] = set()
-    linear = trial.near(state)
-    for _ in range(_LADDER_ROUNDS if of_ladder else _ROUNDS):
-        near = _best_near(linear, trial, refused)
-        while (finer := trial.finer(near.chosen)) is not None:
-            del near, linear  # before the next columns are made
-            trial, linear = finer, finer.near(state)
-            near = _best_near(linear, trial, refused)
-        if near.key in seen:
-            break
-        asked = near.key
-        near, after = _best_fit(near, state, trial)
-        if after is None:
-            refused.add(frozenset(near.names))
-            continue
-        seen += asked, near.key
-        process = None if near.walk is None else near.walk.process
-        settled, predicted = (near.names, near.chosen.out, process), _is_predicted(near, after)
-        del near, linear  # before the next columns are made
-        state, linear = after, trial.near(after)
-        if predicted:
-            break
-    if settled is None and len(state.poses_g) < len(poses_g):  # the set has all poses
-        state = _fitted_without(state, poses_g, ())
-    return state, _at(linear, *(settled or ((), (), None)), trial), trial
-
-
-def _is_predicted(near: Near, fitted: State) -> bool:
-    """Return whether the equations were linear enough: near the fit, the same would be found."""
-    error, variance = abs(near.beside.rss - fitted.rss), fitted.rss / max(fitted.dof, 1)
-    return fitted.dof > 0 and error < _EXACT * max(variance, 1.0)
-
-
-def _best_fit(near: Near, state: State, trial: _Trial) -> tuple[Near, State | None]:
-    """Return the fit of a set, or of a reshaped one whose fit has a better score."""
-    def score_of(chosen: Set, fitted: State) -> float:
-        return float(near.plain.score(fitted.rss, chosen.parameters, chosen.charge))
-
-    best, after = near, trial.fitted(near.chosen, state)
-    most = -np.inf if after is None else score_of(near.chosen, after)
-    for other in sorted(reshaped(near.chosen), key=lambda other: -other.score):
-        fitted = trial.fitted(other, state,
-                              near.plain.rss_of(most, other.parameters, other.charge))
-        if fitted is not None and score_of(other, fitted) > most:
-            best, after, most = replace(near, chosen=other), fitted, score_of(other, fitted)
-    return best, after
-
-
-def _best_near(linear: Linear, trial: _Trial, refused: set[frozenset[str]]) -> Near:
-    """Return the best set near a model, with or without a walk."""
-    def best_of(problem: Linear) -> Set:
-        return next((chosen for chosen in accepted(explored(problem))
-                     if frozenset(chosen.effects) not in refused), Set.of(problem))
-
-    process = trial.process(linear)
-    best = Near(best_of(linear), linear, None, process)
-    if process is None or (linear.worth and not any(_in_time(best))
-                           and is_all_noise(best.chosen)):
-        return best
-    return _with_walk(best, process, best_of)
-
-
-def _with_walk(best: Near, process: Process, best_of: Callable[[Linear], Set]) -> Near:
-    """Return a set with a walk, if it has a better score than the set without one."""
-    linear, beside = best.plain, Set.of(best.plain)
-    tried = [beside, best.chosen]
-    for _ in range(_WALK_ROUNDS):
-        walk = walk_beside(beside, process)
-        if walk.likelihood_ratio < SIGNIFICANT:
-            break
-        beside = best_of(walk.whitened(linear)).within(linear)
-        tried.append(beside)
-    most = best.chosen.score
-    if all(_in_time(best)) and not is_all_noise(best.chosen):
-        most -= _TREND  # what changes with time only, and not as known, wanders
-    for beside in tried:
-        walk = walk_beside(beside, process)
-        if walk.likelihood_ratio > SIGNIFICANT and walk.score > most:
-            most = walk.score
-            best = replace(best, chosen=beside.within(walk.whitened(linear)), walk=walk)
-    return best
-
-
-def _in_time(near: Near) -> list[bool]:
-    """Return which of the chosen effects change with time."""
-    return ['time' in each.entry.needs for each in near.chosen.entries]
-
-
-def _at(linear: Linear, names: tuple[str, ...], out: tuple[int, ...], process: Process | None,
-        trial: _Trial) -> Near:
-    """Return a set near its fit; its effects are in the order of their contribution."""
-    blocks = [int(linear.numbers_of[name][-1]) for name in names]
-    plain = Set.of(linear, blocks, out)
-    walk = None if process is None else walk_beside(plain, process)
-    whole = plain if walk is None else plain.within(walk.whitened(linear))
-    blocks.sort(key=lambda block: -whole.without(block).rss)
-    return Near(whole.instead(blocks), linear, walk, trial.process(linear))
-
-
-def _fitted_without(state: State, poses_g: Poses, out: tuple[int, ...]) -> State:
-    """Return a model fitted to all poses but these; with its values if the fit fails."""
-    kept = without(poses_g, out)
-    return fitted_state(state.model, kept) or State(judge(state.model, kept))
 
 
 def _visible(state: State, names: Iterable[str]) -> tuple[str, ...]:

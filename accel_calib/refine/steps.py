@@ -23,7 +23,8 @@ import numpy as np
 from .curves import LEAST, nearest_effects, probabilities, steepest
 from .formula import formula_of
 from .linear import is_seen, Set
-from .search import Found, of_ladder
+from .search import Found
+from .settle import ladder_set
 from .state import fitted_state, is_noise, State, with_effect
 from ..effects import (
     CHANGES, COVARIATES, effect_named, EFFECTS, EMPIRICAL, empirical_parts, included, is_effect,
@@ -288,7 +289,7 @@ def _p_value(name: str, found: Found) -> float:
         return found.curve.p_value
     if name in near.names:
         return near.chosen.probability(near.block_of(name))
-    chosen, block = of_ladder(final, name)
+    chosen, block = ladder_set(final, name)
     return chosen.probability(block)
 
 
@@ -331,7 +332,7 @@ def _curve(name: str, before: State, share_mg: Floats) -> str:
     steep = steepest(variable, before.poses_g, share_mg)
     if steep is not None:
         words += (f', most between {steep[0]:.4g} and {steep[1]:.4g} '
-                  f'{column_of(variable).unit}').rstrip()
+                  f'{unit_of(variable)}').rstrip()
     nearest = [f'{effect} (leaves {left:.2g} mg)'
                for effect, left in nearest_effects(before).items()]
     return words + (f'; no known effect has this form, the nearest are {", ".join(nearest)}'

@@ -1,0 +1,296 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+From a set of effects to a fitted model in which each of them is sound.
+
+A search finds a set in equations near a model, and a fit makes the next model: `settle` repeats
+both until the set remains the same. `make_sound` checks the effects of the final model, and
+removes or exchanges them.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .beam import accepted, explored, is_all_noise, is_significant, reshaped
+from .curves import Near, probabilities, Process, process_of, SIGNIFICANT, walk_beside
+from .linear import Linear, Set
+from .state import (
+    Candidate, candidates, fitted_state, left_open, linearised, State, with_effect, without)
+from ..calibrate import has_usual_gains
+from ..effects import included, LADDER, Model, WANDER
+from ..estimate import judge
+from ..table import Poses
+
+_ROUNDS = 4
+"""Largest number of searches, each near the model of the one before."""
+
+_LADDER_ROUNDS = 20
+"""The same for effects of the ladder, whose fits are short: several fail if few attitudes do not
+determine them."""
+
+_WALK_ROUNDS = 2
+"""Number of sets beside which a walk is estimated, each found beside the walk before."""
+
+_TREND = 15.0
+"""A walk may have a score lower by this, if the other effects change with time and leave a gap."""
+
+_EXACT = 0.05
+"""Largest error of a predicted sum of squares, in variances, after which a search ends."""
+
+_NOTHING: tuple[frozenset[str], tuple[int, ...], bool] = (frozenset(), (), False)
+"""The key of a choice without effects, outliers and a walk."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """
+    All poses, the effects of a model that stay, and the effects that are tried beside them.
+
+    What is tried must also show beside the model `beside`. `walks`: a walk is tried, too.
+
+    """
+
+    poses_g: Poses
+    fixed: tuple[str, ...]
+    tried: tuple[Candidate, ...]
+    beside: Model
+    walks: bool
+
+    def process(self, linear: Linear) -> Process | None:
+        """Return the modes of a walk; None if the times are not known, or no walk is tried."""
+        return process_of(linear, self.poses_g) if self.walks else None
+
+    def near(self, state: State) -> Linear:
+        return linearised(judge(state.model, self.poses_g), self.fixed, self.tried,
+                          self.beside)
+
+    def finer(self, chosen: Set) -> Trial | None:
+        """Return the trial with further shapes beside those of a set; None if there are none."""
+        shapes = {block.effect: block.shape for block in chosen.entries}
+        tried = tuple(each.finer(shapes.get(each.name), self.poses_g.columns)
+                      for each in self.tried)
+        same = all(new is old for new, old in zip(tried, self.tried, strict=True))
+        return None if same else replace(self, tried=tried)
+
+    def fitted(self, chosen: Set, state: State, most: float = np.inf) -> State | None:
+        """Return the fit of a set; None without a sound fit below `most`."""
+        model = {name: part for name, part in state.model.values.items() if name in self.fixed}
+        for number, values in chosen.values.items():
+            block = chosen.linear.blocks[number]
+            model = with_effect(model, block.effect, np.concatenate([values, block.shape]))
+        after = fitted_state(Model(model), without(self.poses_g, chosen.out), most)
+        if after is None or not chosen.blocks:
+            return after
+        return None if after.fit.at_bound or not has_usual_gains(after.model) else after
+
+
+def settle(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterable[str], *,
+           of_ladder: bool = False) -> tuple[State, Near, Trial]:
+    """
+    Search and fit in turn until a set is found again.
+
+    Return the state, the set near it, and what was tried.
+
+    Effects `of_ladder` are searched without a walk, also where the poses leave gains open.
+
+    """
+    trial = Trial(poses_g, fixed,
+                  tuple(candidates((name for name in names if name not in fixed), poses_g)),
+                  Model({}) if of_ladder else left_open(state), walks=not of_ladder)
+    settled: tuple[tuple[str, ...], tuple[int, ...], Process | None] | None = None
+    begun = set(state.model.effects) <= set(fixed) and len(state.poses_g) == len(poses_g)
+    seen = [_NOTHING] if begun else []
+    refused: set[frozenset[str]] = set()
+    linear = trial.near(state)
+    for _ in range(_LADDER_ROUNDS if of_ladder else _ROUNDS):
+        near = _best_near(linear, trial, refused)
+        while (finer := trial.finer(near.chosen)) is not None:
+            del near, linear  # before the next columns are made
+            trial, linear = finer, finer.near(state)
+            near = _best_near(linear, trial, refused)
+        if near.key in seen:
+            break
+        asked = near.key
+        near, after = _best_fit(near, state, trial)
+        if after is None:
+            refused.add(frozenset(near.names))
+            continue
+        seen += asked, near.key
+        process = None if near.walk is None else near.walk.process
+        settled, predicted = (near.names, near.chosen.out, process), _is_predicted(near, after)
+        del near, linear  # before the next columns are made
+        state, linear = after, trial.near(after)
+        if predicted:
+            break
+    if settled is None and len(state.poses_g) < len(poses_g):  # the set has all poses
+        state = fit_without(state, poses_g, ())
+    return state, _at(linear, *(settled or ((), (), None)), trial), trial
+
+
+def _is_predicted(near: Near, fitted: State) -> bool:
+    """Return whether the equations were linear enough: near the fit, the same would be found."""
+    error, variance = abs(near.beside.rss - fitted.rss), fitted.rss / max(fitted.dof, 1)
+    return fitted.dof > 0 and error < _EXACT * max(variance, 1.0)
+
+
+def _best_fit(near: Near, state: State, trial: Trial) -> tuple[Near, State | None]:
+    """Return the fit of a set, or of a reshaped one whose fit has a better score."""
+    def score_of(chosen: Set, fitted: State) -> float:
+        return float(near.plain.score(fitted.rss, chosen.parameters, chosen.charge))
+
+    best, after = near, trial.fitted(near.chosen, state)
+    most = -np.inf if after is None else score_of(near.chosen, after)
+    for other in sorted(reshaped(near.chosen), key=lambda other: -other.score):
+        fitted = trial.fitted(other, state,
+                              near.plain.rss_of(most, other.parameters, other.charge))
+        if fitted is not None and score_of(other, fitted) > most:
+            best, after, most = replace(near, chosen=other), fitted, score_of(other, fitted)
+    return best, after
+
+
+def _best_near(linear: Linear, trial: Trial, refused: set[frozenset[str]]) -> Near:
+    """Return the best set near a model, with or without a walk."""
+    def best_of(problem: Linear) -> Set:
+        return next((chosen for chosen in accepted(explored(problem))
+                     if frozenset(chosen.effects) not in refused), Set.of(problem))
+
+    process = trial.process(linear)
+    best = Near(best_of(linear), linear, None, process)
+    if process is None or (linear.worth and not any(_in_time(best))
+                           and is_all_noise(best.chosen)):
+        return best
+    return _with_walk(best, process, best_of)
+
+
+def _with_walk(best: Near, process: Process, best_of: Callable[[Linear], Set]) -> Near:
+    """Return a set with a walk, if it has a better score than the set without one."""
+    linear, beside = best.plain, Set.of(best.plain)
+    tried = [beside, best.chosen]
+    for _ in range(_WALK_ROUNDS):
+        walk = walk_beside(beside, process)
+        if walk.likelihood_ratio < SIGNIFICANT:
+            break
+        beside = best_of(walk.whitened(linear)).within(linear)
+        tried.append(beside)
+    most = best.chosen.score
+    if all(_in_time(best)) and not is_all_noise(best.chosen):
+        most -= _TREND  # what changes with time only, and not as known, wanders
+    for beside in tried:
+        walk = walk_beside(beside, process)
+        if walk.likelihood_ratio > SIGNIFICANT and walk.score > most:
+            most = walk.score
+            best = replace(best, chosen=beside.within(walk.whitened(linear)), walk=walk)
+    return best
+
+
+def _in_time(near: Near) -> list[bool]:
+    """Return which of the chosen effects change with time."""
+    return ['time' in each.entry.needs for each in near.chosen.entries]
+
+
+def _at(linear: Linear, names: tuple[str, ...], out: tuple[int, ...], process: Process | None,
+        trial: Trial) -> Near:
+    """Return a set near its fit; its effects are in the order of their contribution."""
+    blocks = [int(linear.numbers_of[name][-1]) for name in names]
+    plain = Set.of(linear, blocks, out)
+    walk = None if process is None else walk_beside(plain, process)
+    whole = plain if walk is None else plain.within(walk.whitened(linear))
+    blocks.sort(key=lambda block: -whole.without(block).rss)
+    return Near(whole.instead(blocks), linear, walk, trial.process(linear))
+
+
+def fit_without(state: State, poses_g: Poses, out: tuple[int, ...]) -> State:
+    """Return a model fitted to all poses but these; with its values if the fit fails."""
+    kept = without(poses_g, out)
+    return fitted_state(state.model, kept) or State(judge(state.model, kept))
+
+
+def make_sound(state: State, near: Near, trial: Trial, base: Model, ladder: tuple[str, ...]
+               ) -> tuple[State, Near]:
+    """
+    Return the final model in which each effect is sound, and the set near it.
+
+    An effect is removed if it is not significant, or if the held-out residual is as small without
+    it; also one of the ladder beside what was found later, in place of which the values of the
+    base return. It gives way to another one that is more probable in its place and whose fit is
+    better.
+
+    """
+    for name in (name for name in ladder[::-1] if name in state.model.values):
+        values = {other: part for other, part in state.model.values.items() if other != name}
+        values.update((other, part) for other, part in base.values.items()
+                      if other not in (*values, *included(values)))
+        fewer = fitted_state(Model(values), state.poses_g)
+        if fewer is not None and not (is_significant(*ladder_set(state, name))
+                                      and _lowers(state, fewer)):
+            state = fewer
+    fixed = tuple(name for name in state.model.values if name not in near.names)
+    if {*fixed} != {*trial.fixed}:
+        trial = replace(trial, fixed=fixed)
+        near = _at(trial.near(state), near.names, near.chosen.out,
+                   None if near.walk is None else near.process, trial)
+    while (doubt := _doubtful(state, near)) is not None:
+        name, other = doubt
+        exchanged = _exchanged(state, near, name, other, trial)
+        score = -np.inf if exchanged is None else exchanged[1].score_above(near.plain.base_rss)
+        if exchanged is None or (other and score <= near.chosen.score):
+            near = replace(near, fitted={**near.fitted, doubt: score})
+        else:
+            state, near = exchanged
+    return state, near
+
+
+def ladder_set(state: State, name: str) -> tuple[Set, int]:
+    """Return the set of an effect of the ladder beside all others of a model, and its block."""
+    others = tuple(other for other in state.model.effects if other != name)
+    names = [other for other in LADDER if other not in others]
+    linear = linearised(state.fit, others, candidates(names, state.poses_g))
+    block, = (number for number, block in enumerate(linear.blocks) if block.effect == name)
+    return Set.of(linear, (block,)), block
+
+
+def _doubtful(state: State, near: Near) -> tuple[str, str] | None:
+    """Return an effect that is not sound, and the one for its place, or '' to remove it."""
+    for name in near.names[::-1]:  # the smallest contribution first
+        if (name, '') in near.fitted:
+            continue
+        if not is_significant(near.chosen, near.block_of(name)):
+            return name, ''
+        values = {other: part for other, part in state.model.values.items() if other != name}
+        fewer = fitted_state(Model(values), state.poses_g) if near.walk is None else None
+        if fewer is not None and not _lowers(state, fewer):
+            return name, ''
+    for name in (*near.names, *(() if near.walk is None else (WANDER,))):
+        other = next(iter(probabilities(name, near)))
+        if other != name:
+            return name, other
+    return None
+
+
+def _lowers(state: State, fewer: State) -> bool:
+    """Return whether the held-out residual of a model is below that of one with fewer effects."""
+    return state.gap_mg(state.held_out) < fewer.gap_mg(fewer.held_out)
+
+
+def _exchanged(state: State, near: Near, name: str, other: str, trial: Trial
+               ) -> tuple[State, Near] | None:
+    """Return the fit with another effect, if any, in the place of one, and the set near it."""
+    chosen = near.beside.instead(block for block in near.chosen.blocks
+                                 if near.plain.blocks[block].effect != name)
+    if other and other != WANDER:
+        chosen = chosen.extended(chosen.best_of(other))
+    after = trial.fitted(chosen, state)
+    if after is None:
+        return None
+    walks = other == WANDER or near.walk is not None
+    new = _at(trial.near(after), chosen.effects, chosen.out, near.process if walks else None,
+              trial)
+    if new.walk is not None and new.walk.likelihood_ratio < SIGNIFICANT:
+        new = replace(new, walk=None, chosen=new.beside)
+    return None if other == WANDER and new.walk is None else (after, new)
