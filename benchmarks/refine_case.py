@@ -173,7 +173,8 @@ class Outcome:
     knocked : mapping of int to float
         Rows that were knocked, and the change of |a| over the noise.
     deviations : tuple of float
-        Errors of the values of the hidden effects over their standard deviations.
+        Errors of the values of the hidden effects over their standard deviations; empty if the
+        refinement is refused.
     held_out : tuple of float or None
         Residual of fresh poses: of the refined calibration, and of the true form [mg].
     fresh : Fresh or None
@@ -263,7 +264,7 @@ def run(case: Case) -> Outcome:
         other = again(np.random.default_rng((*case.seed, 1)), made)
         fresh = _fresh(case, poses, refined, other)
         return Outcome(case, refined.verdict, named, frozenset(refined.disturbed_poses), knocked,
-                       _deviations(refined.calibration, made),
+                       () if refined.refusal else _deviations(refined.calibration, made),
                        _held_out(case, fresh, made, other), fresh,
                        tuple(step.where for step in refined.steps if step.effect == EMPIRICAL),
                        _lag(refined), seconds, tuple(map(_said, refined.steps)))

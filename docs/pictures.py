@@ -313,7 +313,7 @@ def screenshot(page: Path, picture: Path) -> None:
         sys.stdout.write(f'no Chromium: {picture.name} stays as it is\n')
         return
     subprocess.run([browser, '--headless', '--no-sandbox', '--hide-scrollbars',
-                    '--window-size=1000,1150', f'--screenshot={picture}', page.as_uri()],
+                    '--window-size=1280,1000', f'--screenshot={picture}', page.as_uri()],
                    check=True, capture_output=True, timeout=120)
 
 

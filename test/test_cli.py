@@ -288,7 +288,7 @@ def test_a_refinement_is_printed_stored_and_drawn(tmp_path, capsys):
         60)
     assert run('refine', poses, '-o', stored, '--sensor', 'imu_link', '--report', page) == 0
     printed = capsys.readouterr().out
-    for words in ('quadratic', 'square of the force', ' up', '->', 'p < ', 'noise floor',
+    for words in ('quadratic', 'square of the force', ' up', '->', 'p < ', 'GOOD',
                   'only noise remains', 'these data cannot show'):
         assert words in printed
     assert page.read_text().startswith('<!DOCTYPE html>')

@@ -7,10 +7,10 @@ import re
 
 from accel_calib.calibrate import fit_poses
 from accel_calib.effects import (
-    CARRIERS, effect_named, EMPIRICAL, empirical_name, empirical_parts, is_effect, kind_of, MODES,
-    modes_of, VARIABLES)
+    CARRIERS, effect_named, EMPIRICAL, empirical_name, empirical_parts, formula_of, is_effect,
+    kind_of, MODES, modes_of, VARIABLES)
 from accel_calib.findings import rate
-from accel_calib.refine import formula_of, refine
+from accel_calib.refine import refine
 from accel_calib.report import calibration_page
 from accel_calib.units import units_of
 from inside import (
@@ -238,7 +238,7 @@ def test_the_formula_of_a_curve_has_its_form_and_its_values(form, curve):
     sizes = np.linalg.lstsq(waves.T, curve(share) - np.mean(curve(share)), rcond=None)[0]
     scales = np.array([0.002, -0.001, 0.003])
     values = np.concatenate([np.outer(sizes, scales).ravel(), [12.0, 40.0]])
-    words = formula_of('empirical-offset-temperature-1-2-3-4-5-6-7-8-9-10', values, 0.0 * values)
+    words = formula_of('empirical-offset-temperature-1-2-3-4-5-6-7-8-9-10', values, {})
     assert words.endswith('t = temperature - 12, from 0 to 28 °C')
     assert {*re.findall(r'[a-z]+(?=\()', words)} == {form} - {''}
     expressions = re.findall(r'[xyz] = (.*?)(?=, [yz] = |; t)', words)

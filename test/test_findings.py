@@ -222,7 +222,7 @@ def test_a_fit_beside_a_refused_refinement_is_not_bad():
     refused = replace(result, refusal=('the poses do not determine it', 'take more poses'))
     rating = rate(ac.fit(table), refinement=refused)
     assert rating.name == 'USABLE'
-    assert 'quadratic is missing' in rating.reason
+    assert 'that explains them is refused' in rating.reason
     assert rating.next == NextStep('poses', 'take more poses')
     assert rate_refinement(refused).name == 'BAD'
 

@@ -75,8 +75,8 @@ def test_a_temperature_that_is_not_recorded_leaves_no_absurd_offset(seed, is_ref
 
 def test_a_refinement_warns_of_what_a_fit_warns_of():
     poses = near_up(np.random.default_rng(1), 62.0)
-    expected = {words for words in fit_poses(poses, G).warnings if 'do not determine' in words}
-    assert set() < expected <= set(refine(poses, G).calibration.warnings)
+    expected = {each for each in fit_poses(poses, G).noted if each.kind == 'undetermined'}
+    assert set() < expected <= {*refine(poses, G).calibration.noted}
 
 
 @pytest.mark.parametrize('seed', [2, 3])

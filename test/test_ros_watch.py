@@ -215,8 +215,9 @@ def test_a_node_whose_port_is_in_use_says_so_and_works_on(
         node = bench.calibrator(calibration_file=tmp_path / 'c.yaml', web_port=port,
                                 passthrough=True)
         printed_until(node, f'the port {port} of 127.0.0.1 is in use')
-        bench.feed(readings(DIRECTIONS[:1]))
-        assert 'pose' in bench.call('capture_pose').message
+        still = readings(DIRECTIONS[:1])
+        bench.feed(still)
+        assert 'pose' in bench.call_while('capture_pose', lambda: bench.imu(still[-1])).message
         assert node.poll() is None
 
 

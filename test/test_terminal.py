@@ -25,7 +25,7 @@ from inside import (
 import numpy as np
 import pytest
 from rich.console import Console
-from shared import forked, python, ROOT, run, run_json
+from shared import forked, python, random_directions, ROOT, run, run_json
 
 
 @pytest.fixture
@@ -61,6 +61,33 @@ def test_output_fits_the_width(columns, poses, printed, tmp_path):
             and str(tmp_path) not in line]
     assert len(text.splitlines()) > 100
     assert not wide
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_the_verdict_comes_first_and_then_at_most_five_notes(seed, tmp_path, monkeypatch, capsys):
+    rng = np.random.default_rng(seed)
+    readings = random_directions(9 + 3 * seed, rng)
+    readings += [0.04, 0.0, -0.02]
+    readings[seed:2 * seed] *= 1.1
+    np.savetxt(tmp_path / 'poses.csv', np.hstack([readings, 0.002 + 0.0 * readings]),
+               delimiter=',', header='# units: g\nax,ay,az,std_x,std_y,std_z', comments='')
+    monkeypatch.setenv('COLUMNS', '3000')
+
+    def lines_of(*more):
+        run('calibrate', tmp_path / 'poses.csv', '-o', tmp_path / 'c.yaml', '--keep-bad', '--json',
+            tmp_path / 'c.json', *more)
+        return capsys.readouterr().out.splitlines()
+
+    few, every = lines_of(), lines_of('--verbose')
+    result = json.loads((tmp_path / 'c.json').read_text())
+    assert every[0].startswith(result['rating'])
+    head = 1 + max(k for k, line in enumerate(every) if line.startswith(('next', '      accel')))
+    assert few[:head] == every[:head]
+    notes = few[head:[line.startswith('stored') for line in few].index(True)]
+    assert len(notes) <= 5 <= len(every) - head
+    assert notes[:4] == every[head:][:len(notes[:4])]
+    for found in result['findings']:
+        assert found['text'] in '\n'.join(every)
 
 
 @pytest.mark.parametrize('encoding', ['ascii', 'cp1252'])

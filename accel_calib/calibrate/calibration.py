@@ -219,6 +219,12 @@ class Calibration(Record):
         """Names of the values, in the order of `covariance`."""
         return parameter_names(self.model.effects)
 
+    @property
+    def deviations(self) -> dict[str, float]:
+        """Return the standard deviations of the values, by name."""
+        variances = np.maximum(np.diag(self.covariance), 0.0)
+        return dict(zip(self.parameters, np.sqrt(variances).tolist(), strict=True))
+
     @cached_property
     def force_per_g(self) -> float:
         """Corrected force per g, as `Units.force_per_g`."""

@@ -35,7 +35,7 @@ from .pose_planning import (
     determines, dilution, free_parameters, LARGEST_DILUTION, NORM_MODELS, poses_needed,
     refuse_if_unfit, unseen, WEAK_DILUTION)
 from .quality import finished, fit_findings, in_g, LARGEST_OFFSET_G, record_of, rival_findings
-from ..effects import length_rows, linear_model, Model, MODELS, sensor_force, with_vector
+from ..effects import EFFECTS, length_rows, linear_model, Model, MODELS, sensor_force, with_vector
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import (
     closed_form, covariance_with, estimate, faces, Fit, fit_12, fit_norm, fit_sphere, judge,
@@ -332,14 +332,15 @@ def _choose(fits: Mapping[str, Fit]) -> tuple[str, str]:
         gained = max(small.chi2 - large.chi2, 0.0) / added
         chance = float(scipy.special.fdtrc(added, large.variance_dof, gained / large.variance))
         before, after = (rms(fit.equations.of_poses(fit.residual)) * MG for fit in (small, large))
-        change = f'{before:.3g} to {after:.3g} mg'
+        added_words = EFFECTS[MODELS[name].effects[-1]].words
+        change = f'the poses agree to {after:.3g} mg instead of {before:.3g} mg'
         if chance < _LEVEL_OF_MODELS:
-            reasons.append(f'model {name} reduces the residual of model {chosen} from {change} '
-                           f'(by chance: p = {chance:.1g})')
+            reasons.append(f'model {name} adds the {added_words}: {change}, which noise alone '
+                           f'hardly does (p = {chance:.1g})')
             chosen = name
         else:
-            reasons.append(f'model {name} would change it from {change}, which noise explains '
-                           f'(p = {chance:.2g})')
+            reasons.append(f'model {name} would add the {added_words}: {change}, as noise alone '
+                           f'may do (p = {chance:.2g})')
     return chosen, '; '.join(reasons) or f'the poses determine only model {chosen}'
 
 

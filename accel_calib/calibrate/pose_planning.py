@@ -21,8 +21,9 @@ evenly. The singular vectors of the rows are combinations of parameters, ordered
 poses determine them. The combinations that raise the dilution above the limit for a fit are not
 determined. They are described by as few parameters as possible.
 
-Poses that do not determine a model are refused. The error contains the reason, the undetermined
-parameters, the poses to add, and the largest of the smaller models that the poses determine.
+Poses that do not determine a model are refused. The error contains the reason, the parameters
+that are undetermined by themselves, the poses to add, and the largest of the smaller models that
+the poses determine.
 
 **Next pose.** It is one of the 26 orientations that a person can set by eye: the 6 faces, 12 edges
 and 8 corners of the sensor. It is the orientation that increases the determinant of M plus the
@@ -107,9 +108,6 @@ at right angles, come from a sensor that can be turned.
 _WIDE = 75.0
 """Angle above which poses are no longer described as near one direction [°]."""
 
-_MOST_NAMED = 3
-"""Largest number of undetermined combinations in a message."""
-
 
 def effects_of(name: str) -> tuple[str, ...]:
     """Return the effects of a model; model 9 is model 10 in other axes."""
@@ -185,14 +183,18 @@ class Combination:
     weights: Mapping[str, float]
 
     @property
+    def main(self) -> dict[str, float]:
+        """Return the weights that are not small."""
+        least = _MAIN_PART * max(map(abs, self.weights.values()))
+        return {name: weight for name, weight in self.weights.items() if abs(weight) > least}
+
+    @property
     def words(self) -> str:
         """Return the combination in words, such as ``0.71 offset.z - 0.70 axis_gain.z``."""
-        least = _MAIN_PART * max(map(abs, self.weights.values()))
-        main = [(name, weight) for name, weight in self.weights.items() if abs(weight) > least]
-        if len(main) == 1:
-            return main[0][0]
+        if len(self.main) == 1:
+            return next(iter(self.main))
         first, *others = (f'{"-" if weight < 0 else "+"} {abs(weight):.2f} {name}'
-                          for name, weight in main)
+                          for name, weight in self.main.items())
         return ' '.join([first.removeprefix('+ '), *others])
 
 
@@ -493,11 +495,13 @@ def refuse_if_unfit(name: str, directions: Floats, noise: Floats | None = None) 
     offer = (f', or use model {smaller[-1]}, which these poses determine: '
              f'{_omitted(smaller[-1], name, directions, noise)}') if smaller else ''
     few = len(directions) < poses_needed(NORM_MODELS[0])
-    open_ = () if few else identifiability(name, directions, noise).undetermined
+    # Several that are open together say less than the poses that are missing.
+    alone = [] if few else [each.words for each in identifiability(
+        name, directions, noise).undetermined if len(each.main) == 1]
     raise RefusedFitError(
         f'{shape_words(name, directions)}, expected at least {poses_needed(name)} poses spread '
         f'over the sphere for model {name}'
-        f'{f"; not determined: {combination_words(open_)}" if open_ else ""}',
+        f'{f"; not determined: {enumerated(alone)}" if alone else ""}',
         f'{turn_words(missing_poses(name, directions, noise))}, hold it still and continue{offer}')
 
 
@@ -505,11 +509,10 @@ def unseen(chosen: str, directions: Floats, noise: Floats | None = None) -> Iter
     """Yield a finding if the poses determine only `chosen`, and not the largest model."""
     largest = NORM_MODELS[-1]
     if chosen in NORM_MODELS[:-1]:
-        open_ = identifiability(largest, directions, noise).undetermined
         yield Finding(
-            'undetermined', f'the poses do not determine {combination_words(open_)}, so model '
-            f'{chosen} is the largest possible: {_omitted(chosen, largest, directions, noise)}',
-            f'to determine them, {turn_words(missing_poses(largest, directions, noise))}')
+            'undetermined', f'model {chosen} is the largest that these poses determine: '
+            f'{_omitted(chosen, largest, directions, noise)}',
+            f'to fit model {largest}, {turn_words(missing_poses(largest, directions, noise))}')
 
 
 def _omitted(smaller: str, larger: str, directions: Floats, noise: Floats | None) -> str:
@@ -519,14 +522,6 @@ def _omitted(smaller: str, larger: str, directions: Floats, noise: Floats | None
         return words
     error = error_left_in(smaller, larger, directions, noise) * MG
     return f'{words}, which causes an error of |a| of {error:.0f} mg in a common sensor'
-
-
-def combination_words(open_: Sequence[Combination]) -> str:
-    """Return the names of undetermined combinations."""
-    words = [each.words for each in open_[:_MOST_NAMED]]
-    if len(open_) > _MOST_NAMED:
-        words.append(f'{len(open_) - _MOST_NAMED} more')
-    return enumerated(words)
 
 
 def turn_words(missing: Sequence[str]) -> str:

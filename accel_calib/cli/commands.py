@@ -55,7 +55,7 @@ def add_options(made: options.Parser, command: Command) -> None:
         options.share(made, '--also')
 
 
-_NOT_CARRIED = ('json', 'jobs', 'report', 'plan', 'figures', 'force')
+_NOT_CARRIED = ('json', 'jobs', 'report', 'plan', 'figures', 'force', 'verbose')
 """Options of one run, which a following command does not take over."""
 
 
@@ -144,7 +144,7 @@ def _fit(made: options.Parser) -> None:
     add('--flat', type=int, metavar='ROW', help='row of a pose with the robot level, 1-based; it '
         'determines the mounting')
     options.add_mounting(made)
-    options.share(made, '--keep-bad', '--prior', '--sensor-model')
+    options.share(made, '--keep-bad', '--prior', '--sensor-model', '--verbose')
 
 
 def _calibrate(made: options.Parser) -> None:
@@ -167,7 +167,7 @@ def _calibration_of_logs(made: options.Parser, *shared: str) -> None:
     add('--flat', type=_flat, metavar='ROW', help='pose with the robot level: its row, 1-based, '
         'or first or last; it determines the mounting')
     options.add_mounting(made)
-    options.share(made, '--keep-bad', *shared, '--json')
+    options.share(made, '--keep-bad', *shared, '--verbose', '--json')
     options.add_log(made)
     options.add_capture(made)
 
@@ -185,6 +185,7 @@ def _refine(made: options.Parser) -> None:
     options.add_poses(made)
     options.add_base(made)
     options.add_outputs(made, 'refined calibration', 'report')
+    options.share(made, '--verbose')
     made.add_argument('--plan', type=Path, metavar='FILE', help='poses to take next, which '
                       'separate the named effects from their rivals (CSV); not written if there '
                       'is nothing to separate; a folder for several POSES')

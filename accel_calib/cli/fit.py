@@ -45,11 +45,10 @@ def run_fit(args: argparse.Namespace) -> Done:
     return Done(
         {'file': args.poses, **calibration_json(calibration, ahead), 'read_as': found.read_as,
          'read_lines': found.lines},
-        [*found.lines, *calibration_lines(calibration),
-         f'model {calibration.name}: {calibration.reason}',
-         f'next pose: {ahead.next_pose.words}', *lines],
-        outcome.rating, status_of(outcome), stored,
-        partial(_page, args, args.poses, found, outcome))
+        [*_tables(calibration), *lines], outcome.rating, status_of(outcome), stored,
+        partial(_page, args, args.poses, found, outcome),
+        notes=_fit_notes(calibration, f'model {calibration.name}: {calibration.reason}',
+                         f'next pose: {ahead.next_pose.words}', *found.lines))
 
 
 def run_calibrate(args: argparse.Namespace) -> Done:
@@ -65,8 +64,9 @@ def run_calibrate(args: argparse.Namespace) -> Done:
         {'file': args.log, **calibration_json(calibration, outlook(calibration, 'auto')),
          'read_as': found.read_as, 'read_lines': found.lines, 'refined': outcome.line,
          'refinement': None if refinement is None else refinement_json(refinement)},
-        [*found.lines, *calibration_lines(calibration), outcome.line, *lines],
-        outcome.rating, status_of(outcome), stored, partial(_page, args, args.log, found, outcome))
+        [*(_tables(calibration) if args.verbose else ()), *lines], outcome.rating,
+        status_of(outcome), stored, partial(_page, args, args.log, found, outcome),
+        notes=_fit_notes(calibration, outcome.line, *found.lines))
 
 
 def run_thermal(args: argparse.Namespace) -> Done:
@@ -91,10 +91,11 @@ def _thermal_done(args: argparse.Namespace, logs: Sequence[Path], outcome: Therm
     return Done(
         {'file': list(logs), **calibration_json(calibration, outlook(calibration, 'auto')),
          'read_as': outcome.read_as, 'read_lines': lines, 'thermal': curve_json(outcome.curve)},
-        [*lines, *_curve_lines(outcome.curve),
-         *(calibration_lines(calibration) if is_whole else _notes(calibration)), *left_out],
+        [*_curve_lines(outcome.curve),
+         *(_tables(calibration) if is_whole and args.verbose else ()), *left_out],
         outcome.rating, status_of(outcome), stored,
-        partial(thermal_page, outcome, list(map(str, logs)), stored=str(args.output), notes=lines))
+        partial(thermal_page, outcome, list(map(str, logs)), stored=str(args.output), notes=lines),
+        notes=_fit_notes(calibration, *lines))
 
 
 def _curve_lines(curve: Curve) -> Iterator[Any]:
@@ -114,11 +115,6 @@ def _curve_lines(curve: Curve) -> Iterator[Any]:
     else:
         lag = '' if curve.lag_s is None else f', a lag of {curve.lag_s:.0f} s'
         yield f'hysteresis: {short(curve.hysteresis_mg)} mg between warming and cooling{lag}'
-
-
-def _notes(calibration: Calibration) -> Iterator[str]:
-    for warning in calibration.warnings:
-        yield f'note: {warning}'
 
 
 def status_of(outcome: Outcome | ThermalOutcome) -> int:
@@ -165,15 +161,21 @@ def several_fit(results: Sequence[dict[str, Any]]) -> Iterator[str]:
             f'{line}{result["rating"]}', result['rating'], len(line))
 
 
-def calibration_lines(calibration: Calibration) -> Iterator[Any]:
-    """Yield tables and lines: quality, parameters, poses left out and warnings."""
+def _fit_notes(calibration: Calibration, *notes: str) -> list[str]:
+    """Return notes with the rows left out before them; the reasons of several rows follow."""
+    lines = [f'left out: row {each.row}: {each.reason}' for each in calibration.rejected]
+    if len(lines) < 2:
+        return [*lines, *notes]
+    rows = [each.row for each in calibration.rejected]
+    return [f'left out: {listed("row", rows)}', *notes, *lines]
+
+
+def _tables(calibration: Calibration) -> Iterator[Any]:
+    """Yield the residuals and the values of a calibration."""
     yield _quality_table(calibration)
     yield _parameter_table(calibration)
     if calibration.gyro is not None:
         yield _gyro_line(calibration.gyro)
-    for rejected in calibration.rejected:
-        yield f'left out: row {rejected.row}: {rejected.reason}'
-    yield from _notes(calibration)
 
 
 def _quality_table(calibration: Calibration) -> Table:
@@ -214,6 +216,7 @@ def _gyro_line(gyro: GyroBias) -> str:
 
 def run_refine(args: argparse.Namespace) -> Done:
     """Refine a calibration, and store it unless it is refused."""
+    from ..refine import verdict_words
     from ..report import refinement_page
 
     found, result = _refined(args)
@@ -226,10 +229,17 @@ def run_refine(args: argparse.Namespace) -> Done:
 
         write_plan(args.plan, result.plan)
         stored.append(args.plan)
+    rows, missing = result.disturbed_poses, [name for name, _ in result.not_testable]
     return Done({'file': args.poses, **refinement_json(result), 'read_as': found.read_as},
-                [*found.lines, *_shown(args, result)], rate_refinement(result), stored=stored,
+                [*([_steps_table(result)] if result.steps else ()),
+                 *(f'plan: {line}' for line in result.plan.lines if args.plan is not None)],
+                rate_refinement(result), stored=stored,
                 page=partial(refinement_page, result, str(args.poses)),
-                refusal=result.refusal if args.output else ())
+                refusal=result.refusal if args.output else (),
+                notes=[verdict_words(result),
+                       *([f'left out: {listed("row", rows)}'] if rows else ()),
+                       *(f'advice: {line}' for line in result.advice), *found.lines,
+                       *([f'these data cannot show: {", ".join(missing)}'] if missing else ())])
 
 
 def run_report(args: argparse.Namespace) -> Done:
@@ -254,25 +264,6 @@ def _refined(args: argparse.Namespace) -> tuple[Intake, Refinement]:
         base = stored.in_units(found.units) if stored else prior(args) or args.base
         return found, refine(poses, found.units, base=base, sensor=args.sensor, date=now(),
                              also=args.own)
-
-
-def _shown(args: argparse.Namespace, result: Refinement) -> Iterator[Any]:
-    from ..refine import residual_words, verdict_words
-
-    if result.steps:
-        yield _steps_table(result)
-    yield f'{verdict_words(result)}\n{residual_words(result)}'
-    if result.disturbed_poses:
-        yield f'left out: {listed("row", result.disturbed_poses)}'
-    yield from _notes(result.calibration)
-    for line in result.advice:
-        yield f'advice: {line}'
-    if args.plan is not None:
-        for line in result.plan.lines:
-            yield f'plan: {line}'
-    if result.not_testable:
-        names = ', '.join(effect for effect, _ in result.not_testable)
-        yield f'these data cannot show: {names}'
 
 
 def several_refine(results: Sequence[dict[str, Any]]) -> Iterator[str]:

@@ -63,15 +63,20 @@ _KINDS = {'calibration': rb'format: accel_calib', 'page': rb'<!DOCTYPE html',
 
 _HEAD = 4096
 
+_MOST_NOTES = 5
+"""Largest number of notes without ``--verbose``."""
+
 
 @dataclass(frozen=True)
 class Done:
     """
     What a command has done for one input.
 
-    `result` is the JSON, and `shown` are texts and tables for the terminal, which are made when
-    they are printed; the rating follows both. `stored` are the files written. `page` returns the
-    page, if one is asked for. `refusal` is why the file of ``-o`` is not written, and what to do.
+    `result` is the JSON. On the terminal, the rating is followed by its findings and by `notes`,
+    the most important first, of which a few are shown without ``--verbose``, and then by `shown`,
+    texts and tables, which are made when they are printed. `stored` are the files written. `page`
+    returns the page, if one is asked for. `refusal` is why the file of ``-o`` is not written, and
+    what to do.
 
     """
 
@@ -82,6 +87,7 @@ class Done:
     stored: Sequence[Path] = ()
     page: Callable[[], str] | None = None
     refusal: tuple[str, ...] = ()
+    notes: Sequence[str] = ()
 
 
 class Target(NamedTuple):
@@ -167,13 +173,26 @@ def _run_one(args: argparse.Namespace) -> int:
             output.print(f'read as: {error["read_as"]}')
         raise
     write_json(target, done.result)
-    for each in (*done.shown, *(f'stored in {path}' for path in done.stored
-                                if str(path) != STANDARD_OUTPUT),
-                 *(rating_lines(done.rating, args) if done.rating else ())):
+    for each in (*(rating_lines(done.rating, args) if done.rating else ()), *_notes(done, args),
+                 *done.shown, *(f'stored in {path}' for path in done.stored
+                                if str(path) != STANDARD_OUTPUT)):
         output.print(each)
     if done.refusal:
         raise RefusedFitError(f'{args.output} is not written: {done.refusal[0]}', done.refusal[1])
     return done.status
+
+
+def _notes(done: Done, args: argparse.Namespace) -> Iterator[str]:
+    """Yield the findings beside the reason of the rating, and the notes; only a few if short."""
+    rating, lines = done.rating, list[str]()
+    if rating is not None:
+        lines = [f'note: {each.text if each.advice == rating.next.text else each.words}'
+                 for each in rating.findings if each.text != rating.reason]
+    lines += done.notes
+    short = len(lines) > _MOST_NOTES and not getattr(args, 'verbose', True)
+    yield from lines[:_MOST_NOTES - 1] if short else lines
+    if short:
+        yield f'{len(lines) - _MOST_NOTES + 1} more lines with --verbose'
 
 
 def _run_several(args: argparse.Namespace, each: Sequence[argparse.Namespace]) -> int:

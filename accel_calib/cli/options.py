@@ -146,6 +146,7 @@ _SHARED: dict[str, dict[str, Any]] = {
     '--keep-bad': {'action': 'store_true', 'help': 'store a calibration that is BAD, too'},
     '--also': {'type': Path, 'metavar': 'FILE.py', 'help': 'Python file with own effects '
                '(accel_calib.Effect), which are known beside the catalogue; it is executed'},
+    '--verbose': {'action': 'store_true', 'help': 'print all notes and tables'},
     '--json': {'metavar': 'FILE', 'help': 'JSON file to write with the result; - for standard '
                'output'},
     '--force': {'action': 'store_true', 'help': 'replace files of other kinds, too'}}

@@ -38,6 +38,7 @@ from .catalogue import (
 from .form import (
     AFFINE, AXES, by_axis, Context, CUBE, difference, Effect, fitted_places, FORCE, MODES,
     MONOMIALS, ODD_SQUARE, ONE, PRODUCT, SIZE, SQUARE, TO_SEPARATE, WAVE, ZONAL, ZONES)
+from .formula import formula_of
 from .model import (
     AtContext, check_context, CONVERGED_G, correct, EachShape, factors_of, LARGEST_FORCE_G,
     LARGEST_ITERATIONS, length_rows, linear_model, linear_values, Model, ModelForm, MODELS,
@@ -48,15 +49,14 @@ from .thermal import acting_temperature, rate_at, ThermalStream
 
 __all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CHANGES', 'CONVERGED_G', 'COVARIATES', 'CUBE', 'EFFECTS',
            'EMPIRICAL', 'FORCE', 'KNOWN_CODE', 'LADDER', 'LARGEST_FORCE_G', 'LARGEST_ITERATIONS',
-           'MODELS', 'MODES', 'MONOMIALS', 'NOMINAL_SUPPLY', 'ODD_SQUARE', 'OFFSET_POWERS',
-           'ONE', 'PROCESSES', 'PRODUCT', 'REFERENCE_TEMPERATURE', 'SIZE', 'SQUARE',
-           'TO_SEPARATE', 'VARIABLES', 'WANDER', 'WAVE', 'ZONAL', 'ZONES', 'AtContext', 'Context',
-           'EachShape', 'Effect', 'Model', 'ModelForm', 'OwnEffect', 'ThermalStream',
-           'acting_temperature', 'by_axis', 'check_context', 'correct', 'covariate_names',
-           'curve_pairs', 'curve_unit', 'difference', 'effect_named', 'empirical_name',
-           'empirical_parts', 'factors_of', 'fitted_places', 'included', 'is_effect', 'kind_of',
-           'know', 'know_code', 'know_file', 'length_rows', 'linear_model', 'linear_values',
-           'model_with', 'modes_of', 'parameter_names', 'parse_effect', 'predict', 'rate_at',
-           'reading_of', 'sensor_force', 'simulate_poses', 'simulate_recording', 'times',
-           'too_large', 'turn_between', 'unit_of', 'value_unit', 'variable_of', 'variable_words',
-           'with_vector']
+           'MODELS', 'MODES', 'MONOMIALS', 'NOMINAL_SUPPLY', 'ODD_SQUARE', 'OFFSET_POWERS', 'ONE',
+           'PROCESSES', 'PRODUCT', 'REFERENCE_TEMPERATURE', 'SIZE', 'SQUARE', 'TO_SEPARATE',
+           'VARIABLES', 'WANDER', 'WAVE', 'ZONAL', 'ZONES', 'AtContext', 'Context', 'EachShape',
+           'Effect', 'Model', 'ModelForm', 'OwnEffect', 'ThermalStream', 'acting_temperature',
+           'by_axis', 'check_context', 'correct', 'covariate_names', 'curve_pairs', 'curve_unit',
+           'difference', 'effect_named', 'empirical_name', 'empirical_parts', 'factors_of',
+           'fitted_places', 'formula_of', 'included', 'is_effect', 'kind_of', 'know', 'know_code',
+           'know_file', 'length_rows', 'linear_model', 'linear_values', 'model_with', 'modes_of',
+           'parameter_names', 'parse_effect', 'predict', 'rate_at', 'reading_of', 'sensor_force',
+           'simulate_poses', 'simulate_recording', 'times', 'too_large', 'turn_between', 'unit_of',
+           'value_unit', 'variable_of', 'variable_words', 'with_vector']

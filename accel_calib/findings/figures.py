@@ -100,8 +100,7 @@ def linear_figures(calibration: Calibration) -> Iterator[Figure]:
 
 def effect_figures(calibration: Calibration) -> Iterator[Figure]:
     """Yield the values of the effects beyond V and W; shapes at their usual value are left out."""
-    variances = np.maximum(np.diag(calibration.covariance), 0.0)
-    deviations = dict(zip(calibration.parameters, np.sqrt(variances).tolist(), strict=True))
+    deviations = calibration.deviations
     for effect, values in calibration.model.values.items():
         shown = {} if effect in LADDER else effect_named(effect).shown(values)
         for name, value in shown.items():

@@ -187,10 +187,12 @@ def _beyond_noise(expected: Expected, refinement: Refinement | None) -> Iterator
         what = f'{begin}: an effect is missing, or poses moved'
         advice, step = _REFINE.text, _REFINE.kind
     elif refinement.steps and not _has(expected, refinement):
-        names = ', '.join(step.effect for step in refinement.steps)
-        what = f'{begin}: {names} is missing in the model'
-        advice = refinement.refusal[1] if refinement.refusal else 'use the refined calibration'
-        step = 'poses' if refinement.refusal else 'refine'
+        names = ' and '.join(step.effect for step in refinement.steps)
+        what = f'{begin}; the model lacks {names}'
+        advice, step = 'use the refined calibration', 'refine'
+        if refinement.refusal:
+            why, advice = refinement.refusal
+            what, step = f'{begin}, and the model that explains them is refused: {why}', 'poses'
     elif any(step.effect == WANDER for step in refinement.steps):
         what = f'{begin}: the offset changed slowly with time ({WANDER})'
         advice = 'let the sensor warm up, and take the poses within a few minutes'

@@ -474,7 +474,8 @@ class Near:
 
     The equations of `chosen` are whitened if there is a `walk`; those of `plain` are not. If no
     walk is tried, `process` is None. `fitted` are the scores of other effects in the place of one,
-    by both names, where their own fit is not as good as these equations predict.
+    by both names, and what is unusual costs them, where their own fit is not as good as these
+    equations predict.
 
     """
 
@@ -482,7 +483,7 @@ class Near:
     plain: Linear
     walk: Walk | None
     process: Process | None
-    fitted: Mapping[tuple[str, str], float] = field(default_factory=dict)
+    fitted: Mapping[tuple[str, str], tuple[float, float]] = field(default_factory=dict)
 
     @property
     def beside(self) -> Set:
@@ -550,5 +551,7 @@ def _scores(name: str, near: Near, least: float, *, usual: bool) -> dict[str, fl
             scores[effect] = max(score, scores.get(effect, -np.inf))
     if name != WANDER and near.walk is None and near.process is not None:
         scores[WANDER] = walk_beside(others, near.process).score + back * others.unusual
-    return {other: min(score, near.fitted.get((name, other), score))
-            for other, score in scores.items()}
+    for other in scores:
+        own, unusual = near.fitted.get((name, other), (np.inf, 0.0))
+        scores[other] = min(scores[other], own + back * unusual)
+    return scores

@@ -288,6 +288,8 @@ def _record(calibration: Calibration, found: Found, given: Given, sensor: str, d
     outliers = tuple(each.row for each in rejected if each.kind != 'clipped')
     refined, refusal = refined_calibration(calibration, final, found.added, given, rejected)
     refined = replace(refined, sensor=sensor or refined.sensor, date=date or refined.date)
+    if refusal:
+        steps = tuple(replace(step, parameters_sd={}) for step in steps)
     verdict, undecided = verdict_of(found, steps, refused=bool(refusal))
     unexplained = verdict == 'unexplained' and not undecided
     advice = (*advice_for(found, steps, missing, len(outliers), unexplained=unexplained),

@@ -238,9 +238,10 @@ def make_sound(state: State, near: Near, trial: Trial, base: Model, ladder: tupl
     while (doubt := _doubtful(state, near)) is not None:
         name, other = doubt
         exchanged = _exchanged(state, near, name, other, trial)
-        score = -np.inf if exchanged is None else exchanged[1].score_above(near.plain.base_rss)
+        score, unusual = (-np.inf, 0.0) if exchanged is None else (
+            exchanged[1].score_above(near.plain.base_rss), exchanged[1].chosen.unusual)
         if exchanged is None or (other and score <= near.chosen.score):
-            near = replace(near, fitted={**near.fitted, doubt: score})
+            near = replace(near, fitted={**near.fitted, doubt: (score, unusual)})
         else:
             state, near = exchanged
     return state, near

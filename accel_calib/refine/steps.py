@@ -21,15 +21,14 @@ from typing import Literal
 import numpy as np
 
 from .curves import LEAST, nearest_effects, probabilities, steepest
-from .formula import formula_of
 from .linear import is_seen, Set
 from .search import Found
 from .settle import ladder_set
 from .state import fitted_state, is_noise, State, with_effect
 from ..effects import (
-    CHANGES, COVARIATES, effect_named, EFFECTS, EMPIRICAL, empirical_parts, included, is_effect,
-    kind_of, Model, parameter_names, PROCESSES, TO_SEPARATE, unit_of, value_unit, variable_of,
-    variable_words, WANDER)
+    CHANGES, COVARIATES, effect_named, EFFECTS, EMPIRICAL, empirical_parts, formula_of, included,
+    is_effect, kind_of, Model, parameter_names, PROCESSES, TO_SEPARATE, unit_of, value_unit,
+    variable_of, variable_words, WANDER)
 from ..estimate import kinds
 from ..geometry import ATTITUDES, axes_of_signs
 from ..table import column_of, Floats, Poses
@@ -81,7 +80,8 @@ class Step:
     parameters : dict
         Values by name. For a change of a stored calibration: the changes of the values.
     parameters_sd : dict
-        Their standard deviations, of those that are fitted.
+        Their standard deviations, of those that are fitted; empty in a refused refinement, because
+        so few poses choose the wrong model more often than deviations state.
     gap_before_mg, gap_after_mg : float
         Residual without and with the effect [mg].
     held_out_before_mg, held_out_after_mg : float
@@ -95,7 +95,7 @@ class Step:
     variable : str
         Quantity that a covariate or a curve is a function of; empty for other effects.
     formula : str
-        Formula of an empirical curve, in C and Python (`.formula`); empty for other effects.
+        Formula of an empirical curve, in C and Python; empty for other effects.
 
     """
 
@@ -268,8 +268,7 @@ def _step(name: str, states: tuple[State, State], found: Found, date: str, *, un
                 before.gap_mg(first), after.gap_mg(last),
                 before.gap_mg(first_held_out), after.gap_mg(held_out),
                 _p_value(name, found), words, plain_name(name),
-                formula_of(name, values, np.array([*deviations.values()]))
-                if kind_of(name) == EMPIRICAL else '')
+                formula_of(name, values, spread))
 
 
 def _chances(name: str, found: Found, *, usual: bool) -> dict[str, float]:

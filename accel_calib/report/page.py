@@ -140,7 +140,8 @@ def calibration_page(calibration: Calibration, rating: Rating, source: str, *,
             values_section(calibration),
             _covered(calibration, residuals, plan=refinement is None and checked is None),
             section('Before and after', figures([of_before_after(
-                residuals, (checked or calibration.quality).noise_floor_mg)], 'wide')),
+                residuals, (checked or calibration.quality).noise_floor_mg)], 'wide'),
+                kind='half'),
             *_remarks(calibration, residuals, used),
             section('What remains', figures(of_remainder(residuals))),
             *(() if first else searched),
@@ -179,7 +180,7 @@ def thermal_page(outcome: ThermalOutcome, sources: Sequence[str], *, stored: str
                 'Error of held-out parts by degree',
                 ('degree', 'error of parts that were held out [mg]'),
                 [(str(degree), short(error)) for degree, error in enumerate(curve.held_out_mg)],
-                'whole-cells')),
+                'whole-cells'), kind='half'),
             section('Warnings', listing(calibration.warnings)),
             section('Use it', *(block(name, text) for name, text in snippets(
                 calibration, stored))),
@@ -233,7 +234,7 @@ def _coefficients(curve: Curve) -> str:
         for k, (values, deviations) in enumerate(zip(curve.values, curve.deviations), 1)]
     return section('Coefficients', scroll_table(
         'Coefficients by axis', ('', *AXES), rows, 'whole-cells values'), paragraph(
-        'The sum over the powers is added to the reading.', 'soft')) if rows else ''
+        'The sum over the powers is added to the reading.', 'soft'), kind='half') if rows else ''
 
 
 def _is_refined(calibration: Calibration, refinement: Refinement | None) -> bool:
@@ -267,7 +268,7 @@ def _covered(calibration: Calibration, residuals: Residuals, *, plan: bool) -> s
         direction, words = asked.direction, f'Next pose: {asked.words}.'.replace('..', '.')
     return section('Coverage of the sphere', figures(
         [of_coverage(residuals, coverage(residuals.force), direction)], 'wide'),
-        paragraph(words), HINT)
+        paragraph(words), HINT, kind='half')
 
 
 def _remarks(calibration: Calibration, residuals: Residuals, used: Refinement | None
@@ -295,7 +296,7 @@ def values_section(calibration: Calibration) -> str:
     return section('The calibration', paragraph(f'Model {words}'),
                    scroll_table('Values of the calibration', ('', 'value ± deviation', 'usual'),
                                 rows, 'whole-cells values'),
-                   paragraph(note, 'soft'), paragraph(_SOURCE, 'soft'))
+                   paragraph(note, 'soft'), paragraph(_SOURCE, 'soft'), kind='half tall')
 
 
 def axis_figures(vec: Floats, effects: tuple[str, ...]) -> Floats:

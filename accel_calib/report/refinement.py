@@ -58,7 +58,8 @@ def search_sections(result: Refinement, residuals: Residuals, *, used: bool) -> 
     if result.steps:
         note = '' if used else ' '.join((_NOT_USED, *refusal_lines(result)))
         yield section('Effects that were found', paragraph(note), paragraph(verdict_words(result)),
-                      figures([ladder(result)], 'wide'), _overview(result))
+                      figures([ladder(result)], 'wide'), kind='half')
+        yield section('Steps', _overview(result), kind='half')
     for number, step in enumerate(result.steps, 1):
         yield _step(result, number, step)
     left = residuals_of_refinement(result)
@@ -88,13 +89,12 @@ def _is_drawn(step: Step) -> bool:
 
 def _overview(result: Refinement) -> str:
     """Return the table of steps."""
-    head = ('step', 'effect', 'residual [mg]', 'held out [mg]', 'chance', 'rivals')
+    head = ('', 'effect', 'residual [mg]', 'held out [mg]', 'chance')
     rows = [(str(number), step.effect,
              f'{short(step.gap_before_mg)} → {short(step.gap_after_mg)}',
              f'{short(step.held_out_before_mg)} → {short(step.held_out_after_mg)}',
-             chance(step.p_value), ', '.join(step.likely_rivals) or 'none')
-            for number, step in enumerate(result.steps, 1)]
-    return scroll_table('Steps', head, rows, 'whole-but-last')
+             chance(step.p_value)) for number, step in enumerate(result.steps, 1)]
+    return scroll_table('Steps', head, rows)
 
 
 def _story(step: Step) -> str:

@@ -42,6 +42,9 @@ _LABELS = {
     'rate': ('angular rate [rad/s]', 1.0), 'force': ('force along the axis [g]', 1.0)}
 """Label and factor of each variable."""
 
+_PANELS = 3
+"""Largest number of variables in one figure."""
+
 _SPANS = (('h', 3600.0), ('min', 60.0), ('s', 1.0))
 """Units of time [s]; a range of more than three of a unit is drawn in it."""
 
@@ -217,8 +220,10 @@ def of_remainder(residuals: Residuals, prefix: str = 'remaining') -> Iterator[Dr
     if are_spread(residuals.force):
         yield sphere_map(residuals, f'{prefix}_sphere', title, limit, more=', by direction')
     poses_g = residuals.poses_g
-    variables = (recorded(poses_g) or variables_of('quadratic', poses_g, residuals.force))[:3]
-    yield against(residuals, variables, f'{prefix}_variables', title, limit, AFTER)
+    variables = recorded(poses_g) or variables_of('quadratic', poses_g, residuals.force)
+    for k in range(0, len(variables), _PANELS):
+        yield against(residuals, variables[k:k + _PANELS], f'{prefix}_variables{k or ""}', title,
+                      limit, AFTER)
 
 
 def sphere_map(residuals: Residuals, name: str, title: str, limit: float, *, more: str = ''

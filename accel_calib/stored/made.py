@@ -23,7 +23,7 @@ import numpy as np
 
 from ..calibrate import Calibration, in_g, uncertainty_g, with_history
 from ..effects import (
-    AtContext, Context, effect_named, Model, NOMINAL_SUPPLY, REFERENCE_TEMPERATURE)
+    AtContext, Context, effect_named, formula_of, Model, NOMINAL_SUPPLY, REFERENCE_TEMPERATURE)
 from ..geometry import angle_of, OVER_THE_SPHERE, spread_directions
 from ..table import Floats
 from ..units import MG, Units
@@ -323,6 +323,9 @@ def about(calibration: Calibration) -> list[str]:
              f'{quality.rms_after_mg:.3g} mg',
              f'uncertainty of |force|: {uncertainty_g(calibration) * MG:.2g} mg (1 sd, largest '
              'over the sphere)']
+    for name, values in calibration.model.values.items():
+        formula = formula_of(name, values, calibration.deviations).replace('°C', 'degC')
+        lines += [f'formula of {plain_text(part)}' for part in formula.split('; ') if part]
     temperature = poses['temperature'] if 'temperature' in poses else np.zeros(0)
     if np.any(np.isfinite(temperature)):
         lines.append(f'temperature of the poses: {np.nanmin(temperature):.1f} to '

@@ -12,12 +12,15 @@ in C and in Python.
 
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 
 import numpy as np
 
-from ..effects import CARRIERS, curve_unit, empirical_parts, MODES, unit_of, variable_words
+from .catalogue import (
+    CARRIERS, curve_unit, effect_named, EMPIRICAL, empirical_parts, kind_of, unit_of, variable_of,
+    variable_words)
+from .form import MODES
 from ..table import Floats
 from ..units import MG
 
@@ -36,26 +39,29 @@ _Form = tuple[Floats, Callable[[Sequence[float]], str]]
 """The (k, g) functions of a form, and the expression of their k factors."""
 
 
-def formula_of(name: str, values: Floats, spread: Floats) -> str:
+def formula_of(name: str, values: Floats, deviations: Mapping[str, float]) -> str:
     """
-    Return the formula of an empirical curve; empty for one over the direction of the force.
+    Return the formula of an empirical curve; empty for others and over directions of the force.
 
-    `values` (p,) are those of the curve in a model [g, or 1 for a gain], `spread` (p,) their
-    standard deviations. The formula is in mg or mg/g, and readings are in g in its variable.
+    `values` (p,) are those of the curve in a model [g, or 1 for a gain], `deviations` the standard
+    deviations of the parameters of the model. The formula is in mg or mg/g, and readings are in g
+    in its variable.
 
     """
-    carrier, variable, modes = empirical_parts(name)
-    if variable == 'direction':
+    if kind_of(name) != EMPIRICAL or variable_of(name) == 'direction':
         return ''
+    carrier, variable, modes = empirical_parts(name)
+    spread = np.array([deviations.get(f'{name}.{part}', 0.0)
+                       for part in effect_named(name).values])
     whole, _, part = carrier.partition('.')
     names = (part,) if part else CARRIERS[whole]
     low, high = (-1.0, 1.0) if variable == 'force' else values[-2:].tolist()
     share = np.linspace(0.0, 1.0, _COUNT)
     waves = np.cos(np.pi * np.multiply.outer(np.array(modes), share))
-    factors, deviations = (each[:len(names) * len(modes)].reshape(len(modes), len(names)).T * MG
-                           for each in (values, spread))
+    factors, sizes = (each[:len(names) * len(modes)].reshape(len(modes), len(names)).T * MG
+                      for each in (values, spread))
     curves = factors @ waves
-    noise = np.sqrt(np.mean(deviations ** 2 @ waves ** 2, axis=1))
+    noise = np.sqrt(np.mean(sizes ** 2 @ waves ** 2, axis=1))
     most = np.maximum(_EXACT * np.max(np.ptp(curves, axis=1)), 0.5 * noise) + 1e-12
     expression = _of_waves(modes, high - low)
     for group in _forms(share, high - low):
