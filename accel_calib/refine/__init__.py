@@ -16,9 +16,8 @@ of each effect and of its rivals. `steps` describes what was found, `formula` st
 """
 
 from .plan import PlannedPose, PosePlan
-from .refinement import base_words, refine, Refinement, refitted, residual_words, verdict_words
+from .refinement import base_words, refine, Refinement, refitted, verdict_words
 from .steps import chance, shown_name, Stage, Step, times_typical, values_of
 
 __all__ = ['PlannedPose', 'PosePlan', 'Refinement', 'Stage', 'Step', 'base_words', 'chance',
-           'refine', 'refitted', 'residual_words', 'shown_name', 'times_typical', 'values_of',
-           'verdict_words']
+           'refine', 'refitted', 'shown_name', 'times_typical', 'values_of', 'verdict_words']

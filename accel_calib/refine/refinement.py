@@ -39,7 +39,7 @@ from ..estimate import fit_sphere, judge, NotConvergedError, outliers, variance_
 from ..finding import Finding, without as without_kinds
 from ..geometry import unit
 from ..table import check_units, Floats, Poses, Record
-from ..text import counted, short, table
+from ..text import counted, table
 from ..units import BASES, Units
 
 _LEAST_POSES = 4
@@ -174,18 +174,6 @@ def _why_undecided(result: Refinement) -> str:
                 'curve are')
     most = max(result.steps, key=lambda step: len(step.rivals))
     return f'{len(most.rivals)} others explain it about as well as {most.effect}'
-
-
-def residual_words(result: Refinement) -> str:
-    """Return the residual of the base and of the refined model, and the noise floor."""
-    floor = ('not known' if result.noise_floor_mg is None
-             else f'{short(result.noise_floor_mg)} mg')
-    residual = f'{short(result.gap_mg)} mg'
-    if result.steps:
-        residual = f'{short(result.gap_mg)} -> {short(result.remaining_gap_mg)} mg'
-    poses = result.poses_g
-    count = int(np.sum(poses['new'] > 0.0)) if 'new' in poses else len(poses)
-    return f'residual {residual} over {counted(count, "pose")}, noise floor {floor}'
 
 
 def base_words(result: Refinement) -> str:

@@ -125,7 +125,7 @@ class Step:
 
     def odds(self, rival: str) -> str:
         """Return the probability of a rival, and that by the data alone if it differs much."""
-        whole, alone = (each.get(rival, 0.0) for each in (
+        whole, alone = (each.get(rival, LEAST / 10.0) for each in (  # those left out are small
             self.probabilities, self.data_probabilities))
         by_data = f', by the data alone {percent(alone)}' if abs(alone - whole) > _APART else ''
         return f'{percent(whole)}{by_data}'

@@ -34,7 +34,7 @@ from ..errors import AccelCalibError, InputError, RefusedFitError, StoredCalibra
 from ..findings import calibration_json, rate, rate_refinement, Rating, refinement_json
 from ..geometry import angle_of, spread_directions
 from ..pipeline import calibrated, is_partial, is_refined, Plan
-from ..refine import refine, Refinement, residual_words, shown_name, times_typical, verdict_words
+from ..refine import refine, Refinement, shown_name, times_typical, verdict_words
 from ..table import Poses
 from ..text import counted, listed, now, plain
 from ..units import MG, Units
@@ -455,9 +455,8 @@ def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None,
     details += [*calibration.warnings, *refinement.advice]
     if not refinement.refusal:
         details.append(change_words(before, calibration))
-    return Fitted(calibration, f'{rating.name}: {_verdict(refinement)}, '
-                  f'{residual_words(refinement)}', details, rating, refinement,
-                  refusal=refinement.refusal or _refusal(rating))
+    return Fitted(calibration, f'{rating.name}: {_verdict(refinement)}, {rating.figures}', details,
+                  rating, refinement, refusal=refinement.refusal or _refusal(rating))
 
 
 def _verdict(refinement: Refinement) -> str:
