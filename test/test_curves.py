@@ -14,8 +14,8 @@ from accel_calib.refine import refine
 from accel_calib.report import calibration_page
 from accel_calib.units import units_of
 from inside import (
-    beginning, best_curve, fitted_state, format_calibration, Model, parse_calibration, predict,
-    simulate_poses)
+    beginning, best_curve, export, fitted_state, format_calibration, Model, parse_calibration,
+    predict, simulate_poses)
 import numpy as np
 import pytest
 from shared import random_directions, sensor
@@ -225,6 +225,8 @@ def test_a_calibration_with_a_curve_is_stored_and_read_with_all_digits(described
     at = {'temperature': np.array([5.0, 20.0, 28.0, 60.0])}
     reading = np.tile([0.1, 0.2, 0.97], (4, 1))
     np.testing.assert_array_equal(found.correct(reading, at), calibration.correct(reading, at))
+    comment = ' '.join(export(found, 'c').text_or_bytes.replace(' * ', ' ').split())
+    assert described.steps[-1].formula.replace('°C', 'degC') in comment
 
 
 @pytest.mark.parametrize(('form', 'curve'), [

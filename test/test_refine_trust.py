@@ -446,6 +446,7 @@ def test_effects_of_twelve_poses_are_named_and_not_used(seed):
     found = refine(poses, G, base='7')
     assert (len(names(found)), found.verdict) == (1, 'unexplained')
     assert (bool(found.refusal), found.undecided) == (True, True)
+    assert not found.steps[0].parameters_sd
 
 
 def test_samples_of_a_board_that_hardly_turns_give_it_no_absurd_gain():

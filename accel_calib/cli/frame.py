@@ -184,14 +184,13 @@ def _run_one(args: argparse.Namespace) -> int:
 
 def _notes(done: Done, args: argparse.Namespace) -> Iterator[str]:
     """Yield the findings beside the reason of the rating, and the notes; only a few if short."""
-    rating, lines = done.rating, list[str]()
-    if rating is not None:
-        lines = [f'note: {each.text if each.advice == rating.next.text else each.words}'
-                 for each in rating.findings if each.text != rating.reason]
-    lines += done.notes
-    short = len(lines) > _MOST_NOTES and not getattr(args, 'verbose', True)
-    yield from lines[:_MOST_NOTES - 1] if short else lines
-    if short:
+    rating, verbose = done.rating, getattr(args, 'verbose', True)
+    findings = () if rating is None else rating.findings[rating.name != 'GOOD':]
+    lines = [*(f'note: {each.words if verbose else each.text}' for each in findings), *done.notes]
+    if verbose or len(lines) <= _MOST_NOTES:
+        yield from lines
+    else:
+        yield from lines[:_MOST_NOTES - 1]
         yield f'{len(lines) - _MOST_NOTES + 1} more lines with --verbose'
 
 

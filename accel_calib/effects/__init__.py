@@ -5,8 +5,8 @@
 Effects: what each adds to the reading, and its properties.
 
 `form` defines what an effect is, `catalogue` lists those with a known cause and makes curves
-without one, `own` adds those of a user, and `model` computes with a list of them. `simulate` makes
-poses and recordings.
+without one, which `formula` states for a paper or for firmware. `own` adds those of a user, and
+`model` computes with a list of them. `simulate` makes poses and recordings.
 
 An effect is one entry in `EFFECTS`. Simulation, fit, correction, search, report and documentation
 read it from there, so an effect that is added here works in all of them. Its contribution to the

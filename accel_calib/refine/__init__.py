@@ -10,8 +10,8 @@ the catalogue as columns of its equations. `linear` scores sets of these columns
 `beam` searches for the best sets near a model, `settle` repeats this and the fit in turn until
 each effect is sound, and `search` is the whole method. `curves` contains causes without a known
 form: a random walk of the offset, and an empirical curve; beside them it computes the probability
-of each effect and of its rivals. `steps` describes what was found, `formula` states curves, and
-`plan` chooses the poses that separate effects from their rivals.
+of each effect and of its rivals. `steps` describes what was found, and `plan` chooses the poses
+that separate effects from their rivals.
 
 """
 

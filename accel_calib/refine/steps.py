@@ -80,8 +80,8 @@ class Step:
     parameters : dict
         Values by name. For a change of a stored calibration: the changes of the values.
     parameters_sd : dict
-        Their standard deviations, of those that are fitted; empty in a refused refinement, because
-        so few poses choose the wrong model more often than deviations state.
+        Their standard deviations, of those that are fitted; empty in a refused refinement, in
+        which they do not hold.
     gap_before_mg, gap_after_mg : float
         Residual without and with the effect [mg].
     held_out_before_mg, held_out_after_mg : float

@@ -17,6 +17,7 @@ the poses.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -311,7 +312,7 @@ def unit_in_ascii(units: Units, native: str) -> str:
 
 
 def about(calibration: Calibration) -> list[str]:
-    """Return lines about a calibration for a comment: sensor, date, unit, model, quality."""
+    """Return lines about a calibration for a comment: sensor, date, unit, model, curves, quality."""
     quality, poses, units = calibration.quality, calibration.used_poses, calibration.units
     lines = [f'sensor: {plain_text(calibration.sensor) or "not named"}',
              f'date: {plain_text(calibration.date) or "not known"}',
@@ -325,7 +326,7 @@ def about(calibration: Calibration) -> list[str]:
              'over the sphere)']
     for name, values in calibration.model.values.items():
         formula = formula_of(name, values, calibration.deviations).replace('°C', 'degC')
-        lines += [f'formula of {plain_text(part)}' for part in formula.split('; ') if part]
+        lines += map(plain_text, wrap(f'formula of {formula}', _LARGEST_TEXT) if formula else ())
     temperature = poses['temperature'] if 'temperature' in poses else np.zeros(0)
     if np.any(np.isfinite(temperature)):
         lines.append(f'temperature of the poses: {np.nanmin(temperature):.1f} to '
