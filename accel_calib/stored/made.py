@@ -312,7 +312,7 @@ def unit_in_ascii(units: Units, native: str) -> str:
 
 
 def about(calibration: Calibration) -> list[str]:
-    """Return lines about a calibration for a comment: sensor, date, unit, model, curves, quality."""
+    """Return lines about a calibration for a comment: sensor, unit, model, curves, quality."""
     quality, poses, units = calibration.quality, calibration.used_poses, calibration.units
     lines = [f'sensor: {plain_text(calibration.sensor) or "not named"}',
              f'date: {plain_text(calibration.date) or "not known"}',
