@@ -29,8 +29,8 @@ from accel_calib.logs import LogOptions
 from accel_calib.stored import read_calibration
 from accel_calib.table import Floats
 from inside import (
-    announce, CLOCK_OF_A_SOURCE, COMMAND, HEAD_OF_A_PORT, is_port, open_source, PATIENCE_OF_A_PORT,
-    read_log)
+    announce, CLOCK_OF_A_SOURCE, COMMAND, HEAD_OF_A_PORT, interval_of_lines, is_port, open_source,
+    PATIENCE_OF_A_PORT, read_log)
 from live_bench import TurnedSensor
 import numpy as np
 import pytest
@@ -157,6 +157,12 @@ def test_a_rate_is_measured_also_if_lines_are_late_or_follow_a_boot(
         found = samples(source.blocks, 450)
     assert '(measured)' in source.read_as
     assert np.mean(np.diff(found[:, 0])) == pytest.approx(1.0 / RATE_HZ, rel=0.1)
+
+
+def test_a_backlog_of_many_short_reads_does_not_change_the_rate() -> None:
+    backlog = [(k, 0.6 + 1e-4 * k) for k in range(2, 121)]
+    later = [(20 * k, 0.1 * k) for k in range(7, 27)]
+    assert interval_of_lines([(1, 0.0), *backlog, *later]) == pytest.approx(0.005, rel=0.01)
 
 
 def test_bytes_at_another_baud_rate_are_refused_with_that_advice(

@@ -227,7 +227,8 @@ def _understood(name: str, lines: Iterator[list[str]], options: LogOptions, baud
         head += new
         if new:
             arrived.append((len(head), now))
-        if now - tried >= _HEAD_S and len(head) >= _HEAD_LINES and len(arrived) > 1:
+        if now - tried >= _HEAD_S and len(head) >= _HEAD_LINES and (
+                arrived[-1][1] - arrived[0][1] > _WAIT_S):
             tried = now
             try:
                 return LineReader(name, head, _interval(arrived), options)
@@ -241,14 +242,15 @@ def _understood(name: str, lines: Iterator[list[str]], options: LogOptions, baud
 
 def _interval(arrived: list[tuple[int, float]]) -> float:
     """
-    Return the time from line to line [s], from the number of lines at two or more times [s].
+    Return the time from line to line [s], from the number of lines at times [s].
 
     It is the median of the slopes between times half of the list apart (Theil 1950), which neither
-    a backlog at the start nor lines that are late at the end change much.
+    a backlog at the start nor lines that are late at the end change much. Of the times within
+    each `_WAIT_S` the last one counts, because a backlog can take many short reads.
 
     """
-    count, seconds = np.array(arrived).T
-    half = len(arrived) // 2
+    count, seconds = np.array([*{int(at / _WAIT_S): (n, at) for n, at in arrived}.values()]).T
+    half = len(count) // 2
     return float(np.median((seconds[half:] - seconds[:-half]) / (count[half:] - count[:-half])))
 
 
