@@ -27,9 +27,11 @@ from .calibrate import (
     fit_with_fleet, flat_direction, FleetPrior, level, level_by_rows, lies_in_cone, PRIOR,
     SampleContext, thermal_alone, with_curve, without_curve)
 from .capture import (
-    capture, Captured, cells_of, is_turned_over, LEAST_RANGE, Ramp, ramp_of, settings_from)
+    capture, Captured, CaptureSettings, cells_of, is_turned_over, LEAST_RANGE, Ramp, ramp_of,
+    REASONS, settings_from)
 from .effects import Context, LADDER, Model, PROCESSES
 from .errors import InputError, RefusedFitError, saying
+from .finding import Finding
 from .findings import rate, Rating
 from .geometry import unit
 from .logs import Frame, LogOptions, open_log, OpenLog, Piped, Progress
@@ -58,7 +60,8 @@ class Intake:
     Poses of a table or captured from a recording, with the unit of their readings.
 
     `read_as` is how the log was read, empty if nothing was assumed. `notes` are what was left out
-    of the log, and `captured` how the poses were captured, if they were.
+    of the log, and `captured` how the poses were captured, if they were. `findings` are about the
+    samples and the rests of a recording.
 
     """
 
@@ -67,11 +70,13 @@ class Intake:
     read_as: str = ''
     notes: tuple[str, ...] = ()
     captured: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
     @property
     def said(self) -> str:
         """Return how the log was read and captured, in one line, for an error about it."""
-        return ', '.join(filter(None, (self.read_as, *self.captured)))
+        return ', '.join(filter(None, (self.read_as, *self.captured,
+                                       *(each.text for each in self.findings))))
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -151,19 +156,73 @@ def _opened(source: Source, options: LogOptions) -> Iterator[OpenLog]:
 def _captured(source: Source, log: OpenLog, options: LogOptions, settings: Mapping[str, Any],
               progress: Progress) -> tuple[Intake, Captured]:
     """Capture the poses of an open log; InputError without a still stretch."""
-    found = capture(log.watched(progress), log.units, settings_from(settings, log.units))
-    count = len(found.poses)
+    asked = settings_from(settings, log.units)
+    found = capture(log.watched(progress), log.units, asked)
+    _check_measured(found, log.units)
+    count, findings = len(found.poses), _account_of(found, asked, log.units)
     limit, more = _wider(source, found, log.units, options, settings) if count < _FEW else (0.0, 0)
     finds = f'{more} with still_std_max {limit:.3g}'
     if not count:
         name = 'the recording' if isinstance(source, Recording) else str(source)
-        raise _nothing_still(name, found, log.units, settings, finds if more else '')
+        raise _nothing_still(name, found, log.units, asked, findings, finds if more else '')
     lines = [f'captured {counted(count, "pose")} from {counted(found.recorded, "sample")} in '
              f'{found.seconds:.0f} s']
     if more >= 2 * count:
         lines.append(f'{counted(count, "pose")} only, {finds}')
     return Intake(replace(found.poses, units=log.units.name), log.units, log.read_as, log.notes,
-                  tuple(lines)), found
+                  tuple(lines), findings), found
+
+
+_REMEDIES = {
+    'short': 'hold the sensor still for longer in each pose, or capture shorter rests with '
+             '--min-dwell {seconds:.2g}',
+    'limit': 'choose a larger range of the sensor, and record again',
+    'shaking': 'put the sensor on something that does not shake, or accept it with '
+               '--still-std-max',
+    'slope': 'let go of the sensor, and wait until it has settled',
+    'turning': 'let go of the sensor in each pose',
+    'noisy': 'hold the sensor still three times as long in each pose',
+    'length': 'check the unit, or accept them with a wider --still-norm-tolerance',
+    'zeros': 'check the driver and the cable',
+    'frozen': 'check the driver and the cable',
+    'repeated': 'turn the sensor to other orientations, or use --repeated keep'}
+"""What to do about most rests that are no poses, by the reason."""
+
+
+_ONE_LENGTH = 1e-3
+"""Range of the lengths of samples below which they are computed, relative to their length."""
+
+
+def _check_measured(found: Captured, units: Units) -> None:
+    """Refuse samples that all have the same length while the sensor turns."""
+    low, high = found.lengths
+    if high - low < _ONE_LENGTH * high and not _is_one_direction(found.poses):
+        raise InputError(
+            f'the readings have the same length of {short(high)} {units.name} in all directions, '
+            f'to {short(100.0 * (high - low) / high)} %: they are computed, as the gravity of a '
+            'phone is, and not measured; expected readings of an accelerometer',
+            'record the accelerometer itself, with gravity')
+
+
+def _account_of(found: Captured, asked: CaptureSettings, units: Units) -> tuple[Finding, ...]:
+    """Return what was left out of a recording, and why most rests are no poses, if so."""
+    of_reason: dict[str, list[float]] = {}
+    for each in found.rests:
+        of_reason.setdefault(each.reason, []).append(each.end - each.start)
+    missing = [Finding('missing', f'{sum(of_reason[kind]):.3g} s are left out: {REASONS[kind]}',
+                       _REMEDIES[kind]) for kind in ('zeros', 'frozen') if kind in of_reason]
+    dropped = {reason: lengths for reason, lengths in of_reason.items()
+               if reason not in ('', 'zeros', 'frozen', 'repeated')}
+    count, every = sum(map(len, dropped.values())), len(of_reason.get('', ()))
+    if count <= every and 'limit' not in dropped:
+        return tuple(missing)
+    most = max(dropped, key=lambda reason: (count <= every and reason == 'limit',
+                                            len(dropped[reason])))
+    seconds = min(0.9 * float(np.median(dropped[most])), 0.8 * asked.min_dwell)
+    limit = f', at {short(found.limit)} {units.name}' if most == 'limit' else ''
+    return (*missing, Finding(
+        'not_taken', f'{len(dropped[most])} of {counted(count + every, "rest")} are no poses: '
+        f'{REASONS[most]}{limit}', _REMEDIES[most].format(seconds=seconds), 'USABLE', step='record'))
 
 
 def _wider(source: Source, found: Captured, units: Units, options: LogOptions,
@@ -180,19 +239,21 @@ def _wider(source: Source, found: Captured, units: Units, options: LogOptions,
     return tried
 
 
-def _nothing_still(source: str, found: Captured, units: Units, settings: Mapping[str, Any],
-                   finds: str) -> InputError:
-    """Return the error for a recording without a still stretch."""
-    asked = settings_from(settings, units)
-    numbers = (f': in its quietest {asked.still_window:g} s the standard deviation is '
-               f'{found.quietest:.2g} {units.name}, the limit is {found.threshold:.2g} for at '
-               f'least {asked.min_dwell:g} s'
-               if math.isfinite(found.quietest) else '')
-    tried = (f'; {finds} (wide limits make poses inaccurate)' if finds else
-             '; a wider limit (still_std_max) finds none either')
-    return InputError(f'{source} has no still stretch in {counted(found.recorded, "sample")}'
-                      f'{numbers}; expected at least one', 'hold the sensor still in each pose '
-                      f'for some seconds{tried}')
+def _nothing_still(source: str, found: Captured, units: Units, asked: CaptureSettings,
+                   findings: Sequence[Finding], finds: str) -> InputError:
+    """Return the error for a recording without a still stretch, with the reason if rests have."""
+    what = f'{source} has no still stretch in {counted(found.recorded, "sample")}'
+    tried = f'{finds} (wide limits make poses inaccurate)' if finds else ''
+    if findings:
+        return InputError(f'{what}: {"; ".join(each.text for each in findings)}; expected at '
+                          'least one', '; '.join(filter(None, (findings[-1].advice, tried))))
+    if math.isfinite(found.quietest):
+        limit = (f', the limit is {found.threshold:.2g}' if math.isfinite(found.threshold)
+                 else '')
+        what += (f': in its quietest {asked.still_window:g} s the standard deviation is '
+                 f'{found.quietest:.2g} {units.name}{limit} for at least {asked.min_dwell:g} s')
+    return InputError(f'{what}; expected at least one', 'hold the sensor still in each pose for '
+                      f'some seconds; {tried or "a wider limit (still_std_max) finds none either"}')
 
 
 @dataclass(frozen=True)
@@ -421,7 +482,9 @@ def calibrated_log(source: Source, options: LogOptions, found: Intake, plan: Pla
             if high - low >= LEAST_RANGE:
                 return thermally_calibrated([
                     RampIntake(ramp_of(cells), log.units, log.read_as, log.notes)], plan)
-    return calibrated(found.poses, found.units, plan)
+    outcome = calibrated(found.poses, found.units, plan)
+    made = outcome.calibration
+    return replace(outcome, calibration=replace(made, noted=(*made.noted, *found.findings)))
 
 
 def thermally_calibrated(logs: Sequence[Intake | RampIntake], plan: Plan = Plan()

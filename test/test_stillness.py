@@ -92,6 +92,54 @@ def test_all_poses_are_found_and_no_others(sensor, seed):
     assert_all_found(captured(time, reading), truth)
 
 
+def reasons(result: Captured) -> list[str]:
+    return [each.reason for each in result.rests]
+
+
+@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('place', [0.0, 0.5, 1.0])
+@pytest.mark.parametrize('what', ['zeros', 'frozen'])
+def test_missing_samples_are_no_rest_and_hide_no_other(what, place, seed):
+    _, reading, truth = turned(seed, dwell=(2.5, 4.0))
+    moving = int(100.0 * (truth[3][1] + truth[4][0]) / 2.0)
+    at = {0.0: 0, 0.5: moving, 1.0: len(reading)}[place]
+    held = reading[min(at, len(reading) - 1)] * (what == 'frozen')
+    reading = np.insert(reading, at, np.tile(held, (200, 1)), axis=0)
+    result = captured(np.arange(len(reading)) / 100.0, reading)
+    assert reasons(result).count('') == len(result.poses) == len(truth)
+    left = [each.end - each.start for each in result.rests if each.reason == what]
+    assert sum(left) == pytest.approx(2.0, abs=0.3)
+    assert result.threshold == pytest.approx(captured(*turned(seed)[:2]).threshold, rel=0.15)
+
+
+@pytest.mark.parametrize('ratio', [0.1, 0.2, 0.4, 0.8])
+@pytest.mark.parametrize('seed', range(3))
+def test_a_coarse_sensor_that_repeats_its_readings_misses_none(ratio, seed):
+    time, reading, truth = turned(seed, step=2e-3 / ratio, dwell=(2.0, 5.0))
+    result = captured(time, reading)
+    assert_all_found(result, truth)
+    assert not {'zeros', 'frozen'} & {*reasons(result)}
+
+
+@pytest.mark.parametrize(('gain', 'offset'), [
+    ((1.0, 1.0, 1.0), (0.35, -0.4, 0.3)), ((2.0, 1.0, 1.0), (0.0, 0.0, 0.0)),
+    ((0.6, 1.0, 1.4), (0.2, 0.1, -0.3))])
+def test_rests_of_a_sensor_with_large_errors_are_poses_and_those_of_no_gravity_are_not(
+        gain, offset):
+    time, reading, truth = turned(4, poses=14)
+    start, end, _ = truth[6]
+    reading[(time > start) & (time < end)] *= 1.5  # as in a turn of a vehicle
+    result = captured(time, reading * gain + offset)
+    assert reasons(result) == [*[''] * 6, 'length', *[''] * 7]
+
+
+@pytest.mark.parametrize(('reason', 'changes'), [
+    ('short', {'dwell': (0.85, 1.0)}), ('noisy', {'noise': 0.05, 'dwell': (1.5, 2.0)})])
+def test_each_rest_that_is_no_pose_has_its_reason(reason, changes):
+    time, reading, truth = turned(8, **changes)
+    assert reasons(captured(time, reading)).count(reason) > len(truth) / 2
+
+
 def test_a_sensor_sampled_every_ten_seconds_is_captured():
     time, reading = still(3, 4000.0, rate=0.1, noise=7e-5)
     reading[200:] += [0.3, -0.2, -0.05]
@@ -277,7 +325,8 @@ def test_a_dwell_that_is_not_still_according_to_later_ones_is_doubtful():
     first, held = still(8, 5.0)
     held = held + 0.01 * np.sin(2.0 * np.pi * 8.3 * first + 0.3)[:, np.newaxis]
     reading = np.concatenate([held, [[0.0, 0.0, 3.0]] * 100, reading])
-    start, = pushed(rows(np.arange(len(reading)) / 100.0, reading)).doubtful()
+    start, = (each.start for each in pushed(rows(
+        np.arange(len(reading)) / 100.0, reading)).judged() if each.reason)
     assert start < 1.0
 
 

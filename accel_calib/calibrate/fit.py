@@ -35,6 +35,7 @@ from .pose_planning import (
     determines, dilution, free_parameters, LARGEST_DILUTION, NORM_MODELS, poses_needed,
     refuse_if_unfit, unseen, WEAK_DILUTION)
 from .quality import finished, fit_findings, in_g, LARGEST_OFFSET_G, record_of, rival_findings
+from ..capture import check_axes
 from ..effects import EFFECTS, length_rows, linear_model, Model, MODELS, sensor_force, with_vector
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import (
@@ -104,6 +105,7 @@ def fit_poses(poses: Poses, units: Units, *, model: str = 'auto', method: Method
                          f'{MODEL_NAMES} and one of {METHODS}')
     check_units(poses, units)
     sound, rejected = sound_rows(poses, units)
+    check_axes(sound.reading, units)
     if rejected and method == 'algebraic':
         raise RefusedFitError(f'row {rejected[0].row}: {rejected[0].reason}, but the method '
                               'algebraic uses every row', 'remove the row, or use the method ml')

@@ -323,14 +323,23 @@ def _in_sensor_axes(calibration: Calibration, reading: Floats, context: Context 
     return sensor_force(calibration.model, reading_g, calibration.held_context(context))[0]
 
 
+_LEANS_DEGREES = 10.0
+"""Angle of a flat pose from the nearest side of the sensor above which it may not be level."""
+
+
 def doubts_about_flat(rotation: Floats, frame: str) -> Iterator[Finding]:
-    """Yield a finding if the ΔR of a flat pose indicates a wiring fault."""
+    """Yield a finding if the ΔR of a flat pose indicates a wiring fault, or if the pose leans."""
     expected = flat_direction(frame)
     force = rotation @ expected
-    if force @ expected >= _UPRIGHT:
-        return
     face = int(np.argmax(np.abs(force)))
     seen = f'{"-" if force[face] < 0.0 else "+"}{AXES[face]}'
+    lean = math.degrees(math.acos(min(abs(force[face]), 1.0)))
+    if lean > _LEANS_DEGREES:
+        yield Finding('flat_pose', f'the flat pose leans {lean:.1f}° from the side {seen} of the '
+                      'sensor: the sensor is mounted at this angle, or the robot was not level',
+                      'if it was not level, level the mounting again')
+    if force @ expected >= _UPRIGHT:
+        return
     if face == 2:
         causes = 'it is mounted upside down, or z (or every axis) has the wrong sign'
         advice = 'if it is not upside down, correct the sign, because a rotation does not'

@@ -45,8 +45,11 @@ under a fit of the others is only their noise, enlarged ten thousand times."""
 LARGEST_OFFSET_G = 1.0
 """Largest zero-g offset of a working accelerometer [g]; not checked for native units."""
 
-GAINS = (0.5, 2.0)
+GAINS = (0.4, 2.5)
 """Smallest and largest gain of a working accelerometer, relative to the scale of its units."""
+
+_MOST_UNUSUAL = 1e5
+"""Largest value of an effect, relative to that of common sensors."""
 
 LARGEST_RESIDUAL_G = 0.05
 """Largest residual of poses on one ellipsoid [g]."""
@@ -364,6 +367,10 @@ def _check_effects(calibration: Calibration) -> None:
         up = unit(used_g.reading)
         along = model.at({'previous': up, **used_g.columns}).reading(up)
         added = float(np.max(np.linalg.norm(along - up, axis=1)))
+        size = float(np.max(np.abs(effect.split(values)[0]))) / effect.typical
+        if not size < _MOST_UNUSUAL:
+            raise RefusedFitError(f'{name} is {size:.1g} times as large as in common sensors, '
+                                  f'expected less than {_MOST_UNUSUAL:.0e} times', _CHECK_POSES)
         if not added <= effect.plausible_g:
             raise RefusedFitError(f'{name} adds up to {added:.3g} g to a reading, expected less '
                                   f'than {effect.plausible_g:g} g', _CHECK_POSES)

@@ -13,10 +13,12 @@ stretches of a still board whose temperature changes.
 
 from .chunks import CaptureSettings, CONTEXT, REPEATED, Repeated, settings_from
 from .detector import capture, Captured, poses_from, samples_of, select, StillDetector
-from .dwell import Dwell
+from .dwell import Dwell, REASONS, Rest
 from .ramp import cells_of, FASTEST, is_turned_over, LEAST_RANGE, Ramp, ramp_of
 from .rule import rounding_left
+from .sensor import check_axes
 
-__all__ = ['CONTEXT', 'FASTEST', 'LEAST_RANGE', 'REPEATED', 'Captured', 'CaptureSettings',
-           'Dwell', 'Ramp', 'Repeated', 'StillDetector', 'capture', 'cells_of', 'is_turned_over',
-           'poses_from', 'ramp_of', 'rounding_left', 'samples_of', 'select', 'settings_from']
+__all__ = ['CONTEXT', 'CaptureSettings', 'Captured', 'Dwell', 'FASTEST', 'LEAST_RANGE', 'REASONS',
+           'REPEATED', 'Ramp', 'Repeated', 'Rest', 'StillDetector', 'capture', 'cells_of', 'check_axes',
+           'is_turned_over', 'poses_from', 'ramp_of', 'rounding_left', 'samples_of', 'select',
+           'settings_from']

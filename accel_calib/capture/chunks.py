@@ -143,6 +143,8 @@ def sums_type(columns: int) -> np.dtype[Any]:
         ('first', float, 6),                # of reading and rate, relative to the origin
         ('second', float, 6),               # of their squares
         ('at_limit', float, 3),             # samples that repeat the extreme of the axis so far
+        ('repeats', float),                 # samples that repeat the one before in the chunk
+        ('zeros', float),                   # samples that are zero on all axes
         ('context_count', float, (columns,)),  # samples that have the context
         ('context_sum', float, (columns,))])
 
@@ -186,9 +188,15 @@ def sums_of(samples: Floats, starts: Indices, epoch: float, origin: Floats, kind
 
     """
     sums = blank(kind, len(starts))
-    sums['context_count'] = sums['context_sum'] = sums['at_limit'] = 0.0
+    for name in ('context_count', 'context_sum', 'at_limit', 'repeats', 'zeros'):
+        sums[name] = 0.0
     if not len(starts):
         return sums
+    reading = samples[1:4]
+    same = np.append(False, np.all(reading[:, 1:] == reading[:, :-1], axis=0))
+    same[starts] = False
+    sums['repeats'] = np.add.reduceat(same.astype(float), starts)
+    sums['zeros'] = np.add.reduceat((~reading.any(axis=0)).astype(float), starts)
     sums['count'] = np.diff(starts, append=samples.shape[1])
     sums['time'] = np.add.reduceat(samples[0] - epoch, starts)
     values = min(len(samples), MOTION) - 1

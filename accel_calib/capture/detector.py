@@ -15,6 +15,7 @@ is moved outwards by this distance.
 
 """
 
+from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -25,15 +26,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .chunks import (
-    CaptureSettings, chained, Chunker, CONTEXT, Interruption, MOTION, Records, together)
-from .dwell import Dwell, figures, figures_type, judged, OngoingDwell, Tracker
-from .rule import Rule
+    CaptureSettings, chained, Chunker, CHUNKS_PER_WINDOW, CONTEXT, Interruption, MOTION, Records,
+    together)
+from .dwell import Dwell, figures, figures_type, judged, OngoingDwell, Rest, Tracker
+from .rule import MISSING, Rule
 from ..errors import InputError
 from ..table import ABOUT, Floats, numbered, Poses, Recording
 from ..units import Units
 
 _BLOCK = 1 << 14     # samples summed at a time; they fit in the cache
 _AT_ONCE = 1 << 17   # samples passed to the detector at a time
+
+_MISSING_MAX = 10_000
 
 _EARLIER = 100
 """Number of earlier dwells that are used in the test of a new dwell."""
@@ -60,6 +64,7 @@ class StillDetector:
         self.still = False
         self._mean = np.full(6, np.nan)
         self._number = 0
+        self._missing: deque[Rest] = deque(maxlen=_MISSING_MAX)
 
     def push(self, samples: Floats) -> list[Dwell]:
         """
@@ -106,12 +111,16 @@ class StillDetector:
 
     def dwells(self) -> list[Dwell]:
         """Return the kept dwells that are still according to the noise known now."""
-        return [each for each in self._judged() if each is not None]
+        return [each for each in self.judged() if not each.reason]
 
-    def doubtful(self) -> set[float]:
-        """Return the starts of the kept dwells that are not still with the noise known now."""
-        return {float(start) for start, each in zip(self._kept['begin'], self._judged())
-                if each is None}
+    def judged(self) -> list[Dwell]:
+        """Return the kept dwells with the reason why they are no poses with the noise now."""
+        return judged(self._kept, self._rule, self._context) if len(self._kept) else []
+
+    @property
+    def missing(self) -> tuple[Rest, ...]:
+        """Return the most recent times of zeros and of frozen readings, at most 10,000."""
+        return tuple(self._missing)
 
     @property
     def threshold(self) -> float:
@@ -144,6 +153,7 @@ class StillDetector:
             verdict = self._rule.feed(chunks)
             if self._tracker is None:
                 self._tracker = Tracker(self._settings, self._rule, chunks, self._number)
+            self._miss(verdict, chunks.length)
             found += self._tracker.feed(verdict)
             self.still = bool(verdict['still'][-1])
             self._mean = chunks.origin
@@ -161,15 +171,14 @@ class StillDetector:
         return found
 
     def _keep(self, found: list[OngoingDwell]) -> int:
-        """Store the figures of these dwells, and return their number."""
+        """Store the figures of these dwells, and return their number; all for a recording."""
+        if self._most is not None:
+            found = [each for each in found if not each.short]
         if found:
             new = figures(found, known_units=self._rule.known)
             every = chained(self._kept, new)
             self._kept = every if self._most is None else every[-self._most:]
         return len(found)
-
-    def _judged(self) -> list[Dwell | None]:
-        return judged(self._kept, self._rule, self._context) if len(self._kept) else []
 
     def _last(self, count: int) -> list[Dwell]:
         """Return the last dwells that are still, tested together with earlier dwells."""
@@ -182,7 +191,20 @@ class StillDetector:
         earlier = earlier[-_EARLIER:]
         table = chained(earlier, found)
         return [each for each in judged(table, self._rule, self._context, len(earlier))
-                if each is not None]
+                if not each.reason]
+
+    def _miss(self, verdict: Records, length: float) -> None:
+        """Note the chunks of zeros, and the windows of one reading."""
+        for each in verdict[verdict['missing'] > 0]:
+            kind, begin = MISSING[each['missing']], float(each['begin'])
+            if kind == 'frozen':
+                begin -= (CHUNKS_PER_WINDOW - 1) * length
+            elif not each['sums']['zeros']:
+                continue
+            last = self._missing[-1] if self._missing else None
+            if last is not None and last.reason == kind and begin <= last.end + length:
+                begin = self._missing.pop().start
+            self._missing.append(Rest(begin, float(each['end']), kind))
 
 
 def _columns(samples: Floats) -> Floats:
@@ -200,7 +222,9 @@ class Captured:
     `samples` and `recorded` are the numbers of samples in the poses, and in the recording.
     `threshold` is the standard deviation below which a window is still, at the end, and `quietest`
     that of the quietest window, each of the axis with the largest one [unit of the readings].
-    `seconds` is the duration of the recording without interruptions [s].
+    `seconds` is the duration of the recording without interruptions [s]. `rests` is the account of
+    every rest, in order of time. `limit` is the largest reading of those at a limit of the sensor,
+    0 without one. `lengths` are the smallest and the largest |reading| of all samples.
 
     """
 
@@ -211,6 +235,9 @@ class Captured:
     interruptions: tuple[Interruption, ...]
     recorded: int
     quietest: float
+    rests: tuple[Rest, ...]
+    limit: float
+    lengths: tuple[float, float]
 
 
 def capture(recording: Recording | Iterable[Recording], units: Units,
@@ -238,22 +265,32 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
     first = next(parts, None)
     context = CONTEXT if first is None else (*CONTEXT, *first.quantities)
     detector = StillDetector(settings, units, keep=None, context=context)
-    times, recorded = list[float](), 0
+    times, recorded, shortest, longest = list[float](), 0, np.inf, 0.0
     about: dict[str, Any] = {}
     for part in parts if first is None else chain((first,), parts):
         detector.add_recording(part)
         if len(part):
             times = [*times[:1], float(part['time'][0]), float(part['time'][-1])]
             recorded += len(part)
+            size = np.linalg.norm(part.reading, axis=1)
+            shortest = min(shortest, float(np.min(size, initial=np.inf, where=size > 0.0)))
+            longest = max(longest, float(size.max()))
             about = {name: getattr(part, name) for name in ABOUT}
     detector.close()
-    dwells = select(detector.dwells(), settings, units)
+    every = detector.judged()
+    dwells = select([each for each in every if not each.reason], settings, units)
+    taken = {each.start for each in dwells}
+    rests = [each.rest if each.reason or each.start in taken else each.rest._replace(
+        reason='repeated') for each in every]
     interruptions = detector.interruptions
     seconds = times[-1] - times[0] if times else 0.0
     poses = replace(poses_from(dwells, settings), **about)
     return Captured(poses, sum(each.samples for each in dwells),
                     detector.threshold, seconds - sum(each.seconds for each in interruptions),
-                    interruptions, recorded, detector.quietest)
+                    interruptions, recorded, detector.quietest,
+                    tuple(sorted((*rests, *detector.missing))),
+                    max((float(np.max(np.abs(each.mean))) for each in every
+                         if each.reason == 'limit'), default=0.0), (shortest, longest))
 
 
 def samples_of(recording: Recording, start: int, stop: int, context: Sequence[str] = CONTEXT

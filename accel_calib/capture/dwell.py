@@ -48,14 +48,14 @@ from collections.abc import Mapping, Sequence
 import copy
 from dataclasses import dataclass, field
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .chunks import (
     CaptureSettings, chained, Chunks, CHUNKS_PER_WINDOW, Records, summed, sums_type, window_type)
-from .rule import DWELL_SLOPE_G, HORIZON, judged_type, Rule, STRENGTH, WEAK_STRENGTH
+from .rule import DWELL_SLOPE_G, HORIZON, judged_type, RELATIVE, Rule, STRENGTH, WEAK_STRENGTH
 from .trend import excess_of_means, Line, lines_through, strength_of, Trend
 from ..table import Floats
 
@@ -73,6 +73,8 @@ _FIGURES = [
     ('excess', float),        # variance of the mean over that of independent samples
     ('along', float),         # the same along the mean reading, if that is the vertical
     ('beside_slope', bool),   # the reading has a slope directly before or after
+    ('short', bool),          # shorter than `min_dwell`
+    ('at_limit', float),      # share of samples that repeat the extreme of an axis so far
     ('orientation', np.intp),
     ('part_slope', float, 3), ('part_strength', float, 3)]  # first, middle and last half
 """Means and variances in the unit of the readings, slopes per cell, `part_slope` per second."""
@@ -98,10 +100,11 @@ def figures(dwells: Sequence[OngoingDwell], *, known_units: bool) -> Records:
     spread = np.sqrt((1.0 + np.maximum(found['excess'], 1.0)) / total['count'])
     found['lowest'] = level * np.exp(-2.0 * spread)[:, np.newaxis]
     found['average'] = level
-    for name in ('begin', 'end', 'orientation', 'beside_slope'):
+    for name in ('begin', 'end', 'orientation', 'beside_slope', 'short'):
         found[name] = [getattr(dwell, name) for dwell in dwells]
     found['time'] = [dwell.epoch for dwell in dwells] + total['time'] / total['count']
     found['samples'] = total['count']
+    found['at_limit'] = total['at_limit'].max(axis=1) / total['count']
     known = total['context_count']
     found['around'] = np.where(known > 0.0, total['context_sum'], np.nan) / np.maximum(known, 1.0)
     return found
@@ -168,6 +171,31 @@ PART_SLOPE_G = 5e-3
 PART_STRENGTH = 20.0
 """This slope is significant if the sum of its squared scores is larger: p ≈ 2e-4."""
 
+REASONS = {
+    'zeros': 'samples are missing: they are 0 on all axes',
+    'frozen': 'samples are missing: the last reading is repeated, though no other rest repeats it',
+    'limit': 'it is at the limit of the sensor, where its readings end',
+    'short': 'it is shorter than min_dwell',
+    'shaking': 'it varies more than the noise of the sensor',
+    'slope': 'the reading changes during it',
+    'turning': 'the gyro turns during it',
+    'noisy': 'its noise does not exclude a slow turn',
+    'length': 'its |a| is not that of gravity',
+    'repeated': 'it repeats an earlier orientation'}
+"""Why a rest is no pose."""
+
+
+class Rest(NamedTuple):
+    """A rest from its first to its last stamp [s]; `reason` is one of `REASONS`, '' for a pose."""
+
+    start: float
+    end: float
+    reason: str = ''
+
+
+_AT_LIMIT = 0.2
+"""Share of samples that repeat the extreme of an axis above which a rest is at a limit."""
+
 _OWN_EXCESS = 1.5   # factor of uncertainty of the excess of one dwell
 _BIAS_DWELLS = 5    # fewest dwells that determine the bias of the gyro
 _GYRO_RATE = np.radians(0.25)
@@ -199,6 +227,8 @@ class Dwell:
         Whether the sensor may have moved, according to later dwells.
     rate_std : (3,) array
         White noise of one sample of the angular rate [rad/s]; NaN without a rate.
+    reason : str
+        Why it is no pose, one of `REASONS`; empty for a pose.
 
     """
 
@@ -213,27 +243,42 @@ class Dwell:
     orientation: int
     doubtful: bool = False
     rate_std: Floats = field(default_factory=lambda: np.full(3, np.nan))
+    reason: str = ''
+
+    @property
+    def rest(self) -> Rest:
+        return Rest(self.start, self.end, self.reason)
 
 
-def judged(table: Records, rule: Rule, context: Sequence[str], first: int = 0
-           ) -> list[Dwell | None]:
+def judged(table: Records, rule: Rule, context: Sequence[str], first: int = 0) -> list[Dwell]:
     """
-    Return each dwell from `first` on, or None if it is not still according to the noise known now.
+    Return each dwell from `first` on, with the reason why it is no pose with the noise known now.
 
     All dwells of the table of `figures` are used. `context` names its columns of context.
 
     """
-    slopes = trend_of(table)
-    quiet = _quiet(table, slopes, rule)
+    slopes, means = trend_of(table), table['mean'][:, :3]
+    frozen = np.zeros(len(table), bool) if rule.repeats else np.all(
+        table['std'] <= RELATIVE * np.linalg.norm(means, axis=1)[:, np.newaxis], axis=1)
+    limit = rule.limit_of(rule.noise_of(table['mean'].T), DWELL_RATIO, DWELL_RATE_RATIO)
+    reasons = {'short': table['short'], 'frozen': frozen,
+               'limit': (table['at_limit'] > _AT_LIMIT) & (not rule.repeats),
+               'shaking': np.any(limit < table['lowest'].T, axis=0),
+               'slope': _sloping(table, slopes, rule)}
+    quiet = ~np.any(list(reasons.values()), axis=0)
     across, along = (_excess(table[name], quiet) for name in ('excess', 'along'))
     excess = np.minimum(across, along)
     turned, sure = _by_gyro(table, quiet, rule)
-    good = quiet & ~turned & (sure | rule.rests(slopes, across))
+    reasons |= {'turning': turned, 'noisy': ~sure & ~rule.rests(slopes, across)}
+    good = ~np.any(list(reasons.values()), axis=0)
+    reasons['length'] = np.zeros(len(table), bool)
+    reasons['length'][good] = ~rule.reads_gravity(means[good])
     level = table['average'][quiet, :3].sum(axis=0) / (1.0 + quiet.sum())
     std, count = _counts(table[first:], excess[first:], level, rule)
     rate_std = np.maximum(np.sqrt(table['average'][first:, 3:]), rule.rate_resolution)
-    return [_dwell(context, *each) if fine else None for fine, *each in zip(
-        good[first:], table[first:], std.T.copy(), count.tolist(), rate_std)]
+    reason = np.select(list(reasons.values()), list(reasons), '')[first:].tolist()
+    return [_dwell(context, *each) for each in zip(
+        table[first:], std.T.copy(), count.tolist(), rate_std, reason, strict=True)]
 
 
 def _excess(own: Floats, quiet: NDArray[np.bool_]) -> Floats:
@@ -242,16 +287,14 @@ def _excess(own: Floats, quiet: NDArray[np.bool_]) -> Floats:
     return np.asarray(np.maximum(max(1.0, common), own / _OWN_EXCESS))
 
 
-def _quiet(table: Records, slopes: Trend, rule: Rule) -> NDArray[np.bool_]:
-    """Return which dwells are still according to the noise known now, and have no slope."""
-    limit = rule.limit_of(rule.noise_of(table['mean'].T), DWELL_RATIO, DWELL_RATE_RATIO)
+def _sloping(table: Records, slopes: Trend, rule: Rule) -> NDArray[np.bool_]:
+    """Return which dwells have a slope."""
     strength = np.where(table['beside_slope'], WEAK_STRENGTH, STRENGTH)
     moved = rule.moved(slopes, np.asarray(rule.scale), table['average'].T[:3], strength,
                        DWELL_SLOPE_G)
     turned = np.any((table['part_slope'] > PART_SLOPE_G * rule.scale)
                     & (table['part_strength'] > PART_STRENGTH), axis=1)
-    moved |= turned & (rule.scale > 0.0)
-    return np.asarray(~moved & ~np.any(limit < table['lowest'].T, axis=0))
+    return np.asarray(moved | (turned & (rule.scale > 0.0)))
 
 
 def _by_gyro(table: Records, quiet: NDArray[np.bool_], rule: Rule
@@ -284,8 +327,8 @@ def _counts(table: Records, excess: Floats, level: Floats, rule: Rule) -> tuple[
     return std, np.asarray(np.sum(std**2, axis=0) / np.sum(variance, axis=0))
 
 
-def _dwell(context: Sequence[str], found: Any, std: Floats, count: float, rate_std: Floats
-           ) -> Dwell:
+def _dwell(context: Sequence[str], found: Any, std: Floats, count: float, rate_std: Floats,
+           reason: str) -> Dwell:
     known: dict[str, float | Floats] = {
         name: value for name, value in zip(context, found['around'].tolist(), strict=True)
         if math.isfinite(value)}
@@ -294,7 +337,7 @@ def _dwell(context: Sequence[str], found: Any, std: Floats, count: float, rate_s
         known['rate'] = mean[3:]
     return Dwell(float(found['begin']), float(found['end']), float(found['time']), mean[:3], std,
                  count, int(found['samples']), known, int(found['orientation']),
-                 rate_std=rate_std)
+                 rate_std=rate_std, reason=reason)
 
 
 CELLS = 256
@@ -309,7 +352,8 @@ class OngoingDwell:
     The accumulated chunks of a dwell.
 
     `begin` and `end` are the first and last stamp [s], and `cells` the sums over `size` chunks
-    each. `beside_slope`: the reading has a slope directly before or after the dwell.
+    each. `beside_slope`: the reading has a slope directly before or after the dwell. `short`: it is
+    shorter than `min_dwell`.
 
     """
 
@@ -321,7 +365,7 @@ class OngoingDwell:
         self.size = 1
         self.begin = self.end = 0.0
         self.chunks = 0
-        self.beside_slope = False
+        self.beside_slope = self.short = False
         self.orientation = orientation
 
     def add(self, chunks: Records) -> None:
@@ -366,6 +410,9 @@ class OngoingDwell:
 _SAMPLES = 16
 """Smallest number of samples in a dwell."""
 
+_LEAST_REST = 0.5
+"""Length of a rest that is no pose but counts as one, relative to the shortest dwell."""
+
 KNOCK = CHUNKS_PER_WINDOW + 3
 """Largest number of disturbed windows within a dwell: a knock of about 4 chunks."""
 
@@ -409,7 +456,8 @@ class Tracker:
         twin = copy.copy(self)
         twin._dwell = copy.copy(self._dwell)
         twin._decide(last=True)
-        return twin._finished()
+        found = twin._finished()
+        return None if found is None or found.short else found
 
     def _decide(self, last: bool) -> list[OngoingDwell]:
         waiting = self._waiting
@@ -470,9 +518,11 @@ class Tracker:
         return [] if found is None else [found]
 
     def _finished(self) -> OngoingDwell | None:
-        if self._dwell is None or self._dwell.chunks < self._shortest:
+        least = self._shortest * (1.0 if self._longest else _LEAST_REST)  # no ends of split rests
+        if self._dwell is None or self._dwell.chunks < least:
             return None
         self._dwell.beside_slope = self._beside_slope
+        self._dwell.short = self._dwell.chunks < self._shortest
         return self._dwell
 
 
@@ -487,6 +537,9 @@ def _verdict(chunks: Records, last: bool) -> NDArray[np.bool_]:
         due = np.minimum(due, size - 1)
     count = int(np.searchsorted(due, size))
     due, ended = due[:count], ended[:count]
+    missing = np.append(chunks['missing'] > 0, np.zeros(CHUNKS_PER_WINDOW, bool))
+    beside = np.lib.stride_tricks.sliding_window_view(missing, CHUNKS_PER_WINDOW)[:count]
     over = np.any(chunks['sums']['level'][:count] > chunks['limit'][due], axis=1)
     slope = np.append(chunks['trending'], 0)[np.minimum(ended, size)]
-    return np.asarray(still[:count] & ~over & ~(ended - index[:count] < slope))
+    return np.asarray(still[:count] & ~over & ~(ended - index[:count] < slope)
+                      & ~beside.any(axis=1))

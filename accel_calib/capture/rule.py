@@ -50,8 +50,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .chunks import blank, CaptureSettings, chained, Chunks, Records, window_type
-from .trend import columns_of, oscillation, Stretch, stretch, Trend, windows
+from .chunks import (
+    blank, CaptureSettings, chained, Chunks, CHUNKS_PER_WINDOW, Records, window_type)
+from .trend import (
+    Columns, columns_of, oscillation, sliding_max, sliding_sum, Stretch, stretch, Trend, windows)
 from ..table import Floats
 from ..units import Units
 
@@ -119,6 +121,27 @@ STD_FLOOR_G = 3.3e-4
 AT_LIMIT = 0.1
 """Share of samples at a limit above which a variance is too small by a sixth or more."""
 
+MISSING = ('', 'zeros', 'frozen')
+"""What stands in a log where samples are missing: zeros, or the last reading again and again."""
+
+VARIED_STEPS = 0.7
+"""Standard deviation of a rest [steps] above which no noise repeats a reading for a window."""
+
+PLAUSIBLE_G = (0.25, 3.0)
+"""Range of |a| of a rest of a sensor that is not calibrated [g]."""
+
+FEWEST_IN_COMMON, LEAST_IN_COMMON, LEAST_SPREAD = 9, 0.7, 0.03
+"""Fewest rests, smallest share of them, and smallest ratio of the singular values that determine
+what rests have in common."""
+
+AGREE_G = 0.03
+"""Largest RMS difference of the lengths of rests that have an ellipsoid in common [g]."""
+
+LARGEST_OFFSET_G = 1.5
+
+WHITE = 4.0
+"""Largest excess of a stretch whose scatter is noise rather than a motion."""
+
 
 def judged_type(sums: np.dtype[Any]) -> np.dtype[Any]:
     """Return the type of a chunk with the verdict on the window that ends with it."""
@@ -127,6 +150,7 @@ def judged_type(sums: np.dtype[Any]) -> np.dtype[Any]:
         ('begin', float), ('end', float),
         ('limit', float, 6),          # largest level of a still window; infinite without a rate
         ('still', bool),              # the verdict
+        ('missing', np.intp),         # place in `MISSING` of what stands for readings; 0: none
         ('trending', np.intp)])       # chunks over which the reading has a slope or oscillates; 0
 
 
@@ -158,7 +182,8 @@ class Rule:
         self._highest = np.full(3, -np.inf)
         self._axes = 3
         self._before: Records = np.empty(0)  # the first chunks are fresh
-        self._floor = np.full(6, np.inf)
+        self._floors = np.full((2, 6), np.inf)  # of stretches without equal samples, of all
+        self._varied = 0
         self._step = np.full(2, np.inf)
         self.quietest = math.inf
 
@@ -167,6 +192,16 @@ class Rule:
         """Return the reading of 1 g; for native units half the range at rest, 0 if not known."""
         return self._per_g if self.known else float(_half_range(
             self._lowest, self._highest, self._floor[:3]))
+
+    @property
+    def repeats(self) -> bool:
+        """Return whether a rest can repeat one reading, as that of a coarse sensor does."""
+        return self._varied < CHUNKS_PER_WINDOW
+
+    @property
+    def _floor(self) -> Floats:
+        """Return the (6,) smallest variances of a stretch so far."""
+        return np.asarray(self._floors[int(self.repeats)])
 
     def noise_of(self, mean: Floats) -> Floats:
         """Return the variance of the noise of the sensor as known now, for (6, n) means."""
@@ -218,17 +253,26 @@ class Rule:
             self._axes = 6
         size, columns = len(chunks.sums), columns_of(sums, self._axes)
         mean, level = windows(columns)
-        mean = mean[:, -size:] + chunks.origin[:self._axes, np.newaxis]
-        recent = level[:, -size:]
-        self.quietest = float(np.fmin.reduce(recent[:3].max(axis=0), initial=self.quietest))
+        mean += chunks.origin[:self._axes, np.newaxis]
+        zero, equal = windows_without_readings(columns, mean[:3], level[:3])
+        mean, recent = mean[:, -size:], level[:, -size:]
         seen = {length: stretch(columns, level, length, size, chunks.length)
                 for length in SLOPE_CHUNKS}
-        noise = self._learn(seen[LONG], mean, chunks.step)
-        scale = self._scales(mean, np.all(recent <= self.limit_of(noise), axis=0), noise)
+        noise, varied = self._learn(seen[LONG], mean, chunks.step, *(
+            sliding_max(each, LONG - CHUNKS_PER_WINDOW + 1)[-size:] > 0.0
+            for each in (zero, zero + equal)))
+        kind = np.where(zero[-size:] > 0.0, 1, np.where((equal[-size:] > 0.0) & varied, 2, 0))
+        missing = kind > 0
+        self.quietest = float(np.fmin.reduce(
+            recent[:3].max(axis=0)[~missing], initial=self.quietest))
+        scale = self._scales(
+            mean, ~missing & np.all(recent <= self.limit_of(noise), axis=0), noise)
         limit = self.limit_of(at_least_any(noise, scale))
         judged = judged_chunks(chunks, recent, limit)
+        judged['missing'] = kind
         judged['trending'] = self._trending(seen, mean, limit, scale)
-        judged['still'] = self._quiet(mean, recent, limit) & (judged['trending'] == 0)
+        judged['still'] = (self._quiet(mean, recent, limit) & (judged['trending'] == 0)
+                           & ~missing)
         return judged
 
     def moved(self, found: Trend, scale: Floats, variance: Floats,
@@ -251,6 +295,23 @@ class Rule:
         size = np.sqrt(np.sum(found.slope**2, axis=0)) + SURE * found.error * np.sqrt(excess)
         return np.asarray((size < TURN_G * self.scale) | (self.scale == 0.0))
 
+    def reads_gravity(self, means: Floats) -> NDArray[np.bool_]:
+        """
+        Return whether the (n, 3) means of rests are of 1 g within the tolerance.
+
+        An offset and the gains by axis are common to all rests: once these determine them, they do
+        not count as a difference. Before, the differences that a sensor can have are allowed.
+
+        """
+        if not self.known:
+            return np.ones(len(means), bool)
+        tolerance = self._settings.still_norm_tolerance
+        lengths = common_lengths(means / self._per_g)
+        if lengths is None:
+            length = np.linalg.norm(means, axis=1) / self._per_g
+            return np.asarray((length > PLAUSIBLE_G[0]) & (length < PLAUSIBLE_G[1]))
+        return np.asarray(np.abs(lengths - 1.0) <= tolerance)
+
     def _trending(self, seen: Mapping[int, Stretch], mean: Floats, limit: Floats, scale: Floats
                   ) -> NDArray[np.intp]:
         trending = np.zeros(mean.shape[1], dtype=np.intp)
@@ -272,9 +333,6 @@ class Rule:
         quiet = np.all(level[:3] <= limit[:3], axis=0)
         if len(level) > 3:
             quiet &= ~np.any(level[3:] > limit[3:], axis=0)
-        if self.known:
-            norm = np.sqrt(np.sum(mean[:3]**2, axis=0)) / self._per_g
-            quiet &= np.abs(norm - 1.0) <= self._settings.still_norm_tolerance
         if self._settings.still_gyro_max > 0.0 and len(mean) > 3:
             quiet &= ~(np.sum(mean[3:]**2, axis=0) > self._settings.still_gyro_max**2)
         return np.asarray(quiet)
@@ -288,16 +346,59 @@ class Rule:
         self._lowest, self._highest = low[:, -1], high[:, -1]
         return _half_range(low, high, noise[:3])
 
-    def _learn(self, seen: Stretch, mean: Floats, step: Floats) -> Floats:
+    def _learn(self, seen: Stretch, mean: Floats, step: Floats, zero: NDArray[np.bool_],
+               repeated: NDArray[np.bool_]) -> tuple[Floats, NDArray[np.bool_]]:
+        """
+        Return the variance of the noise at each chunk, and whether its rests vary by more than
+        rounding.
+
+        `zero` and `repeated` are stretches with samples of zeros, and these or equal ones.
+
+        """
         axes = len(mean)
         dof = np.maximum(2.0 * seen.samples / (1.0 + seen.excess), 1.0)
         average = seen.variance * np.repeat(np.exp(2.0 * np.sqrt(2.0 / dof)), 3, axis=0)
         steps = np.minimum.accumulate(np.column_stack([self._step, step]), axis=1)[:, 1:]
         average[:3][clipped(average, seen.at_limit, steps, mean)] = np.nan
-        average[:, 0] = np.fmin(average[:, 0], self._floor[:axes])
-        floor = np.fmin.accumulate(average, axis=1)
-        self._floor[:axes], self._step = floor[:, -1], steps[:, -1]
-        return at_least(floor, steps, mean)
+        floors = np.where([repeated[np.newaxis], zero[np.newaxis]], np.nan, average)
+        floors[:, :, 0] = np.fmin(floors[:, :, 0], self._floors[:, :axes])
+        floors = np.fmin.accumulate(floors, axis=2)
+        deviation = np.sqrt(np.max(seen.variance[:3], axis=0))
+        varies = (deviation > VARIED_STEPS * steps[0]) & (seen.trend.excess < WHITE) & ~repeated
+        varies &= ~self.moved(seen.trend, np.asarray(self.scale), seen.variance[:3])
+        if self.known:
+            varies &= deviation < STD_CAP_G * self._per_g
+        count = self._varied + np.cumsum(varies)
+        self._floors[:, :axes], self._step = floors[:, :, -1], steps[:, -1]
+        self._varied = int(count[-1])
+        varied = count >= CHUNKS_PER_WINDOW
+        return at_least(np.where(varied, *floors), steps, mean), varied
+
+
+def common_lengths(means_g: Floats) -> Floats | None:
+    """
+    Return the (n,) lengths of (n, 3) rests relative to the ellipsoid that they have in common [g].
+
+    It has its axes along those of the sensor: Σ a x² + b x = 1. Rests are left out, that which
+    decreases the sum of squares most first, until the others agree. None if they do not, do not
+    determine it, or if it is not that of a sensor.
+
+    """
+    columns, kept = np.hstack([means_g**2, means_g]), np.arange(len(means_g))
+    while len(kept) >= max(FEWEST_IN_COMMON, LEAST_IN_COMMON * len(means_g)):
+        onto, sizes, turn = np.linalg.svd(columns[kept], full_matrices=False)
+        values = (onto.sum(axis=0) / np.maximum(sizes, 1e-300)) @ turn
+        if sizes[-1] < LEAST_SPREAD * sizes[0] or np.any(values[:3] <= 0.0):
+            return None
+        centre = -values[3:] / (2.0 * values[:3])
+        radius = np.sqrt((1.0 + np.sum(values[:3] * centre**2)) / values[:3])
+        lengths = np.linalg.norm((means_g - centre) / radius, axis=1)
+        if np.sqrt(np.mean((lengths[kept] - 1.0)**2)) < AGREE_G:
+            return lengths if np.all(np.abs(centre) < LARGEST_OFFSET_G) else None
+        left = columns[kept] @ values - 1.0
+        own = np.maximum(1.0 - np.sum(onto**2, axis=1), 1e-9)
+        kept = np.delete(kept, np.argmax(left**2 / own))
+    return None
 
 
 def _half_range(low: Floats, high: Floats, noise: Floats) -> Floats:
@@ -307,6 +408,20 @@ def _half_range(low: Floats, high: Floats, noise: Floats) -> Floats:
         turned = half >= np.maximum(TURNED * 0.5 * np.linalg.norm(low + high, axis=0),
                                     TURNED_NOISE * np.sqrt(np.max(noise, axis=0)))
     return np.where(turned, half, 0.0)
+
+
+def windows_without_readings(sums: Columns, mean: Floats, level: Floats
+                             ) -> tuple[Floats, Floats]:
+    """
+    Return the (n,) windows that have samples of zeros, and those of one repeated reading, as 1.
+
+    `mean` and `level` are the (3, n) mean and variance of the windows.
+
+    """
+    zero = sliding_max(sums.zeros, CHUNKS_PER_WINDOW)
+    equal = ((sliding_sum(sums.constant, CHUNKS_PER_WINDOW) == CHUNKS_PER_WINDOW)
+             & np.all(level <= _tiny(mean), axis=0))
+    return zero, equal.astype(float)
 
 
 def at_least(floor: Floats, step: Floats, mean: Floats) -> Floats:

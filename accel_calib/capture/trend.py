@@ -264,18 +264,27 @@ _DIGITS = 1e-14
 
 @dataclass(frozen=True)
 class Columns:
-    """Sums of n chunks as contiguous arrays, (axes, n) of reading and rate."""
+    """
+    Sums of n chunks as contiguous arrays, (axes, n) of reading and rate.
+
+    `constant` (n,) is 1 for chunks whose samples are equal, and `zeros` for those with zeros.
+
+    """
 
     count: Floats
     first: Floats
     second: Floats
     at_limit: Floats
+    constant: Floats
+    zeros: Floats
 
 
 def columns_of(sums: Records, axes: int) -> Columns:
     """Return the sums of n chunks for the reading (3 axes), or reading and rate (6)."""
     first, second = (np.ascontiguousarray(sums[name].T[:axes]) for name in ('first', 'second'))
-    return Columns(sums['count'].copy(), first, second, np.ascontiguousarray(sums['at_limit'].T))
+    count = sums['count'].copy()
+    return Columns(count, first, second, np.ascontiguousarray(sums['at_limit'].T),
+                   (sums['repeats'] == count - 1.0).astype(float), (sums['zeros'] > 0.0).astype(float))
 
 
 def windows(sums: Columns) -> tuple[Floats, Floats]:

@@ -16,7 +16,7 @@ from .frame import (
     check_target, Done, given, log_options, read_lines, settings, stored_calibration, Target)
 from .output import Output, progress
 from ..calibrate import Calibration
-from ..capture import Captured
+from ..capture import Captured, REASONS
 from ..disk import STANDARD_OUTPUT, write_atomically
 from ..effects import parse_effect
 from ..errors import InputError
@@ -37,9 +37,13 @@ def run_capture(args: argparse.Namespace) -> Done:
         'poses': len(captured.poses), 'samples': captured.recorded,
         'samples_in_poses': captured.samples,
         'threshold': captured.threshold, 'seconds': captured.seconds,
+        'rests': [{'start': each.start, 'end': each.end, 'taken': not each.reason,
+                   'reason': REASONS.get(each.reason, '')} for each in captured.rests],
+        'findings': [each.stated for each in found.findings],
         'interruptions': [item._asdict() for item in captured.interruptions],
         'read_lines': replace(found, captured=found.captured[1:]).lines},
-        [*found.lines, *_interruptions(captured)], stored=[args.output])
+        [*found.lines, *(f'note: {each.words}' for each in found.findings),
+         *_interruptions(captured)], stored=[args.output])
 
 
 def _interruptions(captured: Captured) -> Iterator[str]:

@@ -335,7 +335,7 @@ class LiveCapture:
         if threshold > _NOISE_FELL * self._judged_at:
             return 0
         self._judged_at = threshold
-        return self.book.doubt(self.detector.doubtful())
+        return self.book.doubt({each.start for each in self.detector.judged() if each.reason})
 
 
 def _pieces(samples: Floats) -> list[Floats]:

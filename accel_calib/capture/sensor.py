@@ -1,0 +1,77 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Whether numbers can be those of an accelerometer that was turned.
+
+A fit supposes three axes that each read their part of gravity. If they do not, the poses lie in a
+plane, and more poses do not help. The plane of poses that were turned about one axis alone is cut
+from the sphere of gravity, so that they lie on a circle. If they lie in a plane and on no circle,
+an axis does not measure. The normal of the plane names it: along one axis, that axis is stuck;
+halfway between two, one of them is a copy of the other.
+
+"""
+
+import numpy as np
+
+from ..effects import AXES
+from ..errors import InputError
+from ..table import Floats
+from ..text import short
+from ..units import Units
+
+_FEWEST = 6
+"""Fewest readings that determine a circle and check it."""
+
+_FLAT = 0.02
+"""Largest ratio of the scatter across a plane to the scatter in it."""
+
+_OFF_CIRCLE = 0.05
+"""Smallest RMS distance from a circle, relative to its radius, that is on no circle."""
+
+_ALONG = 0.98
+"""Smallest part of the normal of the plane along the direction that names a fault."""
+
+
+def check_axes(reading: Floats, units: Units) -> None:
+    """
+    Raise InputError if (n, 3) readings at rest show an axis that is stuck or a copy of another.
+
+    Parameters
+    ----------
+    reading : (n, 3) array
+        Means of rests in many orientations, in the unit of the readings.
+    units : Units
+        Unit of the readings, for the message.
+
+    """
+    if len(reading) < _FEWEST:
+        return
+    middle = np.mean(reading, axis=0)
+    _, sizes, turn = np.linalg.svd(reading - middle, full_matrices=False)
+    if sizes[2] > _FLAT * sizes[1] or _is_circle((reading - middle) @ turn[:2].T):
+        return
+    normal = np.abs(turn[2])
+    largest = int(np.argmax(normal))
+    if normal[largest] > _ALONG:
+        what = (f'the {AXES[largest]} axis reads {short(middle[largest])} {units.name} in each of '
+                f'{len(reading)} orientations: it does not measure')
+    elif (1.0 - np.min(normal)**2) > _ALONG and np.ptp(np.sort(normal)[1:]) < 1.0 - _ALONG:
+        one, other = (AXES[k] for k in np.sort(np.argsort(normal)[1:]))
+        what = (f'the axes {one} and {other} read the same in each of {len(reading)} '
+                'orientations: one is a copy of the other')
+    else:
+        return
+    raise InputError(f'{what}, expected three axes that each read their part of gravity',
+                     'check the wiring, the driver and the columns of the log')
+
+
+def _is_circle(flat: Floats) -> bool:
+    """Return whether (n, 2) points lie on a circle."""
+    columns = np.column_stack([flat, np.ones(len(flat))])
+    square = np.sum(flat**2, axis=1)
+    values = np.linalg.lstsq(columns, square, rcond=None)[0]
+    centre = values[:2] / 2.0
+    radius = float(np.sqrt(max(values[2] + centre @ centre, 1e-300)))
+    off = np.linalg.norm(flat - centre, axis=1) - radius
+    return bool(np.sqrt(np.mean(off**2)) < _OFF_CIRCLE * radius)
