@@ -222,7 +222,8 @@ def _account_of(found: Captured, asked: CaptureSettings, units: Units) -> tuple[
     limit = f', at {short(found.limit)} {units.name}' if most == 'limit' else ''
     return (*missing, Finding(
         'not_taken', f'{len(dropped[most])} of {counted(count + every, "rest")} are no poses: '
-        f'{REASONS[most]}{limit}', _REMEDIES[most].format(seconds=seconds), 'USABLE', step='record'))
+        f'{REASONS[most]}{limit}', _REMEDIES[most].format(seconds=seconds), 'USABLE',
+        step='record'))
 
 
 def _wider(source: Source, found: Captured, units: Units, options: LogOptions,
@@ -243,17 +244,18 @@ def _nothing_still(source: str, found: Captured, units: Units, asked: CaptureSet
                    findings: Sequence[Finding], finds: str) -> InputError:
     """Return the error for a recording without a still stretch, with the reason if rests have."""
     what = f'{source} has no still stretch in {counted(found.recorded, "sample")}'
-    tried = f'{finds} (wide limits make poses inaccurate)' if finds else ''
+    tried = (f'{finds} (wide limits make poses inaccurate)' if finds else
+             'a wider limit (still_std_max) finds none either')
     if findings:
         return InputError(f'{what}: {"; ".join(each.text for each in findings)}; expected at '
-                          'least one', '; '.join(filter(None, (findings[-1].advice, tried))))
+                          'least one', f'{findings[-1].advice}; {tried}')
     if math.isfinite(found.quietest):
         limit = (f', the limit is {found.threshold:.2g}' if math.isfinite(found.threshold)
                  else '')
         what += (f': in its quietest {asked.still_window:g} s the standard deviation is '
                  f'{found.quietest:.2g} {units.name}{limit} for at least {asked.min_dwell:g} s')
-    return InputError(f'{what}; expected at least one', 'hold the sensor still in each pose for '
-                      f'some seconds; {tried or "a wider limit (still_std_max) finds none either"}')
+    return InputError(f'{what}; expected at least one',
+                      f'hold the sensor still in each pose for some seconds; {tried}')
 
 
 @dataclass(frozen=True)

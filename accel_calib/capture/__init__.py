@@ -19,6 +19,6 @@ from .rule import rounding_left
 from .sensor import check_axes
 
 __all__ = ['CONTEXT', 'CaptureSettings', 'Captured', 'Dwell', 'FASTEST', 'LEAST_RANGE', 'REASONS',
-           'REPEATED', 'Ramp', 'Repeated', 'Rest', 'StillDetector', 'capture', 'cells_of', 'check_axes',
-           'is_turned_over', 'poses_from', 'ramp_of', 'rounding_left', 'samples_of', 'select',
-           'settings_from']
+           'REPEATED', 'Ramp', 'Repeated', 'Rest', 'StillDetector', 'capture', 'cells_of',
+           'check_axes', 'is_turned_over', 'poses_from', 'ramp_of', 'rounding_left', 'samples_of',
+           'select', 'settings_from']

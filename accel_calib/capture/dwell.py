@@ -352,8 +352,8 @@ class OngoingDwell:
     The accumulated chunks of a dwell.
 
     `begin` and `end` are the first and last stamp [s], and `cells` the sums over `size` chunks
-    each. `beside_slope`: the reading has a slope directly before or after the dwell. `short`: it is
-    shorter than `min_dwell`.
+    each. `beside_slope`: the reading has a slope directly before or after the dwell. `short`: it
+    is shorter than `min_dwell`.
 
     """
 

@@ -349,8 +349,7 @@ class Rule:
     def _learn(self, seen: Stretch, mean: Floats, step: Floats, zero: NDArray[np.bool_],
                repeated: NDArray[np.bool_]) -> tuple[Floats, NDArray[np.bool_]]:
         """
-        Return the variance of the noise at each chunk, and whether its rests vary by more than
-        rounding.
+        Return the variance of the noise at each chunk, and whether rests vary beyond rounding.
 
         `zero` and `repeated` are stretches with samples of zeros, and these or equal ones.
 
@@ -372,7 +371,7 @@ class Rule:
         self._floors[:, :axes], self._step = floors[:, :, -1], steps[:, -1]
         self._varied = int(count[-1])
         varied = count >= CHUNKS_PER_WINDOW
-        return at_least(np.where(varied, *floors), steps, mean), varied
+        return at_least(np.where(varied, floors[0], floors[1]), steps, mean), varied
 
 
 def common_lengths(means_g: Floats) -> Floats | None:

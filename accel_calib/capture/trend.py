@@ -284,7 +284,8 @@ def columns_of(sums: Records, axes: int) -> Columns:
     first, second = (np.ascontiguousarray(sums[name].T[:axes]) for name in ('first', 'second'))
     count = sums['count'].copy()
     return Columns(count, first, second, np.ascontiguousarray(sums['at_limit'].T),
-                   (sums['repeats'] == count - 1.0).astype(float), (sums['zeros'] > 0.0).astype(float))
+                   (sums['repeats'] == count - 1.0).astype(float),
+                   (sums['zeros'] > 0.0).astype(float))
 
 
 def windows(sums: Columns) -> tuple[Floats, Floats]:
