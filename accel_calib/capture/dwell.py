@@ -518,7 +518,9 @@ class Tracker:
         return [] if found is None else [found]
 
     def _finished(self) -> OngoingDwell | None:
-        least = self._shortest * (1.0 if self._longest else _LEAST_REST)  # no ends of split rests
+        least = min(max(_LEAST_REST * self._shortest, CHUNKS_PER_WINDOW), self._shortest)
+        if self._longest:  # the end of a rest that was split is no rest
+            least = self._shortest
         if self._dwell is None or self._dwell.chunks < least:
             return None
         self._dwell.beside_slope = self._beside_slope

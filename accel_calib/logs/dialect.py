@@ -71,9 +71,10 @@ EPOCH_S = (1e9, 4e9)
 """Unix times from 2001 to 2096 [s]."""
 
 _CLOCK = re.compile(
-    r'(?:(\d{4}[-/]\d{1,2}[-/]\d{1,2}|\d{1,2}-[A-Za-z]{3}-\d{4}|\d{1,2}\.\d{1,2}\.\d{4})[T ])?'
-    r'(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,:](\d+))?)? ?(Z|UTC|[-+]\d{2}(?::?\d{2})?)?', re.ASCII)
-_DAYS = ('%Y-%m-%d', '%d-%b-%Y', '%d.%m.%Y')
+    r'(?:(\d{4}[-/]\d{1,2}[-/]\d{1,2}|\d{1,2}-[A-Za-z]{3}-\d{4}|\d{1,2}[./]\d{1,2}[./]\d{4})'
+    r',?[T ])?(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,:](\d+))?)? ?([AaPp]\.?[Mm]\.?)? ?'
+    r'(Z|UTC|[-+]\d{2}(?::?\d{2})?)?', re.ASCII)
+_DAYS = ('%Y-%m-%d', '%d-%b-%Y', '%d.%m.%Y', '%m-%d-%Y', '%d-%m-%Y')
 
 IsHeader = Callable[[Sequence[str]], bool]
 
@@ -187,12 +188,14 @@ def _seconds(text: str) -> float | None:
     match = _CLOCK.fullmatch(text)
     if match is None:
         return None
-    date, hour, minute, second, digits, zone = match.groups()
-    day = _day(date) if date else 0.0
-    if day is None or not (int(hour) < 24 and int(minute) < 60 and int(second or 0) <= 60):
+    date, hours, minute, second, digits, half, zone = match.groups()
+    day, hour = _day(date) if date else 0.0, int(hours)
+    if half and 1 <= hour <= 12:
+        hour = hour % 12 + 12 * (half[0] in 'Pp')
+    if day is None or not (hour < 24 and int(minute) < 60 and int(second or 0) <= 60):
         return None
     fraction = float(f'0.{digits}') if digits else 0.0
-    whole = day + int(hour) * 3600.0 + int(minute) * 60.0 + int(second or 0)
+    whole = day + hour * 3600.0 + int(minute) * 60.0 + int(second or 0)
     return whole - _offset(zone) + fraction  # all in s
 
 

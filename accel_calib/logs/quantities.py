@@ -58,6 +58,12 @@ _SMALL = 0.5
 _FACTOR = 1.4
 """Largest factor between the readings at rest and 1 g in their unit."""
 
+_BITS = (10, 12, 13, 14, 16, 18, 20, 24, 32)
+_NEAR_TOP, _MIDDLE, _IN_MIDDLE, _SMOOTHER = 0.9, 0.1, 0.02, 0.5
+"""Bits of numbers that can lose their sign; smallest largest number, and half of the empty middle,
+relative to the range; largest share of numbers in it; largest ratio of the steps with the sign to
+those without."""
+
 _MG = (1000.0 / 1.3, 1012.0)
 """Range of whole numbers at rest that are mg; 1024 counts per g begin above it."""
 
@@ -89,6 +95,14 @@ _LIKELY_RATE_DEG = 3000.0
 _LARGEST_RATE = 40.0
 """Angular rates [rad/s] above those of common gyros, 2000 °/s."""
 
+_SCATTER_AT_REST = 0.03
+"""Largest scatter of readings at rest, relative to 1 g."""
+
+_LARGEST_BIAS = math.radians(12.0)
+_GYRO_NOISE = (math.radians(0.004), math.radians(2.0))
+"""Largest bias of a gyro [rad/s], and range of the noise of one of its samples: of parts from
+tactical grade to the cheapest."""
+
 _LIKELY_TEMPERATURE_C = (-60.0, 150.0)
 
 
@@ -99,7 +113,8 @@ class Quantities:
 
     `clock` converts the times; `rate_hz` is the rate of samples without times. `scales` are the
     factor to our unit and our value at 0, by column. `instance` is the number of the sensor whose
-    rows are read, where rows of several alternate. `said` is what is assumed, and `notes` what is
+    rows are read, where rows of several alternate. `modulus` is 2ⁿ for columns whose numbers of n
+    bits lost their sign. `said` is what is assumed, and `notes` what is
     not used.
 
     """
@@ -110,6 +125,7 @@ class Quantities:
     scales: dict[str, tuple[float, float]] = field(default_factory=dict)
     instance: float | None = None
     rate_hz: float | None = None
+    modulus: dict[str, float] = field(default_factory=dict)
     said: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -156,6 +172,8 @@ class Quantities:
 
     def _scaled(self, cells: Cells, ours: str) -> Floats:
         values = self.chosen.numbers(cells, ours)
+        if ours in self.modulus:
+            values = with_sign(values, self.modulus[ours])
         factor, zero = self.scales.get(ours, (1.0, 0.0))
         return values if (factor, zero) == (1.0, 0.0) else values * factor + zero
 
@@ -182,6 +200,13 @@ def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
     samples = _decide_samples(made, first, options)
     if 'time' in columns.sources and (samples or columns.sources['time'].name != 'time'):
         made.said.append(made.clock.words)
+    for keys in (READING, RATE):
+        if columns.sources.keys() >= set(keys) and (modulus := modulus_of(
+                columns.three(first, keys))):
+            made.modulus |= dict.fromkeys(keys, modulus)
+            made.notes.append(f'{compact(columns.names(keys))} are numbers of '
+                              f'{round(math.log2(modulus))} bits that lost their sign: they are '
+                              'read with it')
     _decide_reading(made, first, options, samples=samples)
     _decide_rate(made, first)
     _decide_temperature(made, first)
@@ -189,6 +214,31 @@ def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
         _convert_if_stated(made, 'supply_voltage', 'V')
     made.notes += unused(columns.layout, columns.sources)
     return made
+
+
+def modulus_of(values: Floats) -> float:
+    """
+    Return 2ⁿ if (n, 3) numbers of n bits lost their sign, else 0.
+
+    Numbers below zero are then near the upper end of the range, hardly any are in its middle, and
+    successive samples jump from one end to the other.
+
+    """
+    largest = float(np.max(values, initial=0.0))
+    bits = next((each for each in _BITS if largest < 2.0**each), 0)
+    if not bits or np.any(values < 0.0) or np.any(values != np.round(values)):
+        return 0.0
+    modulus = 2.0**bits
+    apart = np.abs(values / modulus - 0.5)
+    jumps = np.abs(np.diff(values, axis=0)).sum()
+    steps = np.abs(np.diff(with_sign(values, modulus), axis=0)).sum()
+    empty = largest > _NEAR_TOP * modulus and np.mean(apart < _MIDDLE) < _IN_MIDDLE
+    return modulus if empty and steps < _SMOOTHER * jumps else 0.0
+
+
+def with_sign(values: Floats, modulus: float) -> Floats:
+    """Return numbers below a modulus as numbers with a sign."""
+    return np.where(values >= modulus / 2.0, values - modulus, values)
 
 
 def _instance(columns: Chosen, first: Cells, options: LogOptions, notes: list[str]) -> float:
@@ -215,7 +265,10 @@ def _decide_reading(made: Quantities, first: Cells, options: LogOptions, *, samp
     stated = _stated(columns, options) or (not named and options.default_units) or ''
     if stated and stated != named:
         factor = 1.0
-    rests = rests_of(columns.three(first, READING) * factor, samples=samples)
+    raw = columns.three(first, READING)
+    if modulus := made.modulus.get(READING[0]):
+        raw = with_sign(raw, modulus)
+    rests = rests_of(raw * factor, samples=samples)
     name, words = stated or named, compact(columns.names(READING))
     with saying(', '.join([*made.said, f'{words} in {name}' if name else words])):
         _check_gravity(columns, rests, units_of(name, options.gravity) if name else None)
@@ -386,16 +439,22 @@ def rests_of(reading: Floats, *, samples: bool) -> Rests:
 
 
 def _quiet(reading: Floats) -> Floats:
-    size = int(np.clip(len(reading) // _WINDOWS, _SHORTEST, _LONGEST))
-    count = len(reading) // size
-    if count < 2:
-        return reading
-    windows = reading[:count * size].reshape(count, size, 3)
+    windows = _windows(reading)
+    return reading if len(windows) < 2 else np.asarray(windows[_quietest(windows)].mean(axis=1))
+
+
+def _windows(values: Floats) -> Floats:
+    """Return (n, 3) values as (m, k, 3) windows."""
+    size = int(np.clip(len(values) // _WINDOWS, _SHORTEST, _LONGEST))
+    count = len(values) // size
+    return values[:count * size].reshape(count, size, 3)
+
+
+def _quietest(windows: Floats) -> NDArray[np.intp]:
+    """Return which windows have the least scatter."""
     with np.errstate(over='ignore', invalid='ignore'):
         scatter = np.linalg.norm(windows.std(axis=1), axis=1)
-    quiet = np.argsort(scatter, kind='stable')[:max(2, int(_QUIET_SHARE * count))]
-    means: Floats = windows[quiet].mean(axis=1)
-    return means
+    return np.argsort(scatter, kind='stable')[:max(2, int(_QUIET_SHARE * len(windows)))]
 
 
 def _radius(still: Floats) -> float:
@@ -465,18 +524,46 @@ def _decide_rate(made: Quantities, first: Cells) -> None:
         made.scale(RATE, columns.maker.scales.get('gx', 1.0))
         return
     stated = unit_of('rate', columns.sources['gx'].unit)
+    rests = None if stated else _units_at_rest(made, first)
     largest = float(np.quantile(np.abs(columns.three(first, RATE)), 0.999))
     own = columns.sources['gx'].name == 'gx' and largest < _LARGEST_RATE
-    if stated is None and own and columns.layout.header:
+    if stated is None and own and columns.layout.header and (not rests or 'rad/s' in rests):
         return
-    if stated is None and largest >= _LIKELY_RATE_DEG:
-        _drop(made, RATE, f'the angular rates {words} look like counts and are not used: state '
-              'their unit in the names, such as gyroX_dps')
+    if stated is None and (largest >= _LIKELY_RATE_DEG or rests == {}):
+        _drop(made, RATE, f'the angular rates {words} at rest are those of no gyro in rad/s or '
+              '°/s, and are not used: state their unit in the names, such as gyroX_dps')
         return
-    unit, factor = stated or (('rad/s', 1.0) if largest < _LIKELY_RATE else ('°/s', DEGREE))
+    seen = next(iter(rests.items())) if rests and len(rests) == 1 else None
+    unit, factor = stated or seen or (
+        ('rad/s', 1.0) if largest < _LIKELY_RATE else ('°/s', DEGREE))
     made.scale(RATE, factor)
     made.said.append(f'{words} in {unit}' + ('' if unit == 'rad/s' else ' -> rad/s')
                      + ('' if stated else ' (assumed)'))
+
+
+def _units_at_rest(made: Quantities, first: Cells) -> dict[str, float] | None:
+    """
+    Return the units in which the rates at rest are those of a gyro, with their factors to rad/s.
+
+    None without a rest: only where the accelerometer is still, nothing turns, and the rates are
+    the bias and the noise of the gyro. Rates without noise are computed, and show no unit.
+
+    """
+    columns = made.chosen
+    windows, rates = (_windows(columns.three(first, keys)) for keys in (READING, RATE))
+    if len(windows) < 2:
+        return None
+    quiet = _quietest(windows)
+    length = np.median(np.linalg.norm(windows[quiet].mean(axis=1), axis=1))
+    if np.median(np.max(windows[quiet].std(axis=1), axis=1)) > _SCATTER_AT_REST * length:
+        return None
+    bias = float(np.median(np.max(np.abs(rates[quiet].mean(axis=1)), axis=1)))
+    noise = float(np.median(np.max(rates[quiet].std(axis=1), axis=1)))
+    if noise <= _GYRO_NOISE[0]:
+        return None
+    return {unit: factor for unit, factor in (('rad/s', 1.0), ('°/s', DEGREE))
+            if bias * factor < _LARGEST_BIAS
+            and _GYRO_NOISE[0] < noise * factor < _GYRO_NOISE[1]}
 
 
 def _decide_temperature(made: Quantities, first: Cells) -> None:

@@ -198,6 +198,10 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
     cells = text.blocks()
     first = next(cells)
     quantities = decided(columns, first, options)
+    if quantities.clock.newest_first:
+        first, *rest = (Cells(each.numbers[::-1], [part[::-1] for part in each.texts],
+                              each.row[::-1]) for each in [first, *cells][::-1])
+        cells = iter(rest)
     with saying(quantities.read_as):
         return _decided(path, text, chain((first,), cells), quantities)
 

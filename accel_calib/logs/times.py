@@ -6,7 +6,9 @@ Clock of a text log: the conversion of its column of times to seconds.
 
 A unit that no name states is found from the rate: 1 to 10,000 samples per second are plausible.
 Where two units are, that with a rate nearer to 100 Hz is taken; stamps since 1970 decide before.
-A counter of the clock can start again.
+A counter of the clock can start again. Rows with the newest first are turned round. Stamps that
+are coarser than the samples, such as whole seconds, are spread: the k-th sample of one stamp is k
+periods later, and those of the first stamp, which may lack some, end with it.
 
 """
 
@@ -15,6 +17,7 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .columns import Chosen, FRACTION, LogOptions, rates_beside
 from .dialect import EPOCH_S, has_date, RATES_HZ, seconds_of
@@ -47,6 +50,12 @@ _USUAL_HZ = 100.0
 _GAP = 3.0
 """Steps above this ratio to the median are interruptions."""
 
+_REVERSED = 0.9
+"""Share of steps back in time above which the newest row is the first one."""
+
+_COARSE_S, _COARSE_ROWS = 0.05, 3.0
+"""Smallest step of stamps [s], and smallest number of samples with one stamp, that are spread."""
+
 _MANY_ROWS = 500
 _WINDOW = 8
 _AT_REST = 0.3
@@ -61,7 +70,9 @@ class Clock:
     The conversion of the times of a log to seconds, block by block; `clock_of` makes it.
 
     `scale` is the factor to s. A counter starts again at one of the `periods` [s]. `words` is what
-    is assumed, and `doubts` what contradicts it.
+    is assumed, and `doubts` what contradicts it. `newest_first` is whether the rows are turned
+    round. Stamps with this `interval` are spread over samples with the `period` [s], 0 if they are
+    not; `since` is the number of samples since the `last` stamp changed.
 
     """
 
@@ -73,6 +84,10 @@ class Clock:
     added: float = 0.0
     last: float = math.nan
     starts: int = 0
+    newest_first: bool = False
+    interval: float = 0.0
+    period: float = 0.0
+    since: int = -1
 
     def seconds(self, cells: Cells) -> Floats:
         """Return the times of a block as they are stated [s]."""
@@ -89,6 +104,7 @@ class Clock:
         """Return the times of the next block, which go on where the counter starts again [s]."""
         seconds = self.seconds(cells)
         before = np.concatenate([[self.last], seconds[:-1]])
+        within = self._within(seconds != before) if self.period else 0.0
         steps = np.zeros(len(seconds))
         for period in self.periods:
             again = ((before >= (1.0 - _NEAR_END) * period) & (before < 1.000001 * period)
@@ -98,11 +114,42 @@ class Clock:
         total = self.added + np.cumsum(steps)
         if len(seconds):
             self.last, self.added = float(seconds[-1]), float(total[-1])
-        return seconds + total
+        return seconds + total + within
+
+    def _within(self, changes: NDArray[np.bool_]) -> Floats:
+        """Return the times since the stamp of each row, given which rows change the stamp [s]."""
+        index = np.arange(len(changes))
+        first = np.maximum.accumulate(np.where(changes, index, -1 - self.since))
+        if self.since < 0 and len(changes):  # the first stamp of the log may lack samples
+            size = int(np.argmax(changes[1:])) + 1
+            most = round(self.interval / self.period)
+            first[:size] -= max(most - size, 0)
+        if len(changes):
+            self.since = int(index[-1] - first[-1])
+        return np.minimum((index - first) * self.period, self.interval)
 
 
 def clock_of(columns: Chosen, first: Cells, options: LogOptions) -> Clock:
     """Return the clock of a log with times, from its first block."""
+    clock = _stated_clock(columns, first, options)
+    steps = np.diff(clock.seconds(first))
+    moving = steps[steps != 0.0]
+    clock.newest_first = len(moving) > 1 and bool(np.mean(moving < 0.0) > _REVERSED)
+    if clock.newest_first:
+        clock.words += ', rows turned round (the newest was the first)'
+    if len(moving) > 1 and len(steps) >= _COARSE_ROWS * len(moving):
+        interval = float(np.median(np.abs(moving)))
+        if interval > _COARSE_S:
+            ends = np.flatnonzero(steps)
+            rows = float(ends[-1] - ends[0]) / (len(ends) - 1)
+            clock.interval, clock.period = interval, interval / rows
+            clock.words += (f', stamps of {interval:.3g} s spread over their samples '
+                            f'({1.0 / clock.period:.3g} Hz)')
+    return clock
+
+
+def _stated_clock(columns: Chosen, first: Cells, options: LogOptions) -> Clock:
+    """Return the clock with the unit that is stated, or found from the rate."""
     source, layout = columns.sources['time'], columns.layout
     rate_hz = options.rate or layout.rate_hz
     if rate_hz is not None and bare_name(source.name) in COUNTERS:
@@ -118,7 +165,9 @@ def clock_of(columns: Chosen, first: Cells, options: LogOptions) -> Clock:
             f'{source.name}: {"dates" if dated else "times of the day"}{rate} -> s'))
     stamps = columns.numbers(first, 'time')
     back = np.count_nonzero(np.diff(stamps) < 0.0)
-    if not layout.header and back > _MOST_BACK * (len(stamps) - 1):
+    forth = np.count_nonzero(np.diff(stamps) > 0.0)
+    if not layout.header and back > _MOST_BACK * (len(stamps) - 1) and forth > (
+            1.0 - _REVERSED) * back:
         raise InputError(f'{layout.path} has no header line, and column '
                          f'{source.name} does not increase, expected times',
                          'add a header line, or name the columns with --columns ax=1,ay=2,az=3')
@@ -186,6 +235,8 @@ def _step_of(stamps: Floats) -> float:
     steps = np.diff(stamps)
     if not len(steps):
         return 0.0
+    if np.count_nonzero(steps < 0.0) > _REVERSED * np.count_nonzero(steps):
+        steps = -steps
     middle = float(np.median(steps))
     if middle > 0.0:  # the mean, because stamps can be rounded, but without interruptions
         return float(np.mean(steps[(steps >= 0.0) & (steps <= _GAP * middle)]))
