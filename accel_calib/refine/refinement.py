@@ -279,13 +279,12 @@ def _record(calibration: Calibration, found: Found, given: Given, sensor: str, d
     if refusal:
         steps = tuple(replace(step, parameters_sd={}) for step in steps)
     verdict, undecided = verdict_of(found, steps, refused=bool(refusal))
-    unexplained = verdict == 'unexplained' and not undecided
-    advice = (*advice_for(found, steps, missing, len(outliers), unexplained=unexplained),
-              *plan.advice)
+    advice = advice_for(found, steps, missing, len(outliers),
+                        unexplained=verdict == 'unexplained' and not undecided)
     return Refinement(
-        verdict, final.floor_mg, start.gap_mg(start.fit.residual),
-        final.gap_mg(final.residual), steps, outliers, missing, advice, refined, refusal,
-        final.poses_g, final.fit.equations.force, stages, plan, undecided, found.one_curve)
+        verdict, final.floor_mg, start.gap_mg(start.fit.residual), final.gap_mg(final.residual),
+        steps, outliers, missing, (*advice, *plan.advice), refined, refusal, final.poses_g,
+        final.fit.equations.force, stages, plan, undecided, found.one_curve)
 
 
 def _rejected(found: Found, given: Given) -> tuple[Rejected, ...]:
@@ -294,9 +293,8 @@ def _rejected(found: Found, given: Given) -> tuple[Rejected, ...]:
         rejected += [Rejected(int(row), 'the reading is clipped at the limit of the sensor',
                               'clipped')
                      for row in given.poses_g.row[found.clipped.poses]]
-    return tuple(sorted((*given.rejected, *(each for each in rejected
-                                            if each.row in given.poses.row)),
-                        key=lambda each: each.row))
+    new = [each for each in rejected if each.row in given.poses.row]
+    return tuple(sorted((*given.rejected, *new), key=lambda each: each.row))
 
 
 def _refine_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, sensor: str, date: str,
@@ -471,11 +469,11 @@ def refitted(before: Calibration, poses: Poses, *, sensor: str = '', date: str =
     if lacking:
         raise RefusedFitError(f'the poses have no {" or ".join(lacking)}, which the calibration '
                               'in use corrects for', 'record it, or call ~/reset')
-    given = Given(poses, poses_g, stored=True, rejected=(*doubts, *unsound), notes=())
     final = _settled(before.model, poses_g)
     out = [Rejected(int(row), 'outlier', 'outlier') for row in poses_g.row
            if row not in final.poses_g.row]
-    rejected = tuple(sorted((*given.rejected, *out), key=lambda each: each.row))
+    rejected = tuple(sorted((*doubts, *unsound, *out), key=lambda each: each.row))
+    given = Given(poses, poses_g, stored=True, rejected=rejected, notes=())
     calibration, refusal = refined_calibration(before, final, (), given, rejected)
     if refusal:
         raise RefusedFitError(*refusal)
