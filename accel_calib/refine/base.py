@@ -68,9 +68,6 @@ _REACH = 2.0
 _LEAST_CONSTANT = 0.2
 """Share of readings without scatter above which only these readings define the grid."""
 
-_CONSTANT = 1e-4
-"""Largest relative difference of the scatter that a capture states for constant samples."""
-
 _ON_GRID = 0.6
 """Smallest share of readings on the grid."""
 
@@ -218,8 +215,8 @@ def _rounding(poses_g: Poses, step: float) -> Floats:
 
 
 def _is_constant(std: Floats) -> NDArray[np.bool_]:
-    """Return which samples are constant: std is 0, or what a capture states instead."""
-    return np.asarray(std <= max(float(np.min(std)) * (1.0 + _CONSTANT), 1e-9))
+    """Return which samples are constant: std is 0, or q/√12 within 1e-4, by a capture."""
+    return np.asarray(std <= max(float(np.min(std)) * (1.0 + 1e-4), 1e-9))
 
 
 def _varying(std: Floats) -> Floats:
@@ -241,7 +238,10 @@ def _constant_step(poses_g: Poses) -> float | None:
     apart = apart[apart > 1e-7]
     if sum(map(len, different)) < _LEAST_STEPS or not apart.size:
         return None
-    for step in (*stated, *_steps(apart)):
+    # Typical smallest distances are multiples of the step.
+    smallest = np.quantile(apart, np.linspace(0.0, 0.7, 15), method='nearest')
+    steps = np.unique(np.concatenate([smallest / part for part in (1, 2, 3)]))[::-1]
+    for step in (*stated, *steps):
         if _FINEST_G < step <= _COARSEST_G and _on_grid(np.concatenate(values), step) >= _ON_GRID:
             return float(step)
     return None
@@ -284,12 +284,6 @@ def _correlations(mean: Floats, variance: Floats, tried: Floats) -> Floats:
     spread, away = squares - cosines ** 2 / count, variance - np.mean(variance)
     return summed(coarse * away, fine) / np.sqrt(
         np.maximum(spread, 1e-12 * count) * np.sum(away ** 2))
-
-
-def _steps(apart: Floats) -> Floats:
-    """Return the steps to try: typical smallest distances, and 1/2 and 1/3 of them."""
-    smallest = np.quantile(apart, np.linspace(0.0, 0.7, 15), method='nearest')
-    return np.unique(np.concatenate([smallest / part for part in (1, 2, 3)]))[::-1]
 
 
 def _on_grid(values: Floats, step: float) -> float:

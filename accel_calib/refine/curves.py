@@ -249,12 +249,8 @@ def _held_out(chosen: Set) -> float:
     return float(np.sum(squares - (1.0 / own[kept] if chosen.linear.worth else 0.0)))
 
 
-_NEAREST = 2
-"""Number of known effects that are named as the nearest to a curve."""
-
-
 def nearest_effects(before: State) -> dict[str, float]:
-    """Return the known effects that leave least of the residual, and what they leave [mg]."""
+    """Return the two known effects that leave least of the residual, and what they leave [mg]."""
     names = tuple(name for name in EFFECTS if name not in before.model.values)
     best: list[tuple[float, str, float]] = []
     for each in candidates(names, before.poses_g):  # one by one, which takes less memory
@@ -264,7 +260,7 @@ def nearest_effects(before: State) -> dict[str, float]:
         if rank[number]:
             _, left = Set.of(linear, (number,)).spanned
             best.append((-gain[number], each.name, before.gap_mg(left)))
-    return {name: left_mg for _, name, left_mg in sorted(best)[:_NEAREST]}
+    return {name: left_mg for _, name, left_mg in sorted(best)[:2]}
 
 
 def one_curve(state: State) -> tuple[str, ...]:

@@ -70,9 +70,6 @@ _BEYOND = 0.5
 _WAITS = (0.5, 1.0, 2.0)
 """Times after the last pose, in durations of the session."""
 
-_DRAWS, _SEED = 1000, 1
-"""Random readings for the expected probability; the same for each plan."""
-
 ENOUGH = 0.95
 """Expected probability of the right effect at which a plan ends."""
 
@@ -233,7 +230,8 @@ class _Contest:
         for rows, spread in zip(self.rows, self.spreads, strict=True):
             own = rows[list(taken)].reshape(means.shape[1], -1)
             roots.append(np.linalg.cholesky(np.eye(len(own)) + own @ spread @ own.T))
-        noise = np.random.default_rng(_SEED).normal(size=(_DRAWS, means.shape[1]))
+        # The same random readings for each plan.
+        noise = np.random.default_rng(1).normal(size=(1000, means.shape[1]))
         return sum(float(weight) * self._right(j, means, roots, noise)
                    for j, weight in enumerate(self.weights))
 
@@ -254,28 +252,22 @@ def _fits(name: str, found: Found) -> dict[str, tuple[float, Fit]]:
     What is usual does not replace a pose that would show it.
 
     """
-    fits: dict[str, Fit] = {name: found.final.fit}
+    fits, others = {name: found.final.fit}, found.near.without(name)
+    unchanged = {key: part for key, part in found.final.model.values.items() if key != name}
     weights = probabilities(name, found.near, usual=False)
     for rival, weight in weights.items():
-        if rival != WANDER and shown_name(rival) != shown_name(name) and weight > LEAST:
-            fit = _fit_of(rival, name, found)
-            if fit is not None:
-                fits[rival] = fit
+        if rival == WANDER or shown_name(rival) == shown_name(name) or weight <= LEAST:
+            continue
+        best = others.best_of(rival)
+        values = [others.extended(best).values[best], others.linear.blocks[best].shape]
+        model = Model(with_effect(unchanged, rival, np.concatenate(values)))
+        state = fitted_state(model, found.final.poses_g)
+        if state is not None:
+            fits[rival] = state.fit
     total = sum(weights[each] for each in fits)
     if len(fits) < 2 or max(weights[each] for each in fits) >= ENOUGH * total:
         return {}
     return {each: (weights[each] / total, fit) for each, fit in fits.items()}
-
-
-def _fit_of(rival: str, name: str, found: Found) -> Fit | None:
-    """Return the fit with a rival in the place of an effect, or None without a sound fit."""
-    others = found.near.without(name)
-    best = others.best_of(rival)
-    unchanged = {key: part for key, part in found.final.model.values.items() if key != name}
-    values = with_effect(unchanged, rival, np.concatenate(
-        [others.extended(best).values[best], others.linear.blocks[best].shape]))
-    state = fitted_state(Model(values), found.final.poses_g)
-    return None if state is None else state.fit
 
 
 def _candidates(fit: Fit, varied: Sequence[str]) -> tuple[Poses, Floats, list[dict[str, float]]]:

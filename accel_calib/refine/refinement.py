@@ -407,20 +407,15 @@ def with_changes(model: Model) -> tuple[Model, Floats]:
         elif own not in effects and own not in included(effects):
             effects.append(own)
     names = parameter_names(tuple(effects))
-    owners = [owner for name in model.effects for owner in _owners(name, effects)]
+    owners: list[tuple[str, ...]] = []
+    for own in map(plain_name, model.effects):  # of each value, those of the result it adds to
+        whole = tuple(effect for effect in effects if own in included((effect,)))
+        owners += [(value,) if own in effects else parameter_names(whole)
+                   for value in parameter_names((own,))]
     matrix = np.array([[name in owner for owner in owners] for name in names], float)
     matrix = matrix.reshape(len(names), len(owners))
     values = with_vector(tuple(effects), matrix @ model.vector).values
     return Model(values, model.rotation), matrix
-
-
-def _owners(name: str, effects: list[str]) -> list[set[str]]:
-    """Return the names of the values, among those of some effects, that each value adds to."""
-    own = plain_name(name)
-    if own in effects:
-        return [{value} for value in parameter_names((own,))]
-    whole = tuple(effect for effect in effects if own in included((effect,)))
-    return [set(parameter_names(whole))] * len(parameter_names((own,)))
 
 
 @dataclass(frozen=True)
