@@ -265,7 +265,7 @@ def _record(calibration: Calibration, found: Found, given: Given, sensor: str, d
     if given.stored:  # as stored, without a fit
         kept = calibration.held(start.poses_g)
         start = State(judge(Model(calibration.model.values), kept))
-    steps, stages = steps_of(found, start, calibration.date, joint=given.joint)
+    steps, stages = steps_of(found, start, calibration.date)
     missing, plan = untestable(found, steps), plan_poses(found)
     verdict, _ = verdict_of(found, steps, refused=False)
     if verdict == 'no_gap' and calibration.reason != 'ideal' and not given.stored:
@@ -428,11 +428,6 @@ class Given:
     rejected: tuple[Rejected, ...]
     notes: tuple[Finding, ...]
 
-    @property
-    def joint(self) -> bool:
-        """Whether the poses of the stored calibration are used, too."""
-        return 'new' in self.poses_g
-
 
 def refitted(before: Calibration, poses: Poses, *, sensor: str = '', date: str = ''
              ) -> Calibration:
@@ -495,11 +490,12 @@ def refined_calibration(base: Calibration, final: State, added: tuple[str, ...],
     """Return the refined calibration, and the refusal if it must not be used."""
     model, matrix = with_changes(final.model)
     kept, poses = final.poses_g, given.poses
-    unchanged = final.model.effects == model.effects
-    if given.joint and unchanged and all(key in base.poses for key in model.needs):
-        poses = with_stored(given.poses, base)
-    elif given.joint:
-        kept = kept.take(kept['new'] > 0.0)
+    if 'new' in kept:  # beside the poses of the stored calibration
+        unchanged = final.model.effects == model.effects
+        if unchanged and all(key in base.poses for key in model.needs):
+            poses = with_stored(given.poses, base)
+        else:
+            kept = kept.take(kept['new'] > 0.0)
     at_poses = judge(model, kept if base.form.known_orientation
                      else kept.without_columns(*_ORIENTATION))
     names = ', '.join(plain_name(name) for name in added)

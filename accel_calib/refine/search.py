@@ -305,9 +305,7 @@ def _with_one_curve(found: Found, start: State, poses_g: Poses) -> Found | None:
         curve = best_curve(
             beside.final, poses_g, beside.near.chosen.out, of_force=what == 'force',
             least=max(gained + better - _SEVERAL * (len(names) - 1), CLEARLY))
-        if curve is None:
-            continue
-        described = _with_curve(beside, curve, start, poses_g)
+        described = None if curve is None else _with_curve(beside, curve, start, poses_g)
         if described is not None and (described.final.is_noise or not found.final.is_noise):
             return described
     return None

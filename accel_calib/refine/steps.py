@@ -204,19 +204,18 @@ def verdict_of(found: Found, steps: Sequence[Step], *, refused: bool) -> tuple[V
     return 'explained' if steps else 'no_gap', False
 
 
-def steps_of(found: Found, start: State, date: str, *, joint: bool
+def steps_of(found: Found, start: State, date: str
              ) -> tuple[tuple[Step, ...], tuple[Stage, ...]]:
     """
     Return the steps of a search, and the residuals at each stage.
 
-    The base `start` is as fitted, or as stored at a date; `joint`: its poses are used, too.
+    The base `start` is as fitted, or as stored at a date.
 
     """
     states = _sequence(found, start)
     of_output = _output_steps(found)
-    added = [_step(name, pair, found, date, unseen=joint and k == 0)
-             for k, (name, pair) in enumerate(zip(found.added, pairwise(states), strict=False))]
-    steps = (*of_output, *added)
+    steps = (*of_output, *(_step(name, *pair, found, date) for name, pair in zip(
+        found.added, pairwise(states), strict=False)))
     names = ('base', *(step.effect for step in steps))
     at = (*states[:1] * len(of_output), *states)  # limit and grid leave the residuals
     return steps, tuple(
@@ -238,16 +237,15 @@ def _sequence(found: Found, start: State) -> list[State]:
     return states if found.added[-1:] != (WANDER,) else [*states, states[-1]]
 
 
-def _step(name: str, states: tuple[State, State], found: Found, date: str, *, unseen: bool
-          ) -> Step:
-    """Return the record of one step; `unseen`: the earlier model was not fitted to the poses."""
-    before, after = states
+def _step(name: str, before: State, after: State, found: Found, date: str) -> Step:
+    """Return the record of one step."""
     chances, by_data = (_chances(name, found, usual=usual) for usual in (True, False))
     rivals = tuple(other for other, part in {**by_data, **chances}.items()
                    if other != kind_of(shown_name(name))
                    and max(part, by_data.get(other, 0.0)) > LEAST)
     first, last, held_out = before.fit.residual, after.fit.residual, after.held_out
-    first_held_out = first if unseen else before.held_out
+    is_stored = name == found.added[0] and 'new' in before.poses_g
+    first_held_out = first if is_stored else before.held_out  # the stored model has not seen them
     if name == WANDER:
         first, first_held_out = before.residual, before.held_out
         last = held_out = beside_walk(found)[1]  # it follows the poses: what it predicts counts
