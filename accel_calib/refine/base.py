@@ -307,7 +307,7 @@ def unclipped(poses_g: Poses, base: Model) -> tuple[State | None, Clipped | None
     if not any(_fits_better(model, plain, kept) for model in (base, Model(values))):
         return None, None
     whole = fitted_state(base, with_history(plain, base))
-    if whole is None:
+    if whole is None:  # it converges only without the poses at the limit
         model = beginning(kept, base).model
         whole = State(judge(model, with_history(plain, model)))
     return whole, clip

@@ -315,18 +315,6 @@ def _proportion(pair: tuple[str, str], state: State) -> float:
     return float(2.0 * np.log(min(chi2[0], chi2[len(chi2) // 2])) - np.min(chi2))
 
 
-def steepest(variable: str, poses_g: Poses, share_mg: Floats) -> tuple[float, float] | None:
-    """Return the values of a variable of one number between which a curve changes most."""
-    if variable in ('force', 'direction', 'std'):
-        return None
-    values = poses_g[variable]
-    parts = np.array_split(np.argsort(values, kind='stable'), 5)
-    middle = [float(np.mean(values[part])) for part in parts]
-    size = [float(np.sqrt(np.mean(share_mg[part] ** 2))) for part in parts]
-    at = int(np.argmax(np.abs(np.diff(size))))
-    return middle[at], middle[at + 1]
-
-
 _MODES = 60
 """Modes of each axis: the rest has less than 1 % of the variance of a random walk."""
 

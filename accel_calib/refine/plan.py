@@ -202,15 +202,15 @@ class _Contest:
         return cls(tuple(fits), weights, means, rows,
                    tuple(fit.by_pose.spread for _, fit in fits.values()))
 
-    def gains(self, taken: Sequence[int]) -> Floats:
+    def gains(self, taken: list[int]) -> Floats:
         """Return the (c,) expected change of the log odds by each candidate, after others."""
         total = np.zeros(self.means.shape[1])
         for k, (rows, spread) in enumerate(zip(self.rows, self.spreads, strict=True)):
             left = self.means - self.means[k]
             if taken:  # what the model leaves, and its covariance, after a fit to these
-                own = rows[list(taken)].reshape(-1, rows.shape[2])
+                own = rows[taken].reshape(-1, rows.shape[2])
                 gain = spread @ own.T @ np.linalg.inv(np.eye(len(own)) + own @ spread @ own.T)
-                learned = left[:, list(taken)].reshape(len(left), -1) @ gain.T
+                learned = left[:, taken].reshape(len(left), -1) @ gain.T
                 left = left - np.einsum('crq,jq->jcr', rows, learned)
                 spread = spread - gain @ own @ spread
             sizes = np.eye(rows.shape[1]) + rows @ spread @ np.swapaxes(rows, 1, 2)
@@ -221,14 +221,14 @@ class _Contest:
                     total += weight * self.weights[k] * change
         return total
 
-    def expected(self, taken: Sequence[int]) -> float:
+    def expected(self, taken: list[int]) -> float:
         """Return the expected probability of the right model after some candidates."""
         if not taken:
             return float(np.sum(self.weights ** 2))
-        means = self.means[:, list(taken)].reshape(len(self.means), -1)
+        means = self.means[:, taken].reshape(len(self.means), -1)
         roots = []
         for rows, spread in zip(self.rows, self.spreads, strict=True):
-            own = rows[list(taken)].reshape(means.shape[1], -1)
+            own = rows[taken].reshape(means.shape[1], -1)
             roots.append(np.linalg.cholesky(np.eye(len(own)) + own @ spread @ own.T))
         # The same random readings for each plan.
         noise = np.random.default_rng(1).normal(size=(1000, means.shape[1]))

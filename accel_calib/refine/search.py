@@ -319,10 +319,9 @@ def _with_curve(found: Found, curve: Curve, start: State, poses_g: Poses) -> Fou
                          without(poses_g, curve.out))
     if after is None or after.fit.at_bound:
         return None
-    out = np.array(curve.out, np.intp)
-    return replace(found, base=fit_without(start, poses_g, curve.out), final=after, walk=None,
-                   near=replace(found.near, walk=None, chosen=found.near.beside), outliers=out,
-                   curve=curve)
+    near = replace(found.near, walk=None, chosen=found.near.beside)
+    return replace(found, base=fit_without(start, poses_g, curve.out), final=after, near=near,
+                   walk=None, curve=curve, outliers=np.array(curve.out, np.intp))
 
 
 def _less(found: Found, names: Collection[str]) -> Found | None:

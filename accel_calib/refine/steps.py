@@ -20,7 +20,7 @@ from typing import Literal
 
 import numpy as np
 
-from .curves import LEAST, nearest_effects, probabilities, steepest
+from .curves import LEAST, nearest_effects, probabilities
 from .linear import is_seen, Set
 from .search import Found
 from .settle import ladder_set
@@ -319,9 +319,13 @@ def _curve(name: str, before: State, share_mg: Floats) -> str:
     what = 'size of the force' if whole == 'force' else whole.replace('_', '-')
     words = (f'the {what}{f" of {part}" if part else ""} changes with {variable_words(variable)} '
              f'by up to {np.max(np.abs(share_mg)):.2g} mg')
-    steep = steepest(variable, before.poses_g, share_mg)
-    if steep is not None:
-        words += (f', most between {steep[0]:.4g} and {steep[1]:.4g} '
+    if variable not in ('force', 'direction', 'std'):  # a variable of one number
+        values = before.poses_g[variable]
+        parts = np.array_split(np.argsort(values, kind='stable'), 5)
+        middle = [float(np.mean(values[part])) for part in parts]
+        size = [float(np.sqrt(np.mean(share_mg[part] ** 2))) for part in parts]
+        at = int(np.argmax(np.abs(np.diff(size))))
+        words += (f', most between {middle[at]:.4g} and {middle[at + 1]:.4g} '
                   f'{unit_of(variable)}').rstrip()
     nearest = [f'{effect} (leaves {left:.2g} mg)'
                for effect, left in nearest_effects(before).items()]
@@ -380,6 +384,7 @@ def _directions(force: Floats, share_mg: Floats) -> str:
 def untestable(found: Found, steps: Sequence[Step]) -> tuple[tuple[str, str], ...]:
     """Return the effects that the poses of a search cannot show, with the data to record."""
     linear, testable = found.near.plain, dict[str, float]()
+    # What effects of typical size add to the residual, if they are seen at all.
     for numbers, index, left in found.near.beside.beside(linear.by_width):
         sizes = linear.sizes[index]
         squares = np.linalg.eigvalsh(left * sizes[:, np.newaxis] * sizes[:, :, np.newaxis])
