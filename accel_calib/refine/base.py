@@ -52,9 +52,6 @@ from ..table import Floats, Poses
 MOST = 6000
 """Largest number of equations that a refinement uses."""
 
-_VECTORS = 3
-"""Number of equations of a pose of known or shared orientation."""
-
 _GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 
 _QUIET = 0.7
@@ -70,9 +67,6 @@ _REACH = 2.0
 
 _LEAST_CONSTANT = 0.2
 """Share of readings without scatter above which only these readings define the grid."""
-
-_CONSTANT = 1e-4
-"""Largest relative difference of the scatter that a capture states for constant samples."""
 
 _ON_GRID = 0.6
 """Smallest share of readings on the grid."""
@@ -111,14 +105,8 @@ _RELEVANT = 0.25
 """Smallest part of the variance of a mean that a relevant grid causes."""
 
 
-_DIGITS = 7
-"""Number of decimals [g] in which two readings of the same pose are equal."""
-
 _SAME = 0.999
 """Quantile of chi² below which a stored calibration agrees with poses of its fit."""
-
-_EITHER = ('temperature', 'supply_voltage', 'rate', 'previous')
-"""Context that is set to NaN if the stored poses do not have it, as quantities are."""
 
 _EQUAL = 1e-9
 """Relative difference below which numbers of a quantity are equal."""
@@ -130,38 +118,29 @@ them, relative to the scatter of the length."""
 
 def causes(poses_g: Poses) -> tuple[str, ...]:
     """Return the quantities that vary, other than row numbers and lengths of the readings."""
-    length = np.linalg.norm(poses_g.reading, axis=1)
-    return tuple(key for key in poses_g.quantities
-                 if _varies(poses_g[key]) and not _is_even(poses_g[key])
-                 and not _in_proportion(poses_g[key], length))
-
-
-def _varies(values: Floats) -> bool:
-    known = values[np.isfinite(values)]
-    return bool(len(known)) and float(np.ptp(known)) > _EQUAL * float(np.max(np.abs(known)))
-
-
-def _is_even(values: Floats) -> bool:
-    """Return whether values increase by the same step from row to row: they count the rows."""
-    steps = np.diff(values)
-    return bool(np.all(np.abs(steps - steps[:1]) <= _EQUAL * np.abs(steps[:1])))
-
-
-def _in_proportion(values: Floats, length: Floats) -> bool:
-    """Return whether values are in proportion to the length of the readings, and its noise."""
-    ratio = values / length
-    return bool(np.std(ratio) * np.mean(length) < _OF_READING * np.std(length)
-                * np.abs(np.mean(ratio)))
+    length, found = np.linalg.norm(poses_g.reading, axis=1), []
+    for key in poses_g.quantities:
+        values = poses_g[key]
+        known = values[np.isfinite(values)]
+        if not len(known) or np.ptp(known) <= _EQUAL * np.max(np.abs(known)):
+            continue
+        steps, ratio = np.diff(values), values / length
+        counts_rows = np.all(np.abs(steps - steps[:1]) <= _EQUAL * np.abs(steps[:1]))
+        is_length = (np.std(ratio) * np.mean(length)
+                     < _OF_READING * np.std(length) * np.abs(np.mean(ratio)))
+        if not counts_rows and not is_length:
+            found.append(key)
+    return tuple(found)
 
 
 def sampled(poses: Poses) -> Poses:
     """Return the poses for `MOST` equations, and as many of those of a stored calibration."""
-    most = MOST // (_VECTORS if {'reference', 'orientation'} & set(poses.columns) else 1)
+    most = MOST // (3 if {'reference', 'orientation'} & set(poses.columns) else 1)
     if len(poses) <= most:
         return poses
     new = poses['new'] > 0.0 if 'new' in poses else np.ones(len(poses), bool)
     parts = [part[_kept(poses.take(part), most)]
-             for part in (np.flatnonzero(new), np.flatnonzero(~new)) if len(part)]
+             for part in (np.flatnonzero(new), np.flatnonzero(~new))]
     return poses.take(np.sort(np.concatenate(parts)))
 
 
@@ -231,15 +210,13 @@ def grid_step(poses_g: Poses) -> float | None:
 
 def _rounding(poses_g: Poses, step: float) -> Floats:
     """Return the (3,) variances of the pose means that a grid causes."""
-    variance = np.zeros(3)
-    if 'std' in poses_g:
-        variance = np.mean(_varying(poses_g['std']), axis=0)
+    variance = np.mean(_varying(poses_g['std']), axis=0) if 'std' in poses_g else np.zeros(3)
     return np.asarray(step ** 2 * rounding_left(variance / step ** 2))
 
 
 def _is_constant(std: Floats) -> NDArray[np.bool_]:
-    """Return which samples are constant: std is 0, or what a capture states instead."""
-    return np.asarray(std <= max(float(np.min(std)) * (1.0 + _CONSTANT), 1e-9))
+    """Return which samples are constant: std is 0, or q/√12 within 1e-4, by a capture."""
+    return np.asarray(std <= max(float(np.min(std)) * (1.0 + 1e-4), 1e-9))
 
 
 def _varying(std: Floats) -> Floats:
@@ -250,27 +227,24 @@ def _varying(std: Floats) -> Floats:
 
 def _constant_step(poses_g: Poses) -> float | None:
     """Return the step of which the means of constant samples are multiples, or None."""
-    values = _constant(poses_g)
+    values, stated = list(poses_g.reading.T), list[float]()
+    if 'std' in poses_g:
+        stated = [np.sqrt(12.0) * np.min(poses_g['std'])]  # by a capture, for constant samples
+        still = _is_constant(poses_g['std'])
+        if np.mean(still) > _LEAST_CONSTANT:
+            values = [column[which] for column, which in zip(values, still.T, strict=True)]
     different = [np.unique(column) for column in values]
     apart = np.concatenate([np.diff(column) for column in different])
     apart = apart[apart > 1e-7]
     if sum(map(len, different)) < _LEAST_STEPS or not apart.size:
         return None
-    stated = [] if 'std' not in poses_g else [np.sqrt(12.0) * np.min(poses_g['std'])]
-    for step in (*stated, *_steps(apart)):  # a capture states q/√12 for constant samples
+    # Typical smallest distances are multiples of the step.
+    smallest = np.quantile(apart, np.linspace(0.0, 0.7, 15), method='nearest')
+    steps = np.unique(np.concatenate([smallest / part for part in (1, 2, 3)]))[::-1]
+    for step in (*stated, *steps):
         if _FINEST_G < step <= _COARSEST_G and _on_grid(np.concatenate(values), step) >= _ON_GRID:
             return float(step)
     return None
-
-
-def _constant(poses_g: Poses) -> list[Floats]:
-    """Return the readings of each axis whose samples do not scatter, or all if these are few."""
-    reading = poses_g.reading
-    if 'std' in poses_g:
-        still = _is_constant(poses_g['std'])
-        if np.mean(still) > _LEAST_CONSTANT:
-            return [reading[still[:, axis], axis] for axis in range(3)]
-    return list(reading.T)
 
 
 def _alternating_step(poses_g: Poses) -> float | None:
@@ -312,23 +286,10 @@ def _correlations(mean: Floats, variance: Floats, tried: Floats) -> Floats:
         np.maximum(spread, 1e-12 * count) * np.sum(away ** 2))
 
 
-def _steps(apart: Floats) -> Floats:
-    """Return the steps to try: typical smallest distances, and 1/2 and 1/3 of them."""
-    smallest = np.quantile(apart, np.linspace(0.0, 0.7, 15), method='nearest')
-    return np.unique(np.concatenate([smallest / part for part in (1, 2, 3)]))[::-1]
-
-
 def _on_grid(values: Floats, step: float) -> float:
     """Return the share of readings that are multiples of the step."""
     steps = values / step
     return float(np.mean(np.abs(steps - np.round(steps)) < _OFF_GRID))
-
-
-def with_grid(poses_g: Poses, step: float) -> Poses:
-    """Return the poses with the variance of the grid added to their noise."""
-    noise = np.zeros_like(poses_g.reading) if poses_g.noise is None else poses_g.noise
-    std = np.sqrt(noise ** 2 + _rounding(poses_g, step))
-    return poses_g.with_columns(std=std, count=np.ones(len(poses_g)))
 
 
 def unclipped(poses_g: Poses, base: Model) -> tuple[State | None, Clipped | None]:
@@ -339,16 +300,17 @@ def unclipped(poses_g: Poses, base: Model) -> tuple[State | None, Clipped | None
     # Clipped samples hardly scatter, so their noise is meaningless: all weights are equal here.
     plain = poses_g.without_columns('std')
     kept = without(plain, clip.poses)
-    if not any(_fits_better(model, plain, kept) for model in (base, _linear(base))):
+    # The base may lack offset, gains and cross-axis because of the clip.
+    linear = MODELS['10'].effects
+    values = {name: part for name, part in base.values.items() if name not in included(linear)}
+    values |= {name: np.zeros(3) for name in linear if name not in values}
+    if not any(_fits_better(model, plain, kept) for model in (base, Model(values))):
         return None, None
-    return _whole(plain, kept, base), clip
-
-
-def _linear(base: Model) -> Model:
-    """Return the base with offset, gains and cross-axis, which it may lack because of the clip."""
-    whole = MODELS['10'].effects
-    kept = {name: values for name, values in base.values.items() if name not in included(whole)}
-    return Model({**kept, **{name: np.zeros(3) for name in whole if name not in kept}})
+    whole = fitted_state(base, with_history(plain, base))
+    if whole is None:  # it converges only without the poses at the limit
+        model = beginning(kept, base).model
+        whole = State(judge(model, with_history(plain, model)))
+    return whole, clip
 
 
 def _fits_better(model: Model, plain: Poses, kept: Poses) -> bool:
@@ -361,40 +323,22 @@ def _fits_better(model: Model, plain: Poses, kept: Poses) -> bool:
         whole.linear.score(fewer.rss, float(len(plain) - len(kept)), 0.0) > _CLEARLY)
 
 
-def _whole(plain: Poses, kept: Poses, base: Model) -> State:
-    """Return the base fitted to all poses, or to those kept if that does not converge."""
-    whole = fitted_state(base, with_history(plain, base))
-    if whole is not None:
-        return whole
-    model = beginning(kept, base).model
-    return State(judge(model, with_history(plain, model)))
-
-
 def off_grid(poses_g: Poses, base: Model) -> tuple[Poses, float | None]:
     """Return the poses with the noise of a coarse grid, and its step, if it causes the noise."""
     step = grid_step(poses_g)
     if step is None:
         return poses_g, None
-    plain = beginning(poses_g, base)
-    if plain.fit.noise_known and plain.is_noise:
-        return poses_g, step if _is_included(poses_g, step) else None
-    on_grid = with_grid(poses_g, step)
-    if poses_g.noise is None and not _is_all_noise(beginning(on_grid, base)):
-        return poses_g, None  # perhaps only the digits of the file; the noise is different
+    plain, noise, rounding = beginning(poses_g, base), poses_g.noise, _rounding(poses_g, step)
+    if noise is not None and plain.fit.noise_known and plain.is_noise:
+        is_included = np.median(np.square(noise)) >= _RELEVANT * np.median(rounding)
+        return poses_g, step if is_included else None
+    variance = np.zeros_like(poses_g.reading) if noise is None else noise ** 2
+    on_grid = poses_g.with_columns(std=np.sqrt(variance + rounding), count=np.ones(len(poses_g)))
+    if noise is None:
+        state = beginning(on_grid, base)
+        if not state.is_noise or state.rss <= _LEAST_OF_GRID * state.dof:
+            return poses_g, None  # perhaps only the digits of the file; the noise is different
     return on_grid, step
-
-
-def _is_included(poses_g: Poses, step: float) -> bool:
-    """Return whether the stated noise of the poses includes that of the grid."""
-    if poses_g.noise is None:
-        return False
-    noise = np.median(np.square(poses_g.noise))
-    return bool(noise >= _RELEVANT * np.median(_rounding(poses_g, step)))
-
-
-def _is_all_noise(state: State) -> bool:
-    """Return whether the residuals match the noise of the grid, neither larger nor smaller."""
-    return state.is_noise and state.rss > _LEAST_OF_GRID * state.dof
 
 
 def beside_stored(poses_g: Poses, calibration: Calibration) -> Poses:
@@ -409,25 +353,27 @@ def beside_stored(poses_g: Poses, calibration: Calibration) -> Poses:
     stored = stored.take(np.isin(stored.row, calibration.used_poses.row))
     if not len(stored) or not calibration.model.effects:
         return poses_g
-    shared, edited = _shares(poses_g, stored), has(calibration.noted, 'edited')
+    new, old = ({tuple(row) for row in poses.reading.round(7).tolist()}  # files round
+                for poses in (poses_g, stored))
+    shared, edited = not new.isdisjoint(old), has(calibration.noted, 'edited')
     if shared and not edited and _agrees(calibration, poses_g):
         return poses_g
-    if shared or edited:
-        stored = _as_calibrated(stored, calibration)
-    count = (len(poses_g), len(stored))
-    either = {*_EITHER, *poses_g.quantities}
-    columns = {key: _joined(key, poses_g, stored) for key in poses_g.columns
-               if key in stored or key in either}
+    if shared or edited:  # with the readings that the calibration predicts in their directions
+        here = calibration.model.at(stored.columns)
+        stored = stored.with_columns(reading=here.reading(unit(here.force(stored.reading))))
+    ours, count = {**poses_g.columns, 'new': np.ones(len(poses_g))}, len(stored)
+    optional = ('temperature', 'supply_voltage', 'rate', 'previous', *poses_g.quantities)
+    unknown = {key: np.full((count, *ours[key].shape[1:]), np.nan)
+               for key in optional if key in ours}
+    theirs = {**unknown, **stored.columns, 'new': np.zeros(count)}
     if 'time' in calibration.ranges:  # limited to the range of the calibration
-        held = np.clip(poses_g['time'], *calibration.ranges['time'])
-        columns['time'] = np.concatenate([held, stored['time']])
-    elif 'time' in poses_g:
-        columns['time'] = np.concatenate([poses_g['time'], np.full(count[1], np.nan)])
-    if 'orientation' in poses_g:
-        least = float(np.min(poses_g['orientation']))
-        columns['orientation'] = np.concatenate([
-            poses_g['orientation'], least - 1.0 - np.arange(count[1])])
-    columns['new'] = np.repeat([1.0, 0.0], count)
+        ours['time'] = np.clip(ours['time'], *calibration.ranges['time'])
+    elif 'time' in ours:
+        theirs['time'] = np.full(count, np.nan)
+    if 'orientation' in ours:
+        theirs['orientation'] = np.min(ours['orientation']) - 1.0 - np.arange(count)
+    columns = {key: np.concatenate([values, theirs[key]])
+               for key, values in ours.items() if key in theirs}
     joined = Poses(columns, _rows(poses_g, stored))
     return joined if joined.noise is not None else joined.without_columns('std', 'count')
 
@@ -444,12 +390,6 @@ def _rows(poses: Poses, stored: Poses) -> NDArray[np.int64]:
     return np.concatenate([poses.row, int(poses.row.max()) + 1 + np.arange(len(stored))])
 
 
-def _shares(poses_g: Poses, stored: Poses) -> bool:
-    new, old = ({tuple(row) for row in poses.reading.round(_DIGITS).tolist()}
-                for poses in (poses_g, stored))
-    return not new.isdisjoint(old)
-
-
 def _agrees(calibration: Calibration, poses_g: Poses) -> bool:
     """Return whether a fit to the poses is no better than the calibration as stored."""
     model = Model(calibration.model.values)
@@ -457,15 +397,3 @@ def _agrees(calibration: Calibration, poses_g: Poses) -> bool:
     excess = judge(model, calibration.held(poses_g)).chi2 - fit.chi2
     worse = max(fit.chi2 / max(fit.dof, 1), 1.0)
     return bool(excess / worse < scipy.special.chdtri(len(model.vector), 1.0 - _SAME))
-
-
-def _as_calibrated(stored: Poses, calibration: Calibration) -> Poses:
-    """Return the poses with the readings that the calibration predicts in their directions."""
-    here = calibration.model.at(stored.columns)
-    return stored.with_columns(reading=here.reading(unit(here.force(stored.reading))))
-
-
-def _joined(key: str, poses_g: Poses, stored: Poses) -> Floats:
-    ours = poses_g[key]
-    theirs = stored[key] if key in stored else np.full((len(stored), *ours.shape[1:]), np.nan)
-    return np.concatenate([ours, theirs])

@@ -35,9 +35,9 @@ differences are less certain: c is the share of the degrees of freedom that the 
 
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from itertools import combinations
+from itertools import combinations, product
 import math
 from typing import NamedTuple
 
@@ -65,9 +65,6 @@ _PATIENCE = 2
 
 CLEARLY = 10.0
 """Smallest score of a curve."""
-
-_LEAST_OUTSIDE = 1e-9
-"""Added to the squares of modes outside of the base, so that their equations have a solution."""
 
 _PROPORTION = 2.0
 """Evidence for a proportion of two effects that makes them parts of one curve (Kass and Raftery
@@ -191,7 +188,8 @@ def _rss_beside(problem: Linear, which: slice) -> float:
     """Return the RSS beside some columns, which no set of them falls below."""
     products = np.concatenate(problem.products_with(range(len(problem.blocks))))[which]
     left, along = products[:, :-1][:, which], products[:, -1]
-    gain = along @ np.linalg.solve(left + _LEAST_OUTSIDE * np.eye(len(left)), along)
+    # The small squares are for modes inside of the base: the equations have a solution.
+    gain = along @ np.linalg.solve(left + 1e-9 * np.eye(len(left)), along)
     return float(problem.base_rss - gain)
 
 
@@ -251,12 +249,8 @@ def _held_out(chosen: Set) -> float:
     return float(np.sum(squares - (1.0 / own[kept] if chosen.linear.worth else 0.0)))
 
 
-_NEAREST = 2
-"""Number of known effects that are named as the nearest to a curve."""
-
-
 def nearest_effects(before: State) -> dict[str, float]:
-    """Return the known effects that leave least of the residual, and what they leave [mg]."""
+    """Return the two known effects that leave least of the residual, and what they leave [mg]."""
     names = tuple(name for name in EFFECTS if name not in before.model.values)
     best: list[tuple[float, str, float]] = []
     for each in candidates(names, before.poses_g):  # one by one, which takes less memory
@@ -266,7 +260,7 @@ def nearest_effects(before: State) -> dict[str, float]:
         if rank[number]:
             _, left = Set.of(linear, (number,)).spanned
             best.append((-gain[number], each.name, before.gap_mg(left)))
-    return {name: left_mg for _, name, left_mg in sorted(best)[:_NEAREST]}
+    return {name: left_mg for _, name, left_mg in sorted(best)[:2]}
 
 
 def one_curve(state: State) -> tuple[str, ...]:
@@ -278,10 +272,17 @@ def one_curve(state: State) -> tuple[str, ...]:
 
     """
     named = _by_axis(state.model.effects)
+    if not named:
+        return ()
     further = [name for name in _by_axis(EFFECTS) if name not in named]
     pairs = {pair: _proportion(pair, state) for pair in combinations(named, 2)}
-    for name in named:
-        pairs |= {(name, other): score for other, score in _in_proportion(name, further, state)}
+    linear = linearised(state.fit, state.model.effects, candidates(further, state.poses_g))
+    for name, block in product(named, linear.blocks):
+        column = linear.columns[:, block.columns] @ (
+            linear.sizes[block.columns] * state.model.values[name])
+        gain = (column @ linear.residual) ** 2 / max(float(column @ column), 1e-300)
+        score = linear.score(linear.base_rss - gain, 1.0, linear.choice)
+        pairs[name, block.effect] = float(score)
     best = max(pairs, key=lambda pair: pairs[pair], default=())
     return best if best and pairs[best] > _PROPORTION else ()
 
@@ -312,29 +313,6 @@ def _proportion(pair: tuple[str, str], state: State) -> float:
     spread = mix @ state.fit.covariance[np.ix_(own, own)] @ mix.transpose(0, 2, 1)
     chi2 = np.sum(away * np.linalg.solve(spread, away[..., np.newaxis])[..., 0], axis=1)
     return float(2.0 * np.log(min(chi2[0], chi2[len(chi2) // 2])) - np.min(chi2))
-
-
-def _in_proportion(name: str, further: Sequence[str], state: State
-                   ) -> Iterator[tuple[str, float]]:
-    """Yield effects that a model lacks, and the score of each in proportion to one it has."""
-    linear = linearised(state.fit, state.model.effects, candidates(further, state.poses_g))
-    for block in linear.blocks:
-        column = linear.columns[:, block.columns] @ (
-            linear.sizes[block.columns] * state.model.values[name])
-        gain = (column @ linear.residual) ** 2 / max(float(column @ column), 1e-300)
-        yield block.effect, float(linear.score(linear.base_rss - gain, 1.0, linear.choice))
-
-
-def steepest(variable: str, poses_g: Poses, share_mg: Floats) -> tuple[float, float] | None:
-    """Return the values of a variable of one number between which a curve changes most."""
-    if variable in ('force', 'direction', 'std'):
-        return None
-    values = poses_g[variable]
-    parts = np.array_split(np.argsort(values, kind='stable'), 5)
-    middle = [float(np.mean(values[part])) for part in parts]
-    size = [float(np.sqrt(np.mean(share_mg[part] ** 2))) for part in parts]
-    at = int(np.argmax(np.abs(np.diff(size))))
-    return middle[at], middle[at + 1]
 
 
 _MODES = 60

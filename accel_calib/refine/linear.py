@@ -70,15 +70,6 @@ _MOST_UNUSUAL = 6.0
 _RARE = 5.0
 """Additional cost of each pose that is left out: few poses are knocked."""
 
-_LARGEST_LOG = 100.0
-"""Largest logarithm of a ratio, against overflow."""
-
-_ALONE = 1e-12
-"""Smallest part of the equations of a pose outside of the base, against division by zero."""
-
-_LEAST_NORM = 1e-100
-"""Norm below which a column counts as zero: products of smaller numbers underflow."""
-
 LEAST_OWN = 0.02
 """Smallest 1 - leverage; below it, an equation alone determines a value."""
 
@@ -115,6 +106,10 @@ class Linear:
     orthonormal directions along which the equations are whitened, the (r,) part of each that is
     taken away, and their (r, c + 1) products with the columns and the residual.
 
+    What was computed so far is kept: in `made` the products of blocks, in `outliers` those found
+    beside blocks, and in `without_poses` `root` and `across` of the sets without effects, by the
+    poses left out.
+
     """
 
     onto: Floats
@@ -130,6 +125,10 @@ class Linear:
     penalty: float = 0.0
     taken: Floats | None = None
     white: tuple[Floats, Floats, Floats] | None = None
+    made: dict[int, Floats] = field(default_factory=dict, init=False)
+    outliers: dict[frozenset[int], tuple[int, ...]] = field(default_factory=dict, init=False)
+    without_poses: dict[tuple[int, ...], tuple[Floats, Floats]] = field(
+        default_factory=dict, init=False)
 
     @property
     def columns(self) -> Floats:
@@ -169,20 +168,15 @@ class Linear:
         # By a dot product as `base_rss`: the score of the base is exactly 0.
         return np.append(self._products(slice(-1), -1), self._products(-1, -1))
 
-    @cached_property
-    def _made(self) -> dict[int, Floats]:
-        """Return the products of the blocks that were asked for so far."""
-        return {}
-
     def products_with(self, blocks: Sequence[int]) -> list[Floats]:
         """Return the (w, c + 1) products of each block with all columns and the residual."""
-        new = [block for block in blocks if block not in self._made]
+        new = [block for block in blocks if block not in self.made]
         if new:
             parts = [self.blocks[block].columns for block in new]
             ends = np.cumsum([part.stop - part.start for part in parts])
             index = [column for part in parts for column in range(part.start, part.stop)]
-            self._made.update(zip(new, np.split(self._products(index, slice(None)), ends[:-1])))
-        return [self._made[block] for block in blocks]
+            self.made.update(zip(new, np.split(self._products(index, slice(None)), ends[:-1])))
+        return [self.made[block] for block in blocks]
 
     @cached_property
     def by_width(self) -> list[Group]:
@@ -222,7 +216,7 @@ class Linear:
     def rss_of(self, score: float, parameters: float, charge: float) -> float:
         """Return the RSS with which a set has a score."""
         room = float(self.score(self.base_rss, parameters, charge)) - score
-        ratio = math.exp(min(room / (self.worth + self.dof), _LARGEST_LOG))
+        ratio = math.exp(min(room / (self.worth + self.dof), 100.0))  # no overflow
         return (self.worth + self.base_rss) * ratio - self.worth
 
     @cached_property
@@ -241,16 +235,6 @@ class Linear:
     def rows_of(self, poses: tuple[int, ...]) -> NDArray[np.intp]:
         """Return the indices of the equations of poses."""
         return np.flatnonzero(np.isin(self.pose, poses)) if poses else np.zeros(0, np.intp)
-
-    @cached_property
-    def outliers(self) -> dict[frozenset[int], tuple[int, ...]]:
-        """Return the outliers that were found so far, by the blocks beside them."""
-        return {}
-
-    @cached_property
-    def without_poses(self) -> dict[tuple[int, ...], tuple[Floats, Floats]]:
-        """Return `root` and `across` of the sets without effects, by the poses left out."""
-        return {}
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,26 +261,22 @@ class Set:
     def of(cls, linear: Linear, blocks: Iterable[int] = (), out: Iterable[int] = ()) -> Set:
         out = tuple(sorted(out))
         if out not in linear.without_poses:
-            linear.without_poses[out] = cls._of_poses(linear, out)
+            rows = linear.rows_of(out)
+            own, across = linear.onto[rows], linear.every[:, rows].T.copy()
+            left = np.eye(len(rows)) - own @ own.T
+            if linear.white is not None:
+                axes, loss, along = linear.white
+                taken = axes[rows] * (loss * (2.0 - loss))
+                left -= taken @ axes[rows].T
+                across -= taken @ along
+            size, turn = np.linalg.eigh(left)
+            root = turn / np.sqrt(np.maximum(size, 1e-12))  # against division by zero
+            linear.without_poses[out] = root, root.T @ across
         root, across = linear.without_poses[out]
         found = cls(linear, (), out, root, across, np.eye(len(across)))
         for block in blocks:
             found = found.extended(block)
         return found
-
-    @staticmethod
-    def _of_poses(linear: Linear, out: tuple[int, ...]) -> tuple[Floats, Floats]:
-        rows = linear.rows_of(out)
-        own, across = linear.onto[rows], linear.every[:, rows].T.copy()
-        left = np.eye(len(rows)) - own @ own.T
-        if linear.white is not None:
-            axes, loss, along = linear.white
-            taken = axes[rows] * (loss * (2.0 - loss))
-            left -= taken @ axes[rows].T
-            across -= taken @ along
-        size, turn = np.linalg.eigh(left)
-        root = turn / np.sqrt(np.maximum(size, _ALONE))
-        return root, root.T @ across
 
     def extended(self, block: int) -> Set:
         part = self.linear.blocks[block].columns
@@ -528,5 +508,5 @@ def orthonormal(columns: Floats) -> Floats:
 def _norms(columns: Floats) -> Floats:
     """Return the norms of columns, infinite for a column of zeros, which remains one."""
     sizes: Floats = np.sqrt(np.einsum('mc,mc->c', columns, columns))
-    sizes[sizes < _LEAST_NORM] = np.inf
+    sizes[sizes < 1e-100] = np.inf  # products of smaller numbers underflow
     return sizes

@@ -24,7 +24,8 @@ values of the models are uncertain in them, too, so it is what `refine` will rep
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 import math
@@ -68,9 +69,6 @@ _BEYOND = 0.5
 
 _WAITS = (0.5, 1.0, 2.0)
 """Times after the last pose, in durations of the session."""
-
-_DRAWS, _SEED = 1000, 1
-"""Random readings for the expected probability; the same for each plan."""
 
 ENOUGH = 0.95
 """Expected probability of the right effect at which a plan ends."""
@@ -169,9 +167,11 @@ def plan_poses(found: Found) -> PosePlan:
     rivalries = [fits for name in names if (fits := _fits(name, found))]
     if not rivalries:
         return PosePlan()
-    grid = _Candidates.of(found.final.fit, _varied({name for each in rivalries for name in each}))
-    contests = [_Contest.of(each, found.near, grid.poses_g) for each in rivalries]
-    return _in_words(contests, grid, _chosen(contests))
+    needs = {key for each in rivalries for name in each for key in effect_named(name).needs}
+    varied = [key for key in (*VARIED, *sorted(filter(is_quantity, needs))) if key in needs]
+    poses_g, up, shown = _candidates(found.final.fit, varied)
+    contests = [_Contest.of(each, found.near, poses_g) for each in rivalries]
+    return _in_words(contests, up, shown, _chosen(contests))
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,31 +202,36 @@ class _Contest:
         return cls(tuple(fits), weights, means, rows,
                    tuple(fit.by_pose.spread for _, fit in fits.values()))
 
-    def gains(self, taken: Sequence[int]) -> Floats:
+    def gains(self, taken: list[int]) -> Floats:
         """Return the (c,) expected change of the log odds by each candidate, after others."""
         total = np.zeros(self.means.shape[1])
         for k, (rows, spread) in enumerate(zip(self.rows, self.spreads, strict=True)):
             left = self.means - self.means[k]
-            if taken:
-                left, spread = _after(left, rows, spread, list(taken))
+            if taken:  # what the model leaves, and its covariance, after a fit to these
+                own = rows[taken].reshape(-1, rows.shape[2])
+                gain = spread @ own.T @ np.linalg.inv(np.eye(len(own)) + own @ spread @ own.T)
+                learned = left[:, taken].reshape(len(left), -1) @ gain.T
+                left = left - np.einsum('crq,jq->jcr', rows, learned)
+                spread = spread - gain @ own @ spread
             sizes = np.eye(rows.shape[1]) + rows @ spread @ np.swapaxes(rows, 1, 2)
             for j, weight in enumerate(self.weights):
                 if j != k:
                     solved = np.linalg.solve(sizes, left[j][:, :, np.newaxis])[:, :, 0]
-                    gain = np.minimum(np.sum(left[j] * solved, axis=1) / 2.0, _MOST_GAIN)
-                    total += weight * self.weights[k] * gain
+                    change = np.minimum(np.sum(left[j] * solved, axis=1) / 2.0, _MOST_GAIN)
+                    total += weight * self.weights[k] * change
         return total
 
-    def expected(self, taken: Sequence[int]) -> float:
+    def expected(self, taken: list[int]) -> float:
         """Return the expected probability of the right model after some candidates."""
         if not taken:
             return float(np.sum(self.weights ** 2))
-        means = self.means[:, list(taken)].reshape(len(self.means), -1)
+        means = self.means[:, taken].reshape(len(self.means), -1)
         roots = []
         for rows, spread in zip(self.rows, self.spreads, strict=True):
-            own = rows[list(taken)].reshape(means.shape[1], -1)
+            own = rows[taken].reshape(means.shape[1], -1)
             roots.append(np.linalg.cholesky(np.eye(len(own)) + own @ spread @ own.T))
-        noise = np.random.default_rng(_SEED).normal(size=(_DRAWS, means.shape[1]))
+        # The same random readings for each plan.
+        noise = np.random.default_rng(1).normal(size=(1000, means.shape[1]))
         return sum(float(weight) * self._right(j, means, roots, noise)
                    for j, weight in enumerate(self.weights))
 
@@ -240,14 +245,6 @@ class _Contest:
         return float(np.mean(parts[right] / np.sum(parts, axis=0)))
 
 
-def _after(left: Floats, rows: Floats, spread: Floats, taken: list[int]) -> tuple[Floats, Floats]:
-    """Return what a model leaves of means, and its covariance, after a fit to candidates."""
-    own = rows[taken].reshape(-1, rows.shape[2])
-    gain = spread @ own.T @ np.linalg.inv(np.eye(len(own)) + own @ spread @ own.T)
-    learned = left[:, taken].reshape(len(left), -1) @ gain.T
-    return left - np.einsum('crq,jq->jcr', rows, learned), spread - gain @ own @ spread
-
-
 def _fits(name: str, found: Found) -> dict[str, tuple[float, Fit]]:
     """
     Return probability and fit of an effect and its rivals; empty if the data are certain enough.
@@ -255,61 +252,40 @@ def _fits(name: str, found: Found) -> dict[str, tuple[float, Fit]]:
     What is usual does not replace a pose that would show it.
 
     """
-    fits: dict[str, Fit] = {name: found.final.fit}
+    fits, others = {name: found.final.fit}, found.near.without(name)
+    unchanged = {key: part for key, part in found.final.model.values.items() if key != name}
     weights = probabilities(name, found.near, usual=False)
     for rival, weight in weights.items():
-        if rival != WANDER and shown_name(rival) != shown_name(name) and weight > LEAST:
-            fit = _fit_of(rival, name, found)
-            if fit is not None:
-                fits[rival] = fit
+        if rival == WANDER or shown_name(rival) == shown_name(name) or weight <= LEAST:
+            continue
+        best = others.best_of(rival)
+        values = [others.extended(best).values[best], others.linear.blocks[best].shape]
+        model = Model(with_effect(unchanged, rival, np.concatenate(values)))
+        state = fitted_state(model, found.final.poses_g)
+        if state is not None:
+            fits[rival] = state.fit
     total = sum(weights[each] for each in fits)
     if len(fits) < 2 or max(weights[each] for each in fits) >= ENOUGH * total:
         return {}
     return {each: (weights[each] / total, fit) for each, fit in fits.items()}
 
 
-def _fit_of(rival: str, name: str, found: Found) -> Fit | None:
-    """Return the fit with a rival in the place of an effect, or None without a sound fit."""
-    others = found.near.without(name)
-    best = others.best_of(rival)
-    unchanged = {key: part for key, part in found.final.model.values.items() if key != name}
-    values = with_effect(unchanged, rival, np.concatenate(
-        [others.extended(best).values[best], others.linear.blocks[best].shape]))
-    state = fitted_state(Model(values), found.final.poses_g)
-    return None if state is None else state.fit
-
-
-def _varied(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the columns that these effects are functions of."""
-    needs = {key for name in names for key in effect_named(name).needs}
-    return tuple(key for key in (*VARIED, *sorted(filter(is_quantity, needs))) if key in needs)
-
-
-@dataclass(frozen=True)
-class _Candidates:
+def _candidates(fit: Fit, varied: Sequence[str]) -> tuple[Poses, Floats, list[dict[str, float]]]:
     """
-    Poses that can be taken, with the readings that the final model predicts [g].
+    Return poses that can be taken, with the readings that a model predicts [g].
 
-    `up` is the (c, 3) direction that points up, and `shown` the varied context of each; the time
-    is the wait after the last pose.
+    Return also the (c, 3) direction that points up, and the varied context of each; the time is
+    the wait after the last pose. Those that are easier to set come first.
 
     """
-
-    poses_g: Poses
-    up: Floats
-    shown: tuple[Mapping[str, float], ...]
-
-    @classmethod
-    def of(cls, fit: Fit, varied: tuple[str, ...]) -> _Candidates:
-        """Return the candidates near a model; those that are easier to set come first."""
-        up = np.vstack([ATTITUDES, spread_directions(_DIRECTIONS)])
-        levels = [_levels(key, fit.poses_g) for key in varied]
-        shown = [dict(zip(varied, each, strict=True)) for each in product(*levels)]
-        force = np.tile(up, (len(shown), 1))
-        each = tuple(level for level in shown for _ in up)
-        columns = _columns(fit.poses_g, force, each)
-        columns['reading'] = fit.model.at(columns).reading(force)
-        return cls(Poses(columns, np.arange(1, len(force) + 1)), force, each)
+    directions = np.vstack([ATTITUDES, spread_directions(_DIRECTIONS)])
+    levels = [_levels(key, fit.poses_g) for key in varied]
+    settings = [dict(zip(varied, each, strict=True)) for each in product(*levels)]
+    up = np.tile(directions, (len(settings), 1))
+    shown = [setting for setting in settings for _ in directions]
+    columns = _columns(fit.poses_g, up, shown)
+    columns['reading'] = fit.model.at(columns).reading(up)
+    return Poses(columns, np.arange(1, len(up) + 1)), up, shown
 
 
 def _levels(key: str, poses_g: Poses) -> list[float]:
@@ -364,27 +340,27 @@ def _chosen(contests: Sequence[_Contest]) -> list[tuple[int, _Contest]]:
     left = list(contests)
     while len(chosen) < MOST_POSES:
         taken = [index for index, _ in chosen]
-        expected = [each.expected(taken) for each in left]
-        left = [each for each, right in zip(left, expected, strict=True) if right < ENOUGH]
+        expected = {each: each.expected(taken) for each in left}
+        left = [each for each in left if expected[each] < ENOUGH]
         if not left:
             break
-        worst = left[int(np.argmin([right for right in expected if right < ENOUGH]))]
+        worst = min(left, key=expected.__getitem__)
         gains = worst.gains(taken)
         if np.max(gains) < _LEAST_GAIN:
-            left = [each for each in left if each is not worst]
-            continue
-        chosen.append((int(np.argmax(gains >= _AS_GOOD * np.max(gains))), worst))
+            left.remove(worst)
+        else:
+            chosen.append((int(np.argmax(gains >= _AS_GOOD * np.max(gains))), worst))
     return chosen
 
 
-def _in_words(contests: Sequence[_Contest], grid: _Candidates,
+def _in_words(contests: Sequence[_Contest], up: Floats, shown: Sequence[Mapping[str, float]],
               chosen: Sequence[tuple[int, _Contest]]) -> PosePlan:
     """Return the plan of the chosen candidates, in the order to take them."""
-    ordered = sorted(chosen, key=lambda each: _effort(grid.shown[each[0]]))
+    ordered = sorted(chosen, key=lambda each: _effort(shown[each[0]]))
     taken = [index for index, _ in ordered]
     poses = tuple(
-        PlannedPose(tuple(grid.up[index].tolist()), attitude_words(grid.up[index]),
-                    grid.shown[index], contest.names, contest.expected(taken[:number]))
+        PlannedPose(tuple(up[index].tolist()), attitude_words(up[index]), shown[index],
+                    contest.names, contest.expected(taken[:number]))
         for number, (index, contest) in enumerate(ordered, 1))
     lines: list[str] = []
     for contest in contests:
@@ -418,16 +394,12 @@ def _held(poses: Sequence[PlannedPose]) -> Iterator[str]:
         directions.setdefault(pose.conditions, []).append(pose.words)
     shared: dict[tuple[str, ...], list[str]] = {}
     for where, held in directions.items():
-        shared.setdefault(tuple(_counted(held)), []).append(where)
+        texts = tuple(text if count == 1 else f'{text} ({count} poses)'
+                      for text, count in Counter(held).items())
+        shared.setdefault(texts, []).append(where)
     for texts, places in shared.items():
         where = ' and '.join(filter(None, places))
         yield f'{where + ": " if where else ""}hold {"; ".join(texts)}'
-
-
-def _counted(texts: list[str]) -> list[str]:
-    """Return each text once, with the number of times if there are several."""
-    times = {text: texts.count(text) for text in texts}
-    return [text if count == 1 else f'{text} ({count} poses)' for text, count in times.items()]
 
 
 def versus(names: Sequence[str]) -> str:

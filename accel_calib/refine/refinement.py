@@ -265,7 +265,7 @@ def _record(calibration: Calibration, found: Found, given: Given, sensor: str, d
     if given.stored:  # as stored, without a fit
         kept = calibration.held(start.poses_g)
         start = State(judge(Model(calibration.model.values), kept))
-    steps, stages = steps_of(found, start, calibration.date, joint=given.joint)
+    steps, stages = steps_of(found, start, calibration.date)
     missing, plan = untestable(found, steps), plan_poses(found)
     verdict, _ = verdict_of(found, steps, refused=False)
     if verdict == 'no_gap' and calibration.reason != 'ideal' and not given.stored:
@@ -279,13 +279,12 @@ def _record(calibration: Calibration, found: Found, given: Given, sensor: str, d
     if refusal:
         steps = tuple(replace(step, parameters_sd={}) for step in steps)
     verdict, undecided = verdict_of(found, steps, refused=bool(refusal))
-    unexplained = verdict == 'unexplained' and not undecided
-    advice = (*advice_for(found, steps, missing, len(outliers), unexplained=unexplained),
-              *plan.advice)
+    advice = advice_for(found, steps, missing, len(outliers),
+                        unexplained=verdict == 'unexplained' and not undecided)
     return Refinement(
-        verdict, final.floor_mg, start.gap_mg(start.fit.residual),
-        final.gap_mg(final.residual), steps, outliers, missing, advice, refined, refusal,
-        final.poses_g, final.fit.equations.force, stages, plan, undecided, found.one_curve)
+        verdict, final.floor_mg, start.gap_mg(start.fit.residual), final.gap_mg(final.residual),
+        steps, outliers, missing, (*advice, *plan.advice), refined, refusal, final.poses_g,
+        final.fit.equations.force, stages, plan, undecided, found.one_curve)
 
 
 def _rejected(found: Found, given: Given) -> tuple[Rejected, ...]:
@@ -294,9 +293,8 @@ def _rejected(found: Found, given: Given) -> tuple[Rejected, ...]:
         rejected += [Rejected(int(row), 'the reading is clipped at the limit of the sensor',
                               'clipped')
                      for row in given.poses_g.row[found.clipped.poses]]
-    return tuple(sorted((*given.rejected, *(each for each in rejected
-                                            if each.row in given.poses.row)),
-                        key=lambda each: each.row))
+    new = [each for each in rejected if each.row in given.poses.row]
+    return tuple(sorted((*given.rejected, *new), key=lambda each: each.row))
 
 
 def _refine_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, sensor: str, date: str,
@@ -409,20 +407,15 @@ def with_changes(model: Model) -> tuple[Model, Floats]:
         elif own not in effects and own not in included(effects):
             effects.append(own)
     names = parameter_names(tuple(effects))
-    owners = [owner for name in model.effects for owner in _owners(name, effects)]
+    owners: list[tuple[str, ...]] = []
+    for own in map(plain_name, model.effects):  # of each value, those of the result it adds to
+        whole = tuple(effect for effect in effects if own in included((effect,)))
+        owners += [(value,) if own in effects else parameter_names(whole)
+                   for value in parameter_names((own,))]
     matrix = np.array([[name in owner for owner in owners] for name in names], float)
     matrix = matrix.reshape(len(names), len(owners))
     values = with_vector(tuple(effects), matrix @ model.vector).values
     return Model(values, model.rotation), matrix
-
-
-def _owners(name: str, effects: list[str]) -> list[set[str]]:
-    """Return the names of the values, among those of some effects, that each value adds to."""
-    own = plain_name(name)
-    if own in effects:
-        return [{value} for value in parameter_names((own,))]
-    whole = tuple(effect for effect in effects if own in included((effect,)))
-    return [set(parameter_names(whole))] * len(parameter_names((own,)))
 
 
 @dataclass(frozen=True)
@@ -434,11 +427,6 @@ class Given:
     stored: bool
     rejected: tuple[Rejected, ...]
     notes: tuple[Finding, ...]
-
-    @property
-    def joint(self) -> bool:
-        """Whether the poses of the stored calibration are used, too."""
-        return 'new' in self.poses_g
 
 
 def refitted(before: Calibration, poses: Poses, *, sensor: str = '', date: str = ''
@@ -471,11 +459,11 @@ def refitted(before: Calibration, poses: Poses, *, sensor: str = '', date: str =
     if lacking:
         raise RefusedFitError(f'the poses have no {" or ".join(lacking)}, which the calibration '
                               'in use corrects for', 'record it, or call ~/reset')
-    given = Given(poses, poses_g, stored=True, rejected=(*doubts, *unsound), notes=())
     final = _settled(before.model, poses_g)
     out = [Rejected(int(row), 'outlier', 'outlier') for row in poses_g.row
            if row not in final.poses_g.row]
-    rejected = tuple(sorted((*given.rejected, *out), key=lambda each: each.row))
+    rejected = tuple(sorted((*doubts, *unsound, *out), key=lambda each: each.row))
+    given = Given(poses, poses_g, stored=True, rejected=rejected, notes=())
     calibration, refusal = refined_calibration(before, final, (), given, rejected)
     if refusal:
         raise RefusedFitError(*refusal)
@@ -502,11 +490,12 @@ def refined_calibration(base: Calibration, final: State, added: tuple[str, ...],
     """Return the refined calibration, and the refusal if it must not be used."""
     model, matrix = with_changes(final.model)
     kept, poses = final.poses_g, given.poses
-    unchanged = final.model.effects == model.effects
-    if given.joint and unchanged and all(key in base.poses for key in model.needs):
-        poses = with_stored(given.poses, base)
-    elif given.joint:
-        kept = kept.take(kept['new'] > 0.0)
+    if 'new' in kept:  # beside the poses of the stored calibration
+        unchanged = final.model.effects == model.effects
+        if unchanged and all(key in base.poses for key in model.needs):
+            poses = with_stored(given.poses, base)
+        else:
+            kept = kept.take(kept['new'] > 0.0)
     at_poses = judge(model, kept if base.form.known_orientation
                      else kept.without_columns(*_ORIENTATION))
     names = ', '.join(plain_name(name) for name in added)

@@ -38,7 +38,7 @@ from .base import causes, Clipped, off_grid, unclipped
 from .curves import (
     best_curve, CLEARLY, Curve, Near, one_curve, process_of, SIGNIFICANT, Walk, walk_beside)
 from .linear import LEVEL, Set
-from .settle import fit_without, make_sound, settle, Trial
+from .settle import fit_without, make_sound, settle
 from .state import beginning, Candidate, fitted_state, linearised, State, without
 from ..calibrate import with_previous
 from ..effects import (
@@ -81,24 +81,23 @@ class Found:
     """
     The result of a search.
 
-    `base` and `final` are the states before and after it, with the same poses. `added` are the
-    added effects, in order, with `WANDER` last if the rest is a random walk of the offset;
-    `outliers` (d,) are the indices of the outliers. `near` has the equations near the final
-    model, with what was tried in `trial`; `walk` is beside it at the poses kept. `taken_back` are
-    effects that were removed because they explain too little, or no more than by chance. Poses at
-    the limit of the sensor are left out: they are `clipped`, and `with_clipped` is the base fitted
-    to all poses. `grid_g` is the step of the grid of the readings [g], if it is relevant.
+    `base` and `final` are the states before and after it, with the same poses. `outliers` (d,) are
+    the indices of the outliers. `near` has the equations near the final model; `walk` is beside it
+    at the poses kept. `added` are the added effects, in order, with `WANDER` last if the rest is a
+    random walk of the offset; they are listed at the end of a search. `taken_back` are effects
+    that were removed because they explain too little, or no more than by chance. Poses at the
+    limit of the sensor are left out: they are `clipped`, and `with_clipped` is the base fitted to
+    all poses. `grid_g` is the step of the grid of the readings [g], if it is relevant.
 
     """
 
     base: State
     final: State
-    added: tuple[str, ...]
     outliers: NDArray[np.intp]
     near: Near
-    trial: Trial
     walk: Walk | None = None
     curve: Curve | None = None
+    added: tuple[str, ...] = ()
     taken_back: tuple[str, ...] = ()
     clipped: Clipped | None = None
     grid_g: float | None = None
@@ -165,7 +164,10 @@ def _with_scatter(found: Found, poses_g: Poses, base: Model, also: tuple[str, ..
     if not found.added or 'new' in poses_g:
         return found
     scatter, largest = scatter_of(found.base.fit), np.inf
-    if _gained(found) > scatter.evidence:
+    near = found.near
+    added = near.beside.score if near.walk is None else near.walk.score
+    curve = 0.0 if found.curve is None else found.curve.score
+    if added + curve - near.beside.instead(()).score > scatter.evidence:
         return found
     while scatter.shows and scatter.size_g < _LESS * largest:
         largest = scatter.size_g
@@ -183,14 +185,6 @@ def _weighted(state: State) -> State:
         return state
     found = fitted_state(state.model, beside_scatter(poses_g, scatter.size_g))
     return state if found is None else State(stated(found.fit))
-
-
-def _gained(found: Found) -> float:
-    """Return the score of what was added, relative to nothing beside the same outliers."""
-    near = found.near
-    added = near.beside.score if near.walk is None else near.walk.score
-    curve = 0.0 if found.curve is None else found.curve.score
-    return added + curve - near.beside.instead(()).score
 
 
 def _beside(poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
@@ -222,18 +216,18 @@ def _search(poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
         near = replace(near, chosen=near.chosen.instead(()))
     out = near.chosen.out
     first = fit_without(start, poses_g, out) if out else start
-    found = Found(first, state, _added(ladder, state, near), np.array(out, np.intp), near, trial,
-                  _walk(state, near), taken_back=taken_back)
+    found = Found(first, state, np.array(out, np.intp), near, _walk(state, near),
+                  taken_back=taken_back)
     chance = tuple(name for name in near.names if _is_coincidence(found, name))
     fewer = _less(found, chance)
     found = found if fewer is None else replace(fewer, taken_back=chance)
     found = _described(found, start, poses_g)
-    state, near = make_sound(found.final, found.near, found.trial, found.base.model, ladder)
+    state, near = make_sound(found.final, found.near, trial, found.base.model, ladder)
     return replace(found, final=state, near=near, walk=_walk(state, near),
                    added=_added(ladder, state, near, found.curve))
 
 
-def _added(ladder: tuple[str, ...], state: State, near: Near, curve: Curve | None = None
+def _added(ladder: tuple[str, ...], state: State, near: Near, curve: Curve | None
            ) -> tuple[str, ...]:
     """Return the names of the effects that a model has beyond its base, in order."""
     there = {*state.model.values, *included(state.model.values), WANDER} - _of_a_turn(state)
@@ -311,9 +305,7 @@ def _with_one_curve(found: Found, start: State, poses_g: Poses) -> Found | None:
         curve = best_curve(
             beside.final, poses_g, beside.near.chosen.out, of_force=what == 'force',
             least=max(gained + better - _SEVERAL * (len(names) - 1), CLEARLY))
-        if curve is None:
-            continue
-        described = _with_curve(beside, curve, start, poses_g)
+        described = None if curve is None else _with_curve(beside, curve, start, poses_g)
         if described is not None and (described.final.is_noise or not found.final.is_noise):
             return described
     return None
@@ -327,11 +319,9 @@ def _with_curve(found: Found, curve: Curve, start: State, poses_g: Poses) -> Fou
                          without(poses_g, curve.out))
     if after is None or after.fit.at_bound:
         return None
-    out = np.array(curve.out, np.intp)
-    return replace(found, base=fit_without(start, poses_g, curve.out), final=after, walk=None,
-                   near=replace(found.near, walk=None, chosen=found.near.beside), outliers=out,
-                   curve=curve,
-                   added=(*(name for name in found.added if name != WANDER), curve.name))
+    near = replace(found.near, walk=None, chosen=found.near.beside)
+    return replace(found, base=fit_without(start, poses_g, curve.out), final=after, near=near,
+                   walk=None, curve=curve, outliers=np.array(curve.out, np.intp))
 
 
 def _less(found: Found, names: Collection[str]) -> Found | None:
@@ -349,8 +339,7 @@ def _less(found: Found, names: Collection[str]) -> Found | None:
     blocks = [block for block, name in zip(chosen.blocks, chosen.effects, strict=True)
               if name not in names]
     near = replace(found.near, walk=None, chosen=chosen.instead(blocks))
-    fewer = replace(found, final=state, near=near, walk=None,
-                    added=tuple(name for name in found.added if name not in (*names, WANDER)))
+    fewer = replace(found, final=state, near=near, walk=None)
     return fewer if found.walk is None else _walking(fewer) or fewer
 
 
@@ -373,7 +362,7 @@ def _walking(found: Found) -> Found | None:
     if walk is None or walk.likelihood_ratio < SIGNIFICANT:
         return None
     near = replace(near, walk=walk, chosen=near.chosen.within(walk.whitened(near.plain)))
-    return replace(found, near=near, walk=_walk(found.final, near), added=(*found.added, WANDER))
+    return replace(found, near=near, walk=_walk(found.final, near))
 
 
 def _is_better(curve: Curve, near: Near) -> bool:
@@ -406,11 +395,10 @@ def _of_a_turn(state: State) -> set[str]:
     does not depend on what is named.
 
     """
-    values = {CHANGES[name].base: part for name, part in state.model.values.items()
-              if name in CHANGES}
-    gains = [name for name in state.model.values if name in CHANGES
-             and not effect_named(CHANGES[name].base).is_offset
-             and not CHANGES[name].known_orientation]
+    changes = {name: CHANGES[name] for name in state.model.values if name in CHANGES}
+    values = {change.base: state.model.values[name] for name, change in changes.items()}
+    gains = [name for name, change in changes.items()
+             if not effect_named(change.base).is_offset and not change.known_orientation]
     if not gains or not any(effect_named(name).known_orientation for name in values):
         return set()
     mat_w, mat_c = state.model.linear_part[0], Model(values).linear_part[0] - np.eye(3)

@@ -43,9 +43,6 @@ _TREND = 15.0
 _EXACT = 0.05
 """Largest error of a predicted sum of squares, in variances, after which a search ends."""
 
-_NOTHING: tuple[frozenset[str], tuple[int, ...], bool] = (frozenset(), (), False)
-"""The key of a choice without effects, outliers and a walk."""
-
 
 @dataclass(frozen=True)
 class Trial:
@@ -105,9 +102,9 @@ def settle(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterable
                   Model({}) if of_ladder else left_open(state), walks=not of_ladder)
     settled: tuple[tuple[str, ...], tuple[int, ...], Process | None] | None = None
     begun = set(state.model.effects) <= set(fixed) and len(state.poses_g) == len(poses_g)
-    seen = [_NOTHING] if begun else []
     refused: set[frozenset[str]] = set()
     linear = trial.near(state)
+    seen = [Near(Set.of(linear), linear, None, None).key] if begun else []
     for _ in range(_LADDER_ROUNDS if of_ladder else _ROUNDS):
         near = _best_near(linear, trial, refused)
         while (finer := trial.finer(near.chosen)) is not None:

@@ -43,7 +43,6 @@ _CHI2_LEVEL = 1e-3
 _CHI2_RATIO = 1.3
 """chi² per degree of freedom that still counts as noise: poses repeat worse than samples."""
 
-_OFFSET = Model({'offset': np.zeros(3)})
 _IDEAL = Model({})
 
 
@@ -145,8 +144,8 @@ def linearised(fit: Fit, base: tuple[str, ...], tried: Iterable[Candidate] = (),
     every[-1] = residual
     kinds = len({kind_of(block.effect) for block in blocks})
     return Linear(onto, near.pose, blocks, every, sizes, WORTH if near.noise_known else 0.0,
-                  near.count - onto.shape[1], float(every[-1] @ every[-1]), near.columns(_OFFSET),
-                  2.0 * math.log(1.0 + kinds))
+                  near.count - onto.shape[1], float(every[-1] @ every[-1]),
+                  near.columns(Model({'offset': np.zeros(3)})), 2.0 * math.log(1.0 + kinds))
 
 
 def left_open(state: State) -> Model:

@@ -20,7 +20,7 @@ from typing import Literal
 
 import numpy as np
 
-from .curves import LEAST, nearest_effects, probabilities, steepest
+from .curves import LEAST, nearest_effects, probabilities
 from .linear import is_seen, Set
 from .search import Found
 from .settle import ladder_set
@@ -40,9 +40,6 @@ MOST_RIVALS = 3
 
 _LEAST_VISIBLE = 0.1
 """Smallest visible change of the residuals by an effect of typical size, relative to the noise."""
-
-_LARGEST = 3
-"""Number of directions that are stated."""
 
 _NEAR = np.cos(np.radians(30.0))
 """Poses within 30° of a direction count as poses of this direction."""
@@ -207,19 +204,18 @@ def verdict_of(found: Found, steps: Sequence[Step], *, refused: bool) -> tuple[V
     return 'explained' if steps else 'no_gap', False
 
 
-def steps_of(found: Found, start: State, date: str, *, joint: bool
+def steps_of(found: Found, start: State, date: str
              ) -> tuple[tuple[Step, ...], tuple[Stage, ...]]:
     """
     Return the steps of a search, and the residuals at each stage.
 
-    The base `start` is as fitted, or as stored at a date; `joint`: its poses are used, too.
+    The base `start` is as fitted, or as stored at a date.
 
     """
     states = _sequence(found, start)
     of_output = _output_steps(found)
-    added = [_step(name, pair, found, date, unseen=joint and k == 0)
-             for k, (name, pair) in enumerate(zip(found.added, pairwise(states), strict=False))]
-    steps = (*of_output, *added)
+    steps = (*of_output, *(_step(name, *pair, found, date) for name, pair in zip(
+        found.added, pairwise(states), strict=False)))
     names = ('base', *(step.effect for step in steps))
     at = (*states[:1] * len(of_output), *states)  # limit and grid leave the residuals
     return steps, tuple(
@@ -233,25 +229,23 @@ def _sequence(found: Found, start: State) -> list[State]:
     states, values = [start], dict(found.base.model.values)
     names = [name for name in found.added if name != WANDER]
     for name in names[:-1]:
-        own = found.final.model.values.get(name)
-        values = with_effect(values, name, np.zeros(len(effect_named(name).values))
-                             if own is None else own)
+        nothing = np.zeros(len(effect_named(name).values))
+        values = with_effect(values, name, found.final.model.values.get(name, nothing))
         states.append(fitted_state(Model(values), found.final.poses_g) or states[-1])
     if names:
         states.append(found.final)
     return states if found.added[-1:] != (WANDER,) else [*states, states[-1]]
 
 
-def _step(name: str, states: tuple[State, State], found: Found, date: str, *, unseen: bool
-          ) -> Step:
-    """Return the record of one step; `unseen`: the earlier model was not fitted to the poses."""
-    before, after = states
+def _step(name: str, before: State, after: State, found: Found, date: str) -> Step:
+    """Return the record of one step."""
     chances, by_data = (_chances(name, found, usual=usual) for usual in (True, False))
     rivals = tuple(other for other, part in {**by_data, **chances}.items()
                    if other != kind_of(shown_name(name))
                    and max(part, by_data.get(other, 0.0)) > LEAST)
     first, last, held_out = before.fit.residual, after.fit.residual, after.held_out
-    first_held_out = first if unseen else before.held_out
+    is_stored = name == found.added[0] and 'new' in before.poses_g
+    first_held_out = first if is_stored else before.held_out  # the stored model has not seen them
     if name == WANDER:
         first, first_held_out = before.residual, before.held_out
         last = held_out = beside_walk(found)[1]  # it follows the poses: what it predicts counts
@@ -293,24 +287,21 @@ def _p_value(name: str, found: Found) -> float:
 
 
 def _output_steps(found: Found) -> list[Step]:
-    steps = []
-    gap, held_out = found.base.gap_mg(found.base.residual), found.base.gap_mg(found.base.held_out)
+    after, causes = found.base, list[tuple[str, str, float, State, str]]()
     if found.clipped is not None and found.with_clipped is not None:
         whole, limit_g = found.with_clipped, found.clipped.limit_g
         rows = listed('row', whole.poses_g.row[found.clipped.poses].tolist())
-        where = f'in {rows}: an axis reads {limit_g:.4g} g and its samples hardly scatter'
-        sure = {'saturation': 1.0}
-        steps.append(Step(
-            'saturation', (), sure, sure, {'limit': limit_g}, {}, whole.gap_mg(whole.residual),
-            gap, whole.gap_mg(whole.held_out), held_out, 0.0, where, 'saturation'))
+        causes.append(('saturation', 'limit', limit_g, whole, f'in {rows}: an axis reads '
+                       f'{limit_g:.4g} g and its samples hardly scatter'))
     if found.grid_g is not None:
         step_mg = found.grid_g * MG
-        where = (f'pose means are multiples of {step_mg:.3g} mg, which causes '
-                 f'{step_mg / np.sqrt(12.0):.2g} mg RMS per axis')
-        sure = {'quantisation': 1.0}
-        steps.append(Step('quantisation', (), sure, sure, {'step': found.grid_g}, {}, gap,
-                          gap, held_out, held_out, 0.0, where, 'quantisation'))
-    return steps
+        causes.append(('quantisation', 'step', found.grid_g, after, 'pose means are multiples of '
+                       f'{step_mg:.3g} mg, which causes {step_mg / np.sqrt(12.0):.2g} mg RMS per '
+                       'axis'))
+    return [Step(name, (), {name: 1.0}, {name: 1.0}, {value_name: value}, {},
+                 before.gap_mg(before.residual), after.gap_mg(after.residual),
+                 before.gap_mg(before.held_out), after.gap_mg(after.held_out), 0.0, where, name)
+            for name, value_name, value, before, where in causes]
 
 
 def beside_walk(found: Found) -> tuple[Floats, Floats]:
@@ -328,9 +319,13 @@ def _curve(name: str, before: State, share_mg: Floats) -> str:
     what = 'size of the force' if whole == 'force' else whole.replace('_', '-')
     words = (f'the {what}{f" of {part}" if part else ""} changes with {variable_words(variable)} '
              f'by up to {np.max(np.abs(share_mg)):.2g} mg')
-    steep = steepest(variable, before.poses_g, share_mg)
-    if steep is not None:
-        words += (f', most between {steep[0]:.4g} and {steep[1]:.4g} '
+    if variable not in ('force', 'direction', 'std'):  # a variable of one number
+        values = before.poses_g[variable]
+        parts = np.array_split(np.argsort(values, kind='stable'), 5)
+        middle = [float(np.mean(values[part])) for part in parts]
+        size = [float(np.sqrt(np.mean(share_mg[part] ** 2))) for part in parts]
+        at = int(np.argmax(np.abs(np.diff(size))))
+        words += (f', most between {middle[at]:.4g} and {middle[at + 1]:.4g} '
                   f'{unit_of(variable)}').rstrip()
     nearest = [f'{effect} (leaves {left:.2g} mg)'
                for effect, left in nearest_effects(before).items()]
@@ -347,21 +342,17 @@ def _where(name: str, before: State, found: Found) -> str:
     if kind_of(name) == EMPIRICAL:
         return _curve(name, before, share_mg)
     if 'instant' in effect.shape:
-        return _instant(final.model.values[name][effect.values.index('instant')], poses_g)
+        time, row = poses_g['time'], poses_g.row
+        instant = final.model.values[name][effect.values.index('instant')]
+        last, first = (int(np.nanargmin(np.where(part, np.abs(time - instant), np.nan)))
+                       for part in (time < instant, time >= instant))
+        return (f'between {time[last]:.6g} and {time[first]:.6g} s (rows {row[last]} and '
+                f'{row[first]})')
     column = next((key for key in effect.needs
                    if key in poses_g and key not in ('new', 'previous')), None)
     if column is None:
         return _directions(final.fit.equations.force, share_mg)
     return _range(column, poses_g[column], share_mg)
-
-
-def _instant(instant: float, poses_g: Poses) -> str:
-    """Return a text about the poses before and after an instant."""
-    time = poses_g['time']
-    before, after = (int(np.nanargmin(np.where(part, np.abs(time - instant), np.nan)))
-                     for part in (time < instant, time >= instant))
-    return (f'between {time[before]:.6g} and {time[after]:.6g} s (rows {poses_g.row[before]} and '
-            f'{poses_g.row[after]})')
 
 
 def _range(column: str, values: Floats, share_mg: Floats) -> str:
@@ -380,11 +371,11 @@ def _range(column: str, values: Floats, share_mg: Floats) -> str:
 
 
 def _directions(force: Floats, share_mg: Floats) -> str:
-    """Return a text about the directions with the largest disagreement."""
+    """Return a text about the three directions with the largest disagreement."""
     signs, near = np.sign(ATTITUDES), ATTITUDES @ force.T >= _NEAR
     counts = np.sum(near, axis=1)
     means = np.where(counts > 0, near @ share_mg / np.maximum(counts, 1), 0.0)
-    largest = [k for k in np.argsort(-np.abs(means))[:_LARGEST] if counts[k]]
+    largest = [k for k in np.argsort(-np.abs(means))[:3] if counts[k]]
     return 'with ' + ', '.join(
         f'{axes_of_signs(signs[k])} up ({means[k]:+.2g} mg over {counts[k]} of {len(share_mg)} '
         'poses)' for k in largest)
@@ -392,23 +383,18 @@ def _directions(force: Floats, share_mg: Floats) -> str:
 
 def untestable(found: Found, steps: Sequence[Step]) -> tuple[tuple[str, str], ...]:
     """Return the effects that the poses of a search cannot show, with the data to record."""
-    final, rivals = found.final, (rival for step in steps for rival in step.rivals)
-    return not_testable(final.poses_g, _visible(found.near.beside),
-                        (*final.model.effects, *rivals))
-
-
-def _visible(chosen: Set) -> dict[str, float]:
-    """Return what effects of typical size add to the residual, if they are seen at all."""
-    linear, found = chosen.linear, dict[str, float]()
-    for numbers, index, left in chosen.beside(linear.by_width):
+    linear, testable = found.near.plain, dict[str, float]()
+    # What effects of typical size add to the residual, if they are seen at all.
+    for numbers, index, left in found.near.beside.beside(linear.by_width):
         sizes = linear.sizes[index]
         squares = np.linalg.eigvalsh(left * sizes[:, np.newaxis] * sizes[:, :, np.newaxis])
         seen = is_seen(np.linalg.eigvalsh(left)).any(axis=1)
         for number, square in zip(numbers[seen].tolist(), squares[seen, -1].tolist()):
             block = linear.blocks[number]
-            found[block.effect] = max(math.sqrt(square) * block.entry.typical,
-                                      found.get(block.effect, 0.0))
-    return found
+            testable[block.effect] = max(math.sqrt(square) * block.entry.typical,
+                                         testable.get(block.effect, 0.0))
+    present = (*found.final.model.effects, *(rival for step in steps for rival in step.rivals))
+    return not_testable(found.final.poses_g, testable, present)
 
 
 def not_testable(poses_g: Poses, testable: Mapping[str, float], present: tuple[str, ...]
@@ -462,7 +448,11 @@ def advice_for(found: Found, steps: tuple[Step, ...], untestable: tuple[tuple[st
     `left_out` is the number of poses that were left out; `unexplained`: a gap remains.
 
     """
-    lines = [*_other_sensor(found), *_unseen_turn(found)]
+    lines, poses_g = _other_sensor(found), found.base.poses_g
+    if 'new' in poses_g and 'reference' not in poses_g:
+        lines.append('a mount that has turned since the calibration cannot show: only |force| = '
+                     '1 g is known; take poses of known orientation (ref_x, ref_y, ref_z) with '
+                     'both')
     lines += [_separating(step) for step in steps if step.rivals]
     for step in steps:
         times, effect = times_typical(step), effect_named(step.name)
@@ -477,7 +467,7 @@ def advice_for(found: Found, steps: tuple[Step, ...], untestable: tuple[tuple[st
         were, them = ('was', 'it') if left_out == 1 else ('were', 'them')
         lines.append(f'{counted(left_out, "pose")} {were} left out; take {them} again')
     if found.base.dof < _FEW:
-        lines.append(f'{counted(len(found.base.poses_g), "pose")} leave '
+        lines.append(f'{counted(len(poses_g), "pose")} leave '
                      f'{counted(found.base.dof, "degree")} of freedom, which is too few to detect '
                      'most effects: take 24 poses or more')
     if unexplained:
@@ -512,15 +502,6 @@ def _other_sensor(found: Found) -> list[str]:
     return [f'this is probably another sensor: its {CHANGES[name].base} differs from the stored '
             f'one by {changes[name]:.2g} {CHANGES[name].unit}, which is too much for one sensor; '
             'fit a new calibration from its own poses']
-
-
-def _unseen_turn(found: Found) -> list[str]:
-    """Return a line if the sensor may have turned since the stored calibration, unseen."""
-    poses_g = found.base.poses_g
-    if 'new' not in poses_g or 'reference' in poses_g:
-        return []
-    return ['a mount that has turned since the calibration cannot show: only |force| = 1 g is '
-            'known; take poses of known orientation (ref_x, ref_y, ref_z) with both']
 
 
 def _separating(step: Step) -> str:
