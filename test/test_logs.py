@@ -4,7 +4,7 @@
 """Text logs of any dialect: the same numbers are read, and what is assumed is said."""
 
 from collections.abc import Callable
-from datetime import datetime, timezone
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 import re
 import sys
@@ -698,8 +698,54 @@ def test_angular_rates_and_temperatures_in_counts_are_not_used_and_noted(reads: 
     own = reads('time,accX,accY,accZ,gx,gy,gz,temp', *columns)
     assert not {'rate', 'temperature'} & {*log.table.columns}
     assert 'rate' not in own.table
-    for words in ('gyroX/Y/Z look like counts', 'temp has values of about 20'):
+    for words in ('gyroX/Y/Z at rest are those of no gyro', 'temp has values of about 20'):
         assert any(words in note for note in log.notes)
+
+
+@pytest.mark.parametrize('unit', ['rad/s', '°/s'])
+@pytest.mark.parametrize('names', ['gx,gy,gz', 'GX,GY,GZ', 'gyroX,gyroY,gyroZ'])
+@pytest.mark.parametrize('seed', range(3))
+def test_the_unit_of_a_gyro_is_seen_at_rest(unit: str, names: str, seed: int, reads: Reads
+                                            ) -> None:
+    rng = np.random.default_rng(seed)
+    time, per_s = np.arange(1500) / 100.0, 1.0 if unit == 'rad/s' else 180.0 / np.pi
+    up = rng.normal(size=3)
+    reading = G * up / np.linalg.norm(up) + 0.02 * rng.normal(size=(1500, 3))
+    bias, noise = rng.uniform(-0.05, 0.05, 3), np.radians(rng.uniform(0.08, 0.5))
+    rate = bias + noise * rng.normal(size=(1500, 3))
+    log = reads(f'time,ax,ay,az,{names}', time, reading, rate * per_s)
+    np.testing.assert_allclose(log.table['rate'], rate, rtol=1e-6)
+
+
+@pytest.mark.parametrize('bits', [12, 14, 16])
+@pytest.mark.parametrize('seed', range(3))
+def test_counts_that_lost_their_sign_are_read_with_it(bits: int, seed: int, reads: Reads) -> None:
+    made = samples(seed, per_g=2.0**bits / 4.0)
+    counts = np.round(made['reading'])
+    log = reads('time,accX,accY,accZ', made['time'], counts % 2.0**bits)
+    np.testing.assert_array_equal(log.table.reading, counts)
+    middle = counts + 2.0**(bits - 1)  # without a sign, with zero in the middle
+    log = reads('time,accX,accY,accZ', made['time'], middle)
+    np.testing.assert_array_equal(log.table.reading, middle)
+
+
+@pytest.mark.parametrize('period', [1.0, 0.2, 64.0])
+def test_coarse_stamps_are_spread_over_their_samples(period: float, reads: Reads) -> None:
+    made = samples()
+    time = made['time'] * period  # so that each stamp has 50 samples
+    log = reads('time,ax,ay,az', np.floor(time / period) * period, made['reading'])
+    np.testing.assert_allclose(np.diff(log.table['time']), np.diff(time), atol=0.3 / RATE_HZ)
+
+
+@pytest.mark.parametrize('dated', [True, False])
+def test_rows_with_the_newest_first_are_turned_round(dated: bool, reads: Reads) -> None:
+    made = samples()
+    time = made['time'] + 43_170.0  # through noon
+    texts = [(datetime(2026, 1, 31) + timedelta(seconds=each)).strftime('%m/%d/%Y %I:%M:%S.%f %p')
+             for each in time.tolist()]
+    log = reads('time,ax,ay,az', *(part[::-1] for part in (
+        texts if dated else time, made['reading'])))
+    check(log, made['reading'], time, within_s=2e-6)
 
 
 @pytest.mark.parametrize(('name', 'factor', 'zero'), [

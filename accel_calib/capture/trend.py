@@ -215,7 +215,7 @@ def strength_of(line: Line, spacing: float | Floats, white: Floats) -> Trend:
     square = np.sum(line.square * weight, axis=0)
     neighbours = np.sum(line.neighbours * weight, axis=0)
     correlation = np.clip(neighbours / (square + _TINY) + 3.0 / size, 0.0, _CORRELATION_MAX)
-    power = np.maximum(square / (3.0 * (size - 2)), 1.0)
+    power = np.maximum(square / (3.0 * np.maximum(size - 2, 1)), 1.0)
     excess = power * (1.0 + correlation) / (1.0 - correlation)
     time_square = line.time_square * spacing**2
     strength = np.sum(slope * slope * weight, axis=0) * time_square / excess
