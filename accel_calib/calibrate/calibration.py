@@ -14,7 +14,7 @@ rate of the temperature, for `temperature_rate` and lags.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from html import escape
@@ -509,8 +509,7 @@ def _linear_rows(model: Model, u: Floats) -> Floats:
     linear = Model({name: values for (name, values), effect in
                     zip(model.values.items(), model.terms.effects, strict=True) if effect.linear})
     rows = np.zeros((len(u), 3, len(model.vector)))
-    place = [parameter_names(model.effects).index(name)
-             for name in parameter_names(linear.effects)]
+    place = np.isin(parameter_names(model.effects), parameter_names(linear.effects))
     rows[:, :, place] = linear.basis(u, {}).full
     return rows
 
@@ -566,8 +565,12 @@ class Outside:
 
 def outside(calibration: Calibration, known: Context) -> dict[str, Outside]:
     """Return the comparison of each column that has a range; ``count`` is 0 if all are inside."""
-    found = {}
-    for key, (low, high) in {**calibration.ranges, **_vibration_range(calibration)}.items():
+    found, ranges = {}, dict(calibration.ranges)
+    ends = [values[-2:] for name, values in calibration.model.values.items()
+            if variable_of(name) == 'std']
+    if ends:  # empirical curves over the vibration
+        ranges['std'] = float(np.max(ends, axis=0)[0]), float(np.min(ends, axis=0)[1])
+    for key, (low, high) in ranges.items():
         values = over_axes(known[key]) if key in known else np.zeros(0)
         values = values[np.isfinite(values)]
         if len(values):
@@ -575,15 +578,6 @@ def outside(calibration: Calibration, known: Context) -> dict[str, Outside]:
             found[key] = Outside(key, count, len(values), low, high, float(np.min(values)),
                                  float(np.max(values)))
     return found
-
-
-def _vibration_range(calibration: Calibration) -> dict[str, tuple[float, float]]:
-    """Return the range of the empirical curves over the vibration, if there are any."""
-    ends = [values[-2:] for name, values in calibration.model.values.items()
-            if variable_of(name) == 'std']
-    if not ends:
-        return {}
-    return {'std': (float(np.max(ends, axis=0)[0]), float(np.min(ends, axis=0)[1]))}
 
 
 class SampleContext:
@@ -597,8 +591,13 @@ class SampleContext:
 
     def of(self, known: Context, count: int) -> Context:
         """Return the context of the next block as `of_samples` does."""
-        context = of_samples(known, count, self._calibration.model, self._thermal)
-        self.lacking = _lacking(self._calibration.model, known)
+        model = self._calibration.model
+        context = of_samples(known, count, model, self._thermal)
+        self.lacking = ''
+        if lacking := [key for key in model.neutral if key not in known]:
+            names = [name for name in model.effects if variable_of(name) in lacking]
+            self.lacking = (f'the samples have no {" and ".join(lacking)}: {" and ".join(names)} '
+                            f'{"is" if len(names) == 1 else "are"} not corrected')
         for key, block in outside(self._calibration, context).items():
             before = self._compared.get(key)
             self._compared[key] = block if before is None else replace(
@@ -610,11 +609,3 @@ class SampleContext:
     def left(self) -> list[Outside]:
         """Return the quantities that have left the range of the calibration so far."""
         return [each for each in self._compared.values() if each.count]
-
-
-def _lacking(model: Model, known: Iterable[str]) -> str:
-    """Return a line about the quantities that samples do not have; empty if they have all."""
-    lacking = [key for key in model.neutral if key not in known]
-    names = [name for name in model.effects if variable_of(name) in lacking]
-    return (f'the samples have no {" and ".join(lacking)}: {" and ".join(names)} '
-            f'{"is" if len(names) == 1 else "are"} not corrected') if lacking else ''

@@ -121,10 +121,10 @@ def fit_poses(poses: Poses, units: Units, *, model: str = 'auto', method: Method
 def _without_doubtful(poses: Poses, rejected: tuple[Rejected, ...], units: Units, model: str,
                       method: Method) -> tuple[Calibration, tuple[Rejected, ...]]:
     """Fit without the doubtful poses, if the other poses determine the same model."""
+    every = _fitted(poses, units, model, method)
     sure, doubts = sure_rows(poses)
     if not doubts or method == 'algebraic':
-        return _fitted(poses, units, model, method), rejected
-    every = _fitted(poses, units, model, method)
+        return every, rejected
     try:
         without = _fitted(sure, units, model, method)
     except RefusedFitError:
@@ -287,13 +287,8 @@ def _in_own_axes(name: str, fit: Fit) -> Fit:
     """Return a fit in the axes of its model: those of model 9 are fixed to the sensing axes."""
     if not MODELS[name].sensing_axes:
         return fit
-    return _in_sensing_axes(fit.model.linear_part, fit.poses_g)
-
-
-def _in_sensing_axes(linear_part: tuple[Floats, Floats], poses_g: Poses) -> Fit:
-    """Return model 9 at these poses, from W in any axes, and V."""
-    mat_w, vec_v = linear_part
-    return judge(linear_model('9', lower_triangular(mat_w), vec_v), poses_g, TIES)
+    mat_w, vec_v = fit.model.linear_part
+    return judge(linear_model('9', lower_triangular(mat_w), vec_v), fit.poses_g, TIES)
 
 
 def _fit_rows(poses_g: Poses, name: str, method: Method) -> Fit:
@@ -303,25 +298,22 @@ def _fit_rows(poses_g: Poses, name: str, method: Method) -> Fit:
     if not np.all(np.isfinite(mat_w)):
         raise RefusedFitError(f'the poses are not on an ellipsoid, but model {name} needs one',
                               TAKE_ALL_SIDES)
+    model = linear_model(MODELS[name].norm, mat_w, vec_v)
     if MODELS[name].sensing_axes:
-        return _in_sensing_axes(_of_the_report(mat_w, vec_v, poses_g), poses_g)
-    return judge(start_of(name, poses_g.reading), poses_g)
+        model = _of_the_report(model, poses_g)
+    return _in_own_axes(name, judge(model, poses_g))
 
 
-def _of_the_report(mat_w: Floats, vec_v: Floats, poses_g: Poses) -> tuple[Floats, Floats]:
-    """Return the W and V that minimise the sum of (|a| - g)², eq. 17 of the ESGI'95 report."""
-    effects = MODELS['10'].effects
-
+def _of_the_report(start: Model, poses_g: Poses) -> Model:
+    """Return model 10 with the least sum of (|a| - g)², eq. 17 of the ESGI'95 report."""
     def point_at(values: Floats) -> Point:
-        model = with_vector(effects, values)
+        model = with_vector(start.effects, values)
         u = sensor_force(model, poses_g.reading, {})
         rows = length_rows(model, u, {})
         return Point(np.linalg.norm(u, axis=1) - 1.0, model.basis(u, {}).along(rows))
 
-    start = linear_model('10', mat_w, vec_v).vector
-    free = np.full(len(start), np.inf)
-    found, _ = solve(point_at, start, -free, free)
-    return with_vector(effects, found).linear_part
+    free = np.full(len(start.vector), np.inf)
+    return with_vector(start.effects, solve(point_at, start.vector, -free, free)[0])
 
 
 def _choose(fits: Mapping[str, Fit]) -> tuple[str, str]:
@@ -441,7 +433,10 @@ def _unless_placed_well(poses: Poses, units: Units) -> Calibration | None:
         return None
     away = unit(u) - known @ rotation.T
     variance = _tangential_variance(fit, by_norm.covariance, u)
-    if not _is_placement(away, variance, fit.variance_dof):
+    dof = 2.0 * len(away) - 3.0
+    ratio = float(np.sum(away ** 2) / np.sum(variance)) * 2.0 * len(away) / dof
+    chance = float(scipy.special.fdtrc(dof, fit.variance_dof, ratio))
+    if not (ratio > _LEAST_RATIO and chance < _LEVEL_OF_PLACEMENT):  # the noise explains them
         return None
     angle = np.degrees(np.linalg.norm(away, axis=1))
     words = (f'the known orientations differ by {np.sqrt(np.mean(angle ** 2)):.2g}° (RMS) from a '
@@ -483,11 +478,3 @@ def _tangential_variance(fit: Fit, covariance: Floats, u: Floats) -> Floats:
     along = np.einsum('ni,nij,nj->n', unit(u), spread, unit(u))
     own = 2.0 * fit.equations.scale ** 2 * fit.variance
     return own + np.trace(spread, axis1=1, axis2=2) - along
-
-
-def _is_placement(away: Floats, variance: Floats, variance_dof: float) -> bool:
-    """Return whether the differences are larger than the noise explains."""
-    dof = 2.0 * len(away) - 3.0
-    ratio = float(np.sum(away ** 2) / np.sum(variance)) * 2.0 * len(away) / dof
-    chance = float(scipy.special.fdtrc(dof, variance_dof, ratio))
-    return ratio > _LEAST_RATIO and chance < _LEVEL_OF_PLACEMENT

@@ -102,18 +102,13 @@ def mounting(flat: Floats, frame: str = 'ros') -> Floats:
     if not (np.isfinite(length) and length > 0.0):
         raise InputError(f'the flat pose has the force {flat}, expected about 1 g',
                          'repeat the flat pose with the sensor at rest')
-    column_z = flat / length * flat_direction(frame)[2]
-    return _triad(column_z, _x_towards(column_z, frame))
-
-
-def _x_towards(up: Floats, frame: str) -> Floats:
-    """Return the direction whose horizontal part is the x column by the convention of a frame."""
-    x, y, z = up
+    x, y, z = column_z = flat / length * flat_direction(frame)[2]
+    towards = np.array([1.0, 0.0, 0.0])  # its horizontal part is the x column
     if frame != 'win8' and np.hypot(y, z) < _VERTICAL:  # a level y axis
-        return np.array([0.0, 0.0, -x])
-    if frame != 'win8' or np.hypot(x, z) < _VERTICAL:
-        return np.array([1.0, 0.0, 0.0])
-    return np.array([z, 0.0, -x]) * (-1.0 if z < 0.0 else 1.0)
+        towards = np.array([0.0, 0.0, -x])
+    elif frame == 'win8' and not np.hypot(x, z) < _VERTICAL:
+        towards = np.array([z, 0.0, -x]) * (-1.0 if z < 0.0 else 1.0)
+    return _triad(column_z, towards)
 
 
 def with_heading(rotation: Floats, nose_down: Floats, frame: str = 'ros') -> Floats:
@@ -220,11 +215,6 @@ def angle_words(rotation: Floats) -> str:
         'roll', 'pitch', 'yaw'))
 
 
-def heading_is_arbitrary(rotation: Floats, frame: str) -> bool:
-    """Return whether x (win8: y), which defines the heading, is within 10° of the vertical."""
-    return bool(abs(rotation[1 if frame == 'win8' else 0, 2]) > _STEEP)
-
-
 def level_by_rows(calibration: Calibration, poses: Poses, frame: FrameName, flat: int | None,
                   nose_down: int | None) -> Calibration:
     """
@@ -267,7 +257,8 @@ def level(calibration: Calibration, reading: Floats, frame: FrameName,
     """
     rotation = mounting(_in_sensor_axes(calibration, reading, context), frame)
     kept = calibration.is_levelled and frame == calibration.frame
-    arbitrary = not kept and heading_is_arbitrary(rotation, frame)
+    defining = rotation[1 if frame == 'win8' else 0]  # the axis that defines the heading
+    arbitrary = bool(not kept and abs(defining[2]) > _STEEP)
     if kept:
         rotation = with_heading_of(calibration.rotation, rotation)
     asked = kept and calibration.rotation[:, 2] @ rotation[:, 2] > _SAME_TILT
@@ -410,7 +401,8 @@ _PERMUTATIONS: list[Floats] = [
 
 def _words(permutation: Floats) -> str:
     """Return a description of a signed permutation that is not the identity."""
-    reads = _mapping(permutation)
+    read = zip(AXES, map(axes_of_signs, permutation), strict=True)
+    reads = ', '.join(f'{axis} reads {other}' for axis, other in read if other != f'+{axis}')
     if np.linalg.det(permutation) > 0.0:
         return f'the sensor is rotated by {_turn(permutation.T)} ({reads})'
     diagonal = np.diag(permutation)
@@ -423,12 +415,6 @@ def _words(permutation: Floats) -> str:
         swapped = [axis for axis, own in zip(AXES, diagonal, strict=True) if own == 0.0]
         return f'{" and ".join(swapped)} are swapped'
     return f'the axes are permuted to a mirror image: {reads}'
-
-
-def _mapping(permutation: Floats) -> str:
-    """Return the force that each axis reads, for axes that do not read their own force."""
-    read = zip(AXES, map(axes_of_signs, permutation), strict=True)
-    return ', '.join(f'{axis} reads {other}' for axis, other in read if other != f'+{axis}')
 
 
 def _turn(rotation: Floats) -> str:

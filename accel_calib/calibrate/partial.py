@@ -220,10 +220,12 @@ def without_knocked(poses_g: Poses, kept: Indices, prior: Prior, noise_g: float,
 
 def _likely(poses_g: Poses, kept: Indices, knocked: int, prior: Prior, noise_g: float) -> PriorFit:
     """Return the fit with the most probable variance factor; the other poses were knocked."""
-    used = poses_g.take(kept)
-    model, factors = with_vector(_EFFECTS, prior.mean), _factors(used, noise_g)
+    used, model = poses_g.take(kept), with_vector(_EFFECTS, prior.mean)
     found = []
-    for factor in factors:
+    stated_g = float(np.median(judge(Model({}), used).equations.scale))
+    steps = int(np.ceil(max(np.log(noise_g / stated_g) / np.log(_NOISE_STEP), 0.0)))
+    for step in range(steps, -1, -1):  # from the factor of a large noise to 1
+        factor = _NOISE_STEP ** (2.0 * step)
         try:
             fit = estimate(model, used, prior, factor)
         except NotConvergedError:  # poses as precise as this contradict every common sensor
@@ -237,13 +239,6 @@ def _likely(poses_g: Poses, kept: Indices, knocked: int, prior: Prior, noise_g: 
     if not found:
         raise NotConvergedError
     return max(found, key=lambda likely: likely.log_evidence)
-
-
-def _factors(poses_g: Poses, noise_g: float) -> list[float]:
-    """Return the variance factors to try, from that of a large noise to 1."""
-    scale = float(np.median(judge(Model({}), poses_g).equations.scale))
-    steps = int(np.ceil(max(np.log(noise_g / scale) / np.log(_NOISE_STEP), 0.0)))
-    return [_NOISE_STEP ** (2.0 * step) for step in range(steps, -1, -1)]
 
 
 def _log_evidence(fit: Fit, factor: float, prior: Prior) -> float:
@@ -333,7 +328,12 @@ def fit_partial(poses: Poses, units: Units, *, sensor: str = '', date: str = '')
     found = most_probable(only_norm(in_g(sound, units)), priors_of(), FIRST_NOISE_G, LARGEST_SHARE)
     calibration = _recorded(found, poses, sound, units, PRIOR, rejected)
     about = carried(calibration)
-    return finished(replace(calibration, reason=_known_words(about), noted=(
+    along = ('along gravity the sum of offset and gain, and so |a|, is known to '
+             f'{_mg(about.along_g)}')
+    reason = f'1 pose: {along}' if about.count == 1 else (
+        f'the {about.count} poses lie within {about.cone.degrees:.0f}° of one direction: {along}, '
+        f'and at each pose |a| to {_mg(about.among_g)}')
+    return finished(replace(calibration, reason=reason, noted=(
         _open(about), *calibration.noted)), sensor, date)
 
 
@@ -366,11 +366,16 @@ def fit_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, *, sensor: str
 def _recorded(found: PriorFit, poses: Poses, sound: Poses, units: Units, method: str,
               rejected: tuple[Rejected, ...]) -> Calibration:
     """Return a fit to the sound poses as a calibration."""
-    out = sound.take(~np.isin(found.original, found.kept))
+    fit, out = found.fit, sound.take(~np.isin(found.original, found.kept))
+    noted = fit_findings(fit, 0.0)
+    if fit.dof <= 0:
+        noted = (Finding('no_check', f'{counted(len(fit.poses_g), "pose")} cannot show whether '
+                         'poses repeat as well as the noise of their samples predicts',
+                         'take more poses'), *without(noted, 'no_check'))
     return record_of(
-        found.fit, poses, units, unit(sound.reading)[found.kept], NAME, method,
-        rejected=(*rejected, *rejected_by(found.fit.model, in_g(out, units))),
-        noted=(*copies(found.original, sound), *partial_findings(found.fit)))
+        fit, poses, units, unit(sound.reading)[found.kept], NAME, method,
+        rejected=(*rejected, *rejected_by(fit.model, in_g(out, units))),
+        noted=(*copies(found.original, sound), *noted))
 
 
 def usable(poses: Poses, units: Units, what: str) -> tuple[Poses, tuple[Rejected, ...]]:
@@ -381,8 +386,12 @@ def usable(poses: Poses, units: Units, what: str) -> tuple[Poses, tuple[Rejected
                          'the sensor to 9 or more poses spread over the sphere and fit')
     check_units(poses, units)
     sound, rejected = sound_rows(poses, units)
-    sound, others = _of_plausible_length(sound, units)
-    rejected = (*rejected, *others)
+    length = np.linalg.norm(units.to_g(sound.reading), axis=1)
+    near = np.abs(length - 1.0) <= LARGEST_ERROR_G  # others are no readings of gravity alone
+    rejected += tuple(
+        Rejected(int(row), f'the length of the reading is {size:.3g} g, expected about 1 g')
+        for row, size in zip(sound.row[~near], length[~near], strict=True))
+    sound = sound.take(near)
     sure, doubts = sure_rows(sound)
     if len(sure):
         sound, rejected = sure, (*rejected, *doubts)
@@ -390,25 +399,6 @@ def usable(poses: Poses, units: Units, what: str) -> tuple[Poses, tuple[Rejected
         raise RefusedFitError(f'found 0 sound poses of {counted(len(poses), "row")}, expected at '
                               'least 1', 'hold the sensor still and capture a pose')
     return sound, rejected
-
-
-def _of_plausible_length(poses: Poses, units: Units) -> tuple[Poses, tuple[Rejected, ...]]:
-    """Separate readings of about 1 g from others, which are no readings of gravity alone."""
-    length = np.linalg.norm(units.to_g(poses.reading), axis=1)
-    near = np.abs(length - 1.0) <= LARGEST_ERROR_G
-    return poses.take(near), tuple(
-        Rejected(int(row), f'the length of the reading is {size:.3g} g, expected about 1 g')
-        for row, size in zip(poses.row[~near], length[~near], strict=True))
-
-
-def partial_findings(fit: Fit) -> tuple[Finding, ...]:
-    """Return the findings about the noise of the poses."""
-    found = fit_findings(fit, 0.0)
-    if fit.dof > 0:
-        return found
-    return (Finding('no_check', f'{counted(len(fit.poses_g), "pose")} cannot show whether poses '
-                    'repeat as well as the noise of their samples predicts', 'take more poses'),
-            *without(found, 'no_check'))
 
 
 @dataclass(frozen=True)
@@ -458,16 +448,6 @@ def _across(covariance: Floats, axis: Floats) -> float:
     """Return the largest standard deviation at right angles to an axis."""
     across = np.eye(3) - np.outer(axis, axis)
     return float(np.sqrt(np.max(np.linalg.eigvalsh(across @ covariance @ across))))
-
-
-def _known_words(about: Carried) -> str:
-    """Return a text about what the poses determine."""
-    if about.count == 1:
-        return (f'1 pose: along gravity the sum of offset and gain, and so |a|, is known to '
-                f'{_mg(about.along_g)}')
-    return (f'the {about.count} poses lie within {about.cone.degrees:.0f}° of one direction: '
-            'along gravity the sum of offset and gain, and so |a|, is known to '
-            f'{_mg(about.along_g)}, and at each pose |a| to {_mg(about.among_g)}')
 
 
 def _open(about: Carried) -> Finding:

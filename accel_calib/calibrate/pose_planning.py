@@ -352,7 +352,11 @@ def next_pose(directions: Floats, name: str = '10', noise: Floats | None = None,
     information = information_of(name, directions, noise)
     error, fits = _error(name, information, count), determines(name, directions, noise)
     up = _best(name, directions, information)
-    if up is None or not _helps(name, up, information, count):
+    helps = up is not None and (  # reduces the error visibly
+        _largest_error(name, information) > _GOOD_DILUTION
+        or _error(name, information + information_of(name, up[np.newaxis]), count + 1)
+        <= (1.0 - _LEAST_GAIN) * error)
+    if up is None or not helps:
         certain = (f'{error * noise_g * MG:.2g} mg' if noise_g is not None
                    else f'{error:.2g} times the noise of a pose')
         words = f'more poses no longer help: {count} poses determine |a| to within {certain}'
@@ -360,15 +364,6 @@ def next_pose(directions: Floats, name: str = '10', noise: Floats | None = None,
     total = count + len(list(_planned(name, directions, information, _SPARE)))
     words = f'turn the sensor so that {words_of(up)} points up ({axes_of_signs(up)})'
     return NextPose(up, words, error, total, fits)
-
-
-def _helps(name: str, up: Floats, information: Floats, count: int) -> bool:
-    """Return whether a pose in this direction improves a fit visibly."""
-    if _largest_error(name, information) > _GOOD_DILUTION:
-        return True
-    after = information + information_of(name, up[np.newaxis])
-    limit = (1.0 - _LEAST_GAIN) * _error(name, information, count)
-    return _error(name, after, count + 1) <= limit
 
 
 def _planned(name: str, directions: Floats, information: Floats, spare: int) -> Iterator[Floats]:
@@ -392,25 +387,20 @@ def missing_poses(name: str, directions: Floats, noise: Floats | None = None) ->
 
 def _best(name: str, directions: Floats, information: Floats) -> Floats | None:
     """Return the untaken attitude that increases det M most, or None if all are taken."""
-    up = _attitudes(name)
+    up, rows = _attitudes(name)
     free = np.max(up @ directions.T, axis=1, initial=-1.0) < _TAKEN
     if not np.any(free):
         return None
-    rows = _attitude_rows(name)
     to_come = np.linalg.inv(information + _mean_information(name))
     gains = np.linalg.slogdet(np.eye(rows.shape[1]) + rows @ to_come @ np.swapaxes(rows, 1, 2))[1]
     return up[np.argmax(np.where(free, np.round(gains, 6), -1.0))]  # the first of equals
 
 
-def _attitudes(name: str) -> Floats:
-    """Return the attitudes that a person can set by eye for a model, (n, 3) unit vectors."""
-    return ATTITUDES[:6] if name == ORIENTED else ATTITUDES
-
-
 @lru_cache(maxsize=8)
-def _attitude_rows(name: str) -> Floats:
-    """Return the rows of a pose in each of the attitudes."""
-    return rows_of(name, _attitudes(name))
+def _attitudes(name: str) -> tuple[Floats, Floats]:
+    """Return the (n, 3) attitudes that a person can set by eye for a model, and their rows."""
+    up = ATTITUDES[:6] if name == ORIENTED else ATTITUDES
+    return up, rows_of(name, up)
 
 
 def _error(name: str, information: Floats, count: int) -> float:

@@ -127,9 +127,13 @@ def quality_of(fit: Fit, units: Units, directions: Floats) -> Quality:
     """Return figures of a fit; `directions` are up in each of its poses, (n, 3) unit vectors."""
     vectors = 'reference' in fit.poses_g
     held_out = _held_out(fit)
+    floor = None
+    if fit.noise_known:  # the fit absorbs a part of the noise
+        data = fit.by_pose
+        own = np.trace(data.own, axis1=1, axis2=2) - (data.columns.shape[1] - data.rows)
+        floor = rms(fit.equations.scale * np.sqrt(np.maximum(own, 0.0))) * MG
     return Quality(*_residuals(fit.model, fit.poses_g, units, vectors),
-                   None if held_out is None else rms(held_out) * MG,
-                   _noise_floor_mg(fit),
+                   None if held_out is None else rms(held_out) * MG, floor,
                    fit.chi2 / fit.dof if fit.noise_known and fit.dof > 0 else None,
                    coverage(directions))
 
@@ -150,15 +154,6 @@ def record_of(fit: Fit, poses: Poses, units: Units, directions: Floats, name: st
         name, method, fit.model, units, poses.sensor, 'ros', '',
         fit.covariance if covariance is None else covariance, quality_of(fit, units, directions),
         poses, tuple(sorted(rejected, key=lambda pose: pose.row)), reason, noted)
-
-
-def _noise_floor_mg(fit: Fit) -> float | None:
-    """Return the residual that measured noise causes after the fit absorbs a part of it [mg]."""
-    if not fit.noise_known:
-        return None
-    data, scale = fit.by_pose, fit.equations.scale
-    own = np.trace(data.own, axis1=1, axis2=2) - (data.columns.shape[1] - data.rows)
-    return rms(scale * np.sqrt(np.maximum(own, 0.0))) * MG
 
 
 def errors_before(poses_g: Poses, units: Units, *, vectors: bool) -> Floats:
@@ -285,34 +280,25 @@ def gated(calibration: Calibration) -> Calibration:
     Raise RefusedFitError if it is not plausible.
 
     """
-    _check_numbers(calibration)
-    _check_rotation(calibration.model.rotation)
+    model, rotation = calibration.model, calibration.model.rotation
+    for what, values in (('value', model.vector), ('gain', model.linear_part[0]),
+                         ('rotation', rotation), ('covariance', calibration.covariance)):
+        if not np.all(np.isfinite(values)):
+            raise RefusedFitError(f'the calibration has a {what} that is not finite, expected '
+                                  'finite numbers', _CHECK_POSES)
+    if not (rotation.shape == (3, 3) and np.linalg.det(rotation) > 0.0
+            and np.allclose(rotation @ rotation.T, np.eye(3), atol=_ROTATION_TOLERANCE)):
+        raise RefusedFitError('the mounting ΔR is not orthonormal, or it is a mirror image; '
+                              'expected a rotation', 'level the mounting again')
     _check_covariance(calibration.covariance)
     _check_gain(calibration)
     _check_effects(calibration)
     residual = calibration.quality.rms_after_mg / MG
-    if calibration.model.effects and not residual <= LARGEST_RESIDUAL_G:
+    if model.effects and not residual <= LARGEST_RESIDUAL_G:
         raise RefusedFitError(
             f'the residual is {residual * MG:.3g} mg (RMS) after the fit, expected less than '
             f'{LARGEST_RESIDUAL_G * MG:.0f} mg: the poses are not on an ellipsoid', _CHECK_POSES)
     return _with_uncertainty(calibration)
-
-
-def _check_numbers(calibration: Calibration) -> None:
-    model = calibration.model
-    for what, values in (('value', model.vector), ('gain', model.linear_part[0]),
-                         ('rotation', model.rotation), ('covariance', calibration.covariance)):
-        if not np.all(np.isfinite(values)):
-            raise RefusedFitError(f'the calibration has a {what} that is not finite, expected '
-                                  'finite numbers', _CHECK_POSES)
-
-
-def _check_rotation(rotation: Floats) -> None:
-    proper = (rotation.shape == (3, 3) and np.linalg.det(rotation) > 0.0
-              and np.allclose(rotation @ rotation.T, np.eye(3), atol=_ROTATION_TOLERANCE))
-    if not proper:
-        raise RefusedFitError('the mounting ΔR is not orthonormal, or it is a mirror image; '
-                              'expected a rotation', 'level the mounting again')
 
 
 def _check_covariance(covariance: Floats) -> None:

@@ -119,9 +119,6 @@ class GyroBias(Record):
             raise ValueError(f'the sd of the gyro bias is {self.sd.tolist()}, expected 0 or more')
         if self.rests < 1:
             raise ValueError(f'the gyro bias has {self.rests} rests, expected at least 1')
-        self._check_temperatures()
-
-    def _check_temperatures(self) -> None:
         known = tuple(self.temperatures)
         if not known and math.isnan(self.temperature) and not np.any(self.slope):
             return
@@ -218,7 +215,10 @@ def gyro_bias_of(poses: Poses) -> GyroBias | None:
     if 'time' in poses:
         poses = poses.take(np.argsort(poses['time'], kind='stable'))
     rests = poses.take(_agreeing(poses))
-    level, line = np.ones((len(rests), 1)), _line_over_temperature(rests)
+    level = line = np.ones((len(rests), 1))
+    warm = rests.columns.get('temperature', np.zeros(len(rests)))
+    if len(rests) >= _ENOUGH and np.ptp(warm) > 0.0:
+        line = np.column_stack([level, warm - warm.mean()])
     sloping = _fitted([line] * 3, rests).is_sloping
     chosen = _fitted([line if each else level for each in sloping], rests)
     (bias, slope), (sd, _) = chosen.values, chosen.deviation
@@ -281,30 +281,20 @@ class _RateFit:
     @property
     def deviation(self) -> Floats:
         """Return the standard deviations, including the correlation of successive rests."""
-        return np.asarray(np.sqrt(self.variance * self._excess()))
-
-    def _excess(self) -> float:
         count, square = len(self.residual), float(np.sum(self.residual ** 2))
         if count < _ENOUGH or square == 0.0:
-            return 1.0
+            return np.sqrt(self.variance)
         neighbours = float(np.sum(self.residual[1:] * self.residual[:-1]))
         # Without the mean, independent residuals have a correlation of -1/n.
         correlation = min(max(neighbours / square + 1.0 / count, 0.0), _CORRELATION_MAX)
-        return (1.0 + correlation) / (1.0 - correlation)
+        excess = (1.0 + correlation) / (1.0 - correlation)
+        return np.asarray(np.sqrt(self.variance * excess))
 
     @property
     def is_sloping(self) -> NDArray[np.bool_]:
         """Return which axes have a significant slope."""
         limit = float(scipy.special.stdtrit(len(self.residual) - 2, 1.0 - _TAIL))
         return np.asarray(np.abs(self.values[1]) > limit * self.deviation[1])
-
-
-def _line_over_temperature(rests: Poses) -> Floats:
-    """Return 1 and the temperature minus its mean, (n, 2); 1 alone if it shows no line."""
-    one, warm = np.ones(len(rests)), rests.columns.get('temperature', np.zeros(len(rests)))
-    if len(warm) < _ENOUGH or not np.ptp(warm) > 0.0:
-        return one[:, np.newaxis]
-    return np.column_stack([one, warm - warm.mean()])
 
 
 def _fitted(designs: Sequence[Floats], rests: Poses) -> _RateFit:

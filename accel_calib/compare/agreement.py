@@ -55,7 +55,7 @@ import scipy
 from ..calibrate import Calibration, fit_unknown, in_g, NORM_MODELS, with_history
 from ..effects import Context, effect_named, Model, reading_of
 from ..errors import InputError, RefusedFitError
-from ..estimate import Fit, judge, scatter_of
+from ..estimate import judge, scatter_of
 from ..table import Floats
 from ..text import counted
 from ..units import STANDARD_GRAVITY
@@ -114,7 +114,10 @@ def rotation_free(calibration: Calibration, context: Context, per_g: float) -> R
     here = {key: np.repeat(column, 3, 0) for key, column in context.items()}
     slope_w = model.basis(np.zeros((3, 3)), here, np.eye(3)).full  # (column, row, p)
     mat_s, slope_s = _polar(mat_w, np.swapaxes(slope_w, 0, 1))
-    reading_scale, force_scale = _scales(calibration, per_g)
+    units = calibration.units  # the common unit is the standard g, or native
+    reading_scale = force_scale = (units.per_g / STANDARD_GRAVITY if units.is_si else units.per_g)
+    if units.is_native:
+        reading_scale, force_scale = units.per_g / per_g, 1.0
     gain_scale = reading_scale / force_scale
     own = [k for k, name in enumerate(calibration.parameters)
            if effect_named(name.rpartition('.')[0]).bends]
@@ -125,15 +128,6 @@ def rotation_free(calibration: Calibration, context: Context, per_g: float) -> R
         np.concatenate([slope_v * reading_scale, slope_s[_ENTRIES] * gain_scale,
                         np.eye(size)[own]]),
         np.linalg.solve(mat_s, mat_w) @ model.rotation, reading_scale, force_scale)
-
-
-def _scales(calibration: Calibration, per_g: float) -> tuple[float, float]:
-    """Return the factors from readings and forces to the common unit, standard g or native."""
-    units = calibration.units
-    if units.is_native:
-        return units.per_g / per_g, 1.0
-    scale = units.per_g / STANDARD_GRAVITY if units.is_si else units.per_g
-    return scale, scale
 
 
 def _polar(mat_w: Floats, slope_w: Floats) -> tuple[Floats, Floats]:
@@ -226,23 +220,18 @@ def _scale(pool: Sequence[Repeatability]) -> tuple[float, float]:
 
 def repeatability_of(calibration: Calibration) -> Repeatability:
     """Return how well the poses of a calibration repeat."""
-    fit = _fit_of(calibration)
+    model = Model(calibration.model.values)
+    poses_g = with_history(in_g(calibration.poses, calibration.units), model)
+    poses_g = poses_g.take(np.isin(poses_g.row, calibration.used_poses.row))
+    if not calibration.form.known_orientation:
+        poses_g = poses_g.without_columns('reference')
+    fit = judge(model, poses_g, np.eye(len(model.vector)))
     free = int(np.linalg.matrix_rank(fit.columns))
     # Over its own poses, the variances of a fit sum to the number of free parameters.
     total = float(np.einsum('mp,pq,mq->', fit.columns, calibration.covariance, fit.columns))
     belief = fit.variance_dof - fit.dof if fit.noise_known else 0.0
     return Repeatability(calibration.covariance, fit.chi2, fit.equations.count - free,
                          0.0 if not free or scatter_of(fit).shows else total / free, belief)
-
-
-def _fit_of(calibration: Calibration) -> Fit:
-    """Return the model of a calibration at the poses it was fitted to."""
-    model = Model(calibration.model.values)
-    poses_g = with_history(in_g(calibration.poses, calibration.units), model)
-    poses_g = poses_g.take(np.isin(poses_g.row, calibration.used_poses.row))
-    if not calibration.form.known_orientation:
-        poses_g = poses_g.without_columns('reference')
-    return judge(model, poses_g, np.eye(len(model.vector)))
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ contain its effect.
 
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from itertools import combinations, pairwise
@@ -52,54 +52,49 @@ def _contexts_of(calibrations: Sequence[Calibration]) -> list[Context]:
 
 
 def _notes_of(given: Sequence[Comparable], names: tuple[str, ...], deviation: Floats,
-              noisier: Sequence[int]) -> tuple[str, ...]:
-    """Return notes that limit the meaning; the (n, t) deviation is 0 where a model omits one."""
+              noisier: Sequence[int]) -> Iterator[str]:
+    """Yield notes that limit the meaning; the (n, t) deviation is 0 where a model omits one."""
     calibrations = [run.calibration for run in given]
-    smaller = (
-        f'run {k} (model {run.calibration.name}) omits parameters of model {run.sure.name}: they '
-        'are taken as zero, with the uncertainty that its poses allow'
-        for k, run in enumerate(given, 1) if run.calibration is not run.sure)
-    worse = (f'the poses of run {k + 1} repeat significantly worse than those of the others: the '
-             'run has less weight' for k in noisier)
-    return (*_shared(calibrations), *smaller, *_left_out(names, deviation),
-            *_temperatures(calibrations), *worse)
+    yield from _shared(calibrations)
+    for k, run in enumerate(given, 1):
+        if run.calibration is not run.sure:
+            yield (f'run {k} (model {run.calibration.name}) omits parameters of model '
+                   f'{run.sure.name}: they are taken as zero, with the uncertainty that its poses '
+                   'allow')
+    yield from _left_out(names, deviation)
+    known = [float(np.median(run.poses['temperature'])) for run in calibrations
+             if 'temperature' in run.poses]
+    corrected = all('temperature' in run.model.needs for run in calibrations)
+    if len(known) >= 2 and not max(known) - min(known) < _WARMER and not corrected:
+        yield (f'the poses were taken at {min(known):.0f} to {max(known):.0f} °C, and not all '
+               'runs correct for temperature: this can cause differences')
+    for k in noisier:
+        yield (f'the poses of run {k + 1} repeat significantly worse than those of the others: '
+               'the run has less weight')
 
 
-def _shared(calibrations: Sequence[Calibration]) -> list[str]:
-    """Return notes about runs with common poses."""
+def _shared(calibrations: Sequence[Calibration]) -> Iterator[str]:
+    """Yield notes about runs with common poses."""
     rows = [{tuple(row) for row in (run.poses.reading / run.force_per_g).round(7).tolist()}
             for run in calibrations]
-    notes = []
     for (i, first), (j, second) in combinations(enumerate(rows, 1), 2):
         common, least = len(first & second), min(len(first), len(second))
         if common:
             what = 'all their poses' if common == least else counted(common, 'pose')
-            notes.append(f'runs {i} and {j} share {what}: they are not independent, so their '
-                         'agreement means little')
-    return notes
+            yield (f'runs {i} and {j} share {what}: they are not independent, so their agreement '
+                   'means little')
 
 
-def _left_out(names: tuple[str, ...], deviation: Floats) -> list[str]:
-    """Return notes about parameters that only some of the models have."""
+def _left_out(names: tuple[str, ...], deviation: Floats) -> Iterator[str]:
+    """Yield notes about parameters that only some of the models have."""
     notes: dict[tuple[int, ...], list[str]] = {}
     for name, column in zip(names, deviation.T, strict=True):
         without = tuple((np.flatnonzero(column == 0.0) + 1).tolist())
         if 0 < len(without) < len(column):
             notes.setdefault(without, []).append(name)
-    return [f'the model of {listed("run", runs)} omits {", ".join(found)} and so assumes zero; '
-            'for an equal comparison, fit all runs with one model'
-            for runs, found in notes.items()]
-
-
-def _temperatures(calibrations: Sequence[Calibration]) -> list[str]:
-    """Return a note if the temperatures differ and some runs do not correct for temperature."""
-    known = [float(np.median(run.poses['temperature'])) for run in calibrations
-             if 'temperature' in run.poses]
-    if len(known) < 2 or max(known) - min(known) < _WARMER or all(
-            'temperature' in run.model.needs for run in calibrations):
-        return []
-    return [f'the poses were taken at {min(known):.0f} to {max(known):.0f} °C, and not all runs '
-            'correct for temperature: this can cause differences']
+    for runs, found in notes.items():
+        yield (f'the model of {listed("run", runs)} omits {", ".join(found)} and so assumes zero; '
+               'for an equal comparison, fit all runs with one model')
 
 
 @dataclass(frozen=True)
@@ -254,7 +249,7 @@ def compare_runs(given: Sequence[Comparable]) -> Comparison:
         p_value >= LEVEL, p_value, chi2, rank, outlier(runs) if p_value < LEVEL else None,
         _each(prepared, p_values(runs)),
         tuple(_parameter(*column) for column in zip(names, values.T, stated.T, strict=True)),
-        _tilt_deg(prepared), _notes_of(given, names, stated, scaled.noisier))
+        _tilt_deg(prepared), tuple(_notes_of(given, names, stated, scaled.noisier)))
 
 
 def _prepared(given: Sequence[Comparable], covariances: Sequence[Floats]) -> list[_Prepared]:
@@ -405,20 +400,16 @@ def history_of(calibrations: Sequence[Calibration]) -> History:
 def _moment(index: int, calibration: Calibration) -> Moment:
     poses = calibration.used_poses
     warm = float(np.median(poses['temperature'])) if 'temperature' in poses else None
-    return Moment(index, _when(index, calibration.date), calibration.name, warm,
-                  calibration.quality.rms_after_mg)
-
-
-def _when(index: int, date: str) -> datetime | None:
-    """Return a date in UTC; a date without a time zone is taken as UTC."""
-    if not date:
-        return None
-    try:
-        when = datetime.fromisoformat(date.replace('Z', '+00:00'))
-    except ValueError:
-        raise InputError(f'the date of calibration {index + 1} is {date!r}, expected a date such '
-                         'as 2026-11-22T09:30:00+00:00', 'correct date: in the file') from None
-    return when.replace(tzinfo=when.tzinfo or timezone.utc).astimezone(timezone.utc)
+    date, when = calibration.date, None
+    if date:
+        try:
+            when = datetime.fromisoformat(date.replace('Z', '+00:00'))
+        except ValueError:
+            raise InputError(f'the date of calibration {index + 1} is {date!r}, expected a date '
+                             'such as 2026-11-22T09:30:00+00:00',
+                             'correct date: in the file') from None
+        when = when.replace(tzinfo=when.tzinfo or timezone.utc).astimezone(timezone.utc)
+    return Moment(index, when, calibration.name, warm, calibration.quality.rms_after_mg)
 
 
 def _change_in(comparison: Comparison) -> DatedChange:

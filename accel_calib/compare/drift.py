@@ -310,16 +310,12 @@ def status(state: Drift) -> str:
         return (f'|a| at rest differs by {state.error * MG:.2f} mg from 1 g, stated uncertainty '
                 f'{state.stated * MG:.2f} mg')
     found = state.change
+    changed = 'the offset or the gain has changed'
+    if found.clear and len(found.shift) == 1:
+        changed = f'the gain has changed by {100.0 * found.shift[0]:+.2f} %'
+    elif found.clear:
+        x, y, z = found.shift * MG
+        changed = f'the offset has changed by ({x:+.1f}, {y:+.1f}, {z:+.1f}) mg'
     return (f'|a| at rest has differed by {found.error * MG:+.2f} mg from 1 g for '
             f'{counted(state.lasted, "rest")}, stated uncertainty {state.stated * MG:.2f} mg'
-            f'{_kind(found)}: {state.remedy[0]}')
-
-
-def _kind(found: LastingChange) -> str:
-    """Return a text about what changed."""
-    if not found.clear:
-        return '; the offset or the gain has changed'
-    if len(found.shift) == 1:  # the gain
-        return f'; the gain has changed by {100.0 * found.shift[0]:+.2f} %'
-    x, y, z = found.shift * MG
-    return f'; the offset has changed by ({x:+.1f}, {y:+.1f}, {z:+.1f}) mg'
+            f'; {changed}: {state.remedy[0]}')

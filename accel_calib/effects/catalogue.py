@@ -96,11 +96,6 @@ def _lags(context: Context) -> Iterator[Floats]:
                 yield np.array([lag, of_sensor])
 
 
-def _forms(context: Context) -> Iterator[Floats]:
-    """Yield both forms of the hysteresis."""
-    yield from np.array([[0.0], [1.0]])
-
-
 def _warming_to(power: int) -> Factor:
     return lambda context, shape: (context['temperature'] - REFERENCE_TEMPERATURE) ** power
 
@@ -122,10 +117,6 @@ def _motion(context: Mapping[str, Any], shape: Floats) -> Floats:
     return np.sign(towards) if shape[0] else towards
 
 
-def _supply_change(context: Mapping[str, Any], shape: Floats) -> Any:
-    return context['supply_voltage'] / NOMINAL_SUPPLY - 1.0
-
-
 def _since(context: Mapping[str, Any], shape: Floats) -> Any:
     return (context['time'] - shape[0]) / HOUR
 
@@ -139,10 +130,6 @@ def _after(context: Mapping[str, Any], shape: Floats) -> Any:
     return np.asarray(context['time'] >= shape[0], float)
 
 
-def _variances(context: Mapping[str, Any], shape: Floats) -> Any:
-    return np.asarray(context['std'], float).T ** 2
-
-
 def _centripetal(context: Mapping[str, Any], shape: Floats) -> Floats:
     """Return the (9, n) entries of ω×(ω×·) per metre [g], row by row."""
     rate = np.asarray(context['rate'], float).T
@@ -150,14 +137,6 @@ def _centripetal(context: Mapping[str, Any], shape: Floats) -> Floats:
     entries = [rate[i] * rate[j] - (squared if i == j else 0.0)
                for i in range(3) for j in range(3)]
     return np.array(entries) / STANDARD_GRAVITY
-
-
-def _clipped(reading: Floats, values: Floats) -> Floats:
-    return np.clip(reading, -values[0], values[0])
-
-
-def _on_grid(reading: Floats, values: Floats) -> Floats:
-    return np.round(reading / values[0]) * values[0]
 
 
 _bending = partial(Effect, plausible_g=0.5, family='force')
@@ -210,7 +189,9 @@ EFFECTS: dict[str, Effect] = {
         needs=('time', 'temperature'), over=('temperature_rate',)),
     'supply_ratio': Effect(
         'offset and gain in proportion to the supply', 'ratiometric output', ('gain', *AXES),
-        'g/g', 1.0, 1.0, _SUPPLY, _supply_change, ('supply_voltage',), scales=True),
+        'g/g', 1.0, 1.0, _SUPPLY,
+        lambda context, shape: context['supply_voltage'] / NOMINAL_SUPPLY - 1.0,
+        ('supply_voltage',), scales=True),
     'offset_drift': _in_time(
         'offset that drifts with time', 'bias drift', AXES, 'g/h', 0.0005, terms=by_axis(ONE),
         factor=_since, needs=('time',), shape=('start',), shapes=_from_start),
@@ -232,16 +213,19 @@ EFFECTS: dict[str, Effect] = {
         shapes=_instants),
     'vibration_rectification': Effect(
         'offset that grows with vibration', 'vibration rectification coefficient VRC', AXES,
-        'g/g²', 0.002, 0.5, by_axis(ONE), _variances, ('std',)),
+        'g/g²', 0.002, 0.5, by_axis(ONE),
+        lambda context, shape: np.asarray(context['std'], float).T ** 2, ('std',)),
     'hysteresis': Effect('offset that depends on the previous pose', 'hysteresis', AXES, 'g',
-                         0.001, 0.5, by_axis(ONE), _motion, ('previous',), ('form',), _forms,
-                         usual=(0.0,)),
+                         0.001, 0.5, by_axis(ONE), _motion, ('previous',), ('form',),
+                         lambda context: iter(np.array([[0.0], [1.0]])), usual=(0.0,)),
     'lever_arm': Effect('centripetal force away from the axis of rotation', 'size effect', AXES,
                         'm', 0.1, 5.0, _LEVER, _centripetal, ('rate',)),
-    'saturation': Effect('readings clipped at a limit', 'full-scale range', ('limit',), 'g', 2.0,
-                         np.inf, (), output=_clipped),
-    'quantisation': Effect('readings on a grid', 'resolution', ('step',), 'g', 0.001, np.inf, (),
-                           output=_on_grid),
+    'saturation': Effect(
+        'readings clipped at a limit', 'full-scale range', ('limit',), 'g', 2.0, np.inf, (),
+        output=lambda reading, limit: np.clip(reading, -limit[0], limit[0])),
+    'quantisation': Effect(
+        'readings on a grid', 'resolution', ('step',), 'g', 0.001, np.inf, (),
+        output=lambda reading, step: np.round(reading / step[0]) * step[0]),
 }
 """All effects that are functions of the force and the context."""
 

@@ -35,7 +35,8 @@ _WAVES = np.arange(0.5, MODES + 1.0, 0.025)
 
 _COUNT = 201
 
-_Form = tuple[Floats, Callable[[Sequence[float]], str]]
+_Expression = Callable[[Sequence[float]], str]
+_Form = tuple[Floats, _Expression]
 """The (k, g) functions of a form, and the expression of their k factors."""
 
 
@@ -63,7 +64,7 @@ def formula_of(name: str, values: Floats, deviations: Mapping[str, float]) -> st
     curves = factors @ waves
     noise = np.sqrt(np.mean(sizes ** 2 @ waves ** 2, axis=1))
     most = np.maximum(_EXACT * np.max(np.ptp(curves, axis=1)), 0.5 * noise) + 1e-12
-    expression = _of_waves(modes, high - low)
+    expression: _Expression = partial(_of_waves, modes, high - low)
     for group in _forms(share, high - low):
         fits = [np.linalg.lstsq(functions.T, curves.T, rcond=None)[0].T for functions, _ in group]
         errors = [np.max(np.sqrt(np.mean((fit @ functions - curves) ** 2, axis=1)) / most)
@@ -118,12 +119,9 @@ def _sine(rate: float, row: Sequence[float]) -> str:
     return f'{row[0]:.5g} {_signed(size)}*sin({rate:.5g}*t {_signed(angle)})'
 
 
-def _of_waves(modes: Sequence[int], span: float) -> Callable[[Sequence[float]], str]:
-    def expression(row: Sequence[float]) -> str:
-        return ' '.join(f'{_signed(value)}*cos({np.pi * mode / span:.6g}*t)'
-                        for mode, value in zip(modes, row, strict=True))
-
-    return expression
+def _of_waves(modes: Sequence[int], span: float, row: Sequence[float]) -> str:
+    return ' '.join(f'{_signed(value)}*cos({np.pi * mode / span:.6g}*t)'
+                    for mode, value in zip(modes, row, strict=True))
 
 
 def _signed(value: float) -> str:

@@ -400,12 +400,10 @@ class Model(Record):
 
     def at(self, context: Context) -> AtContext:
         """Return the model at columns of n rows; raise InputError if a needed one is missing."""
-        return self._without_context if self.terms.fixed else self._at(self._factors(context))
-
-    def _factors(self, context: Context) -> Floats:
-        """Return the (t, n) factors of the terms."""
+        if self.terms.fixed:
+            return self._without_context
         alone = self._alone(context)
-        return alone if self.terms.scaling is None else alone * self._scales(alone)
+        return self._at(alone * self._scales(alone))
 
     def _scales(self, alone: Floats) -> Floats:
         """Return by what another effect scales the terms, (t, n), or (t, 1) if none does."""

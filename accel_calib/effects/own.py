@@ -3,7 +3,7 @@
 
 """Effects of a user: their definition, and how a process comes to know them."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,7 +17,7 @@ from .form import AXES, by_axis, each_axis, Effect, Monomial, MONOMIALS, ONE
 from .model import terms_of
 from ..disk import check_regular
 from ..errors import AccelCalibError, InputError
-from ..table import Floats, is_quantity
+from ..table import is_quantity
 
 _NAME = re.compile(r'[a-z][a-z0-9_]{0,63}')
 
@@ -78,12 +78,10 @@ class OwnEffect:
         if self.variable and not is_quantity(self.variable) and self.variable not in _ALONE:
             raise self._refused(f'is a function of {self.variable!r}, expected one of '
                                 f'{", ".join(_ALONE)}, or the name of another column')
-        if self.form is not None and self.slope is not None:
-            self._check_slope(self.form, self.slope)
-
-    def _check_slope(self, form: Callable[[Any], Any], slope: Callable[[Any], Any]) -> None:
-        stated = np.broadcast_to(slope(_PROBED_G), _PROBED_G.shape)
-        real = (form(_PROBED_G + _PROBE_STEP_G) - form(_PROBED_G - _PROBE_STEP_G)) / (
+        if self.form is None or self.slope is None:
+            return
+        stated = np.broadcast_to(self.slope(_PROBED_G), _PROBED_G.shape)
+        real = (self.form(_PROBED_G + _PROBE_STEP_G) - self.form(_PROBED_G - _PROBE_STEP_G)) / (
             2.0 * _PROBE_STEP_G)
         error = np.abs(stated - real) / np.maximum(np.abs(real), 1.0)
         worst = int(np.argmax(error))
@@ -96,11 +94,12 @@ class OwnEffect:
 
     def entry(self, first: int) -> Effect:
         """Return the effect, with the index of the first of its `monomials`."""
-        factor = partial(_own_factor, self.variable, self.change) if self.variable else None
-        return Effect(
-            self.words, 'own effect', AXES, self.unit, self.typical, 0.5,
-            by_axis(ONE if self.form is None else first), factor,
-            (self.variable,) if self.variable else (), own=True)
+        effect = partial(Effect, self.words, 'own effect', AXES, self.unit, self.typical, 0.5,
+                         by_axis(ONE if self.form is None else first), own=True)
+        if not self.variable:
+            return effect()
+        return effect(factor=lambda context, shape: self.change(context[self.variable]),
+                      needs=(self.variable,))
 
     @property
     def monomials(self) -> list[Monomial]:
@@ -110,11 +109,6 @@ class OwnEffect:
 
 _ALONE = ('time', 'temperature', 'supply_voltage')
 """Columns of one number that an own effect can be a function of, besides quantities."""
-
-
-def _own_factor(variable: str, change: Callable[[Any], Any], context: Mapping[str, Any],
-                shape: Floats) -> Any:
-    return change(context[variable])
 
 
 def know(effects: Iterable[OwnEffect]) -> tuple[str, ...]:

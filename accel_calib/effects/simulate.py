@@ -88,21 +88,16 @@ def simulate_poses(model: Model, directions: Floats, rng: np.random.Generator, *
     return Poses(columns, numbered(columns))
 
 
-def _between(start: Floats, end: Floats) -> Floats:
-    """Return the unit tangent at `start` of the arc to `end`."""
-    normal = end - start * (start @ end)
-    if np.linalg.norm(normal) < 1e-9:
-        normal = np.cross(start, np.eye(3)[np.argmin(np.abs(start))])
-    return normal / np.linalg.norm(normal)
-
-
 def turn_between(start: Floats, end: Floats, seconds: float, count: int
                  ) -> tuple[Floats, Floats]:
     """Return a turn along the shortest arc as `path` does, with `count` samples in `seconds`."""
     tau = (np.arange(count) + 1.0)[:, np.newaxis] / (count + 1.0)
     share = tau ** 3 * (10.0 - 15.0 * tau + 6.0 * tau ** 2)
     speed = 30.0 * tau ** 2 * (1.0 - tau) ** 2 / seconds
-    along = _between(start, end)
+    normal = end - start * (start @ end)
+    if np.linalg.norm(normal) < 1e-9:
+        normal = np.cross(start, np.eye(3)[np.argmin(np.abs(start))])
+    along = normal / np.linalg.norm(normal)
     arc = np.arctan2(np.linalg.norm(np.cross(start, end)), start @ end)
     force = np.cos(arc * share) * start + np.sin(arc * share) * along
     # In body axes, up turns opposite to the body: df/dt = -ω × f.

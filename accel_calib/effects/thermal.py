@@ -267,8 +267,10 @@ class ThermalStream:
         time = max(time, before)
         for key, lag in self._lags.items():
             if not lag.of_sensor:
-                self._behind[key] = _one_step(self._behind[key], time - before,
-                                              temperature - warm, lag.seconds)
+                steps = (time - before) / lag.seconds
+                share = -math.expm1(-steps) / steps if steps > 0.0 else 1.0
+                self._behind[key] = (self._behind[key] * math.exp(-steps)
+                                     + (temperature - warm) * share)
         if self._uses_rate:
             self._average(time, temperature)
         self._set_value(time, temperature)
@@ -346,10 +348,3 @@ class ThermalStream:
             rate[first:last] = self._line[0] + self._line[1] * (time[first:last] - self._begin)
             first = last
         return rate
-
-
-def _one_step(behind: float, step: float, rise: float, lag: float) -> float:
-    """Return T - A after one step of a linear temperature."""
-    steps = step / lag
-    share = -math.expm1(-steps) / steps if steps > 0.0 else 1.0
-    return behind * math.exp(-steps) + rise * share

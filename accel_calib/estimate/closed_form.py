@@ -342,17 +342,11 @@ def faces(reading: Floats) -> Floats | None:
     return reference if aligned and len(np.unique(reference, axis=0)) == 6 else None
 
 
-def _ties() -> Floats:
-    """Return the (12, 9) matrix from offset and lower triangle of W to the values of the model."""
-    entries = np.zeros((6, 3, 3))
-    entries[range(6), (0, 1, 2, 1, 2, 2), (0, 1, 2, 0, 0, 1)] = 1.0
-    return np.column_stack([
-        *(linear_model('9', _IDENTITY, vec_v).vector for vec_v in _IDENTITY),
-        *(linear_model('9', _IDENTITY + entry, np.zeros(3)).vector for entry in entries)])
-
-
-TIES = _ties()
-"""The matrix for model 9."""
+TIES = np.column_stack([
+    *(linear_model('9', _IDENTITY, vec_v).vector for vec_v in _IDENTITY),
+    *(linear_model('9', _IDENTITY + np.outer(_IDENTITY[i], _IDENTITY[j]), np.zeros(3)).vector
+      for i, j in ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1)))])
+"""The (12, 9) matrix from offset and lower triangle of W to the values of model 9."""
 
 
 @dataclass(frozen=True)

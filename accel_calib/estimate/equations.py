@@ -216,8 +216,6 @@ def measured(poses_g: Poses) -> Measured:
     def kind(groups: Sequence[Indices]) -> _Kind:
         which = np.concatenate([known[:0], *groups])
         group = np.repeat(np.arange(len(groups)), [len(each) for each in groups])
-        if not len(which):
-            return _Kind(which, group, {}, reading[:0], s[:0])
         if np.array_equal(which, np.arange(len(s))):
             return _Kind(which, group, poses_g.columns, reading, s)
         context = {key: values[which] for key, values in poses_g.columns.items()}
@@ -420,16 +418,7 @@ def variance_factor(chi2: float, dof: int, noise_known: bool) -> float:
         return 1.0 if noise_known else _student(_BELIEF_IN_USUAL)
     if not noise_known or chi2 > _BEYOND * dof:
         return chi2 / dof * _student(dof)
-    return _of_mixture(chi2, dof)
-
-
-def _student(dof: float) -> float:
-    """Return the squared ratio of the 95 % intervals of Student's t and a normal variable."""
-    return float(scipy.special.stdtrit(dof, 0.5 + _INTERVAL / 2.0) / _NORMAL) ** 2
-
-
-def _of_mixture(chi2: float, dof: int) -> float:
-    """Return the factor for measured noise, which may be correct."""
+    # The measured noise may be correct: a mixture over λ, with a share of `_RIGHT` at 1.
     width, held = _grid()
     likelihood = (chi2 * (1.0 - 1.0 / _SCALES) - dof * np.log(_SCALES)) / 2.0
     largest = np.max(likelihood)
@@ -440,6 +429,11 @@ def _of_mixture(chi2: float, dof: int) -> float:
     share = (_INTERVAL - part[above - 1]) / (part[above] - part[above - 1])
     between = width[above - 1] * (width[above] / width[above - 1]) ** share
     return float(between / _NORMAL) ** 2
+
+
+def _student(dof: float) -> float:
+    """Return the squared ratio of the 95 % intervals of Student's t and a normal variable."""
+    return float(scipy.special.stdtrit(dof, 0.5 + _INTERVAL / 2.0) / _NORMAL) ** 2
 
 
 def belief_beside(dof: int, chi2: float, noise_known: bool) -> float:

@@ -222,16 +222,12 @@ class Fit:
     @cached_property
     def variance(self) -> float:
         """Variance of a residual in units of the noise, moderated towards 1."""
-        return (self._belief + self.chi2) / self.variance_dof
+        return (belief_in(self.noise_known) + self.chi2) / self.variance_dof
 
     @cached_property
     def variance_dof(self) -> float:
         """Degrees of freedom of `variance`."""
-        return self._belief + self.dof
-
-    @cached_property
-    def _belief(self) -> float:
-        return belief_in(self.noise_known)
+        return belief_in(self.noise_known) + self.dof
 
     @cached_property
     def by_pose(self) -> ByPose:
@@ -460,8 +456,12 @@ def estimate(start: Model, poses_g: Poses, prior: Prior | None = None,
     def point_at(values: Floats) -> Point:
         model = model_at(values)
         near = equations(model, poses)
-        return _with_prior(Point(near.residual, near.columns(model)[:, fitted], near),
-                           values, prior, weight)
+        columns = near.columns(model)[:, fitted]
+        if prior is None:
+            return Point(near.residual, columns, near)
+        rows = prior.whitening * weight
+        return Point(np.concatenate([near.residual, rows @ (prior.mean - values)]),
+                     np.vstack([columns, rows]), near, _SINGULAR_WITH_PRIOR)
 
     lower, upper = _bounds(start, poses_g)
     lower, upper = lower[fitted], upper[fitted]
@@ -474,22 +474,14 @@ def estimate(start: Model, poses_g: Poses, prior: Prior | None = None,
                free_of(start), at_bound, own, factor)
 
 
-def _with_prior(point: Point, values: Floats, prior: Prior | None, weight: float) -> Point:
-    """Return a point with the rows of the prior at these values after those of the poses."""
-    if prior is None:
-        return point
-    rows = prior.whitening * weight
-    return Point(np.concatenate([point.residual, rows @ (prior.mean - values)]),
-                 np.vstack([point.columns, rows]), point.source, _SINGULAR_WITH_PRIOR)
-
-
 def _bounds(start: Model, poses_g: Poses) -> tuple[Floats, Floats]:
     """Return (p,) lower and (p,) upper bounds of all values; they include the start values."""
     lower, upper = [], []
     for effect, (name, values) in zip(start.terms.effects, start.values.items(), strict=True):
         limits = np.full((2, len(values)), np.inf) * [[-1.0], [1.0]]
         if name not in LADDER and name not in CHANGES:
-            size = _largest_contribution(Model({name: values}), poses_g)
+            basis = Model({name: values}).basis(unit(poses_g.reading), poses_g.columns).full
+            size = np.max(np.linalg.norm(basis[:, :, :len(effect.parameters)], axis=1), axis=0)
             most = effect.plausible_g / np.maximum(size, effect.plausible_g * _SMALLEST)
             limits[:, :len(most)] = -most, most
             places = fitted_places(effect, effect.split(values)[1])
@@ -501,10 +493,3 @@ def _bounds(start: Model, poses_g: Poses) -> tuple[Floats, Floats]:
         lower.append(np.minimum(limits[0], values))
         upper.append(np.maximum(limits[1], values))
     return np.concatenate(lower), np.concatenate(upper)
-
-
-def _largest_contribution(model: Model, poses_g: Poses) -> Floats:
-    """Return the (p,) largest reading at the poses for a value of 1 of each parameter."""
-    basis = model.basis(unit(poses_g.reading), poses_g.columns).full
-    parameters = len(model.terms.effects[0].parameters)
-    return np.max(np.linalg.norm(basis[:, :, :parameters], axis=1), axis=0)

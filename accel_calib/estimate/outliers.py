@@ -42,8 +42,6 @@ deviations.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 import math
 from typing import NamedTuple
 
@@ -139,8 +137,8 @@ def outliers_among(residual: Floats, basis: Floats, rows: Indices, dof: Sequence
     residual = (beside - flat @ (flat.swapaxes(1, 2) @ beside)).reshape(residual.shape)
     pose, size = _removed_in_turn(residual, basis, own, rows, max(limits))
     whole = np.sum(residual ** 2, axis=(1, 2))
-    return [_Removed(pose[k, :limit], rows[pose[k, :limit]], size[k, :limit], float(whole[k]),
-                     dof[k], len(rows)).outliers(noise_known) for k, limit in enumerate(limits)]
+    return [_extreme(pose[k, :limit], size[k, :limit], rows, float(whole[k]), dof[k],
+                     noise_known=noise_known) for k, limit in enumerate(limits)]
 
 
 def _limit(spare: int, total: int, rows: int) -> int:
@@ -148,44 +146,31 @@ def _limit(spare: int, total: int, rows: int) -> int:
     return max(min(int(LARGEST_SHARE * total), spare // (2 * rows)), 0)
 
 
-@dataclass(frozen=True)
-class _Removed:
+def _extreme(pose: Indices, size: Floats, rows: Indices, whole: float, dof: int, *,
+             noise_known: bool) -> Indices:
     """
-    Poses removed in turn: the (k,) index `pose` and number of equations `rows` of each.
+    Return the outliers among the (k,) indices of poses that were removed in turn.
 
-    `size` (k,) is its squared residual against the others, in units of its variance; `whole`, the
-    sum of squared residuals, `dof` and `count` belong to the start.
+    `size` (k,) is the squared residual of each against the others, in units of its variance.
+    `rows` (n,) are the numbers of equations of all poses, `whole` the sum of squared residuals and
+    `dof` those of the start.
 
     """
+    removed = np.cumsum(rows[pose])
+    rss = np.maximum(whole - np.cumsum([0.0, *size]), 0.0)  # before each removal, and at the end
 
-    pose: Indices
-    rows: Indices
-    size: Floats
-    whole: float
-    dof: int
-    count: int
-
-    @cached_property
-    def rss(self) -> Floats:
-        """(k + 1,) array, sum of squared residuals before each removal, and at the end."""
-        return np.maximum(self.whole - np.cumsum([0.0, *self.size]), 0.0)
-
-    def outliers(self, noise_known: bool) -> Indices:
-        """Return the indices of the poses that are outliers."""
-        count = self._extreme(belief_in(noise_known))
-        if count:
-            left = self.dof - int(np.sum(self.rows[:count]))
-            count = self._extreme(belief_beside(left, self.rss[count], noise_known))
-        return np.sort(self.pose[:count])
-
-    def _extreme(self, belief: float) -> int:
-        """Return how many of the removed poses are outliers."""
-        removed = np.cumsum([0, *self.rows])
-        dof = np.maximum(belief + self.dof - removed[1:], 1e-9)
-        others = np.maximum(belief + self.rss[:-1] - self.size, 1e-300) / dof
-        chance = beyond(self.size / self.rows / others, self.rows, dof)
-        found = np.flatnonzero(chance < LEVEL / (self.count - np.arange(len(self.pose))))
+    def count(belief: float) -> int:
+        left = np.maximum(belief + dof - removed, 1e-9)
+        others = np.maximum(belief + rss[:-1] - size, 1e-300) / left
+        chance = beyond(size / rows[pose] / others, rows[pose], left)
+        found = np.flatnonzero(chance < LEVEL / (len(rows) - np.arange(len(pose))))
         return int(found[-1]) + 1 if len(found) else 0
+
+    extreme = count(belief_in(noise_known))
+    if extreme:
+        left = dof - int(removed[extreme - 1])
+        extreme = count(belief_beside(left, rss[extreme], noise_known))
+    return np.sort(pose[:extreme])
 
 
 def beyond(ratio: Floats, rows: Indices, dof: Floats | float) -> Floats:
@@ -338,12 +323,16 @@ def _fit_norm(name: str, poses_g: Poses) -> tuple[Fit, Indices]:
     direct = _without_outliers(name, poses_g, everyone)
     if direct is not None and direct[0].chi2 <= _SUSPICIOUS * max(direct[0].dof, 1):
         return direct
-    robust = _from_those_that_agree(name, poses_g)
+    most = _most(name, len(poses_g))
+    robust = None if most < 1 else _with_those_that_agree(
+        name, poses_g, agreeing(name, poses_g, most))
     if robust is None:
         if direct is None:
             raise NotConvergedError
         return direct
-    found, gross = direct, _grossest_first(*robust, poses_g)
+    out = np.setdiff1d(everyone, robust[1])  # sorted by the residual below, the largest first
+    away = np.abs(judge(robust[0].model, poses_g).residual[out])
+    found, gross = direct, out[np.argsort(-away, kind='stable')]
     for count in range(len(gross) + 1):
         if found is not None and found[0].variance <= _CLEARLY * robust[0].variance:
             return found
@@ -356,13 +345,6 @@ def outliers(fit: Fit, total: int) -> Indices:
     data = fit.by_pose
     return outliers_among(data.residual[np.newaxis], data.basis[np.newaxis], data.rows, [fit.dof],
                           total, noise_known=fit.noise_known)[0]
-
-
-def _grossest_first(fit: Fit, kept: Indices, poses_g: Poses) -> Indices:
-    """Return the poses that a fit leaves out, in decreasing order of the residual."""
-    out = np.setdiff1d(np.arange(len(poses_g)), kept)
-    away = np.abs(judge(fit.model, poses_g).residual[out])
-    return out[np.argsort(-away, kind='stable')]
 
 
 def _without_outliers(name: str, poses_g: Poses, kept: Indices
@@ -379,14 +361,6 @@ def _without_outliers(name: str, poses_g: Poses, kept: Indices
     if len(kept) < len(poses_g):
         return _with_those_that_agree(name, poses_g, kept) or (fit, kept)
     return fit, kept
-
-
-def _from_those_that_agree(name: str, poses_g: Poses) -> tuple[Fit, Indices] | None:
-    """Fit the poses that agree best, and include those that agree with them."""
-    most = _most(name, len(poses_g))
-    if most < 1:
-        return None
-    return _with_those_that_agree(name, poses_g, agreeing(name, poses_g, most))
 
 
 def _with_those_that_agree(name: str, poses_g: Poses, kept: Indices
@@ -453,13 +427,15 @@ def rivals(fit: Fit, kept: Indices, out: Indices, poses_g: Poses,
 
     """
     found = []
+    belief = belief_beside(fit.dof, fit.chi2, fit.noise_known)
     for wrong, instead in _look_alikes(fit, kept, out, poses_g):
         others = np.union1d(np.setdiff1d(kept, [instead]), [wrong])
         try:
             rival = refit(poses_g.take(others))
         except NotConvergedError:
             continue
-        odds = _odds(rival, fit)
+        difference = _log_probability(rival, belief) - _log_probability(fit, belief)
+        odds = float(np.exp(min(difference, _LARGEST_LOG)))
         if odds >= LEVEL:
             found.append(Rival(wrong, instead, rival, odds))
     return tuple(found)
@@ -505,13 +481,6 @@ def _explained(shift: Floats, own: Floats, others: Floats, spread: Floats) -> Fl
     moved = others @ (spread @ (own.T @ shift))
     solved = np.linalg.pinv(left, _ALONE, hermitian=True) @ moved[:, :, np.newaxis]
     return np.sum(moved * solved[:, :, 0], axis=1) / max(shift @ inverse @ shift, 1e-300)
-
-
-def _odds(rival: Fit, fit: Fit) -> float:
-    """Return the ratio of the probabilities of two hypotheses."""
-    belief = belief_beside(fit.dof, fit.chi2, fit.noise_known)
-    difference = _log_probability(rival, belief) - _log_probability(fit, belief)
-    return float(np.exp(min(difference, _LARGEST_LOG)))
 
 
 def _log_probability(fit: Fit, belief: float) -> float:

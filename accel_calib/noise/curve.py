@@ -141,7 +141,6 @@ class Spread:
 
     """
 
-    size: int
     pairs: NDArray[np.intp]
     gamma: Floats
     weight: Floats
@@ -152,7 +151,7 @@ class Spread:
         used = np.flatnonzero(sizes[:_RANDOM])
         gamma = np.einsum('c,pcg->pg', sizes[used], self.gamma[:, used])
         found = np.einsum('pg,pg->p', self.weight, gamma**2)
-        matrix = np.zeros((self.size, self.size))
+        matrix = np.zeros(self.of_mean.shape[1:])
         matrix[self.pairs[:, 0], self.pairs[:, 1]] = found
         matrix[self.pairs[:, 1], self.pairs[:, 0]] = found
         if sizes[_RANDOM] > 0.0:
@@ -175,7 +174,7 @@ def spread_of(lengths: Counts, samples: int) -> Spread:
     of_mean[:, first, second] = 0.5 * np.einsum('pg,pcg->cp', weight, gamma) * (
         lengths[first] * lengths[second])
     of_mean[:, second, first] = of_mean[:, first, second]
-    return Spread(len(lengths), np.column_stack([first, second]), gamma, weight, of_mean)
+    return Spread(np.column_stack([first, second]), gamma, weight, of_mean)
 
 
 def _lags(one: int, two: int, samples: int) -> Counts:
@@ -248,10 +247,13 @@ def longest_rest(recording: Recording, units: Units) -> LongRest:
     """Return the longest rest without an interruption; raise InputError if it is too short."""
     time = recording['time']
     best, seconds = (0, 0), 0.0
-    for start, end in sorted(_still(recording, units), key=lambda each: each[0] - each[1]):
-        if end - start <= seconds:
+    detector = StillDetector(CaptureSettings(), units, keep=None)
+    detector.add_recording(recording)
+    detector.close()
+    for dwell in sorted(detector.dwells(), key=lambda dwell: dwell.start - dwell.end):
+        if dwell.end - dwell.start <= seconds:
             break
-        for part in _uninterrupted(time, start, end):
+        for part in _uninterrupted(time, dwell.start, dwell.end):
             length = float(time[part[1] - 1] - time[part[0]])
             best, seconds = (part, length) if length > seconds else (best, seconds)
     count = best[1] - best[0]
@@ -277,43 +279,32 @@ def _uninterrupted(time: Floats, start: float, end: float) -> Iterator[tuple[int
         yield int(part[0]), int(part[-1]) + 1
 
 
-def _still(recording: Recording, units: Units) -> list[tuple[float, float]]:
-    """Return first and last stamp of each rest."""
-    detector = StillDetector(CaptureSettings(), units, keep=None)
-    detector.add_recording(recording)
-    detector.close()
-    return [(dwell.start, dwell.end) for dwell in detector.dwells()]
-
-
 def _regular(rest: Recording, units: Units) -> LongRest:
     """Return the samples of a rest with equal spacing."""
     time = rest['time']
     step = np.diff(time)
     usual = float(np.median(step))
+    notes = []
     late = step > _LONG * usual
     missing = np.maximum(np.round(step[late] / usual) - 1.0, 0.0).sum() if usual > 0.0 else np.inf
     if not 0.0 < missing <= _MOST_MISSING * len(time):
         rate = (len(time) - 1) / float(time[-1] - time[0])
-        notes = _jitter(step)
+        mean = float(np.mean(step))
+        if float(np.std(step)) > _UNEVEN * mean:
+            notes.append(
+                f'the stamps are uneven ({np.min(step) * 1e3:.3g} to {np.max(step) * 1e3:.3g} ms '
+                f'apart): the samples are taken as regular, one each {mean * 1e3:.4g} ms')
     else:
         steps = np.where(late, np.maximum(np.round(step / usual), 1.0), 1.0)
         place = np.append(0.0, np.cumsum(steps)).astype(np.int64)
         rate = place[-1] / float(time[-1] - time[0])
         rest = rest.take(np.searchsorted(place, np.arange(place[-1] + 1), side='right') - 1)
-        notes = [f'{counted(int(missing), "sample")} of {len(rest)} are missing in the rest, '
-                 'and are replaced by the sample before']
+        notes.append(f'{counted(int(missing), "sample")} of {len(rest)} are missing in the rest, '
+                     'and are replaced by the sample before')
     values = units.to_g(rest.reading.T)
     if 'rate' in rest:
         values = np.concatenate([values, rest['rate'].T])
     return LongRest(float(time[0]), rate, values, rest.columns.get('temperature'), tuple(notes))
-
-
-def _jitter(step: Floats) -> list[str]:
-    mean = float(np.mean(step))
-    if float(np.std(step)) <= _UNEVEN * mean:
-        return []
-    return [f'the stamps are uneven ({np.min(step) * 1e3:.3g} to {np.max(step) * 1e3:.3g} ms '
-            f'apart): the samples are taken as regular, one each {mean * 1e3:.4g} ms']
 
 
 def whole(blocks: Iterable[Recording]) -> Recording:

@@ -268,10 +268,12 @@ def _axis(kind: Kind, axis: str, unit: str, values: Floats, rate: float, spread:
     expected = shares(lengths) @ fitted.squares
     low, high = _band(variances, lengths, fitted, spread)
     tau = lengths / rate
+    across = np.diff(np.eye(len(lengths)), axis=0)
+    relative = covariance / np.outer(expected, expected)
     return AxisNoise(
         kind, axis, unit, tau, size * np.sqrt(variances), size * low, size * high,
         size * np.sqrt(expected), 0.5 * np.diff(np.log2(variances)),
-        _slope_sd(covariance / np.outer(expected, expected)),
+        0.5 / np.log(2.0) * np.sqrt(np.diag(across @ relative @ across.T)),
         {name: each.times(size * (1.0 / rate) ** _POWERS[name])
          for name, each in zip(COMPONENTS, fitted.components, strict=True)},
         (float(tau[fitted.first]), float(tau[fitted.last])), fitted.p_value,
@@ -290,11 +292,6 @@ def _band(variances: Floats, lengths: Counts, fitted: Fitted, spread: Spread
     low, high = (np.sqrt(variances * freedom / scipy.stats.chi2.ppf(part, freedom))
                  for part in (1.0 - tail, tail))
     return low, high
-
-
-def _slope_sd(relative: Floats) -> Floats:
-    across = np.diff(np.eye(len(relative)), axis=0)
-    return np.asarray(0.5 / np.log(2.0) * np.sqrt(np.diag(across @ relative @ across.T)))
 
 
 def _coarse_step(values: Floats, noise: float) -> float:
