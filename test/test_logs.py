@@ -717,6 +717,16 @@ def test_the_unit_of_a_gyro_is_seen_at_rest(unit: str, names: str, seed: int, re
     np.testing.assert_allclose(log.table['rate'], rate, rtol=1e-6)
 
 
+@pytest.mark.parametrize('order', [('reading', 'rate'), ('rate', 'reading')])
+@pytest.mark.parametrize('seed', range(3))
+def test_columns_without_names_have_the_roles_that_their_values_show(
+        order: tuple[str, str], seed: int, reads: Reads) -> None:
+    made = samples(seed)
+    log = reads('', made['time'], *(made[key] for key in order))
+    check(log, made['reading'], made['time'])
+    np.testing.assert_allclose(log.table['rate'], made['rate'], rtol=1e-7)
+
+
 @pytest.mark.parametrize('bits', [12, 14, 16])
 @pytest.mark.parametrize('seed', range(3))
 def test_counts_that_lost_their_sign_are_read_with_it(bits: int, seed: int, reads: Reads) -> None:

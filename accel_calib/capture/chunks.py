@@ -57,8 +57,9 @@ class CaptureSettings:
         Largest magnitude of the mean angular rate [rad/s]. 0: not checked, because gyros have
         biases and may be in counts.
     still_norm_tolerance : float
-        Largest difference of |mean| from 1 g [g]; not used for native units. The default is wide
-        because the sensor is not calibrated yet.
+        Largest difference of |a| of a rest from 1 g [g], beside the offset and the gains by axis
+        that all rests have in common; not used for native units. While the rests are too few to
+        show these, 0.25 to 3 g are accepted.
     min_dwell : float
         Shortest dwell that becomes a pose [s], without its edges. At low sample rates it is
         extended to sixteen samples.

@@ -215,7 +215,8 @@ def add_capture(made: Parser) -> None:
                           'sensor)'},
         'still_gyro_max': {'metavar': 'RAD/S', 'help': 'largest mean angular rate (default: not '
                            'checked)'},
-        'still_norm_tolerance': {'metavar': 'G', 'help': 'largest difference of |mean| from 1 g'},
+        'still_norm_tolerance': {'metavar': 'G', 'help': 'largest difference of |a| from '
+                                 '1 g, beside what all rests have in common'},
         'min_dwell': {'metavar': 'S', 'help': 'shortest still stretch that becomes a pose'},
         'max_dwell': {'metavar': 'S', 'help': 'split longer rests into poses with the same '
                       'orientation'},

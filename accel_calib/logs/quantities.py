@@ -58,6 +58,9 @@ _SMALL = 0.5
 _FACTOR = 1.4
 """Largest factor between the readings at rest and 1 g in their unit."""
 
+_STEADY, _STEADIER = 5.0, 3.0
+"""Smallest steadiness of gravity, and smallest ratio to that of rates."""
+
 _BITS = (10, 12, 13, 14, 16, 18, 20, 24, 32)
 _NEAR_TOP, _MIDDLE, _IN_MIDDLE, _SMOOTHER = 0.9, 0.1, 0.02, 0.5
 """Bits of numbers that can lose their sign; smallest largest number, and half of the empty middle,
@@ -191,6 +194,12 @@ def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
         made.said.append(f'{columns.maker.name} format')
         made.notes += [columns.maker.note] if columns.maker.note else []
     made.said += columns.layout.words
+    if not (columns.layout.header or options.columns) and _are_exchanged(columns, first):
+        swapped = dict(zip((*READING, *RATE), (*RATE, *READING), strict=True))
+        columns = replace(columns, sources={
+            key: columns.sources[swapped.get(key, key)] for key in columns.sources})
+        made.chosen = columns
+        made.said.append(f'{compact(columns.names(RATE))} are a gyro by their values')
     if 'instance' in columns.sources:
         made.instance = _instance(columns, first, options, made.notes)
         first = _of_instance(columns, first, made.instance)
@@ -214,6 +223,22 @@ def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
         _convert_if_stated(made, 'supply_voltage', 'V')
     made.notes += unused(columns.layout, columns.sources)
     return made
+
+
+def _are_exchanged(columns: Chosen, first: Cells) -> bool:
+    """Return whether the rates of columns without names have a steady length, as gravity has."""
+    if not columns.sources.keys() >= {*READING, *RATE}:
+        return False
+    reading, rate = (_steadiness(columns.three(first, keys)) for keys in (READING, RATE))
+    return rate > _STEADY and rate > _STEADIER * reading
+
+
+def _steadiness(values: Floats) -> float:
+    """Return the median length of (n, 3) vectors, relative to its scatter over them."""
+    length = np.linalg.norm(values, axis=1)
+    middle = float(np.median(length))
+    scatter = float(np.median(np.abs(length - middle)))
+    return middle / scatter if scatter > 0.0 else math.inf if middle > 0.0 else 0.0
 
 
 def modulus_of(values: Floats) -> float:

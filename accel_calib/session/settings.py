@@ -207,8 +207,8 @@ class CalibratorSettings:
         _CAPTURE.still_gyro_max, 'Largest mean angular rate of a still sensor [rad/s]. 0: not '
         'checked, because gyros have biases', limits=(0.0, 10.0))
     still_norm_tolerance: float = parameter(
-        _CAPTURE.still_norm_tolerance, 'Largest difference of |a| of a still sensor from 1 g [g]',
-        limits=(0.01, 1.0))
+        _CAPTURE.still_norm_tolerance, 'Largest difference of |a| of a rest from 1 g, beside '
+        'what all rests have in common [g]', limits=(0.01, 1.0))
     min_dwell: float = parameter(
         _CAPTURE.min_dwell, 'Shortest rest that becomes a pose [s]', limits=(0.1, 600.0))
     max_dwell: float = parameter(
