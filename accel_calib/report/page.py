@@ -36,7 +36,7 @@ from ..calibrate import Calibration, Curve, mounting_figures, outlook
 from ..effects import (
     AXES, effect_named, EMPIRICAL, empirical_parts, kind_of, REFERENCE_TEMPERATURE, value_unit,
     variable_words, with_vector)
-from ..findings import effect_figures, Figure, rate_refinement, residual_figures
+from ..findings import effect_figures, rate_refinement, residual_figures
 from ..geometry import coverage
 from ..refine import verdict_words
 from ..table import Floats
@@ -179,8 +179,8 @@ def thermal_page(outcome: ThermalOutcome, sources: Sequence[str], *, stored: str
             section('Held out', scroll_table(
                 'Error of held-out parts by degree',
                 ('degree', 'error of parts that were held out [mg]'),
-                [(str(degree), short(error)) for degree, error in enumerate(curve.held_out_mg)],
-                'whole-cells'), kind='half'),
+                [(str(degree), short(error)) for degree, error in enumerate(curve.held_out_mg)]),
+                kind='half'),
             section('Warnings', listing(calibration.warnings)),
             section('Use it', *(block(name, text) for name, text in snippets(
                 calibration, stored))),
@@ -354,21 +354,16 @@ def _effect_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
         name, _, part = figure.key.rpartition('.')
         if kind_of(name) == EMPIRICAL or not (figure.value or figure.sd):
             continue
-        label = f'{name.replace("_", " ")} {part}'
-        if part in effect_named(name).parameters:
-            yield label, *_with_typical(figure, name, part)
-        else:
+        label, effect = f'{name.replace("_", " ")} {part}', effect_named(name)
+        if part not in effect.parameters:
             yield label, f'{figure.value:.5g} {figure.unit}'.rstrip(), ''
-
-
-def _with_typical(figure: Figure, effect: str, parameter: str) -> tuple[str, str]:
-    """Return the value of an effect, and its typical size; small ones in millionths."""
-    unit, scale = value_unit(effect, parameter)
-    typical, factor = effect_named(effect).typical * scale, 1.0
-    if unit.startswith('g') and 0.0 < typical < _SMALL:
-        unit, factor = f'µ{unit}', MG ** 2
-    return (signed(figure.value * factor, figure.sd * factor, unit),
-            f'±{short(typical * factor)} {unit}' if 0.0 < typical < np.inf else '')
+            continue
+        unit, scale = value_unit(name, part)
+        typical, factor = effect.typical * scale, 1.0
+        if unit.startswith('g') and 0.0 < typical < _SMALL:
+            unit, factor = f'µ{unit}', MG ** 2
+        yield (label, signed(figure.value * factor, figure.sd * factor, unit),
+               f'±{short(typical * factor)} {unit}' if 0.0 < typical < np.inf else '')
 
 
 def _pose_table(residuals: Residuals, calibration: Calibration) -> str:
@@ -412,21 +407,17 @@ def snippets(calibration: Calibration, stored: str) -> tuple[tuple[str, str], ..
               f"     parameters=[{{'calibration_file': {stored!r},\n"
               f"                  'units': {calibration.units.name!r}}}],\n"
               "     remappings=[('imu/data_raw', 'imu/data_raw')])")
-    return (('ROS 2', ros), ('ROS 2 launch file', launch),
-            ('Python', _python(calibration, stored)), ('C', _c(calibration)),
-            ('C header, Arduino, PX4, ArduPilot and others',
-             f'accel-calib export {shlex.quote(stored)} --to c -o calibration.h'))
-
-
-def _python(calibration: Calibration, stored: str) -> str:
     known = ''.join(f', {key}={key}' for key in calibration.model.needs
                     if key in ('time', 'temperature', 'supply_voltage', 'rate'))
-    unit, force = calibration.units.symbol, calibration.units.symbol
-    if calibration.units.is_native:
-        unit, force = 'native units', 'g'
-    return ('import accel_calib as ac\n\n'
-            f'calibration = ac.load({stored!r})\n'
-            f'force = calibration.apply(readings{known})  # (n, 3), {unit} -> {force}')
+    symbol = calibration.units.symbol
+    units = 'native units -> g' if calibration.units.is_native else f'{symbol} -> {symbol}'
+    python = ('import accel_calib as ac\n\n'
+              f'calibration = ac.load({stored!r})\n'
+              f'force = calibration.apply(readings{known})  # (n, 3), {units}')
+    return (('ROS 2', ros), ('ROS 2 launch file', launch),
+            ('Python', python), ('C', _c(calibration)),
+            ('C header, Arduino, PX4, ArduPilot and others',
+             f'accel-calib export {shlex.quote(stored)} --to c -o calibration.h'))
 
 
 def _c(calibration: Calibration) -> str:
