@@ -172,7 +172,14 @@ def thermal_page(outcome: ThermalOutcome, sources: Sequence[str], *, stored: str
     calibration, curve = outcome.calibration, outcome.curve
     names = ', '.join(Path(source).name or source for source in sources)
     title = f'Offset over temperature of {calibration.sensor or names}'
-    body = [_curve_numbers(curve),
+    low, high = curve.range_c
+    hysteresis = ('not known' if curve.hysteresis_mg is None
+                  else f'{short(curve.hysteresis_mg)} mg')
+    body = [numbers([('range', f'{low:.1f} to {high:.1f} °C'), ('degree', str(curve.degree)),
+                     ('change', f'{short(curve.change_mg)} mg'),
+                     ('residual', f'{short(curve.residual_mg)} mg'),
+                     ('uncertainty up to', f'{short(curve.band_mg)} mg'),
+                     ('hysteresis', hysteresis)]),
             section('Offset over temperature', figures(
                 _of_axis(curve, axis) for axis in range(3)), HINT),
             _coefficients(curve), values_section(calibration),
@@ -188,17 +195,6 @@ def thermal_page(outcome: ThermalOutcome, sources: Sequence[str], *, stored: str
     return rated_sheet(title, [
         ', '.join(sources), f'fitted {calibration.date}' if calibration.date else ''],
         outcome.rating, body)
-
-
-def _curve_numbers(curve: Curve) -> str:
-    low, high = curve.range_c
-    hysteresis = ('not known' if curve.hysteresis_mg is None
-                  else f'{short(curve.hysteresis_mg)} mg')
-    return numbers([('range', f'{low:.1f} to {high:.1f} °C'), ('degree', str(curve.degree)),
-                    ('change', f'{short(curve.change_mg)} mg'),
-                    ('residual', f'{short(curve.residual_mg)} mg'),
-                    ('uncertainty up to', f'{short(curve.band_mg)} mg'),
-                    ('hysteresis', hysteresis)])
 
 
 def _of_axis(curve: Curve, axis: int) -> Drawing:
