@@ -52,27 +52,22 @@ def rate(calibration: Calibration, *, refinement: Refinement | None = None) -> R
         A refinement of the same poses; its calibration, or the base, is rated.
 
     """
-    expected = Expected(calibration)
+    expected, quality = Expected(calibration), calibration.quality
     good = (f'corrected readings in new orientations are right to {mg(expected.error_mg)} '
             f'({degrees(expected.error_mg)} of tilt)')
-    return rated(findings_of(expected, refinement), good, _figures(expected),
+    figures = [f'{number(quality.rms_before_mg)} -> {mg(quality.rms_after_mg)}']
+    if quality.held_out_rms_mg is not None and not expected.is_partial:
+        figures.append(f'of new poses {mg(quality.held_out_rms_mg)}')
+    noise = quality.noise_floor_mg
+    figures += ['noise not known' if noise is None else f'noise {mg(noise)}',
+                counted(len(expected.poses), 'pose'),
+                f'{100.0 * quality.coverage:.0f} % of the sphere']
+    return rated(findings_of(expected, refinement), good, ', '.join(figures),
                  step_after(calibration))
 
 
 def rate_refinement(result: Refinement) -> Rating:
     return rate(result.calibration, refinement=result)
-
-
-def _figures(expected: Expected) -> str:
-    quality = expected.quality
-    parts = [f'{number(quality.rms_before_mg)} -> {mg(quality.rms_after_mg)}']
-    if quality.held_out_rms_mg is not None and not expected.is_partial:
-        parts.append(f'of new poses {mg(quality.held_out_rms_mg)}')
-    noise = quality.noise_floor_mg
-    parts.append('noise not known' if noise is None else f'noise {mg(noise)}')
-    parts += [counted(len(expected.poses), 'pose'),
-              f'{100.0 * quality.coverage:.0f} % of the sphere']
-    return ', '.join(parts)
 
 
 def findings_of(expected: Expected, refinement: Refinement | None) -> tuple[Finding, ...]:

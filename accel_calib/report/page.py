@@ -80,10 +80,9 @@ _STEP = 1e-6
 _SAME = 1e-9
 _PAIRS = ((0, 1), (0, 2), (1, 2))
 
-_USUAL_OFFSET_MG = {'x': 50.0, 'y': 50.0, 'z': 80.0}
-_USUAL_GAIN_PERCENT = 3.0
-_USUAL_CROSS_AXIS_PERCENT = 2.0
-_USUAL_CROSS_AXIS = float(np.degrees(_USUAL_CROSS_AXIS_PERCENT / 100.0))
+_USUAL_OFFSET = {'x': '±50 mg', 'y': '±50 mg', 'z': '±80 mg'}
+_USUAL_GAIN = '±3 %'
+_USUAL_CROSS_AXIS = '±2 %, 1.1°'
 _SOURCE = (
     'Usual: the initial tolerances of a common part, the MPU-6050 (data sheet PS-MPU-6000A, '
     'revision 3.4, section 6.2). For other effects: the typical size in the catalogue of effects.')
@@ -321,7 +320,7 @@ def _linear_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
     scale, unit = (per_g, 'native') if native else (MG, 'mg')
     for axis, value, sd in zip(AXES, found[0], deviation[0], strict=True):
         if sd or value:
-            usual = '' if native else f'±{_USUAL_OFFSET_MG[axis]:g} mg'
+            usual = '' if native else _USUAL_OFFSET[axis]
             yield f'offset {axis}', signed(value * scale, sd * scale, unit), usual
     equal = np.ptp(found[1]) < _SAME
     for axis, value, sd in zip(AXES[:1] if equal else AXES, found[1], deviation[1], strict=False):
@@ -329,13 +328,12 @@ def _linear_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
         if native:
             yield name, signed(value * per_g, sd * per_g, 'native per g'), ''
         elif sd or abs(value - 1.0) > _SAME:
-            yield (name, signed((value - 1.0) * 100.0, sd * 100.0, '%'),
-                   f'±{_USUAL_GAIN_PERCENT:g} %')
+            yield name, signed((value - 1.0) * 100.0, sd * 100.0, '%'), _USUAL_GAIN
     for (i, j), value, sd in zip(_PAIRS, found[2], deviation[2], strict=True):
         if sd or abs(value - 90.0) > _SAME:
             words = signed(value - 90.0, sd)
             yield (f'angle {AXES[i]} to {AXES[j]}', f'90° {words[0]} {words[1:]}°',
-                   f'±{_USUAL_CROSS_AXIS_PERCENT:g} %, {_USUAL_CROSS_AXIS:.1f}°')
+                   _USUAL_CROSS_AXIS)
 
 
 def _effect_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:

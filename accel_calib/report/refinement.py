@@ -230,9 +230,6 @@ def of_curve(result: Refinement, step: int) -> Drawing:
 
 # ----------------------------------------------------------------------------- the ladder
 
-_LADDER_WIDTH_INCHES = 4.9
-_LEVEL_INCHES = 0.52
-
 _Level = tuple[str, float, float | None]
 """Name, residual and held-out residual [mg] of the base or after a step."""
 
@@ -247,8 +244,7 @@ def ladder(result: Refinement) -> Drawing:
     levels: list[_Level] = [(base_words(result), result.gap_mg, held_out), *(
         (f'+ {step.effect}', step.gap_after_mg, step.held_out_after_mg) for step in result.steps)]
     floor_mg = result.noise_floor_mg
-    with drawn(1.25 + _LEVEL_INCHES * len(levels), width_inches=_LADDER_WIDTH_INCHES, grid='x'
-               ) as (figure, (panel,)):
+    with drawn(1.25 + 0.52 * len(levels), width_inches=4.9, grid='x') as (figure, (panel,)):
         _draw_levels(panel, levels)
         if floor_mg:
             panel.axvline(floor_mg, color=ACCENT, linewidth=1.6, linestyle=(0, (5, 3)),

@@ -205,7 +205,6 @@ BAND = 1.96
 EDGE: Any = {'markeredgecolor': PAPER, 'markeredgewidth': 0.4}
 """Edge of a filled marker."""
 
-_PNG_DPI = 160
 _LEGEND_INCHES, _LEGEND_ROW_INCHES = 0.12, 0.18
 """Height of the frame and of a row of a legend."""
 
@@ -316,7 +315,7 @@ def add_band(panel: Any, at: Floats, low: Floats, high: Floats, colour: str, alp
 def save(drawing: Drawing, path: Path) -> None:
     """Write a figure to a file; the suffix sets the format."""
     with _styled():
-        drawing.figure.savefig(path, dpi=_PNG_DPI, facecolor='white')
+        drawing.figure.savefig(path, dpi=160, facecolor='white')
 
 
 # ----------------------------------------------------------------------------- figures on a page

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from ..calibrate import Calibration
     from ..findings import Rating
 
-_NOISE_INCHES = 4.0
 _LOOKS = dict(zip('xyz', zip(AXIS_COLOURS, 'os^')))
 """Colour and marker of each axis."""
 
@@ -78,11 +77,19 @@ def _allan(axes: Sequence[AxisNoise]) -> Drawing:
     """Draw the Allan deviation of the axes of one sensor over τ, with their 95 % bands."""
     kind, hover = axes[0].kind, {}
     unit, scale = shown_unit(kind, 'bias_instability', axes[0].unit)
-    with drawn(_NOISE_INCHES, f'{kind.capitalize()}: Allan deviation') as (figure, (panel,)):
+    with drawn(4.0, f'{kind.capitalize()}: Allan deviation') as (figure, (panel,)):
         panel.set(xscale='log', yscale='log', xlabel='averaging time τ [s]',
                   ylabel=f'Allan deviation [{unit}]')
         for axis in axes:
-            hover[f'curve_{axis.axis}'] = _draw_axis(panel, axis, unit, scale)
+            (colour, marker), name = _LOOKS[axis.axis], f'curve_{axis.axis}'
+            add_band(panel, axis.tau, axis.low * scale, axis.high * scale, colour)
+            used = (axis.tau >= axis.used[0]) & (axis.tau <= axis.used[1])
+            panel.plot(axis.tau[used], axis.model[used] * scale, color=colour, linewidth=1.0)
+            panel.plot(axis.tau, axis.deviation * scale, linestyle='none', marker=marker,
+                       color=colour, markersize=4.0, label=axis.axis, gid=name)
+            hover[name] = tuple(
+                Mark(f'{axis.axis}, τ = {duration(float(tau))}: {value * scale:.3g} {unit}')
+                for tau, value in zip(axis.tau, axis.deviation, strict=True))
         # Wide bands at long τ must not compress the curves.
         every = np.concatenate([axis.deviation for axis in axes]) * scale
         panel.set_ylim(0.5 * float(np.min(every)), 2.0 * float(np.max(every)))
@@ -92,18 +99,6 @@ def _allan(axes: Sequence[AxisNoise]) -> Drawing:
             f'{duration(float(axis.tau[np.argmin(axis.deviation)]))}' for axis in axes]
     return Drawing(f'allan_{kind}', f'Allan deviation of the {kind} over τ: {", ".join(ends)}',
                    figure, hover)
-
-
-def _draw_axis(panel: Any, axis: AxisNoise, unit: str, scale: float) -> Marks:
-    """Draw one axis, and return the texts of its markers."""
-    colour, marker = _LOOKS[axis.axis]
-    add_band(panel, axis.tau, axis.low * scale, axis.high * scale, colour)
-    used = (axis.tau >= axis.used[0]) & (axis.tau <= axis.used[1])
-    panel.plot(axis.tau[used], axis.model[used] * scale, color=colour, linewidth=1.0)
-    panel.plot(axis.tau, axis.deviation * scale, linestyle='none', marker=marker, color=colour,
-               markersize=4.0, label=axis.axis, gid=f'curve_{axis.axis}')
-    return tuple(Mark(f'{axis.axis}, τ = {duration(float(tau))}: {value * scale:.3g} {unit}')
-                 for tau, value in zip(axis.tau, axis.deviation, strict=True))
 
 
 def _table(found: NoiseFigures, kind: Kind) -> str:
@@ -347,25 +342,20 @@ def history_page(history: History, sources: Sequence[Path],
                 short(change.comparison.runs[1].rms_mg))
                for first, second, change in zip(history.labels, history.labels[1:],
                                                 history.changes, strict=False)]
+    moments = []
+    for k, (label, moment) in enumerate(zip(history.labels, history.moments, strict=True)):
+        warm = '' if moment.temperature is None else f'{moment.temperature:.1f}'
+        moments.append((str(k + 1), label, sources[moment.index].name, moment.model, warm,
+                        short(moment.residual_mg), *(
+                            in_words(each.name, each.values[k], each.stated_sd[k])
+                            for each in history.parameters)))
     body = [section('Over the dates', figures(of_history(history)), HINT),
             section('Changes', scroll_table('Changes', (
                 'from', 'to', 'verdict', 'p', 'largest change', 'RMS [mg]'), changes)),
-            section('Calibrations', _moments(history, sources)),
+            section('Calibrations', scroll_table('Calibrations', (
+                '', 'date', 'file', 'model', '°C', 'residual [mg]',
+                *(spoken(each.name) for each in history.parameters)), moments)),
             section('Notes', listing(history.notes)), how_to_read(*_HOW_TO_READ)]
     return rated_sheet(f'History of {len(calibrations)} calibrations{_of_sensor(calibrations)}',
                        [f'{history.labels[0]} to {history.labels[-1]}'],
                        rate_comparison(history.whole), body)
-
-
-def _moments(history: History, sources: Sequence[Path]) -> str:
-    """Return a table of the calibrations with their parameters."""
-    head = ('', 'date', 'file', 'model', '°C', 'residual [mg]',
-            *(spoken(each.name) for each in history.parameters))
-    rows = []
-    for k, (label, moment) in enumerate(zip(history.labels, history.moments, strict=True)):
-        warm = '' if moment.temperature is None else f'{moment.temperature:.1f}'
-        values = (in_words(each.name, each.values[k], each.stated_sd[k])
-                  for each in history.parameters)
-        rows.append((str(k + 1), label, sources[moment.index].name, moment.model, warm,
-                     short(moment.residual_mg), *values))
-    return scroll_table('Calibrations', head, rows)
