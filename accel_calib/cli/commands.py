@@ -30,8 +30,9 @@ class Command(NamedTuple):
     A command.
 
     `module` of this folder has the function ``run_NAME``. `example` is the end of the help; its
-    first line is an example. `options` adds the options to a parser. `writes` is the kind of the
-    file that ``-o`` names, empty for any, and `about` the argument that an error in JSON is about.
+    first line is an example, without ``accel-calib NAME``. `options` adds the options to a parser.
+    `writes` is the kind of the file that ``-o`` names, empty for any, and `about` the argument
+    that an error in JSON is about.
 
     """
 
@@ -45,7 +46,7 @@ class Command(NamedTuple):
 
 def add_options(made: options.Parser, command: Command) -> None:
     """Add the options and the example of a command to its parser."""
-    made.epilog = f'example:\n  {command.example}'
+    made.epilog = f'example:\n  {made.prog} {command.example}'
     made.formatter_class = argparse.RawDescriptionHelpFormatter
     command.options(made)
     known = {action.dest for action in made._actions}
@@ -371,70 +372,66 @@ _FOR_ROS = 'all arguments after --ros-args are passed to ROS'
 COMMANDS = {
     'demo': Command(
         'demonstrate the calibration of a simulated Imu with the nodes, without hardware',
-        'nodes', 'accel-calib demo --hidden temperature', _demo),
+        'nodes', '--hidden temperature', _demo),
     'calibrate': Command(
-        'make a calibration, a page and a verdict from any log', 'fit',
-        'accel-calib calibrate log.csv --flat last', _calibrate, 'calibration', 'log'),
+        'make a calibration, a page and a verdict from any log', 'fit', 'log.csv --flat last',
+        _calibrate, 'calibration', 'log'),
     'thermal': Command(
         'fit the offset over temperature to logs of a still board that warms up', 'fit',
-        'accel-calib thermal warm_up.ulg poses.ulg -o calibration.yaml', _thermal, 'calibration',
-        'logs'),
+        'warm_up.ulg poses.ulg -o calibration.yaml', _thermal, 'calibration', 'logs'),
     'capture': Command(
         'find the still stretches of a recording and write the pose table', 'recordings',
-        'accel-calib capture recording.mcap -o poses.csv', _capture, 'table'),
+        'recording.mcap -o poses.csv', _capture, 'table'),
     'fit': Command(
-        'fit a calibration to still poses', 'fit',
-        'accel-calib fit poses.csv -o calibration.yaml --flat 1', _fit, 'calibration'),
+        'fit a calibration to still poses', 'fit', 'poses.csv -o calibration.yaml --flat 1', _fit,
+        'calibration'),
     'verify': Command(
         'evaluate a calibration on poses that it was not fitted to', 'compare',
-        'accel-calib verify other_log.csv -c calibration.yaml --max 5\n'
+        'other_log.csv -c calibration.yaml --max 5\n'
         'exit status:\n  0: within --max, 1: above --max, 2: bad input', _verify),
     'compare': Command(
         'test whether calibrations of one sensor agree within their uncertainties', 'compare',
-        'accel-calib compare monday.yaml tuesday.yaml wednesday.yaml\n'
+        'monday.yaml tuesday.yaml wednesday.yaml\n'
         'exit status:\n  0: they agree, 1: they do not agree, 2: they cannot be compared',
         _compare),
     'history': Command(
         'show offset and gain over the dates of calibrations of one sensor', 'compare',
-        'accel-calib history january.yaml april.yaml july.yaml --report history.html', _compare),
+        'january.yaml april.yaml july.yaml --report history.html', _compare),
     'refine': Command(
         'find effects that a calibration lacks, and add them', 'fit',
-        'accel-calib refine poses.csv -o refined.yaml --report report.html', _refine,
-        'calibration', 'poses'),
+        'poses.csv -o refined.yaml --report report.html', _refine, 'calibration', 'poses'),
     'fleet': Command(
         'calibrate the recordings of many sensors in parallel, on Dask', 'fit',
-        'accel-calib fleet recordings/ -o results/\n'
+        'recordings/ -o results/\n'
         "  accel-calib fleet 's3://fleet/*.mcap' -o results/ --scheduler tcp://10.0.0.1:8786",
         _fleet),
     'apply': Command(
         'correct a recording with a calibration', 'recordings',
-        'accel-calib apply recording.mcap -c calibration.yaml -o corrected', _apply, 'table'),
+        'recording.mcap -c calibration.yaml -o corrected', _apply, 'table'),
     'export': Command(
         'write a calibration in the format of a firmware, an autopilot or another tool',
-        'recordings', 'accel-calib export calibration.yaml --to c -o imu.h', _export, 'export'),
+        'recordings', 'calibration.yaml --to c -o imu.h', _export, 'export'),
     'noise': Command(
         'find noise density, bias instability and random walk from a long rest', 'compare',
-        'accel-calib noise rest.mcap --json noise.json --report noise.html', _noise),
+        'rest.mcap --json noise.json --report noise.html', _noise),
     'simulate': Command(
         'simulate poses or a recording of a sensor with known effects', 'recordings',
-        'accel-calib simulate -o poses.csv --effect offset=0.02,-0.01,0.03 '
-        '--effect axis_gain=0.01', _simulate, 'table'),
+        '-o poses.csv --effect offset=0.02,-0.01,0.03 --effect axis_gain=0.01', _simulate,
+        'table'),
     'report': Command(
         'write a report about effects that a calibration lacks, with figures (HTML)', 'fit',
-        'accel-calib report poses.csv -o report.html --figures figures', _report, 'page'),
+        'poses.csv -o report.html --figures figures', _report, 'page'),
     'watch': Command(
         'show the progress of a calibrator node, and which pose is next', 'nodes',
-        f'accel-calib watch --node left/calibrator\n\nCtrl-C ends it; {_FOR_ROS}', _watch),
+        f'--node left/calibrator\n\nCtrl-C ends it; {_FOR_ROS}', _watch),
     'live': Command(
         'calibrate on a page in the browser, from a serial port or a recording', 'nodes',
-        'accel-calib live /dev/ttyUSB0 --baud 115200 -o calibration.yaml\n\n'
+        '/dev/ttyUSB0 --baud 115200 -o calibration.yaml\n\n'
         'open the link that it prints in a browser; Ctrl-C ends it', _live, 'calibration'),
     'node': Command(
-        'run the calibrator node', 'nodes',
-        f'accel-calib node --ros-args -r imu/data_raw:=/imu/raw\n\n{_FOR_ROS}'),
+        'run the calibrator node', 'nodes', f'--ros-args -r imu/data_raw:=/imu/raw\n\n{_FOR_ROS}'),
     'simulator': Command(
-        'run the simulated Imu node', 'nodes',
-        f'accel-calib simulator --ros-args -p poses:=12\n\n{_FOR_ROS}'),
+        'run the simulated Imu node', 'nodes', f'--ros-args -p poses:=12\n\n{_FOR_ROS}'),
 }
 
 

@@ -21,7 +21,7 @@ from ..compare import compare, Comparison, History, history_of
 from ..errors import InputError
 from ..findings import (
     change_in_words, GAINS, in_words, OFFSETS, rate_comparison, rate_noise, rate_verification)
-from ..logs import open_log, OpenLog, Progress
+from ..logs import open_log
 from ..noise import check_allantools, duration, noise_of, NoiseFigures, to_json, whole
 from ..pipeline import Correction
 from ..report import calibration_page
@@ -29,7 +29,7 @@ from ..report.stability import (
     comparison_page, figure_rows, history_page, kalibr_lines, need_lines, noise_page,
     parameter_rows)
 from ..stored import read_calibration
-from ..table import check_units, Recording
+from ..table import check_units
 from ..text import counted, plain, short
 from ..units import units_of
 
@@ -108,15 +108,9 @@ def _comparison_lines(paths: list[Path], models: list[str], comparison: Comparis
 
 
 def run_history(args: argparse.Namespace) -> Done:
-    """Sort calibrations by date, and compare them."""
+    """Sort calibrations by date, and compare them; in JSON, runs are numbered from 1."""
     calibrations = [read_calibration(path) for path in args.calibrations]
     history = history_of(calibrations)
-    return Done(_history_result(args, history), _history_lines(history),
-                page=partial(history_page, history, args.calibrations, calibrations))
-
-
-def _history_result(args: argparse.Namespace, history: History) -> dict[str, Any]:
-    """Return the result for JSON; runs are numbered from 1, in order of date."""
     paths, changes = args.calibrations, []
     for number, change in enumerate(history.changes, 1):
         rating, comparison = rate_comparison(change.comparison), change.comparison
@@ -125,7 +119,7 @@ def _history_result(args: argparse.Namespace, history: History) -> dict[str, Any
             'p_value': comparison.p_value, 'rms_mg': comparison.runs[1].rms_mg,
             'largest_mg': comparison.runs[1].largest_mg, 'parameter': change.parameter,
             'change': change.change, 'change_sd': change.sd, **rated(rating, args)})
-    return {
+    result = {
         'agree': history.whole.agree, 'p_value': history.whole.p_value,
         'runs': [{'file': paths[moment.index], 'date': moment.when and moment.when.isoformat(),
                   'model': moment.model, 'temperature': moment.temperature,
@@ -133,10 +127,22 @@ def _history_result(args: argparse.Namespace, history: History) -> dict[str, Any
         'parameters': [{'name': each.name, 'values': each.values, 'stated_sd': each.stated_sd}
                        for each in history.parameters],
         'changes': changes, 'notes': history.notes}
+    return Done(result, _history_lines(history),
+                page=partial(history_page, history, paths, calibrations))
 
 
 def _history_lines(history: History) -> Iterator[Any]:
-    yield _dates_table(history)
+    """Yield offset and gain, one row per calibration and axis, and a line for each change."""
+    rows = []
+    found = {each.name: each for each in history.parameters}
+    for k, (label, moment) in enumerate(zip(history.labels, history.moments, strict=True)):
+        warm = '' if moment.temperature is None else f'{moment.temperature:.0f} °C'
+        for begin, names in zip((label, warm, ''), zip(OFFSETS, GAINS, strict=True), strict=True):
+            cells = (in_words(name, found[name].values[k], found[name].stated_sd[k])
+                     for name in names)
+            rows.append((begin, names[0][-1], *(cell.rpartition(' ')[0].replace('−', '-')
+                                                for cell in cells)))
+    yield table('', ('date', '', 'offset [mg]', 'gain - 1 [%]'), rows, show_edge=False, **NARROW)
     for first, second, change in zip(history.labels, history.labels[1:], history.changes,
                                      strict=False):
         comparison = change.comparison
@@ -149,27 +155,19 @@ def _history_lines(history: History) -> Iterator[Any]:
         yield f'note: {note}'
 
 
-def _dates_table(history: History) -> Table:
-    """Return a table of offset and gain, one row per calibration and axis."""
-    rows = []
-    found = {each.name: each for each in history.parameters}
-    for k, (label, moment) in enumerate(zip(history.labels, history.moments, strict=True)):
-        warm = '' if moment.temperature is None else f'{moment.temperature:.0f} °C'
-        for begin, names in zip((label, warm, ''), zip(OFFSETS, GAINS, strict=True), strict=True):
-            cells = (in_words(name, found[name].values[k], found[name].stated_sd[k])
-                     for name in names)
-            rows.append((begin, names[0][-1], *(cell.rpartition(' ')[0].replace('−', '-')
-                                                for cell in cells)))
-    return table('', ('date', '', 'offset [mg]', 'gain - 1 [%]'), rows, show_edge=False, **NARROW)
-
-
 def run_noise(args: argparse.Namespace) -> Done:
     """Find a long rest, and compute the figures of its noise."""
     check_allantools()
     calibration = args.calibration and stored_calibration(args.calibration)
     with open_log(args.recording, log_options(args, calibration)) as log:
-        with progress('samples') as moved:
-            recording = _samples(log, args.recording, moved)
+        if log.poses is None:
+            with progress('samples') as moved:
+                recording = whole(log.watched(moved))
+        elif 'time' in log.poses and 'count' not in log.poses:
+            recording = log.poses.as_recording()  # a table of slow samples looks like poses
+        else:
+            raise InputError(f'{args.recording} is a pose table, expected a recording',
+                             'use the samples of a long rest, with their time')
         lines, units = read_lines(log), log.units
     if calibration:
         recording = Correction(calibration, units, recording.sensor)(recording)
@@ -178,21 +176,6 @@ def run_noise(args: argparse.Namespace) -> Done:
         found = noise_of(recording, units, args.gravity, moved)
     return Done({'recording': args.recording, **to_json(found)}, [*lines, *_noise_lines(found)],
                 rate_noise(found), page=partial(noise_page, found, str(args.recording)))
-
-
-def _samples(log: OpenLog, path: Path, moved: Progress) -> Recording:
-    """
-    Return the samples of a log.
-
-    A table of slow samples has the form of a pose table without the columns of a pose.
-
-    """
-    if log.poses is None:
-        return whole(log.watched(moved))
-    if 'time' in log.poses and 'count' not in log.poses:
-        return log.poses.as_recording()
-    raise InputError(f'{path} is a pose table, expected a recording',
-                     'use the samples of a long rest, with their time')
 
 
 def _noise_lines(found: NoiseFigures) -> Iterator[str | Table]:

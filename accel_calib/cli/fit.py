@@ -18,7 +18,7 @@ from .frame import (
     console, Done, FAILED, given, intake, log_options, prior, rows_between, settings,
     stored_calibration)
 from .output import error_line, progress, short_if_known, table, Verdict, working
-from ..calibrate import Calibration, Curve, GyroBias, NORM_MODELS, outlook
+from ..calibrate import Calibration, Curve, NORM_MODELS, outlook
 from ..effects import AXES, effect_named
 from ..errors import InputError
 from ..findings import (
@@ -154,11 +154,12 @@ def _page(args: argparse.Namespace, log: Path, found: Intake, outcome: Outcome) 
 def several_fit(results: Sequence[dict[str, Any]]) -> Iterator[str]:
     """Yield a line for each of several results."""
     for result in results:
-        line = f'{result["file"]} ' + (error_line(result) or (
-            f'model {result["model"]}: {result["rms_before_mg"]:.3g} -> '
-            f'{result["rms_after_mg"]:.3g} mg, '))
-        yield line if 'error' in result else Verdict(
-            f'{line}{result["rating"]}', result['rating'], len(line))
+        if 'error' in result:
+            yield f'{result["file"]} {error_line(result)}'
+            continue
+        line = (f'{result["file"]} model {result["model"]}: {result["rms_before_mg"]:.3g} -> '
+                f'{result["rms_after_mg"]:.3g} mg, ')
+        yield Verdict(f'{line}{result["rating"]}', result['rating'], len(line))
 
 
 def _fit_notes(calibration: Calibration, *notes: str) -> list[str]:
@@ -171,17 +172,9 @@ def _fit_notes(calibration: Calibration, *notes: str) -> list[str]:
 
 
 def _tables(calibration: Calibration) -> Iterator[Any]:
-    """Yield the residuals and the values of a calibration."""
-    yield _quality_table(calibration)
-    yield _parameter_table(calibration)
-    if calibration.gyro is not None:
-        yield _gyro_line(calibration.gyro)
-
-
-def _quality_table(calibration: Calibration) -> Table:
-    """Return a table of the residual before and after the fit."""
-    quality = calibration.quality
-    return table('Residual of |force| [mg]', (
+    """Yield the residuals, the values of the model, and the gyro bias."""
+    quality, gyro = calibration.quality, calibration.gyro
+    yield table('Residual of |force| [mg]', (
         f'model {calibration.name}, {counted(len(calibration.used_poses), "pose")}', 'before',
         'after'), (
         ('RMS', short(quality.rms_before_mg), short(quality.rms_after_mg)),
@@ -189,27 +182,20 @@ def _quality_table(calibration: Calibration) -> Table:
          short(quality.max_after_percent * MG / 100.0)),
         ('held out', '', short_if_known(quality.held_out_rms_mg)),
         ('noise floor', '', short_if_known(quality.noise_floor_mg))))
-
-
-def _parameter_table(calibration: Calibration) -> Table:
-    """Return a table of the parameters that the model has, with their standard deviations."""
-    table = Table(title='reading = W ΔR force + V', show_header=False)
-    table.add_column('', no_wrap=True)
-    table.add_column('', no_wrap=True, justify='right')
-    table.add_column('', no_wrap=True)
+    parameters = Table(title='reading = W ΔR force + V', show_header=False)
+    parameters.add_column('', no_wrap=True)
+    parameters.add_column('', no_wrap=True, justify='right')
+    parameters.add_column('', no_wrap=True)
     for each in (*linear_figures(calibration), *effect_figures(calibration)):
-        table.add_row(each.label, with_sd(each.value, each.sd), each.unit)
-    return table
-
-
-def _gyro_line(gyro: GyroBias) -> str:
-    """Return the gyro bias as a line of text, in °/s."""
-    values = ', '.join(f'{axis} {with_sd(bias, sd)}' for axis, bias, sd in zip(
-        'xyz', np.degrees(gyro.bias), np.degrees(gyro.sd), strict=True))
-    slope = ('' if not np.any(gyro.slope) else
-             f' at {gyro.temperature:.1f} °C, changes by '
-             f'{", ".join(f"{each:+.2g}" for each in np.degrees(gyro.slope))} °/s per °C')
-    return f'gyro bias: {values} °/s{slope} ({counted(gyro.rests, "rest")})'
+        parameters.add_row(each.label, with_sd(each.value, each.sd), each.unit)
+    yield parameters
+    if gyro is not None:
+        values = ', '.join(f'{axis} {with_sd(bias, sd)}' for axis, bias, sd in zip(
+            AXES, np.degrees(gyro.bias), np.degrees(gyro.sd), strict=True))
+        slope = ('' if not np.any(gyro.slope) else
+                 f' at {gyro.temperature:.1f} °C, changes by '
+                 f'{", ".join(f"{each:+.2g}" for each in np.degrees(gyro.slope))} °/s per °C')
+        yield f'gyro bias: {values} °/s{slope} ({counted(gyro.rests, "rest")})'
 
 
 # ----------------------------------------------------------------------------- effects

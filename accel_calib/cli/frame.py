@@ -118,7 +118,15 @@ def run(args: argparse.Namespace) -> int:
         from ..report import check_matplotlib
 
         check_matplotlib()
-    return _run_one(each[0]) if len(each) == 1 else _run_several(args, each)
+    if len(each) == 1:
+        return _run_one(each[0])
+    outcomes = _in_parallel(_attempt, each, args.jobs)
+    results = [result for _, result in outcomes]
+    write_json(args.json, results)
+    output = console(args)
+    for line in _function('several', args.command)(results):
+        output.print(line)
+    return max(status for status, _ in outcomes)
 
 
 def _function(kind: str, command: str) -> Callable[[Any], Any]:
@@ -192,16 +200,6 @@ def _notes(done: Done, args: argparse.Namespace) -> Iterator[str]:
     else:
         yield from lines[:_MOST_NOTES - 1]
         yield f'{len(lines) - _MOST_NOTES + 1} more lines with --verbose'
-
-
-def _run_several(args: argparse.Namespace, each: Sequence[argparse.Namespace]) -> int:
-    outcomes = _in_parallel(_attempt, each, args.jobs)
-    results = [result for _, result in outcomes]
-    write_json(args.json, results)
-    output = console(args)
-    for line in _function('several', args.command)(results):
-        output.print(line)
-    return max(status for status, _ in outcomes)
 
 
 def _attempt(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
@@ -309,8 +307,8 @@ def _targets(args: argparse.Namespace, each: Sequence[argparse.Namespace]) -> It
             yield Target('page', target.path.with_suffix('.html'), 'page', 'the page of -o')
 
 
-def _check_piped(args: argparse.Namespace, each: Sequence[argparse.Namespace]) -> None:
-    """Check that at most one result goes to standard output."""
+def _check_targets(args: argparse.Namespace, each: Sequence[argparse.Namespace]) -> None:
+    """Check that one result at most goes to standard output, and each file that is written."""
     piped = [target.option for target in _outputs(args) if target.is_piped]
     if len(piped) > 1:
         raise InputError(f'{" and ".join(piped)} are both -, expected one of them on standard '
@@ -318,10 +316,6 @@ def _check_piped(args: argparse.Namespace, each: Sequence[argparse.Namespace]) -
     if piped and piped != ['--json'] and (len(each) > 1 or not COMMANDS[args.command].writes):
         raise InputError(f'{piped[0]} is -, expected a folder here',
                          'use a folder; results of several files do not fit into one')
-
-
-def _check_targets(args: argparse.Namespace, each: Sequence[argparse.Namespace]) -> None:
-    _check_piped(args, each)
     read = [getattr(args, name, None) for name in _INPUTS]
     inputs = [path for value in read for path in (value if isinstance(value, list) else [value])
               if isinstance(path, Path)]

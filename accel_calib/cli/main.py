@@ -33,6 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     with _leaving():
         from .commands import parser
+        from .options import BAD_INPUT, in_one_line
         from ..errors import AccelCalibError, crash_words, system_error
         from ..one_thread import use_one_thread
 
@@ -40,13 +41,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _open_streams()
         if '_ARGCOMPLETE' in os.environ:
             _complete()
-        own, for_ros = _split(sys.argv[1:] if arguments is None else arguments)
+        given = sys.argv[1:] if arguments is None else list(arguments)
+        at = given.index('--ros-args') if '--ros-args' in given else len(given)
+        own = given[:at]
         top = parser(own[:1])
         args = top.parse_command(own, own[0] if own else '')
         if not args.command:
             top.print_help()
             return 0
-        args.for_ros = for_ros
+        args.for_ros = given[at:]
         from .frame import run  # imports numpy and rich
 
     try:
@@ -65,7 +68,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     finally:
         if arguments is None:  # Python's own end would print that it was interrupted
             signal.signal(signal.SIGINT, signal.SIG_IGN)
-    return _refuse(args.command, line)
+    print(f'accel-calib {args.command}: {in_one_line(line)}', file=sys.stderr)
+    return BAD_INPUT
 
 
 @contextmanager
@@ -111,19 +115,6 @@ def _complete() -> None:
     from .commands import parser
 
     argcomplete.autocomplete(parser())
-
-
-def _split(arguments: Sequence[str]) -> tuple[Sequence[str], Sequence[str]]:
-    """Split the arguments into those of this program and those of ROS."""
-    at = list(arguments).index('--ros-args') if '--ros-args' in arguments else len(arguments)
-    return arguments[:at], arguments[at:]
-
-
-def _refuse(command: str, line: str) -> int:
-    from .options import BAD_INPUT, in_one_line
-
-    print(f'accel-calib {command}: {in_one_line(line)}', file=sys.stderr)
-    return BAD_INPUT
 
 
 if __name__ == '__main__':

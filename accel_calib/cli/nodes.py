@@ -15,7 +15,7 @@ that they can be read from a distance. Two columns of the terminal, or half a ro
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 import math
@@ -115,37 +115,30 @@ def run_demo(args: argparse.Namespace) -> Done:
             demonstrate_page(WEB_PORT, output.print, is_over)
         return Done()
     outcome = demonstrate(output.print, HIDDEN.get(args.hidden, ''))
-    verdict = [] if args.hidden is None else [_verdict(outcome)]
-    return Done(_to_json(outcome), [_errors_table(outcome), *verdict],
+    found = asdict(outcome)
+    before, after = found.pop('before'), found.pop('after')
+    for when, errors in (('before', before), ('after', after)):
+        for name, value in errors.items():
+            quantity, unit = name.split('_')
+            found[f'{quantity}_{when}_{unit}'] = value
+    return Done(found, _demo_lines(outcome, before, after),
                 status=0 if outcome.succeeded else FAILED)
 
 
-def _to_json(outcome: Outcome) -> dict[str, Any]:
-    """Return the JSON: errors before and after by name, and the rest of the outcome."""
-    found = asdict(outcome)
-    for when in ('before', 'after'):
-        for name, value in found.pop(when).items():
-            quantity, unit = name.split('_')
-            found[f'{quantity}_{when}_{unit}'] = value
-    return found
-
-
-def _verdict(outcome: Outcome) -> str:
-    """Return whether the hidden effect was found."""
-    named = ', '.join(outcome.found) or 'nothing'
-    lag = f' with a lag of {outcome.lag_s:.1f} s' if outcome.lag_s else ''
-    passed = 'found' if outcome.hidden in outcome.found else 'NOT found'
-    return f'{passed}: hidden was {outcome.hidden}, ~/refine added {named}{lag}'
-
-
-def _errors_table(outcome: Outcome) -> Table:
+def _demo_lines(outcome: Outcome, before: Mapping[str, float], after: Mapping[str, float]
+                ) -> Iterator[Any]:
+    """Yield a table of the errors, and whether the hidden effect was found if there is one."""
     columns = (('imu/data_calibrated', 'after ~/refine') if outcome.hidden else
                ('imu/data_raw', 'imu/data_calibrated'))
-    before, after = asdict(outcome.before), asdict(outcome.after)
-    return table(
+    yield table(
         f'Errors at {outcome.rests} rests in other poses, after {outcome.seconds:.0f} s',
         ('', *columns), ((words, f'{before[name]:.3g}', f'{after[name]:.3g}')
                          for name, words in _ERRORS.items()))
+    if outcome.hidden:
+        named = ', '.join(outcome.found) or 'nothing'
+        lag = f' with a lag of {outcome.lag_s:.1f} s' if outcome.lag_s else ''
+        passed = 'found' if outcome.hidden in outcome.found else 'NOT found'
+        yield f'{passed}: hidden was {outcome.hidden}, ~/refine added {named}{lag}'
 
 
 # ----------------------------------------------------------------------------- watch
@@ -185,13 +178,29 @@ _SAME = math.cos(math.radians(10.0))
 
 
 class _Row(NamedTuple):
-    """A row of the screen: what it shows, in words, and as the share of a bar (NaN: no bar)."""
+    """
+    A row of the screen: what it shows, in words, and as the share of a bar (NaN: no bar).
+
+    It is drawn as its bar, which fills the available width and has a line at the limit.
+
+    """
 
     label: str
     words: str
     share: float = math.nan
     style: str = GOOD
     limit: float = math.nan
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        full, empty, line = '#-|' if options.ascii_only else '█░┃'
+        width = options.max_width
+        done = round(min(self.share, 1.0) * width)
+        text = Text(full * done, style=self.style, no_wrap=True)
+        text.append(empty * (width - done), style='dim')
+        if not math.isnan(self.limit):
+            at = min(round(self.limit * width), width - 1)
+            text = Text.assemble(text[:at], (line, 'bold white'), text[at + 1:], no_wrap=True)
+        yield text
 
 
 def run_watch(args: argparse.Namespace) -> Done:
@@ -203,22 +212,16 @@ def run_watch(args: argparse.Namespace) -> Done:
             raise InputError(f'ROS 2 is not installed ({err}), but the command needs it',
                              NEEDS_ROS) from err
         for_ros = [args.command, *args.for_ros]
-        if args.once:
-            _print(*watch.current(args.node, is_over, for_ros))
-        else:
+        if not args.once:
             with _output(args.bell) as show:
                 watch.watch(args.node, show, is_over, for_ros)
+            return Done()
+        node, progress = watch.current(args.node, is_over, for_ros)
+        if progress is not None and sys.stdout.isatty():
+            Output().print(screen(node, progress))
+        elif progress is not None:
+            print(*state(node, progress), sep='\n', flush=True)
     return Done()
-
-
-def _print(node: str, progress: Progress | None) -> None:
-    """Print a progress once."""
-    if progress is None:
-        return
-    if sys.stdout.isatty():
-        Output().print(screen(node, progress))
-    else:
-        print(*state(node, progress), sep='\n', flush=True)
 
 
 @contextmanager
@@ -278,7 +281,13 @@ def screen(node: str, progress: Progress | None, problem: str = '') -> Renderabl
     """
     parts: list[RenderableType] = [Text(problem, style=f'bold {BAD}')] if problem else []
     if progress is not None:
-        parts += [_table(_rows(progress)), '', *_next(node, progress)]
+        rows = Table.grid(padding=(0, 2, 0, 0), expand=True)
+        rows.add_column(no_wrap=True)
+        rows.add_column(ratio=1)
+        rows.add_column(no_wrap=True, min_width=_WORDS)
+        for row in _rows(progress):
+            rows.add_row(Text(row.label), '' if math.isnan(row.share) else row, Text(row.words))
+        parts += [rows, '', *_next(node, progress)]
     elif not problem:
         parts.append(Text('waiting for the first message'))
     return Panel(Group(*parts), title=Text(node), border_style=BAD if problem else 'dim')
@@ -304,17 +313,12 @@ def changes(node: str, before: Progress | None, now: Progress) -> Iterator[str]:
     """Yield a line for each change that the user must know; all is new if `before` is None."""
     if before is None or (before.poses, before.advice) != (now.poses, now.advice):
         what = 'captured pose' if captured(before, now) else 'poses:'
+        command = '' if now.step == 'poses' else now.command  # a pose comes first
+        call = f': {service_call(node, command)}' if command else ''
         yield (f'{what} {_count(now)}; coverage {now.coverage:.0%}; accuracy {_accuracy(now)}; '
-               f'next: {now.advice or "wait"}{_end(node, now)}')
+               f'next: {now.advice or "wait"}{call}')
     if before is None or before.still != now.still:
         yield f'still: hold it for {now.min_dwell:g} s' if now.still else 'moving'
-
-
-def _end(node: str, progress: Progress) -> str:
-    """Return the end of a line with the call of a service, unless a pose comes first."""
-    if progress.step == 'poses' or not progress.command:
-        return ''
-    return f': {service_call(node, progress.command)}'
 
 
 def service_call(node: str, name: str) -> str:
@@ -325,9 +329,11 @@ def service_call(node: str, name: str) -> str:
 def _rows(progress: Progress) -> list[_Row]:
     now, style = progress, GOOD if progress.still else BAD
     share = now.poses / max(now.poses, now.total, 1)
+    dwell = (f'{now.dwell:.1f} s of {now.min_dwell:g} s'
+             f'{", long enough" if now.dwell >= now.min_dwell else ""}')
     return [
         _Row('stillness', _stillness(now), now.stillness / _SCALE, style, 1.0 / _SCALE),
-        _Row('dwell', _dwell(now), now.dwell / now.min_dwell, style),
+        _Row('dwell', dwell, now.dwell / now.min_dwell, style),
         _Row('poses', _count(now), share),
         _Row('coverage', f'{now.coverage:.0%} of the sphere', now.coverage),
         _Row('accuracy', _accuracy(now)), _Row('|a|', _length(now)),
@@ -341,11 +347,6 @@ def _stillness(progress: Progress) -> str:
     digits = 2 if progress.stillness < 10.0 else 0
     times = f'{progress.stillness:.{digits}f} times the limit'
     return f'{"still" if progress.still else "moving"}, {times}'
-
-
-def _dwell(progress: Progress) -> str:
-    enough = progress.dwell >= progress.min_dwell
-    return f'{progress.dwell:.1f} s of {progress.min_dwell:g} s{", long enough" if enough else ""}'
 
 
 def _count(progress: Progress) -> str:
@@ -395,35 +396,6 @@ def _sides(progress: Progress) -> str:
     if signs @ progress.direction < _SAME * np.linalg.norm(signs):
         return ''
     return words_of(signs).removeprefix('the ').rsplit(' ', 1)[0].upper()
-
-
-def _table(rows: Iterable[_Row]) -> Table:
-    table = Table.grid(padding=(0, 2, 0, 0), expand=True)
-    table.add_column(no_wrap=True)
-    table.add_column(ratio=1)
-    table.add_column(no_wrap=True, min_width=_WORDS)
-    for row in rows:
-        bar = '' if math.isnan(row.share) else _Bar(row)
-        table.add_row(Text(row.label), bar, Text(row.words))
-    return table
-
-
-@dataclass(frozen=True)
-class _Bar:
-    """A bar that fills the available width, with a line at the limit."""
-
-    row: _Row
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        full, empty, line = '#-|' if options.ascii_only else '█░┃'
-        width = options.max_width
-        done = round(min(self.row.share, 1.0) * width)
-        text = Text(full * done, style=self.row.style, no_wrap=True)
-        text.append(empty * (width - done), style='dim')
-        if not math.isnan(self.row.limit):
-            at = min(round(self.row.limit * width), width - 1)
-            text = Text.assemble(text[:at], (line, 'bold white'), text[at + 1:], no_wrap=True)
-        yield text
 
 
 @dataclass(frozen=True)

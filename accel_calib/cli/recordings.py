@@ -6,17 +6,14 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
 from dataclasses import asdict, replace
 from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from .frame import (
     check_target, Done, given, log_options, read_lines, settings, stored_calibration, Target)
 from .output import Output, progress
-from ..calibrate import Calibration
-from ..capture import Captured, REASONS
+from ..capture import REASONS
 from ..disk import STANDARD_OUTPUT, write_atomically
 from ..effects import parse_effect
 from ..errors import InputError
@@ -24,15 +21,18 @@ from ..logs import is_bag, open_log, write_blocks, write_table
 from ..pipeline import captured_from, Correction
 from ..text import counted
 
-if TYPE_CHECKING:
-    from ..stored.exports import Exported
-
 
 def run_capture(args: argparse.Namespace) -> Done:
     """Find the still stretches of a recording, and write the poses."""
     with progress('samples') as moved:
         found, captured = captured_from(args.recording, log_options(args), settings(args), moved)
     write_table(args.output, found.poses)
+    lines = [*found.lines, *(f'note: {each.words}' for each in found.findings)]
+    for item in captured.interruptions:
+        what = {'gap': f'samples are missing for {item.seconds:.3g} s',
+                'jump_back': f'the stamps jump back by {-item.seconds:.3g} s',
+                'stopped': 'the stamps do not change'}[item.kind]
+        lines.append(f'note: after {item.time:.3f} s {what}')
     return Done({
         'poses': len(captured.poses), 'samples': captured.recorded,
         'samples_in_poses': captured.samples,
@@ -42,16 +42,7 @@ def run_capture(args: argparse.Namespace) -> Done:
         'findings': [each.stated for each in found.findings],
         'interruptions': [item._asdict() for item in captured.interruptions],
         'read_lines': replace(found, captured=found.captured[1:]).lines},
-        [*found.lines, *(f'note: {each.words}' for each in found.findings),
-         *_interruptions(captured)], stored=[args.output])
-
-
-def _interruptions(captured: Captured) -> Iterator[str]:
-    for item in captured.interruptions:
-        what = {'gap': f'samples are missing for {item.seconds:.3g} s',
-                'jump_back': f'the stamps jump back by {-item.seconds:.3g} s',
-                'stopped': 'the stamps do not change'}[item.kind]
-        yield f'note: after {item.time:.3f} s {what}'
+        lines, stored=[args.output])
 
 
 def run_apply(args: argparse.Namespace) -> Done:
@@ -59,35 +50,26 @@ def run_apply(args: argparse.Namespace) -> Done:
     calibration = stored_calibration(args.calibration)
     if args.no_rotate:
         calibration = calibration.in_sensor_frame
-    lines: list[str] = []
+    lines, notes = list[str](), list[str]()
     if isinstance(args.recording, Path) and is_bag(args.recording):
-        count = _correct_bag(args, calibration, lines)
+        from ..messages import correct_bag
+
+        if str(args.output) == STANDARD_OUTPUT:
+            raise InputError('a bag cannot be written to standard output, expected a file',
+                             'name a file with -o')
+        with progress('messages') as moved:
+            count = correct_bag(args.recording, calibration, args.output, log_options(args),
+                                moved, notes.append)
     else:
-        count = _correct_table(args, calibration, lines)
-    return Done(shown=[*lines, f'corrected {counted(count, "sample")}'], stored=[args.output])
-
-
-def _correct_bag(args: argparse.Namespace, calibration: Calibration, lines: list[str]) -> int:
-    from ..messages import correct_bag
-
-    if str(args.output) == STANDARD_OUTPUT:
-        raise InputError('a bag cannot be written to standard output, expected a file',
-                         'name a file with -o')
-    with progress('messages') as moved:
-        return correct_bag(args.recording, calibration, args.output, log_options(args), moved,
-                           lambda line: lines.append(f'note: {line}'))
-
-
-def _correct_table(args: argparse.Namespace, calibration: Calibration, lines: list[str]) -> int:
-    """Correct a log that is not a bag; how it was read is added to the lines."""
-    with (open_log(args.recording, log_options(args, calibration)) as log,
-          progress('samples') as moved):
-        correction = Correction(calibration, log.units, log.sensor)
-        blocks = log.watched(moved) if log.poses is None else (log.poses,)
-        count = write_blocks(args.output, map(correction, blocks))
-        lines += read_lines(log)
-    lines += [f'note: {line}' for line in correction.notes]
-    return count
+        with (open_log(args.recording, log_options(args, calibration)) as log,
+              progress('samples') as moved):
+            correction = Correction(calibration, log.units, log.sensor)
+            blocks = log.watched(moved) if log.poses is None else (log.poses,)
+            count = write_blocks(args.output, map(correction, blocks))
+            lines += read_lines(log)
+        notes += correction.notes
+    return Done(shown=[*lines, *(f'note: {note}' for note in notes),
+                       f'corrected {counted(count, "sample")}'], stored=[args.output])
 
 
 def run_simulate(args: argparse.Namespace) -> Done:
@@ -103,36 +85,23 @@ def run_simulate(args: argparse.Namespace) -> Done:
 
 def run_export(args: argparse.Namespace) -> Done:
     """Write the file, and print what it does not hold on standard error."""
-    from ..stored.exports import export, Options, read_noise
+    from ..stored.exports import export, identifier, Options, read_noise
 
-    calibration = stored_calibration(args.calibration)
-    chosen = Options(**{**given(Options, args), 'name': args.name or _name(args)})
+    calibration, is_file = stored_calibration(args.calibration), args.output != STANDARD_OUTPUT
+    named = args.output if is_file and args.output is not None else args.calibration
+    chosen = Options(**{**given(Options, args), 'name': args.name or identifier(Path(named).stem)})
     noise = None if args.noise is None else read_noise(args.noise)
     made = export(calibration, args.to, noise, chosen)
-    target = _target(args, made)
+    target = (args.calibration.with_name(f'{args.calibration.stem}{made.suffix}')
+              if args.output is None else Path(args.output))
+    if is_file:
+        check_target(Target('output', target, 'export', '-o'), [args.calibration],
+                     force=args.force)
     write_atomically(target, made.write)
-    console, is_file = Output(stderr=True), args.output != STANDARD_OUTPUT
+    console = Output(stderr=True)
     for line in (*made.losses, *(f'note: {note}' for note in made.notes),
                  *([f'stored in {target}'] if is_file else [])):
         console.print(line)
     return Done({'format': args.to, 'file': target if is_file else None,
                  'calibration': args.calibration, 'leaves_mg': made.leaves_mg,
                  'losses': [asdict(loss) for loss in made.details], 'notes': made.notes})
-
-
-def _name(args: argparse.Namespace) -> str:
-    """Return the name of the functions, from the name of the file to write."""
-    from ..stored.exports import identifier
-
-    named = args.output if args.output not in (None, STANDARD_OUTPUT) else args.calibration
-    return identifier(Path(named).stem)
-
-
-def _target(args: argparse.Namespace, made: Exported) -> Path:
-    """Return the file to write."""
-    if args.output == STANDARD_OUTPUT:
-        return Path(args.output)
-    target = (args.calibration.with_name(f'{args.calibration.stem}{made.suffix}')
-              if args.output is None else Path(args.output))
-    check_target(Target('output', target, 'export', '-o'), [args.calibration], force=args.force)
-    return target

@@ -43,8 +43,6 @@ if TYPE_CHECKING:
     from ..refine import Refinement
 
 OFFSETS, GAINS, CROSS = NAMES[:3], NAMES[3:6], NAMES[6:]
-_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2), (1, 0), (2, 0), (2, 1))
-"""Order of the entries of W."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +88,8 @@ def linear_figures(calibration: Calibration) -> Iterator[Figure]:
     for axis, offset, sd in zip(AXES, calibration.offset, calibration.offset_sd, strict=True):
         yield Figure(f'offset.{axis}', f'offset {axis}', unit, float(offset), float(sd))
     per_g = 'per g' if calibration.units.is_native else ''
-    for i, j in _ENTRIES:
+    # The diagonal of W, what is above it, and what is below it.
+    for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2), (1, 0), (2, 0), (2, 1)):
         value, sd = float(gain[i, j]), float(gain_sd[i, j])
         mirrored = i > j and value == gain[j, i]
         if (sd > 0.0 or value) and not mirrored:
@@ -133,7 +132,8 @@ def change_in_words(name: str, change: float, sd: float) -> str:
 
 
 def calibration_json(calibration: Calibration, ahead: Outlook) -> dict[str, Any]:
-    """Return a calibration for JSON, with what its poses determine."""
+    """Return a calibration for JSON, with what its poses determine; None: not known."""
+    gyro, noise = calibration.gyro, calibration.noise
     return {
         'model': calibration.name, 'method': calibration.method,
         'units': calibration.units.name, 'sensor': calibration.sensor,
@@ -144,16 +144,10 @@ def calibration_json(calibration: Calibration, ahead: Outlook) -> dict[str, Any]
         'poses_used': len(calibration.poses) - len(calibration.rejected),
         'poses_rejected': [asdict(rejected) for rejected in calibration.rejected],
         **asdict(calibration.quality), 'reason': calibration.reason,
-        'warnings': calibration.warnings, **_own_names(calibration), **_rest_noise(calibration),
+        'warnings': calibration.warnings, **_own_names(calibration),
+        'gyro_bias': gyro and gyro.bias, 'gyro_bias_sd': gyro and gyro.sd,
+        'noise_force': noise and _known(noise.force), 'noise_rate': noise and _known(noise.rate),
         **_outlook(ahead)}
-
-
-def _rest_noise(calibration: Calibration) -> dict[str, Any]:
-    """Return the gyro bias [rad/s] and the noise of a sample for JSON; None if not known."""
-    gyro, noise = calibration.gyro, calibration.noise
-    return {'gyro_bias': gyro and gyro.bias, 'gyro_bias_sd': gyro and gyro.sd,
-            'noise_force': noise and _known(noise.force),
-            'noise_rate': noise and _known(noise.rate)}
 
 
 def _known(values: Floats) -> Floats | None:

@@ -52,10 +52,17 @@ def rate(calibration: Calibration, *, refinement: Refinement | None = None) -> R
         A refinement of the same poses; its calibration, or the base, is rated.
 
     """
-    expected = Expected(calibration)
+    expected, quality = Expected(calibration), calibration.quality
     good = (f'corrected readings in new orientations are right to {mg(expected.error_mg)} '
             f'({degrees(expected.error_mg)} of tilt)')
-    return rated(findings_of(expected, refinement), good, _figures(expected),
+    figures = [f'{number(quality.rms_before_mg)} -> {mg(quality.rms_after_mg)}']
+    if quality.held_out_rms_mg is not None and not expected.is_partial:
+        figures.append(f'of new poses {mg(quality.held_out_rms_mg)}')
+    noise = quality.noise_floor_mg
+    figures += ['noise not known' if noise is None else f'noise {mg(noise)}',
+                counted(len(expected.poses), 'pose'),
+                f'{100.0 * quality.coverage:.0f} % of the sphere']
+    return rated(findings_of(expected, refinement), good, ', '.join(figures),
                  step_after(calibration))
 
 
@@ -63,38 +70,22 @@ def rate_refinement(result: Refinement) -> Rating:
     return rate(result.calibration, refinement=result)
 
 
-def _figures(expected: Expected) -> str:
-    quality = expected.quality
-    parts = [f'{number(quality.rms_before_mg)} -> {mg(quality.rms_after_mg)}']
-    if quality.held_out_rms_mg is not None and not expected.is_partial:
-        parts.append(f'of new poses {mg(quality.held_out_rms_mg)}')
-    noise = quality.noise_floor_mg
-    parts.append('noise not known' if noise is None else f'noise {mg(noise)}')
-    parts += [counted(len(expected.poses), 'pose'),
-              f'{100.0 * quality.coverage:.0f} % of the sphere']
-    return ', '.join(parts)
-
-
 def findings_of(expected: Expected, refinement: Refinement | None) -> tuple[Finding, ...]:
     """Return what is worth knowing about a calibration, that which decides its rating first."""
     named = [*_beyond_noise(expected, refinement), *_not_corrected(expected)]
     error = expected.inexact_mg if named else expected.error_mg
-    own = [*_refused(expected, refinement), *_too_large(expected, refinement),
-           *_figures_beyond_limits(expected, refinement), *_limited(expected),
-           *_checked(expected), *named, *_inexact(expected, error, refinement),
-           *_left_out(expected)]
+    own = [*_too_large(expected, refinement), *_figures_beyond_limits(expected, refinement),
+           *_limited(expected), *_checked(expected), *named,
+           *_inexact(expected, error, refinement)]
     kinds = {each.kind for each in own}
     return ranked((*own, *without(expected.calibration.noted, *kinds)))
 
 
-def _refused(expected: Expected, refinement: Refinement | None) -> Iterator[Finding]:
+def _too_large(expected: Expected, refinement: Refinement | None) -> Iterator[Finding]:
+    """Yield a finding if the calibration is refused, or the readings are as good without it."""
     if refinement is not None and refinement.refusal and _has(expected, refinement):
         message, advice = refinement.refusal
         yield Finding('refused', message, advice, 'BAD')
-
-
-def _too_large(expected: Expected, refinement: Refinement | None) -> Iterator[Finding]:
-    """Yield a finding if the readings are as good without the calibration."""
     own, remedy = expected.own_mg, _remedy(expected, refinement)
     before, calibrated = expected.before_mg, bool(expected.calibration.model.effects)
     if expected.noise_mg is None and expected.dof < TO_CHECK.value:
@@ -119,7 +110,7 @@ def _figures_beyond_limits(expected: Expected, refinement: Refinement | None) ->
                       'BAD', step=remedy.kind)
     if noise is None or expected.dof < TO_CHECK.value or not expected.calibration.model.effects:
         return
-    rows = tuple(each.row for each in expected.calibration.rejected if each.kind == 'outlier')
+    rows = _outliers(expected)
     many = 100.0 * len(rows) > MANY_OUT.value * len(expected.calibration.poses)
     if many and quality.rms_after_mg > FAR_OFF.value * noise:
         yield Finding('far_off', f'the residual is {quality.rms_after_mg / noise:.0f} times the '
@@ -132,7 +123,12 @@ def _figures_beyond_limits(expected: Expected, refinement: Refinement | None) ->
                       'take the readings of the sensor itself', 'BAD')
 
 
+def _outliers(expected: Expected) -> tuple[int, ...]:
+    return tuple(each.row for each in expected.calibration.rejected if each.kind == 'outlier')
+
+
 def _limited(expected: Expected) -> Iterator[Finding]:
+    """Yield what the calibration is not for, and a finding if it is that of few of the poses."""
     if not expected.calibration.model.effects:
         yield Finding('mounting_alone', 'it is a mounting alone: offset and gain are not '
                       'calibrated', _more_poses(expected), 'USABLE')
@@ -143,19 +139,27 @@ def _limited(expected: Expected) -> Iterator[Finding]:
     elif expected.is_partial:
         yield Finding('partial', 'the poses lie near one direction: in other orientations the '
                       f'error is up to {mg(expected.worst_mg)}', _more_poses(expected), 'USABLE')
+    left_out, poses = expected.calibration.rejected, expected.calibration.poses
+    if left_out and 100.0 * len(left_out) > LEFT_OUT.value * len(poses):
+        yield Finding('left_out', f'{len(left_out)} of {counted(len(poses), "pose")} were left '
+                      'out', 'hold the sensor still in each pose, and take them again',
+                      'USABLE', tuple(each.row for each in left_out))
 
 
 def _checked(expected: Expected) -> Iterator[Finding]:
     if expected.is_partial or not expected.calibration.model.effects:
         return
+    out = _outliers(expected)
     if expected.dof == 0:
         yield Finding('no_check', 'nothing checks the fit: there are only as many poses as values',
                       _more_poses(expected), 'USABLE')
     elif expected.noise_mg is None and expected.dof < TO_CHECK.value:
         yield Finding('few_checks', f'only {counted(expected.dof, "pose")} more than values check '
                       'the fit, and the noise is not known', _more_poses(expected), 'USABLE')
-    else:
-        yield from _too_few_left(expected)
+    elif out and expected.dof < TO_CHECK.value + PER_OUTLIER.value * len(out):
+        yield Finding('outliers', f'{counted(len(out), "outlier")} left out, and only '
+                      f'{counted(expected.dof, "pose")} more than values check the fit',
+                      _more_poses(expected), 'USABLE', out)
     open_ = 1.0 - expected.quality.coverage
     if 100.0 * open_ > 100.0 - COVERED.value:
         yield Finding('not_covered', f'{100.0 * open_:.0f} % of the sphere is far from all poses, '
@@ -166,14 +170,6 @@ def _checked(expected: Expected) -> Iterator[Finding]:
         rows = expected.poses.row[expected.poses['doubtful'] > 0.0].tolist()
         yield Finding('doubtful', f'the sensor may have moved in {listed("row", rows)}',
                       'take these poses again', 'USABLE', tuple(rows))
-
-
-def _too_few_left(expected: Expected) -> Iterator[Finding]:
-    out = [each.row for each in expected.calibration.rejected if each.kind == 'outlier']
-    if out and expected.dof < TO_CHECK.value + PER_OUTLIER.value * len(out):
-        yield Finding('outliers', f'{counted(len(out), "outlier")} left out, and only '
-                      f'{counted(expected.dof, "pose")} more than values check the fit',
-                      _more_poses(expected), 'USABLE', tuple(out))
 
 
 def _beyond_noise(expected: Expected, refinement: Refinement | None) -> Iterator[Finding]:
@@ -227,29 +223,19 @@ def _inexact(expected: Expected, error: float, refinement: Refinement | None) ->
     """Yield a finding if an error that has no name yet is too large [mg]."""
     if expected.is_partial or not expected.calibration.model.effects:
         return
-    if error > GOOD_ERROR.value:
-        if expected.omitted_mg > max(GOOD_ERROR.value / 2.0, expected.own_mg):
-            yield Finding('omitted', f'model {expected.omits} omits what these poses do not '
-                          f'determine: the error may be {mg(error)}', _more_poses(expected),
-                          'USABLE')
-        else:
-            remedy = _remedy(expected, refinement)
-            yield Finding('new_orientations', 'the error in new orientations is up to '
-                          f'{mg(error)}, expected at most {mg(GOOD_ERROR.value)}', remedy.text,
-                          'USABLE', step=remedy.kind)
+    large = error > GOOD_ERROR.value
+    if large and expected.omitted_mg > max(GOOD_ERROR.value / 2.0, expected.own_mg):
+        yield Finding('omitted', f'model {expected.omits} omits what these poses do not '
+                      f'determine: the error may be {mg(error)}', _more_poses(expected), 'USABLE')
+    elif large:
+        remedy = _remedy(expected, refinement)
+        yield Finding('new_orientations', f'the error in new orientations is up to {mg(error)}, '
+                      f'expected at most {mg(GOOD_ERROR.value)}', remedy.text, 'USABLE',
+                      step=remedy.kind)
     elif expected.worst_mg > WORST_ERROR.value:
         yield Finding('far_from_poses', f'the error is up to {mg(expected.worst_mg)} where there '
                       f'is no pose, expected at most {mg(WORST_ERROR.value)}',
                       _more_poses(expected), 'USABLE')
-
-
-def _left_out(expected: Expected) -> Iterator[Finding]:
-    calibration = expected.calibration
-    rows = tuple(each.row for each in calibration.rejected)
-    if rows and 100.0 * len(rows) > LEFT_OUT.value * len(calibration.poses):
-        yield Finding('left_out', f'{len(rows)} of {counted(len(calibration.poses), "pose")} were '
-                      'left out', 'hold the sensor still in each pose, and take them again',
-                      'USABLE', rows)
 
 
 def _more_poses(expected: Expected) -> str:

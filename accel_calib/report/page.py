@@ -36,7 +36,7 @@ from ..calibrate import Calibration, Curve, mounting_figures, outlook
 from ..effects import (
     AXES, effect_named, EMPIRICAL, empirical_parts, kind_of, REFERENCE_TEMPERATURE, value_unit,
     variable_words, with_vector)
-from ..findings import effect_figures, Figure, rate_refinement, residual_figures
+from ..findings import effect_figures, rate_refinement, residual_figures
 from ..geometry import coverage
 from ..refine import verdict_words
 from ..table import Floats
@@ -80,10 +80,9 @@ _STEP = 1e-6
 _SAME = 1e-9
 _PAIRS = ((0, 1), (0, 2), (1, 2))
 
-_USUAL_OFFSET_MG = {'x': 50.0, 'y': 50.0, 'z': 80.0}
-_USUAL_GAIN_PERCENT = 3.0
-_USUAL_CROSS_AXIS_PERCENT = 2.0
-_USUAL_CROSS_AXIS = float(np.degrees(_USUAL_CROSS_AXIS_PERCENT / 100.0))
+_USUAL_OFFSET = {'x': '±50 mg', 'y': '±50 mg', 'z': '±80 mg'}
+_USUAL_GAIN = '±3 %'
+_USUAL_CROSS_AXIS = '±2 %, 1.1°'
 _SOURCE = (
     'Usual: the initial tolerances of a common part, the MPU-6050 (data sheet PS-MPU-6000A, '
     'revision 3.4, section 6.2). For other effects: the typical size in the catalogue of effects.')
@@ -172,15 +171,22 @@ def thermal_page(outcome: ThermalOutcome, sources: Sequence[str], *, stored: str
     calibration, curve = outcome.calibration, outcome.curve
     names = ', '.join(Path(source).name or source for source in sources)
     title = f'Offset over temperature of {calibration.sensor or names}'
-    body = [_curve_numbers(curve),
+    low, high = curve.range_c
+    hysteresis = ('not known' if curve.hysteresis_mg is None
+                  else f'{short(curve.hysteresis_mg)} mg')
+    body = [numbers([('range', f'{low:.1f} to {high:.1f} °C'), ('degree', str(curve.degree)),
+                     ('change', f'{short(curve.change_mg)} mg'),
+                     ('residual', f'{short(curve.residual_mg)} mg'),
+                     ('uncertainty up to', f'{short(curve.band_mg)} mg'),
+                     ('hysteresis', hysteresis)]),
             section('Offset over temperature', figures(
                 _of_axis(curve, axis) for axis in range(3)), HINT),
             _coefficients(curve), values_section(calibration),
             section('Held out', scroll_table(
                 'Error of held-out parts by degree',
                 ('degree', 'error of parts that were held out [mg]'),
-                [(str(degree), short(error)) for degree, error in enumerate(curve.held_out_mg)],
-                'whole-cells'), kind='half'),
+                [(str(degree), short(error)) for degree, error in enumerate(curve.held_out_mg)]),
+                kind='half'),
             section('Warnings', listing(calibration.warnings)),
             section('Use it', *(block(name, text) for name, text in snippets(
                 calibration, stored))),
@@ -188,17 +194,6 @@ def thermal_page(outcome: ThermalOutcome, sources: Sequence[str], *, stored: str
     return rated_sheet(title, [
         ', '.join(sources), f'fitted {calibration.date}' if calibration.date else ''],
         outcome.rating, body)
-
-
-def _curve_numbers(curve: Curve) -> str:
-    low, high = curve.range_c
-    hysteresis = ('not known' if curve.hysteresis_mg is None
-                  else f'{short(curve.hysteresis_mg)} mg')
-    return numbers([('range', f'{low:.1f} to {high:.1f} °C'), ('degree', str(curve.degree)),
-                    ('change', f'{short(curve.change_mg)} mg'),
-                    ('residual', f'{short(curve.residual_mg)} mg'),
-                    ('uncertainty up to', f'{short(curve.band_mg)} mg'),
-                    ('hysteresis', hysteresis)])
 
 
 def _of_axis(curve: Curve, axis: int) -> Drawing:
@@ -325,7 +320,7 @@ def _linear_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
     scale, unit = (per_g, 'native') if native else (MG, 'mg')
     for axis, value, sd in zip(AXES, found[0], deviation[0], strict=True):
         if sd or value:
-            usual = '' if native else f'±{_USUAL_OFFSET_MG[axis]:g} mg'
+            usual = '' if native else _USUAL_OFFSET[axis]
             yield f'offset {axis}', signed(value * scale, sd * scale, unit), usual
     equal = np.ptp(found[1]) < _SAME
     for axis, value, sd in zip(AXES[:1] if equal else AXES, found[1], deviation[1], strict=False):
@@ -333,13 +328,12 @@ def _linear_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
         if native:
             yield name, signed(value * per_g, sd * per_g, 'native per g'), ''
         elif sd or abs(value - 1.0) > _SAME:
-            yield (name, signed((value - 1.0) * 100.0, sd * 100.0, '%'),
-                   f'±{_USUAL_GAIN_PERCENT:g} %')
+            yield name, signed((value - 1.0) * 100.0, sd * 100.0, '%'), _USUAL_GAIN
     for (i, j), value, sd in zip(_PAIRS, found[2], deviation[2], strict=True):
         if sd or abs(value - 90.0) > _SAME:
             words = signed(value - 90.0, sd)
             yield (f'angle {AXES[i]} to {AXES[j]}', f'90° {words[0]} {words[1:]}°',
-                   f'±{_USUAL_CROSS_AXIS_PERCENT:g} %, {_USUAL_CROSS_AXIS:.1f}°')
+                   _USUAL_CROSS_AXIS)
 
 
 def _effect_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
@@ -354,21 +348,16 @@ def _effect_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
         name, _, part = figure.key.rpartition('.')
         if kind_of(name) == EMPIRICAL or not (figure.value or figure.sd):
             continue
-        label = f'{name.replace("_", " ")} {part}'
-        if part in effect_named(name).parameters:
-            yield label, *_with_typical(figure, name, part)
-        else:
+        label, effect = f'{name.replace("_", " ")} {part}', effect_named(name)
+        if part not in effect.parameters:
             yield label, f'{figure.value:.5g} {figure.unit}'.rstrip(), ''
-
-
-def _with_typical(figure: Figure, effect: str, parameter: str) -> tuple[str, str]:
-    """Return the value of an effect, and its typical size; small ones in millionths."""
-    unit, scale = value_unit(effect, parameter)
-    typical, factor = effect_named(effect).typical * scale, 1.0
-    if unit.startswith('g') and 0.0 < typical < _SMALL:
-        unit, factor = f'µ{unit}', MG ** 2
-    return (signed(figure.value * factor, figure.sd * factor, unit),
-            f'±{short(typical * factor)} {unit}' if 0.0 < typical < np.inf else '')
+            continue
+        unit, scale = value_unit(name, part)
+        typical, factor = effect.typical * scale, 1.0
+        if unit.startswith('g') and 0.0 < typical < _SMALL:
+            unit, factor = f'µ{unit}', MG ** 2
+        yield (label, signed(figure.value * factor, figure.sd * factor, unit),
+               f'±{short(typical * factor)} {unit}' if 0.0 < typical < np.inf else '')
 
 
 def _pose_table(residuals: Residuals, calibration: Calibration) -> str:
@@ -412,21 +401,17 @@ def snippets(calibration: Calibration, stored: str) -> tuple[tuple[str, str], ..
               f"     parameters=[{{'calibration_file': {stored!r},\n"
               f"                  'units': {calibration.units.name!r}}}],\n"
               "     remappings=[('imu/data_raw', 'imu/data_raw')])")
-    return (('ROS 2', ros), ('ROS 2 launch file', launch),
-            ('Python', _python(calibration, stored)), ('C', _c(calibration)),
-            ('C header, Arduino, PX4, ArduPilot and others',
-             f'accel-calib export {shlex.quote(stored)} --to c -o calibration.h'))
-
-
-def _python(calibration: Calibration, stored: str) -> str:
     known = ''.join(f', {key}={key}' for key in calibration.model.needs
                     if key in ('time', 'temperature', 'supply_voltage', 'rate'))
-    unit, force = calibration.units.symbol, calibration.units.symbol
-    if calibration.units.is_native:
-        unit, force = 'native units', 'g'
-    return ('import accel_calib as ac\n\n'
-            f'calibration = ac.load({stored!r})\n'
-            f'force = calibration.apply(readings{known})  # (n, 3), {unit} -> {force}')
+    symbol = calibration.units.symbol
+    units = 'native units -> g' if calibration.units.is_native else f'{symbol} -> {symbol}'
+    python = ('import accel_calib as ac\n\n'
+              f'calibration = ac.load({stored!r})\n'
+              f'force = calibration.apply(readings{known})  # (n, 3), {units}')
+    return (('ROS 2', ros), ('ROS 2 launch file', launch),
+            ('Python', python), ('C', _c(calibration)),
+            ('C header, Arduino, PX4, ArduPilot and others',
+             f'accel-calib export {shlex.quote(stored)} --to c -o calibration.h'))
 
 
 def _c(calibration: Calibration) -> str:

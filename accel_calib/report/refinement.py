@@ -59,7 +59,12 @@ def search_sections(result: Refinement, residuals: Residuals, *, used: bool) -> 
         note = '' if used else ' '.join((_NOT_USED, *refusal_lines(result)))
         yield section('Effects that were found', paragraph(note), paragraph(verdict_words(result)),
                       figures([ladder(result)], 'wide'), kind='half')
-        yield section('Steps', _overview(result), kind='half')
+        yield section('Steps', scroll_table(
+            'Steps', ('', 'effect', 'residual [mg]', 'held out [mg]', 'chance'),
+            [(str(number), step.effect,
+              f'{short(step.gap_before_mg)} → {short(step.gap_after_mg)}',
+              f'{short(step.held_out_before_mg)} → {short(step.held_out_after_mg)}',
+              chance(step.p_value)) for number, step in enumerate(result.steps, 1)]), kind='half')
     for number, step in enumerate(result.steps, 1):
         yield _step(result, number, step)
     left = residuals_of_refinement(result)
@@ -71,42 +76,28 @@ def search_sections(result: Refinement, residuals: Residuals, *, used: bool) -> 
 
 
 def _step(result: Refinement, number: int, step: Step) -> str:
-    """Return the section of a step, from 1."""
+    """Return the section of a step, from 1: where it was found, and what it changes."""
+    effect = effect_named(step.name)
+    rivals = ', '.join(f'{code(name)} ({step.odds(name)})' for name in step.rivals)
+    story = (f'{code(step.effect)} ({escape(effect.term)}). Found '
+             f'{escape(step.where)}. With this effect the residual decreases from '
+             f'{short(step.gap_before_mg)} to <strong>{short(step.gap_after_mg)} mg</strong>, '
+             f'and the held-out residual from {short(step.held_out_before_mg)} to '
+             f'{short(step.held_out_after_mg)} mg; '
+             f'<span class="whole">{escape(chance(step.p_value))}</span>.'
+             + (f' These poses cannot distinguish it from {rivals}.' if rivals else ''))
     shown = values_of(step)
     table = paragraph(step.formula) if step.formula else scroll_table(
         f'Values of step {number}', [name for name, _ in shown],
         [[value for _, value in shown]] if shown else [])
     curve = figures([of_curve(result, number - 1)], 'wide') if _is_drawn(step) else ''
-    title = f'{number}. {effect_named(step.name).words.capitalize()}'
-    return section(title, f'<p>{_story(step)}</p>\n', table,
+    return section(f'{number}. {effect.words.capitalize()}', f'<p>{story}</p>\n', table,
                    figures(of_step(result, number - 1)), curve)
 
 
 def _is_drawn(step: Step) -> bool:
     """Return whether a step is a curve over one variable; one over directions is on the sphere."""
     return step.effect == EMPIRICAL and step.variable != 'direction'
-
-
-def _overview(result: Refinement) -> str:
-    """Return the table of steps."""
-    head = ('', 'effect', 'residual [mg]', 'held out [mg]', 'chance')
-    rows = [(str(number), step.effect,
-             f'{short(step.gap_before_mg)} → {short(step.gap_after_mg)}',
-             f'{short(step.held_out_before_mg)} → {short(step.held_out_after_mg)}',
-             chance(step.p_value)) for number, step in enumerate(result.steps, 1)]
-    return scroll_table('Steps', head, rows)
-
-
-def _story(step: Step) -> str:
-    """Return a text about the location of the disagreement, and the effect on the residual."""
-    rivals = ', '.join(f'{code(name)} ({step.odds(name)})' for name in step.rivals)
-    return (f'{code(step.effect)} ({escape(effect_named(step.name).term)}). Found '
-            f'{escape(step.where)}. With this effect the residual decreases from '
-            f'{short(step.gap_before_mg)} to <strong>{short(step.gap_after_mg)} mg</strong>, '
-            f'and the held-out residual from {short(step.held_out_before_mg)} to '
-            f'{short(step.held_out_after_mg)} mg; '
-            f'<span class="whole">{escape(chance(step.p_value))}</span>.'
-            + (f' These poses cannot distinguish it from {rivals}.' if rivals else ''))
 
 
 def refusal_lines(result: Refinement) -> tuple[str, ...]:
@@ -239,9 +230,6 @@ def of_curve(result: Refinement, step: int) -> Drawing:
 
 # ----------------------------------------------------------------------------- the ladder
 
-_LADDER_WIDTH_INCHES = 4.9
-_LEVEL_INCHES = 0.52
-
 _Level = tuple[str, float, float | None]
 """Name, residual and held-out residual [mg] of the base or after a step."""
 
@@ -256,8 +244,7 @@ def ladder(result: Refinement) -> Drawing:
     levels: list[_Level] = [(base_words(result), result.gap_mg, held_out), *(
         (f'+ {step.effect}', step.gap_after_mg, step.held_out_after_mg) for step in result.steps)]
     floor_mg = result.noise_floor_mg
-    with drawn(1.25 + _LEVEL_INCHES * len(levels), width_inches=_LADDER_WIDTH_INCHES, grid='x'
-               ) as (figure, (panel,)):
+    with drawn(1.25 + 0.52 * len(levels), width_inches=4.9, grid='x') as (figure, (panel,)):
         _draw_levels(panel, levels)
         if floor_mg:
             panel.axvline(floor_mg, color=ACCENT, linewidth=1.6, linestyle=(0, (5, 3)),

@@ -230,7 +230,7 @@ def sphere_map(residuals: Residuals, name: str, title: str, limit: float, *, mor
                ) -> Drawing:
     """Draw residuals over the sphere; `limit` is the end of the colour scale [mg]."""
     force, values, signed = residuals.force, residuals.after_mg, residuals.signed
-    marks, hover = _marks(residuals, values), dict[str, Marks]()
+    marks, hover = _marks(residuals), dict[str, Marks]()
     with drawn(HEIGHT_INCHES, title, columns=2, grid='') as (figure, discs):
         for disc, half, up in _hemispheres(discs):
             here = _inside(force, up)
@@ -248,29 +248,30 @@ def sphere_map(residuals: Residuals, name: str, title: str, limit: float, *, mor
 
 
 def _hemispheres(discs: Sequence[Any]) -> Iterator[tuple[Any, str, bool]]:
-    """Yield the disc and the name of each hemisphere, and whether its pole is +z."""
-    for disc, (name, up) in zip(discs, (('up', True), ('down', False)), strict=True):
-        _draw_disc(disc, up=up)
-        yield disc, name, up
+    """
+    Yield the map and the name of each hemisphere, and whether its pole is +z.
+
+    The map has the rim, the circle at 45° and the sensor axes.
+
+    """
+    angle = np.linspace(0.0, 2.0 * np.pi, 181)
+    circle = np.array([np.cos(angle), np.sin(angle)])
+    middle = np.sqrt(1.0 - np.sqrt(0.5))
+    for disc, name, pole in zip(discs, ('up', 'down'), ('+z up', '−z up'), strict=True):
+        disc.fill(*circle, facecolor=DISC, edgecolor=RIM, zorder=0)
+        disc.plot(*(middle * circle), color=FAINT, linewidth=0.8, zorder=1)
+        disc.plot([-1, 1], [0, 0], [0, 0], [-1, 1], color=FAINT, linewidth=0.8, zorder=1)
+        for axis, x, y in (('+x', 1, 0), ('-x', -1, 0), ('+y', 0, 1), ('-y', 0, -1)):
+            disc.text(1.13 * x, 1.12 * y, with_minus(axis), ha='center', va='center', fontsize=8.5)
+        disc.text(-1.22, 1.08, pole, fontsize=9.5)
+        disc.set(xlim=(-1.24, 1.24), ylim=(-1.22, 1.22), aspect='equal')
+        disc.axis('off')
+        yield disc, name, name == 'up'
 
 
 def _inside(force: Floats, up: bool) -> NDArray[np.intp]:
     """Return the indices of the (n, 3) directions in a hemisphere."""
     return np.flatnonzero((force[:, 2] >= 0.0) == up)
-
-
-def _draw_disc(disc: Any, *, up: bool) -> None:
-    """Draw the map of the hemisphere +z or -z with the sensor axes."""
-    angle = np.linspace(0.0, 2.0 * np.pi, 181)
-    disc.fill(np.cos(angle), np.sin(angle), facecolor=DISC, edgecolor=RIM, zorder=0)
-    middle = np.sqrt(1.0 - np.sqrt(0.5))
-    disc.plot(middle * np.cos(angle), middle * np.sin(angle), color=FAINT, linewidth=0.8, zorder=1)
-    disc.plot([-1, 1], [0, 0], [0, 0], [-1, 1], color=FAINT, linewidth=0.8, zorder=1)
-    for name, x, y in (('+x', 1, 0), ('-x', -1, 0), ('+y', 0, 1), ('-y', 0, -1)):
-        disc.text(1.13 * x, 1.12 * y, with_minus(name), ha='center', va='center', fontsize=8.5)
-    disc.text(-1.22, 1.08, '+z up' if up else '−z up', fontsize=9.5)
-    disc.set(xlim=(-1.24, 1.24), ylim=(-1.22, 1.22), aspect='equal')
-    disc.axis('off')
 
 
 def _equal_area(force: Floats) -> Floats:

@@ -76,8 +76,13 @@ def rated_sheet(title: str, about: Iterable[str], rating: Rating, body: Iterable
     """
     line = ' · '.join(part for part in (*about, f'accel_calib {__version__}') if part)
     return sheet(f'{rating.name.capitalize()}: {title[0].lower()}{title[1:]}', (
-        f'<h1>{escape(heading or title)}</h1>\n<p class="about">{escape(line)}</p>\n',
-        _verdict(rating, more), *body), script=script)
+        f'<h1>{escape(heading or title)}</h1>\n<p class="about">{escape(line)}</p>\n'
+        f'<div class="verdict {escape(rating.name)}" role="note">\n'
+        f'<p><strong>{escape(rating.name)}</strong> '
+        f'{escape(rating.figures.replace("->", "→"))}</p>\n'
+        f'{paragraph(_sentence(rating.reason))}{paragraph(more)}'
+        f'<p><b>Next:</b> {escape(_sentence(rating.next.text))}</p>\n</div>\n',
+        *body), script=script)
 
 
 def sheet(title: str, body: Iterable[str], *, script: bool = True) -> str:
@@ -105,15 +110,6 @@ def _part_of_page(name: str) -> str:
     """Return the style sheet or the script of all pages, without its licence."""
     text = (files(__package__) / 'page' / name).read_text(encoding='utf-8')
     return text.partition('\n\n')[2]
-
-
-def _verdict(rating: Rating, more: str) -> str:
-    """Return the name and figures of a verdict, its reason, and what to do next."""
-    return (f'<div class="verdict {escape(rating.name)}" role="note">\n'
-            f'<p><strong>{escape(rating.name)}</strong> '
-            f'{escape(rating.figures.replace("->", "→"))}</p>\n'
-            f'{paragraph(_sentence(rating.reason))}{paragraph(more)}'
-            f'<p><b>Next:</b> {escape(_sentence(rating.next.text))}</p>\n</div>\n')
 
 
 def _sentence(text: str) -> str:
@@ -209,7 +205,6 @@ BAND = 1.96
 EDGE: Any = {'markeredgecolor': PAPER, 'markeredgewidth': 0.4}
 """Edge of a filled marker."""
 
-_PNG_DPI = 160
 _LEGEND_INCHES, _LEGEND_ROW_INCHES = 0.12, 0.18
 """Height of the frame and of a row of a legend."""
 
@@ -320,23 +315,20 @@ def add_band(panel: Any, at: Floats, low: Floats, high: Floats, colour: str, alp
 def save(drawing: Drawing, path: Path) -> None:
     """Write a figure to a file; the suffix sets the format."""
     with _styled():
-        drawing.figure.savefig(path, dpi=_PNG_DPI, facecolor='white')
+        drawing.figure.savefig(path, dpi=160, facecolor='white')
 
 
 # ----------------------------------------------------------------------------- figures on a page
 
 def figures(drawings: Iterable[Drawing], kind: str = 'pair', *, script: bool = True) -> str:
     """Return figures, in a grid of the CSS class `kind`: ``wide`` or ``pair``."""
-    parts = [_figure(drawing, script=script) for drawing in drawings]
+    parts = []
+    for drawing in drawings:
+        label = escape(f'{drawing.title}. Arrow keys move from marker to marker.')
+        live = (f' class="live" tabindex="0" role="group" aria-label="{label}"'
+                if script and any(drawing.hover.values()) else '')
+        parts.append(f'<figure{live}>{_inline_svg(drawing)}</figure>')
     return f'<div class="figures {kind}">\n' + '\n'.join(parts) + '\n</div>\n' if parts else ''
-
-
-def _figure(drawing: Drawing, *, script: bool) -> str:
-    svg = _inline_svg(drawing)
-    if not script or not any(drawing.hover.values()):
-        return f'<figure>{svg}</figure>'
-    label = escape(f'{drawing.title}. Arrow keys move from marker to marker.')
-    return f'<figure class="live" tabindex="0" role="group" aria-label="{label}">{svg}</figure>'
 
 
 def _inline_svg(drawing: Drawing) -> str:

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from ..calibrate import Calibration
     from ..findings import Rating
 
-_NOISE_INCHES = 4.0
 _LOOKS = dict(zip('xyz', zip(AXIS_COLOURS, 'os^')))
 """Colour and marker of each axis."""
 
@@ -59,7 +58,12 @@ _HOW_TO_READ_NOISE = (
 
 def noise_page(found: NoiseFigures, source: str) -> str:
     """Return the page of the noise of the recording in the file `source`, as HTML."""
-    body = [_rest(found), figures(_allan(found.of(kind)) for kind in found.kinds),
+    pairs = [('rest', duration(found.seconds)), ('samples', f'{found.samples:,}'),
+             ('rate', f'{found.rate:.5g} Hz')]
+    if found.temperature is not None:
+        low, high = found.temperature
+        pairs.append(('temperature', f'{low:.1f} to {high:.1f} °C'))
+    body = [numbers(pairs), figures(_allan(found.of(kind)) for kind in found.kinds),
             *(_table(found, kind) for kind in found.kinds),
             section('Notes', listing(found.notes)),
             section('Not seen', listing(need_lines(found))),
@@ -73,11 +77,19 @@ def _allan(axes: Sequence[AxisNoise]) -> Drawing:
     """Draw the Allan deviation of the axes of one sensor over τ, with their 95 % bands."""
     kind, hover = axes[0].kind, {}
     unit, scale = shown_unit(kind, 'bias_instability', axes[0].unit)
-    with drawn(_NOISE_INCHES, f'{kind.capitalize()}: Allan deviation') as (figure, (panel,)):
+    with drawn(4.0, f'{kind.capitalize()}: Allan deviation') as (figure, (panel,)):
         panel.set(xscale='log', yscale='log', xlabel='averaging time τ [s]',
                   ylabel=f'Allan deviation [{unit}]')
         for axis in axes:
-            hover[f'curve_{axis.axis}'] = _draw_axis(panel, axis, unit, scale)
+            (colour, marker), name = _LOOKS[axis.axis], f'curve_{axis.axis}'
+            add_band(panel, axis.tau, axis.low * scale, axis.high * scale, colour)
+            used = (axis.tau >= axis.used[0]) & (axis.tau <= axis.used[1])
+            panel.plot(axis.tau[used], axis.model[used] * scale, color=colour, linewidth=1.0)
+            panel.plot(axis.tau, axis.deviation * scale, linestyle='none', marker=marker,
+                       color=colour, markersize=4.0, label=axis.axis, gid=name)
+            hover[name] = tuple(
+                Mark(f'{axis.axis}, τ = {duration(float(tau))}: {value * scale:.3g} {unit}')
+                for tau, value in zip(axis.tau, axis.deviation, strict=True))
         # Wide bands at long τ must not compress the curves.
         every = np.concatenate([axis.deviation for axis in axes]) * scale
         panel.set_ylim(0.5 * float(np.min(every)), 2.0 * float(np.max(every)))
@@ -87,27 +99,6 @@ def _allan(axes: Sequence[AxisNoise]) -> Drawing:
             f'{duration(float(axis.tau[np.argmin(axis.deviation)]))}' for axis in axes]
     return Drawing(f'allan_{kind}', f'Allan deviation of the {kind} over τ: {", ".join(ends)}',
                    figure, hover)
-
-
-def _draw_axis(panel: Any, axis: AxisNoise, unit: str, scale: float) -> Marks:
-    """Draw one axis, and return the texts of its markers."""
-    colour, marker = _LOOKS[axis.axis]
-    add_band(panel, axis.tau, axis.low * scale, axis.high * scale, colour)
-    used = (axis.tau >= axis.used[0]) & (axis.tau <= axis.used[1])
-    panel.plot(axis.tau[used], axis.model[used] * scale, color=colour, linewidth=1.0)
-    panel.plot(axis.tau, axis.deviation * scale, linestyle='none', marker=marker, color=colour,
-               markersize=4.0, label=axis.axis, gid=f'curve_{axis.axis}')
-    return tuple(Mark(f'{axis.axis}, τ = {duration(float(tau))}: {value * scale:.3g} {unit}')
-                 for tau, value in zip(axis.tau, axis.deviation, strict=True))
-
-
-def _rest(found: NoiseFigures) -> str:
-    pairs = [('rest', duration(found.seconds)), ('samples', f'{found.samples:,}'),
-             ('rate', f'{found.rate:.5g} Hz')]
-    if found.temperature is not None:
-        low, high = found.temperature
-        pairs.append(('temperature', f'{low:.1f} to {high:.1f} °C'))
-    return numbers(pairs)
 
 
 def _table(found: NoiseFigures, kind: Kind) -> str:
@@ -138,15 +129,13 @@ def figure_rows(axes: Sequence[AxisNoise]) -> Iterator[tuple[str, str, list[str]
 
 def need_lines(found: NoiseFigures) -> list[str]:
     """Return a line for each figure that is not seen."""
-    return [f'{WORDS[figure]} of the {kind}: {_axes_without(found, kind, figure)}{need}'
-            for (kind, figure), need in found.needs.items()]
-
-
-def _axes_without(found: NoiseFigures, kind: Kind, figure: str) -> str:
-    """Return the axes on which a figure is not seen, if it is seen on others."""
-    axes = found.of(kind)
-    without = [axis.axis for axis in axes if not axis.figures[figure].seen]
-    return '' if len(without) == len(axes) else f'not seen on {", ".join(without)}: '
+    lines = []
+    for (kind, figure), need in found.needs.items():
+        axes = found.of(kind)
+        without = [axis.axis for axis in axes if not axis.figures[figure].seen]
+        where = '' if len(without) == len(axes) else f'not seen on {", ".join(without)}: '
+        lines.append(f'{WORDS[figure]} of the {kind}: {where}{need}')
+    return lines
 
 
 def kalibr_lines(found: NoiseFigures) -> list[str]:
@@ -223,27 +212,24 @@ def _draw_parameters(panel: Any, found: Sequence[Parameter], labels: Sequence[st
 
 def of_history(history: History) -> Iterator[Drawing]:
     """Yield offset, gain and cross-axis over the dates, with bands."""
+    at, dated = places_of([None if moment.when is None else moment.when.timestamp()
+                           for moment in history.moments])
+    warm = _temperatures(history)
     for key, words, names in GROUPS:
         found = [each for each in history.parameters if each.name in names and (
             names is not CROSS or np.any(each.stated_sd))]
-        if found:
-            yield _over_dates(f'history_{key}', f'{words} over the dates, with 95 % band', history,
-                              found)
-
-
-def _over_dates(key: str, title: str, history: History, found: Sequence[Parameter]) -> Drawing:
-    at, dated = places_of([None if moment.when is None else moment.when.timestamp()
-                           for moment in history.moments])
-    warm, hover = _temperatures(history), {}
-    with drawn(0.9 + 1.25 * len(found), title, len(found), sharex=True) as (figure, panels):
-        for k, (panel, each) in enumerate(zip(panels, found, strict=True)):
-            markers = _draw_line(panel, each, at, warm)
-            markers.set_gid(f'panel{k}')
-            hover[f'panel{k}'] = _marks(history, each)
-        if warm is not None:
-            add_bar(figure, markers, panels, 'temperature [°C]', pad=0.02)
-        label_dates(panels[-1], at, 'date of the fit', dated=dated)
-    return Drawing(key, title, figure, hover)
+        if not found:
+            continue
+        title, hover = f'{words} over the dates, with 95 % band', dict[str, Marks]()
+        with drawn(0.9 + 1.25 * len(found), title, len(found), sharex=True) as (figure, panels):
+            for k, (panel, each) in enumerate(zip(panels, found, strict=True)):
+                markers = _draw_line(panel, each, at, warm)
+                markers.set_gid(f'panel{k}')
+                hover[f'panel{k}'] = _marks(history, each)
+            if warm is not None:
+                add_bar(figure, markers, panels, 'temperature [°C]', pad=0.02)
+            label_dates(panels[-1], at, 'date of the fit', dated=dated)
+        yield Drawing(f'history_{key}', title, figure, hover)
 
 
 def places_of(stamps: Sequence[float | None]) -> tuple[Floats, bool]:
@@ -319,7 +305,11 @@ def comparison_page(comparison: Comparison, rating: Rating, sources: Sequence[Pa
     """Return the page of a comparison of the calibrations in the files `sources`, as HTML."""
     labels = [f'{k} {source.name}' for k, source in enumerate(sources, 1)]
     title = f'Comparison of {len(calibrations)} calibrations{_of_sensor(calibrations)}'
-    body = [section('Calibrations', _runs(comparison, calibrations, labels)),
+    runs = [(label, each.date[:10], each.name, short(run.rms_mg), short(run.expected_mg),
+             short(run.largest_mg), f'{run.p_value:.2g}')
+            for label, each, run in zip(labels, calibrations, comparison.runs, strict=True)]
+    body = [section('Calibrations', scroll_table('Calibrations', (
+                'run', 'date', 'model', 'RMS [mg]', 'expected [mg]', 'largest [mg]', 'p'), runs)),
             section('Parameters', figures(of_parameters(comparison, labels)), HINT,
                     scroll_table('Parameters', ('', 'mean', 'spread', 'stated', 'ratio'),
                                  list(parameter_rows(comparison)))),
@@ -331,16 +321,6 @@ def comparison_page(comparison: Comparison, rating: Rating, sources: Sequence[Pa
 def _of_sensor(calibrations: Sequence[Calibration]) -> str:
     name = next((each.sensor for each in calibrations if each.sensor), '')
     return f' of {name}' if name else ''
-
-
-def _runs(comparison: Comparison, calibrations: Sequence[Calibration], labels: Sequence[str]
-          ) -> str:
-    """Return a table that compares each run with the others."""
-    head = ('run', 'date', 'model', 'RMS [mg]', 'expected [mg]', 'largest [mg]', 'p')
-    rows = [(label, each.date[:10], each.name, short(run.rms_mg), short(run.expected_mg),
-             short(run.largest_mg), f'{run.p_value:.2g}')
-            for label, each, run in zip(labels, calibrations, comparison.runs, strict=True)]
-    return scroll_table('Calibrations', head, rows)
 
 
 def parameter_rows(comparison: Comparison) -> Iterator[tuple[str, ...]]:
@@ -356,36 +336,26 @@ def parameter_rows(comparison: Comparison) -> Iterator[tuple[str, ...]]:
 def history_page(history: History, sources: Sequence[Path],
                  calibrations: Sequence[Calibration]) -> str:
     """Return the page of a history of the calibrations in the files `sources`, as HTML."""
+    changes = [(first, second, f'{"agree" if change.comparison.agree else "differ"}, '
+                f'{rate_comparison(change.comparison).name}', f'{change.comparison.p_value:.2g}',
+                change_words(change.parameter, change.change, change.sd),
+                short(change.comparison.runs[1].rms_mg))
+               for first, second, change in zip(history.labels, history.labels[1:],
+                                                history.changes, strict=False)]
+    moments = []
+    for k, (label, moment) in enumerate(zip(history.labels, history.moments, strict=True)):
+        warm = '' if moment.temperature is None else f'{moment.temperature:.1f}'
+        moments.append((str(k + 1), label, sources[moment.index].name, moment.model, warm,
+                        short(moment.residual_mg), *(
+                            in_words(each.name, each.values[k], each.stated_sd[k])
+                            for each in history.parameters)))
     body = [section('Over the dates', figures(of_history(history)), HINT),
-            section('Changes', _changes(history)),
-            section('Calibrations', _moments(history, sources)),
+            section('Changes', scroll_table('Changes', (
+                'from', 'to', 'verdict', 'p', 'largest change', 'RMS [mg]'), changes)),
+            section('Calibrations', scroll_table('Calibrations', (
+                '', 'date', 'file', 'model', '°C', 'residual [mg]',
+                *(spoken(each.name) for each in history.parameters)), moments)),
             section('Notes', listing(history.notes)), how_to_read(*_HOW_TO_READ)]
     return rated_sheet(f'History of {len(calibrations)} calibrations{_of_sensor(calibrations)}',
                        [f'{history.labels[0]} to {history.labels[-1]}'],
                        rate_comparison(history.whole), body)
-
-
-def _changes(history: History) -> str:
-    """Return a table with the verdict of each step."""
-    head = ('from', 'to', 'verdict', 'p', 'largest change', 'RMS [mg]')
-    rows = [(first, second, f'{"agree" if change.comparison.agree else "differ"}, '
-             f'{rate_comparison(change.comparison).name}', f'{change.comparison.p_value:.2g}',
-             change_words(change.parameter, change.change, change.sd),
-             short(change.comparison.runs[1].rms_mg))
-            for first, second, change in zip(history.labels, history.labels[1:], history.changes,
-                                             strict=False)]
-    return scroll_table('Changes', head, rows)
-
-
-def _moments(history: History, sources: Sequence[Path]) -> str:
-    """Return a table of the calibrations with their parameters."""
-    head = ('', 'date', 'file', 'model', '°C', 'residual [mg]',
-            *(spoken(each.name) for each in history.parameters))
-    rows = []
-    for k, (label, moment) in enumerate(zip(history.labels, history.moments, strict=True)):
-        warm = '' if moment.temperature is None else f'{moment.temperature:.1f}'
-        values = (in_words(each.name, each.values[k], each.stated_sd[k])
-                  for each in history.parameters)
-        rows.append((str(k + 1), label, sources[moment.index].name, moment.model, warm,
-                     short(moment.residual_mg), *values))
-    return scroll_table('Calibrations', head, rows)
