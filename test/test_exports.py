@@ -575,6 +575,8 @@ def test_the_command_writes_beside_the_calibration(to, stored, tmp_path, capsys)
     noise.write_text(json.dumps(NOISE), encoding='utf-8')
     before = stored.read_bytes()
     assert run('export', stored, '--to', to, '--noise', noise) == 0
+    capsys.readouterr()
+    assert run('export', stored, '--to', to, '--noise', noise) == 0  # it replaces its own file
     path = tmp_path / f'calibration{EXPORT_FORMATS[to].suffix}'
     wanted = export(HEADERS['affine'], to, NOISE, ExportOptions(name='calibration'))
     assert path.read_bytes() == wanted.data
@@ -584,6 +586,17 @@ def test_the_command_writes_beside_the_calibration(to, stored, tmp_path, capsys)
     for line in wanted.losses:
         assert line in ' '.join(printed.err.split())
     assert f'stored in {path}' in ' '.join(printed.err.split())
+
+
+@pytest.mark.parametrize('to', ['json', 'npz', 'realsense', 'c'])
+def test_only_an_export_is_replaced(to, stored, tmp_path, capsys):
+    foreign, path = io.BytesIO(), tmp_path / f'calibration{EXPORT_FORMATS[to].suffix}'
+    np.savez(foreign, a=np.arange(3))
+    for content in (b'{"mine": 1}', foreign.getvalue(), b'accel_calib: my notes\n',
+                    stored.read_bytes(), b'run accel-calib export calibration.yaml\n'):
+        path.write_bytes(content)
+        assert 'exists and is no export' in refused(capsys, 'export', stored, '--to', to)
+        assert path.read_bytes() == content
 
 
 def test_the_command_writes_to_standard_output_and_its_losses_to_standard_error(stored, capfd):
