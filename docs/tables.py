@@ -29,6 +29,7 @@ from accel_calib.findings import LIMITS  # noqa: E402
 from accel_calib.logs.names import UNITS, WORDS  # noqa: E402
 from accel_calib.session import CalibratorSettings  # noqa: E402
 from accel_calib.session.settings import default_of, expected  # noqa: E402
+from accel_calib.stored.exports import FORMATS  # noqa: E402
 from accel_calib.table import COLUMNS  # noqa: E402
 import api_page  # noqa: E402
 
@@ -53,6 +54,14 @@ def effects() -> Iterator[str]:
         values = ', '.join(effect.values)
         yield (f'| `{name}` | {effect.words} | {effect.term} | {values} | {effect.unit} | '
                f'{effect.typical:g} | {needs} |')
+
+
+def exports() -> Iterator[str]:
+    """Yield the formats of exports."""
+    yield '| `--to` | file | equation | holds |'
+    yield '|---|---|---|---|'
+    for name, each in FORMATS.items():
+        yield f'| `{name}` | `NAME{each.suffix}` | {each.equation} | {each.holds} |'
 
 
 def rating() -> Iterator[str]:
@@ -84,8 +93,9 @@ def names() -> Iterator[str]:
         yield f'| {ours} | {" ".join(words)} | {texts} |'
 
 
-TABLES = {'columns': columns, 'effects': effects, 'findings': partial(kinds, KINDS),
-          'names': names, 'rating': rating, 'steps': partial(kinds, STEPS)}
+TABLES = {'columns': columns, 'effects': effects, 'exports': exports,
+          'findings': partial(kinds, KINDS), 'names': names, 'rating': rating,
+          'steps': partial(kinds, STEPS)}
 REFERENCE = 'api.md'
 PARAMETERS = HERE.parent / 'config' / 'calibrator.yaml'
 COMMENT = '    # '

@@ -224,8 +224,9 @@ def test_every_command_has_help_with_an_example(command, capsys):
 
 
 @pytest.mark.parametrize(('arguments', 'without'), [
-    (['--help'], ['numpy', 'yaml', 'rich']), (['fly'], ['numpy']),
-    (['fit', '{poses}'], ['matplotlib', 'rosbags', 'accel_calib.refine', 'accel_calib.report'])])
+    (['--help'], ['numpy', 'yaml', 'rich', 'jinja2']), (['fly'], ['numpy']),
+    (['fit', '{poses}'], ['matplotlib', 'rosbags', 'jinja2', 'accel_calib.refine',
+                          'accel_calib.report'])])
 def test_only_what_is_used_is_imported(arguments, without, poses):
     code = (f'import sys\nfrom {main.__module__} import main\n'
             'try:\n    main()\nexcept SystemExit:\n    pass\n'

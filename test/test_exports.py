@@ -158,7 +158,7 @@ def test_foreign_text_stays_in_comments(to, sensor):
     def lines(name):
         made = replace(HEADERS['affine'], sensor=name, date=name, stream='')
         return [line for line in text_of(made, to, NOISE, name='imu').split('\n')
-                if not re.match(r'#? |# | \*|  "comment"', line)]
+                if not re.match(r'#? |# | \*|//|  "comment"', line)]
 
     assert lines(sensor) == lines('imu_link')
 
@@ -174,13 +174,20 @@ def test_any_text_becomes_an_identifier(text, name):
     *(('affine', 'c', {'name': name}, 'expected a letter')
       for name in ('9', 'a b', 'a;', '_a', '\u00fc', 'a' * 42)),
     ('counts', 'px4', {}, 'native readings, but .* m/s2'),
-    ('counts', 'ardupilot', {}, 'native readings, but .* m/s2'),
+    *(('counts', to, {}, 'native readings, but .* m/s2')
+      for to in ('ardupilot', 'realsense', 'openvins', 'dlio')),
+    ('affine', 'inav', {'counts_per_g': 1e6}, 'counts, expected at most 32767'),
+    ('affine', 'mpu6050', {'name': '*/'}, 'expected a letter'),
+    ('vast', 'mpu6050', {}, 'counts, expected at most 32767'),
+    ('counts', 'inav', {'counts_per_g': 65536.0}, 'iNav takes 1 to 8192'),
+    ('counts', 'inav', {'counts_per_g': 0.5}, 'iNav takes 1 to 8192'),
     ('affine', 'px4', {'instance': 9}, '--instance is 9'),
     ('affine', 'ardupilot', {'instance': 9}, '--instance is 9'),
     ('affine', 'betaflight', {'counts_per_g': 1e6}, 'counts, expected at most 32767')])
 def test_what_a_format_cannot_hold_is_refused(name, to, options, message):
+    made = sensor_with({'offset': [20.0, 0.0, 0.0]}) if name == 'vast' else HEADERS[name]
     with pytest.raises(InputError, match=message):
-        text_of(HEADERS[name], to, **options)
+        text_of(made, to, **options)
 
 
 def qgroundcontrol(text):
@@ -336,6 +343,105 @@ def test_imucal_corrects_as_apply_does(name):
     assert found.acc_unit == ('g' if name == 'in_g' else 'm/s^2')
 
 
+def inav(text, raw):
+    """Correct counts by applyAccelerationZero of iNav, with its integers and their ranges [g]."""
+    found = dict(re.findall(r'^set (\w+) = (-?\d+)$', text, re.M))
+    zero, gain = (np.array([int(found.pop(f'acc{name}_{axis}')) for axis in 'xyz'])
+                  for name in ('zero', 'gain'))
+    assert not found
+    assert text.endswith('\nsave\n')
+    assert np.all((np.abs(zero) < 2 ** 15) & (gain >= 1) & (gain <= 8192))
+    return np.fix((np.round(raw * 2048).astype(int) - zero) * gain / 4096) / 2048
+
+
+def mpu6050(text, raw):
+    """Add the change to words with a factory trim, and return what the chip then reads [g]."""
+    change = np.array(re.findall(r'change\[3\] = {(.*)};', text)[0].split(','), int)
+    factory = np.random.default_rng(3).integers(-9000, 9000, 3)
+    words = (factory + change).astype(np.int16)
+    np.testing.assert_array_equal(words & 1, factory & 1)  # reserved
+    return raw + ((words >> 1) - (factory >> 1)) / 1024
+
+
+def fusion(text, raw):
+    """Correct readings by FusionModelInertial, in single precision [g]."""
+    found = {name: np.array(re.findall(r'([^{ ,]+)f', body), np.float32)
+             for name, body in re.findall(r'^static const \w+ (\w+) = {(.*)};', text, re.M)}
+    matrix, sensitivity, offset = (found[f'accelerometer{name}'] for name in (
+        'Misalignment', 'Sensitivity', 'Offset'))
+    return ((raw.astype(np.float32) - offset) * sensitivity) @ matrix.reshape(3, 3).T
+
+
+def realsense(text, raw):
+    """Correct readings as check_X of rs-imu-calibration: with one row for each column of raw."""
+    found = json.loads(text)['imus'][0]['accelerometer']
+    return np.column_stack([raw, -np.ones(len(raw))]) @ np.reshape(
+        found['scale_and_alignment'] + found['bias'], (4, 3))
+
+
+def openvins(text, raw):
+    """Correct readings as the Propagator of OpenVINS, from the bias that it starts with."""
+    first, rest = text.split('\n', 1)
+    assert first == '%YAML:1.0'
+    found = yaml.safe_load(rest)['imu0']
+    assert {**found, **NOISE, 'model': 'kalibr'} == found
+    np.testing.assert_array_equal([found['Tw'], found['R_IMUtoGYRO']], [np.eye(3)] * 2)
+    scale = np.linalg.inv(found['Ta'])
+    np.testing.assert_allclose(np.triu(scale, 1), 0.0, atol=1e-12)  # not read for kalibr
+    turn, bias = np.array(found['R_IMUtoACC']), re.search(r'init_dyn_bias_a: (\[.*\])', text)[1]
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
+    return (raw - json.loads(bias)) @ scale.T @ turn
+
+
+def dlio(text, raw):
+    """Correct readings by callbackImu of DLIO, in single precision."""
+    found = yaml.safe_load(text)['/**']['ros__parameters']
+    assert found['imu/calibration'] is False
+    matrix, bias = (np.array(found[f'imu/intrinsics/accel/{name}'], np.float32)
+                    for name in ('sm', 'bias'))
+    return raw.astype(np.float32) @ matrix.reshape(3, 3).T - bias
+
+
+USERS = {  # with the unit of readings and forces, what is held, and the largest difference [g]
+    inav: ('g', ('offset', 'axis_gain'), 2.1 / 2048), mpu6050: ('g', ('offset',), 1.01 / 2048),
+    fusion: ('own', AFFINE, 1e-6), realsense: ('m/s2', AFFINE, 1e-12),
+    openvins: ('m/s2', AFFINE, 2e-6), dlio: ('m/s2', AFFINE, 1e-6)}
+
+
+@pytest.mark.parametrize(('user', 'unit', 'per_g'), [
+    *((user, unit, None) for user in USERS for unit in ('m/s2', 'g')),
+    (inav, 'native', 2071.0), (fusion, 'native', 2071.0)])
+@pytest.mark.parametrize('seed', [1, 2, 3])
+def test_a_program_corrects_from_its_file_as_apply_does(user, unit, per_g, seed):
+    needed, held, most = USERS[user]
+    rng = np.random.default_rng(seed)
+    effects = {name: rng.uniform(-0.04, 0.04, 3) for name in held}
+    turn = rotation_from_rpy(*rng.uniform(-0.3, 0.3, 3)) if user in (fusion, realsense) else None
+    made = sensor_with(effects, rotation=turn, unit=unit, per_g=per_g)
+    count = made.units.per_g / 2048 if per_g is None else 1.0
+    reading = np.round(samples(made)[0] / count) * count
+    raw = reading / count / 2048 * {'g': 1.0, 'm/s2': 9.80665, 'own': 2048 * count}[needed]
+    found = export(made, user.__name__, NOISE)
+    force = user(found.text_or_bytes, raw) / (9.80665 if needed == 'm/s2' else 1.0)
+    np.testing.assert_allclose(force, made.apply(reading) / made.force_per_g, atol=most)
+    assert user is openvins or found.leaves_mg < 2e3 * most  # a vector
+
+
+def test_the_gyro_is_turned_where_the_file_says_so():
+    bias = np.array([0.01, -0.02, 0.005])
+    gyro = GyroBias(bias, np.full(3, 1e-4), 12, np.nan, np.zeros(3), ())
+    made, rate = replace(HEADERS['levelled'], gyro=gyro), np.array([0.1, 0.2, 0.3])
+    found = json.loads(text_of(made, 'realsense'))['imus'][0]['gyroscope']
+    turned = (bias + rate) @ np.reshape(found['scale_and_alignment'], (3, 3)) - found['bias']
+    np.testing.assert_allclose(turned, TILTED.T @ rate, atol=1e-12)
+    matrix = re.search(r'gyroscopeMisalignment = {(.*)};', text_of(made, 'fusion'))[1]
+    np.testing.assert_allclose(np.array(matrix.replace('f', '').split(','), float).reshape(3, 3),
+                               TILTED.T, atol=1e-7)
+    node = yaml.safe_load(text_of(made, 'dlio'))['/**']['ros__parameters']
+    np.testing.assert_array_equal(node['imu/intrinsics/gyro/bias'], bias)
+    assert any('rotation of' in line for line in export(made, 'dlio').losses)
+
+
 @pytest.mark.parametrize(('stream', 'topic'), [('', '/imu0'), ('/left/imu: "x"',) * 2])
 def test_kalibr_gets_the_noise_as_numbers(stream, topic):
     made = replace(HEADERS['affine'], stream=stream)
@@ -351,7 +457,7 @@ def test_vins_gets_the_noise_of_one_sample():
         'gyr_w': pytest.approx(3e-6 * 200 ** 0.5), 'g_norm': 9.80665}
 
 
-@pytest.mark.parametrize('to', ['kalibr', 'vins'])
+@pytest.mark.parametrize('to', ['kalibr', 'vins', 'openvins'])
 @pytest.mark.parametrize(('noise', 'message'), [
     (None, '--noise is not given'), ({}, 'has no accelerometer_noise_density'),
     ({**NOISE, 'gyroscope_random_walk': None}, 'has no gyroscope_random_walk'),
@@ -469,6 +575,8 @@ def test_the_command_writes_beside_the_calibration(to, stored, tmp_path, capsys)
     noise.write_text(json.dumps(NOISE), encoding='utf-8')
     before = stored.read_bytes()
     assert run('export', stored, '--to', to, '--noise', noise) == 0
+    capsys.readouterr()
+    assert run('export', stored, '--to', to, '--noise', noise) == 0  # it replaces its own file
     path = tmp_path / f'calibration{EXPORT_FORMATS[to].suffix}'
     wanted = export(HEADERS['affine'], to, NOISE, ExportOptions(name='calibration'))
     assert path.read_bytes() == wanted.data
@@ -478,6 +586,17 @@ def test_the_command_writes_beside_the_calibration(to, stored, tmp_path, capsys)
     for line in wanted.losses:
         assert line in ' '.join(printed.err.split())
     assert f'stored in {path}' in ' '.join(printed.err.split())
+
+
+@pytest.mark.parametrize('to', ['json', 'npz', 'realsense', 'c'])
+def test_only_an_export_is_replaced(to, stored, tmp_path, capsys):
+    foreign, path = io.BytesIO(), tmp_path / f'calibration{EXPORT_FORMATS[to].suffix}'
+    np.savez(foreign, a=np.arange(3))
+    for content in (b'{"mine": 1}', foreign.getvalue(), b'accel_calib: my notes\n',
+                    stored.read_bytes(), b'run accel-calib export calibration.yaml\n'):
+        path.write_bytes(content)
+        assert 'exists and is no export' in refused(capsys, 'export', stored, '--to', to)
+        assert path.read_bytes() == content
 
 
 def test_the_command_writes_to_standard_output_and_its_losses_to_standard_error(stored, capfd):

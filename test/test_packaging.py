@@ -18,6 +18,7 @@ EXECUTABLES = ('accel-calib', 'calibrator', 'calibrator_lifecycle', 'simulator')
 
 # pip installs apsw, backports.zstd and lz4 with rosbags.
 ROSDEP_KEYS = {
+    'Jinja2': 'python3-jinja2',
     'PyYAML': 'python3-yaml',
     'aiohttp': 'python3-aiohttp',
     'apsw': 'python3-rosbags-pip',

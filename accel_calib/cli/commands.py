@@ -239,19 +239,20 @@ def _export(made: options.Parser) -> None:
                       help='format, see below')
     made.add_argument('-o', '--output', metavar='FILE', help='file to write; - for standard '
                       'output (default: beside the calibration, named after it)')
-    made.add_argument('--noise', type=Path, metavar='FILE', help='kalibr, vins: result of '
-                      'accel-calib noise --json')
+    made.add_argument('--noise', type=Path, metavar='FILE', help='kalibr, vins, openvins: '
+                      'result of accel-calib noise --json')
     options.add_fields(made, Options, {
-        'name': {'help': 'c, arduino: first part of the names in the header (default: from the '
-                 'name of the calibration)'},
+        'name': {'help': 'c, arduino, mpu6050: first part of the names in the header (default: '
+                 'from the name of the calibration)'},
         'instance': {'metavar': 'N', 'help': 'px4, ardupilot: number of the accelerometer '
                      '(default: px4 0, ardupilot 1)'},
         'device_id': {'metavar': 'ID', 'help': 'px4, ardupilot: device id of the accelerometer'},
-        'axes': {'choices': ('same', 'flu'), 'help': 'px4, ardupilot, betaflight: axes of the '
-                 'readings; same: of the flight controller; flu: x forward, y left, z up, for '
-                 'readings from ROS (default: %(default)s)'},
-        'counts_per_g': {'metavar': 'COUNTS', 'help': 'betaflight: acc_1G of the driver (default: '
-                         '2048, or the power of two nearest to the native units)'}})
+        'axes': {'choices': ('same', 'flu'), 'help': 'px4, ardupilot, betaflight, inav, '
+                 'mpu6050: axes of the readings; same: of the flight controller; flu: x forward, '
+                 'y left, z up, for readings from ROS (default: %(default)s)'},
+        'counts_per_g': {'metavar': 'COUNTS', 'help': 'betaflight, inav: acc_1G of the driver; '
+                         'mpu6050: counts per g of native readings (default: 2048, or the power '
+                         'of two nearest to the native units)'}})
     options.share(made, '--json')
 
 

@@ -58,7 +58,7 @@ _WITH_PAGE = ('calibrate', 'thermal')
 _SUFFIXES = {'calibration': '.yaml', 'page': '.html', 'table': '.csv'}
 _KINDS = {'calibration': rb'format: accel_calib', 'page': rb'<!DOCTYPE html',
           'result': rb'\s*[{\[]', 'table': rb'(#[^\n]*\n)*[^\n]*\bax\b[^\n]*',
-          'export': rb'(?s)PK|\{|.*accel[-_]calib'}
+          'export': rb'(?s).*(written by accel-calib|accel_calib) export'}
 """Beginning of a file of each kind."""
 
 _HEAD = 4096
@@ -353,7 +353,8 @@ def check_target(target: Target, inputs: Iterable[Path], *, force: bool) -> None
         return
     with path.open('rb') as file:
         head = file.read(_HEAD)
-    if head.strip() and not re.match(_KINDS[target.kind], head):
+    # Text in an array of NumPy has three zero bytes beside each letter.
+    if head.strip() and not re.match(_KINDS[target.kind], head.replace(b'\0', b'')):
         raise InputError(f'{option} {path} exists and is no {target.kind} of accel_calib, '
                          'expected a new file', 'choose another name, or replace it with --force')
 

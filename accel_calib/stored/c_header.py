@@ -17,17 +17,15 @@ smallest one after which u changes by less than the precision of a float.
 
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 import re
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .made import (
-    about, Format, frame_words, Made, Options, polynomial, single, steady_at, steady_grid,
-    temperature_range, TITLE)
+    frame_words, literal, Made, Options, polynomial, single, steady_at, steady_grid,
+    temperature_range)
 from ..calibrate import Calibration
 from ..effects import (
     CUBE, MONOMIALS, ODD_SQUARE, PRODUCT, REFERENCE_TEMPERATURE, SIZE, SQUARE, WAVE, ZONAL, ZONES)
@@ -45,16 +43,6 @@ _LARGEST_STEPS = 20
 _NAME = re.compile(r'[A-Za-z][A-Za-z0-9_]{0,40}')
 _BEYOND = 2.0
 """The repetitions converge for forces up to this [g]."""
-
-_C_USE = ('use:', '  float raw[3], force[3];', '  {name}_apply(raw, {temperature}force);')
-_ARDUINO_USE = (
-    'use: save this file beside the sketch, and write',
-    '  #include "{name}.h"',
-    '  void loop() {{',
-    '    float raw[3] = {{imu.x(), imu.y(), imu.z()}};  // as in the log of the calibration',
-    '    float force[3];',
-    '    {name}_apply(raw, {temperature}force);',
-    '  }}')
 
 
 @dataclass(frozen=True)
@@ -156,18 +144,32 @@ def _with_steps(header: Header, calibration: Calibration) -> Header:
     return found
 
 
-def _make(calibration: Calibration, options: Options, use: Sequence[str]) -> Made:
-    """Return a header for C99 and C++, with these lines about its use."""
+def header(calibration: Calibration, options: Options) -> Made:
+    """Return the values of a header for C99 and C++, or for a sketch."""
     own = [effect.words for effect in calibration.model.terms.effects if effect.own]
     if own:
         raise InputError(f'the calibration has an effect of the user ({own[0]}), which has no '
                          'code in C', 'refine without --also, or write this correction by hand')
-    header, per_g = _header_of(calibration), calibration.force_per_g
-    return Made(_text(header, calibration, _name_of(calibration, options), use),
-                lambda reading, temperature: header.force(reading, temperature) / per_g, True)
+    made, name = _header_of(calibration), name_of(calibration, options)
+    degrees = sorted({ZONES[(index - ZONAL) // 3].degree
+                      for index in made.monomial.tolist() if index >= ZONAL})
+    values = {
+        'name': name, 'roots': bool(np.any(made.monomial >= WAVE)),
+        'M': _array('M', made.matrix) if made.is_affine else '', 'B': _array('B', made.vec_v[0]),
+        'N': _array('N', made.inverse), 'R': _array('R', made.turn), 'steps': made.steps,
+        'V': [_horner(column) for column in made.vec_v.T], 'per_unit': 1.0 / made.per_g,
+        'bend': [_added(made, axis, name) for axis in range(3)],
+        'legendre': [(degree, _horner(np.array(next(
+            zone.polynomial for zone in ZONES if zone.degree == degree)))) for degree in degrees],
+        'unit': 'm/s^2' if calibration.units.is_si else 'g', 'frame': frame_words(calibration),
+        's': {'unknown': REFERENCE_TEMPERATURE, 'middle': _signed(made.middle),
+              'low': made.middle - made.half, 'high': made.middle + made.half,
+              'per_half': 1.0 / made.half} if made.of_temperature else None}
+    return Made(values, lambda reading, temperature: (
+        made.force(reading, temperature) / calibration.force_per_g), True)
 
 
-def _name_of(calibration: Calibration, options: Options) -> str:
+def name_of(calibration: Calibration, options: Options) -> str:
     """Return the name of the functions; raise InputError if the one asked for is none in C."""
     if options.name and not _NAME.fullmatch(options.name):
         raise InputError(f'the name is {options.name!r}, expected a letter, and then at most '
@@ -182,45 +184,11 @@ def identifier(text: str) -> str:
     return name if name[:1].isalpha() else f'accel_{name}'.rstrip('_')
 
 
-def _text(header: Header, calibration: Calibration, name: str, use: Sequence[str]) -> str:
-    unit = 'm/s^2' if calibration.units.is_si else 'g'
-    temperature = 'temperature, ' if header.of_temperature else ''
-    comment = [TITLE, '', *about(calibration), '',
-               f'force: {unit}, {frame_words(calibration)}; at rest +1 g on the axis that points '
-               'up', *_equation(header), '',
-               *(line.format(name=name, temperature=temperature) for line in use)]
-    guard = f'ACCEL_CALIB_{name.upper()}_H'
-    lines = ['/*', *(f' * {line}'.rstrip() for line in comment), ' */', f'#ifndef {guard}',
-             f'#define {guard}', '',
-             *(['#include <math.h>', ''] if np.any(header.monomial >= WAVE) else []),
-             f'/* 1 if {name}_apply takes the temperature [degC] */',
-             f'#define {name.upper()}_NEEDS_TEMPERATURE {int(header.of_temperature)}', '',
-             *(_affine(header, name) if header.is_affine else _general(header, name)), '',
-             f'#endif /* {guard} */']
-    return '\n'.join(lines) + '\n'
-
-
-def _equation(header: Header) -> list[str]:
-    if header.is_affine:
-        return ['equation: force = M (raw - B)']
-    lines = ['equation: force = R u, u = N ((raw - V(s)) / per_g - (W(s) - W(0)) u - bend(u))']
-    if header.of_temperature:
-        low, high = header.middle - header.half, header.middle + header.half
-        lines.append(f's is the temperature, limited to {low:.6g} to {high:.6g} degC, scaled to '
-                     '-1 to 1')
-    return lines
-
-
-def _literal(value: float) -> str:
-    text = str(np.float32(value))
-    return f'{text}f' if set('.e') & set(text) else f'{text}.0f'
-
-
 def _array(kind: str, values: Floats) -> str:
     """Return the definition of a C array of one or two dimensions."""
     sizes = ''.join(f'[{size}]' for size in values.shape)
-    parts = ([f'{{{", ".join(map(_literal, row))}}}' for row in values] if values.ndim == 2
-             else list(map(_literal, values)))
+    parts = ([f'{{{", ".join(map(literal, row))}}}' for row in values] if values.ndim == 2
+             else list(map(literal, values)))
     start = f'    static const float {kind}{sizes} = '
     text = f'{start}{{{", ".join(parts)}}};'
     if len(text) <= 99:
@@ -229,68 +197,9 @@ def _array(kind: str, values: Floats) -> str:
     return f'{start}{{\n        {lines}}};'
 
 
-def _affine(header: Header, name: str) -> list[str]:
-    return [f'static inline void {name}_apply(const float raw[3], float force[3])', '{',
-            _array('M', header.matrix), _array('B', header.vec_v[0]),
-            '    const float x = raw[0] - B[0], y = raw[1] - B[1], z = raw[2] - B[2];',
-            '    int i;', '',
-            '    for (i = 0; i < 3; ++i) {',
-            '        force[i] = M[i][0] * x + M[i][1] * y + M[i][2] * z;', '    }', '}']
-
-
-def _general(header: Header, name: str) -> list[str]:
-    temperature = 'float temperature, ' if header.of_temperature else ''
-    degrees = sorted({ZONES[(index - ZONAL) // 3].degree
-                      for index in header.monomial.tolist() if index >= ZONAL})
-    return [*(line for degree in degrees for line in _legendre(degree, name)),
-            f'static inline void {name}_apply(const float raw[3], {temperature}float force[3])',
-            '{', _array('N', header.inverse), _array('R', header.turn),
-            *_scaled_temperature(header),
-            f'    const float per_unit = {_literal(1.0 / header.per_g)};',
-            f'    float d[3], e[3], u[3]{", v[3]" if degrees else ""};', '    int i, step;', '',
-            *(f'    d[{axis}] = (raw[{axis}] - {_horner(header.vec_v[:, axis])}) * per_unit;'
-              for axis in range(3)),
-            *_product('u', 'N', 'd', '    '),
-            f'    for (step = 0; step < {header.steps}; ++step) {{',
-            *(_DIRECTION if degrees else ()),
-            *(f'        e[{axis}] = d[{axis}]{_added(header, axis, name)};' for axis in range(3)),
-            *_product('u', 'N', 'e', '        '), '    }', *_product('force', 'R', 'u', '    '),
-            '}']
-
-
-def _product(left: str, matrix: str, right: str, indent: str) -> list[str]:
-    """Return the lines of C that set a vector to a matrix times another vector."""
-    row = ' + '.join(f'{matrix}[i][{column}] * {right}[{column}]' for column in range(3))
-    return [f'{indent}for (i = 0; i < 3; ++i) {{', f'{indent}    {left}[i] = {row};',
-            f'{indent}}}']
-
-
-def _scaled_temperature(header: Header) -> list[str]:
-    """Return the lines that compute s; a temperature that is NaN counts as the reference."""
-    if not header.of_temperature:
-        return []
-    low, high = (_literal(header.middle + sign * header.half) for sign in (-1.0, 1.0))
-    unknown, per_half = _literal(REFERENCE_TEMPERATURE), _literal(1 / header.half)
-    return [f'    const float known = temperature == temperature ? temperature : {unknown};',
-            f'    const float held = known < {low} ? {low} : (known > {high} ? {high} : known);',
-            f'    const float s = (held - {_signed(header.middle)}) * {per_half};']
-
-
 def _signed(value: float) -> str:
     """Return a literal, in brackets if it is negative."""
-    return f'({_literal(value)})' if value < 0 else _literal(value)
-
-
-_DIRECTION = ('        for (i = 0; i < 3; ++i) {',
-              '            v[i] = u[i] / sqrtf(u[0] * u[0] + u[1] * u[1] + u[2] * u[2] + 1e-30f);',
-              '        }')
-
-
-def _legendre(degree: int, name: str) -> list[str]:
-    """Return the lines of a Legendre polynomial."""
-    polynomial = next(np.array(zone.polynomial) for zone in ZONES if zone.degree == degree)
-    return [f'static inline float {name}_p{degree}(float s)', '{',
-            f'    return {_horner(polynomial)};', '}', '']
+    return f'({literal(value)})' if value < 0 else literal(value)
 
 
 def _horner(polynomial: Floats) -> str:
@@ -327,7 +236,7 @@ def _monomial(index: int, name: str) -> str:
         mode, axis = divmod(index - WAVE, 3)
         x = f'u[{axis}]'
         held = f'({x} < -1.0f ? -1.0f : ({x} > 1.0f ? 1.0f : {x}))'
-        return f'cosf({_literal((mode + 1) * np.pi / 2.0)} * ({held} + 1.0f))'
+        return f'cosf({literal((mode + 1) * np.pi / 2.0)} * ({held} + 1.0f))'
     if index >= PRODUCT:
         one, two = ((0, 1), (0, 2), (1, 2))[index - PRODUCT]
         return f'u[{one}] * u[{two}]'
@@ -336,10 +245,3 @@ def _monomial(index: int, name: str) -> str:
     if index >= ODD_SQUARE:
         return f'{x} * {size.format(x)}'
     return f'{x} * {x} * {x}' if index >= CUBE else f'{x} * {x}'
-
-
-FORMATS = {
-    'c': Format('C header', '.h', 'header in C99 and C++, single precision',
-                partial(_make, use=_C_USE), 'options'),
-    'arduino': Format('Arduino header', '.h', 'header for an Arduino sketch',
-                      partial(_make, use=_ARDUINO_USE), 'options')}

@@ -4,44 +4,36 @@
 """
 Exports of a calibration to the places where it is used, and the plan of poses as CSV.
 
-`.c_header` and `.flight_controllers` make headers and parameters; the other files are made here:
-
-========= ================================================ ==================================
-format    equation                                         source
-========= ================================================ ==================================
-imu_calib force = SM raw - bias                            accel_calib.cpp of dpkoch/imu_calib
-imucal    force = R_a⁻¹ K_a⁻¹ (raw - b_a), K_a diagonal    FerrarisCalibrationInfo
-Kalibr    no correction; noise by square root of hertz     wiki, IMU Noise Model
-VINS      no correction; noise of one sample               integration_base.h of VINS-Fusion
-========= ================================================ ==================================
+An export is one entry of `FORMATS`, and a template of the same name in the folder ``templates``.
+The values for the templates are made in `.c_header`, `.flight_controllers`, `.affine` and
+`.noise_figures`; `.made` measures what an export does not hold, and fills the template.
 
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import suppress
 import csv
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 import io
 import json
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, TextIO, TYPE_CHECKING, TypeGuard
+from typing import Any, TextIO, TYPE_CHECKING
 
 import numpy as np
 
-from . import c_header, flight_controllers
-from .c_header import identifier
+from .affine import affine, imucal
+from .c_header import header, identifier
 from .calibration_yaml import CORRECTION
-from .made import (
-    about, affine_fit, commented, Correction, difference_mg, Format, frame_words, LEAST_LOSS_MG,
-    Loss, losses_of, Made, Options, plain_text, unit_in_ascii)
+from .flight_controllers import ardupilot, counts, px4
+from .made import difference_mg, Format, LEAST_LOSS_MG, Loss, losses_of, Made, Options, rendered
+from .noise_figures import Noise, noise_alone, openvins, read_noise
 from .. import __version__
 from ..calibrate import Calibration
-from ..disk import check_regular, write_atomically
+from ..disk import write_atomically
 from ..errors import InputError
-from ..table import Floats, LARGEST
 from ..units import STANDARD_GRAVITY
 
 if TYPE_CHECKING:
@@ -50,76 +42,22 @@ if TYPE_CHECKING:
 __all__ = ['CALIBRATION_ALONE', 'FORMATS', 'Exported', 'Format', 'Loss', 'Noise', 'Options',
            'export', 'identifier', 'read_noise', 'write_plan']
 
-_IMU_CALIB_URL = ('https://github.com/dpkoch/imu_calib/blob/master/src/accel_calib/'
-                  'accel_calib.cpp')
-_IMUCAL_URL = 'https://imucal.readthedocs.io/en/latest/modules/generated/imucal.html'
-_KALIBR_URL = 'https://github.com/ethz-asl/kalibr/wiki/IMU-Noise-Model'
-_VINS_URL = ('https://github.com/HKUST-Aerial-Robotics/VINS-Fusion/blob/master/vins_estimator/'
-             'src/factor/integration_base.h')
-
-_IMUCAL_VERSION = '2.0.0'
-
-_NOISE = {'accelerometer_noise_density': 'm/s^2/sqrt(Hz)',
-          'accelerometer_random_walk': 'm/s^3/sqrt(Hz)',
-          'gyroscope_noise_density': 'rad/s/sqrt(Hz)',
-          'gyroscope_random_walk': 'rad/s^2/sqrt(Hz)', 'update_rate': 'Hz'}
-"""Figures of ``accel-calib noise --json``, and their units."""
-
-_VINS = {'acc_n': ('accelerometer_noise_density', 'm/s^2'),
-         'gyr_n': ('gyroscope_noise_density', 'rad/s'),
-         'acc_w': ('accelerometer_random_walk', 'm/s^3'),
-         'gyr_w': ('gyroscope_random_walk', 'rad/s^2')}
-"""Keys of VINS, with the figure of the noise and its unit for one sample."""
-
 _CONTEXT = {'temperature': ('temperature', 1.0), 'supply_voltage': ('supply_voltage', 1.0),
             'std': ('vibration', STANDARD_GRAVITY), 'time': ('wait', 1.0)}
 """Column of the plan and its unit, by column of the poses: °C, V, m/s², s after the last pose.
 Quantities keep their name."""
 
-Noise = Mapping[str, Any]
+_GITHUB = 'https://github.com/'
+_ALL = 'offset, gains, mounting'
+_BY_AXIS = 'offset, gain of each axis, thermal offset'
+_OF_FILE = 'that of the [file](files.md#calibration)'
 
 
-def _affine(calibration: Calibration, factor: float = 1.0) -> tuple[Floats, Floats, Correction]:
-    """Return M and c with force = M raw - c in the unit of `apply`, and the correction in g."""
-    unit = calibration.force_per_g * factor
-    matrix, constant = (each * unit for each in affine_fit(calibration))
-    return matrix, constant, lambda reading, temperature: (reading @ matrix.T - constant) / unit
+def _json(calibration: Calibration) -> Made:
+    return Made({'content': _content(calibration)}, None, True, notes=_left_alone(calibration))
 
 
-def _make_imu_calib(calibration: Calibration) -> Made:
-    matrix, constant, correct = _affine(calibration)
-    lines = ['SM:', *(f'  - {_yaml_number(value)}' for value in matrix.ravel().tolist()),
-             'bias:', *(f'  - {_yaml_number(value)}' for value in constant.tolist())]
-    comment = [f'source: {_IMU_CALIB_URL}',
-               f'equation: force = SM raw - bias; SM row by row; {frame_words(calibration)}']
-    return Made(commented(calibration, comment, lines), correct, True)
-
-
-def _make_imucal(calibration: Calibration) -> Made:
-    """Return the JSON file of imucal: FerrarisCalibrationInfo."""
-    units, gyro = calibration.units, calibration.gyro
-    matrix, constant, correct = _affine(calibration, STANDARD_GRAVITY if units.is_native else 1.0)
-    gain = np.linalg.inv(matrix)
-    sizes = np.linalg.norm(gain, axis=1)
-    no_gyro = ' The bias of the gyro is not known: it is 0.' if gyro is None else ''
-    content = {
-        'cal_type': 'Ferraris',
-        'acc_unit': 'm/s^2' if units.is_native else unit_in_ascii(units, ''),
-        'gyr_unit': 'rad/s', 'from_acc_unit': unit_in_ascii(units, 'a.u.'),
-        'from_gyr_unit': 'rad/s',
-        'comment': '; '.join(['written by accel-calib export', *about(calibration)])
-        + f'; {frame_words(calibration)}.{no_gyro}',
-        'K_a': np.diag(sizes), 'R_a': gain / sizes[:, np.newaxis], 'b_a': gain @ constant,
-        'K_g': np.eye(3), 'R_g': calibration.rotation, 'K_ga': np.zeros((3, 3)),
-        'b_g': np.zeros(3) if gyro is None else gyro.bias, '_format_version': _IMUCAL_VERSION}
-    return Made(_json(content), correct, True)
-
-
-def _make_json(calibration: Calibration) -> Made:
-    return Made(_json(_content(calibration)), None, True, _affine_alone(calibration))
-
-
-def _make_npz(calibration: Calibration) -> Made:
+def _npz(calibration: Calibration) -> Made:
     """Return all values as a NumPy archive; texts and effects are arrays of text."""
     content = _content(calibration)
     effects = content.pop('effects')
@@ -132,12 +70,12 @@ def _make_npz(calibration: Calibration) -> Made:
         arrays[f'range.{key}'] = np.array(limits)
     file = io.BytesIO()
     np.savez(file, **arrays)  # type: ignore[arg-type]
-    return Made(file.getvalue(), None, True, _affine_alone(calibration))
+    return Made({}, None, True, notes=_left_alone(calibration), data=file.getvalue())
 
 
-def _affine_alone(calibration: Calibration) -> tuple[str, ...]:
+def _left_alone(calibration: Calibration) -> tuple[str, ...]:
     """Return a note about readers that use matrix and offset alone."""
-    left = difference_mg(calibration, Made('', lambda reading, temperature: (
+    left = difference_mg(calibration, Made({}, lambda reading, temperature: (
         reading - calibration.offset) @ calibration.matrix.T @ calibration.rotation
         / calibration.force_per_g, True))
     if left < LEAST_LOSS_MG:
@@ -165,127 +103,84 @@ def _content(calibration: Calibration) -> dict[str, Any]:
         'rms_before_mg': quality.rms_before_mg, 'rms_after_mg': quality.rms_after_mg}
 
 
-def _json(content: Mapping[str, Any]) -> str:
-    return json.dumps(content, indent=2, allow_nan=False, default=lambda array: array.tolist()
-                      ) + '\n'
-
-
-def _make_kalibr(calibration: Calibration, noise: Noise | None) -> Made:
-    """Return imu.yaml of Kalibr; raise InputError if a figure of the noise is missing."""
-    figures, notes = _noise_figures(noise, 'Kalibr')
-    comment = [f'source: {_KALIBR_URL}', 'Kalibr corrects no offset and gain: correct recordings '
-               'with accel-calib apply.', *notes]
-    # The topic of most examples, if that of the readings is not known.
-    topic = json.dumps(plain_text(calibration.stream) or '/imu0')
-    lines = [f'rostopic: {topic}', *(
-        f'{key}: {_noise_number(figures[key])}  # {unit}' for key, unit in _NOISE.items())]
-    return _of_noise(calibration, commented(calibration, comment, lines), notes)
-
-
-def _make_vins(calibration: Calibration, noise: Noise | None) -> Made:
-    """Return lines for VINS; raise InputError if a figure of the noise is missing."""
-    figures, notes = _noise_figures(noise, 'VINS')
-    root = float(np.sqrt(figures['update_rate']))
-    comment = [f'source: {_VINS_URL}',
-               'VINS does not correct offset and gain: correct readings with accel-calib first.',
-               f'noise of one sample = density * sqrt({figures["update_rate"]:.6g} Hz)', *notes,
-               'Put these lines into the configuration file, below "imu parameters".']
-    gravity = calibration.units.per_g if calibration.units.is_si else STANDARD_GRAVITY
-    lines = [*(f'{name}: {_noise_number(figures[key] * root)}  # {unit}, density '
-               f'{figures[key]:.6g}' for name, (key, unit) in _VINS.items()),
-             f'g_norm: {_yaml_number(gravity)}  # m/s^2']
-    return _of_noise(calibration, commented(calibration, comment, lines), notes)
-
-
-def _of_noise(calibration: Calibration, text: str, notes: tuple[str, ...]) -> Made:
-    """Return the file of a tool that takes the readings as they are."""
-    advice = ('the correction is not in this file: use accel-calib apply for recordings, or the '
-              'calibrator node')
-    return Made(text, lambda reading, temperature: calibration.units.to_g(reading), False,
-                (advice, *notes))
-
-
-def _noise_number(value: float) -> str:
-    return _yaml_number(float(f'{value:.9g}'))
-
-
-def _yaml_number(value: float) -> str:
-    """Return a number for YAML 1.1, which reads 1e-05 without a point as text."""
-    mantissa, exponent, power = repr(float(value)).partition('e')
-    return mantissa + ('' if '.' in mantissa else '.0') + exponent + power
-
-
-def _noise_figures(noise: Noise | None, label: str) -> tuple[dict[str, float], tuple[str, ...]]:
-    """
-    Return the figures of the noise that a file needs, and notes about them.
-
-    A random walk that is not seen in the recording is replaced by its upper limit. Other figures
-    that are missing or not positive raise InputError.
-
-    """
-    if noise is None:
-        raise InputError(f'{label} needs the noise of the sensor, but --noise is not given',
-                         'run accel-calib noise RECORDING --json noise.json, and add --noise '
-                         'noise.json')
-    figures, notes = {}, []
-    for key in _NOISE:
-        value, limits = noise.get(key), noise.get(f'{key}_axes_upper')
-        reason = plain_text(str(noise.get(f'{key}_reason') or ''))
-        if (value is None and 'random_walk' in key and isinstance(limits, list) and limits
-                and all(map(_is_positive, limits))):
-            value = max(limits)
-            notes.append(f'{key} is not seen ({reason or "no reason is stated"}): its upper limit '
-                         f'{value:.3g} is used')
-        if not _is_positive(value):
-            found = f'has no {key}' if value is None else f'has {key} {value!r}'
-            raise InputError(f'the file of the noise {found}{reason and ": "}{reason}, but '
-                             f'{label} needs a positive number', 'record a longer rest and run '
-                             'accel-calib noise again, or write the figure of the data sheet into '
-                             'the file')
-        figures[key] = value
-    return figures, tuple(notes)
-
-
-def _is_positive(value: object) -> TypeGuard[float]:
-    return (isinstance(value, int | float) and not isinstance(value, bool)
-            and 0.0 < value < LARGEST)
-
-
-def read_noise(path: Path) -> Noise:
-    """
-    Read a file of ``accel-calib noise --json``.
-
-    Raises
-    ------
-    InputError
-        If it is not a JSON object.
-    OSError
-        If the file cannot be read.
-
-    """
-    check_regular(path)
-    content, fault = None, 'is not a JSON file'
-    with suppress(ValueError):
-        content = json.loads(path.read_text(encoding='utf-8'))
-        fault = 'contains no JSON object'
-    if not isinstance(content, Mapping):
-        raise InputError(f'{path} {fault}, expected the result of accel-calib noise --json',
-                         'run accel-calib noise RECORDING --json noise.json')
-    return content
-
-
 FORMATS: Mapping[str, Format] = MappingProxyType({
-    **c_header.FORMATS, **flight_controllers.FORMATS,
-    'imu_calib': Format('imu_calib', '_imu_calib.yaml', 'YAML file of the ROS package',
-                        _make_imu_calib, source=_IMU_CALIB_URL),
-    'imucal': Format('imucal', '_imucal.json', 'FerrarisCalibrationInfo as JSON', _make_imucal,
-                     source=_IMUCAL_URL),
-    'kalibr': Format('Kalibr', '_imu.yaml', 'imu.yaml with the noise', _make_kalibr, 'noise',
-                     _KALIBR_URL),
-    'vins': Format('VINS', '_vins.yaml', 'lines of the noise for its configuration', _make_vins,
-                   'noise', _VINS_URL),
-    'json': Format('JSON', '.json', 'all values', _make_json),
-    'npz': Format('NumPy', '.npz', 'all values as arrays', _make_npz)})
+    'c': Format(
+        'C header', '.h', 'header in C99 and C++, single precision',
+        'force = M (raw - B), and [more](#c-and-arduino)',
+        'all but lag, time, supply and rotation', header, needs='options'),
+    'arduino': Format(
+        'Arduino header', '.h', 'header for an Arduino sketch', 'as `c`', 'as `c`', header,
+        needs='options'),
+    'px4': Format(
+        'PX4', '_px4.params', 'parameter file of QGroundControl',
+        '(raw - thermal(T - TREF) - OFF) SCALE', _BY_AXIS, px4,
+        _GITHUB + 'PX4/PX4-Autopilot/blob/main/src/lib/sensor_calibration/Accelerometer.hpp',
+        needs='options', metric=True),
+    'ardupilot': Format(
+        'ArduPilot', '_ardupilot.param', 'parameter file of Mission Planner and MAVProxy',
+        '(raw - p(T - 35) + p(CALTEMP - 35) - OFFS) SCAL', _BY_AXIS, ardupilot,
+        _GITHUB + 'ArduPilot/ardupilot/blob/master/libraries/AP_InertialSensor/'
+        'AP_InertialSensor_Backend.cpp', needs='options', metric=True),
+    'betaflight': Format(
+        'Betaflight', '_betaflight.txt', 'commands for its command line',
+        '(raw - acc_calibration) / acc_1G', 'offset in counts',
+        partial(counts, label='Betaflight'),
+        _GITHUB + 'betaflight/betaflight/blob/master/src/main/sensors/acceleration.c',
+        needs='options'),
+    'inav': Format(
+        'iNav', '_inav.txt', 'commands for its command line',
+        '(raw - acczero) accgain / 4096 / acc_1G', 'offset, gain of each axis',
+        partial(counts, label='iNav', with_gain=True),
+        _GITHUB + 'iNavFlight/inav/blob/master/src/main/sensors/acceleration.c', needs='options'),
+    'mpu6050': Format(
+        'MPU-6050', '_mpu6050.h', 'change of the offset registers; MPU-6500 and 9250, too',
+        'raw + change, in 1/2048 g', 'offset in 0.98 mg',
+        partial(counts, label='MPU-6050', register_per_g=2048.0, step=2, notes=(
+            'add the change to the words that the chip has after power-on, each time, and verify '
+            'it with new poses: drivers state 1/2048 g, but also 1/4096 g for the MPU-6050',)),
+        'RM-MPU-9250A-00 rev. 1.4, section 4.39, and mpu_set_accel_bias_6050_reg of InvenSense',
+        needs='options'),
+    'fusion': Format(
+        'Fusion', '_fusion.h', 'parameters of FusionCalibrationInertial by x-io',
+        'force = misalignment ((raw - offset) * sensitivity)', _ALL,
+        partial(affine, force_per_g=1.0),
+        _GITHUB + 'xioTechnologies/Fusion/blob/main/Fusion/FusionModel.h'),
+    'realsense': Format(
+        'RealSense', '_realsense.json', 'calibration.json of rs-imu-calibration',
+        'force = scale_and_alignment^T raw - bias', f'{_ALL}, gyro bias',
+        partial(affine, notes=(
+            'it is for readings that are recorded with enable_motion_correction = 0',)),
+        _GITHUB + 'IntelRealSense/librealsense/blob/master/tools/rs-imu-calibration/'
+        'rs-imu-calibration.py', metric=True),
+    'openvins': Format(
+        'OpenVINS', '_imu_chain.yaml', 'kalibr_imu_chain.yaml with gains and noise',
+        'force = R_IMUtoACC^T Ta^-1 (raw - estimated bias)', 'gains, noise',
+        openvins, _GITHUB + 'rpng/open_vins/blob/master/ov_msckf/src/state/Propagator.cpp',
+        needs='noise', metric=True),
+    'dlio': Format(
+        'DLIO', '_dlio.yaml', 'parameters of its ROS 2 node', 'force = sm raw - bias',
+        'offset, gains, gyro bias',
+        partial(affine, levelled=False, notes=(
+            'DLIO turns readings by extrinsics/baselink2imu/R first: this file is for R = 1',)),
+        _GITHUB + 'vectr-ucla/direct_lidar_inertial_odometry/blob/master/src/dlio/odom.cc',
+        metric=True),
+    'imu_calib': Format(
+        'imu_calib', '_imu_calib.yaml', 'YAML file of the ROS package', 'force = SM raw - bias',
+        _ALL, affine, _GITHUB + 'dpkoch/imu_calib/blob/master/src/accel_calib/accel_calib.cpp'),
+    'imucal': Format(
+        'imucal', '_imucal.json', 'FerrarisCalibrationInfo as JSON',
+        'force = R_a^-1 K_a^-1 (raw - b_a)', f'{_ALL}, gyro bias', imucal,
+        'https://imucal.readthedocs.io/en/latest/modules/generated/imucal.html'),
+    'kalibr': Format(
+        'Kalibr', '_imu.yaml', 'imu.yaml with the noise', 'none', 'noise',
+        partial(noise_alone, label='Kalibr'), _GITHUB + 'ethz-asl/kalibr/wiki/IMU-Noise-Model',
+        needs='noise'),
+    'vins': Format(
+        'VINS', '_vins.yaml', 'lines of the noise for its configuration', 'none', 'noise',
+        partial(noise_alone, label='VINS'), _GITHUB + 'HKUST-Aerial-Robotics/VINS-Fusion/blob/'
+        'master/vins_estimator/src/factor/integration_base.h', needs='noise'),
+    'json': Format('JSON', '.json', 'all values', _OF_FILE, 'everything', _json),
+    'npz': Format('NumPy', '.npz', 'all values as arrays', _OF_FILE, 'everything', _npz)})
 """The formats by name."""
 
 CALIBRATION_ALONE = tuple(name for name, each in FORMATS.items() if each.needs != 'noise')
@@ -334,7 +229,7 @@ def export(calibration: Calibration, to: str, noise: Noise | None = None,
     to : str
         One of `FORMATS`.
     noise : mapping, optional
-        Noise of the sensor (`read_noise`), for ``kalibr`` and ``vins``.
+        Noise of the sensor (`read_noise`), for formats that need it.
     options : Options
         Choices that some formats have.
 
@@ -350,12 +245,23 @@ def export(calibration: Calibration, to: str, noise: Noise | None = None,
         raise ValueError(f'format is {to!r}, expected one of {", ".join(FORMATS)}')
     chosen = FORMATS[to]
     beside = {'': (), 'options': (options,), 'noise': (noise,)}[chosen.needs]
+    if chosen.metric and calibration.units.is_native:
+        raise InputError(
+            f'the calibration is for native readings, but {chosen.label} corrects readings in '
+            f'm/s2', f'fit a calibration to the readings that {chosen.label} logs in m/s2')
 
     def make(of: Calibration) -> Made:
-        return chosen.make(of, *beside)
+        if not chosen.metric:
+            return chosen.make(of, *beside)
+        metric = of.in_units('m/s2')
+        made, factor = chosen.make(metric, *beside), metric.units.per_g / of.units.per_g
+        correct = made.correct
+        return made if correct is None else replace(
+            made, correct=lambda reading, temperature: correct(reading * factor, temperature))
 
     made = make(calibration)
-    return Exported(made.content, chosen.suffix, difference_mg(calibration, made),
+    content = made.data or rendered(to, chosen, calibration, made)
+    return Exported(content, chosen.suffix, difference_mg(calibration, made),
                     losses_of(calibration, chosen.label, make, made), made.notes)
 
 

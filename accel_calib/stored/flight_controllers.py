@@ -2,14 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Parameters of flight controllers: PX4, ArduPilot and Betaflight.
+Parameters of flight controllers, and registers of a chip.
 
 =========== ============================================================== ====================
-format      equation of the firmware                                       readings
+format      equation, by axis                                              readings
 =========== ============================================================== ====================
-PX4         (raw - thermal(T - TREF) - OFF) SCALE, by axis                 m/s², sensor_accel
-ArduPilot   (raw - p(T - 35 °C) + p(CALTEMP - 35 °C) - OFFS) SCAL, by axis m/s², IMU message
-Betaflight  (raw - acc_calibration) / acc_1G, by axis                      counts
+PX4         (raw - thermal(T - TREF) - OFF) SCALE                          m/s², sensor_accel
+ArduPilot   (raw - p(T - 35 °C) + p(CALTEMP - 35 °C) - OFFS) SCAL          m/s², IMU message
+Betaflight  (raw - acc_calibration) / acc_1G                               counts
+iNav        (raw - acczero) accgain / 4096 / acc_1G                        counts
+MPU-6050    raw + change of the register                                   1/2048 g
 =========== ============================================================== ====================
 
 T is limited to the range of the polynomial. The values are the least-squares fit over the sphere
@@ -19,7 +21,7 @@ those of the vehicle; the log also states the place of the sensor in the paramet
 turn readings to x forward, y left, z up;
 ``axes='flu'`` turns them back by 180° about x, which changes the sign of the offsets of y and z.
 
-Sources beside the code of the firmware (the URLs below): temperature of PX4 [1]_ and of
+Sources beside those of the formats (`exports`): temperature of PX4 [1]_ and of
 ArduPilot [2]_, and the parameter file of QGroundControl [3]_.
 
 .. [1] https://docs.px4.io/main/en/advanced_config/sensor_thermal_calibration
@@ -33,29 +35,21 @@ from dataclasses import replace
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from .made import (
-    commented, Format, Made, Options, polynomial, single, steady_at, steady_grid,
-    temperature_range)
+from .c_header import name_of
+from .made import Made, Options, polynomial, single, steady_at, steady_grid, temperature_range
 from ..calibrate import Calibration
 from ..errors import InputError
 from ..logs import ARDUPILOT_REFERENCE, ByAxis, DEGREE, PER_MILLION
 from ..table import Autopilot, Firmware, Floats
 from ..units import STANDARD_GRAVITY
 
-_PX4_URL = ('https://github.com/PX4/PX4-Autopilot/blob/main/src/lib/sensor_calibration/'
-            'Accelerometer.hpp')
-_ARDUPILOT_URL = ('https://github.com/ArduPilot/ardupilot/blob/master/libraries/'
-                  'AP_InertialSensor/AP_InertialSensor_Backend.cpp')
-_BETAFLIGHT_URL = ('https://github.com/betaflight/betaflight/blob/master/src/main/sensors/'
-                   'acceleration.c')
-
-_INT32, _REAL32 = 6, 9
-"""MAV_PARAM_TYPE of MAVLink."""
-
 _COUNTS_PER_G = 2048.0
 """Counts per g of Betaflight's drivers at the range of 16 g."""
 
 _LARGEST_COUNT = 32767
+_UNIT_GAIN, _LARGEST_GAIN = 4096, 8192
+"""The gain 1 of iNav, and the largest one of its settings.yaml."""
+
 _PX4_INSTANCES, _ARDUPILOT_INSTANCES = (0, 1, 2, 3), (1, 2, 3)
 _TO_FRD = np.array([1.0, -1.0, -1.0])
 """Signs of the axes x forward, y left, z up, in those of an autopilot."""
@@ -107,11 +101,11 @@ def _degree(calibration: Calibration) -> int:
     return len(polynomial(np.linspace(-1.0, 1.0, 9), vec_v, _EXACT_G, DEGREE)) - 1
 
 
-def _make_px4(calibration: Calibration, options: Options) -> Made:
+def px4(calibration: Calibration, options: Options) -> Made:
+    """Return the parameters of PX4."""
     place, options = _place(calibration, options, 'px4')
     instance = _instance(options, _PX4_INSTANCES, 'PX4')
-    metric = _in_metric(calibration, 'PX4')
-    found = _fit_by_axis(metric, options)
+    found = _fit_by_axis(calibration, options)
     prefix = f'CAL_ACC{instance}_'
     thermal = f'TC_A{instance if place.thermal is None else place.thermal}_'
     rows = {**_device(options, prefix), **_three(prefix, 'OFF', found.offset),
@@ -122,24 +116,18 @@ def _make_px4(calibration: Calibration, options: Options) -> Made:
         for order, part in enumerate([np.zeros(3), *found.thermal]):
             rows |= {f'{thermal}X{order}_{axis}': value for axis, value in enumerate(part)}
     ids = f'{prefix}ID' + (f' and {thermal}ID' if found.of_temperature else '')
-    notes = _notes(place)
-    if options.device_id is None:
-        notes += (f'PX4 uses these values for the accelerometer whose device id is in {ids}; '
-                  'check it in QGroundControl, or use --device-id (device_id of sensor_accel)',)
-    comment = [*_notes(place), _AXES[options.axes], f'source: {_PX4_URL}',
-               'equation: (raw - thermal(T - TREF) - OFF) * SCALE, by axis, in m/s^2, before the '
-               'rotation of the board', 'Vehicle-Id Component-Id Name Value Type']
-    lines = [f'1\t1\t{name}\t{_number(value)}\t'
-             f'{_INT32 if isinstance(value, int) else _REAL32}' for name, value in rows.items()]
-    text = commented(calibration, comment, lines)
-    return _made(text, found, metric, calibration, options, notes)
+    advice = () if options.device_id is not None else (
+        f'PX4 uses these values for the accelerometer whose device id is in {ids}; check it in '
+        'QGroundControl, or use --device-id (device_id of sensor_accel)',)
+    made = _made(rows, found, calibration, options, place)
+    return replace(made, notes=made.notes + advice)
 
 
-def _make_ardupilot(calibration: Calibration, options: Options) -> Made:
+def ardupilot(calibration: Calibration, options: Options) -> Made:
+    """Return the parameters of ArduPilot."""
     place, options = _place(calibration, options, 'ardupilot')
     instance = _instance(options, _ARDUPILOT_INSTANCES, 'ArduPilot')
-    metric = _in_metric(calibration, 'ArduPilot')
-    found = _fit_by_axis(metric, options, ARDUPILOT_REFERENCE)
+    found = _fit_by_axis(calibration, options, ARDUPILOT_REFERENCE)
     prefix = f'INS_ACC{"" if instance == 1 else instance}'
     # The firmware adds the polynomial at CALTEMP, so that it is zero there.
     offset = found.offset + found.moved(ARDUPILOT_REFERENCE)
@@ -153,12 +141,7 @@ def _make_ardupilot(calibration: Calibration, options: Options) -> Made:
     if found.of_temperature or place.thermal is not None:  # zeros replace those of the vehicle
         for order, part in enumerate(found.thermal, 1):
             rows |= _three(f'{thermal}ACC{order}_', '', part * PER_MILLION)
-    comment = [*_notes(place), _AXES[options.axes], f'source: {_ARDUPILOT_URL}',
-               'equation: (raw - p(T - 35) + p(CALTEMP - 35) - OFFS) * SCAL, by axis, in m/s^2, '
-               'before the rotation of the board; p has the coefficients INS_TCAL / 1e6']
-    lines = [f'{name},{_number(value)}' for name, value in rows.items()]
-    return _made(commented(calibration, comment, lines), found, metric, calibration, options,
-                 _notes(place))
+    return _made(rows, found, calibration, options, place)
 
 
 def _place(calibration: Calibration, options: Options, firmware: Firmware
@@ -174,54 +157,61 @@ def _place(calibration: Calibration, options: Options, firmware: Firmware
         device_id=stated.device_id if options.device_id is None else options.device_id)
 
 
-def _notes(place: Autopilot) -> tuple[str, ...]:
-    """Return a note on readings that the old parameters still correct."""
-    return (f'do not load this file: the readings were corrected already, and by what is not '
-            f'known ({place.corrected})',) if place.corrected else ()
-
-
-def _made(text: str, found: ByAxis, metric: Calibration, calibration: Calibration,
-          options: Options, notes: tuple[str, ...]) -> Made:
-    """Return the file with the correction by its values, in single precision."""
+def _made(rows: Parameters, found: ByAxis, calibration: Calibration, options: Options,
+          place: Autopilot) -> Made:
+    """Return parameters with the correction by their values, in single precision."""
     written = replace(found, offset=single(found.offset), scale=single(found.scale),
                       thermal=single(found.thermal))
-    factor, signs = metric.units.per_g / calibration.units.per_g, _signs(options)
-    return Made(text, lambda reading, temperature: written.correct(
-        reading * factor * signs, temperature) * signs / metric.units.per_g, False, notes)
+    signs, per_g = _signs(options), calibration.units.per_g
+    notes = (f'do not load this file: the readings were corrected already, and by what is not '
+             f'known ({place.corrected})',) if place.corrected else ()
+    return Made({'rows': rows}, lambda reading, temperature: written.correct(
+        reading * signs, temperature) * signs / per_g, False, (*notes, _AXES[options.axes]), notes)
 
 
-def _make_betaflight(calibration: Calibration, options: Options) -> Made:
-    signs, per_g, units = _signs(options), _counts_per_g(calibration, options), calibration.units
-    factor = 1.0 if units.is_native else per_g / (STANDARD_GRAVITY if units.is_si else 1.0)
+def counts(calibration: Calibration, options: Options, label: str, with_gain: bool = False,
+           register_per_g: float | None = None, step: int = 1, notes: tuple[str, ...] = ()
+           ) -> Made:
+    """
+    Return the whole numbers zero and gain of the correction (raw - zero) gain / 4096 in counts.
+
+    The counts are those of the readings, or of a register with this many per g. `step` is the
+    smallest change of zero. InputError is raised for values that the program refuses.
+
+    """
+    signs, units, per_g = _signs(options), calibration.units, _counts_per_g(calibration, options)
+    unit = register_per_g or per_g
+    factor = unit / (per_g if units.is_native else STANDARD_GRAVITY if units.is_si else 1.0)
     grid = steady_grid(calibration)
-    counts = np.round(np.mean(grid.reading * factor - grid.force * per_g, axis=0) * signs)
-    if np.max(np.abs(counts)) > _LARGEST_COUNT:
-        raise InputError(f'the largest offset is {np.max(np.abs(counts)):.0f} counts, expected at '
+    raw, force = grid.reading * factor * signs, grid.force * unit * signs
+    slope, zero = np.ones(3), np.mean(raw - force, axis=0)
+    if with_gain:
+        slope, start = np.transpose([np.polyfit(*each, 1) for each in zip(raw.T, force.T)])
+        zero = -start / slope
+    zero, gain = np.round(zero / step) * step, np.round(slope * _UNIT_GAIN)
+    if np.max(np.abs(zero)) > _LARGEST_COUNT:
+        raise InputError(f'the largest offset is {np.max(np.abs(zero)):.0f} counts, expected at '
                          f'most {_LARGEST_COUNT}', 'correct --counts-per-g')
-    comment = [_AXES[options.axes], f'source: {_BETAFLIGHT_URL}',
-               f'equation: (raw - acc_calibration) / acc_1G, by axis, acc_1G = {per_g:g} counts; '
-               'the fourth number says that the calibration is done']
-    values = ','.join(f'{int(value)}' for value in counts)
-    text = commented(calibration, comment, [f'set acc_calibration = {values},1', 'save'])
-    return Made(text, lambda reading, temperature: (reading * factor - counts * signs) / per_g,
-                False, rounded={'offset': 'counts'})
+    if np.min(gain) < 1 or np.max(gain) > _LARGEST_GAIN:
+        raise InputError(f'the gains are {", ".join(f"{each:.0f}" for each in gain)}, but {label} '
+                         f'takes 1 to {_LARGEST_GAIN} ({_UNIT_GAIN} is 1)', 'correct '
+                         '--counts-per-g, or fit the calibration to readings in m/s2 or g')
+    rounded = {'offset': 'counts' if step == 1 else f'steps of {step}/{unit:g} g',
+               **dict.fromkeys(('gain', 'axis_gain') if with_gain else (), f'1/{_UNIT_GAIN}')}
+    values = {'name': name_of(calibration, options), 'zero': zero.astype(int),
+              'gain': gain.astype(int)}
+    return Made(values, lambda reading, temperature: (
+        reading * factor * signs - zero) * signs * gain / (_UNIT_GAIN * unit), False,
+        (_AXES[options.axes], f'1 g = {unit:g} counts'), notes, rounded)
 
 
 def _counts_per_g(calibration: Calibration, options: Options) -> float:
-    """Return the counts per g of the firmware: those asked for, or a power of two near them."""
+    """Return the counts per g of the readings: those asked for, or a power of two near them."""
     if options.counts_per_g is not None:
         return options.counts_per_g
     if not calibration.units.is_native:
         return _COUNTS_PER_G
     return float(2.0 ** np.round(np.log2(calibration.units.per_g)))
-
-
-def _in_metric(calibration: Calibration, label: str) -> Calibration:
-    """Return the calibration for readings in m/s²; raise InputError if they are native."""
-    if calibration.units.is_native:
-        raise InputError(f'the calibration is for native readings, but {label} corrects readings '
-                         'in m/s2', f'fit a calibration to the readings that {label} logs in m/s2')
-    return calibration.in_units('m/s2')
 
 
 def _instance(options: Options, known: tuple[int, ...], label: str) -> int:
@@ -243,21 +233,3 @@ def _device(options: Options, prefix: str) -> Parameters:
 
 def _three(start: str, end: str, values: Floats) -> Parameters:
     return {f'{start}{axis}{end}': float(value) for axis, value in zip('XYZ', values)}
-
-
-def _number(value: float) -> str:
-    """Return a number in single precision without exponent."""
-    if isinstance(value, int):
-        return str(value)
-    positive_zero = np.float32(value) + np.float32(0.0)
-    return np.format_float_positional(positive_zero, unique=True, trim='0')
-
-
-FORMATS = {
-    'px4': Format('PX4', '_px4.params', 'parameter file of QGroundControl', _make_px4, 'options',
-                  _PX4_URL),
-    'ardupilot': Format('ArduPilot', '_ardupilot.param',
-                        'parameter file of Mission Planner and MAVProxy', _make_ardupilot,
-                        'options', _ARDUPILOT_URL),
-    'betaflight': Format('Betaflight', '_betaflight.txt', 'commands for its command line',
-                         _make_betaflight, 'options', _BETAFLIGHT_URL)}

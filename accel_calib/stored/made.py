@@ -17,8 +17,9 @@ the poses.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from textwrap import wrap
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -27,7 +28,11 @@ from ..effects import (
     AtContext, Context, effect_named, formula_of, Model, NOMINAL_SUPPLY, REFERENCE_TEMPERATURE)
 from ..geometry import angle_of, OVER_THE_SPHERE, spread_directions
 from ..table import Floats
+from ..text import plain
 from ..units import MG, Units
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
 
 Correction = Callable[[Floats, Floats], Floats]
 """(n, 3) readings in the unit of the calibration, (n,) temperatures [°C] -> (n, 3) force [g]."""
@@ -38,7 +43,7 @@ _DIRECTIONS = 100
 LEAST_LOSS_MG = 0.005
 """Smaller losses are not mentioned: rounding to single precision causes about 0.0001 mg."""
 
-TITLE = 'Calibration of an accelerometer, written by accel-calib export.'
+TITLE = 'Calibration of an accelerometer, written by accel-calib export'
 _LARGEST_TEXT = 200
 _TEMPERATURE_KEYS = ('temperature', 'temperature_of_offset', 'temperature_of_gain')
 _AXES = {'ros': 'x forward, y left, z up', 'ned': 'x north, y east, z down, read along gravity',
@@ -76,19 +81,23 @@ class Options:
 @dataclass(frozen=True)
 class Made:
     """
-    The content of a file, and what it does.
+    The values of an export, and what they do.
 
-    `correct` is the correction that the written values make by the equation of the format; None
-    for a format that holds everything. `levelled` states whether it includes the mounting, and
-    `rounded` what the values of an effect are rounded to. `notes` say what the user has to do.
+    `values` fill the template of the format: numbers, arrays and text of one line; `data` is the
+    whole file instead, if it is no text. `correct` is the correction that they make by the
+    equation of the format; None for a format that holds everything. `levelled` states whether it
+    includes the mounting, and `rounded` what the values of an effect are rounded to. `comment` are
+    more lines for the comment of the file, and `notes` say what the user has to do.
 
     """
 
-    content: str | bytes
+    values: Mapping[str, Any]
     correct: Correction | None
     levelled: bool
+    comment: Sequence[str] = ()
     notes: tuple[str, ...] = ()
     rounded: Mapping[str, str] = field(default_factory=dict)
+    data: bytes = b''
 
 
 @dataclass(frozen=True)
@@ -97,18 +106,22 @@ class Format:
     A format that a calibration can be exported to.
 
     `label` is the name of what reads the file, `suffix` the end of its name, `what` its content in
-    a few words, and `source` the definition of the format; empty for formats of this package.
-    `make` returns the file of a calibration. What it `needs` beside is ``options``, or the
-    ``noise`` of the sensor.
+    a few words, `equation` how the reader corrects, `holds` which effects it has, and `source` the
+    definition of the format; empty for formats of this package. `make` returns the values of a
+    calibration for the template. What it `needs` beside is ``options``, or the ``noise`` of the
+    sensor. A `metric` reader takes readings in m/s² only.
 
     """
 
     label: str
     suffix: str
     what: str
+    equation: str
+    holds: str
     make: Callable[..., Made]
-    needs: str = ''
     source: str = ''
+    needs: str = ''
+    metric: bool = False
 
 
 @dataclass(frozen=True)
@@ -229,8 +242,8 @@ def losses_of(calibration: Calibration, label: str, make: Callable[[Calibration]
             found.append(Loss('', f'{label} leaves {total:.2g} mg in all{where}', total))
     if calibration.is_levelled and not made.levelled:
         angle = angle_of(calibration.rotation)
-        found.append(Loss('mounting', f'{label} has its own setting for the mounting: this file '
-                          f'leaves the rotation of {angle:.2f} deg',
+        found.append(Loss('mounting', f'this file of {label} holds no mounting: it leaves the '
+                          f'rotation of {angle:.2f} deg',
                           2.0 * np.sin(np.radians(angle) / 2.0) * np.sqrt(2.0 / 3.0) * MG))
     return tuple(found)
 
@@ -334,14 +347,62 @@ def about(calibration: Calibration) -> list[str]:
     return lines
 
 
-def commented(calibration: Calibration, comment: Sequence[str], lines: Sequence[str]) -> str:
-    """Return the text of a file with these lines, and a comment on top."""
-    above = [TITLE, *about(calibration), *comment]
-    return '\n'.join([*(f'# {line}' for line in above), *lines, ''])
-
-
 def frame_words(calibration: Calibration) -> str:
     """Return the frame of the levelled force in words."""
     if not calibration.is_levelled:
         return 'in the axes of the sensor'
     return f'in the levelled frame {calibration.frame}: {_AXES[calibration.frame]}'
+
+
+# The templates
+
+
+def rendered(name: str, chosen: Format, calibration: Calibration, made: Made) -> str:
+    """Return the text of a file, from the template of this name."""
+    of_reader = [f'source: {chosen.source}', f'equation: {chosen.equation}']
+    comment = [TITLE, *about(calibration), *(of_reader if chosen.source else ()), *made.comment]
+    template = _environment().get_template(f'{name}.j2')
+    return template.render({**plain(made.values), 'comment': comment})
+
+
+@cache
+def _environment() -> 'Environment':
+    """Return the environment of the templates."""
+    # The import is here because it would slow down commands that export nothing.
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    made = Environment(loader=PackageLoader('accel_calib.stored'), undefined=StrictUndefined,
+                       trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)
+    made.policies['json.dumps_kwargs'] = {'allow_nan': False}
+    made.filters |= {'lines': _lines, 'yaml': _yaml, 'single': _single, 'literal': literal,
+                     'flat': lambda rows: np.ravel(rows).tolist(),
+                     'transposed': lambda rows: np.transpose(rows).tolist()}
+    return made
+
+
+def _lines(lines: Sequence[str], mark: str) -> str:
+    return '\n'.join(f'{mark} {line}'.rstrip() for line in lines)
+
+
+def _yaml(value: Any) -> str:
+    """Return numbers for YAML 1.1, which reads 1e-05 without a point as text."""
+    if isinstance(value, list):
+        return f'[{", ".join(map(_yaml, value))}]'
+    mantissa, exponent, power = repr(float(value)).partition('e')
+    return mantissa + ('' if '.' in mantissa else '.0') + exponent + power
+
+
+def _single(value: float) -> str:
+    """Return a number in single precision without exponent."""
+    if isinstance(value, int):
+        return str(value)
+    positive_zero = np.float32(value) + np.float32(0.0)
+    return np.format_float_positional(positive_zero, unique=True, trim='0')
+
+
+def literal(value: Any) -> str:
+    """Return numbers as literals of C in single precision."""
+    if isinstance(value, list):
+        return f'{{{", ".join(map(literal, value))}}}'
+    text = str(np.float32(value))
+    return f'{text}f' if set('.e') & set(text) else f'{text}.0f'
