@@ -484,7 +484,13 @@ def calibrated_log(source: Source, options: LogOptions, found: Intake, plan: Pla
             if high - low >= LEAST_RANGE:
                 return thermally_calibrated([
                     RampIntake(ramp_of(cells), log.units, log.read_as, log.notes)], plan)
-    outcome = calibrated(found.poses, found.units, plan)
+    try:
+        outcome = calibrated(found.poses, found.units, plan)
+    except RefusedFitError as err:
+        for each in found.findings:
+            if each.kind == 'not_taken':  # the poses that are missing were rests
+                raise RefusedFitError(f'{err.message}; {each.text}', each.advice) from None
+        raise
     made = outcome.calibration
     return replace(outcome, calibration=replace(made, noted=(*made.noted, *found.findings)))
 

@@ -74,7 +74,7 @@ _FIGURES = [
     ('along', float),         # the same along the mean reading, if that is the vertical
     ('beside_slope', bool),   # the reading has a slope directly before or after
     ('short', bool),          # shorter than `min_dwell`
-    ('at_limit', float),      # share of samples that repeat the extreme of an axis so far
+    ('at_limit', float, 3),   # share of samples that repeat the extreme of an axis so far
     ('orientation', np.intp),
     ('part_slope', float, 3), ('part_strength', float, 3)]  # first, middle and last half
 """Means and variances in the unit of the readings, slopes per cell, `part_slope` per second."""
@@ -104,7 +104,7 @@ def figures(dwells: Sequence[OngoingDwell], *, known_units: bool) -> Records:
         found[name] = [getattr(dwell, name) for dwell in dwells]
     found['time'] = [dwell.epoch for dwell in dwells] + total['time'] / total['count']
     found['samples'] = total['count']
-    found['at_limit'] = total['at_limit'].max(axis=1) / total['count']
+    found['at_limit'] = total['at_limit'] / count
     known = total['context_count']
     found['around'] = np.where(known > 0.0, total['context_sum'], np.nan) / np.maximum(known, 1.0)
     return found
@@ -193,8 +193,12 @@ class Rest(NamedTuple):
     reason: str = ''
 
 
-_AT_LIMIT = 0.2
-"""Share of samples that repeat the extreme of an axis above which a rest is at a limit."""
+_AT_LIMIT, _QUIETER = 0.2, 0.6
+"""Share of samples that repeat the extreme of an axis, and standard deviation relative to that of
+other rests, above and below which a rest is at a limit."""
+
+_STUCK = 1e-3
+"""Range of an axis, relative to the largest reading, below which it is stuck."""
 
 _OWN_EXCESS = 1.5   # factor of uncertainty of the excess of one dwell
 _BIAS_DWELLS = 5    # fewest dwells that determine the bias of the gyro
@@ -261,15 +265,17 @@ def judged(table: Records, rule: Rule, context: Sequence[str], first: int = 0) -
     frozen = np.zeros(len(table), bool) if rule.repeats else np.all(
         table['std'] <= RELATIVE * np.linalg.norm(means, axis=1)[:, np.newaxis], axis=1)
     limit = rule.limit_of(rule.noise_of(table['mean'].T), DWELL_RATIO, DWELL_RATE_RATIO)
-    reasons = {'short': table['short'], 'frozen': frozen,
-               'limit': (table['at_limit'] > _AT_LIMIT) & (not rule.repeats),
+    turned = np.ptp(means, axis=0) > _STUCK * np.max(np.abs(means))  # else an axis is stuck
+    quieter = table['std'] < _QUIETER * np.median(table['std'], axis=0)
+    ends = np.any((table['at_limit'] > _AT_LIMIT) & turned & quieter, axis=1)
+    reasons = {'short': table['short'], 'frozen': frozen, 'limit': ends & (not rule.repeats),
                'shaking': np.any(limit < table['lowest'].T, axis=0),
                'slope': _sloping(table, slopes, rule)}
     quiet = ~np.any(list(reasons.values()), axis=0)
     across, along = (_excess(table[name], quiet) for name in ('excess', 'along'))
     excess = np.minimum(across, along)
-    turned, sure = _by_gyro(table, quiet, rule)
-    reasons |= {'turning': turned, 'noisy': ~sure & ~rule.rests(slopes, across)}
+    turning, sure = _by_gyro(table, quiet, rule)
+    reasons |= {'turning': turning, 'noisy': ~sure & ~rule.rests(slopes, across)}
     good = ~np.any(list(reasons.values()), axis=0)
     reasons['length'] = np.zeros(len(table), bool)
     reasons['length'][good] = ~rule.reads_gravity(means[good])
