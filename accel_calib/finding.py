@@ -47,6 +47,7 @@ KINDS: Mapping[str, str] = MappingProxyType({
     'thermal_hysteresis': 'the readings differ between warming and cooling',
     'not_corrected': 'an effect cannot be corrected in single samples',
     'omitted': 'a smaller model omits what the poses do not determine',
+    'limited': 'readings end at the limit of the sensor',
     'not_taken': 'most rests of the recording are no poses',
     'new_orientations': 'the error in new orientations is larger than a limit',
     'far_from_poses': 'the error is large where there is no pose',

@@ -159,7 +159,7 @@ def _captured(source: Source, log: OpenLog, options: LogOptions, settings: Mappi
     asked = settings_from(settings, log.units)
     found = capture(log.watched(progress), log.units, asked)
     _check_measured(found, log.units)
-    count, findings = len(found.poses), _account_of(found, asked, log.units)
+    count, findings = len(found.poses), _account_of(found, asked)
     limit, more = _wider(source, found, log.units, options, settings) if count < _FEW else (0.0, 0)
     finds = f'{more} with still_std_max {limit:.3g}'
     if not count:
@@ -176,7 +176,6 @@ def _captured(source: Source, log: OpenLog, options: LogOptions, settings: Mappi
 _REMEDIES = {
     'short': 'hold the sensor still for longer in each pose, or capture shorter rests with '
              '--min-dwell {seconds:.2g}',
-    'limit': 'choose a larger range of the sensor, and record again',
     'shaking': 'put the sensor on something that does not shake, or accept it with '
                '--still-std-max',
     'slope': 'let go of the sensor, and wait until it has settled',
@@ -204,7 +203,7 @@ def _check_measured(found: Captured, units: Units) -> None:
             'record the accelerometer itself, with gravity')
 
 
-def _account_of(found: Captured, asked: CaptureSettings, units: Units) -> tuple[Finding, ...]:
+def _account_of(found: Captured, asked: CaptureSettings) -> tuple[Finding, ...]:
     """Return what was left out of a recording, and why most rests are no poses, if so."""
     of_reason: dict[str, list[float]] = {}
     for each in found.rests:
@@ -214,15 +213,13 @@ def _account_of(found: Captured, asked: CaptureSettings, units: Units) -> tuple[
     dropped = {reason: lengths for reason, lengths in of_reason.items()
                if reason not in ('', 'zeros', 'frozen', 'repeated')}
     count, every = sum(map(len, dropped.values())), len(of_reason.get('', ()))
-    if count <= every and 'limit' not in dropped:
+    if count <= every:
         return tuple(missing)
-    most = max(dropped, key=lambda reason: (count <= every and reason == 'limit',
-                                            len(dropped[reason])))
+    most = max(dropped, key=lambda reason: len(dropped[reason]))
     seconds = min(0.9 * float(np.median(dropped[most])), 0.8 * asked.min_dwell)
-    limit = f', at {short(found.limit)} {units.name}' if most == 'limit' else ''
     return (*missing, Finding(
         'not_taken', f'{len(dropped[most])} of {counted(count + every, "rest")} are no poses: '
-        f'{REASONS[most]}{limit}', _REMEDIES[most].format(seconds=seconds), 'USABLE',
+        f'{REASONS[most]}', _REMEDIES[most].format(seconds=seconds), 'USABLE',
         step='record'))
 
 

@@ -75,6 +75,7 @@ COLUMNS: dict[str, Column] = {
     'label': Column(('label',), '', 'free text'),
     'doubtful': Column(('doubtful',), '',
                        '1: the sensor may have moved, according to later rests'),
+    'at_limit': Column(('at_limit',), '', '1: the samples end at the limit of the sensor'),
     'own_scatter': Column(('own_scatter_x', 'own_scatter_y', 'own_scatter_z'),
                           'unit of the reading', 'standard deviation of a pose beyond the noise '
                           'of its mean', made=True),

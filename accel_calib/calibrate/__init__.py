@@ -17,7 +17,7 @@ from .calibration import (
     RejectedKind, SampleContext, STORED_METHODS, thermal_stream, USES_LIMIT, with_history,
     with_previous)
 from .fit import (
-    directions_of, fit_poses, fit_unknown, only_norm, rejected_by, sound_rows, sure_rows)
+    CLIPPED, directions_of, fit_poses, fit_unknown, only_norm, rejected_by, sound_rows, sure_rows)
 from .mounting import (
     angle_words, flat_direction, in_frame, level, level_by_rows, mounting_figures, mounting_of,
     mounting_words, on_topics, set_heading, with_given_mounting)
@@ -32,9 +32,9 @@ from .quality import (
 from .rest_noise import gyro_bias_of, GyroBias, sample_noise_of, SampleNoise, with_rest_noise
 from .thermal import Curve, curve_of, thermal_alone, with_curve, without_curve
 
-__all__ = ['FLEET', 'LARGEST_DILUTION', 'LARGEST_OFFSET_G', 'NORM_MODELS', 'OF_A_FIT', 'PRIOR',
-           'STORED_METHODS', 'USES_LIMIT', 'Calibration', 'Curve', 'FleetPrior', 'GyroBias',
-           'NextPose', 'Outlook', 'Outside', 'Quality', 'Rejected', 'RejectedKind',
+__all__ = ['CLIPPED', 'FLEET', 'LARGEST_DILUTION', 'LARGEST_OFFSET_G', 'NORM_MODELS', 'OF_A_FIT',
+           'PRIOR', 'STORED_METHODS', 'USES_LIMIT', 'Calibration', 'Curve', 'FleetPrior',
+           'GyroBias', 'NextPose', 'Outlook', 'Outside', 'Quality', 'Rejected', 'RejectedKind',
            'SampleContext', 'SampleNoise', 'Verification', 'angle_words', 'check_sensor',
            'curve_of', 'determines', 'deviations_g', 'dilution', 'directions_in', 'directions_of',
            'error_left_in', 'errors_after', 'errors_before', 'fit_findings', 'fit_partial',

@@ -45,7 +45,7 @@ from ..estimate import (
 from ..finding import Finding
 from ..geometry import rms, unit
 from ..table import check_units, Poses
-from ..text import listed
+from ..text import listed, short
 from ..units import Floats, Indices, Method, METHODS, MG, MODEL_NAMES, Units
 
 _LARGEST_REST_G = 3.0
@@ -67,6 +67,8 @@ _LEAST_RATIO = 4.0
 _WARN_DEGREES = 0.2
 _WARN_CHI2 = 4.0
 """Residuals above both limits cause a finding about the placement."""
+
+CLIPPED = 'the reading is clipped at the limit of the sensor'
 
 _ROUNDS = 20
 _SMALL_ANGLE = 1e-6
@@ -109,13 +111,20 @@ def fit_poses(poses: Poses, units: Units, *, model: str = 'auto', method: Method
     if rejected and method == 'algebraic':
         raise RefusedFitError(f'row {rejected[0].row}: {rejected[0].reason}, but the method '
                               'algebraic uses every row', 'remove the row, or use the method ml')
-    calibration, rejected = _without_doubtful(sound, rejected, units, model, method)
+    inside, ended, limited = inside_rows(sound, units) if method == 'ml' else (sound, (), ())
+    try:
+        calibration, rejected = _without_doubtful(inside, (*rejected, *ended), units, model,
+                                                  method)
+    except RefusedFitError as err:
+        for each in limited:
+            raise RefusedFitError(f'{err.message}; {each.text}', each.advice) from None
+        raise
     left_out = sorted((*rejected, *calibration.rejected), key=lambda pose: pose.row)
     # The fitted table has references that the input may lack.
     every = calibration.poses if len(calibration.poses) == len(poses) else poses
     return finished(replace(
         calibration, poses=every, rejected=tuple(left_out),
-        noted=(*wiring(calibration), *calibration.noted)), sensor, date)
+        noted=(*wiring(calibration), *limited, *calibration.noted)), sensor, date)
 
 
 def _without_doubtful(poses: Poses, rejected: tuple[Rejected, ...], units: Units, model: str,
@@ -162,6 +171,21 @@ def sound_rows(poses: Poses, units: Units) -> tuple[Poses, tuple[Rejected, ...]]
                          f'the uncertainty of the mean is {largest[k]:.3g}, so the sensor was not '
                          'at rest') for k in np.flatnonzero(bad)]
     return (poses.take(~bad), tuple(rejected)) if rejected else (poses, ())
+
+
+def inside_rows(poses: Poses, units: Units
+                ) -> tuple[Poses, tuple[Rejected, ...], tuple[Finding, ...]]:
+    """Separate poses from those that the capture marked as at the limit of the sensor."""
+    ended = poses['at_limit'] > 0.0 if 'at_limit' in poses else np.zeros(len(poses), bool)
+    if not np.any(ended):
+        return poses, (), ()
+    rows = tuple(poses.row[ended].tolist())
+    limit = float(np.max(np.abs(poses.reading[ended])))
+    return poses.take(~ended), tuple(
+        Rejected(row, CLIPPED, 'clipped') for row in rows), (Finding(
+            'limited', f'{len(rows)} of {len(poses)} poses are left out, because the readings end '
+            f'at {short(limit)} {units.name}, the limit of the sensor', 'choose a larger range of '
+            'the sensor, and record again', 'USABLE', rows, 'record'),)
 
 
 def sure_rows(poses: Poses) -> tuple[Poses, tuple[Rejected, ...]]:

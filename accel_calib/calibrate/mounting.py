@@ -325,11 +325,11 @@ def doubts_about_flat(rotation: Floats, frame: str) -> Iterator[Finding]:
     face = int(np.argmax(np.abs(force)))
     seen = f'{"-" if force[face] < 0.0 else "+"}{AXES[face]}'
     lean = math.degrees(math.acos(min(abs(force[face]), 1.0)))
-    if lean > _LEANS_DEGREES:
-        yield Finding('flat_pose', f'the flat pose leans {lean:.1f}° from the side {seen} of the '
-                      'sensor: the sensor is mounted at this angle, or the robot was not level',
-                      'if it was not level, level the mounting again')
     if force @ expected >= _UPRIGHT:
+        if lean > _LEANS_DEGREES:
+            yield Finding('flat_pose', f'the flat pose leans {lean:.1f}° from the side {seen} of '
+                          'the sensor: the sensor is mounted at this angle, or the robot was not '
+                          'level', 'if it was not level, level the mounting again')
         return
     if face == 2:
         causes = 'it is mounted upside down, or z (or every axis) has the wrong sign'

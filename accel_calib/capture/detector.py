@@ -223,8 +223,7 @@ class Captured:
     `threshold` is the standard deviation below which a window is still, at the end, and `quietest`
     that of the quietest window, each of the axis with the largest one [unit of the readings].
     `seconds` is the duration of the recording without interruptions [s]. `rests` is the account of
-    every rest, in order of time. `limit` is the largest reading of those at a limit of the sensor,
-    0 without one. `lengths` are the smallest and the largest |reading| of all samples.
+    every rest, in order of time. `lengths` are the smallest and the largest |reading|.
 
     """
 
@@ -236,7 +235,6 @@ class Captured:
     recorded: int
     quietest: float
     rests: tuple[Rest, ...]
-    limit: float
     lengths: tuple[float, float]
 
 
@@ -289,8 +287,7 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
                     detector.threshold, seconds - sum(each.seconds for each in interruptions),
                     interruptions, recorded, detector.quietest,
                     tuple(sorted((*rests, *detector.missing))),
-                    max((float(np.max(np.abs(each.mean))) for each in every
-                         if each.reason == 'limit'), default=0.0), (shortest, longest))
+                    (shortest, longest))
 
 
 def samples_of(recording: Recording, start: int, stop: int, context: Sequence[str] = CONTEXT
@@ -333,7 +330,7 @@ def poses_from(dwells: Sequence[Dwell], settings: CaptureSettings = CaptureSetti
     Return the pose table of these dwells.
 
     It has the columns that all dwells have, ``orientation`` if ``max_dwell`` is finite, and
-    ``doubtful`` if a dwell is doubtful.
+    ``doubtful`` and ``at_limit`` if a dwell is.
 
     """
     def of(name: str) -> Floats:
@@ -349,8 +346,9 @@ def poses_from(dwells: Sequence[Dwell], settings: CaptureSettings = CaptureSetti
         columns['rate_std'] = of('rate_std')
     if np.isfinite(settings.max_dwell):
         columns['orientation'] = of('orientation').astype(np.int64)
-    if any(each.doubtful for each in dwells):
-        columns['doubtful'] = of('doubtful')
+    for name in ('doubtful', 'at_limit'):
+        if any(getattr(each, name) for each in dwells):
+            columns[name] = of(name)
     return Poses(columns, numbered(columns))
 
 

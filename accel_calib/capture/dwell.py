@@ -174,7 +174,6 @@ PART_STRENGTH = 20.0
 REASONS = {
     'zeros': 'samples are missing: they are 0 on all axes',
     'frozen': 'samples are missing: the last reading is repeated, though no other rest repeats it',
-    'limit': 'it is at the limit of the sensor, where its readings end',
     'short': 'it is shorter than min_dwell',
     'shaking': 'it varies more than the noise of the sensor',
     'slope': 'the reading changes during it',
@@ -233,6 +232,8 @@ class Dwell:
         White noise of one sample of the angular rate [rad/s]; NaN without a rate.
     reason : str
         Why it is no pose, one of `REASONS`; empty for a pose.
+    at_limit : bool
+        Whether the samples of an axis end at the limit of the sensor.
 
     """
 
@@ -248,6 +249,7 @@ class Dwell:
     doubtful: bool = False
     rate_std: Floats = field(default_factory=lambda: np.full(3, np.nan))
     reason: str = ''
+    at_limit: bool = False
 
     @property
     def rest(self) -> Rest:
@@ -268,7 +270,7 @@ def judged(table: Records, rule: Rule, context: Sequence[str], first: int = 0) -
     turned = np.ptp(means, axis=0) > _STUCK * np.max(np.abs(means))  # else an axis is stuck
     quieter = table['std'] < _QUIETER * np.median(table['std'], axis=0)
     ends = np.any((table['at_limit'] > _AT_LIMIT) & turned & quieter, axis=1)
-    reasons = {'short': table['short'], 'frozen': frozen, 'limit': ends & (not rule.repeats),
+    reasons = {'short': table['short'], 'frozen': frozen,
                'shaking': np.any(limit < table['lowest'].T, axis=0),
                'slope': _sloping(table, slopes, rule)}
     quiet = ~np.any(list(reasons.values()), axis=0)
@@ -283,8 +285,10 @@ def judged(table: Records, rule: Rule, context: Sequence[str], first: int = 0) -
     std, count = _counts(table[first:], excess[first:], level, rule)
     rate_std = np.maximum(np.sqrt(table['average'][first:, 3:]), rule.rate_resolution)
     reason = np.select(list(reasons.values()), list(reasons), '')[first:].tolist()
+    ends &= not rule.repeats
     return [_dwell(context, *each) for each in zip(
-        table[first:], std.T.copy(), count.tolist(), rate_std, reason, strict=True)]
+        table[first:], std.T.copy(), count.tolist(), rate_std, reason, ends[first:].tolist(),
+        strict=True)]
 
 
 def _excess(own: Floats, quiet: NDArray[np.bool_]) -> Floats:
@@ -334,7 +338,7 @@ def _counts(table: Records, excess: Floats, level: Floats, rule: Rule) -> tuple[
 
 
 def _dwell(context: Sequence[str], found: Any, std: Floats, count: float, rate_std: Floats,
-           reason: str) -> Dwell:
+           reason: str, at_limit: bool) -> Dwell:
     known: dict[str, float | Floats] = {
         name: value for name, value in zip(context, found['around'].tolist(), strict=True)
         if math.isfinite(value)}
@@ -343,7 +347,7 @@ def _dwell(context: Sequence[str], found: Any, std: Floats, count: float, rate_s
         known['rate'] = mean[3:]
     return Dwell(float(found['begin']), float(found['end']), float(found['time']), mean[:3], std,
                  count, int(found['samples']), known, int(found['orientation']),
-                 rate_std=rate_std, reason=reason)
+                 rate_std=rate_std, reason=reason, at_limit=at_limit)
 
 
 CELLS = 256

@@ -139,7 +139,8 @@ def _limited(expected: Expected) -> Iterator[Finding]:
     elif expected.is_partial:
         yield Finding('partial', 'the poses lie near one direction: in other orientations the '
                       f'error is up to {mg(expected.worst_mg)}', _more_poses(expected), 'USABLE')
-    left_out, poses = expected.calibration.rejected, expected.calibration.poses
+    poses = expected.calibration.poses
+    left_out = [each for each in expected.calibration.rejected if each.kind != 'clipped']
     if left_out and 100.0 * len(left_out) > LEFT_OUT.value * len(poses):
         yield Finding('left_out', f'{len(left_out)} of {counted(len(poses), "pose")} were left '
                       'out', 'hold the sensor still in each pose, and take them again',

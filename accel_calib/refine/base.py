@@ -174,6 +174,9 @@ class Clipped:
 
 def clipped(poses_g: Poses) -> Clipped | None:
     """Return the poses at a limit, detected by the scatter of their samples, or None."""
+    if 'at_limit' in poses_g and np.any(poses_g['at_limit']):  # the capture has seen it
+        ended = np.flatnonzero(poses_g['at_limit'])
+        return Clipped(float(np.max(np.abs(poses_g.reading[ended]))), ended)
     if 'std' not in poses_g:
         return None
     reading, std = poses_g.reading, poses_g['std']

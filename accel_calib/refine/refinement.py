@@ -30,9 +30,10 @@ from .state import fitted_state, is_noise, State
 from .steps import (
     advice_for, not_testable, plain_name, Stage, Step, steps_of, untestable, Verdict, verdict_of)
 from ..calibrate import (
-    Calibration, check_sensor, fit_findings, fit_poses, fit_with_fleet, FLEET, FleetPrior, gated,
-    in_g, LARGEST_DILUTION, OF_A_FIT, only_norm, posterior, quality_of, record_of, refuse_if_unfit,
-    Rejected, rejected_by, sound_rows, sure_rows, uncertainty_g, with_history, with_rest_noise)
+    Calibration, check_sensor, CLIPPED, fit_findings, fit_poses, fit_with_fleet, FLEET, FleetPrior,
+    gated, in_g, LARGEST_DILUTION, OF_A_FIT, only_norm, posterior, quality_of, record_of,
+    refuse_if_unfit, Rejected, rejected_by, sound_rows, sure_rows, uncertainty_g, with_history,
+    with_rest_noise)
 from ..effects import CHANGES, included, Model, MODELS, parameter_names, PROCESSES, with_vector
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import fit_sphere, judge, NotConvergedError, outliers, variance_factor
@@ -290,8 +291,7 @@ def _record(calibration: Calibration, found: Found, given: Given, sensor: str, d
 def _rejected(found: Found, given: Given) -> tuple[Rejected, ...]:
     rejected = [*rejected_by(found.final.model, given.poses_g.take(found.outliers))]
     if found.clipped is not None:
-        rejected += [Rejected(int(row), 'the reading is clipped at the limit of the sensor',
-                              'clipped')
+        rejected += [Rejected(int(row), CLIPPED, 'clipped')
                      for row in given.poses_g.row[found.clipped.poses]]
     new = [each for each in rejected if each.row in given.poses.row]
     return tuple(sorted((*given.rejected, *new), key=lambda each: each.row))
