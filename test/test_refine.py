@@ -121,7 +121,7 @@ def test_the_last_step_leaves_what_the_calibration_leaves(taken):
 
 @pytest.mark.parametrize('seed', range(3))
 def test_a_supply_that_scales_gains_that_differ_leaves_no_gap(seed, taken):
-    hidden = {'supply_ratio': 100.0, 'vibration_rectification': 3.0}
+    hidden = {'supply_ratio': 100.0, 'offset_temperature': 3.0}
     found = refine(taken([5, seed], hidden, poses=60, noise_mg=1.0)[0], MPS2, base='10')
     assert (sorted(names(found)), found.verdict) == (sorted(hidden), 'explained')
 

@@ -192,7 +192,7 @@ class Rest(NamedTuple):
     reason: str = ''
 
 
-_AT_LIMIT, _QUIETER = 0.2, 0.6
+_AT_LIMIT, _QUIETER = 0.2, 0.25
 """Share of samples that repeat the extreme of an axis, and standard deviation relative to that of
 other rests, above and below which a rest is at a limit."""
 
@@ -268,7 +268,8 @@ def judged(table: Records, rule: Rule, context: Sequence[str], first: int = 0) -
         table['std'] <= RELATIVE * np.linalg.norm(means, axis=1)[:, np.newaxis], axis=1)
     limit = rule.limit_of(rule.noise_of(table['mean'].T), DWELL_RATIO, DWELL_RATE_RATIO)
     turned = np.ptp(means, axis=0) > _STUCK * np.max(np.abs(means))  # else an axis is stuck
-    quieter = table['std'] < _QUIETER * np.median(table['std'], axis=0)
+    usual = np.median(table['std'], axis=0)
+    quieter = (table['std'] < _QUIETER * usual) & (usual > rule.step)
     ends = np.any((table['at_limit'] > _AT_LIMIT) & turned & quieter, axis=1)
     reasons = {'short': table['short'], 'frozen': frozen,
                'shaking': np.any(limit < table['lowest'].T, axis=0),
@@ -285,7 +286,6 @@ def judged(table: Records, rule: Rule, context: Sequence[str], first: int = 0) -
     std, count = _counts(table[first:], excess[first:], level, rule)
     rate_std = np.maximum(np.sqrt(table['average'][first:, 3:]), rule.rate_resolution)
     reason = np.select(list(reasons.values()), list(reasons), '')[first:].tolist()
-    ends &= not rule.repeats
     return [_dwell(context, *each) for each in zip(
         table[first:], std.T.copy(), count.tolist(), rate_std, reason, ends[first:].tolist(),
         strict=True)]

@@ -199,6 +199,11 @@ class Rule:
         return self._varied < CHUNKS_PER_WINDOW
 
     @property
+    def step(self) -> float:
+        """Return the smallest step between successive readings, 0 before the first one."""
+        return float(self._step[0]) if math.isfinite(self._step[0]) else 0.0
+
+    @property
     def _floor(self) -> Floats:
         """Return the (6,) smallest variances of a stretch so far."""
         return np.asarray(self._floors[int(self.repeats)])
@@ -217,8 +222,7 @@ class Rule:
         samples over many dwells. The std is always above 0.
 
         """
-        step = float(self._step[0])
-        step = step if math.isfinite(step) else 0.0
+        step = self.step
         tiny = RELATIVE * np.sqrt(np.sum(mean**2, axis=0))
         resolution = np.maximum(step / math.sqrt(12.0), tiny)
         left = step**2 * rounding_left(level / step**2) if step > 0.0 else np.zeros(3)

@@ -29,6 +29,10 @@ _FLAT = 0.02
 _OFF_CIRCLE = 0.05
 """Smallest RMS distance from a circle, relative to its radius, that is on no circle."""
 
+_WIDE = 0.65
+"""Smallest extent of the poses from their middle in the plane, relative to 1 g; for native
+readings to the distance of the plane from zero."""
+
 _ALONG = 0.98
 """Smallest part of the normal of the plane along the direction that names a fault."""
 
@@ -49,7 +53,10 @@ def check_axes(reading: Floats, units: Units) -> None:
         return
     middle = np.mean(reading, axis=0)
     _, sizes, turn = np.linalg.svd(reading - middle, full_matrices=False)
-    if sizes[2] > _FLAT * sizes[1] or _is_circle((reading - middle) @ turn[:2].T):
+    flat = (reading - middle) @ turn[:2].T
+    one_g = abs(float(middle @ turn[2])) if units.is_native else units.per_g
+    wide = np.max(np.linalg.norm(flat, axis=1)) > _WIDE * one_g  # not a cap of the sphere
+    if sizes[2] > _FLAT * sizes[1] or not wide or _is_circle(flat):
         return
     normal = np.abs(turn[2])
     largest = int(np.argmax(normal))

@@ -174,9 +174,6 @@ class Clipped:
 
 def clipped(poses_g: Poses) -> Clipped | None:
     """Return the poses at a limit, detected by the scatter of their samples, or None."""
-    if 'at_limit' in poses_g and np.any(poses_g['at_limit']):  # the capture has seen it
-        ended = np.flatnonzero(poses_g['at_limit'])
-        return Clipped(float(np.max(np.abs(poses_g.reading[ended]))), ended)
     if 'std' not in poses_g:
         return None
     reading, std = poses_g.reading, poses_g['std']
@@ -189,7 +186,9 @@ def clipped(poses_g: Poses) -> Clipped | None:
     usual[np.isinf(usual)] = 0.0  # all poses are near the ends of an axis
     quiet = near & (std < _QUIET * usual)
     # Samples pile up at a limit, which is that of all axes; one pose may be quiet by chance.
-    if np.sum(quiet) + np.sum(near & (std < _STILL * usual)) < _LEAST_PILED:
+    seen = 'at_limit' in poses_g and bool(np.any(poses_g['at_limit']))  # by the capture
+    piled = np.sum(quiet) + np.sum(near & (std < _STILL * usual))
+    if not np.any(quiet) or (piled < _LEAST_PILED and not seen):
         return None
     ends = np.any(quiet, axis=1)
     limit = float(np.max(np.abs(extremes[ends])))
