@@ -198,7 +198,11 @@ def _member_of(path: Path, members: Sequence[Member], options: LogOptions, expec
         raise InputError(f'{path} has the tables {shown(names)}, expected one of an accelerometer',
                          'export the table of the accelerometer, with gravity, or name one with '
                          f'--topic "{names[0]}" to see why it is not read')
-    left = _preferred(tables)
+    ranks = {member: (not record_instead(columns.layout.header, columns.layout.path), any(
+        meaning(name).quantity == 'reading' or 'accel' in name.casefold()
+        for name in (Path(member.name).stem, *columns.names(READING[:1]))))
+        for member, columns in tables.items()}
+    left = [member for member in tables if ranks[member] == max(ranks.values())]
     if len(left) > 1:
         raise InputError(f'{path} has {len(left)} tables of accelerometers, '
                          f'{shown([member.name for member in left])}, expected one',
@@ -208,47 +212,35 @@ def _member_of(path: Path, members: Sequence[Member], options: LogOptions, expec
     return left[0], (f'{left[0].name} is read of {len(names)} tables: {why}',) * (len(names) > 1)
 
 
-def _preferred(tables: Mapping[Member, Chosen]) -> list[Member]:
-    """Return the tables of accelerometers by their names, as far as the names tell."""
-    ranks = {member: (not record_instead(columns.layout.header, columns.layout.path),
-                      _is_named(member, columns)) for member, columns in tables.items()}
-    return [member for member in tables if ranks[member] == max(ranks.values())]
-
-
-def _is_named(member: Member, columns: Chosen) -> bool:
-    names = [Path(member.name).stem, *columns.names(READING[:1])]
-    return any(meaning(name).quantity == 'reading' or 'accel' in name.casefold()
-               for name in names)
-
-
 def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
     columns = chosen(text.layout, options)
     text.choose(columns, skip_bad=options.skip_bad)
     cells = text.blocks()
     first = next(cells)
     quantities = decided(columns, first, options)
-    with saying(quantities.read_as):
-        return _decided(path, text, chain((first,), cells), quantities)
-
-
-def _decided(path: Path, text: TextTable, cells: Iterator[Cells], quantities: Quantities
-             ) -> OpenLog:
-    blocks = _converted(path, text.layout.about, cells, quantities)
-    head = next(blocks)
-    check_units(head, quantities.units, str(path))
+    blocks = _converted(path, text.layout.about, chain((first,), cells), quantities)
     poses = None
     samples: Iterator[Recording]
-    if are_samples(head.columns):
-        samples = (block.as_recording() for block in chain((head,), blocks))
-        count = _estimated(text, len(head))
-    else:
-        poses = _without_lacking(concatenated([head, *blocks]), quantities.notes)
-        if are_untimed_samples(poses.columns):
-            raise InputError(f'{path} has no times, but its {len(poses)} rows look like samples '
-                             'of a recording, expected a column time', 'state the samples per '
-                             'second with --rate HZ, or name the column with --columns '
-                             'time=NAME; if each row is a pose, add a column orientation')
-        samples, count = _as_samples(path, poses), len(poses)
+    with saying(quantities.read_as):
+        head = next(blocks)
+        check_units(head, quantities.units, str(path))
+        if are_samples(head.columns):
+            samples = (block.as_recording() for block in chain((head,), blocks))
+            count = _estimated(text, len(head))
+        else:
+            poses = concatenated([head, *blocks])
+            lacking = [key for key in poses.quantities if not np.isfinite(poses[key]).all()]
+            poses = poses.without_columns(*lacking)
+            if lacking:
+                quantities.notes.append(
+                    f'not used, because cells are not numbers: {some(lacking)}')
+            if are_untimed_samples(poses.columns):
+                raise InputError(
+                    f'{path} has no times, but its {len(poses)} rows look like samples of a '
+                    'recording, expected a column time', 'state the samples per second with '
+                    '--rate HZ, or name the column with --columns time=NAME; if each row is a '
+                    'pose, add a column orientation')
+            samples, count = _as_samples(path, poses), len(poses)
     rate = '' if quantities.rate_hz is None else f'{quantities.rate_hz:g} Hz (stated)'
     return OpenLog(samples, count, quantities.units, head.sensor,
                    ', '.join(filter(None, (quantities.read_as, rate))), poses,
@@ -261,14 +253,6 @@ def _converted(path: Path, about: Mapping[str, Any], cells: Iterator[Cells],
         columns, row = quantities.columns(block)
         check_values(columns, str(path))
         yield Poses(columns, row, **{**about, 'units': quantities.units.name})
-
-
-def _without_lacking(poses: Poses, notes: list[str]) -> Poses:
-    """Return poses without quantities that lack a number in a row; they are noted."""
-    lacking = [key for key in poses.quantities if not np.isfinite(poses[key]).all()]
-    if lacking:
-        notes.append(f'not used, because cells are not numbers: {some(lacking)}')
-    return poses.without_columns(*lacking)
 
 
 def _estimated(text: TextTable, count: int) -> int:

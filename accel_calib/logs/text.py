@@ -245,23 +245,13 @@ class TextTable:
 
     def _unquoted(self, lines: list[str]) -> tuple[list[str], str, Sequence[int]] | None:
         """Return lines without quotes, parted by tabs; or None if ragged."""
-        delimiter, width = self.layout.dialect.delimiter, self.layout.width
-        between = f'"{delimiter}"'
-        stripped = [line.strip() for line in lines]
-        if all(line.count(between) == width - 1 and line.count('"') == 2 * width
-               and '\t' not in line and line[0] == line[-1] == '"' for line in stripped):
-            kept = [line[1:-1].replace(between, '\t') for line in stripped]
-            columns: Sequence[int] = self._numeric
-        else:
-            rows = [split(line, delimiter) for line in lines]
-            if any(len(row) != width for row in rows):
-                return None
-            cells = [[row[k] for k in self._numeric] for row in rows]
-            if any('\t' in cell or '\n' in cell for row in cells for cell in row):
-                return None
-            kept = ['\t'.join(row) for row in cells]
-            columns = list(range(len(self._numeric)))
-        return kept, '\t', columns
+        rows = [split(line, self.layout.dialect.delimiter) for line in lines]
+        if any(len(row) != self.layout.width for row in rows):
+            return None
+        cells = [[row[k] for k in self._numeric] for row in rows]
+        if any('\t' in cell or '\n' in cell for row in cells for cell in row):
+            return None
+        return ['\t'.join(row) for row in cells], '\t', range(len(self._numeric))
 
     def _without_cut(self, lines: list[str]) -> list[str]:
         """Return rows without a last one that is cut; note that it is left out."""
