@@ -58,9 +58,9 @@ setup(
         ],
         # Figures and pages.
         'report': ['matplotlib>=3.6,<3.12'],
-        # Flight logs of PX4 and ArduPilot, and Excel files.
-        'logs': ['openpyxl>=3.1.2,<4', 'pymavlink>=2.4.41,<2.5', 'pyulog>=1.1,<2',
-                 'xlrd>=2.0.1,<3'],
+        # Flight logs of PX4 and ArduPilot, HDF5, Excel, Parquet and Feather files.
+        'logs': ['h5py>=3.10,<4', 'openpyxl>=3.1.2,<4', 'pyarrow>=14,<27',
+                 'pymavlink>=2.4.41,<2.5', 'pyulog>=1.1,<2', 'xlrd>=2.0.1,<3'],
         # Figures and DataFrames in a notebook.
         'notebook': ['matplotlib>=3.6,<3.12', 'pandas>=2.1.4,<4'],
         # Allan deviation: accel-calib noise.
@@ -73,9 +73,10 @@ setup(
         'completion': ['argcomplete>=3.1.4,<4'],
         'docs': ['sphinx<10', 'myst-parser<6', 'sphinx-rtd-theme<4'],
         'test': ['aiohttp>=3.9.1,<4', 'allantools>=2024.4,<2025', 'argcomplete>=3.1.4,<4',
-                 'hypothesis>=6.100,<7', 'imucal>=2.4,<3', 'matplotlib>=3.6,<3.12',
-                 'openpyxl>=3.1.2,<4', 'pandas>=2.1.4,<4', 'playwright>=1.49,<2',
-                 'pymavlink>=2.4.41,<2.5', 'pyserial>=3.5,<4', 'pytest>=7.4,<10',
+                 'h5py>=3.10,<4', 'hypothesis>=6.100,<7', 'imucal>=2.4,<3',
+                 'matplotlib>=3.6,<3.12', 'openpyxl>=3.1.2,<4', 'pandas>=2.1.4,<4',
+                 'playwright>=1.49,<2', 'pyarrow>=14,<27', 'pymavlink>=2.4.41,<2.5',
+                 'pyserial>=3.5,<4', 'pytest>=7.4,<10',
                  'pytest-xdist>=3.4,<4', 'pyulog>=1.1,<2', 'segno>=1.6,<2',
                  'setuptools>=68.1.2,<85', 'xlrd>=2.0.1,<3'],
         # With a store of s3. Apart, because pip takes minutes to find old versions of it.

@@ -222,8 +222,7 @@ def read_recording(path: Source, *, topic: str = '', sensor: str = '') -> Record
     """
     Read a recording.
 
-    Text in any dialect, a rosbag2 (folder, mcap, db3), a ROS 1 bag, or a flight log of PX4 (.ulg)
-    or ArduPilot (.bin).
+    Any format of docs/log_formats.md.
 
     Parameters
     ----------

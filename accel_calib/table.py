@@ -402,7 +402,8 @@ def check_units(poses: Table, units: Units, source: str = '') -> None:
     length = median_length(poses.reading)
     if not units.is_native and not _is_likely(length, units.per_g):
         supported = next((name for name in _likely(length) if name in _SUPPORTED), None)
-        advice = (f'set the units of the readings to {supported}' if supported else
+        advice = (f'set the units of the readings to {supported} (--units {supported})'
+                  if supported else
                   f'{_look(length)}set the units of the readings to native; the fit estimates '
                   'their scale')
         raise InputError(f'{source and f"{source}: "}the length of the readings is about '

@@ -26,6 +26,7 @@ sys.path[:0] = [str(HERE.parent), str(HERE)]
 from accel_calib.effects import EFFECTS  # noqa: E402
 from accel_calib.finding import KINDS, STEPS  # noqa: E402
 from accel_calib.findings import LIMITS  # noqa: E402
+from accel_calib.logs import FORMATS  # noqa: E402
 from accel_calib.logs.names import UNITS, WORDS  # noqa: E402
 from accel_calib.session import CalibratorSettings  # noqa: E402
 from accel_calib.session.settings import default_of, expected  # noqa: E402
@@ -93,8 +94,25 @@ def names() -> Iterator[str]:
         yield f'| {ours} | {" ".join(words)} | {texts} |'
 
 
+def short(name: str) -> str:
+    """Return a name without its article."""
+    return name.removeprefix('a ').removeprefix('an ')
+
+
+def formats() -> Iterator[str]:
+    """Yield the formats of logs."""
+    yield '| format | suffixes | needs |'
+    yield '|---|---|---|'
+    for each in FORMATS:
+        if not each.advice:
+            suffixes = ' '.join(f'`{suffix}`' for suffix in each.suffixes)
+            yield f'| {short(each.name)} | {suffixes} | {each.needs and f"`{each.needs}`"} |'
+    refused = ', '.join(short(each.name) for each in FORMATS if each.advice)
+    yield f'| refused with what converts it | {refused} | |'
+
+
 TABLES = {'columns': columns, 'effects': effects, 'exports': exports,
-          'findings': partial(kinds, KINDS), 'names': names, 'rating': rating,
+          'findings': partial(kinds, KINDS), 'formats': formats, 'names': names, 'rating': rating,
           'steps': partial(kinds, STEPS)}
 REFERENCE = 'api.md'
 PARAMETERS = HERE.parent / 'config' / 'calibrator.yaml'

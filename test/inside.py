@@ -64,7 +64,6 @@ from accel_calib.logs import (
     bag_samples, bounded_bags, containers, layout_with, LogOptions, open_bag, open_log, text)
 from accel_calib.logs.bounded_bags import decompressed, largest
 from accel_calib.logs.flight import read_dataflash, read_ulg
-from accel_calib.logs.formats import ULOG as ULG_MAGIC
 from accel_calib.logs.names import format_named, meaning, NAMES as LOG_FORMATS, unit_of
 from accel_calib.logs.quantities import are_samples
 from accel_calib.logs.serialized import frame_ids, stamps_of

@@ -308,7 +308,7 @@ def test_the_report_has_a_page_and_figures(poses, tmp_path):
 @pytest.mark.parametrize(('module', 'line'), [
     ('matplotlib', 'refine poses.csv --report r.html'), ('aiohttp', 'live poses.csv'),
     ('pyulog', f'capture {LOGS}/px4/default.ulg -o p.csv'),
-    ('pymavlink.DFReader', f'capture {LOGS}/ardupilot/two_imus.bin -o p.csv')])
+    ('pymavlink', f'capture {LOGS}/ardupilot/two_imus.bin -o p.csv')])
 def test_a_missing_library_is_named_in_one_line_with_how_to_install_it(module, line, poses, capsys,
                                                                        monkeypatch):
     monkeypatch.chdir(poses.parent)

@@ -196,15 +196,15 @@ FLIGHTS = ({'flight': 'ULog\x01\x12\x35'},
      'gyro.csv, baro.csv, expected one of an acc'),
     (zipped, {'meta/time': 'a,b\n'}, 'holds 0 tables'),
     (encrypted, ONE, 'needs a password'),
-    (before_its_start, ONE, 'cannot be unpacked .*a file starts before'),
-    *((write, flight, 'holds the flight log flight.*unpack it')
+    (before_its_start, ONE, 'is damaged .*a file starts before'),
+    *((write, flight, 'holds flight.csv, an? .* log.*unpack it')
       for write in (zipped, stored) for flight in FLIGHTS),
     (matlab, {'log': {'acc': np.ones((9, 3))}},
      'holds struct log, expected plain arrays.*writetimetable'),
     (matlab, {'name': 'phone'}, 'holds char name, expected plain arrays'),
     (matlab, {'gyr': np.ones((9, 2))}, 'ax, ay, az'),
     (raw, ('sensorlog.mat', TIMETABLE), 'expected plain arrays.*writetimetable'),
-    (raw, ('log.mat', VERSION_7_3), r'version 7\.3.*save\(file, "-v7"\)'),
+    (raw, ('log.mat', VERSION_7_3), 'is damaged .*expected an HDF5 file'),
     *((raw, (name, BLACKBOX), f'decode it with blackbox_decode {name}')
       for name in ('LOG00001.BFL', 'btfl.bbl', 'LOG.TXT'))])
 def test_a_container_without_a_table_to_read_is_refused_with_what_to_do(
@@ -280,7 +280,7 @@ def test_an_excel_file_that_would_take_minutes_is_refused(
 def test_a_long_name_in_a_damaged_archive_is_not_shown_whole(tmp_path: Path) -> None:
     path = zipped(tmp_path, {60_000 * 'a': '1,2,3\n'})
     path.write_bytes(path.read_bytes().replace(b'aaa', b'bbb', 1))
-    with pytest.raises(InputError, match='cannot be unpacked') as caught:
+    with pytest.raises(InputError, match='is damaged') as caught:
         read_log(path)
     assert len(str(caught.value)) < 1000
 

@@ -11,6 +11,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import accel_calib
+from accel_calib.logs import FORMATS
 import pytest
 from shared import ROOT
 
@@ -97,7 +98,7 @@ def test_the_page_about_installation_lists_every_part_and_the_readme_those_that_
 def test_messages_name_packages_of_the_index(setup_py: dict[str, Any]) -> None:
     sources = [path.read_text(encoding='utf-8') for path in (ROOT / 'accel_calib').rglob('*.py')]
     asked = {name for source in sources for names in re.findall(r"needing\('([^']+)'", source)
-             for name in names.split()}
+             for name in names.split()} | {each.needs for each in FORMATS} - {''}
     known = {name for extra in setup_py['extras_require'].values()
              for name in distributions(extra)}
     assert {'aiohttp', 'dask', 'pandas', 'pyulog'} <= asked <= known

@@ -102,8 +102,11 @@ def next_command(step: NextStep, args: argparse.Namespace) -> str:
     return ''
 
 
-_ANY_LOG = ('CSV in any dialect, rosbag2 folder, .mcap, .db3, ROS 1 .bag, PX4 .ulg or '
-            'ArduPilot .bin')
+def _any_log() -> str:
+    """Return what a log can be."""
+    from ..logs import SUFFIXES
+
+    return f'text in any dialect, or a rosbag2 folder, {", ".join(SUFFIXES)}'
 
 
 def _flat(text: str) -> int | str:
@@ -149,7 +152,7 @@ def _fit(made: options.Parser) -> None:
 
 
 def _calibrate(made: options.Parser) -> None:
-    options.add_source(made, 'log', f'recording or pose table: {_ANY_LOG}')
+    options.add_source(made, 'log', f'recording or pose table: {_any_log()}')
     _calibration_of_logs(made, '--prior', '--sensor-model', '--no-refine')
 
 
@@ -208,7 +211,7 @@ def _compare(made: options.Parser) -> None:
 
 
 def _capture(made: options.Parser) -> None:
-    options.add_source(made, 'recording', _ANY_LOG)
+    options.add_source(made, 'recording', _any_log())
     made.add_argument('-o', '--output', type=Path, required=True, metavar='FILE',
                       help='pose table to write; - for standard output')
     options.add_capture(made)
@@ -217,7 +220,7 @@ def _capture(made: options.Parser) -> None:
 
 
 def _apply(made: options.Parser) -> None:
-    options.add_source(made, 'recording', _ANY_LOG)
+    options.add_source(made, 'recording', _any_log())
     options.add_stored(made, required=True)
     made.add_argument('-o', '--output', type=Path, required=True, metavar='OUT',
                       help='CSV table or bag to write, of the same kind as the recording; - '
@@ -257,7 +260,7 @@ def _export(made: options.Parser) -> None:
 
 
 def _noise(made: options.Parser) -> None:
-    options.add_source(made, 'recording', f'recording with a long rest: {_ANY_LOG}')
+    options.add_source(made, 'recording', f'recording with a long rest: {_any_log()}')
     options.add_stored(made, 'stored calibration to apply first, for readings in counts or volts')
     options.add_page(made, 'page to write with the Allan deviation and the figures (HTML)')
     options.add_log(made)

@@ -36,15 +36,12 @@ from ..disk import check_regular
 from ..effects import KNOWN_CODE, MODELS
 from ..errors import AccelCalibError, crash_words, InputError, RefusedFitError
 from ..findings import residual_figures
-from ..logs import LogOptions
+from ..logs import LogOptions, SUFFIXES
 from ..pipeline import calibrated, Intake, Outcome, Plan, poses_of
 from ..table import Poses
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-_SUFFIXES = ('.csv', '.tsv', '.txt', '.log', '.mcap', '.db3', '.bag', '.ulg', '.bin')
-"""Endings of recordings in a folder; a file that is named itself can have any ending."""
 
 _MAGIC = '*?['
 _BLOCK = 1 << 20
@@ -77,7 +74,7 @@ def recordings(given: Iterable[str]) -> Iterator[Input]:
             yield found
         if found is None:
             raise InputError(f'{text} holds no recording, expected at least one that ends with '
-                             f'{", ".join(_SUFFIXES)}',
+                             f'{", ".join(SUFFIXES)}',
                              'correct the name, or put a glob in quotes')
 
 
@@ -124,7 +121,7 @@ def _at(path: Path, root: Path) -> Iterator[Input]:
     elif path.is_dir():
         for each in sorted(path.iterdir()):
             if not each.name.startswith('.') and (
-                    each.is_dir() or each.suffix.lower() in _SUFFIXES):
+                    each.is_dir() or each.suffix.lower() in SUFFIXES):
                 yield from _at(each, root)
 
 
@@ -155,7 +152,7 @@ def _found_at(system: Any, path: str) -> tuple[PurePosixPath, list[str]]:
 
 
 def _files_below(system: Any, path: str) -> list[str]:
-    return [each for each in system.find(path) if each.lower().endswith(_SUFFIXES)]
+    return [each for each in system.find(path) if each.lower().endswith(SUFFIXES)]
 
 
 @contextmanager

@@ -15,11 +15,10 @@ from .bag import Bag, damage_as_input_error, open_bag
 from .bag_samples import context_of, ContextTopics
 from .columns import LogOptions
 from .containers import Frame, Piped
+from .formats import FORMATS, is_bag, OpenLog, Progress, SUFFIXES
 from .names import NAMES
 from .quantities import are_untimed_samples
-from .read import (
-    is_bag, LineReader, open_log, OpenLog, Progress, read_poses, read_recording, write_blocks,
-    write_table)
+from .read import LineReader, open_log, read_poses, read_recording, write_blocks, write_table
 from .serialized import (
     ACCELERATION, ACCELERATION_COVARIANCE, ANGULAR_VELOCITY, ANGULAR_VELOCITY_COVARIANCE,
     doubles_at, IMU_DOUBLES, joined, Layout, layout_of, layout_with, LITTLE_ENDIAN, Messages,
@@ -27,11 +26,11 @@ from .serialized import (
     STAMP_AT, THREE)
 
 __all__ = ['ACCELERATION', 'ACCELERATION_COVARIANCE', 'ANGULAR_VELOCITY',
-           'ANGULAR_VELOCITY_COVARIANCE', 'ARDUPILOT_REFERENCE', 'DEGREE', 'IMU_DOUBLES',
-           'LITTLE_ENDIAN', 'NAMES', 'NAME_AT', 'NINE', 'ORIENTATION', 'ORIENTATION_COVARIANCE',
-           'PER_MILLION', 'STAMP', 'STAMP_AT', 'THREE', 'Bag', 'ByAxis', 'ContextTopics', 'Frame',
-           'Layout', 'LineReader', 'LogOptions', 'Messages', 'OpenLog', 'Piped', 'Progress',
-           'are_untimed_samples', 'context_of', 'damage_as_input_error', 'doubles_at', 'is_bag',
-           'joined', 'layout_of', 'layout_with', 'open_bag', 'open_log',
-           'put_doubles', 'read_poses', 'read_recording', 'renamed', 'samples_of', 'write_blocks',
-           'write_table']
+           'ANGULAR_VELOCITY_COVARIANCE', 'ARDUPILOT_REFERENCE', 'DEGREE', 'FORMATS',
+           'IMU_DOUBLES', 'LITTLE_ENDIAN', 'NAMES', 'NAME_AT', 'NINE', 'ORIENTATION',
+           'ORIENTATION_COVARIANCE', 'PER_MILLION', 'STAMP', 'STAMP_AT',
+           'SUFFIXES', 'THREE', 'Bag', 'ByAxis', 'ContextTopics', 'Frame', 'Layout', 'LineReader',
+           'LogOptions', 'Messages', 'OpenLog', 'Piped', 'Progress', 'are_untimed_samples',
+           'context_of', 'damage_as_input_error', 'doubles_at', 'is_bag', 'joined', 'layout_of',
+           'layout_with', 'open_bag', 'open_log', 'put_doubles', 'read_poses', 'read_recording',
+           'renamed', 'samples_of', 'write_blocks', 'write_table']

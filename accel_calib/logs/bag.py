@@ -23,7 +23,7 @@ import warnings
 import numpy as np
 from numpy.typing import NDArray
 
-from .formats import damage_refused
+from .damage import damage_refused
 from .serialized import frame_ids, IMU_DOUBLES, joined, Messages, samples_of
 from ..disk import check_regular
 from ..errors import InputError

@@ -17,7 +17,7 @@ Dates are those of ISO 8601, ``2026-01-31T12:00:00.250Z``, with a blank for the 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 import csv
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from functools import lru_cache
 import json
@@ -52,8 +52,18 @@ _RATE = re.compile(
 _MONITOR = re.compile(r'^(\d{1,2}:\d{2}:\d{2}(?:\.\d+)?) -> ')
 """Time that the serial monitor of the Arduino IDE puts before a line."""
 
-_LABEL = re.compile(r'(?:^|(?<=[\s,;|]))[A-Za-z_][A-Za-z_0-9 .]*?\s*[:=]\s*(?=[-+.\d])')
-"""Name before a number, as the serial plotter of the Arduino IDE has it: ``ax:0.01``."""
+_LABEL = re.compile(r'(?:^|(?<=[\s,;|]))[A-Za-z_][A-Za-z_0-9 .]*?(?:\s*[:=]\s*|\s+)(?=[-+.\d])')
+"""Name before a number, as the serial plotter of the Arduino IDE has it: ``ax:0.01``, ``x 1``."""
+
+_LABELLED_UNIT = re.compile(r'(?<=[\d.]) *(?:m?g|m/s(?:\^?2|²|/s)|(?:°|deg|rad)/s|dps|°?C)'
+                            r'(?=[\s,;|]|$)')
+"""Unit after a number with a name."""
+
+_ONE_LABEL = re.compile(r'\s*([A-Za-z]\w*)(?:\s*[:=]\s*|\s+)[-+]?\d*\.?\d+(?:\s*\D{0,6})?')
+_MOTIONCAL = re.compile(r'Raw:(?:-?\d+,){8}-?\d+\s*')
+_MOTIONCAL_NAMES = ('accX', 'accY', 'accZ', *6 * ('',))
+"""Names of the counts that the sketches for MotionCal print; those of gyro and magnetometer have
+no unit."""
 
 _NUMBER = re.compile(r'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?', re.ASCII)
 _LIKE_NUMBER = re.compile(r'[-+]?(?:(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?|nan|inf)',
@@ -85,13 +95,20 @@ class Dialect:
     How the cells of a table are parted; an empty delimiter is any run of blanks.
 
     `monitor`: each line begins with the time of a serial monitor. `labelled`: each number follows
-    its name.
+    its name. `prefix`: begin of the lines that are rows, and `marks`: first characters of those
+    that are not.
 
     """
 
     delimiter: str
     monitor: bool = False
     labelled: bool = False
+    prefix: str = ''
+    marks: str = '#'
+
+    def is_row(self, line: str) -> bool:
+        """Return whether a line can be a row."""
+        return not (line[0] in self.marks or line.isspace()) and self.prefix in line
 
     def cells(self, line: str) -> list[str]:
         """Return the cells of a line, without quotes and blanks around them."""
@@ -101,7 +118,8 @@ class Dialect:
         """Return a line without names, and with the time of a monitor as its first cell."""
         if self.monitor:
             line = _MONITOR.sub(lambda found: found[1] + (self.delimiter or ' '), line)
-        return _LABEL.sub('', line) if self.labelled else line
+        line = line.removeprefix(self.prefix)
+        return _LABEL.sub('', _LABELLED_UNIT.sub('', line)) if self.labelled else line
 
 
 @dataclass(frozen=True)
@@ -219,6 +237,14 @@ def _offset(zone: str | None) -> float:
     return -size if zone[0] == '-' else size
 
 
+def first_label(head: Sequence[str]) -> str:
+    """Return the first name of numbers that stand one per line; empty if they do not."""
+    names = [match[1] for match in map(_ONE_LABEL.fullmatch, head) if match]
+    cycle = list(dict.fromkeys(names))
+    repeats = len(cycle) >= 3 and names[:3 * len(cycle)] == 3 * cycle
+    return cycle[0] if repeats and 4 * len(names) > len(head) else ''
+
+
 def is_comment(line: str) -> bool:
     """Return whether a line is a comment."""
     return line.startswith(_COMMENTS)
@@ -299,9 +325,14 @@ class _Finder:
     def __init__(self, head: Sequence[str], is_header: IsHeader) -> None:
         self.head, self.is_header = head, is_header
         self.filled = [k for k, line in enumerate(head) if not line.isspace()]
-        self.plain = [k for k in self.filled if not is_comment(head[k])]
-        timed = sum(_MONITOR.match(head[k]) is not None for k in self.plain)
-        self.monitor = timed > len(self.plain) / 2
+        timed = sum(_MONITOR.match(head[k]) is not None for k in self.filled)
+        raw = sum(_MOTIONCAL.fullmatch(head[k]) is not None for k in self.filled)
+        is_gcdc = any(line.startswith(';Headers,') for line in head)
+        self.dialect = Dialect(',', timed > len(self.filled) / 2,
+                               prefix='Raw:' if raw > len(self.filled) / 3 else '',
+                               marks='#;' if is_gcdc else '#')
+        self.plain = [k for k in self.filled
+                      if self.dialect.is_row(head[k]) and not is_comment(head[k])]
 
     def named(self) -> _Found | None:
         """Return the names in the first line with known names."""
@@ -309,7 +340,7 @@ class _Finder:
             if not any(map(str.isalpha, self.head[k][:1000])):
                 continue
             for delimiter in DELIMITERS:
-                dialect = Dialect(delimiter, self.monitor)
+                dialect = replace(self.dialect, delimiter=delimiter)
                 cells = self._names(k, dialect)
                 if (_are_names(cells) and self.is_header(cells)
                         and (self._fits(k + 1, dialect, cells)
@@ -319,8 +350,8 @@ class _Finder:
 
     def _names(self, k: int, dialect: Dialect) -> list[str]:
         """Return the cells of a header line; a time in front of them is the name of the times."""
-        line = self.head[k].lstrip('#/% ') if is_comment(self.head[k]) else self.head[k]
-        cells = dialect.cells(line)
+        line = self.head[k].removeprefix(';Headers,')
+        cells = dialect.cells(line.lstrip('#/% ') if is_comment(line) else line)
         return ['time', *cells[1:]] if dialect.monitor and is_clock(cells[0]) else cells
 
     def _fits(self, start: int, dialect: Dialect, cells: Sequence[str]) -> bool:
@@ -335,24 +366,27 @@ class _Finder:
         tried = []
         for labelled in (False, True):
             for delimiter in DELIMITERS:
-                dialect = Dialect(delimiter, self.monitor, labelled)
-                widths = Counter(filter(None, (_row_width(dialect.cells(line))
-                                               for line in lines)))
-                width, count = max(widths.items(), key=lambda item: item[1], default=(0, 0))
-                tried.append((count, width, dialect))
-        count, width, dialect = max(tried, key=lambda each: each[0])
+                dialect = replace(self.dialect, delimiter=delimiter, labelled=labelled)
+                widths = Counter(filter(any, (_row_width(dialect.cells(line)) for line in lines)))
+                (width, others), count = max(widths.items(), key=lambda item: item[1],
+                                             default=((0, 0), 0))
+                tried.append((count, -others, width, dialect))
+        count, _, width, dialect = max(tried, key=lambda each: each[:2])
         if not count:
             return None
-        first = next((k for k in self.plain if _row_width(dialect.cells(self.head[k])) == width),
+        first = next((k for k in self.plain
+                      if _row_width(dialect.cells(self.head[k]))[0] == width),
                      self.plain[-1])
         return self._with_names(dialect, first, width)
 
     def _with_names(self, dialect: Dialect, first: int, width: int) -> _Found:
         """Return the dialect with the names in the last line before the numbers, if any."""
+        if dialect.prefix:
+            return _Found(dialect, _MOTIONCAL_NAMES, first)
         if dialect.labelled:
-            line = _MONITOR.sub('', self.head[first])
+            line = _LABELLED_UNIT.sub('', _MONITOR.sub('', self.head[first]))
             names = tuple(name.strip(' :=\t') for name in _LABEL.findall(line))
-            return _Found(dialect, (*(('time',) if self.monitor else ()), *names), first)
+            return _Found(dialect, (*('time',) * dialect.monitor, *names), first)
         for k in reversed([k for k in self.filled if k < first]):
             cells = self._names(k, dialect)
             if len(cells) == width and _are_names(cells):
@@ -389,11 +423,11 @@ def _are_names(cells: Sequence[str]) -> bool:
     return len(cells) >= 3 and not any(map(_LIKE_NUMBER.fullmatch, cells))
 
 
-def _row_width(cells: Sequence[str]) -> int:
-    """Return the number of cells of a row of numbers; 0 for other lines."""
+def _row_width(cells: Sequence[str]) -> tuple[int, int]:
+    """Return the numbers of cells, and of those of text, of a row of numbers; 0 of others."""
     numbers = sum(_LIKE_NUMBER.fullmatch(cell) is not None for cell in cells)
     others = sum(bool(cell) and not is_clock(cell) for cell in cells) - numbers
-    return len(cells) if numbers >= 3 and others <= numbers else 0
+    return (len(cells), others) if numbers >= 3 and others <= numbers else (0, 0)
 
 
 def _width(header: Sequence[str], rows: Sequence[Sequence[str]]) -> int:

@@ -48,9 +48,9 @@ from numpy.typing import NDArray
 from .autopilot import (
     ardupilot_correction, as_sensed, AsSensed, at, choose, Correction, finite, FlightLog, Message,
     Parameters, px4_correction, px4_slot, sound, Stated, vectors)
-from .formats import DATAFLASH, sound_log
+from .damage import sound_log
 from .names import MICRO, PX4_FIELDS, PX4_SPANS
-from ..errors import InputError, needing
+from ..errors import InputError
 from ..table import Autopilot, Floats
 from ..text import counted
 
@@ -137,8 +137,8 @@ def _correction(chosen: Message, parameters: Parameters, device: int,
 def _px4_messages(path: Path
                   ) -> tuple[list[Message], Parameters, tuple[int, int] | None, list[str]]:
     """Return the messages and parameters that matter, the release of PX4, and notes on damage."""
-    with needing('pyulog', 'a PX4 log (.ulg)'):
-        from pyulog import ULog
+    from pyulog import ULog
+
     with _WholeReads(io.FileIO(path)) as file, sound_log(path, 'a PX4 log (.ulg)'):
         log = ULog(file, [*PX4_MESSAGES, *_ALSO])
         found = [Message(data.name, data.multi_id, data.data, _px4_time(data.data))
@@ -211,6 +211,9 @@ _READING, _RATES = ('AccX', 'AccY', 'AccZ'), ('GyrX', 'GyrY', 'GyrZ')
 _ARDUPILOT_ADVICE = 'take the log from the vehicle whole: it begins with all parameters'
 _MOST_SENSORS = 255
 _NAME = re.compile(r'(IMU|ACC|GYR)([1-9]?)')
+DATAFLASH = b'\xa3\x95\x80'
+"""First bytes of a binary log: the head of a message FMT."""
+
 _STAMPS = {'SampleUS': MICRO, 'TimeUS': MICRO, 'SampleMS': 1e-3, 'TimeMS': 1e-3}
 """Fields with the time of a sample, the best first, and their factors to seconds."""
 
@@ -321,8 +324,7 @@ def _wanted(name: str) -> bool:
 
 def _indexed(path: Path) -> Any:
     """Return the log of pymavlink, which knows where each message begins."""
-    with needing('pymavlink', 'an ArduPilot log (.bin)'):
-        from pymavlink.DFReader import DFReader_binary
+    from pymavlink.DFReader import DFReader_binary
 
     class Index(DFReader_binary):  # type: ignore[misc]
         def init_clock(self) -> None:

@@ -1,85 +1,408 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Binary formats of logs: their first bytes, and the errors of the libraries that read them."""
+r"""
+The formats of logs, and how each is opened: one entry of `FORMATS` per format.
 
-from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
-import errno
+The first bytes of a file decide; only where none fit, its suffix. Reading, ``fleet``, help, the
+documentation and the refusals are made from this table. A new format is a new entry: its name,
+suffixes, first bytes, and a function that returns its tables (see
+`accel_calib.logs.containers.Member`). An entry without such a function is recognised in order to
+name the program that converts it.
+
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, closing, contextmanager, ExitStack
+from dataclasses import dataclass, replace
+from functools import partial
+from importlib import import_module
 import io
-import os
+from itertools import chain
 from pathlib import Path
 import re
+from typing import Any
 
-from ..errors import InputError
-from ..text import reason
+import numpy as np
 
-HEAD = 8192
-"""Number of first bytes by which a file is recognised."""
+from . import arrays, containers, records
+from .autopilot import FlightLog
+from .bag import open_bag
+from .bag_samples import context_of, imu_samples, rate_words
+from .columns import Chosen, chosen, is_log_header, LogOptions
+from .containers import Member, Stream
+from .damage import DamagedLogError, sound_log
+from .dialect import shown
+from .flight import DATAFLASH, read_dataflash, read_ulg
+from .names import meaning, READING, record_instead
+from .quantities import are_samples, are_untimed_samples, decided, Quantities
+from .text import Cells, open_text, PEEKED, TextTable
+from ..disk import FIRST_LINE
+from ..errors import InputError, needing, saying
+from ..table import check_units, check_values, concatenated, Poses, Recording
+from ..text import some
+from ..units import Units, units_of
 
-ZIP, OLE = b'PK\x03\x04', b'\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1'
-MATLAB, MATLAB_HDF5 = b'MATLAB 5.0 MAT-file', b'MATLAB 7.3 MAT-file'
-BLACKBOX = b'H Product:Blackbox flight data recorder'
-CONTAINERS = (ZIP, OLE, MATLAB, MATLAB_HDF5, BLACKBOX)
-"""First bytes of files of several tables, and of a log that has to be decoded."""
+_HEAD, _TAIL = 8192, 65536
+"""Number of first and last bytes by which a file is recognised: a ZIP archive ends with the names
+of its files."""
 
-ULOG, DATAFLASH = b'ULog\x01\x12\x35', b'\xa3\x95\x80'
-"""First bytes of logs of PX4, and of binary logs of ArduPilot (the head of a message FMT)."""
-
-FLIGHT_LOG = re.compile(rb'\A(?:' + re.escape(ULOG) + b'|' + re.escape(DATAFLASH) + b')'
-                        rb'|^FMT, *\d+, *\d+, *\w+, *\w+', re.MULTILINE)
-"""What the first bytes of a flight log hold; the text logs of ArduPilot have messages FMT."""
-
-_STANDARD_ERROR = 2
-
-_BY_VALUE = (None, errno.EINVAL, errno.EOVERFLOW, errno.EISDIR, errno.EFBIG, errno.ENAMETOOLONG,
-             errno.ENOTDIR)
-"""System errors that a damaged size or place in a file causes; others are not about its bytes."""
+_MOST_TABLES = 500
+Progress = Callable[[int, int], object]
+"""Function called with the number of samples done, and that of all samples."""
 
 
-class DamagedLogError(InputError):
-    """A library cannot read a log."""
-
-
-@contextmanager
-def damage_refused(what: str, expected: str, advice: str) -> Iterator[None]:
+@dataclass(frozen=True)
+class OpenLog:
     """
-    Turn what a library raises for damaged bytes into a DamagedLogError.
+    An open log that is read block by block; `open_log` makes it.
 
-    Errors of the system, such as a missing file or permission, pass.
+    `blocks` are the samples, in order; their size does not depend on that of the log. An error is
+    raised when a table without times is read as samples. `samples` is the number of samples; of a
+    long text log, an estimate from the size of the file. `sensor` is empty if it is not stated.
+    `read_as` is how the log is read, in one line, empty if nothing is assumed. `poses` are those
+    of a pose table. `noted` returns the notes so far: what was left out.
 
     """
-    try:
-        yield
-    except InputError:
-        raise
-    except Exception as err:  # libraries of logs raise errors of any class
-        if isinstance(err, OSError) and err.errno not in _BY_VALUE:
-            raise
-        raise DamagedLogError(f'{what} ({reason(err)}), expected {expected}', advice) from err
+
+    blocks: Iterator[Recording]
+    samples: int
+    units: Units
+    sensor: str = ''
+    read_as: str = ''
+    poses: Poses | None = None
+    noted: Callable[[], Sequence[str]] = tuple
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Return what is left out; complete once all blocks are read."""
+        return tuple(self.noted())
+
+    def watched(self, progress: Progress) -> Iterator[Recording]:
+        """Yield the blocks, and call a function with the number of samples done and of all."""
+        done = 0
+        for block in self.blocks:
+            yield block
+            done += len(block)
+            progress(done, max(done, self.samples))
+
+
+# ------------------------------------------------------------------------ bags and flight logs
+
+@contextmanager
+def _bag(_: 'Format', path: Path, options: LogOptions) -> Iterator[OpenLog]:
+    with open_bag(path) as bag:
+        topic = bag.imu_topic(options.topic)
+        sensor = options.sensor or bag.first_frame_id(topic)
+        context = context_of(bag, topic, sensor, options)
+        notes = [*bag.notes, *context.notes]
+        blocks = imu_samples(bag, topic, sensor, chosen=bool(options.sensor), context=context,
+                             notes=notes)
+        # Drivers exist that publish g, although Imu messages are in m/s².
+        units = units_of(options.units or options.default_units or 'm/s2', options.gravity)
+        yield OpenLog(_checked(bag.path, blocks, units), bag.count(topic), units, sensor,
+                      f'Imu messages of {topic}{rate_words(bag, topic)} in {units.name}',
+                      noted=lambda: notes)
 
 
 @contextmanager
-def sound_log(path: Path, expected: str, advice: str = 'copy it from the vehicle again'
-              ) -> Iterator[None]:
-    """Refuse damage as `damage_refused` does, and drop what a library prints."""
-    with damage_refused(f'{path} is damaged', expected, advice), redirect_stdout(
-            io.StringIO()), redirect_stderr(io.StringIO()), _silent_c():
-        yield
+def _flight(known: 'Format', path: Path, options: LogOptions) -> Iterator[OpenLog]:
+    log: FlightLog = known.read(path, options.topic, options.instance)
+    recording = log.recording
+    check_values(recording.columns, str(path))
+    units = units_of('m/s2', options.gravity)
+    if options.units not in ('', units.name):
+        raise InputError(f'{path} is in {units.name}, but --units is {options.units}',
+                         'remove --units')
+    yield OpenLog(_checked(path, iter((recording,)), units), len(recording), units,
+                  recording.sensor, log.read_as, noted=lambda: log.notes)
+
+
+def _checked(path: Path, blocks: Iterator[Recording], units: Units) -> Iterator[Recording]:
+    """Yield the blocks, and check the unit of the first one."""
+    for first in blocks:
+        check_units(first, units, str(path))
+        yield first
+        yield from blocks
+
+
+# ------------------------------------------------------------------------------------- tables
+
+@contextmanager
+def _tables(known: 'Format', path: Path, options: LogOptions) -> Iterator[OpenLog]:
+    with ExitStack() as stack:
+        with sound_log(path, known.name, containers.AGAIN):
+            members = known.read(path, stack)
+        with open_members(path, members, options, known.name) as log:
+            yield log
 
 
 @contextmanager
-def _silent_c() -> Iterator[None]:
-    """Drop what C code prints to standard error, which Python cannot redirect."""
-    try:
-        kept = os.dup(_STANDARD_ERROR)
-    except OSError:  # standard error is closed, so nothing is printed
-        yield
-        return
-    try:
-        with open(os.devnull, 'wb') as nowhere:
-            os.dup2(nowhere.fileno(), _STANDARD_ERROR)
-            yield
-    finally:
-        os.dup2(kept, _STANDARD_ERROR)
-        os.close(kept)
+def open_members(path: Path, members: Sequence[Member], options: LogOptions, expected: str = ''
+                 ) -> Iterator[OpenLog]:
+    """Open the one of the tables of a file that has the accelerometer, and note why it is."""
+    member, why = _member_of(path, members, options, expected)
+    with _opened(path, member, options, expected) as text:
+        log = _text(path / member.name, text, options)
+        yield replace(log, read_as=', '.join(filter(None, (member.name, log.read_as))),
+                      noted=lambda: (*why, *log.notes))
+
+
+@contextmanager
+def _opened(path: Path, member: Member, options: LogOptions, expected: str
+            ) -> Iterator[TextTable]:
+    """Open a table as text; InputError if its bytes are of another format."""
+    with closing(member.parts()) as parts, io.BufferedReader(
+            Stream(path, expected, parts), PEEKED) as raw:
+        name = member.name or (path.stem if path.suffix in containers.PACKED else path.name)
+        inside = recognised(Path(name), raw.peek())
+        if inside is not FORMATS[-1]:
+            raise InputError(f'{path} holds {name}, {inside.name}, expected a table of text',
+                             containers.UNPACK)
+        with open_text(path / member.name, lambda cells: is_log_header(cells, options), raw,
+                       member.size) as text:
+            yield text
+
+
+def _member_of(path: Path, members: Sequence[Member], options: LogOptions, expected: str
+               ) -> tuple[Member, tuple[str, ...]]:
+    """
+    Return the table with the accelerometer, and a note on why if there are others.
+
+    `options.topic` can name it; raise InputError if there is none, or several. Tables of linear
+    acceleration come last, and tables whose names say that they are of an accelerometer first.
+
+    """
+    names = [member.name for member in members]
+    if names == ['']:
+        return members[0], ()
+    wanted = [member for member in members if options.topic in ('', member.name)]
+    if not 0 < len(names) <= _MOST_TABLES:
+        raise InputError(f'{path} holds {len(names)} tables, expected 1 to {_MOST_TABLES}',
+                         'check that this is the intended file')
+    if not wanted:
+        raise InputError(f'{path} has no table {options.topic}, expected one of {shown(names)}',
+                         f'name one of these with --topic "{names[0]}"')
+    tables: dict[Member, Chosen] = {}
+    refused: list[InputError] = []
+    for member in wanted:
+        try:
+            with _opened(path, member, options, expected) as text:
+                tables[member] = chosen(text.layout, options)
+        except InputError as err:
+            refused.append(err)
+    if not tables:
+        damaged = [err for err in refused if isinstance(err, DamagedLogError)]
+        if damaged or len(wanted) == 1:
+            raise (damaged or refused)[0]
+        raise InputError(f'{path} has the tables {shown(names)}, expected one of an accelerometer',
+                         'export the table of the accelerometer, with gravity, or name one with '
+                         f'--topic "{names[0]}" to see why it is not read')
+    ranks = {member: (not record_instead(columns.layout.header, columns.layout.path), any(
+        meaning(name).quantity == 'reading' or 'accel' in name.casefold()
+        for name in (Path(member.name).stem, *columns.names(READING[:1]))))
+        for member, columns in tables.items()}
+    left = [member for member in tables if ranks[member] == max(ranks.values())]
+    if len(left) > 1:
+        raise InputError(f'{path} has {len(left)} tables of accelerometers, '
+                         f'{shown([member.name for member in left])}, expected one',
+                         f'choose one with --topic "{left[0].name}"')
+    why = ('--topic names it' if options.topic else 'its name is that of an accelerometer'
+           if len(tables) > 1 else 'no other one has an accelerometer')
+    return left[0], (f'{left[0].name} is read of {len(names)} tables: {why}',) * (len(names) > 1)
+
+
+def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
+    columns = chosen(text.layout, options)
+    text.choose(columns, skip_bad=options.skip_bad)
+    cells = text.blocks()
+    first = next(cells)
+    quantities = decided(columns, first, options)
+    if quantities.clock.newest_first:
+        first, *rest = (Cells(each.numbers[::-1], [part[::-1] for part in each.texts],
+                              each.row[::-1]) for each in [first, *cells][::-1])
+        cells = iter(rest)
+    blocks = _converted(path, text.layout.about, chain((first,), cells), quantities)
+    poses = None
+    samples: Iterator[Recording]
+    with saying(quantities.read_as):
+        head = next(blocks)
+        check_units(head, quantities.units, str(path))
+        if are_samples(head.columns):
+            samples = (block.as_recording() for block in chain((head,), blocks))
+            count = _estimated(text, len(head))
+        else:
+            poses = concatenated([head, *blocks])
+            lacking = [key for key in poses.quantities if not np.isfinite(poses[key]).all()]
+            poses = poses.without_columns(*lacking)
+            if lacking:
+                quantities.notes.append(
+                    f'not used, because cells are not numbers: {some(lacking)}')
+            if are_untimed_samples(poses.columns):
+                raise InputError(
+                    f'{path} has no times, but its {len(poses)} rows look like samples of a '
+                    'recording, expected a column time', 'state the samples per second with '
+                    '--rate HZ, or name the column with --columns time=NAME; if each row is a '
+                    'pose, add a column orientation')
+            samples, count = _as_samples(path, poses), len(poses)
+    rate = '' if quantities.rate_hz is None else f'{quantities.rate_hz:g} Hz (stated)'
+    return OpenLog(samples, count, quantities.units, head.sensor,
+                   ', '.join(filter(None, (quantities.read_as, rate))), poses,
+                   noted=lambda: (*text.notes, *quantities.all_notes))
+
+
+def _converted(path: Path, about: Mapping[str, Any], cells: Iterator[Cells],
+               quantities: Quantities) -> Iterator[Poses]:
+    for block in cells:
+        columns, row = quantities.columns(block)
+        check_values(columns, str(path))
+        yield Poses(columns, row, **{**about, 'units': quantities.units.name})
+
+
+def _estimated(text: TextTable, count: int) -> int:
+    """Return the number of rows, from the size of the file and of the `count` of a block."""
+    if not text.more:
+        return count
+    width = 2 if text.layout.encoding.startswith('utf-16') else 1
+    return max(count, int(text.size / width / max(text.characters, 1) * count))
+
+
+def _as_samples(path: Path, poses: Poses) -> Iterator[Recording]:
+    """Yield the rows of a table as samples, for a command that needs samples."""
+    if 'time' not in poses:
+        raise InputError(f'{path} has no column time, expected a recording', 'add the times of '
+                         'the samples, or name their column with --columns time=NAME')
+    yield poses.as_recording()
+
+
+# ---------------------------------------------------------------------------------- formats
+
+@dataclass(frozen=True)
+class Format:
+    """
+    A format of logs.
+
+    Parameters
+    ----------
+    name : str
+        What a file is, for messages.
+    suffixes : tuple of str
+        Suffixes of its files, in lower case.
+    first : bytes
+        Regular expression that the first bytes match; empty if only the suffix tells.
+    read : function or None
+        Function of a path and a stack of open files that returns the tables; for flight logs,
+        `read_ulg` or `read_dataflash`.
+    needs : str
+        Package that has to be installed.
+    advice : str
+        What to do with a file that is not read; ``{}`` stands for its name.
+    opened : function
+        Function of the format, a path and `LogOptions` that opens a log.
+
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    first: bytes
+    read: Any = None
+    needs: str = ''
+    advice: str = ''
+    opened: Callable[..., AbstractContextManager[OpenLog]] = _tables
+
+
+_EXPORT = 'export it as CSV with '
+_ZIP = rb'PK\x03\x04'
+
+FORMATS = (
+    Format('a bag', ('.mcap', '.db3', '.bag'), b'', opened=_bag),
+    Format('a PX4 log', ('.ulg',), rb'ULog\x01\x12\x35', read_ulg, 'pyulog', opened=_flight),
+    Format('an ArduPilot log', ('.bin',), DATAFLASH, read_dataflash, 'pymavlink', opened=_flight),
+    Format('an ArduPilot log as text', ('.log',), rb'(?:.*\n)?FMT, *\d+, *\d+, *\w+, *\w+',
+           read_dataflash, opened=_flight),
+    Format('a NumPy file', ('.npy', '.npz'), rb'\x93NUMPY|' + _ZIP + rb'.*\.npyPK',
+           arrays.of_numpy),
+    Format('an Excel file (.xlsx)', ('.xlsx', '.xlsm'), _ZIP + rb'.*xl/workbook\.xml',
+           containers.sheets, 'openpyxl'),
+    Format('an Excel file (.xls)', ('.xls',), rb'\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1',
+           containers.old_sheets, 'xlrd'),
+    Format('an ActiGraph log', ('.gt3x',), _ZIP + rb'.*log\.bin',
+           advice=f'{_EXPORT}ActiLife, or with pygt3x'),
+    Format('a ZIP archive', ('.zip',), _ZIP, containers.archived),
+    Format('a MATLAB file', ('.mat',), rb'MATLAB 5\.0 MAT-file', arrays.matlab),
+    Format('an HDF5 file', ('.h5', '.hdf5'), rb'\x89HDF\r\n|MATLAB 7\.3 MAT-file', arrays.hdf5,
+           'h5py'),
+    Format('a Parquet file', ('.parquet',), b'PAR1', partial(records.columnar, 'parquet'),
+           'pyarrow'),
+    Format('a Feather file', ('.feather', '.arrow'), b'ARROW1', partial(records.columnar, 'ipc'),
+           'pyarrow'),
+    Format('JSON lines', ('.jsonl', '.ndjson'), rb'\s*\{[^\n]*\}\s*\n\s*\{',
+           partial(records.lines, records.json_line)),
+    Format('a JSON file', ('.json',), rb'\s*(?:\{\s*"|\[\s*(?:\{|\[\s*[-"\d]))',
+           records.json_document),
+    Format('lines of InfluxDB', ('.lp',), rb'(?:#[^\n]*\n)*[^\s,=]+(?:,[^\s=]+=[^\s]+)* '
+           rb'[^\s=]+=[-\d.]+[iu]?(?:,[^\s=]+=[^\s]+)* \d{9,19}\s', partial(
+               records.lines, records.influx_line)),
+    Format('a log of the Betaflight blackbox', ('.bbl', '.bfl'),
+           b'H Product:Blackbox flight data recorder', advice='decode it with blackbox_decode {}'),
+    Format('a telemetry log of MAVLink', ('.tlog',), b'', advice='use the .bin log of the '
+           'vehicle, or mavlogdump.py --format csv --types RAW_IMU {}'),
+    Format('a GENEActiv log', ('.bin',), b'Device Identity',
+           advice=f'{_EXPORT}the GENEActiv software, or with GENEAread in R'),
+    Format('an Axivity log', ('.cwa',), rb'MD\xfc\x03', advice=f'{_EXPORT}OmGui or cwa-convert'),
+    Format('an XDF file', ('.xdf', '.xdfz'), b'XDF:', advice='load it with pyxdf, and store time '
+           'and readings as CSV'),
+    Format('an enDAQ log', ('.ide',), rb'\x1a\x45\xdf\xa3',
+           advice=f'{_EXPORT}enDAQ Lab, or with idelib'),
+    Format('a stream of WitMotion frames', (), rb'.{0,10}?(?:\x55[\x50-\x5a].{9}){3}',
+           advice='record it with the WitMotion software, which writes text'),
+    Format('a Shimmer log', (), rb'.{30}\0[\x03\x0a]..\0[\x01-\x03]\0',
+           advice=f'{_EXPORT}Consensys, or read it with pyshimmer'),
+    Format('a NilsPod log', (), rb'[\x30-\x40]...[\x01\x02\x04\x05\x0a\x14\x28\x50\xa0]'
+           rb'[\x10\x20\x40\x80][\0-\x02].[\x02\x04\x08\x10]',
+           advice='load it with nilspodlib, and store the readings as CSV'),
+    Format('a calibration', (), FIRST_LINE.encode(), advice='use the log or the table that it was '
+           'made from; most commands take a calibration with -c'),
+    Format('a packed file', tuple(containers.PACKED),
+           b'|'.join(first for first, _ in containers.PACKED.values()), containers.text),
+    Format('text', ('.csv', '.tsv', '.txt', '.log'), b'',
+           containers.text))
+"""The formats; of several that fit, the first one counts."""
+
+SUFFIXES = tuple(dict.fromkeys(
+    suffix for each in FORMATS if not each.advice for suffix in each.suffixes))
+"""Suffixes of the formats that are read."""
+
+
+def recognised(path: Path, head: bytes) -> Format:
+    """Return the format of a file with these first bytes."""
+    suffix = path.suffix.lower()
+    is_binary = b'\0' in head
+    fitting = (each for each in FORMATS if each.first and re.match(each.first, head, re.DOTALL))
+    named = (each for each in FORMATS
+             if suffix in each.suffixes and (is_binary or not each.first))
+    return next(chain(fitting, named), FORMATS[-1])
+
+
+def is_bag(path: Path) -> bool:
+    """Return whether a path names a bag rather than a table."""
+    return path.is_dir() or path.suffix.lower() in FORMATS[0].suffixes
+
+
+@contextmanager
+def open_file(path: Path, options: LogOptions) -> Iterator[OpenLog]:
+    """Open a file in its format; errors as in `open_log`."""
+    known = FORMATS[0]
+    if not is_bag(path):
+        with path.open('rb') as file:
+            head = file.read(_HEAD)
+            file.seek(max(file.tell(), path.stat().st_size - _TAIL))
+            known = recognised(path, head + file.read())
+    if known.advice:
+        raise InputError(f'{path} is {known.name}, expected a log or a table that is read',
+                         known.advice.format(path.name))
+    if known.needs:
+        with needing(known.needs, known.name):
+            import_module(known.needs)
+    with known.opened(known, path, options) as log:
+        yield log

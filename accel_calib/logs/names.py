@@ -259,6 +259,7 @@ def _quantity(words: Sequence[str], unit: str) -> str:
              if any(len(word) > 1 and word in known for word in words)]
     found = found or [_LETTERS[word] for word in words if word in _LETTERS]
     found = found or [key for key, known in WORDS.items() if words[0] in known]
+    found = found or ['time'] * (words[-1] == 't')  # inside a group: imu/t
     if 'time' in found and unit_of('temperature', unit):
         return 'temperature'
     for first in ('time', 'temperature'):

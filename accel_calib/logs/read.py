@@ -11,11 +11,10 @@ Three kinds of comments are read, with values in JSON: ``# units: "m/s2"``,
 
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 import csv
-from dataclasses import dataclass, replace
-from itertools import chain
+from dataclasses import replace
 import json
 from pathlib import Path
 from typing import Any, TextIO
@@ -23,64 +22,18 @@ from typing import Any, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from .autopilot import FlightLog
-from .bag import Bag, open_bag
-from .bag_samples import context_of, imu_samples, rate_words
 from .columns import chosen, is_log_header, LogOptions
-from .containers import Frame, open_table, Piped
+from .containers import Frame, Piped
 from .dialect import layout_of
-from .flight import read_dataflash, read_ulg
-from .formats import CONTAINERS, FLIGHT_LOG, HEAD, ULOG
-from .quantities import are_samples, are_untimed_samples, decided, Quantities
-from .text import Cells, open_text, TextTable
-from ..disk import check_regular, FIRST_LINE, write_atomically
+from .formats import open_file, open_members, OpenLog
+from .quantities import decided
+from .text import Cells, TextTable
+from ..disk import check_regular, write_atomically
 from ..errors import InputError, saying
-from ..table import (
-    check_units, check_values, column_of, COLUMNS, concatenated, Poses, Recording, Table)
-from ..text import counted, some
-from ..units import Units, units_of
-
-_BAG_SUFFIXES = ('.bag', '.mcap', '.db3')
+from ..table import check_values, column_of, COLUMNS, concatenated, Poses, Recording, Table
+from ..text import counted
 
 _DIGITS = '.12g'
-
-Progress = Callable[[int, int], object]
-"""Function called with the number of samples done, and that of all samples."""
-
-
-@dataclass(frozen=True)
-class OpenLog:
-    """
-    An open log that is read block by block; `open_log` makes it.
-
-    `blocks` are the samples, in order; their size does not depend on that of the log. An error is
-    raised when a table without times is read as samples. `samples` is the number of samples; of a
-    long text log, an estimate from the size of the file. `sensor` is empty if it is not stated.
-    `read_as` is how the log is read, in one line, empty if nothing is assumed. `poses` are those
-    of a pose table. `noted` returns the notes so far: what was left out.
-
-    """
-
-    blocks: Iterator[Recording]
-    samples: int
-    units: Units
-    sensor: str = ''
-    read_as: str = ''
-    poses: Poses | None = None
-    noted: Callable[[], Sequence[str]] = tuple
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Return what is left out; complete once all blocks are read."""
-        return tuple(self.noted())
-
-    def watched(self, progress: Progress) -> Iterator[Recording]:
-        """Yield the blocks, and call a function with the number of samples done and of all."""
-        done = 0
-        for block in self.blocks:
-            yield block
-            done += len(block)
-            progress(done, max(done, self.samples))
 
 
 def read_poses(path: Path) -> Poses:
@@ -121,145 +74,12 @@ def open_log(path: Path | Piped | Frame, options: LogOptions = LogOptions()) -> 
     """
     if isinstance(path, Path) and not path.is_dir():
         check_regular(path)
-    with _opened(path, options) as log, saying(log.read_as):
+    if isinstance(path, Path):
+        opened = open_file(path, options)
+    else:
+        opened = open_members(Path(str(path)), [path.table], options)
+    with opened as log, saying(log.read_as):
         yield log
-
-
-@contextmanager
-def _opened(path: Path | Piped | Frame, options: LogOptions) -> Iterator[OpenLog]:
-    if not isinstance(path, Path):
-        name = Path(str(path))
-        with path.table.text(name, options) as text:
-            yield _text(name, text, options)
-        return
-    if is_bag(path):
-        with open_bag(path) as bag:
-            yield _bag(bag, options)
-        return
-    with path.open('rb') as file:
-        head = file.read(HEAD)
-    if head.startswith(FIRST_LINE.encode()):
-        raise InputError(f'{path} is a calibration, expected a log or a table of poses',
-                         'use the log or the table that it was made from; most commands take a '
-                         'calibration with -c')
-    if head.startswith(CONTAINERS) or (path.suffix == '.mat' and b'\0' in head):
-        with open_table(path, head, options) as (member, text):
-            log = _text(path / member, text, options)
-            yield replace(log, read_as=', '.join(filter(None, (member, log.read_as))))
-    elif FLIGHT_LOG.search(head):
-        read_flight = read_ulg if head.startswith(ULOG) else read_dataflash
-        yield _flight(path, read_flight(path, options.topic, options.instance), options)
-    else:
-        with open_text(path, lambda cells: is_log_header(cells, options)) as text:
-            yield _text(path, text, options)
-
-
-def is_bag(path: Path) -> bool:
-    """Return whether a path names a bag rather than a table."""
-    return path.is_dir() or path.suffix in _BAG_SUFFIXES
-
-
-def _bag(bag: Bag, options: LogOptions) -> OpenLog:
-    topic = bag.imu_topic(options.topic)
-    sensor = options.sensor or bag.first_frame_id(topic)
-    context = context_of(bag, topic, sensor, options)
-    notes = [*bag.notes, *context.notes]
-    blocks = imu_samples(bag, topic, sensor, chosen=bool(options.sensor), context=context,
-                         notes=notes)
-    # Drivers exist that publish g, although Imu messages are in m/s².
-    units = units_of(options.units or options.default_units or 'm/s2', options.gravity)
-    return OpenLog(_checked(bag.path, blocks, units), bag.count(topic), units, sensor,
-                   f'Imu messages of {topic}{rate_words(bag, topic)} in {units.name}',
-                   noted=lambda: notes)
-
-
-def _flight(path: Path, log: FlightLog, options: LogOptions) -> OpenLog:
-    recording = log.recording
-    check_values(recording.columns, str(path))
-    units = units_of('m/s2', options.gravity)
-    if options.units not in ('', units.name):
-        raise InputError(f'{path} is in {units.name}, but --units is {options.units}',
-                         'remove --units')
-    return OpenLog(_checked(path, iter((recording,)), units), len(recording), units,
-                   recording.sensor, log.read_as, noted=lambda: log.notes)
-
-
-def _checked(path: Path, blocks: Iterator[Recording], units: Units) -> Iterator[Recording]:
-    """Yield the blocks, and check the unit of the first one."""
-    for first in blocks:
-        check_units(first, units, str(path))
-        yield first
-        yield from blocks
-
-
-def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
-    columns = chosen(text.layout, options)
-    text.choose(columns, skip_bad=options.skip_bad)
-    cells = text.blocks()
-    first = next(cells)
-    quantities = decided(columns, first, options)
-    if quantities.clock.newest_first:
-        first, *rest = (Cells(each.numbers[::-1], [part[::-1] for part in each.texts],
-                              each.row[::-1]) for each in [first, *cells][::-1])
-        cells = iter(rest)
-    with saying(quantities.read_as):
-        return _decided(path, text, chain((first,), cells), quantities)
-
-
-def _decided(path: Path, text: TextTable, cells: Iterator[Cells], quantities: Quantities
-             ) -> OpenLog:
-    blocks = _converted(path, text.layout.about, cells, quantities)
-    head = next(blocks)
-    check_units(head, quantities.units, str(path))
-    poses = None
-    samples: Iterator[Recording]
-    if are_samples(head.columns):
-        samples = (block.as_recording() for block in chain((head,), blocks))
-        count = _estimated(text, len(head))
-    else:
-        poses = _without_lacking(concatenated([head, *blocks]), quantities.notes)
-        if are_untimed_samples(poses.columns):
-            raise InputError(f'{path} has no times, but its {len(poses)} rows look like samples '
-                             'of a recording, expected a column time', 'state the samples per '
-                             'second with --rate HZ, or name the column with --columns '
-                             'time=NAME; if each row is a pose, add a column orientation')
-        samples, count = _as_samples(path, poses), len(poses)
-    rate = '' if quantities.rate_hz is None else f'{quantities.rate_hz:g} Hz (stated)'
-    return OpenLog(samples, count, quantities.units, head.sensor,
-                   ', '.join(filter(None, (quantities.read_as, rate))), poses,
-                   noted=lambda: (*text.notes, *quantities.all_notes))
-
-
-def _converted(path: Path, about: Mapping[str, Any], cells: Iterator[Cells],
-               quantities: Quantities) -> Iterator[Poses]:
-    for block in cells:
-        columns, row = quantities.columns(block)
-        check_values(columns, str(path))
-        yield Poses(columns, row, **{**about, 'units': quantities.units.name})
-
-
-def _without_lacking(poses: Poses, notes: list[str]) -> Poses:
-    """Return poses without quantities that lack a number in a row; they are noted."""
-    lacking = [key for key in poses.quantities if not np.isfinite(poses[key]).all()]
-    if lacking:
-        notes.append(f'not used, because cells are not numbers: {some(lacking)}')
-    return poses.without_columns(*lacking)
-
-
-def _estimated(text: TextTable, count: int) -> int:
-    """Return the number of rows, from the size of the file and of the `count` of a block."""
-    if not text.more:
-        return count
-    width = 2 if text.layout.encoding.startswith('utf-16') else 1
-    return max(count, int(text.size / width / max(text.characters, 1) * count))
-
-
-def _as_samples(path: Path, poses: Poses) -> Iterator[Recording]:
-    """Yield the rows of a table as samples, for a command that needs samples."""
-    if 'time' not in poses:
-        raise InputError(f'{path} has no column time, expected a recording', 'add the times of '
-                         'the samples, or name their column with --columns time=NAME')
-    yield poses.as_recording()
 
 
 # ---------------------------------------------------------------------------- writing of tables

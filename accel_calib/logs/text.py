@@ -11,19 +11,21 @@ The rows are read once, in blocks, so the memory needed does not depend on the l
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 import io
 from itertools import chain, islice
 from operator import methodcaller
 from pathlib import Path
-from typing import TYPE_CHECKING
+import re
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .dialect import is_clock, is_comment, is_number, IsHeader, Layout, layout_of, short, split
+from .dialect import (
+    first_label, is_clock, is_comment, is_number, IsHeader, Layout, layout_of, short, split)
 from ..errors import InputError
 from ..table import Floats
 from ..text import counted
@@ -39,7 +41,7 @@ _HEAD_CHARACTERS = 2_000_000
 _LONGEST_LINE = 16_000_000
 """Longest line [characters]."""
 
-_PEEKED = 1 << 16
+PEEKED = 1 << 16
 """Number of bytes from which the encoding is found."""
 
 _BLANK = ' \t\r\n,;|'
@@ -59,17 +61,29 @@ class Cells:
 
 
 @contextmanager
-def open_text(path: Path, is_header: IsHeader, stream: tuple[io.RawIOBase, int] | None = None
+def open_text(path: Path, is_header: IsHeader, raw: io.BufferedReader[Any], size: int
               ) -> Iterator[TextTable]:
-    """Open the text table of a file, or of a stream with its size; see `layout_of`."""
-    file, size = stream or (io.FileIO(path), path.stat().st_size)
-    with io.BufferedReader(file, _PEEKED) as raw:
-        encoding = _encoding(raw.peek())
-        with io.TextIOWrapper(raw, encoding, errors='replace', newline=None) as text:
-            head, whole = _head(path, text)
-            layout = layout_of(path, head, is_header, encoding)
-            lines = chain(head[layout.start:], () if whole else text)
-            yield TextTable(layout, lines, size)
+    """Open the text table of a file of this size [bytes]; see `layout_of`."""
+    encoding = _encoding(raw.peek())
+    with io.TextIOWrapper(raw, encoding, errors='replace', newline=None) as text:
+        head = _head(path, text)
+        rows: Iterator[str] = text
+        if label := first_label(head):
+            rows = _readings(chain(head, text), label)
+            head = list(islice(rows, _HEAD_LINES))
+        layout = layout_of(path, head, is_header, encoding)
+        yield TextTable(layout, chain(head[layout.start:], rows), size)
+
+
+def _readings(lines: Iterable[str], label: str) -> Iterator[str]:
+    """Yield the lines from each one with a label to the next as one line."""
+    parts: list[str] = []
+    for line in lines:
+        if parts and re.match(rf'\s*{label}\b', line):
+            yield f'{" ".join(parts)}\n'
+            parts = []
+        parts.append(line.strip())
+    yield f'{" ".join(parts)}\n'
 
 
 def _encoding(head: bytes) -> str:
@@ -91,21 +105,21 @@ def _encoding(head: bytes) -> str:
     return 'utf-8'
 
 
-def _head(path: Path, file: io.TextIOWrapper) -> tuple[list[str], bool]:
-    """Return the first lines, and whether they are the whole file."""
+def _head(path: Path, file: io.TextIOWrapper) -> list[str]:
+    """Return the first lines."""
     lines: list[str] = []
     characters = 0
     while len(lines) < _HEAD_LINES and (characters < _HEAD_CHARACTERS or len(lines) < 2):
         line = file.readline(_LONGEST_LINE)
         if not line:
-            return lines, True
+            break
         if len(line) == _LONGEST_LINE:
             raise InputError(f'{path} has a line of more than {_LONGEST_LINE} characters, '
                              'expected a table with one line for each row',
                              'use a CSV table or a bag')
         lines.append(line)
         characters += len(line)
-    return lines, False
+    return lines
 
 
 class TextTable:
@@ -161,7 +175,7 @@ class TextTable:
 
     def read(self, lines: Sequence[str], *, last: bool = False) -> Cells:
         """Return the rows of the next lines; a row that is cut at the last line is left out."""
-        kept = [line for line in lines if line[0] != '#' and not line.isspace()]
+        kept = list(filter(self.layout.dialect.is_row, lines))
         rows_of = _joined_quotes(kept) if '"' in ''.join(kept) else kept
         number = np.arange(self._row + 1, self._row + len(rows_of) + 1)
         where = (self._line, lines) if len(rows_of) == len(kept) else (-1, lines)
@@ -218,7 +232,7 @@ class TextTable:
     def _plain(self, lines: list[str]) -> tuple[list[str], str | None, Sequence[int]] | None:
         """Return lines for loadtxt with their delimiter and columns, or None if ragged."""
         dialect, width = self.layout.dialect, self.layout.width
-        if dialect.monitor or dialect.labelled:
+        if dialect.monitor or dialect.labelled or dialect.prefix:
             lines = [dialect.plain(line) for line in lines]
         if '"' in ''.join(lines):
             return self._unquoted(lines)
@@ -231,23 +245,13 @@ class TextTable:
 
     def _unquoted(self, lines: list[str]) -> tuple[list[str], str, Sequence[int]] | None:
         """Return lines without quotes, parted by tabs; or None if ragged."""
-        delimiter, width = self.layout.dialect.delimiter, self.layout.width
-        between = f'"{delimiter}"'
-        stripped = [line.strip() for line in lines]
-        if all(line.count(between) == width - 1 and line.count('"') == 2 * width
-               and '\t' not in line and line[0] == line[-1] == '"' for line in stripped):
-            kept = [line[1:-1].replace(between, '\t') for line in stripped]
-            columns: Sequence[int] = self._numeric
-        else:
-            rows = [split(line, delimiter) for line in lines]
-            if any(len(row) != width for row in rows):
-                return None
-            cells = [[row[k] for k in self._numeric] for row in rows]
-            if any('\t' in cell or '\n' in cell for row in cells for cell in row):
-                return None
-            kept = ['\t'.join(row) for row in cells]
-            columns = list(range(len(self._numeric)))
-        return kept, '\t', columns
+        rows = [split(line, self.layout.dialect.delimiter) for line in lines]
+        if any(len(row) != self.layout.width for row in rows):
+            return None
+        cells = [[row[k] for k in self._numeric] for row in rows]
+        if any('\t' in cell or '\n' in cell for row in cells for cell in row):
+            return None
+        return ['\t'.join(row) for row in cells], '\t', range(len(self._numeric))
 
     def _without_cut(self, lines: list[str]) -> list[str]:
         """Return rows without a last one that is cut; note that it is left out."""
@@ -271,11 +275,18 @@ class TextTable:
             elif is_comment(line.lstrip()) or not line.replace('""', '').strip(_BLANK):
                 continue
             elif not self._skip_bad or not self._bad:
-                self._bad = f'{_place(k, *where)}row {rows[k]}{fault}'
+                self._bad = f'{self._place(k, *where)}row {rows[k]}{fault}'
                 if not self._skip_bad:
                     raise self._error(self._bad)
             self._bad_count += fault is not None
         return good
+
+    def _place(self, index: int, before: int, lines: Sequence[str]) -> str:
+        """Return the line number of a row among lines, in words; empty if it is not known."""
+        numbers = (before + k + 1 for k, line in enumerate(lines)
+                   if before >= 0 and self.layout.dialect.is_row(line))
+        number = next(islice(numbers, index, None), None)
+        return '' if number is None else f'line {number}: '
 
     def _error(self, words: str) -> InputError:
         mark = ',' if words.startswith('line') else ':'
@@ -312,12 +323,3 @@ def _joined_quotes(lines: list[str]) -> list[str]:
         joined.append(''.join(lines[k:end + 1]))
         k = end + 1
     return joined
-
-
-def _place(index: int, before: int, lines: Sequence[str]) -> str:
-    """Return the line number of a row among lines, in words; empty if it is not known."""
-    if before < 0:
-        return ''
-    numbers = (before + k + 1 for k, line in enumerate(lines)
-               if line[0] != '#' and not line.isspace())
-    return f'line {next(n for k, n in enumerate(numbers) if k == index)}: '

@@ -12,7 +12,7 @@ from faults import inputs
 from faults.fuzz import KINDS, outcomes
 from faults.inputs import Files
 from faults.sample import FACTOR, sample
-from inside import read_log, ULG_MAGIC
+from inside import read_log
 import pytest
 
 CASES = 30 * FACTOR
@@ -67,7 +67,7 @@ def test_a_cut_definition_of_a_ulog_ends(monkeypatch: pytest.MonkeyPatch) -> Non
     pytest.importorskip('pyulog')
     unknown = struct.pack('<HB', 9000, ord('z')) + bytes(9000)
     cut = struct.pack('<HB', 9000, 0)
-    logs = iter([ULG_MAGIC + bytes(9) + rest for rest in (
+    logs = iter([b'ULog\x01\x12\x35' + bytes(9) + rest for rest in (
         unknown + cut + bytes(10), unknown + cut, b'\x12\x01\0\0')])
     monkeypatch.setitem(KINDS, 'cut', (
         lambda: lambda rng: Files('log.ulg', {'log.ulg': next(logs)}),
