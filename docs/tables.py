@@ -30,7 +30,7 @@ from accel_calib.logs import FORMATS  # noqa: E402
 from accel_calib.logs.names import UNITS, WORDS  # noqa: E402
 from accel_calib.session import CalibratorSettings  # noqa: E402
 from accel_calib.session.settings import default_of, expected  # noqa: E402
-from accel_calib.stored.exports import FORMATS  # noqa: E402
+from accel_calib.stored.exports import FORMATS as EXPORTS  # noqa: E402
 from accel_calib.table import COLUMNS  # noqa: E402
 import api_page  # noqa: E402
 
@@ -61,7 +61,7 @@ def exports() -> Iterator[str]:
     """Yield the formats of exports."""
     yield '| `--to` | file | equation | holds |'
     yield '|---|---|---|---|'
-    for name, each in FORMATS.items():
+    for name, each in EXPORTS.items():
         yield f'| `{name}` | `NAME{each.suffix}` | {each.equation} | {each.holds} |'
 
 

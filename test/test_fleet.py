@@ -682,6 +682,16 @@ def deadly(name: str) -> str:
     return name
 
 
+def test_a_cluster_that_lost_all_workers_for_good_starts_another(monkeypatch: Any) -> None:
+    monkeypatch.setattr(sys.modules['accel_calib.fleet.run'], '_ABSENT_S', 1.0)
+    with cluster(workers=1) as client:
+        nanny, = client.cluster.workers.values()
+        monkeypatch.setattr(nanny, 'instantiate', nanny.finished)  # does not start it again
+        assert dict(mapped(client, str.upper, ['a'])) == {'a': 'A'}
+        os.kill(nanny.pid, signal.SIGKILL)
+        assert dict(mapped(client, str.upper, ['b', 'c'])) == {'b': 'B', 'c': 'C'}
+
+
 def test_of_recordings_that_share_a_task_only_the_deadly_one_fails(client: Any) -> None:
     items = [*map(str, range(30)), 'deadly', *map(str, range(30, 40))]
     scheduler = client.cluster.scheduler

@@ -50,6 +50,12 @@ _Result = TypeVar('_Result')
 _AHEAD = 4
 """Tasks in the queue per worker thread: enough that none waits for the program."""
 
+_ABSENT_S = 30.0
+"""Time without any worker after which a cluster of this machine starts another one [s]."""
+
+_LOOK_S = 0.2
+"""Interval at which the workers are looked for [s]."""
+
 _TASK_S = 0.5
 """Duration of a task [s]: recordings share it if they are quick, because a task costs the program
 some milliseconds."""
@@ -290,7 +296,7 @@ def mapped(client: Client, function: Callable[..., Any], items: Iterable[_Item],
 
     rest, alone, pace = iter(items), list[_Item](), _Pace()
     waiting: dict[Any, list[_Item]] = {}
-    done = as_completed(loop=client.loop)
+    done, workers = as_completed(loop=client.loop), _Workers(client)
     limit = _AHEAD * max(sum(client.nthreads().values()), 1)
     while True:
         while len(waiting) < limit and (batch := [alone.pop()] if alone else
@@ -301,10 +307,13 @@ def mapped(client: Client, function: Callable[..., Any], items: Iterable[_Item],
         if not waiting:
             return
         with _ctrl_c_passes():
+            while not done.has_ready():
+                time.sleep(_LOOK_S / 10.0)
+                workers.look()
             future = next(done)
         batch = waiting.pop(future)
         try:
-            results, seconds = _result_of(client, future)
+            results, seconds = _result_of(client, future, workers)
         except KilledWorker as err:
             if len(batch) > 1:  # find out which one
                 alone += batch
@@ -315,15 +324,41 @@ def mapped(client: Client, function: Callable[..., Any], items: Iterable[_Item],
         yield from zip(batch, results, strict=True)
 
 
-def _result_of(client: Client, future: Any) -> tuple[list[Any], float]:
+class _Workers:
+    """
+    Starts a worker of a cluster of this machine if none has been there for some time.
+
+    Dask starts a worker that died again, but not one that died before it said that it started.
+
+    """
+
+    def __init__(self, client: Client) -> None:
+        self._cluster = client.cluster
+        self._seen = time.monotonic()
+
+    def look(self) -> None:
+        now = time.monotonic()
+        if self._cluster is None or self._cluster.scheduler.workers:
+            self._seen = now
+        elif now - self._seen > _ABSENT_S:
+            self._seen = now
+            self._cluster.scale(len(self._cluster.workers) + 1)
+
+
+def _result_of(client: Client, future: Any, workers: _Workers) -> tuple[list[Any], float]:
     """Return the result of a task; raise InputError if the scheduler is gone."""
     from concurrent.futures import CancelledError
 
+    from distributed import TimeoutError as NotYet
     from distributed.comm import CommClosedError
 
     try:
-        found: tuple[list[Any], float] = future.result()
-        return found
+        while True:  # the worker that has the result can die before it is fetched
+            try:
+                found: tuple[list[Any], float] = future.result(timeout=_LOOK_S)
+                return found
+            except NotYet:
+                workers.look()
     except (CancelledError, CommClosedError) as err:
         raise InputError(f'the scheduler {client.scheduler.addr} is gone; expected it to stay '
                          'until the end', 'start it again, and run the same command: done '
