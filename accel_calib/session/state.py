@@ -333,6 +333,8 @@ def _pose_figures(session: Session) -> Iterator[tuple[str, str]]:
     yield 'interruptions of the clock', str(len(breaks))
     yield 'last interruption', (
         f'{breaks[-1].kind}, {breaks[-1].seconds:.2f} s' if breaks else 'none')
+    yield 'zeros or frozen readings [s]', (
+        f'{sum(each.end - each.start for each in live.detector.missing):.1f}')
 
 
 def _sensor_figures(session: Session) -> Iterator[tuple[str, str]]:
