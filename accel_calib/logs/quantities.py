@@ -207,8 +207,9 @@ def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
         made.clock = clock_of(columns, first, options)
         made.notes += made.clock.doubts
     samples = _decide_samples(made, first, options)
+    made.clock.newest_first &= samples  # rows of poses keep their numbers
     if 'time' in columns.sources and (samples or columns.sources['time'].name != 'time'):
-        made.said.append(made.clock.words)
+        made.said.append(made.clock.said)
     for keys in (READING, RATE):
         if columns.sources.keys() >= set(keys) and (modulus := modulus_of(
                 columns.three(first, keys))):
@@ -508,7 +509,7 @@ def are_samples(columns: Mapping[str, NDArray[Any]]) -> bool:
     """Return whether rows are samples: with time, not marked as poses, and dense or many."""
     if 'time' not in columns or _OF_POSES & columns.keys() or len(columns['time']) < 2:
         return False
-    apart = float(np.median(np.diff(columns['time'])))
+    apart = abs(float(np.median(np.diff(columns['time']))))
     return apart < _SAMPLES_APART_S or len(columns['time']) > _MOST_POSES
 
 

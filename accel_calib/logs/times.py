@@ -89,6 +89,17 @@ class Clock:
     period: float = 0.0
     since: int = -1
 
+    @property
+    def said(self) -> str:
+        """Return what is assumed, and what is done about the order and the steps of the stamps."""
+        parts = [self.words]
+        if self.newest_first:
+            parts.append('rows turned round (the newest was the first)')
+        if self.period:
+            parts.append(f'stamps of {self.interval:.3g} s spread over their samples '
+                         f'({1.0 / self.period:.3g} Hz)')
+        return ', '.join(parts)
+
     def seconds(self, cells: Cells) -> Floats:
         """Return the times of a block as they are stated [s]."""
         columns = self.columns
@@ -135,16 +146,12 @@ def clock_of(columns: Chosen, first: Cells, options: LogOptions) -> Clock:
     steps = np.diff(clock.seconds(first))
     moving = steps[steps != 0.0]
     clock.newest_first = len(moving) > 1 and bool(np.mean(moving < 0.0) > _REVERSED)
-    if clock.newest_first:
-        clock.words += ', rows turned round (the newest was the first)'
     if len(moving) > 1 and len(steps) >= _COARSE_ROWS * len(moving):
         interval = float(np.median(np.abs(moving)))
         if interval > _COARSE_S:
             ends = np.flatnonzero(steps)
             rows = float(ends[-1] - ends[0]) / (len(ends) - 1)
             clock.interval, clock.period = interval, interval / rows
-            clock.words += (f', stamps of {interval:.3g} s spread over their samples '
-                            f'({1.0 / clock.period:.3g} Hz)')
     return clock
 
 
