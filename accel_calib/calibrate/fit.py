@@ -115,16 +115,16 @@ def fit_poses(poses: Poses, units: Units, *, model: str = 'auto', method: Method
     try:
         calibration, rejected = _without_doubtful(inside, (*rejected, *ended), units, model,
                                                   method)
+        left_out = sorted((*rejected, *calibration.rejected), key=lambda pose: pose.row)
+        # The fitted table has references that the input may lack.
+        every = calibration.poses if len(calibration.poses) == len(poses) else poses
+        return finished(replace(
+            calibration, poses=every, rejected=tuple(left_out),
+            noted=(*wiring(calibration), *limited, *calibration.noted)), sensor, date)
     except RefusedFitError as err:
         for each in limited:
             raise RefusedFitError(f'{err.message}; {each.text}', each.advice) from None
         raise
-    left_out = sorted((*rejected, *calibration.rejected), key=lambda pose: pose.row)
-    # The fitted table has references that the input may lack.
-    every = calibration.poses if len(calibration.poses) == len(poses) else poses
-    return finished(replace(
-        calibration, poses=every, rejected=tuple(left_out),
-        noted=(*wiring(calibration), *limited, *calibration.noted)), sensor, date)
 
 
 def _without_doubtful(poses: Poses, rejected: tuple[Rejected, ...], units: Units, model: str,

@@ -207,8 +207,11 @@ def _search(poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
     state, near, trial = settle(begun, poses_g, fixed, names)
     if 'hysteresis' in near.names:  # a large one has distorted the directions
         force = judge(state.model, poses_g).equations.force
-        poses_g = with_previous(poses_g, unit(force))
-        state, near, trial = settle(State(judge(state.model, poses_g)), poses_g, fixed, names)
+        turned = with_previous(poses_g, unit(force))
+        again = judge(state.model, turned)
+        if np.all(np.isfinite(again.residual)):  # else it is far from that of any sensor
+            poses_g = turned
+            state, near, trial = settle(State(again), poses_g, fixed, names)
     begun = fit_without(begun, poses_g, near.chosen.out)
     taken_back: tuple[str, ...] = ()
     if near.names and near.walk is None and not _explains(begun, state):
