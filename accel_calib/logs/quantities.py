@@ -62,7 +62,7 @@ _STEADY, _STEADIER = 5.0, 3.0
 """Smallest steadiness of gravity, and smallest ratio to that of rates."""
 
 _BITS = (10, 12, 13, 14, 16, 18, 20, 24, 32)
-_NEAR_TOP, _MIDDLE, _IN_MIDDLE, _SMOOTHER = 0.9, 0.1, 0.02, 0.5
+_NEAR_TOP, _MIDDLE, _IN_MIDDLE, _SMOOTHER = 0.9, 0.1, 0.02, 0.7
 """Bits of numbers that can lose their sign; smallest largest number, and half of the empty middle,
 relative to the range; largest share of numbers in it; largest ratio of the steps with the sign to
 those without."""
