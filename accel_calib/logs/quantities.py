@@ -228,7 +228,8 @@ def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
 
 def _are_exchanged(columns: Chosen, first: Cells) -> bool:
     """Return whether the rates of columns without names have a steady length, as gravity has."""
-    if not columns.sources.keys() >= {*READING, *RATE}:
+    if (not columns.sources.keys() >= {*READING, *RATE}
+            or rests_of(columns.three(first, READING), samples=True).unit is not None):
         return False
     reading, rate = (_steadiness(columns.three(first, keys)) for keys in (READING, RATE))
     return rate > _STEADY and rate > _STEADIER * reading
