@@ -124,8 +124,13 @@ AT_LIMIT = 0.1
 MISSING = ('', 'zeros', 'frozen')
 """What stands in a log where samples are missing: zeros, or the last reading again and again."""
 
-VARIED_STEPS = 0.7
-"""Standard deviation of a rest [steps] above which no noise repeats a reading for a window."""
+VARIED_STEPS, VARIED_SHARE, MOST_REPEATED = 0.7, 0.1, 600.0
+"""Standard deviation of a rest [steps] above which no noise repeats a reading for a window. The
+sensor has such rests if they are a tenth of those with a repeated reading, of which at most this
+number counts, so that a driver that was frozen for an hour is found soon after."""
+
+BY_CHANCE = 1e-5
+"""Largest chance of a window of one reading, from the largest share of repeated samples."""
 
 PLAUSIBLE_G = (0.25, 3.0)
 """Range of |a| of a rest of a sensor that is not calibrated [g]."""
@@ -170,7 +175,8 @@ class Rule:
     """
     The rule with its state: the last chunks, and noise and resolution so far.
 
-    `quietest` is the variance of the axis with the largest one, in the quietest window so far.
+    `quietest` is the variance of the axis with the largest one, in the quietest window so far, and
+    `repeats` whether a rest can repeat one reading, as that of a coarse sensor does.
 
     """
 
@@ -183,7 +189,9 @@ class Rule:
         self._axes = 3
         self._before: Records = np.empty(0)  # the first chunks are fresh
         self._floors = np.full((2, 6), np.inf)  # of stretches without equal samples, of all
-        self._varied = 0
+        self._counts = np.zeros(2)  # stretches that varied, and that did not
+        self._same = 0.0
+        self.repeats = True
         self._step = np.full(2, np.inf)
         self.quietest = math.inf
 
@@ -192,11 +200,6 @@ class Rule:
         """Return the reading of 1 g; for native units half the range at rest, 0 if not known."""
         return self._per_g if self.known else float(_half_range(
             self._lowest, self._highest, self._floor[:3]))
-
-    @property
-    def repeats(self) -> bool:
-        """Return whether a rest can repeat one reading, as that of a coarse sensor does."""
-        return self._varied < CHUNKS_PER_WINDOW
 
     @property
     def step(self) -> float:
@@ -371,10 +374,14 @@ class Rule:
         varies &= ~self.moved(seen.trend, np.asarray(self.scale), seen.variance[:3])
         if self.known:
             varies &= deviation < STD_CAP_G * self._per_g
-        count = self._varied + np.cumsum(varies)
+        counts = self._counts[:, np.newaxis] + np.cumsum([varies, repeated & ~zero], axis=1)
+        same = np.maximum.accumulate(np.append(
+            self._same, np.where(seen.trend.excess < WHITE, seen.same, 0.0) * ~repeated))[1:]
+        chance = same ** (seen.samples * CHUNKS_PER_WINDOW / LONG - 1.0)
+        share = VARIED_SHARE * np.minimum(counts[1], MOST_REPEATED)
+        varied = (counts[0] >= np.maximum(share, CHUNKS_PER_WINDOW)) & (chance < BY_CHANCE)
         self._floors[:, :axes], self._step = floors[:, :, -1], steps[:, -1]
-        self._varied = int(count[-1])
-        varied = count >= CHUNKS_PER_WINDOW
+        self._counts, self._same, self.repeats = counts[:, -1], float(same[-1]), not varied[-1]
         return at_least(np.where(varied, floors[0], floors[1]), steps, mean), varied
 
 
@@ -422,7 +429,8 @@ def windows_without_readings(sums: Columns, mean: Floats, level: Floats
 
     """
     zero = sliding_max(sums.zeros, CHUNKS_PER_WINDOW)
-    equal = ((sliding_sum(sums.constant, CHUNKS_PER_WINDOW) == CHUNKS_PER_WINDOW)
+    constant = (sums.repeats == sums.count - 1.0).astype(float)
+    equal = ((sliding_sum(constant, CHUNKS_PER_WINDOW) == CHUNKS_PER_WINDOW)
              & np.all(level <= _tiny(mean), axis=0))
     return zero, equal.astype(float)
 

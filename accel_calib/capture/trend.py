@@ -267,7 +267,7 @@ class Columns:
     """
     Sums of n chunks as contiguous arrays, (axes, n) of reading and rate.
 
-    `constant` (n,) is 1 for chunks whose samples are equal, and `zeros` for those with zeros.
+    `repeats` (n,) are the samples that repeat the one before; `zeros` is 1 for chunks with zeros.
 
     """
 
@@ -275,7 +275,7 @@ class Columns:
     first: Floats
     second: Floats
     at_limit: Floats
-    constant: Floats
+    repeats: Floats
     zeros: Floats
 
 
@@ -284,7 +284,7 @@ def columns_of(sums: Records, axes: int) -> Columns:
     first, second = (np.ascontiguousarray(sums[name].T[:axes]) for name in ('first', 'second'))
     count = sums['count'].copy()
     return Columns(count, first, second, np.ascontiguousarray(sums['at_limit'].T),
-                   (sums['repeats'] == count - 1.0).astype(float),
+                   sums['repeats'].copy(),
                    (sums['zeros'] > 0.0).astype(float))
 
 
@@ -305,7 +305,8 @@ class Stretch:
     `trend` has the slopes of the reading, (3, m), and `excess` (groups, m) is that of the noise of
     the mean, for reading and rate. `variance` (axes, m) is the mean variance of the windows, and
     `highest` (3, m) the largest one of the reading. `samples` (m,) is their number, and `at_limit`
-    (3, m) the share that repeats the extreme of its axis so far. `means` (3, m + length - 1) are
+    (3, m) the share that repeats the extreme of its axis so far. `same` (m,) is the share that
+    repeats the sample before. `means` (3, m + length - 1) are
     those of the chunks of the reading. `scatter` (m,) is the mean square of their residuals, sum
     over the axes, and `white` (m,) the same for independent samples.
 
@@ -317,6 +318,7 @@ class Stretch:
     highest: Floats
     samples: Floats
     at_limit: Floats
+    same: Floats
     means: Floats
     scatter: Floats
     white: Floats
@@ -341,8 +343,9 @@ def stretch(sums: Columns, level: Floats, length: int, size: int, spacing: float
     found = strength_of(line, spacing, _grouped(white))
     reading = Trend(found.slope[:, 0], *(part[0] for part in found[1:]))
     at_limit = sliding_sum(sums.at_limit[:, start:], length) / count
+    same = sliding_sum(sums.repeats[start:], length) / np.maximum(count - length, 1.0)
     return Stretch(reading, found.excess, variance, sliding_max(level[:3], inner), count, at_limit,
-                   cells[:3], scatter, np.sum(white, axis=0))
+                   same, cells[:3], scatter, np.sum(white, axis=0))
 
 
 def _grouped(values: Floats) -> Floats:
