@@ -49,6 +49,13 @@ def dwell(time: float, direction: Any, count: float = 50.0) -> Dwell:
                  np.full(3, 0.01), count, 50, {}, round(time))
 
 
+def test_a_mark_of_a_pose_outlives_a_restart() -> None:
+    marked = replace(dwell(0.0, [0, 0, 1]), at_limit=True, doubtful=True)
+    book = PoseBook(CaptureSettings(), UNITS)
+    book.add_stored(poses_from([dwell(5.0, [0, 1, 0]), marked]))
+    assert book.poses()['at_limit'].tolist() == book.poses()['doubtful'].tolist() == [0.0, 1.0]
+
+
 @pytest.mark.parametrize(('up', 'noise'), [
     ((300.0, -200.0, 16500.0), 0.4), ((300.0, -200.0, 16500.0), 40.0),
     ((2048.0, 2060.0, 2458.0), 3.0)])  # 12 bits with the zero in the middle

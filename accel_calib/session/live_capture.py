@@ -181,10 +181,11 @@ def _dwell_of(poses: Poses, k: int) -> Dwell:
     count = float(poses['count'][k]) if 'count' in poses else 1.0
     std = poses['std'][k] if 'std' in poses else poses.reading[k] * 0.0
     context = {key: poses[key][k] for key in (*CONTEXT, 'rate', *poses.quantities) if key in poses}
-    doubtful = 'doubtful' in poses and bool(poses['doubtful'][k])
+    doubtful, at_limit = (name in poses and bool(poses[name][k])
+                          for name in ('doubtful', 'at_limit'))
     rate_std = poses['rate_std'][k] if 'rate_std' in poses else np.full(3, np.nan)
     return Dwell(time, time, time, poses.reading[k], std, count, max(1, round(count)), context,
-                 -1 - k, doubtful, rate_std)
+                 -1 - k, doubtful, rate_std, at_limit=at_limit)
 
 
 LONG_REST = 300.0
