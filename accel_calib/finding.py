@@ -11,10 +11,13 @@ of the findings.
 
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, get_args, Literal
+
+from .errors import RefusedFitError
 
 Level = Literal['GOOD', 'USABLE', 'BAD']
 LEVELS: tuple[Level, ...] = get_args(Level)
@@ -168,6 +171,17 @@ def without(findings: Iterable[Finding], *kinds: str) -> tuple[Finding, ...]:
 
 def has(findings: Iterable[Finding], kind: str) -> bool:
     return any(each.kind == kind for each in findings)
+
+
+@contextmanager
+def explained_by(findings: Iterable[Finding]) -> Iterator[None]:
+    """Let a refusal inside state the first of these findings, and its advice."""
+    try:
+        yield
+    except RefusedFitError as err:
+        for each in findings:
+            raise RefusedFitError(f'{err.message}; {each.text}', each.advice) from None
+        raise
 
 
 def ranked(findings: Iterable[Finding]) -> tuple[Finding, ...]:

@@ -27,11 +27,11 @@ from .calibrate import (
     fit_with_fleet, flat_direction, FleetPrior, level, level_by_rows, lies_in_cone, PRIOR,
     SampleContext, thermal_alone, with_curve, without_curve)
 from .capture import (
-    capture, Captured, CaptureSettings, cells_of, is_turned_over, LEAST_RANGE, Ramp, ramp_of,
-    REASONS, settings_from)
+    account_of, capture, Captured, CaptureSettings, cells_of, check_measured, is_turned_over,
+    LEAST_RANGE, Ramp, ramp_of, settings_from)
 from .effects import Context, LADDER, Model, PROCESSES
 from .errors import InputError, RefusedFitError, saying
-from .finding import Finding
+from .finding import explained_by, Finding
 from .findings import rate, Rating
 from .geometry import unit
 from .logs import Frame, LogOptions, open_log, OpenLog, Piped, Progress
@@ -158,8 +158,9 @@ def _captured(source: Source, log: OpenLog, options: LogOptions, settings: Mappi
     """Capture the poses of an open log; InputError without a still stretch."""
     asked = settings_from(settings, log.units)
     found = capture(log.watched(progress), log.units, asked)
-    _check_measured(found, log.units)
-    count, findings = len(found.poses), _account_of(found, asked)
+    if not _is_one_direction(found.poses):
+        check_measured(found.lengths, log.units)
+    count, findings = len(found.poses), account_of(found.rests, asked)
     limit, more = _wider(source, found, log.units, options, settings) if count < _FEW else (0.0, 0)
     finds = f'{more} with still_std_max {limit:.3g}'
     if not count:
@@ -171,56 +172,6 @@ def _captured(source: Source, log: OpenLog, options: LogOptions, settings: Mappi
         lines.append(f'{counted(count, "pose")} only, {finds}')
     return Intake(replace(found.poses, units=log.units.name), log.units, log.read_as, log.notes,
                   tuple(lines), findings), found
-
-
-_REMEDIES = {
-    'short': 'hold the sensor still for longer in each pose, or capture shorter rests with '
-             '--min-dwell {seconds:.2g}',
-    'shaking': 'put the sensor on something that does not shake, or accept it with '
-               '--still-std-max',
-    'slope': 'let go of the sensor, and wait until it has settled',
-    'turning': 'let go of the sensor in each pose',
-    'noisy': 'hold the sensor still three times as long in each pose',
-    'length': 'check the unit, or accept them with a wider --still-norm-tolerance',
-    'zeros': 'check the driver and the cable',
-    'frozen': 'check the driver and the cable',
-    'repeated': 'turn the sensor to other orientations, or use --repeated keep'}
-"""What to do about most rests that are no poses, by the reason."""
-
-
-_ONE_LENGTH = 1e-3
-"""Range of the lengths of samples below which they are computed, relative to their length."""
-
-
-def _check_measured(found: Captured, units: Units) -> None:
-    """Refuse samples that all have the same length while the sensor turns."""
-    low, high = found.lengths
-    if high - low < _ONE_LENGTH * high and not _is_one_direction(found.poses):
-        raise InputError(
-            f'the readings have the same length of {short(high)} {units.name} in all directions, '
-            f'to {short(100.0 * (high - low) / high)} %: they are computed, as the gravity of a '
-            'phone is, and not measured; expected readings of an accelerometer',
-            'record the accelerometer itself, with gravity')
-
-
-def _account_of(found: Captured, asked: CaptureSettings) -> tuple[Finding, ...]:
-    """Return what was left out of a recording, and why most rests are no poses, if so."""
-    of_reason: dict[str, list[float]] = {}
-    for each in found.rests:
-        of_reason.setdefault(each.reason, []).append(each.end - each.start)
-    missing = [Finding('missing', f'{sum(of_reason[kind]):.3g} s are left out: {REASONS[kind]}',
-                       _REMEDIES[kind]) for kind in ('zeros', 'frozen') if kind in of_reason]
-    dropped = {reason: lengths for reason, lengths in of_reason.items()
-               if reason not in ('', 'zeros', 'frozen', 'repeated')}
-    count, every = sum(map(len, dropped.values())), len(of_reason.get('', ()))
-    if count <= every:
-        return tuple(missing)
-    most = max(dropped, key=lambda reason: len(dropped[reason]))
-    seconds = min(0.9 * float(np.median(dropped[most])), 0.8 * asked.min_dwell)
-    return (*missing, Finding(
-        'not_taken', f'{len(dropped[most])} of {counted(count + every, "rest")} are no poses: '
-        f'{REASONS[most]}', _REMEDIES[most].format(seconds=seconds), 'USABLE',
-        step='record'))
 
 
 def _wider(source: Source, found: Captured, units: Units, options: LogOptions,
@@ -383,9 +334,21 @@ class Outcome:
         return rate(self.calibration, refinement=self.refinement)
 
 
-def calibrated(poses: Poses, units: Units, plan: Plan = Plan()) -> Outcome:
+def calibrated(poses: Poses, units: Units, plan: Plan = Plan(),
+               findings: Sequence[Finding] = ()) -> Outcome:
     """
     Fit, refine if the poses can carry it, and level, as planned.
+
+    Parameters
+    ----------
+    poses : Poses
+        The poses, in the unit of the readings.
+    units : Units
+        Unit of the readings.
+    plan : Plan
+        How to fit, refine and level them.
+    findings : sequence of Finding
+        What is known of the recording that they come from (`Intake.findings`).
 
     Raises
     ------
@@ -396,7 +359,8 @@ def calibrated(poses: Poses, units: Units, plan: Plan = Plan()) -> Outcome:
 
     """
     date, chosen = now(), poses if plan.rows is None else poses.take(plan.rows)
-    calibration = _fit(chosen, units, plan, date)
+    with explained_by(each for each in findings if each.kind == 'not_taken'):
+        calibration = _fit(chosen, units, plan, date)
     refinement, line = None, 'not refined, as asked'
     if plan.refined:
         refinement, line = _refinement(chosen, units, plan, date)
@@ -407,6 +371,7 @@ def calibrated(poses: Poses, units: Units, plan: Plan = Plan()) -> Outcome:
     else:
         calibration = level_by_rows(calibration, poses, plan.frame, _row(poses, plan.flat),
                                     plan.nose_down)
+    calibration = replace(calibration, noted=(*calibration.noted, *findings))
     return Outcome(calibration, refinement, line)
 
 
@@ -481,15 +446,7 @@ def calibrated_log(source: Source, options: LogOptions, found: Intake, plan: Pla
             if high - low >= LEAST_RANGE:
                 return thermally_calibrated([
                     RampIntake(ramp_of(cells), log.units, log.read_as, log.notes)], plan)
-    try:
-        outcome = calibrated(found.poses, found.units, plan)
-    except RefusedFitError as err:
-        for each in found.findings:
-            if each.kind == 'not_taken':  # the poses that are missing were rests
-                raise RefusedFitError(f'{err.message}; {each.text}', each.advice) from None
-        raise
-    made = outcome.calibration
-    return replace(outcome, calibration=replace(made, noted=(*made.noted, *found.findings)))
+    return calibrated(found.poses, found.units, plan, found.findings)
 
 
 def thermally_calibrated(logs: Sequence[Intake | RampIntake], plan: Plan = Plan()

@@ -42,7 +42,7 @@ from ..estimate import (
     closed_form, covariance_with, estimate, faces, Fit, fit_12, fit_norm, fit_sphere, judge,
     lower_triangular, NotConvergedError, originals, outliers, outliers_or_scatter, Point,
     pose_noise, rivals, solve, start_of, stated, TIES, with_scatter_of)
-from ..finding import Finding
+from ..finding import explained_by, Finding
 from ..geometry import rms, unit
 from ..table import check_units, Poses
 from ..text import listed, short
@@ -112,7 +112,7 @@ def fit_poses(poses: Poses, units: Units, *, model: str = 'auto', method: Method
         raise RefusedFitError(f'row {rejected[0].row}: {rejected[0].reason}, but the method '
                               'algebraic uses every row', 'remove the row, or use the method ml')
     inside, ended, limited = inside_rows(sound, units) if method == 'ml' else (sound, (), ())
-    try:
+    with explained_by(limited):
         calibration, rejected = _without_doubtful(inside, (*rejected, *ended), units, model,
                                                   method)
         left_out = sorted((*rejected, *calibration.rejected), key=lambda pose: pose.row)
@@ -121,10 +121,6 @@ def fit_poses(poses: Poses, units: Units, *, model: str = 'auto', method: Method
         return finished(replace(
             calibration, poses=every, rejected=tuple(left_out),
             noted=(*wiring(calibration), *limited, *calibration.noted)), sensor, date)
-    except RefusedFitError as err:
-        for each in limited:
-            raise RefusedFitError(f'{err.message}; {each.text}', each.advice) from None
-        raise
 
 
 def _without_doubtful(poses: Poses, rejected: tuple[Rejected, ...], units: Units, model: str,

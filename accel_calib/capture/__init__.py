@@ -6,19 +6,21 @@ From samples to still poses. The node and recordings use the same rule.
 
 `chunks` sums the samples over short intervals of header time. `rule` decides whether the sensor is
 still in each chunk, from the arithmetic in `trend`. `dwell` joins still chunks to dwells, and
-accepts or rejects each. `detector` is the entry point, and makes the pose table. `ramp` makes the
-stretches of a still board whose temperature changes.
+accepts or rejects each, and `account` states why. `sensor` checks whether numbers can be those of
+a sensor. `detector` is the entry point, and makes the pose table. `ramp` makes the stretches of a
+still board whose temperature changes.
 
 """
 
+from .account import account_of, Rest
 from .chunks import CaptureSettings, CONTEXT, REPEATED, Repeated, settings_from
 from .detector import capture, Captured, poses_from, samples_of, select, StillDetector
-from .dwell import Dwell, REASONS, Rest
+from .dwell import Dwell
 from .ramp import cells_of, FASTEST, is_turned_over, LEAST_RANGE, Ramp, ramp_of
 from .rule import rounding_left
-from .sensor import check_axes
+from .sensor import check_axes, check_measured
 
-__all__ = ['CONTEXT', 'CaptureSettings', 'Captured', 'Dwell', 'FASTEST', 'LEAST_RANGE', 'REASONS',
-           'REPEATED', 'Ramp', 'Repeated', 'Rest', 'StillDetector', 'capture', 'cells_of',
-           'check_axes', 'is_turned_over', 'poses_from', 'ramp_of', 'rounding_left', 'samples_of',
-           'select', 'settings_from']
+__all__ = ['CONTEXT', 'FASTEST', 'LEAST_RANGE', 'REPEATED', 'Captured', 'CaptureSettings',
+           'Dwell', 'Ramp', 'Repeated', 'Rest', 'StillDetector', 'account_of', 'capture',
+           'cells_of', 'check_axes', 'check_measured', 'is_turned_over', 'poses_from', 'ramp_of',
+           'rounding_left', 'samples_of', 'select', 'settings_from']

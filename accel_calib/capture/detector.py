@@ -25,10 +25,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .account import Rest
 from .chunks import (
     CaptureSettings, chained, Chunker, CHUNKS_PER_WINDOW, CONTEXT, Interruption, MOTION, Records,
     together)
-from .dwell import Dwell, figures, figures_type, judged, OngoingDwell, Rest, Tracker
+from .dwell import Dwell, figures, figures_type, judged, OngoingDwell, Tracker
 from .rule import MISSING, Rule
 from ..errors import InputError
 from ..table import ABOUT, Floats, numbered, Poses, Recording
@@ -171,8 +172,8 @@ class StillDetector:
         return found
 
     def _keep(self, found: list[OngoingDwell]) -> int:
-        """Store the figures of these dwells, and return their number; all for a recording."""
-        if self._most is not None:
+        """Store the figures of these dwells, and return their number."""
+        if self._most is not None:  # only the account of a recording has the short ones
             found = [each for each in found if not each.short]
         if found:
             new = figures(found, known_units=self._rule.known)

@@ -48,11 +48,12 @@ from collections.abc import Mapping, Sequence
 import copy
 from dataclasses import dataclass, field
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .account import Rest
 from .chunks import (
     CaptureSettings, chained, Chunks, CHUNKS_PER_WINDOW, Records, summed, sums_type, window_type)
 from .rule import DWELL_SLOPE_G, HORIZON, judged_type, RELATIVE, Rule, STRENGTH, WEAK_STRENGTH
@@ -170,27 +171,6 @@ PART_SLOPE_G = 5e-3
 
 PART_STRENGTH = 20.0
 """This slope is significant if the sum of its squared scores is larger: p ≈ 2e-4."""
-
-REASONS = {
-    'zeros': 'samples are missing: they are 0 on all axes',
-    'frozen': 'samples are missing: the last reading is repeated, though no other rest repeats it',
-    'short': 'it is shorter than min_dwell',
-    'shaking': 'it varies more than the noise of the sensor',
-    'slope': 'the reading changes during it',
-    'turning': 'the gyro turns during it',
-    'noisy': 'its noise does not exclude a slow turn',
-    'length': 'its |a| is not that of gravity',
-    'repeated': 'it repeats an earlier orientation'}
-"""Why a rest is no pose."""
-
-
-class Rest(NamedTuple):
-    """A rest from its first to its last stamp [s]; `reason` is one of `REASONS`, '' for a pose."""
-
-    start: float
-    end: float
-    reason: str = ''
-
 
 _AT_LIMIT, _QUIETER = 0.2, 0.25
 """Share of samples that repeat the extreme of an axis, and standard deviation relative to that of

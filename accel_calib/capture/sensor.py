@@ -4,11 +4,14 @@
 """
 Whether numbers can be those of an accelerometer that was turned.
 
-A fit supposes three axes that each read their part of gravity. If they do not, the poses lie in a
-plane, and more poses do not help. The plane of poses that were turned about one axis alone is cut
-from the sphere of gravity, so that they lie on a circle. If they lie in a plane and on no circle,
-an axis does not measure. The normal of the plane names it: along one axis, that axis is stuck;
-halfway between two, one of them is a copy of the other.
+**Axes.** A fit supposes three axes that each read their part of gravity. If they do not, the poses
+lie in a plane, and more poses do not help. The plane of poses that were turned about one axis
+alone is cut from the sphere of gravity, so that they lie on a circle. If they lie in a plane and
+on no circle, an axis does not measure. The normal of the plane names it: along one axis, that axis
+is stuck; halfway between two, one of them is a copy of the other.
+
+**Length.** The gravity that a phone computes has the same length in all directions. Noise, offset
+and gains of a sensor change that of what it measures.
 
 """
 
@@ -19,6 +22,9 @@ from ..errors import InputError
 from ..table import Floats
 from ..text import short
 from ..units import Units
+
+_ONE_LENGTH = 1e-3
+"""Range of the lengths of samples below which they are computed, relative to their length."""
 
 _FEWEST = 6
 """Fewest readings that determine a circle and check it."""
@@ -71,6 +77,17 @@ def check_axes(reading: Floats, units: Units) -> None:
         return
     raise InputError(f'{what}, expected three axes that each read their part of gravity',
                      'check the wiring, the driver and the columns of the log')
+
+
+def check_measured(lengths: tuple[float, float], units: Units) -> None:
+    """Raise InputError if the smallest and largest |reading| of a turned sensor are the same."""
+    low, high = lengths
+    if high - low < _ONE_LENGTH * high:
+        raise InputError(
+            f'the readings have the same length of {short(high)} {units.name} in all directions, '
+            f'to {short(100.0 * (high - low) / high)} %: they are computed, as the gravity of a '
+            'phone is, and not measured; expected readings of an accelerometer',
+            'record the accelerometer itself, with gravity')
 
 
 def _is_circle(flat: Floats) -> bool:

@@ -284,8 +284,7 @@ def columns_of(sums: Records, axes: int) -> Columns:
     first, second = (np.ascontiguousarray(sums[name].T[:axes]) for name in ('first', 'second'))
     count = sums['count'].copy()
     return Columns(count, first, second, np.ascontiguousarray(sums['at_limit'].T),
-                   sums['repeats'].copy(),
-                   (sums['zeros'] > 0.0).astype(float))
+                   sums['repeats'].copy(), (sums['zeros'] > 0.0).astype(float))
 
 
 def windows(sums: Columns) -> tuple[Floats, Floats]:
@@ -305,10 +304,10 @@ class Stretch:
     `trend` has the slopes of the reading, (3, m), and `excess` (groups, m) is that of the noise of
     the mean, for reading and rate. `variance` (axes, m) is the mean variance of the windows, and
     `highest` (3, m) the largest one of the reading. `samples` (m,) is their number, and `at_limit`
-    (3, m) the share that repeats the extreme of its axis so far. `same` (m,) is the share that
-    repeats the sample before. `means` (3, m + length - 1) are
-    those of the chunks of the reading. `scatter` (m,) is the mean square of their residuals, sum
-    over the axes, and `white` (m,) the same for independent samples.
+    (3, m) the share that repeats the extreme of its axis so far; `same` (m,) is the share that
+    repeats the sample before. `means` (3, m + length - 1) are those of the chunks of the reading.
+    `scatter` (m,) is the mean square of their residuals, sum over the axes, and `white` (m,) the
+    same for independent samples.
 
     """
 

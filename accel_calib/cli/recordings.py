@@ -13,7 +13,6 @@ from pathlib import Path
 from .frame import (
     check_target, Done, given, log_options, read_lines, settings, stored_calibration, Target)
 from .output import Output, progress
-from ..capture import REASONS
 from ..disk import STANDARD_OUTPUT, write_atomically
 from ..effects import parse_effect
 from ..errors import InputError
@@ -38,7 +37,7 @@ def run_capture(args: argparse.Namespace) -> Done:
         'samples_in_poses': captured.samples,
         'threshold': captured.threshold, 'seconds': captured.seconds,
         'rests': [{'start': each.start, 'end': each.end, 'taken': not each.reason,
-                   'reason': REASONS.get(each.reason, '')} for each in captured.rests],
+                   'reason': each.words} for each in captured.rests],
         'findings': [each.stated for each in found.findings],
         'interruptions': [item._asdict() for item in captured.interruptions],
         'read_lines': replace(found, captured=found.captured[1:]).lines},

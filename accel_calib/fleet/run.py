@@ -53,8 +53,9 @@ _AHEAD = 4
 _ABSENT_S = 30.0
 """Time without any worker after which a cluster of this machine starts another one [s]."""
 
-_LOOK_S = 0.2
-"""Interval at which the workers are looked for [s]."""
+_LOOK_S, _FETCH_S = 0.02, 10.0
+"""Interval at which tasks and workers are looked for [s], and time to fetch a result [s], which
+begins again after it."""
 
 _TASK_S = 0.5
 """Duration of a task [s]: recordings share it if they are quick, because a task costs the program
@@ -308,7 +309,7 @@ def mapped(client: Client, function: Callable[..., Any], items: Iterable[_Item],
             return
         with _ctrl_c_passes():
             while not done.has_ready():
-                time.sleep(_LOOK_S / 10.0)
+                time.sleep(_LOOK_S)
                 workers.look()
             future = next(done)
         batch = waiting.pop(future)
@@ -355,7 +356,7 @@ def _result_of(client: Client, future: Any, workers: _Workers) -> tuple[list[Any
     try:
         while True:  # the worker that has the result can die before it is fetched
             try:
-                found: tuple[list[Any], float] = future.result(timeout=_LOOK_S)
+                found: tuple[list[Any], float] = future.result(timeout=_FETCH_S)
                 return found
             except NotYet:
                 workers.look()

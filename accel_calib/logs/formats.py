@@ -156,7 +156,7 @@ def _opened(path: Path, member: Member, options: LogOptions, expected: str
             Stream(path, expected, parts), PEEKED) as raw:
         name = member.name or (path.stem if path.suffix in containers.PACKED else path.name)
         inside = recognised(Path(name), raw.peek())
-        if inside is not FORMATS[-1]:
+        if inside is not TEXT:
             raise InputError(f'{path} holds {name}, {inside.name}, expected a table of text',
                              containers.UNPACK)
         with open_text(path / member.name, lambda cells: is_log_header(cells, options), raw,
@@ -369,6 +369,8 @@ FORMATS = (
            containers.text))
 """The formats; of several that fit, the first one counts."""
 
+BAG, TEXT = FORMATS[0], FORMATS[-1]
+
 SUFFIXES = tuple(dict.fromkeys(
     suffix for each in FORMATS if not each.advice for suffix in each.suffixes))
 """Suffixes of the formats that are read."""
@@ -381,18 +383,18 @@ def recognised(path: Path, head: bytes) -> Format:
     fitting = (each for each in FORMATS if each.first and re.match(each.first, head, re.DOTALL))
     named = (each for each in FORMATS
              if suffix in each.suffixes and (is_binary or not each.first))
-    return next(chain(fitting, named), FORMATS[-1])
+    return next(chain(fitting, named), TEXT)
 
 
 def is_bag(path: Path) -> bool:
     """Return whether a path names a bag rather than a table."""
-    return path.is_dir() or path.suffix.lower() in FORMATS[0].suffixes
+    return path.is_dir() or path.suffix.lower() in BAG.suffixes
 
 
 @contextmanager
 def open_file(path: Path, options: LogOptions) -> Iterator[OpenLog]:
     """Open a file in its format; errors as in `open_log`."""
-    known = FORMATS[0]
+    known = BAG
     if not is_bag(path):
         with path.open('rb') as file:
             head = file.read(_HEAD)

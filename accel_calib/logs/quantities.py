@@ -173,10 +173,16 @@ class Quantities:
         """Set the factor of columns to our unit, and our value at 0."""
         self.scales.update(dict.fromkeys(keys, (factor, zero)))
 
+    def three(self, cells: Cells, ours: Sequence[str]) -> Floats:
+        """Return the numbers of three columns with their sign, (n, 3), in the unit of the file."""
+        return np.column_stack([self._signed(cells, name) for name in ours])
+
+    def _signed(self, cells: Cells, ours: str) -> Floats:
+        values, modulus = self.chosen.numbers(cells, ours), self.modulus.get(ours)
+        return with_sign(values, modulus) if modulus else values
+
     def _scaled(self, cells: Cells, ours: str) -> Floats:
-        values = self.chosen.numbers(cells, ours)
-        if ours in self.modulus:
-            values = with_sign(values, self.modulus[ours])
+        values = self._signed(cells, ours)
         factor, zero = self.scales.get(ours, (1.0, 0.0))
         return values if (factor, zero) == (1.0, 0.0) else values * factor + zero
 
@@ -194,22 +200,9 @@ def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
         made.said.append(f'{columns.maker.name} format')
         made.notes += [columns.maker.note] if columns.maker.note else []
     made.said += columns.layout.words
-    if not (columns.layout.header or options.columns) and _are_exchanged(columns, first):
-        swapped = dict(zip((*READING, *RATE), (*RATE, *READING), strict=True))
-        columns = replace(columns, sources={
-            key: columns.sources[swapped.get(key, key)] for key in columns.sources})
-        made.chosen = columns
-        made.said.append(f'{compact(columns.names(RATE))} are a gyro by their values')
     if 'instance' in columns.sources:
         made.instance = _instance(columns, first, options, made.notes)
         first = _of_instance(columns, first, made.instance)
-    if 'time' in columns.sources:
-        made.clock = clock_of(columns, first, options)
-        made.notes += made.clock.doubts
-    samples = _decide_samples(made, first, options)
-    made.clock.newest_first &= samples  # rows of poses keep their numbers
-    if 'time' in columns.sources and (samples or columns.sources['time'].name != 'time'):
-        made.said.append(made.clock.said)
     for keys in (READING, RATE):
         if columns.sources.keys() >= set(keys) and (modulus := modulus_of(
                 columns.three(first, keys))):
@@ -217,6 +210,19 @@ def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
             made.notes.append(f'{compact(columns.names(keys))} are numbers of '
                               f'{round(math.log2(modulus))} bits that lost their sign: they are '
                               'read with it')
+    if not (columns.layout.header or options.columns) and _are_exchanged(made, first):
+        swapped = dict(zip((*READING, *RATE), (*RATE, *READING), strict=True))
+        columns = made.chosen = replace(columns, sources={
+            key: columns.sources[swapped.get(key, key)] for key in columns.sources})
+        made.modulus = {swapped[key]: each for key, each in made.modulus.items()}
+        made.said.append(f'{compact(columns.names(RATE))} are a gyro by their values')
+    if 'time' in columns.sources:
+        made.clock = clock_of(columns, first, options)
+        made.notes += made.clock.doubts
+    samples = _decide_samples(made, first, options)
+    made.clock.newest_first &= samples  # rows of poses keep their numbers
+    if 'time' in columns.sources and (samples or columns.sources['time'].name != 'time'):
+        made.said.append(made.clock.said)
     _decide_reading(made, first, options, samples=samples)
     _decide_rate(made, first)
     _decide_temperature(made, first)
@@ -226,12 +232,12 @@ def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
     return made
 
 
-def _are_exchanged(columns: Chosen, first: Cells) -> bool:
+def _are_exchanged(made: Quantities, first: Cells) -> bool:
     """Return whether the rates of columns without names have a steady length, as gravity has."""
-    if (not columns.sources.keys() >= {*READING, *RATE}
-            or rests_of(columns.three(first, READING), samples=True).unit is not None):
+    if (not made.chosen.sources.keys() >= {*READING, *RATE}
+            or rests_of(made.three(first, READING), samples=True).unit is not None):
         return False
-    reading, rate = (_steadiness(columns.three(first, keys)) for keys in (READING, RATE))
+    reading, rate = (_steadiness(made.three(first, keys)) for keys in (READING, RATE))
     return rate > _STEADY and rate > _STEADIER * reading
 
 
@@ -292,10 +298,7 @@ def _decide_reading(made: Quantities, first: Cells, options: LogOptions, *, samp
     stated = _stated(columns, options) or (not named and options.default_units) or ''
     if stated and stated != named:
         factor = 1.0
-    raw = columns.three(first, READING)
-    if modulus := made.modulus.get(READING[0]):
-        raw = with_sign(raw, modulus)
-    rests = rests_of(raw * factor, samples=samples)
+    rests = rests_of(made.three(first, READING) * factor, samples=samples)
     name, words = stated or named, compact(columns.names(READING))
     with saying(', '.join([*made.said, f'{words} in {name}' if name else words])):
         _check_gravity(columns, rests, units_of(name, options.gravity) if name else None)
@@ -316,7 +319,7 @@ def _decide_reading(made: Quantities, first: Cells, options: LogOptions, *, samp
 
 def _decide_samples(made: Quantities, first: Cells, options: LogOptions) -> bool:
     """Return whether rows are samples, rather than poses; set their rate if they lack times."""
-    raw = made.chosen.three(first, READING)
+    raw = made.three(first, READING)
     there = {key: raw for key, column in COLUMNS.items() if column.names[0] in made.chosen.sources}
     if 'time' in made.chosen.sources:
         return are_samples({**there, 'time': made.clock.seconds(first)})
@@ -552,7 +555,7 @@ def _decide_rate(made: Quantities, first: Cells) -> None:
         return
     stated = unit_of('rate', columns.sources['gx'].unit)
     rests = None if stated else _units_at_rest(made, first)
-    largest = float(np.quantile(np.abs(columns.three(first, RATE)), 0.999))
+    largest = float(np.quantile(np.abs(made.three(first, RATE)), 0.999))
     own = columns.sources['gx'].name == 'gx' and largest < _LARGEST_RATE
     if stated is None and own and columns.layout.header and (not rests or 'rad/s' in rests):
         return
@@ -576,8 +579,7 @@ def _units_at_rest(made: Quantities, first: Cells) -> dict[str, float] | None:
     the bias and the noise of the gyro. Rates without noise are computed, and show no unit.
 
     """
-    columns = made.chosen
-    windows, rates = (_windows(columns.three(first, keys)) for keys in (READING, RATE))
+    windows, rates = (_windows(made.three(first, keys)) for keys in (READING, RATE))
     if len(windows) < 2:
         return None
     quiet = _quietest(windows)

@@ -1,0 +1,65 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The account of every rest of a recording: whether it became a pose, or why not."""
+
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+
+from .chunks import CaptureSettings
+from ..finding import Finding
+from ..text import counted
+
+REASONS: Mapping[str, tuple[str, str]] = MappingProxyType({
+    'zeros': ('samples are missing: they are 0 on all axes', 'check the driver and the cable'),
+    'frozen': ('samples are missing: the last reading is repeated, though no other rest repeats '
+               'it', 'check the driver and the cable'),
+    'short': ('it is shorter than min_dwell', 'hold the sensor still for longer in each pose, or '
+              'capture shorter rests with --min-dwell {seconds:.2g}'),
+    'shaking': ('it varies more than the noise of the sensor', 'put the sensor on something that '
+                'does not shake, or accept it with --still-std-max'),
+    'slope': ('the reading changes during it', 'let go of the sensor, and wait until it has '
+              'settled'),
+    'turning': ('the gyro turns during it', 'let go of the sensor in each pose'),
+    'noisy': ('its noise does not exclude a slow turn', 'hold the sensor still three times as '
+              'long in each pose'),
+    'length': ('its |a| is not that of gravity', 'check the unit, or accept them with a wider '
+               '--still-norm-tolerance'),
+    'repeated': ('it repeats an earlier orientation', '')})
+"""Why a rest is no pose, and what to do about it."""
+
+
+class Rest(NamedTuple):
+    """A rest from its first to its last stamp [s]; `reason` is one of `REASONS`, '' for a pose."""
+
+    start: float
+    end: float
+    reason: str = ''
+
+    @property
+    def words(self) -> str:
+        """Return why it is no pose; empty for a pose."""
+        return REASONS[self.reason][0] if self.reason else ''
+
+
+def account_of(rests: Sequence[Rest], settings: CaptureSettings) -> tuple[Finding, ...]:
+    """Return what was left out of a recording, and why most rests are no poses, if so."""
+    seconds: dict[str, list[float]] = {}
+    for each in rests:
+        seconds.setdefault(each.reason, []).append(each.end - each.start)
+    found = [Finding('missing', f'{sum(seconds[kind]):.3g} s are left out: {REASONS[kind][0]}',
+                     REASONS[kind][1]) for kind in ('zeros', 'frozen') if kind in seconds]
+    dropped = {reason: lengths for reason, lengths in seconds.items()
+               if reason not in ('', 'zeros', 'frozen', 'repeated')}
+    count, taken = sum(map(len, dropped.values())), len(seconds.get('', ()))
+    if count > taken:
+        most = max(dropped, key=lambda reason: len(dropped[reason]))
+        words, remedy = REASONS[most]
+        enough = min(0.9 * float(np.median(dropped[most])), 0.8 * settings.min_dwell)
+        found.append(Finding(
+            'not_taken', f'{len(dropped[most])} of {counted(count + taken, "rest")} are no '
+            f'poses: {words}', remedy.format(seconds=enough), 'USABLE', step='record'))
+    return tuple(found)
