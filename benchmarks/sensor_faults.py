@@ -44,8 +44,8 @@ _PAGE = """\
 
 Made by `python benchmarks/sensor_faults.py {command}`. Each set is a recording of 14 poses with
 other errors of the sensor, noise, rate and orientations, and with one fault. *Named*: a finding, a
-note or the refusal is about the fault. *Wrong*: a calibration that is not BAD leaves an error of |a|
-above 10 mg in new orientations.
+note or the refusal is about the fault. *Wrong*: a calibration that is not BAD leaves an error of
+|a| above 10 mg in new orientations.
 
 Machine: {machine}.
 
@@ -182,6 +182,8 @@ def error_mg(made: Outcome, model: Model, log: Log, clean: Log, rng: np.random.G
         reading = np.column_stack([reading, np.ones(500)]) @ changed
     reading = reading[np.all(np.abs(reading) < limits, axis=1)]
     own = made.calibration
+    if own.units.name == 'g':  # counts of about 1000 to the g are read as mg
+        reading = reading * 1e-3
     length = np.linalg.norm(own.correct(reading, own.typical_context(len(reading))), axis=1)
     return float(np.sqrt(np.mean((length / own.force_per_g - 1.0)**2))) * 1e3
 
