@@ -253,7 +253,7 @@ def ramp_or_poses(source: Path | Piped | Frame, options: LogOptions = LogOptions
 def _is_one_direction(poses: Poses) -> bool:
     """Return whether poses are of one board that was not turned."""
     up = unit(poses.reading)
-    return bool(np.all(up @ up[0] > _ONE_DIRECTION))
+    return bool(np.all(up @ up[:1].T > _ONE_DIRECTION))
 
 
 Flat = int | Literal['first', 'last'] | None
