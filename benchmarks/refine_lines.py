@@ -263,7 +263,7 @@ def said_lines(outcomes: Sequence[Outcome]) -> list[Line]:
 def _seconds(what: str, outcomes: Sequence[Outcome], most: float | None = None) -> Line:
     seconds = np.array([o.seconds for o in outcomes] or [np.nan])
     middle = float(np.median(seconds))
-    return Line(f'{what}: seconds per set', f'{middle:.2f}, longest {np.max(seconds):.2f}',
+    return Line(f'{what}: CPU seconds per set', f'{middle:.2f}, longest {np.max(seconds):.2f}',
                 '' if most is None else f'< {most:g}', len(outcomes),
                 None if most is None else middle < most)
 
