@@ -386,7 +386,7 @@ def fit(poses: Source | Poses | Data, *, units: UnitName | None = None,
     plan = Plan(model=model, method=method, refined=False, flat=flat, nose_down=nose_down,
                 frame=frame, sensor=sensor)
     found = poses_of(*_asked(poses, units, gravity))
-    return _public(calibrated(found.poses, found.units, plan, found.findings).calibration)
+    return _public(calibrated(found.poses, found.units, plan).calibration)
 
 
 def refine(poses: Source | Poses | Data, *, base: str | Calibration = 'auto',

@@ -63,6 +63,9 @@ KINDS: Mapping[str, str] = MappingProxyType({
     'uncertainty': 'the stated uncertainty is large in some directions',
     'undetermined': 'the poses do not determine the largest model',
     'missing': 'samples of the recording are missing',
+    'signs': 'numbers of the log lost their sign',
+    'clock': 'the order or the times of the rows are not those of the samples',
+    'columns': 'what columns hold is decided by their values',
     'copies': 'equal rows count as one pose',
     'unlike_fleet': 'the sensor is unlike the fleet',
     'unnamed': 'recordings of a fleet do not say of which sensor they are',
@@ -175,11 +178,13 @@ def has(findings: Iterable[Finding], kind: str) -> bool:
 
 @contextmanager
 def explained_by(findings: Iterable[Finding]) -> Iterator[None]:
-    """Let a refusal inside state the first of these findings, and its advice."""
+    """Let a refusal inside state the first finding that asks for another recording."""
     try:
         yield
     except RefusedFitError as err:
         for each in findings:
+            if each.next.kind != 'record':
+                continue
             raise RefusedFitError(f'{err.message}; {each.text}', each.advice) from None
         raise
 

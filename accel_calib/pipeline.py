@@ -27,13 +27,12 @@ from .calibrate import (
     fit_with_fleet, flat_direction, FleetPrior, level, level_by_rows, lies_in_cone, PRIOR,
     SampleContext, thermal_alone, with_curve, without_curve)
 from .capture import (
-    account_of, capture, Captured, CaptureSettings, cells_of, check_measured, is_turned_over,
-    LEAST_RANGE, Ramp, ramp_of, settings_from)
+    account_of, capture, Captured, CaptureSettings, cells_of, check_measured, is_one_direction,
+    is_turned_over, LEAST_RANGE, Ramp, ramp_of, settings_from)
 from .effects import Context, LADDER, Model, PROCESSES
 from .errors import InputError, RefusedFitError, saying
 from .finding import explained_by, Finding
 from .findings import rate, Rating
-from .geometry import unit
 from .logs import Frame, LogOptions, open_log, OpenLog, Piped, Progress
 from .table import check_units, Poses, range_of, Recording, Table
 from .text import counted, now, short
@@ -43,9 +42,6 @@ if TYPE_CHECKING:
     from .refine import Refinement
 
 Source = Path | Piped | Frame | Poses | Recording
-
-_ONE_DIRECTION = math.cos(math.radians(6.0))
-"""Cosine of the largest angle between readings of a board that was not turned."""
 
 _FEW = 6
 """Fewer poses than these are too few for a calibration with all axes."""
@@ -60,8 +56,7 @@ class Intake:
     Poses of a table or captured from a recording, with the unit of their readings.
 
     `read_as` is how the log was read, empty if nothing was assumed. `notes` are what was left out
-    of the log, and `captured` how the poses were captured, if they were. `findings` are about the
-    samples and the rests of a recording.
+    of the log, and `captured` how the poses were captured, if they were.
 
     """
 
@@ -70,13 +65,12 @@ class Intake:
     read_as: str = ''
     notes: tuple[str, ...] = ()
     captured: tuple[str, ...] = ()
-    findings: tuple[Finding, ...] = ()
 
     @property
     def said(self) -> str:
         """Return how the log was read and captured, in one line, for an error about it."""
-        return ', '.join(filter(None, (self.read_as, *self.captured,
-                                       *(each.text for each in self.findings))))
+        left_out = (each.text for each in self.poses.findings if each.kind == 'missing')
+        return ', '.join(filter(None, (self.read_as, *self.captured, *left_out)))
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -122,7 +116,7 @@ def poses_of(source: Source, options: LogOptions = LogOptions(),
     """
     with _opened(source, options) as log:
         if log.poses is not None:
-            return Intake(log.poses, log.units, log.read_as, log.notes)
+            return Intake(log.poses, log.units, log.read_as, log.noted())
         return _captured(source, log, options, settings, progress)[0]
 
 
@@ -158,8 +152,7 @@ def _captured(source: Source, log: OpenLog, options: LogOptions, settings: Mappi
     """Capture the poses of an open log; InputError without a still stretch."""
     asked = settings_from(settings, log.units)
     found = capture(log.watched(progress), log.units, asked)
-    if not _is_one_direction(found.poses):
-        check_measured(found.lengths, log.units)
+    check_measured(found.poses.reading, found.lengths, log.units)
     count, findings = len(found.poses), account_of(found.rests, asked)
     limit, more = _wider(source, found, log.units, options, settings) if count < _FEW else (0.0, 0)
     finds = f'{more} with still_std_max {limit:.3g}'
@@ -170,8 +163,8 @@ def _captured(source: Source, log: OpenLog, options: LogOptions, settings: Mappi
              f'{found.seconds:.0f} s']
     if more >= 2 * count:
         lines.append(f'{counted(count, "pose")} only, {finds}')
-    return Intake(replace(found.poses, units=log.units.name), log.units, log.read_as, log.notes,
-                  tuple(lines), findings), found
+    return Intake(replace(found.poses, units=log.units.name, findings=(*log.findings, *findings)),
+                  log.units, log.read_as, log.noted(), tuple(lines)), found
 
 
 def _wider(source: Source, found: Captured, units: Units, options: LogOptions,
@@ -240,20 +233,14 @@ def ramp_or_poses(source: Path | Piped | Frame, options: LogOptions = LogOptions
         table = log.poses
         # A recording of slow samples has the form of a pose table.
         if table is not None and not ('time' in table and 'count' not in table
-                                      and _is_one_direction(table)):
-            return Intake(table, log.units, log.read_as, log.notes)
+                                      and is_one_direction(table.reading)):
+            return Intake(table, log.units, log.read_as, log.noted())
         samples = log.watched(progress) if table is None else (Recording(
             table.columns, table.row, table.units, table.sensor, table.autopilot),)
         cells = cells_of(samples, log.units)
         if not is_turned_over(cells):
             return RampIntake(ramp_of(cells), log.units, log.read_as, log.notes)
     return poses_of(source, options, settings, progress)
-
-
-def _is_one_direction(poses: Poses) -> bool:
-    """Return whether poses are of one board that was not turned."""
-    up = unit(poses.reading)
-    return bool(np.all(up @ up[:1].T > _ONE_DIRECTION))
 
 
 Flat = int | Literal['first', 'last'] | None
@@ -334,8 +321,7 @@ class Outcome:
         return rate(self.calibration, refinement=self.refinement)
 
 
-def calibrated(poses: Poses, units: Units, plan: Plan = Plan(),
-               findings: Sequence[Finding] = ()) -> Outcome:
+def calibrated(poses: Poses, units: Units, plan: Plan = Plan()) -> Outcome:
     """
     Fit, refine if the poses can carry it, and level, as planned.
 
@@ -347,8 +333,6 @@ def calibrated(poses: Poses, units: Units, plan: Plan = Plan(),
         Unit of the readings.
     plan : Plan
         How to fit, refine and level them.
-    findings : sequence of Finding
-        What is known of the recording that they come from (`Intake.findings`).
 
     Raises
     ------
@@ -359,7 +343,7 @@ def calibrated(poses: Poses, units: Units, plan: Plan = Plan(),
 
     """
     date, chosen = now(), poses if plan.rows is None else poses.take(plan.rows)
-    with explained_by(each for each in findings if each.kind == 'not_taken'):
+    with explained_by(poses.findings):
         calibration = _fit(chosen, units, plan, date)
     refinement, line = None, 'not refined, as asked'
     if plan.refined:
@@ -371,7 +355,6 @@ def calibrated(poses: Poses, units: Units, plan: Plan = Plan(),
     else:
         calibration = level_by_rows(calibration, poses, plan.frame, _row(poses, plan.flat),
                                     plan.nose_down)
-    calibration = replace(calibration, noted=(*calibration.noted, *findings))
     return Outcome(calibration, refinement, line)
 
 
@@ -439,14 +422,14 @@ def calibrated_log(source: Source, options: LogOptions, found: Intake, plan: Pla
     spans `LEAST_RANGE`, the board was still while it warmed up.
 
     """
-    if found.captured and not found.units.is_native and _is_one_direction(found.poses):
+    if found.captured and not found.units.is_native and is_one_direction(found.poses.reading):
         with _opened(source, options) as log:
             cells = cells_of(log.blocks, log.units)
             low, high = range_of(cells, 'temperature')
             if high - low >= LEAST_RANGE:
                 return thermally_calibrated([
                     RampIntake(ramp_of(cells), log.units, log.read_as, log.notes)], plan)
-    return calibrated(found.poses, found.units, plan, found.findings)
+    return calibrated(found.poses, found.units, plan)
 
 
 def thermally_calibrated(logs: Sequence[Intake | RampIntake], plan: Plan = Plan()

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError, needing
+from .finding import Finding
 from .text import counted, table
 from .units import Floats as Floats, STANDARD_GRAVITY, UnitName, Units
 
@@ -199,6 +200,8 @@ class Table(Record):
         Name of the sensor; empty if the source does not state it.
     autopilot : Autopilot or None
         Its place in an autopilot, for readings of a flight log.
+    findings : tuple of Finding
+        What was found in the samples and the rests that they come from.
 
     """
 
@@ -207,6 +210,7 @@ class Table(Record):
     units: UnitName | Literal[''] = ''
     sensor: str = ''
     autopilot: Autopilot | None = None
+    findings: tuple[Finding, ...] = ()
 
     def __post_init__(self) -> None:
         if 'reading' not in self.columns:

@@ -4,10 +4,12 @@
 """
 Faults of a sensor, its driver and its clock: whether they are named, and never calibrated.
 
-A simulated recording is given a fault, written as a CSV file, and calibrated as a user does it.
-It is *named* if a finding, a note or the refusal is about the fault, and *wrong* if a calibration
-that is not BAD leaves an error of |a| above 10 mg in orientations that it has not seen. A
-recording without a fault must have no finding about the samples::
+A simulated recording is given a fault, and calibrated as a user does it: from a CSV file, from a
+bag, by the session of a node, and by the session of the live page. It is *named* if a finding, a
+note, a line of the log or the refusal is about the fault, and *wrong* if a calibration that is not
+BAD leaves an error of |a| above 10 mg in orientations that it has not seen. A recording without a
+fault must have no finding about the samples. Faults of the text and of the order of rows are no
+faults of messages::
 
     python benchmarks/sensor_faults.py --sets 50 --markdown docs/figures/sensor_faults.md
 
@@ -21,31 +23,43 @@ from dataclasses import dataclass
 from pathlib import Path
 import sys
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT)]
+sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 
+from accel_calib.calibrate import Calibration  # noqa: E402
 from accel_calib.effects import Model, model_with, predict, simulate_recording  # noqa: E402
 from accel_calib.errors import AccelCalibError  # noqa: E402
-from accel_calib.finding import has  # noqa: E402
+from accel_calib.finding import Finding, has  # noqa: E402
+from accel_calib.findings import Rating  # noqa: E402
 from accel_calib.geometry import spread_directions, unit  # noqa: E402
-from accel_calib.logs import LogOptions  # noqa: E402
+from accel_calib.logs import LogOptions, open_log  # noqa: E402
 from accel_calib.pipeline import calibrated_log, Outcome, poses_of  # noqa: E402
-from accel_calib.table import Floats  # noqa: E402
+from accel_calib.session import checks, columns_of  # noqa: E402
+from accel_calib.table import concatenated, Floats  # noqa: E402
+from bag_files import fill, header, IMU, imu, writer_of  # noqa: E402
+from driven import Driver  # noqa: E402
 from figures import machine, markdown, parser, publish  # noqa: E402
 import numpy as np  # noqa: E402
 
 G = 9.80665
 _WRONG_MG = 10.0
 
+OF_SAMPLES = ('missing', 'not_taken', 'signs', 'clock', 'columns', 'limited')
+"""Kinds of findings that a sound recording does not have."""
+
+Said = tuple[str, Calibration | None, Rating | None]
+
 _PAGE = """\
 # Faults of sensors
 
-Made by `python benchmarks/sensor_faults.py {command}`. Each set is a recording of 14 poses with
-other errors of the sensor, noise, rate and orientations, and with one fault. *Named*: a finding, a
-note or the refusal is about the fault. *Wrong*: a calibration that is not BAD leaves an error of
-|a| above 10 mg in new orientations.
+Made by `python benchmarks/sensor_faults.py {command}`. Each set is a
+recording of 14 poses with other errors of the sensor, noise, rate and orientations, and with one
+fault. It comes as a CSV file, as a bag, as messages to the session of a node, and as a recording
+that the live page plays. *Named*: a finding, a note, a line of the log or the refusal is about the
+fault. *Wrong*: a calibration that is not BAD leaves an error of |a| above 10 mg in new
+orientations.
 
 Machine: {machine}.
 
@@ -147,18 +161,90 @@ def recording(rng: np.random.Generator) -> tuple[Log, Model]:
     return Log(made['time'], G * made.reading, made['rate']), model
 
 
-def outcome(log: Log, folder: Path) -> tuple[str, Outcome | None]:
-    """Return what is said of a recording, and its calibration unless it is refused."""
+def of_file(path: Path, units: Literal['', 'native']) -> Said:
+    """Return what ``calibrate`` says of a file."""
+    options = LogOptions(units=units)
+    try:
+        found = poses_of(path, options)
+        made = calibrated_log(path, options, found)
+    except AccelCalibError as err:
+        return str(err), None, None
+    assert isinstance(made, Outcome)
+    return (' '.join([*found.lines, *(each.words for each in made.rating.findings)]),
+            made.calibration, made.rating)
+
+
+def of_csv(log: Log, folder: Path) -> Said:
+    path = folder / 'log.csv'
+    np.savetxt(path, np.column_stack(log[:3]), fmt='%.7g', delimiter=',', header=log.header,
+               comments='')
+    return of_file(path, '')
+
+
+def of_bag(log: Log, folder: Path) -> Said:
+    path = folder / 'log.bag'
+    path.unlink(missing_ok=True)
+    writer, store = writer_of(path, 'bag')
+    stamps = 10**18 + np.round(log.time * 1e9).astype(int)
+    fill(writer, store, [('/imu', IMU)], (
+        (0, 10**18 + 10**7 * k, imu(store, header(store, int(stamp)), reading, rate))
+        for k, (stamp, reading, rate) in enumerate(zip(stamps, log.reading, log.rate))))
+    return of_file(path, _units(log))
+
+
+def of_node(log: Log, _: Path) -> Said:
+    return _of_session(log, _units(log), ())
+
+
+def of_live(log: Log, folder: Path) -> Said:
     path = folder / 'log.csv'
     np.savetxt(path, np.column_stack(log[:3]), fmt='%.7g', delimiter=',', header=log.header,
                comments='')
     try:
-        found = poses_of(path, LogOptions())
-        made = calibrated_log(path, LogOptions(), found)
+        with open_log(path, LogOptions()) as opened:
+            read = concatenated(list(opened.blocks))
+            return _of_session(Log(read['time'], read.reading, read['rate'] if 'rate' in read
+                                   else np.full((len(read), 3), np.nan)), opened.units.name,
+                               opened.findings)
     except AccelCalibError as err:
-        return str(err), None
-    assert isinstance(made, Outcome)
-    return ' '.join([*found.lines, *(each.words for each in made.rating.findings)]), made
+        return str(err), None, None
+
+
+def _of_session(log: Log, units: str, found: tuple[Finding, ...]) -> Said:
+    """Push the samples of a log into a session, and let it fit."""
+    with TemporaryDirectory() as own:
+        return _pushed(log, Driver(units=units or 'm/s2', calibration_file=f'{own}/own.yaml'),
+                       found)
+
+
+def _pushed(log: Log, driver: Driver, found: tuple[Finding, ...]) -> Said:
+    driver.session.found = found
+    context = np.full((len(log.time), len(columns_of(driver.session.settings))), np.nan)
+    rows = np.column_stack([*log[:3], context])
+    for block in np.array_split(rows, max(1, len(rows) // 25)):
+        driver.now += 25 * float(np.median(np.diff(log.time)))
+        if driver.session.accepts('imu_link'):
+            driver.session.push(block, driver.now)
+        driver.tick()
+    answer = ''
+    try:
+        answer = driver.ask('fit')
+    except AccelCalibError as err:
+        answer = str(err)
+    rating = driver.sensor.rating
+    findings = () if rating is None else rating.findings
+    said = ' '.join([answer, *(line.words for line in driver.log), *(
+        each.words for each in findings), *(str(each) for each in checks(driver.session))])
+    return said, driver.calibration, rating
+
+
+SURFACES = {'CSV': of_csv, 'bag': of_bag, 'node': of_node, 'live': of_live}
+OF_TEXT = ('whole seconds', 'newest first')
+
+
+def _units(log: Log) -> Literal['', 'native']:
+    """Return the unit that a user states who publishes counts."""
+    return 'native' if 'accX' in log.header else ''
 
 
 def meant(name: str, log: Log, clean: Log) -> Log:
@@ -171,7 +257,8 @@ def meant(name: str, log: Log, clean: Log) -> Log:
     return log
 
 
-def error_mg(made: Outcome, model: Model, log: Log, clean: Log, rng: np.random.Generator) -> float:
+def error_mg(own: Calibration, model: Model, log: Log, clean: Log, rng: np.random.Generator
+             ) -> float:
     """Return the RMS error of |a| in new orientations, inside the range of the readings [mg]."""
     reading = G * predict(model, unit(rng.normal(size=(500, 3))), {})
     limits = np.max(np.abs(log.reading), axis=0)
@@ -181,52 +268,53 @@ def error_mg(made: Outcome, model: Model, log: Log, clean: Log, rng: np.random.G
         changed = np.linalg.lstsq(columns, log.reading[inside], rcond=None)[0]
         reading = np.column_stack([reading, np.ones(500)]) @ changed
     reading = reading[np.all(np.abs(reading) < limits, axis=1)]
-    own = made.calibration
     if own.units.name == 'g':  # counts of about 1000 to the g are read as mg
         reading = reading * 1e-3
     length = np.linalg.norm(own.correct(reading, own.typical_context(len(reading))), axis=1)
     return float(np.sqrt(np.mean((length / own.force_per_g - 1.0)**2))) * 1e3
 
 
-def counted(name: str, sets: int, seed: int, folder: Path) -> Counter[str]:
+def counted(name: str, surface: str, sets: int, seed: int, folder: Path) -> Counter[str]:
     """Return how many sets of a fault are named, calibrated, and wrong."""
     fault, counts = FAULTS[name], Counter[str]()
     for number in range(sets):
         rng = np.random.default_rng([seed, list(FAULTS).index(name), number])
         clean, model = recording(rng)
         log = fault.make(clean, rng)
-        said, made = outcome(log, folder)
-        counts['named'] += not fault.words or any(word in said for word in fault.words)
-        if made is not None:
-            counts['calibrated'] += made.rating.name != 'BAD'
-            counts['false'] += has(made.rating.findings, 'missing') or has(
-                made.rating.findings, 'not_taken')
+        said, made, rating = SURFACES[surface](log, folder)
+        named = not fault.words or any(word in said for word in fault.words)
+        counts['named'] += named
+        if made is not None and rating is not None:
+            counts['calibrated'] += rating.name != 'BAD'
+            counts['false'] += any(has(rating.findings, kind) for kind in OF_SAMPLES)
             error = error_mg(made, model, meant(name, log, clean), clean, rng)
-            counts['wrong'] += made.rating.name != 'BAD' and error > _WRONG_MG
-        unnamed = not any(word in said for word in fault.words or ('',))
-        if unnamed or (fault.right and made is None):
-            print(f'{name}, set {number}: {said}', file=sys.stderr)
+            counts['wrong'] += rating.name != 'BAD' and error > _WRONG_MG
+        if not named or (fault.right and made is None):
+            print(f'{name}, {surface}, set {number}: {said[-400:]}', file=sys.stderr)
     return counts
 
 
 def main() -> None:
     asked = parser(__doc__, sets=50, seed=2030)
-    asked.add_argument('--clean', type=int, default=500, help='sets without a fault')
+    asked.add_argument('--clean', type=int, default=125, help='sets without a fault')
     asked.add_argument('--only', default='', help='faults, separated by commas')
     given = asked.parse_args()
     rows = []
     with TemporaryDirectory() as folder:
         for name, fault in FAULTS.items():
-            if given.only and name not in given.only.split(','):
-                continue
-            sets = given.clean if name == 'none' else given.sets
-            found = counted(name, sets, given.seed, Path(folder))
-            rows.append((name, sets, found['named'] if fault.words else '', found['calibrated'],
-                         found['wrong'], found['false'] if name == 'none' else ''))
-            print(rows[-1], file=sys.stderr)
+            for surface in SURFACES:
+                if (given.only and name not in given.only.split(',')) or (
+                        name in OF_TEXT and surface in ('bag', 'node')):
+                    continue
+                sets = given.clean if name == 'none' else given.sets
+                found = counted(name, surface, sets, given.seed, Path(folder))
+                rows.append((name, surface, sets, found['named'] if fault.words else '',
+                             found['calibrated'], found['wrong'],
+                             found['false'] if name == 'none' else ''))
+                print(rows[-1], file=sys.stderr)
     command = ' '.join(sys.argv[1:])
     publish(_PAGE.format(command=command, machine=machine(), rows=markdown(
-        ('fault', 'sets', 'named', 'calibrated', 'wrong', 'false findings'), rows)),
+        ('fault', 'as', 'sets', 'named', 'calibrated', 'wrong', 'false findings'), rows)),
         given.markdown)
 
 

@@ -14,15 +14,16 @@ import signal
 import socket
 from threading import Event
 import time
-from types import SimpleNamespace
 
 from accel_calib.errors import InputError
 from accel_calib.session import CalibratorSettings
 from accel_calib.table import Floats
+from accel_calib.units import units_of
 from inside import (
     CALIBRATION_ALONE, Host, LARGEST_LIVE_MESSAGE, LIVE_COMMANDS, live_log, LIVE_PERIOD,
     model_with, PAGE_FOLDER, PageServer, PATIENCE_FOR_A_HELLO, PATIENCE_FOR_A_REQUEST,
-    PERIOD_OF_A_COMPLAINT, qr_code, reachable, simulate_recording, spread_directions, STUCK)
+    PERIOD_OF_A_COMPLAINT, qr_code, reachable, simulate_recording, Source, spread_directions,
+    STUCK)
 import numpy as np
 import pytest
 from shared import children, wait
@@ -59,8 +60,8 @@ class Bench:
     def __init__(self, stack: ExitStack, folder: Path, poses: int = 1,
                  blocks: Callable[[Floats, Event], Iterator[Floats]] = played) -> None:
         self._stack, self.path, self.played = stack, folder / 'c.yaml', Event()
-        source = SimpleNamespace(name='bench.csv', sensor='imu_link', problem=str,
-                                 blocks=blocks(rows_of(spread_directions(poses)), self.played))
+        source = Source('bench.csv', 'imu_link', units_of('m/s2'), '',
+                        blocks(rows_of(spread_directions(poses)), self.played))
         self.host, self.logged = stack.enter_context(
             hosted(source, calibration_file=str(self.path)))
         self.base = self.host.server.link.partition('/#')[0]
@@ -384,7 +385,7 @@ def test_a_viewer_without_hello_is_closed(bench: Bench, monkeypatch: pytest.Monk
 def test_a_port_in_use_is_an_error_in_one_line(shared: Bench, tmp_path: Path) -> None:
     settings = CalibratorSettings(calibration_file=str(tmp_path / 'd.yaml'), web_port=shared.port)
     with pytest.raises(InputError, match=f'port {shared.port} of 127.0.0.1 is in use'):
-        Host(SimpleNamespace(name='bench.csv'), settings, print)
+        Host(Source('bench.csv', '', units_of('m/s2'), '', iter(())), settings, print)
     with pytest.raises(InputError, match='cannot be served at 192.0.2.7'):
         PageServer(shared.host.exchange, '192.0.2.7', 0).start()
 

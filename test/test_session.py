@@ -13,7 +13,7 @@ from typing import Any
 
 from accel_calib.calibrate import level, set_heading
 from accel_calib.errors import InputError, StoredCalibrationError
-from accel_calib.finding import Finding, LEVELS
+from accel_calib.finding import Finding, has, LEVELS
 from accel_calib.logs import read_poses, write_table
 from accel_calib.session import CalibratorSettings, changed, Level, state
 from accel_calib.stored import read_calibration, write_calibration
@@ -617,3 +617,18 @@ def test_poses_that_lack_a_quantity_are_said(readings: Readings) -> None:
     driver.tick()
     assert 'motor_current' not in driver.poses
     assert re.search(r'\d of \d.*motor_current.*~/reset', driver.logged('warning'))
+
+
+def test_a_rest_that_is_no_pose_is_said_with_its_reason(readings: Readings) -> None:
+    driver = Driver(min_dwell=1.5)
+    driver.feed(readings(spread_directions(4)))
+    driver.feed(readings(spread_directions(9)[6:], dwell=1.0))
+    assert [line.words for line in driver.log if 'is no pose' in line.words] == [
+        'this rest is no pose: it is shorter than min_dwell']
+    driver.feed(np.zeros((150, 3)))
+    driver.feed(readings(spread_directions(12)))
+    driver.ask('fit')
+    assert has(driver.calibration.noted, 'missing')
+    driver.ask('undo_pose')
+    driver.ask('refine')
+    assert has(driver.calibration.noted, 'missing')

@@ -267,8 +267,9 @@ def rival_findings(found: tuple[Rival, ...], row: NDArray[np.int64]) -> Iterator
 
 
 def finished(calibration: Calibration, sensor: str, date: str) -> Calibration:
-    """Return a calibration that has passed the gate, with the figures of its rests."""
-    named = replace(calibration, sensor=sensor or calibration.sensor, date=date)
+    """Return a calibration that has passed the gate, with what is known of its rests."""
+    named = replace(calibration, sensor=sensor or calibration.sensor, date=date,
+                    noted=(*calibration.noted, *calibration.poses.findings))
     return with_rest_noise(gated(named), named.poses)
 
 

@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 
 from .account import Rest
 from .chunks import (
-    CaptureSettings, chained, Chunker, CHUNKS_PER_WINDOW, CONTEXT, Interruption, MOTION, Records,
-    together)
+    CaptureSettings, chained, Chunker, Chunks, CHUNKS_PER_WINDOW, CONTEXT, Interruption, MOTION,
+    Records, together)
 from .dwell import Dwell, figures, figures_type, judged, OngoingDwell, Tracker
 from .rule import MISSING, Rule
 from ..errors import InputError
@@ -50,7 +50,8 @@ class StillDetector:
 
     `keep` is the number of finished dwells to keep; None: all. `context` are the keys of the
     further columns of the samples: temperature, supply voltage, and quantities. `still` is whether
-    the sensor is still now.
+    the sensor is still now, and `lengths` are the smallest |reading| above 0 and the largest one.
+    `refused` are the rests that ended in the last `push` or `close`, and are no poses.
 
     """
 
@@ -62,7 +63,8 @@ class StillDetector:
         self._tracker: Tracker | None = None
         self._most = keep
         self._kept = np.empty(0, figures_type(len(context)))
-        self.still = False
+        self.still, self.lengths = False, (math.inf, 0.0)
+        self.refused: tuple[Rest, ...] = ()
         self._mean = np.full(6, np.nan)
         self._number = 0
         self._missing: deque[Rest] = deque(maxlen=_MISSING_MAX)
@@ -107,8 +109,8 @@ class StillDetector:
         dwell = None if self._tracker is None else self._tracker.current()
         if dwell is None:
             return None
-        found = self._beside(figures([dwell], known_units=self._rule.known), self._kept)
-        return found[0] if found else None
+        found, = self._beside(figures([dwell], known_units=self._rule.known), self._kept)
+        return None if found.reason else found
 
     def dwells(self) -> list[Dwell]:
         """Return the kept dwells that are still according to the noise known now."""
@@ -147,7 +149,13 @@ class StillDetector:
 
     def _feed(self, blocks: Iterable[Floats], last: bool) -> list[OngoingDwell]:
         found: list[OngoingDwell] = []
-        whole = [chunks for block in blocks for chunks in self._chunker.feed(block, last)]
+        whole = list[Chunks]()
+        for block in blocks:
+            whole += self._chunker.feed(block, last)
+            length = np.sqrt(np.einsum('an,an->n', block[1:4], block[1:4]))
+            self.lengths = (
+                float(np.min(length, initial=self.lengths[0], where=length > 0.0)),
+                float(np.max(length, initial=self.lengths[1])))
         for chunks in together(whole):
             if chunks.fresh:
                 found += self._leave()
@@ -173,6 +181,7 @@ class StillDetector:
 
     def _keep(self, found: list[OngoingDwell]) -> int:
         """Store the figures of these dwells, and return their number."""
+        self.refused = tuple(Rest(each.begin, each.end, 'short') for each in found if each.short)
         if self._most is not None:  # only the account of a recording has the short ones
             found = [each for each in found if not each.short]
         if found:
@@ -186,13 +195,13 @@ class StillDetector:
         if not count:
             return []
         count = min(count, len(self._kept))
-        return self._beside(self._kept[-count:], self._kept[:-count])
+        every = self._beside(self._kept[-count:], self._kept[:-count])
+        self.refused += tuple(each.rest for each in every if each.reason)
+        return [each for each in every if not each.reason]
 
     def _beside(self, found: Records, earlier: Records) -> list[Dwell]:
         earlier = earlier[-_EARLIER:]
-        table = chained(earlier, found)
-        return [each for each in judged(table, self._rule, self._context, len(earlier))
-                if not each.reason]
+        return judged(chained(earlier, found), self._rule, self._context, len(earlier))
 
     def _miss(self, verdict: Records, length: float) -> None:
         """Note the chunks of zeros, and the windows of one reading."""
@@ -264,16 +273,13 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
     first = next(parts, None)
     context = CONTEXT if first is None else (*CONTEXT, *first.quantities)
     detector = StillDetector(settings, units, keep=None, context=context)
-    times, recorded, shortest, longest = list[float](), 0, np.inf, 0.0
+    times, recorded = list[float](), 0
     about: dict[str, Any] = {}
     for part in parts if first is None else chain((first,), parts):
         detector.add_recording(part)
         if len(part):
             times = [*times[:1], float(part['time'][0]), float(part['time'][-1])]
             recorded += len(part)
-            size = np.linalg.norm(part.reading, axis=1)
-            shortest = min(shortest, float(np.min(size, initial=np.inf, where=size > 0.0)))
-            longest = max(longest, float(size.max()))
             about = {name: getattr(part, name) for name in ABOUT}
     detector.close()
     every = detector.judged()
@@ -287,8 +293,7 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
     return Captured(poses, sum(each.samples for each in dwells),
                     detector.threshold, seconds - sum(each.seconds for each in interruptions),
                     interruptions, recorded, detector.quietest,
-                    tuple(sorted((*rests, *detector.missing))),
-                    (shortest, longest))
+                    tuple(sorted((*rests, *detector.missing))), detector.lengths)
 
 
 def samples_of(recording: Recording, start: int, stop: int, context: Sequence[str] = CONTEXT

@@ -15,19 +15,29 @@ and gains of a sensor change that of what it measures.
 
 """
 
+import math
+
 import numpy as np
 
 from ..effects import AXES
-from ..errors import InputError
+from ..errors import RefusedFitError
+from ..geometry import unit
 from ..table import Floats
 from ..text import short
 from ..units import Units
+
+_ONE_DIRECTION = math.cos(math.radians(6.0))
+"""Cosine of the largest angle between readings of a board that was not turned."""
 
 _ONE_LENGTH = 1e-3
 """Range of the lengths of samples below which they are computed, relative to their length."""
 
 _FEWEST = 6
 """Fewest readings that determine a circle and check it."""
+
+_NEAR_END, _EMPTY = 0.9, 0.2
+"""Smallest part of the range of counts that is near its end, and half of the part of the range
+around its middle that is empty if they lost their sign: the reading of 0 g lies between others."""
 
 _FLAT = 0.02
 """Largest ratio of the scatter across a plane to the scatter in it."""
@@ -45,7 +55,7 @@ _ALONG = 0.98
 
 def check_axes(reading: Floats, units: Units) -> None:
     """
-    Raise InputError if (n, 3) readings at rest show an axis that is stuck or a copy of another.
+    Raise RefusedFitError if (n, 3) readings show an axis that is stuck or a copy of another.
 
     Parameters
     ----------
@@ -57,6 +67,8 @@ def check_axes(reading: Floats, units: Units) -> None:
     """
     if len(reading) < _FEWEST:
         return
+    if units.is_native:
+        _check_signs(reading)
     middle = np.mean(reading, axis=0)
     _, sizes, turn = np.linalg.svd(reading - middle, full_matrices=False)
     flat = (reading - middle) @ turn[:2].T
@@ -75,15 +87,46 @@ def check_axes(reading: Floats, units: Units) -> None:
                 'orientations: one is a copy of the other')
     else:
         return
-    raise InputError(f'{what}, expected three axes that each read their part of gravity',
-                     'check the wiring, the driver and the columns of the log')
+    raise RefusedFitError(f'{what}, expected three axes that each read their part of gravity',
+                              'check the wiring, the driver and the columns of the log')
 
 
-def check_measured(lengths: tuple[float, float], units: Units) -> None:
-    """Raise InputError if the smallest and largest |reading| of a turned sensor are the same."""
+def _check_signs(reading: Floats) -> None:
+    """Refuse (n, 3) counts of which those below zero stand at the other end of their range."""
+    largest = float(np.max(reading))
+    modulus = 2.0**math.ceil(math.log2(max(largest, 1.0)))
+    if (np.min(reading) < 0.0 or largest < _NEAR_END * modulus
+            or np.any(np.abs(reading / modulus - 0.5) < _EMPTY)):
+        return
+    raise RefusedFitError(
+        f'the readings are near 0 or near {modulus:.0f} counts, and none is between: numbers of '
+        f'{math.log2(modulus):.0f} bits have lost their sign; expected counts with a sign',
+        'read them as signed numbers in the driver')
+
+
+def is_one_direction(reading: Floats) -> bool:
+    """Return whether (n, 3) readings at rest are of one board that was not turned."""
+    up = unit(reading)
+    return bool(np.all(up @ up[:1].T > _ONE_DIRECTION))
+
+
+def check_measured(reading: Floats, lengths: tuple[float, float], units: Units) -> None:
+    """
+    Raise RefusedFitError if a sensor that was turned always reads the same |reading|.
+
+    Parameters
+    ----------
+    reading : (n, 3) array
+        Means of rests, in the unit of the readings.
+    lengths : (float, float)
+        Smallest and largest |reading| of all samples.
+    units : Units
+        Unit of the readings, for the message.
+
+    """
     low, high = lengths
-    if high - low < _ONE_LENGTH * high:
-        raise InputError(
+    if high - low < _ONE_LENGTH * high and not is_one_direction(reading):
+        raise RefusedFitError(
             f'the readings have the same length of {short(high)} {units.name} in all directions, '
             f'to {short(100.0 * (high - low) / high)} %: they are computed, as the gravity of a '
             'phone is, and not measured; expected readings of an accelerometer',

@@ -43,10 +43,11 @@ def run_verify(args: argparse.Namespace) -> Done:
         check_units(poses, calibration.units)
         verification = verify(calibration, poses)
     rating = rate_verification(verification, calibration, poses)
-    page = partial(calibration_page, calibration, rating, str(args.poses), notes=found.lines,
+    lines = [*found.lines, *(each.words for each in poses.findings)]
+    page = partial(calibration_page, calibration, rating, str(args.poses), notes=lines,
                    verification=(verification, poses), stored=str(args.calibration))
     result = {'file': args.poses, 'poses': len(poses), **asdict(verification),
-              **rated(rating, args), 'read_as': found.read_as, 'read_lines': found.lines,
+              **rated(rating, args), 'read_as': found.read_as, 'read_lines': lines,
               'rating_lines': [str(line) for line in rating_lines(rating, args)]}
     above = args.max is not None and not verification.rms_after_mg <= args.max
     result |= {} if args.max is None else {'max_mg': args.max, 'above_max': above}

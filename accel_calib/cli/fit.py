@@ -39,8 +39,7 @@ def run_fit(args: argparse.Namespace) -> Done:
     """Fit and store a calibration."""
     with intake(args, args.poses) as found, working('fitting'):
         rows = rows_between(found.poses, args.rows) if args.rows else None
-        outcome = calibrated(found.poses, found.units, plan_of(args, rows=rows, refined=False),
-                             found.findings)
+        outcome = calibrated(found.poses, found.units, plan_of(args, rows=rows, refined=False))
     calibration = outcome.calibration
     ahead, (lines, stored) = outlook(calibration, args.model), store(args, outcome)
     return Done(

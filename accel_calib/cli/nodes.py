@@ -86,6 +86,8 @@ def run_live(args: argparse.Namespace) -> Done:
                       speed=args.speed) as source, ended() as is_over):
         if source.read_as:
             output.print(f'read as: {source.read_as}')
+        for each in source.findings:
+            output.print(f'note: {each.words}')
         host = Host(source, CalibratorSettings(
             units=source.units.name, gravity=args.gravity, calibration_file=str(args.output),
             web_host=args.host, web_port=args.port, also=str(args.also or ''), **settings(args)),

@@ -26,7 +26,7 @@ def run_capture(args: argparse.Namespace) -> Done:
     with progress('samples') as moved:
         found, captured = captured_from(args.recording, log_options(args), settings(args), moved)
     write_table(args.output, found.poses)
-    lines = [*found.lines, *(f'note: {each.words}' for each in found.findings)]
+    lines = [*found.lines, *(f'note: {each.words}' for each in found.poses.findings)]
     for item in captured.interruptions:
         what = {'gap': f'samples are missing for {item.seconds:.3g} s',
                 'jump_back': f'the stamps jump back by {-item.seconds:.3g} s',
@@ -38,7 +38,7 @@ def run_capture(args: argparse.Namespace) -> Done:
         'threshold': captured.threshold, 'seconds': captured.seconds,
         'rests': [{'start': each.start, 'end': each.end, 'taken': not each.reason,
                    'reason': each.words} for each in captured.rests],
-        'findings': [each.stated for each in found.findings],
+        'findings': [each.stated for each in found.poses.findings],
         'interruptions': [item._asdict() for item in captured.interruptions],
         'read_lines': replace(found, captured=found.captured[1:]).lines},
         lines, stored=[args.output])

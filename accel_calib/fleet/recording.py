@@ -376,7 +376,7 @@ def row_of(found: Input, path: Path, options: Options) -> tuple[Row, Calibration
         intake = poses_of(path, options.log, options.settings)
         row = _about(found, options, intake.poses, path)
         outcome = calibrated(intake.poses, intake.units, Plan(
-            sensor=row['sensor'], refined=options.refined, also=options.own), intake.findings)
+            sensor=row['sensor'], refined=options.refined, also=options.own))
     except OSError:
         raise  # it may be possible to read it later
     except AccelCalibError as err:

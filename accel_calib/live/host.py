@@ -252,6 +252,7 @@ class Host:
         self._waiting: list[Floats] = []
         self._passed = self._ticked = self._shown = -math.inf
         self.session = Session(settings, source.name)
+        self.session.found = source.findings
         self.session.publishers = None
         self._worker = Worker(self.session, self._tasks.put, self._show, self._flush)
         self.exchange = Exchange(self.session, self._worker, self._tasks.put)

@@ -20,6 +20,7 @@ import numpy as np
 
 from ..capture import samples_of
 from ..errors import InputError, needing
+from ..finding import Finding
 from ..logs import LineReader, LogOptions, open_log
 from ..table import Floats, Recording
 from ..units import Units
@@ -61,6 +62,8 @@ class Source:
         How they are read, in one line; empty if nothing is assumed.
     blocks : iterator of (n, 9) array
         The samples, as for `accel_calib.capture.StillDetector.push`. A block can be empty.
+    findings : tuple of Finding
+        What was decided by the first values, against what they seem to be.
     problem : callable
         Function that returns why no samples come at present; empty if nothing is wrong.
 
@@ -71,6 +74,7 @@ class Source:
     units: Units
     read_as: str
     blocks: Iterator[Floats]
+    findings: tuple[Finding, ...] = ()
     problem: Callable[[], str] = str
 
 
@@ -109,10 +113,12 @@ def open_source(name: str, options: LogOptions, *, baud: int = 115200, speed: fl
         with closing(_Port(name, baud)) as port:
             reader = _understood(name, port.lines(), options, baud)
             yield Source(name, '', reader.units, reader.read_as,
-                         _in_order(_arriving(reader, port.lines())), lambda: port.problem)
+                         _in_order(_arriving(reader, port.lines())), reader.findings,
+                         lambda: port.problem)
         return
     with open_log(Path(name), options) as log:
-        yield Source(name, log.sensor, log.units, log.read_as, _played(log.blocks, speed))
+        yield Source(name, log.sensor, log.units, log.read_as, _played(log.blocks, speed),
+                     log.findings)
 
 
 # ----------------------------------------------------------------------------- a recording

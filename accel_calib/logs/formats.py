@@ -39,6 +39,7 @@ from .quantities import are_samples, are_untimed_samples, decided, Quantities
 from .text import Cells, open_text, PEEKED, TextTable
 from ..disk import FIRST_LINE
 from ..errors import InputError, needing, saying
+from ..finding import Finding
 from ..table import check_units, check_values, concatenated, Poses, Recording
 from ..text import some
 from ..units import Units, units_of
@@ -61,7 +62,8 @@ class OpenLog:
     raised when a table without times is read as samples. `samples` is the number of samples; of a
     long text log, an estimate from the size of the file. `sensor` is empty if it is not stated.
     `read_as` is how the log is read, in one line, empty if nothing is assumed. `poses` are those
-    of a pose table. `noted` returns the notes so far: what was left out.
+    of a pose table. `noted` returns the notes so far: what was left out. `findings` are what was
+    decided by the values of the first block, against what they seem to be.
 
     """
 
@@ -71,12 +73,13 @@ class OpenLog:
     sensor: str = ''
     read_as: str = ''
     poses: Poses | None = None
-    noted: Callable[[], Sequence[str]] = tuple
+    noted: Callable[[], tuple[str, ...]] = tuple
+    findings: tuple[Finding, ...] = ()
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Return what is left out; complete once all blocks are read."""
-        return tuple(self.noted())
+        """Return what is left out, and the findings; complete once all blocks are read."""
+        return (*self.noted(), *(each.text for each in self.findings))
 
     def watched(self, progress: Progress) -> Iterator[Recording]:
         """Yield the blocks, and call a function with the number of samples done and of all."""
@@ -102,7 +105,7 @@ def _bag(_: 'Format', path: Path, options: LogOptions) -> Iterator[OpenLog]:
         units = units_of(options.units or options.default_units or 'm/s2', options.gravity)
         yield OpenLog(_checked(bag.path, blocks, units), bag.count(topic), units, sensor,
                       f'Imu messages of {topic}{rate_words(bag, topic)} in {units.name}',
-                      noted=lambda: notes)
+                      noted=lambda: tuple(notes))
 
 
 @contextmanager
@@ -145,7 +148,7 @@ def open_members(path: Path, members: Sequence[Member], options: LogOptions, exp
     with _opened(path, member, options, expected) as text:
         log = _text(path / member.name, text, options)
         yield replace(log, read_as=', '.join(filter(None, (member.name, log.read_as))),
-                      noted=lambda: (*why, *log.notes))
+                      noted=lambda: (*why, *log.noted()))
 
 
 @contextmanager
@@ -234,7 +237,7 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
         else:
             poses = concatenated([head, *blocks])
             lacking = [key for key in poses.quantities if not np.isfinite(poses[key]).all()]
-            poses = poses.without_columns(*lacking)
+            poses = replace(poses.without_columns(*lacking), findings=quantities.all_findings)
             if lacking:
                 quantities.notes.append(
                     f'not used, because cells are not numbers: {some(lacking)}')
@@ -248,7 +251,8 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
     rate = '' if quantities.rate_hz is None else f'{quantities.rate_hz:g} Hz (stated)'
     return OpenLog(samples, count, quantities.units, head.sensor,
                    ', '.join(filter(None, (quantities.read_as, rate))), poses,
-                   noted=lambda: (*text.notes, *quantities.all_notes))
+                   noted=lambda: (*text.notes, *quantities.all_notes),
+                   findings=quantities.all_findings)
 
 
 def _converted(path: Path, about: Mapping[str, Any], cells: Iterator[Cells],

@@ -30,6 +30,7 @@ from .names import DEGREE, meaning, RATE, READING, record_instead, unit_of, ZERO
 from .text import Cells
 from .times import Clock, clock_of
 from ..errors import InputError, saying
+from ..finding import Finding
 from ..table import COLUMNS, Floats
 from ..units import STANDARD_GRAVITY, UnitName, Units, units_of
 
@@ -117,8 +118,8 @@ class Quantities:
     `clock` converts the times; `rate_hz` is the rate of samples without times. `scales` are the
     factor to our unit and our value at 0, by column. `instance` is the number of the sensor whose
     rows are read, where rows of several alternate. `modulus` is 2ⁿ for columns whose numbers of n
-    bits lost their sign. `said` is what is assumed, and `notes` what is
-    not used.
+    bits lost their sign. `said` is what is assumed, `notes` what is not used, and `findings` what
+    the values contradict.
 
     """
 
@@ -131,6 +132,12 @@ class Quantities:
     modulus: dict[str, float] = field(default_factory=dict)
     said: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
+
+    @property
+    def all_findings(self) -> tuple[Finding, ...]:
+        """Return what the values contradict, and what is done about the times."""
+        return (*self.findings, *self.clock.findings)
 
     @property
     def read_as(self) -> str:
@@ -207,15 +214,18 @@ def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
         if columns.sources.keys() >= set(keys) and (modulus := modulus_of(
                 columns.three(first, keys))):
             made.modulus |= dict.fromkeys(keys, modulus)
-            made.notes.append(f'{compact(columns.names(keys))} are numbers of '
-                              f'{round(math.log2(modulus))} bits that lost their sign: they are '
-                              'read with it')
+            made.findings.append(Finding(
+                'signs', f'{compact(columns.names(keys))} are numbers of '
+                f'{round(math.log2(modulus))} bits that lost their sign: they are read with it',
+                'print them as signed numbers'))
     if not (columns.layout.header or options.columns) and _are_exchanged(made, first):
         swapped = dict(zip((*READING, *RATE), (*RATE, *READING), strict=True))
         columns = made.chosen = replace(columns, sources={
             key: columns.sources[swapped.get(key, key)] for key in columns.sources})
         made.modulus = {swapped[key]: each for key, each in made.modulus.items()}
-        made.said.append(f'{compact(columns.names(RATE))} are a gyro by their values')
+        words = f'{compact(columns.names(RATE))} are a gyro by their values'
+        made.said.append(words)
+        made.findings.append(Finding('columns', words, 'name the columns in the first line'))
     if 'time' in columns.sources:
         made.clock = clock_of(columns, first, options)
         made.notes += made.clock.doubts
@@ -539,10 +549,9 @@ def are_untimed_samples(columns: Mapping[str, NDArray[Any]]) -> bool:
 
 # ---------------------------------------------------------------------------------- context
 
-def _drop(made: Quantities, keys: Sequence[str], note: str) -> None:
+def _drop(made: Quantities, keys: Sequence[str]) -> None:
     sources = {key: value for key, value in made.chosen.sources.items() if key not in keys}
     made.chosen = replace(made.chosen, sources=sources)
-    made.notes.append(note)
 
 
 def _decide_rate(made: Quantities, first: Cells) -> None:
@@ -560,15 +569,20 @@ def _decide_rate(made: Quantities, first: Cells) -> None:
     if stated is None and own and columns.layout.header and (not rests or 'rad/s' in rests):
         return
     if stated is None and (largest >= _LIKELY_RATE_DEG or rests == {}):
-        _drop(made, RATE, f'the angular rates {words} at rest are those of no gyro in rad/s or '
-              '°/s, and are not used: state their unit in the names, such as gyroX_dps')
+        _drop(made, RATE)
+        made.findings.append(Finding(
+            'columns', f'the angular rates {words} at rest are those of no gyro in rad/s or °/s, '
+            'and are not used', 'state their unit in the names, such as gyroX_dps'))
         return
     seen = next(iter(rests.items())) if rests and len(rests) == 1 else None
     unit, factor = stated or seen or (
         ('rad/s', 1.0) if largest < _LIKELY_RATE else ('°/s', DEGREE))
     made.scale(RATE, factor)
-    made.said.append(f'{words} in {unit}' + ('' if unit == 'rad/s' else ' -> rad/s')
-                     + ('' if stated else ' (assumed)'))
+    read_as = f'{words} in {unit}{"" if unit == "rad/s" else " -> rad/s"}'
+    made.said.append(read_as if stated else f'{read_as} (assumed)')
+    if not stated:
+        made.findings.append(Finding(
+            'columns', f'{read_as}, by their values', 'state their unit in the names'))
 
 
 def _units_at_rest(made: Quantities, first: Cells) -> dict[str, float] | None:
@@ -607,9 +621,10 @@ def _decide_temperature(made: Quantities, first: Cells) -> None:
     if _LIKELY_TEMPERATURE_C[0] <= middle <= _LIKELY_TEMPERATURE_C[1]:
         made.said.append(f'{source.name} in °C (assumed)')
         return
-    _drop(made, ['temperature'], f'the temperature {source.name} has values of about '
-          f'{middle:.4g} in a unit that is not known, and is not used: state its unit in the '
-          'name, such as temperature_K')
+    _drop(made, ['temperature'])
+    made.findings.append(Finding(
+        'columns', f'the temperature {source.name} has values of about {middle:.4g} in a unit '
+        'that is not known, and is not used', 'state its unit in the name, such as temperature_K'))
 
 
 def _convert_if_stated(made: Quantities, key: str, ours: str) -> bool:

@@ -161,7 +161,7 @@ class LineReader:
         rate = '' if timed else (f'no times, {rate_hz:.4g} Hz '
                                  f'({"stated" if options.rate else "measured"})')
         self.read_as = ', '.join(filter(None, (self._quantities.read_as, rate)))
-        self.first = self._recording(first)
+        self.first, self.findings = self._recording(first), self._quantities.all_findings
 
     def samples(self, lines: Sequence[str]) -> Recording | None:
         """Return the samples of the next complete lines; None if there are none."""

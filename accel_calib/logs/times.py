@@ -24,6 +24,7 @@ from .dialect import EPOCH_S, has_date, RATES_HZ, seconds_of
 from .names import bare_name, COUNTERS, READING, TICKS, unit_of, UNITS
 from .text import Cells
 from ..errors import InputError
+from ..finding import Finding
 from ..table import Floats
 
 _UNITS = dict(UNITS['time'].values())
@@ -92,13 +93,15 @@ class Clock:
     @property
     def said(self) -> str:
         """Return what is assumed, and what is done about the order and the steps of the stamps."""
-        parts = [self.words]
-        if self.newest_first:
-            parts.append('rows turned round (the newest was the first)')
-        if self.period:
-            parts.append(f'stamps of {self.interval:.3g} s spread over their samples '
-                         f'({1.0 / self.period:.3g} Hz)')
-        return ', '.join(parts)
+        return ', '.join([self.words, *(each.text for each in self.findings)])
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Return what is done about the order and the steps of the stamps."""
+        order = Finding('clock', 'rows turned round (the newest was the first)')
+        steps = Finding('clock', f'stamps of {self.interval:.3g} s spread over their samples '
+                        f'({1.0 / (self.period or 1.0):.3g} Hz)')
+        return (order,) * self.newest_first + (steps,) * bool(self.period)
 
     def seconds(self, cells: Cells) -> Floats:
         """Return the times of a block as they are stated [s]."""

@@ -37,7 +37,7 @@ from ..calibrate import (
 from ..effects import CHANGES, included, Model, MODELS, parameter_names, PROCESSES, with_vector
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import fit_sphere, judge, NotConvergedError, outliers, variance_factor
-from ..finding import Finding, without as without_kinds
+from ..finding import explained_by, Finding, without as without_kinds
 from ..geometry import unit
 from ..table import check_units, Floats, Poses, Record
 from ..text import counted, table
@@ -219,12 +219,13 @@ def refine(poses: Poses, units: Units, *, base: str | Calibration | FleetPrior =
         check_sensor(base, poses.sensor)
         check_sensor(base, sensor)
     sure, doubts = sure_rows(poses)
-    if doubts:
-        try:
-            return _refine(poses, sure, doubts, units, base, sensor, date, also)
-        except RefusedFitError:
-            pass  # the fit needs the doubtful poses
-    return _refine(poses, poses, (), units, base, sensor, date, also)
+    with explained_by(poses.findings):
+        if doubts:
+            try:
+                return _refine(poses, sure, doubts, units, base, sensor, date, also)
+            except RefusedFitError:
+                pass  # the fit needs the doubtful poses
+        return _refine(poses, poses, (), units, base, sensor, date, also)
 
 
 def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Units,
@@ -255,7 +256,7 @@ def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Un
     sample = Finding('note', f'the refinement uses {len(poses_g)} of {total} poses, spread evenly '
                      'over the table, to bound its time and memory; it does not look for '
                      'disturbed poses among the others; choose rows to use others')
-    note = (sample,) if len(poses_g) < total else ()
+    note = (*(poses.findings if stored else ()), *((sample,) if len(poses_g) < total else ()))
     given = Given(poses, poses_g, stored is not None, (*rejected, *unsound), note)
     return _record(calibration, found, given, sensor or poses.sensor, date)
 

@@ -296,12 +296,13 @@ def _sound(session: Session, name: str, function: Callable[..., Fitted], *given:
     session.files.usable()
     sensor, changes = session.sensor, session.sensor.changes
     sensor.live.refresh()
-    poses = sensor.live.book.poses()
+    count = len(sensor.live.book.poses())
     session.computing += 1
     try:
+        poses = sensor.live.poses(session.found)
         found: Fitted = yield Compute(function, poses, *given)
     except RefusedFitError as error:
-        sensor.guide.refuse(len(poses), error.advice)
+        sensor.guide.refuse(count, error.advice)
         raise
     finally:
         session.computing -= 1
@@ -310,11 +311,11 @@ def _sound(session: Session, name: str, function: Callable[..., Fitted], *given:
                            'the result is discarded', f'call ~/{name} again')
     if found.refusal:
         why, advice = found.refusal
-        sensor.guide.refuse(len(poses), advice)
+        sensor.guide.refuse(count, advice)
         if found.refinement is not None:
             session.rate(found.refinement)
         raise RefusedFitError(f'{found.words}; not used: {why}', advice)
-    sensor.fitted_poses = len(poses)
+    sensor.fitted_poses = count
     return found
 
 

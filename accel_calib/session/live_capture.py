@@ -18,12 +18,16 @@ pose is marked as doubtful, and the fit leaves it out if possible.
 
 from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass, replace
+import math
 from operator import is_
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..capture import CaptureSettings, CONTEXT, Dwell, poses_from, select, StillDetector
+from ..capture import (
+    account_of, CaptureSettings, check_measured, CONTEXT, Dwell, poses_from, Rest, select,
+    StillDetector)
+from ..finding import Finding
 from ..table import Floats, Poses
 from ..units import Units
 
@@ -84,6 +88,10 @@ class PoseBook:
     def holds(self, dwell: Dwell) -> bool:
         """Return whether this rest is a provisional pose."""
         return any(overlap(dwell, each) for each in self.held)
+
+    def lacks(self, rest: Rest) -> bool:
+        """Return whether a rest is part of no pose, provisional or doubtful ones included."""
+        return not any(overlap(rest, each) for each in (*self.held, *self._dwells))
 
     def _has(self, dwell: Dwell) -> bool:
         """Return whether a rest is known already: a recording is played again."""
@@ -163,7 +171,7 @@ def with_temperature(dwells: list[Dwell]) -> list[Dwell]:
     return [completed(dwell) for dwell in dwells]
 
 
-def overlap(one: Dwell, other: Dwell) -> bool:
+def overlap(one: Dwell | Rest, other: Dwell) -> bool:
     """Return whether two dwells overlap in time; they are then the same rest."""
     return one.start <= other.end and other.start <= one.end
 
@@ -210,7 +218,8 @@ class Change:
     The changes that samples caused.
 
     `rest` is the latest rest, if it is new or has a new average, `poses` whether the poses
-    changed, and `doubted` the number of poses newly marked as doubtful.
+    changed, and `doubted` the number of poses newly marked as doubtful. `refused` are rests that
+    ended and are no poses.
 
     """
 
@@ -218,6 +227,7 @@ class Change:
     ended: tuple[Dwell, ...] = ()
     poses: bool = False
     doubted: int = 0
+    refused: tuple[Rest, ...] = ()
 
 
 class LiveCapture:
@@ -226,8 +236,8 @@ class LiveCapture:
     def __init__(self, settings: CaptureSettings, units: Units,
                  context: Sequence[str] = CONTEXT) -> None:
         self.detector = StillDetector(settings, units, context=context)
-        self.book = PoseBook(settings, units)
-        self._window = settings.still_window
+        self.book, self._units = PoseBook(settings, units), units
+        self._settings, self._begun = settings, -math.inf
         self._rest: Dwell | None = None
         self._declined: Dwell | None = None
         self._looked = self._known_until = self._was_still = 0.0
@@ -248,8 +258,9 @@ class LiveCapture:
         """
         for piece in _pieces(samples):
             change = self._after(self.detector.push(piece), float(piece[-1, 0]), capture)
-            if change is not None:
-                yield change
+            refused = tuple(filter(self.book.lacks, self.detector.refused))
+            if change is not None or refused:
+                yield replace(change or Change(), refused=refused)
 
     def interrupt(self, capture: bool) -> list[Change]:
         """End the ongoing rest, because the stream is interrupted; parameters as in `push`."""
@@ -269,6 +280,19 @@ class LiveCapture:
         self._looked, self._known_until = time, time + _LOOK_EVERY
         return self._look(capture) if still else self._doubt_held(time)
 
+    def poses(self, found: tuple[Finding, ...]) -> Poses:
+        """
+        Return the poses with findings about their samples: these, and those of the rests.
+
+        RefusedFitError if no sensor measures so.
+
+        """
+        rests = [*(each.rest for each in self.detector.judged()), *self.detector.missing]
+        own = [each for each in rests if each.start >= self._begun]
+        poses = replace(self.book.poses(), findings=(*found, *account_of(own, self._settings)))
+        check_measured(poses.reading, self.detector.lengths, self._units)
+        return poses
+
     def capture(self, rest: Dwell) -> None:
         """Capture the ongoing rest as a pose."""
         self.book.hold(rest)
@@ -287,7 +311,7 @@ class LiveCapture:
 
     def clear(self) -> None:
         """Remove all poses; the ongoing rest is not captured again."""
-        self._declined = self._rest
+        self._declined, self._begun = self._rest, self._looked
         self.book.clear()
 
     def _look(self, capture: bool) -> Change | None:
@@ -324,7 +348,7 @@ class LiveCapture:
         def is_over(dwell: Dwell) -> bool:
             windows, samples = _SURELY_OVER
             period = _length(dwell) / dwell.samples
-            away = max(windows * self._window, samples * period)
+            away = max(windows * self._settings.still_window, samples * period)
             return not dwell.start <= time <= max(dwell.end, self._was_still) + away
 
         count = self.book.doubt_held(is_over)

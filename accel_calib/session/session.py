@@ -43,6 +43,7 @@ from ..text import counted
 from ..units import FrameName, units_of
 
 if TYPE_CHECKING:
+    from ..finding import Finding
     from ..findings import Rating
     from ..refine import Refinement
 
@@ -105,6 +106,7 @@ class Session:
         self.sensor = Sensor(settings, self.units)
         self.statistics, self.around = StreamStatistics(clock), Around(clock)
         self.missing: dict[str, str] = {}
+        self.found: tuple[Finding, ...] = ()  # in the samples before they come here
         self.files = SensorFiles(settings, topic)
         self.commands, self.reports = Commands(self), Reports(self)
         # Messages in ned are those of ros, turned.
@@ -229,6 +231,10 @@ class Session:
                 self.log('warning', f'{counted(change.doubted, "pose")} taken while the sensor '
                          'moved or vibrated, as by motors: later rests are quieter; a fit leaves '
                          'out such poses if the others are sufficient')
+            for rest in change.refused:
+                if 2.0 * (rest.end - rest.start) > self.settings.min_dwell and (
+                        next_action(self).kind == 'poses'):
+                    self.log('info', f'this rest is no pose: {rest.words}', rest.reason, AGAIN)
             if change.poses:
                 new = change.rest is not None and sensor.guide.is_new_rest(change.rest.start)
                 self.poses_changed(ended=bool(change.ended), new_rest=new)

@@ -279,6 +279,9 @@ _DROPPED = {
 _LIKELY_G = (0.2, 5.0)
 """Range of |a| [g]; outside of it the unit is probably wrong."""
 
+_WITHOUT_GRAVITY_G = 0.07
+"""Mean |a| below which no unit makes the readings those of a sensor that measures gravity [g]."""
+
 _UNITS = (('g', 0.8, 1.2), ('m/s2', 8.0, 12.0))
 """Units with the lowest and highest |reading| of a resting sensor in this unit."""
 
@@ -329,6 +332,9 @@ def _wrong_unit(statistics: StreamStatistics, units: Units) -> str:
     length, size = statistics.length_g(units), statistics.length
     if not (length < _LIKELY_G[0] or length > _LIKELY_G[1]):
         return ''
+    if length < _WITHOUT_GRAVITY_G and not units.is_native:
+        return (f'|a| is {length:.3g} g, expected about 1 g at rest: this is linear acceleration, '
+                'gravity removed: let the driver publish what the accelerometer reads')
     likely = next((name for name, low, high in _UNITS if low < size < high), 'native')
     return (f'|a| is {length:.3g} g, expected about 1 g at rest: start the node with '
             f'units:={likely}')
