@@ -59,8 +59,7 @@ from accel_calib.geometry import (
     attitude_words, distinct, OVER_THE_SPHERE, quaternion_of, rotation_from_rpy, spread_directions,
     unit, words_of)
 from accel_calib.live import sources
-from accel_calib.live.sources import (
-    _interval as interval_of_lines, is_port, open_source, Source)
+from accel_calib.live.sources import _interval as interval_of_lines, is_port, open_source, Source
 from accel_calib.logs import (
     bag_samples, bounded_bags, containers, layout_with, LogOptions, open_bag, open_log, text)
 from accel_calib.logs.bounded_bags import decompressed, largest

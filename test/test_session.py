@@ -623,8 +623,8 @@ def test_a_rest_that_is_no_pose_is_said_with_its_reason(readings: Readings) -> N
     driver = Driver(min_dwell=1.5)
     driver.feed(readings(spread_directions(4)))
     driver.feed(readings(spread_directions(9)[6:], dwell=1.0))
-    assert [line.words for line in driver.log if 'is no pose' in line.words] == [
-        'this rest is no pose: it is shorter than min_dwell']
+    assert [line.words for line in driver.log if 'gave no pose' in line.words] == [
+        'this rest gave no pose: shorter than min_dwell']
     driver.feed(np.zeros((150, 3)))
     driver.feed(readings(spread_directions(12)))
     driver.ask('fit')

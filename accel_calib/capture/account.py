@@ -17,18 +17,18 @@ REASONS: Mapping[str, tuple[str, str]] = MappingProxyType({
     'zeros': ('samples are missing: they are 0 on all axes', 'check the driver and the cable'),
     'frozen': ('samples are missing: the last reading is repeated, though no other rest repeats '
                'it', 'check the driver and the cable'),
-    'short': ('it is shorter than min_dwell', 'hold the sensor still for longer in each pose, or '
+    'short': ('shorter than min_dwell', 'hold the sensor still for longer in each pose, or '
               'capture shorter rests with --min-dwell {seconds:.2g}'),
-    'shaking': ('it varies more than the noise of the sensor', 'put the sensor on something that '
+    'shaking': ('more variation than the noise of the sensor', 'put the sensor on something that '
                 'does not shake, or accept it with --still-std-max'),
-    'slope': ('the reading changes during it', 'let go of the sensor, and wait until it has '
+    'slope': ('a change of the reading', 'let go of the sensor, and wait until it has '
               'settled'),
-    'turning': ('the gyro turns during it', 'let go of the sensor in each pose'),
-    'noisy': ('its noise does not exclude a slow turn', 'hold the sensor still three times as '
+    'turning': ('a turn, by the gyro', 'let go of the sensor in each pose'),
+    'noisy': ('noise that does not exclude a slow turn', 'hold the sensor still three times as '
               'long in each pose'),
-    'length': ('its |a| is not that of gravity', 'check the unit, or accept them with a wider '
+    'length': ('a length that is not that of gravity', 'check the unit, or accept them with a wider '
                '--still-norm-tolerance'),
-    'repeated': ('it repeats an earlier orientation', '')})
+    'repeated': ('an earlier orientation', '')})
 """Why a rest is no pose, and what to do about it."""
 
 
@@ -60,6 +60,6 @@ def account_of(rests: Sequence[Rest], settings: CaptureSettings) -> tuple[Findin
         words, remedy = REASONS[most]
         enough = min(0.9 * float(np.median(dropped[most])), 0.8 * settings.min_dwell)
         found.append(Finding(
-            'not_taken', f'{len(dropped[most])} of {counted(count + taken, "rest")} are no '
-            f'poses: {words}', remedy.format(seconds=enough), 'USABLE', step='record'))
+            'not_taken', f'{len(dropped[most])} of {counted(count + taken, "rest")} gave no pose: '
+            f'{words}', remedy.format(seconds=enough), 'USABLE', step='record'))
     return tuple(found)

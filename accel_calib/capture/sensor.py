@@ -39,8 +39,9 @@ _NEAR_END, _EMPTY = 0.9, 0.2
 """Smallest part of the range of counts that is near its end, and half of the part of the range
 around its middle that is empty if they lost their sign: the reading of 0 g lies between others."""
 
-_FLAT = 0.02
-"""Largest ratio of the scatter across a plane to the scatter in it."""
+_FLAT, _FLATTER = 0.02, 0.004
+"""Largest ratio of the scatter across a plane to the scatter in it; that of a cap of 2° or less,
+which is one orientation."""
 
 _OFF_CIRCLE = 0.05
 """Smallest RMS distance from a circle, relative to its radius, that is on no circle."""
@@ -74,6 +75,8 @@ def check_axes(reading: Floats, units: Units) -> None:
     flat = (reading - middle) @ turn[:2].T
     one_g = abs(float(middle @ turn[2])) if units.is_native else units.per_g
     wide = np.max(np.linalg.norm(flat, axis=1)) > _WIDE * one_g  # not a cap of the sphere
+    if units.is_native:  # 1 g is not known: a flat piece that is no cap is as good as a wide one
+        wide |= sizes[2] < _FLATTER * sizes[1]
     if sizes[2] > _FLAT * sizes[1] or not wide or _is_circle(flat):
         return
     normal = np.abs(turn[2])
@@ -88,7 +91,7 @@ def check_axes(reading: Floats, units: Units) -> None:
     else:
         return
     raise RefusedFitError(f'{what}, expected three axes that each read their part of gravity',
-                              'check the wiring, the driver and the columns of the log')
+                          'check the wiring, the driver and the columns of the log')
 
 
 def _check_signs(reading: Floats) -> None:

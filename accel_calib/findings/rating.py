@@ -154,6 +154,9 @@ def _checked(expected: Expected) -> Iterator[Finding]:
     if expected.dof == 0:
         yield Finding('no_check', 'nothing checks the fit: there are only as many poses as values',
                       _more_poses(expected), 'USABLE')
+    elif expected.quality.held_out_rms_mg is None and _is_beyond_noise(expected):
+        yield Finding('no_check', 'the poses of one orientation differ by more than their noise, '
+                      'and no orientation checks the others', _more_poses(expected), 'BAD')
     elif expected.noise_mg is None and expected.dof < TO_CHECK.value:
         yield Finding('few_checks', f'only {counted(expected.dof, "pose")} more than values check '
                       'the fit, and the noise is not known', _more_poses(expected), 'USABLE')
@@ -173,12 +176,17 @@ def _checked(expected: Expected) -> Iterator[Finding]:
                       'take these poses again', 'USABLE', tuple(rows))
 
 
+def _is_beyond_noise(expected: Expected) -> bool:
+    hidden, noise = expected.hidden_mg, expected.noise_mg
+    return noise is not None and hidden >= max(
+        MATTERS.value, noise * math.sqrt(HIDDEN.value ** 2 - 1.0))
+
+
 def _beyond_noise(expected: Expected, refinement: Refinement | None) -> Iterator[Finding]:
     """Yield a finding if the poses show what the model does not contain."""
-    hidden, noise = expected.hidden_mg, expected.noise_mg
-    if noise is None or hidden < MATTERS.value or hidden < noise * math.sqrt(
-            HIDDEN.value ** 2 - 1.0):
+    if not _is_beyond_noise(expected):
         return
+    hidden = expected.hidden_mg
     begin, step = f'{mg(hidden)} of the residual are not noise', 'poses'
     if refinement is None:
         what = f'{begin}: an effect is missing, or poses moved'

@@ -234,7 +234,7 @@ class Session:
             for rest in change.refused:
                 if 2.0 * (rest.end - rest.start) > self.settings.min_dwell and (
                         next_action(self).kind == 'poses'):
-                    self.log('info', f'this rest is no pose: {rest.words}', rest.reason, AGAIN)
+                    self.log('info', f'this rest gave no pose: {rest.words}', rest.reason, AGAIN)
             if change.poses:
                 new = change.rest is not None and sensor.guide.is_new_rest(change.rest.start)
                 self.poses_changed(ended=bool(change.ended), new_rest=new)
