@@ -152,6 +152,9 @@ def _captured(source: Source, log: OpenLog, options: LogOptions, settings: Mappi
     """Capture the poses of an open log; InputError without a still stretch."""
     asked = settings_from(settings, log.units)
     found = capture(log.watched(progress), log.units, asked)
+    if np.any(found.least):
+        with _opened(source, options) as again:
+            found = capture(again.blocks, log.units, asked, found.least)
     check_measured(found.poses.reading, found.lengths, log.units)
     count, findings = len(found.poses), account_of(found.rests, asked)
     limit, more = _wider(source, found, log.units, options, settings) if count < _FEW else (0.0, 0)

@@ -73,9 +73,8 @@ def rows_of(folder: Path, place: Path) -> list[tuple[str, str, str, str]]:
             path, name = place / given.stem, given.stem
             path.write_bytes(gzip.decompress(given.read_bytes()))
         verdict, read_as, words = said(path, LogOptions(**OPTIONS.get(name, {})))
-        short = (words.replace(f'{path.parent}/', '').replace(str(path), name), read_as)
-        rows.append((name.replace('_', '\\_'), verdict, *(
-            each.replace('|', '\\|') for each in short[::-1])))
+        words = words.replace(f'{path.parent}/', '').replace('|', '\\|')
+        rows.append((name.replace('_', '\\_'), verdict, read_as.replace('|', '\\|'), words))
         print(name, verdict, file=sys.stderr)
     return rows
 

@@ -99,6 +99,14 @@ def _inserted(log: Log, place: float, rows: int, value: float) -> Log:
     return log._replace(time=np.arange(len(reading)) * period, reading=reading, rate=rate)
 
 
+def _starting(log: Log, rng: np.random.Generator) -> Log:
+    """Return a log that begins with what a filter makes of one reading."""
+    made = _inserted(log, 0.0, 150, 1.0)
+    made.reading[:150] += 10.0**rng.uniform(-6.0, -3.7) * rng.normal(size=(150, 3))
+    made.rate[:150] += 1e-6 * rng.normal(size=(150, 3))
+    return made
+
+
 def _with_axis(log: Log, axis: int, values: Floats | float) -> Log:
     reading = log.reading.copy()
     reading[:, axis] = values
@@ -124,6 +132,9 @@ FAULTS = {
     'zeros last': Fault(lambda log, rng: _inserted(log, 1.0, 300, 0.0), ('are 0',), True),
     'frozen': Fault(lambda log, rng: _inserted(log, rng.uniform(), 300, 1.0),
                     ('is repeated',), True),
+    'filter first': Fault(_starting, (), True),
+    'gyro not on': Fault(lambda log, rng: log._replace(rate=np.where(
+        np.arange(len(log.time))[:, np.newaxis] < 250, 0.0, log.rate)), (), True),
     'stuck axis': Fault(lambda log, rng: _with_axis(
         log, int(rng.integers(3)), rng.uniform(-9.0, 9.0)), ('does not measure',)),
     'dead axis': Fault(lambda log, rng: _with_axis(

@@ -17,6 +17,8 @@ REASONS: Mapping[str, tuple[str, str]] = MappingProxyType({
     'zeros': ('samples are missing: they are 0 on all axes', 'check the driver and the cable'),
     'frozen': ('samples are missing: the last reading is repeated, though no other rest repeats '
                'it', 'check the driver and the cable'),
+    'quiet': ('samples are missing: they vary far less than at all rests', 'check the driver: a '
+              'filter that starts looks so'),
     'short': ('shorter than min_dwell', 'hold the sensor still for longer in each pose, or '
               'capture shorter rests with --min-dwell {seconds:.2g}'),
     'shaking': ('more variation than the noise of the sensor', 'put the sensor on something that '
@@ -26,8 +28,8 @@ REASONS: Mapping[str, tuple[str, str]] = MappingProxyType({
     'turning': ('a turn, by the gyro', 'let go of the sensor in each pose'),
     'noisy': ('noise that does not exclude a slow turn', 'hold the sensor still three times as '
               'long in each pose'),
-    'length': ('a length that is not that of gravity', 'check the unit, or accept them with a wider '
-               '--still-norm-tolerance'),
+    'length': ('a length that is not that of gravity', 'check the unit, or accept them with a '
+               'wider --still-norm-tolerance'),
     'repeated': ('an earlier orientation', '')})
 """Why a rest is no pose, and what to do about it."""
 
@@ -51,9 +53,9 @@ def account_of(rests: Sequence[Rest], settings: CaptureSettings) -> tuple[Findin
     for each in rests:
         seconds.setdefault(each.reason, []).append(each.end - each.start)
     found = [Finding('missing', f'{sum(seconds[kind]):.3g} s are left out: {REASONS[kind][0]}',
-                     REASONS[kind][1]) for kind in ('zeros', 'frozen') if kind in seconds]
+                     REASONS[kind][1]) for kind in ('zeros', 'frozen', 'quiet') if kind in seconds]
     dropped = {reason: lengths for reason, lengths in seconds.items()
-               if reason not in ('', 'zeros', 'frozen', 'repeated')}
+               if reason not in ('', 'zeros', 'frozen', 'quiet', 'repeated')}
     count, taken = sum(map(len, dropped.values())), len(seconds.get('', ()))
     if count > taken:
         most = max(dropped, key=lambda reason: len(dropped[reason]))

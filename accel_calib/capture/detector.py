@@ -51,15 +51,16 @@ class StillDetector:
     `keep` is the number of finished dwells to keep; None: all. `context` are the keys of the
     further columns of the samples: temperature, supply voltage, and quantities. `still` is whether
     the sensor is still now, and `lengths` are the smallest |reading| above 0 and the largest one.
-    `refused` are the rests that ended in the last `push` or `close`, and are no poses.
+    `refused` are the rests that ended in the last `push` or `close`, and are no poses. `least`
+    are variances below which nothing is a rest, as another detector of these samples found them.
 
     """
 
     def __init__(self, settings: CaptureSettings, units: Units, keep: int | None = 1000,
-                 context: Sequence[str] = CONTEXT) -> None:
+                 context: Sequence[str] = CONTEXT, least: Floats = np.zeros(6)) -> None:
         self._settings, self._context = settings, context
         self._chunker = Chunker(settings, len(context))
-        self._rule = Rule(settings, units)
+        self._rule = Rule(settings, units, least)
         self._tracker: Tracker | None = None
         self._most = keep
         self._kept = np.empty(0, figures_type(len(context)))
@@ -80,7 +81,9 @@ class StillDetector:
             be finite; NaN marks other missing values.
 
         """
-        return self._last(self.add([_columns(samples)]))
+        found = self._last(self.add([_columns(samples)]))
+        self._rule.least = self.least
+        return found
 
     def add(self, blocks: Iterable[Floats]) -> int:
         """
@@ -119,6 +122,11 @@ class StillDetector:
     def judged(self) -> list[Dwell]:
         """Return the kept dwells with the reason why they are no poses with the noise now."""
         return judged(self._kept, self._rule, self._context) if len(self._kept) else []
+
+    @property
+    def least(self) -> Floats:
+        """Return the (6,) variances below which nothing is a rest, as known now; 0: not known."""
+        return self._rule.levels.least
 
     @property
     def missing(self) -> tuple[Rest, ...]:
@@ -207,7 +215,7 @@ class StillDetector:
         """Note the chunks of zeros, and the windows of one reading."""
         for each in verdict[verdict['missing'] > 0]:
             kind, begin = MISSING[each['missing']], float(each['begin'])
-            if kind == 'frozen':
+            if kind != 'zeros':
                 begin -= (CHUNKS_PER_WINDOW - 1) * length
             elif not each['sums']['zeros']:
                 continue
@@ -233,7 +241,9 @@ class Captured:
     `threshold` is the standard deviation below which a window is still, at the end, and `quietest`
     that of the quietest window, each of the axis with the largest one [unit of the readings].
     `seconds` is the duration of the recording without interruptions [s]. `rests` is the account of
-    every rest, in order of time. `lengths` are the smallest and the largest |reading|.
+    every rest, in order of time. `lengths` are the smallest and the largest |reading|. `least` are
+    the (6,) variances below which nothing was a rest of the sensor: if one is not 0 and was not
+    given, the samples are to be captured again with them.
 
     """
 
@@ -246,10 +256,12 @@ class Captured:
     quietest: float
     rests: tuple[Rest, ...]
     lengths: tuple[float, float]
+    least: Floats
 
 
 def capture(recording: Recording | Iterable[Recording], units: Units,
-            settings: CaptureSettings = CaptureSettings()) -> Captured:
+            settings: CaptureSettings = CaptureSettings(), least: Floats = np.zeros(6)
+            ) -> Captured:
     """
     Find the still poses of a recording, in order of time.
 
@@ -262,6 +274,8 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
         Unit of the readings.
     settings : CaptureSettings
         Settings of the detector and of the poses.
+    least : (6,) array
+        Variances of readings and rates below which nothing is a rest (`Captured.least`).
 
     Raises
     ------
@@ -272,7 +286,7 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
     parts = iter([recording] if isinstance(recording, Recording) else recording)
     first = next(parts, None)
     context = CONTEXT if first is None else (*CONTEXT, *first.quantities)
-    detector = StillDetector(settings, units, keep=None, context=context)
+    detector = StillDetector(settings, units, keep=None, context=context, least=least)
     times, recorded = list[float](), 0
     about: dict[str, Any] = {}
     for part in parts if first is None else chain((first,), parts):
@@ -293,7 +307,8 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
     return Captured(poses, sum(each.samples for each in dwells),
                     detector.threshold, seconds - sum(each.seconds for each in interruptions),
                     interruptions, recorded, detector.quietest,
-                    tuple(sorted((*rests, *detector.missing))), detector.lengths)
+                    tuple(sorted((*rests, *detector.missing))), detector.lengths,
+                    detector.least)
 
 
 def samples_of(recording: Recording, start: int, stop: int, context: Sequence[str] = CONTEXT

@@ -52,6 +52,7 @@ from numpy.typing import NDArray
 
 from .chunks import (
     blank, CaptureSettings, chained, Chunks, CHUNKS_PER_WINDOW, Records, window_type)
+from .levels import Levels
 from .trend import (
     Columns, columns_of, oscillation, sliding_max, sliding_sum, Stretch, stretch, Trend, windows)
 from ..table import Floats
@@ -121,8 +122,12 @@ STD_FLOOR_G = 3.3e-4
 AT_LIMIT = 0.1
 """Share of samples at a limit above which a variance is too small by a sixth or more."""
 
-MISSING = ('', 'zeros', 'frozen')
-"""What stands in a log where samples are missing: zeros, or the last reading again and again."""
+MISSING = ('', 'zeros', 'frozen', 'quiet')
+"""What stands in a log where samples are missing: zeros, the last reading again and again, or what
+is far quieter than the rests of the sensor."""
+
+QUIETER = 8.0
+"""Ratio of the variance at rest to that of what is no rest of this sensor."""
 
 VARIED_STEPS, VARIED_SHARE, MOST_REPEATED = 0.7, 0.1, 600.0
 """Standard deviation of a rest [steps] above which no noise repeats a reading for a window. The
@@ -176,12 +181,15 @@ class Rule:
     The rule with its state: the last chunks, and noise and resolution so far.
 
     `quietest` is the variance of the axis with the largest one, in the quietest window so far, and
-    `repeats` whether a rest can repeat one reading, as that of a coarse sensor does.
+    `repeats` whether a rest can repeat one reading, as that of a coarse sensor does. `least` are
+    the (6,) variances below which nothing is a rest of this sensor, 0 if they are not known.
 
     """
 
-    def __init__(self, settings: CaptureSettings, units: Units) -> None:
-        self._settings = settings
+    def __init__(self, settings: CaptureSettings, units: Units, least: Floats = np.zeros(6)
+                 ) -> None:
+        self._settings, self._given, self.least = settings, least, least
+        self.levels = Levels()
         self.known = not units.is_native
         self._per_g = units.per_g
         self._lowest = np.full(3, np.inf)
@@ -190,7 +198,7 @@ class Rule:
         self._before: Records = np.empty(0)  # the first chunks are fresh
         self._floors = np.full((2, 6), np.inf)  # of stretches without equal samples, of all
         self._counts = np.zeros(2)  # stretches that varied, and that did not
-        self._same = 0.0
+        self._same, self._seen = 0.0, 0
         self.repeats = True
         self._step = np.full(2, np.inf)
         self.quietest = math.inf
@@ -215,7 +223,7 @@ class Rule:
         """Return the variance of the noise of the sensor as known now, for (6, n) means."""
         axes = len(mean)
         noise = at_least(self._floor[:axes, np.newaxis], self._step[:, np.newaxis], mean)
-        return at_least_any(noise, np.asarray(self.scale))
+        return at_least_any(np.fmax(noise, self.least[:axes, np.newaxis]), np.asarray(self.scale))
 
     def rounding(self, mean: Floats, level: Floats) -> tuple[Floats, Floats]:
         """
@@ -265,10 +273,12 @@ class Rule:
         mean, recent = mean[:, -size:], level[:, -size:]
         seen = {length: stretch(columns, level, length, size, chunks.length)
                 for length in SLOPE_CHUNKS}
+        gaps = (zero, zero + equal, np.where(level[3:] == 0.0, 1.0, 0.0))
         noise, varied = self._learn(seen[LONG], mean, chunks.step, *(
-            sliding_max(each, LONG - CHUNKS_PER_WINDOW + 1)[-size:] > 0.0
-            for each in (zero, zero + equal)))
+            sliding_max(each, LONG - CHUNKS_PER_WINDOW + 1)[..., -size:] > 0.0 for each in gaps))
         kind = np.where(zero[-size:] > 0.0, 1, np.where((equal[-size:] > 0.0) & varied, 2, 0))
+        quiet = np.all(QUIETER * recent[:3] < self._given[:3, np.newaxis], axis=0)
+        kind[quiet & (kind == 0) & np.any(recent[:3] > 0.0, axis=0)] = 3
         missing = kind > 0
         self.quietest = float(np.fmin.reduce(
             recent[:3].max(axis=0)[~missing], initial=self.quietest))
@@ -354,11 +364,13 @@ class Rule:
         return _half_range(low, high, noise[:3])
 
     def _learn(self, seen: Stretch, mean: Floats, step: Floats, zero: NDArray[np.bool_],
-               repeated: NDArray[np.bool_]) -> tuple[Floats, NDArray[np.bool_]]:
+               repeated: NDArray[np.bool_], off: NDArray[np.bool_]
+               ) -> tuple[Floats, NDArray[np.bool_]]:
         """
         Return the variance of the noise at each chunk, and whether rests vary beyond rounding.
 
-        `zero` and `repeated` are stretches with samples of zeros, and these or equal ones.
+        `zero` and `repeated` are stretches with samples of zeros, and these or equal ones, and
+        `off` those in which an axis of the gyro does not vary for a window: it is not on yet.
 
         """
         axes = len(mean)
@@ -366,14 +378,20 @@ class Rule:
         average = seen.variance * np.repeat(np.exp(2.0 * np.sqrt(2.0 / dof)), 3, axis=0)
         steps = np.minimum.accumulate(np.column_stack([self._step, step]), axis=1)[:, 1:]
         average[:3][clipped(average, seen.at_limit, steps, mean)] = np.nan
+        average[3:][off] = np.nan
         floors = np.where([repeated[np.newaxis], zero[np.newaxis]], np.nan, average)
         floors[:, :, 0] = np.fmin(floors[:, :, 0], self._floors[:, :axes])
         floors = np.fmin.accumulate(floors, axis=2)
         deviation = np.sqrt(np.max(seen.variance[:3], axis=0))
-        varies = (deviation > VARIED_STEPS * steps[0]) & (seen.trend.excess < WHITE) & ~repeated
-        varies &= ~self.moved(seen.trend, np.asarray(self.scale), seen.variance[:3])
+        calm = (seen.trend.excess < WHITE) & ~zero
+        calm &= ~self.moved(seen.trend, np.asarray(self.scale), seen.variance[:3])
         if self.known:
-            varies &= deviation < STD_CAP_G * self._per_g
+            calm &= deviation < STD_CAP_G * self._per_g
+        varies = calm & ~repeated & (deviation > VARIED_STEPS * steps[0])
+        apart = slice(-self._seen % LONG, None, LONG)
+        self.levels.add(np.where(~zero & (calm | (average == 0.0)), average, np.nan)[:, apart],
+                        mean[:3, apart])
+        self._seen += len(calm)
         counts = self._counts[:, np.newaxis] + np.cumsum([varies, repeated & ~zero], axis=1)
         same = np.maximum.accumulate(np.append(
             self._same, np.where(seen.trend.excess < WHITE, seen.same, 0.0) * ~repeated))[1:]
@@ -382,7 +400,8 @@ class Rule:
         varied = (counts[0] >= np.maximum(share, CHUNKS_PER_WINDOW)) & (chance < BY_CHANCE)
         self._floors[:, :axes], self._step = floors[:, :, -1], steps[:, -1]
         self._counts, self._same, self.repeats = counts[:, -1], float(same[-1]), not varied[-1]
-        return at_least(np.where(varied, floors[0], floors[1]), steps, mean), varied
+        noise = np.fmax(np.where(varied, floors[0], floors[1]), self.least[:axes, np.newaxis])
+        return at_least(noise, steps, mean), varied
 
 
 def common_lengths(means_g: Floats) -> Floats | None:
