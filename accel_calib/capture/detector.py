@@ -160,10 +160,12 @@ class StillDetector:
         whole = list[Chunks]()
         for block in blocks:
             whole += self._chunker.feed(block, last)
-            length = np.sqrt(np.einsum('an,an->n', block[1:4], block[1:4]))
-            self.lengths = (
-                float(np.min(length, initial=self.lengths[0], where=length > 0.0)),
-                float(np.max(length, initial=self.lengths[1])))
+            x, y, z = block[1:4]
+            square = x * x + y * y + z * z
+            if len(square):
+                low = square.min() or np.min(square, initial=np.inf, where=square > 0.0)
+                self.lengths = (min(self.lengths[0], math.sqrt(low)),
+                                max(self.lengths[1], math.sqrt(square.max())))
         for chunks in together(whole):
             if chunks.fresh:
                 found += self._leave()
