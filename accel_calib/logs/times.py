@@ -12,7 +12,6 @@ periods later, and those of the first stamp, which may lack some, end with it.
 
 """
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import math
 
@@ -205,23 +204,14 @@ def _unit_of_time(columns: Chosen, first: Cells, stamps: Floats) -> str:
     stated = unit_of('time', source.unit)
     if stated:
         return stated[0]
-    if layout.header and source.name == 'time' and (layout.about or 'count' in columns.sources
-                                                    or not _by_rate(columns, first, stamps)):
+    if layout.header and source.name == 'time' and (
+            layout.about or 'count' in columns.sources or (
+                columns.names(READING) == list(READING)
+                and not _is_dense(stamps, columns.three(first, READING)))):
         return 's'
+    # A unit with a plausible rate, best one that the file states; else s.
     units = TICKS.get(bare_name(source.name), _UNITS)
-    return _unit_by_rate(stamps, rates_beside(layout, source), units)
-
-
-def _by_rate(columns: Chosen, first: Cells, stamps: Floats) -> bool:
-    """Return whether the unit of a column ``time`` is found from the rate; by default it is s."""
-    return (columns.names(READING) != list(READING)
-            or _is_dense(stamps, columns.three(first, READING)))
-
-
-def _unit_by_rate(stamps: Floats, beside: Sequence[float], units: Mapping[str, float]
-                  ) -> str:
-    """Return the unit with a plausible rate, best one that the file states; else s."""
-    step = _step_of(stamps)
+    beside, step = rates_beside(layout, source), _step_of(stamps)
     if not step > 0.0:
         return 's'
     rates = {name: 1.0 / (step * unit) for name, unit in units.items()}
