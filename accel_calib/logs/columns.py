@@ -18,11 +18,10 @@ from typing import Literal
 
 import numpy as np
 
-from .dialect import is_clock, is_number, Layout, shown
+from .dialect import Cells, is_clock, is_number, Layout, shown
 from .names import (
     BARE, bare_name, check_sensor, COUNTERS, format_named, is_unit, LINEAR_WORDS, LogFormat,
     may_cause, Meaning, meaning, OURS, RATE, READING, recognise, unit_of, WHOLE_WORDS, WORDS)
-from .text import Cells
 from ..errors import InputError
 from ..table import COLUMNS, Floats, quantity_key
 from ..units import STANDARD_GRAVITY, UnitName
@@ -171,8 +170,9 @@ def chosen(layout: Layout, options: LogOptions) -> Chosen:
     given = dict(options.columns)
     if maker is None or set(READING) & given.keys():
         found = sources(layout, given)
-        if 'time' not in found and 'time' not in given and (options.rate or layout.rate_hz):
-            found |= {'time': source for source in [counter(layout)] if source}
+        counted = counter(layout) if options.rate or layout.rate_hz else None
+        if counted and 'time' not in found and 'time' not in given:
+            found['time'] = counted
         return with_indices(layout, found)
     check_sensor(header[:MOST], layout.path)
     found = sources(layout, {**maker.present(header), **given})

@@ -27,6 +27,7 @@ import re
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..table import ABOUT, Autopilot, Floats
@@ -162,6 +163,15 @@ class Layout:
         """Return the name of a column, or its number from 1."""
         has_name = column < len(self.header) and self.header[column]
         return short(self.header[column]) if has_name else str(column + 1)
+
+
+@dataclass(frozen=True)
+class Cells:
+    """A block of rows: (n, k) numbers, k texts of n cells, and n row numbers from 1."""
+
+    numbers: Floats
+    texts: list[list[str]]
+    row: NDArray[np.int64]
 
 
 def split(line: str, delimiter: str) -> list[str]:

@@ -116,19 +116,15 @@ def read_ulg(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
     device = _device(chosen, found)
     autopilot = Autopilot('px4', px4_slot(parameters, device), device or None,
                           px4_slot(parameters, device, 'TC_A'))
-    if chosen.name == _RAW:
-        sensed = AsSensed(columns, autopilot)
-    else:
-        sensed = as_sensed(columns, parameters, autopilot, lambda: _correction(
-            chosen, parameters, device, release), _PX4_ADVICE)
+
+    def correction() -> Correction:
+        if chosen.name == _FILTERED:
+            raise UnknownCorrectionError(f'{chosen.name} lacks the bias that PX4 estimates')
+        return px4_correction(parameters, device, release)
+
+    sensed = (AsSensed(columns, autopilot) if chosen.name == _RAW else
+              as_sensed(columns, parameters, autopilot, correction, _PX4_ADVICE))
     return choice.log('PX4 log', sensed, 'temperature of the sensor', (*notes, *invalid))
-
-
-def _correction(chosen: Message, parameters: Parameters, device: int,
-                release: tuple[int, int] | None) -> Correction:
-    if chosen.name == _FILTERED:
-        raise UnknownCorrectionError(f'{chosen.name} lacks the bias that PX4 estimates')
-    return px4_correction(parameters, device, release)
 
 
 def _px4_messages(path: Path
@@ -241,10 +237,16 @@ def read_dataflash(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
         'the reading is not a number')
     sources = (message for message in (chosen, *found) if message.instance == chosen.instance)
     columns |= choice.rates(columns['time'], sources, _RATES)
-    columns |= _ardupilot_temperature(chosen, columns['time'], found)
-    parameters = _parameters(tables.get('PARM', {}))
-    number = chosen.instance + 1
-    sensed = as_sensed(columns, parameters, _autopilot(parameters, number),
+    columns |= at(columns['time'], 'temperature', (
+        (message, message.fields[name]) for message in found for name in ('T', 'Temp')
+        if (message.name, message.instance) == ('IMU', chosen.instance)
+        and np.any(message.fields.get(name, 0.0))))
+    parameters, number = _parameters(tables.get('PARM', {})), chosen.instance + 1
+    *_, (_, values) = parameters.spans()
+    device = values.get(f'INS_ACC{"" if number == 1 else number}_ID', 0.0)
+    warm = values.get(f'INS_TCAL{number}_ENABLE', 0.0) != 0.0
+    autopilot = Autopilot('ardupilot', number, int(device) or None, number if warm else None)
+    sensed = as_sensed(columns, parameters, autopilot,
                        lambda: ardupilot_correction(parameters, number), _ARDUPILOT_ADVICE)
     return choice.log('ArduPilot log', sensed, 'temperature T', (*notes, *dropped))
 
@@ -269,22 +271,6 @@ def _ardupilot_messages(tables: Mapping[str, _Table]) -> list[Message]:
     return found
 
 
-def _ardupilot_temperature(chosen: Message, time: Floats, found: Sequence[Message]
-                           ) -> dict[str, Floats]:
-    """Return the temperature that IMU of the same sensor reports."""
-    sources = ((message, message.fields['T' if 'T' in message.fields else 'Temp'])
-               for message in found if (message.name, message.instance) == ('IMU', chosen.instance)
-               and {'T', 'Temp'} & set(message.fields))
-    return at(time, 'temperature', (each for each in sources if np.any(each[1])))
-
-
-def _autopilot(parameters: Parameters, instance: int) -> Autopilot:
-    *_, (_, values) = parameters.spans()
-    device = values.get(f'INS_ACC{"" if instance == 1 else instance}_ID', 0.0)
-    warm = values.get(f'INS_TCAL{instance}_ENABLE', 0.0) != 0.0
-    return Autopilot('ardupilot', instance, int(device) or None, instance if warm else None)
-
-
 def _parameters(table: _Table) -> Parameters:
     """Return the messages PARM, in order; damaged ones are left out."""
     stamp = next((key for key in _STAMPS if key in table), '')
@@ -296,8 +282,7 @@ def _parameters(table: _Table) -> Parameters:
         for time, name, value in rows), _STAMPS[stamp])
 
 
-def _indexed(path: Path) -> Any:
-    """Return the log of pymavlink, which knows where each message begins."""
+def _binary(path: Path) -> tuple[dict[str, _Table], list[str]]:
     from pymavlink.DFReader import DFReader_binary
 
     class Index(DFReader_binary):  # type: ignore[misc]
@@ -305,13 +290,8 @@ def _indexed(path: Path) -> Any:
             """Skip the search for a GPS time, which parses a whole log that has none."""
 
     with sound_log(path, 'an ArduPilot log (.bin)'):
-        log = Index(str(path))
+        log = Index(str(path))  # it knows where each message begins
         log.close()
-    return log
-
-
-def _binary(path: Path) -> tuple[dict[str, _Table], list[str]]:
-    log = _indexed(path)
     data = np.frombuffer(path.read_bytes(), np.uint8)
     tables, cut = {}, 0
     for number, form in log.formats.items():

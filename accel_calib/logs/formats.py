@@ -31,11 +31,11 @@ from .bag import open_bag
 from .bag_samples import context_of, imu_samples, rate_words
 from .columns import Chosen, chosen, is_log_header, LogOptions
 from .containers import DamagedLogError, Frame, Member, Piped, sound_log, Stream
-from .dialect import shown
+from .dialect import Cells, shown
 from .flight import DATAFLASH, read_dataflash, read_ulg
 from .names import meaning, READING, record_instead
 from .quantities import are_samples, are_untimed_samples, decided
-from .text import Cells, open_text, PEEKED, TextTable
+from .text import open_text, PEEKED, TextTable
 from ..disk import check_regular, FIRST_LINE
 from ..errors import InputError, needing, saying
 from ..finding import Finding
@@ -245,7 +245,7 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
         else:
             poses = concatenated([head, *blocks])
             lacking = [key for key in poses.quantities if not np.isfinite(poses[key]).all()]
-            poses = replace(poses.without_columns(*lacking), findings=quantities.all_findings)
+            poses = replace(poses.without_columns(*lacking), findings=tuple(quantities.findings))
             if lacking:
                 quantities.notes.append(
                     f'not used, because cells are not numbers: {some(lacking)}')
@@ -260,7 +260,7 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
     return OpenLog(samples, count, quantities.units, head.sensor,
                    ', '.join(filter(None, (quantities.read_as, rate))), poses,
                    noted=lambda: (*text.notes, *quantities.all_notes),
-                   findings=quantities.all_findings)
+                   findings=tuple(quantities.findings))
 
 
 def _as_samples(path: Path, poses: Poses) -> Iterator[Recording]:

@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .columns import Chosen, LogOptions, unused
+from .dialect import Cells
 from .names import DEGREE, meaning, RATE, READING, record_instead, unit_of, ZEROS
-from .text import Cells
 from .times import Clock, clock_of
 from ..errors import InputError, saying
 from ..finding import Finding
@@ -119,7 +119,7 @@ class Quantities:
     factor to our unit and our value at 0, by column. `instance` is the number of the sensor whose
     rows are read, where rows of several alternate. `modulus` is 2ⁿ for columns whose numbers of n
     bits lost their sign. `said` is what is assumed, `notes` what is not used, and `findings` what
-    the values contradict.
+    the values contradict, and what is done about the times.
 
     """
 
@@ -135,11 +135,6 @@ class Quantities:
     findings: list[Finding] = field(default_factory=list)
 
     @property
-    def all_findings(self) -> tuple[Finding, ...]:
-        """Return what the values contradict, and what is done about the times."""
-        return (*self.findings, *self.clock.findings)
-
-    @property
     def read_as(self) -> str:
         """Return what is assumed, in one line."""
         return ', '.join(self.said)
@@ -148,11 +143,10 @@ class Quantities:
     def all_notes(self) -> tuple[str, ...]:
         """Return what is not used, and whether the counter of the clock started again."""
         starts = self.clock.starts
-        if not starts:
-            return tuple(self.notes)
         times = 'once' if starts == 1 else f'{starts} times'
-        return (*self.notes, f'the clock starts again {times} at the end of its range; its times '
-                'are continued')
+        again = (f'the clock starts again {times} at the end of its range; its times are '
+                 'continued',)
+        return (*self.notes, *(again if starts else ()))
 
     def columns(self, cells: Cells) -> tuple[dict[str, NDArray[Any]], NDArray[np.int64]]:
         """Return the columns of a block in our units, and its row numbers."""
@@ -239,6 +233,7 @@ def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
     if 'supply_voltage' in columns.sources:
         _convert_if_stated(made, 'supply_voltage', 'V')
     made.notes += unused(columns.layout, columns.sources)
+    made.findings += made.clock.findings
     return made
 
 

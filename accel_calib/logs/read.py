@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .columns import chosen, is_log_header, LogOptions
-from .dialect import layout_of
+from .dialect import Cells, layout_of
 from .formats import open_log
 from .quantities import decided
-from .text import Cells, TextTable
+from .text import TextTable
 from ..disk import write_atomically
 from ..errors import InputError
 from ..table import check_values, column_of, COLUMNS, concatenated, Poses, Recording, Table
@@ -128,7 +128,7 @@ class LineReader:
         rate = '' if timed else (f'no times, {rate_hz:.4g} Hz '
                                  f'({"stated" if options.rate else "measured"})')
         self.read_as = ', '.join(filter(None, (self._quantities.read_as, rate)))
-        self.first, self.findings = self._recording(first), self._quantities.all_findings
+        self.first, self.findings = self._recording(first), tuple(self._quantities.findings)
 
     def samples(self, lines: Sequence[str]) -> Recording | None:
         """Return the samples of the next complete lines; None if there are none."""

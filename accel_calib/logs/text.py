@@ -13,26 +13,22 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 import io
 from itertools import chain, islice
-from operator import methodcaller
 from pathlib import Path
 import re
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .columns import Chosen
 from .dialect import (
-    first_label, is_clock, is_comment, is_number, IsHeader, Layout, layout_of, short, split)
+    Cells, first_label, is_clock, is_comment, is_number, IsHeader, Layout, layout_of, short, split)
 from ..errors import InputError
 from ..table import Floats
 from ..text import counted
-
-if TYPE_CHECKING:
-    from .columns import Chosen
 
 ROWS = 65536
 """Number of lines in a block."""
@@ -50,15 +46,6 @@ _BLANK = ' \t\r\n,;|'
 
 _QUOTED_LINES = 20
 """Largest number of lines of one quoted cell."""
-
-
-@dataclass(frozen=True)
-class Cells:
-    """A block of rows: (n, k) numbers, k texts of n cells, and n row numbers from 1."""
-
-    numbers: Floats
-    texts: list[list[str]]
-    row: NDArray[np.int64]
 
 
 @contextmanager
@@ -211,47 +198,34 @@ class TextTable:
 
     def _parsed(self, lines: list[str]) -> Floats | None:
         """Return the numbers of rows, or None if a row has a fault."""
-        if not lines or not self._numeric:
+        layout, columns = self.layout, self._numeric
+        dialect, delimiter = layout.dialect, layout.dialect.delimiter
+        if not lines or not columns:
             sound = all(self._fault(line) is None for line in lines)
-            return np.zeros((len(lines), len(self._numeric))) if sound else None
-        plain = self._plain(lines)
-        cells = self.layout.dialect.cells
-        if plain is None or any(not is_clock(cells(line)[k])
-                                for k in self._dates for line in lines):
+            return np.zeros((len(lines), len(columns))) if sound else None
+        texts = lines
+        if dialect.monitor or dialect.labelled or dialect.prefix:
+            texts = list(map(dialect.plain, lines))
+        if '"' in ''.join(texts):  # lines without quotes, parted by tabs
+            rows = [split(line, delimiter) for line in texts]
+            cells = [[row[k] for k in columns] for row in rows if len(row) == layout.width]
+            texts = ['\t'.join(row) for row in cells]
+            delimiter, columns, breaks = '\t', tuple(range(len(columns))), len(columns) - 1
+        else:
+            breaks = layout.width - 1
+        if len(texts) < len(lines) or {line.count(delimiter) if delimiter else
+                                       len(line.split()) - 1 for line in texts} != {breaks}:
             return None
-        lines, delimiter, columns = plain
-        if delimiter != ',' and self.layout.decimal != '.':
-            lines = [line.replace(',', '.') for line in lines]
+        if any(not is_clock(dialect.cells(line)[k]) for k in self._dates for line in lines):
+            return None
+        if delimiter != ',' and layout.decimal != '.':
+            texts = [line.replace(',', '.') for line in texts]
         try:
-            values = np.loadtxt(lines, delimiter=delimiter, usecols=columns, ndmin=2,
+            values = np.loadtxt(texts, delimiter=delimiter or None, usecols=columns, ndmin=2,
                                 comments=None, quotechar=None)
         except ValueError:
             return None
         return values if len(values) == len(lines) and np.isfinite(values).all() else None
-
-    def _plain(self, lines: list[str]) -> tuple[list[str], str | None, Sequence[int]] | None:
-        """Return lines for loadtxt with their delimiter and columns, or None if ragged."""
-        dialect, width = self.layout.dialect, self.layout.width
-        if dialect.monitor or dialect.labelled or dialect.prefix:
-            lines = [dialect.plain(line) for line in lines]
-        if '"' in ''.join(lines):
-            return self._unquoted(lines)
-        delimiter = dialect.delimiter
-        counts = (map(methodcaller('count', delimiter), lines) if delimiter else
-                  (len(line.split()) - 1 for line in lines))
-        if set(counts) != {width - 1}:
-            return None
-        return lines, delimiter or None, self._numeric
-
-    def _unquoted(self, lines: list[str]) -> tuple[list[str], str, Sequence[int]] | None:
-        """Return lines without quotes, parted by tabs; or None if ragged."""
-        rows = [split(line, self.layout.dialect.delimiter) for line in lines]
-        if any(len(row) != self.layout.width for row in rows):
-            return None
-        cells = [[row[k] for k in self._numeric] for row in rows]
-        if any('\t' in cell or '\n' in cell for row in cells for cell in row):
-            return None
-        return ['\t'.join(row) for row in cells], '\t', range(len(self._numeric))
 
     def _good(self, lines: Sequence[str], rows: NDArray[np.int64],
               place: Sequence[int]) -> list[int]:

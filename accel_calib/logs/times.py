@@ -19,9 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .columns import Chosen, FRACTION, LogOptions, rates_beside
-from .dialect import EPOCH_S, has_date, RATES_HZ, seconds_of
+from .dialect import Cells, EPOCH_S, has_date, RATES_HZ, seconds_of
 from .names import bare_name, COUNTERS, READING, TICKS, unit_of, UNITS
-from .text import Cells
 from ..errors import InputError
 from ..finding import Finding
 from ..table import Floats
@@ -217,12 +216,12 @@ def _unit_of_time(columns: Chosen, first: Cells, stamps: Floats) -> str:
     rates = {name: 1.0 / (step * unit) for name, unit in units.items()}
     plausible = [name for name, rate in rates.items() if RATES_HZ[0] * 0.9 <= rate
                  <= RATES_HZ[1] * 1.1]
-    stated = [name for name in rates if any(_agree(rates[name], rate) for rate in beside)]
+    agreeing = [name for name in rates if any(_agree(rates[name], rate) for rate in beside)]
     since_1970 = [name for name in plausible
                   if EPOCH_S[0] <= float(np.median(stamps)) * units[name] <= EPOCH_S[1]]
     if not np.all(stamps == np.round(stamps)) and 's' in plausible:
         plausible = ['s']
-    return min(stated or since_1970 or plausible, default='s',
+    return min(agreeing or since_1970 or plausible, default='s',
                key=lambda name: abs(math.log(rates[name] / _USUAL_HZ)))
 
 
