@@ -15,10 +15,10 @@ from .bag import Bag, damage_as_input_error, open_bag
 from .bag_samples import context_of, ContextTopics
 from .columns import LogOptions
 from .containers import Frame, Piped
-from .formats import FORMATS, is_bag, OpenLog, Progress, SUFFIXES
+from .formats import FORMATS, is_bag, open_log, OpenLog, Progress, SUFFIXES
 from .names import NAMES
 from .quantities import are_untimed_samples
-from .read import LineReader, open_log, read_poses, read_recording, write_blocks, write_table
+from .read import LineReader, read_poses, read_recording, write_blocks, write_table
 from .serialized import (
     ACCELERATION, ACCELERATION_COVARIANCE, ANGULAR_VELOCITY, ANGULAR_VELOCITY_COVARIANCE,
     doubles_at, IMU_DOUBLES, joined, Layout, layout_of, layout_with, LITTLE_ENDIAN, Messages,

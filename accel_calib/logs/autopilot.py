@@ -36,8 +36,9 @@ first message in order of preference whose samples are dense enough for the capt
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+import math
 import re
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,19 +132,22 @@ class ByAxis:
         return bool(np.any(self.thermal))
 
 
-class Stated(NamedTuple):
-    """A value of a parameter, from a time [s] on."""
-
-    time: float
-    name: str
-    value: float
+class UnknownCorrectionError(Exception):
+    """A log does not state how its readings are corrected."""
 
 
 class Parameters:
-    """The parameters of a vehicle that matter here, in order of time; `lookup` finds a value."""
+    """
+    The parameters of a vehicle that matter here, in order of time; `lookup` finds a value.
 
-    def __init__(self, stated: Sequence[Stated]) -> None:
-        self._stated = [each for each in stated if _MATTER.match(each.name)]
+    They are made of the times from which values hold, as stored, the names and the values; those
+    that are not numbers are left out. `unit` is that of the times [s].
+
+    """
+
+    def __init__(self, stated: Iterable[tuple[Any, str, Any]], unit: float) -> None:
+        self._stated = [(float(time) * unit, name, float(value)) for time, name, value in stated
+                        if _MATTER.match(name) and _is_number(time) and _is_number(value)]
         self.used: dict[str, float] = {}
 
     def __bool__(self) -> bool:
@@ -152,19 +156,19 @@ class Parameters:
     def spans(self) -> Iterator[tuple[float, Values]]:
         """Yield from when on which values hold; the first value of each holds from the start."""
         values: dict[str, float] = {}
-        for each in self._stated:
-            values.setdefault(each.name, each.value)
+        for _, name, value in self._stated:
+            values.setdefault(name, value)
         yield -np.inf, dict(values)
-        for each in self._stated:
-            if values[each.name] != each.value and not _AT_BOOT.match(each.name):
-                values[each.name] = each.value
-                yield each.time, dict(values)
+        for time, name, value in self._stated:
+            if values[name] != value and not _AT_BOOT.match(name):
+                values[name] = value
+                yield time, dict(values)
 
     def lookup(self, values: Values, name: str, usual: float) -> float:
         """Return a value, or the usual one; others than the usual one are named in a note."""
         value = float(values.get(name, usual))
         if not np.isfinite(value):
-            raise _unknown(f'{name} is not a number')
+            raise UnknownCorrectionError(f'{name} is not a number')
         if value != usual:
             self.used[name] = value
         return value
@@ -172,11 +176,6 @@ class Parameters:
     def three(self, values: Values, pattern: str, usual: float) -> Floats:
         """Return the values of the axes, (3,); ``{}`` in the pattern is the axis."""
         return np.array([self.lookup(values, pattern.format(axis), usual) for axis in 'XYZ'])
-
-    @property
-    def turned(self) -> bool:
-        """Whether a rotation was used."""
-        return any(_TURNS.search(name) for name in self.used)
 
     @property
     def words(self) -> str:
@@ -188,14 +187,21 @@ class Parameters:
 
 
 Correction = Callable[[Values], ByAxis]
-"""Function that returns the correction of some values; InputError if it is not known."""
+"""Function that returns the correction of some values, or raises UnknownCorrectionError."""
+
+
+def _is_number(value: float | str | bytes) -> bool:
+    try:
+        return math.isfinite(float(value))
+    except ValueError:  # a damaged line of text, or a damaged parameter
+        return False
 
 
 def raw_columns(columns: Mapping[str, Floats], parameters: Parameters, correction: Correction
                 ) -> dict[str, Floats]:
     """Return columns with the readings of the sensor in its own axes; rates are only turned."""
     if not parameters:
-        raise _unknown('its parameters are not in the log')
+        raise UnknownCorrectionError('its parameters are not in the log')
     time, found = columns['time'], {key: values.copy() for key, values in columns.items()}
     temperature = found.get('temperature', np.zeros(len(time)))
     spans = list(parameters.spans())
@@ -205,7 +211,7 @@ def raw_columns(columns: Mapping[str, Floats], parameters: Parameters, correctio
             continue
         old = correction(values)
         if old.of_temperature and 'temperature' not in found:
-            raise _unknown('it depends on the temperature, which the log lacks')
+            raise UnknownCorrectionError('it depends on the temperature, which the log lacks')
         found['reading'][which] = old.raw(found['reading'][which], temperature[which])
         if 'rate' in found:
             found['rate'][which] = found['rate'][which] @ old.rotation
@@ -227,7 +233,7 @@ def px4_correction(parameters: Parameters, device: int, release: tuple[int, int]
                    ) -> Correction:
     """Return the correction of PX4 for the accelerometer with this id, of a known release."""
     if not device:
-        raise _unknown('the log does not state the device id of the accelerometer')
+        raise UnknownCorrectionError('the log does not state the device id of the accelerometer')
     slot = px4_slot(parameters, device)
 
     def correction(values: Values) -> ByAxis:
@@ -238,32 +244,25 @@ def px4_correction(parameters: Parameters, device: int, release: tuple[int, int]
         if number < 0.0:  # internal: it follows the board
             number = parameters.lookup(values, 'SENS_BOARD_ROT', 0.0)
         if number >= _FIRST_OTHER and release is not None and release < _BEFORE_MAVLINK:
-            raise _unknown(f'PX4 {release[0]}.{release[1]} numbers rotation {number:.0f} in '
-                           'another way')
+            raise UnknownCorrectionError(f'PX4 {release[0]}.{release[1]} numbers rotation '
+                                         f'{number:.0f} in another way')
         level = parameters.three(values, 'SENS_BOARD_{}_OFF', 0.0)
         rotation = _rotation(level) @ _numbered('SENS_BOARD_ROT', number, _ROTATIONS)
-        constant, thermal, reference, limits = _px4_thermal(parameters, values, device)
-        return ByAxis(offset + constant, scale, thermal, reference, limits, rotation)
+        slots = _slots(values, device, _THERMAL)
+        start = f'{_THERMAL}{slots[0]}_' if slots else 'uncalibrated '
+        constant, *thermal = (np.array([parameters.lookup(values, f'{start}X{order}_{axis}', 0.0)
+                                        for axis in range(3)]) for order in range(DEGREE + 1))
+        limits = values.get(f'{start}TMIN', 0.0), values.get(f'{start}TMAX', 100.0)
+        return ByAxis(offset + constant, scale, np.array(thermal),
+                      values.get(f'{start}TREF', 25.0), limits, rotation)
 
     return correction
-
-
-def _px4_thermal(parameters: Parameters, values: Values, device: int
-                 ) -> tuple[Floats, Floats, float, tuple[float, float]]:
-    slots = _slots(values, device, _THERMAL)
-    if not slots:
-        return np.zeros(3), np.zeros((DEGREE, 3)), 0.0, (0.0, 0.0)
-    start = f'{_THERMAL}{slots[0]}_'
-    constant, *thermal = (np.array([parameters.lookup(values, f'{start}X{order}_{axis}', 0.0)
-                                    for axis in range(3)]) for order in range(DEGREE + 1))
-    return (constant, np.array(thermal), float(values.get(f'{start}TREF', 25.0)),
-            (float(values.get(f'{start}TMIN', 0.0)), float(values.get(f'{start}TMAX', 100.0))))
 
 
 def ardupilot_correction(parameters: Parameters, instance: int) -> Correction:
     """Return the correction of ArduPilot for an accelerometer, numbered from 1."""
     if instance not in _ARDUPILOT_INSTANCES:
-        raise _unknown(f'parameters of accelerometer {instance} are not read')
+        raise UnknownCorrectionError(f'parameters of accelerometer {instance} are not read')
     start = f'INS_ACC{"" if instance == 1 else instance}'
     thermal_start = f'INS_TCAL{instance}_'
 
@@ -274,12 +273,12 @@ def ardupilot_correction(parameters: Parameters, instance: int) -> Correction:
         if values.get(f'{thermal_start}ENABLE') == 1:
             thermal = np.array([parameters.three(values, f'{thermal_start}ACC{order}_{{}}', 0.0)
                                 for order in range(1, DEGREE + 1)]) / PER_MILLION
-            limits = (float(values.get(f'{thermal_start}TMIN', 0.0)),
-                      float(values.get(f'{thermal_start}TMAX', 70.0)))
+            limits = (values.get(f'{thermal_start}TMIN', 0.0),
+                      values.get(f'{thermal_start}TMAX', 70.0))
         found = ByAxis(offset, scale, thermal, ARDUPILOT_REFERENCE, limits,
                        _ardupilot_rotation(parameters, values))
         # The firmware adds the polynomial at CALTEMP, so that it is zero there.
-        at_offset = float(values.get(f'INS_ACC{instance}_CALTEMP', -300.0))
+        at_offset = values.get(f'INS_ACC{instance}_CALTEMP', -300.0)
         return replace(found, offset=offset - found.moved(at_offset))
 
     return correction
@@ -292,30 +291,26 @@ def _ardupilot_rotation(parameters: Parameters, values: Values) -> Floats:
         return _numbered('AHRS_ORIENTATION', number, _OF_ARDUPILOT)
     lacking = [name for name in names if name not in values]
     if lacking:
-        raise _unknown(f'AHRS_ORIENTATION is {number:.0f}, and the log lacks {lacking[0]}')
+        raise UnknownCorrectionError(
+            f'AHRS_ORIENTATION is {number:.0f}, and the log lacks {lacking[0]}')
     return _rotation([parameters.lookup(values, name, 0.0) for name in names])
 
 
 def _numbered(name: str, number: float, known: Mapping[int, Sequence[float]]) -> Floats:
-    """Return the rotation with a number; raise InputError if there is none."""
+    """Return the rotation with a number."""
     if int(number) not in known:
-        raise _unknown(f'{name} is {number:.0f}, a rotation that is not known')
+        raise UnknownCorrectionError(f'{name} is {number:.0f}, a rotation that is not known')
     return _rotation(known[int(number)])
 
 
 def _rotation(degrees: Sequence[float] | Floats) -> Floats:
-    roll, pitch, yaw = np.radians(degrees)
-    return rotation_from_rpy(roll, pitch, yaw)
+    return rotation_from_rpy(*np.radians(degrees))
 
 
 def _scale(scale: Floats) -> Floats:
     if np.any(scale <= 0.0):
-        raise _unknown(f'a scale is {np.min(scale):g}')
+        raise UnknownCorrectionError(f'a scale is {np.min(scale):g}')
     return scale
-
-
-def _unknown(why: str) -> InputError:
-    return InputError(why, 'record a log with all parameters')
 
 
 # ------------------------------------------------------------------------- messages of a log
@@ -369,12 +364,13 @@ def as_sensed(columns: Mapping[str, Floats], parameters: Parameters, autopilot: 
     """Return columns without the correction, or as they are with a note why that is not known."""
     try:
         raw = raw_columns(columns, parameters, correction())
-    except InputError as err:
-        return AsSensed(columns, replace(autopilot, corrected=err.message), notes=(
-            f'readings are left as the vehicle corrected them ({err.message}), so do not load an '
-            f'export of their calibration into it; {advice}',))
+    except UnknownCorrectionError as err:
+        return AsSensed(columns, replace(autopilot, corrected=str(err)), notes=(
+            f'readings are left as the vehicle corrected them ({err}), so do not load an export '
+            f'of their calibration into it; {advice}',))
     undone = (f'the correction by the vehicle is undone: {parameters.words}',)
-    return AsSensed(raw, autopilot, parameters.turned, undone if parameters.words else ())
+    return AsSensed(raw, autopilot, any(map(_TURNS.search, parameters.used)),
+                    undone if parameters.words else ())
 
 
 @dataclass(frozen=True)
@@ -426,12 +422,10 @@ class Choice:
     def rates(self, time: Floats, sources: Iterable[Message], names: Sequence[str]
               ) -> dict[str, Floats]:
         """Return the angular rates of the first source with these fields that is as dense."""
-        for message in sources:
-            if message.rate_hz >= 0.5 * self.message.rate_hz and set(names) <= set(message.fields):
-                rates = vectors(message.fields, names)
-                if finite(rates):
-                    return {'rate': np.column_stack([at(time, message, each) for each in rates.T])}
-        return {}
+        return at(time, 'rate', (
+            (message, vectors(message.fields, names)) for message in sources
+            if message.rate_hz >= 0.5 * self.message.rate_hz and set(names) <= set(message.fields)
+        ))
 
 
 def choose(found: Sequence[Message], preferred: Sequence[str], topic: str, sensor: str,
@@ -468,15 +462,21 @@ def vectors(fields: Mapping[str, NDArray[Any]], names: Sequence[str]) -> Floats:
     return np.column_stack([fields[name] for name in names]).astype(float)
 
 
-def at(time: Floats, source: Message, values: NDArray[Any]) -> Floats:
-    """Return values of another message at these times, interpolated; the ends are held."""
-    order = np.argsort(source.time, kind='stable')
-    return np.interp(time, source.time[order], values[order].astype(float))
+def at(time: Floats, key: str, sources: Iterable[tuple[Message, NDArray[Any]]]
+       ) -> dict[str, Floats]:
+    """
+    Return a column at these times: the first values of other messages that are all finite numbers.
 
+    They are interpolated; the ends are held.
 
-def finite(values: NDArray[Any]) -> bool:
-    """Return whether there are values and all are finite numbers."""
-    return len(values) > 0 and bool(np.all(np.isfinite(values)))
+    """
+    for source, values in sources:
+        if len(values) and np.all(np.isfinite(values)):
+            order = np.argsort(source.time, kind='stable')
+            parts = [np.interp(time, source.time[order], part[order].astype(float))
+                     for part in np.atleast_2d(values.T)]
+            return {key: np.column_stack(parts) if len(parts) > 1 else parts[0]}
+    return {}
 
 
 def sound(message: Message, columns: Mapping[str, Floats], why: str,

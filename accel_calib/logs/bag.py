@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
@@ -23,7 +23,7 @@ import warnings
 import numpy as np
 from numpy.typing import NDArray
 
-from .damage import damage_refused
+from .containers import damage_refused
 from .serialized import frame_ids, IMU_DOUBLES, joined, Messages, samples_of
 from ..disk import check_regular
 from ..errors import InputError
@@ -96,14 +96,9 @@ class Bag:
         InputError.
 
         """
-        with damage_as_input_error(self.path):
-            messages = self.reader.messages(connections)
-        while True:
-            with damage_as_input_error(self.path):
-                block = _next_block(messages, size)
-            if not block:
-                return
-            yield block
+        sound = damage_as_input_error(self.path)
+        messages = sound(self.reader.messages)(connections)
+        yield from iter(sound(partial(_next_block, messages, size)), [])
 
     def first(self, topic: str, msgtype: str = IMU, size: int = 1) -> list[Received]:
         return next(self.blocks(self.connections(topic, msgtype), size), [])
@@ -278,12 +273,9 @@ def _check_messages(block: Sequence[tuple[Any, Any, Any]]) -> None:
                                   ((bytes, memoryview, bytearray), 2, 'content')):
         if not {type(message[position]) for message in block} <= {*kinds}:
             bad = next(message for message in block if type(message[position]) not in kinds)
+            cell = bad[position]
             raise ValueError(f'a message on {bad[0].topic} has the {what} '
-                             f'{_beginning(bad[position])!r}')
-
-
-def _beginning(cell: Any) -> Any:
-    return cell[:20] if isinstance(cell, (str, bytes)) else cell
+                             f'{cell[:20] if isinstance(cell, (str, bytes)) else cell!r}')
 
 
 def _types(connection: Connection, *, ros2: bool) -> Typestore:

@@ -122,10 +122,6 @@ class ContextTopic:
     def what(self) -> str:
         return f'{self.topic} ({self.msgtype})'
 
-    @property
-    def connections(self) -> list[Connection]:
-        return self.bag.connections(self.topic, self.msgtype)
-
     def values(self, block: Sequence[Received]) -> tuple[Floats, Floats]:
         """Return the times [s] and values of messages; a damaged message is an InputError."""
         if self.msgtype == TEMPERATURE:
@@ -142,7 +138,8 @@ class ContextTopic:
 
     def track(self) -> Track:
         """Return the values of the whole bag."""
-        blocks = [self.values(block) for block in self.bag.blocks(self.connections)]
+        connections = self.bag.connections(self.topic, self.msgtype)
+        blocks = [self.values(block) for block in self.bag.blocks(connections)]
         time, value = np.hstack([np.zeros((2, 0)), *map(np.array, blocks)])
         known = np.flatnonzero(np.isfinite(value))
         order = known[np.argsort(time[known], kind='stable')]
@@ -278,28 +275,25 @@ def _with_clock_and_unit(topic: ContextTopic, imu: str, *, named: bool
                              f'{topic.quantity.words}', 'name another topic')
         return None, [f'there is no {topic.quantity.words}: {message}']
     notes = []
-    late = _late(topic.bag, imu)
+    of_imu = topic.bag.first(imu, size=_PEEKED)
+    stamps = stamps_of(topic.bag.joined([raw for _, _, raw in of_imu], imu, 0)) if of_imu else 0.0
+    # The stamps of the first messages of the Imu after their receipt [s].
+    late = float(np.median(stamps - _received(of_imu))) if of_imu else 0.0
     if not np.median(np.abs(time - _received(block) - late)) <= _SAME_CLOCK_S:
         topic = replace(topic, late=late)
         notes.append(f'the messages on {topic.what} have no stamp of the clock of the Imu: their '
                      'times are those at which the bag received them')
     if topic.msgtype != TEMPERATURE and len(known):
-        name, factor, summand = _unit(topic, float(np.median(known)))
+        typical, (ours, lowest, highest, *_) = float(np.median(known)), topic.quantity.units[0]
+        fitting = [unit for unit in topic.quantity.units if unit[1] <= typical < unit[2]]
+        if not fitting:
+            raise InputError(f'{topic.bag.path}: the values on {topic.what} are about '
+                             f'{typical:.4g}, expected a {topic.quantity.words} from {lowest:g} '
+                             f'to {highest:g} {ours}', 'name another topic')
+        name, _, _, factor, summand = fitting[0]
         topic = replace(topic, factor=factor, summand=summand)
-        notes += [f'the numbers on {topic.what} are read as {name}'] if name else []
+        notes += [f'the numbers on {topic.what} are read as {name}'] if name != ours else []
     return topic, notes
-
-
-def _unit(topic: ContextTopic, typical: float) -> tuple[str, float, float]:
-    """Return the unit of a value, empty if it is that of the column, and its conversion."""
-    quantity = topic.quantity
-    for k, (name, least, most, factor, summand) in enumerate(quantity.units):
-        if least <= typical < most:
-            return name if k else '', factor, summand
-    (name, least, most, *_), *_ = quantity.units
-    raise InputError(f'{topic.bag.path}: the values on {topic.what} are about {typical:.4g}, '
-                     f'expected a {quantity.words} from {least:g} to {most:g} {name}',
-                     'name another topic')
 
 
 def rate_words(bag: Bag, imu: str) -> str:
@@ -309,20 +303,10 @@ def rate_words(bag: Bag, imu: str) -> str:
     return f' at {(len(received) - 1) / seconds:.3g} Hz' if seconds > 0.0 else ''
 
 
-def _late(bag: Bag, imu: str) -> float:
-    """Return the median stamp of the first messages of an Imu after their receipt [s]."""
-    block = bag.first(imu, size=_PEEKED)
-    if not block:
-        return 0.0
-    stamps = stamps_of(bag.joined([raw for _, _, raw in block], imu, 0))
-    return float(np.median(stamps - _received(block)))
-
-
 def _not_used(bag: Bag, quantity: Quantity, used: ContextTopic | None) -> list[str]:
     topics = dict(sorted({c.topic: c.msgtype for c in bag.reader.connections
-                          if c.msgcount and _looks_like(c, quantity)}.items()))
-    if used is not None:
-        topics.pop(used.topic, None)
+                          if c.msgcount and (used is None or c.topic != used.topic)
+                          and _looks_like(c, quantity)}.items()))
     named = [f'{topic} ({msgtype})' for topic, msgtype in topics.items()]
     if len(named) == 1:
         return [f'topic {named[0]} looks like a {quantity.words} and is not used: name it with '

@@ -11,18 +11,17 @@ the names cannot tell apart are an error, because a wrong choice would give a wr
 """
 
 from collections import Counter
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 import re
 from typing import Literal
 
 import numpy as np
 
-from .dialect import is_clock, is_number, Layout, shown
+from .dialect import Cells, is_clock, is_number, Layout, shown
 from .names import (
     BARE, bare_name, check_sensor, COUNTERS, format_named, is_unit, LINEAR_WORDS, LogFormat,
     may_cause, Meaning, meaning, OURS, RATE, READING, recognise, unit_of, WHOLE_WORDS, WORDS)
-from .text import Cells
 from ..errors import InputError
 from ..table import COLUMNS, Floats, quantity_key
 from ..units import STANDARD_GRAVITY, UnitName
@@ -170,7 +169,11 @@ def chosen(layout: Layout, options: LogOptions) -> Chosen:
             maker = None
     given = dict(options.columns)
     if maker is None or set(READING) & given.keys():
-        return with_indices(layout, _counted(layout, options, sources(layout, given)))
+        found = sources(layout, given)
+        counted = counter(layout) if options.rate or layout.rate_hz else None
+        if counted and 'time' not in found and 'time' not in given:
+            found['time'] = counted
+        return with_indices(layout, found)
     check_sensor(header[:MOST], layout.path)
     found = sources(layout, {**maker.present(header), **given})
     for ours, theirs in maker.divisors.items():
@@ -178,14 +181,6 @@ def chosen(layout: Layout, options: LogOptions) -> Chosen:
     if maker.instance:
         found['instance'] = column(layout, maker.instance)
     return with_indices(layout, found, maker)
-
-
-def _counted(layout: Layout, options: LogOptions, found: dict[str, Source]) -> dict[str, Source]:
-    """Return columns with the counter of the samples as time, if there is only their rate."""
-    if 'time' in found or 'time' in options.columns or not (options.rate or layout.rate_hz):
-        return found
-    source = counter(layout)
-    return found if source is None else {**found, 'time': source}
 
 
 def with_indices(layout: Layout, sources: Mapping[str, Source],
@@ -197,21 +192,17 @@ def with_indices(layout: Layout, sources: Mapping[str, Source],
         if cells and all(map(is_clock, cells)):
             text.append(sources['time'].index)
     used = {source.index for source in sources.values()}
-    quantities = {} if maker else _quantities(layout, used, sources)
+    quantities: dict[str, int] = {}  # the other columns of numbers that can be a cause
+    for k, name in enumerate(() if maker else layout.header[:MOST]):
+        free = k not in used and meaning(name).quantity in ('', *sources) and may_cause(name)
+        if free and quantity_key(name) and _are_numbers(_sample(layout, k)):
+            quantities.setdefault(quantity_key(name), k)
     numeric = (*sorted(used - set(text)), *quantities.values())
     return Chosen(layout, sources, maker, numeric, tuple(text), quantities)
 
 
-def _quantities(layout: Layout, used: Container[int], sources: Mapping[str, Source]
-                ) -> dict[str, int]:
-    """Return the indices of the other columns of numbers that can be a cause, by key."""
-    found: dict[str, int] = {}
-    for k, name in enumerate(layout.header[:MOST]):
-        free = k not in used and meaning(name).quantity in ('', *sources) and may_cause(name)
-        if free and quantity_key(name) and all(
-                is_number(row[k].replace(',', '.')) for row in layout.sample if k < len(row)):
-            found.setdefault(quantity_key(name), k)
-    return found
+def _are_numbers(cells: Sequence[str]) -> bool:
+    return all(is_number(cell.replace(',', '.')) for cell in cells)
 
 
 def _sample(layout: Layout, index: int) -> list[str]:
@@ -222,19 +213,16 @@ def sources(layout: Layout, given: Mapping[str, str]) -> dict[str, Source]:
     """Return columns under our names; `given` are those that the user or a maker names."""
     header = layout.header
     found = _given(layout, given)
-    if not header:
-        found = {**_by_order(layout, found), **found}
-    elif set(READING) <= set(header) and not set(READING) & set(found):
+    if set(READING) <= set(header) and not set(READING) & set(found):
         found = {**_own(layout), **found}
-    else:
-        found = {**_readings(layout, found), **found}
+    elif not set(READING) <= set(found):
+        found = {**(_readings(layout) if header else _by_order(layout)), **found}
     if header:
         found = {**_contexts(layout, found), **found}
     # What is not asked for, and holds other text than numbers, does not stand in the way.
     plain = {ours: source for ours, source in found.items()
              if ours not in CONTEXT or ours in given or source.name == ours
-             or all(is_number(cell.replace(',', '.'))
-                    for cell in _sample(layout, source.index)[:_FIRST_ROWS])}
+             or _are_numbers(_sample(layout, source.index)[:_FIRST_ROWS])}
     return {ours: source for ours, source in plain.items() if given.get(ours, ours)}
 
 
@@ -276,10 +264,8 @@ def _source(layout: Layout, index: int) -> Source:
     return Source(index, layout.name(index), unit)
 
 
-def _by_order(layout: Layout, found: Mapping[str, Source]) -> dict[str, Source]:
+def _by_order(layout: Layout) -> dict[str, Source]:
     """Return the columns of a table without header, by their order."""
-    if set(READING) <= set(found):
-        return {}
     orders = {3: READING, 4: ('time', *READING), 5: ('time', *READING, 'temperature'),
               7: ('time', *READING, *RATE), 8: ('time', *READING, *RATE, 'temperature')}
     if layout.width not in orders:
@@ -300,9 +286,7 @@ def _own(layout: Layout) -> dict[str, Source]:
             if not own.made and index.keys() >= set(own.names) for name in own.names}
 
 
-def _readings(layout: Layout, found: Mapping[str, Source]) -> dict[str, Source]:
-    if set(READING) <= set(found):
-        return {}
+def _readings(layout: Layout) -> dict[str, Source]:
     header = layout.header
     groups = list(_triples('reading', header).values())
     words = {triple[0]: set(meaning(header[triple[0]]).group) for triple in groups}
@@ -379,7 +363,10 @@ def _contexts(layout: Layout, found: Mapping[str, Source]) -> dict[str, Source]:
     if 'time' not in found:
         clocks = _clocks(layout, by_quantity.get('time', ()))
         if clocks:
-            best = max(clocks, key=lambda k: (clocks[k], _time_rank(header[k]), -k))
+            # The name that is most plainly that of the time of a sample.
+            best = max(clocks, key=lambda k: (
+                clocks[k], header[k].casefold() == 'time', {*WORDS['time']}.issuperset(
+                    meaning(header[k]).group), bool(meaning(header[k]).unit), -k))
             more |= {'time': _source(layout, best), **_fraction(layout, best)}
     if RATE[0] not in found:
         more |= {name: _source(layout, k) for name, k in zip(RATE, _rates(header, found))}
@@ -437,13 +424,6 @@ def rates_beside(layout: Layout, time: Source) -> list[float]:
             if step > 0.0:
                 rates.append(1.0 / (unit[1] * step))
     return rates
-
-
-def _time_rank(name: str) -> tuple[bool, bool, bool]:
-    """Return how plainly a name is that of the time of a sample."""
-    known = meaning(name)
-    words = [word for word in known.group if word not in WORDS['time']]
-    return name.casefold() == 'time', not words, bool(known.unit)
 
 
 def _fraction(layout: Layout, best: int) -> dict[str, Source]:

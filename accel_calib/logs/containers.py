@@ -6,8 +6,8 @@ Tables in files: text, packed or not, ZIP archives, sheets of Excel; standard in
 
 phyphox and Sensor Logger export a ZIP archive with one CSV file for each sensor, and phyphox an
 Excel file with one sheet for each. Each table is a `Member`: the bytes of a CSV file, piece by
-piece, so that it is read as any other text log is. `accel_calib.logs.arrays` and
-`accel_calib.logs.records` make members of other files.
+piece, so that it is read as any other text log is. `accel_calib.logs.records`
+makes members of other files.
 
 """
 
@@ -15,15 +15,17 @@ from __future__ import annotations
 
 import bz2
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import contextmanager, ExitStack, redirect_stderr, redirect_stdout
 import csv
 from dataclasses import dataclass
+import errno
 from functools import partial
 import gzip
 import io
 from itertools import chain, islice
 import json
 import lzma
+import os
 from pathlib import Path
 import re
 import sys
@@ -32,9 +34,9 @@ import zipfile
 
 import numpy as np
 
-from .damage import damage_refused
 from ..errors import InputError
 from ..table import ABOUT
+from ..text import reason
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -67,8 +69,66 @@ PACKED: Mapping[str, tuple[bytes, Callable[..., Any]]] = {
 AGAIN = 'copy it again, or export the log as CSV'
 UNPACK = 'unpack it, and use the log in it'
 
+_STANDARD_ERROR = 2
+
+_BY_VALUE = (None, errno.EINVAL, errno.EOVERFLOW, errno.EISDIR, errno.EFBIG, errno.ENAMETOOLONG,
+             errno.ENOTDIR)
+"""System errors that a damaged size or place in a file causes; others are not about its bytes."""
+
 Bytes = Generator[bytes, None, None]
 
+
+# ------------------------------------------------------------------------------ damage
+
+class DamagedLogError(InputError):
+    """A library cannot read a log."""
+
+
+@contextmanager
+def damage_refused(what: str, expected: str, advice: str) -> Iterator[None]:
+    """
+    Turn what a library raises for damaged bytes into a DamagedLogError.
+
+    Errors of the system, such as a missing file or permission, pass.
+
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as err:  # libraries of logs raise errors of any class
+        if isinstance(err, OSError) and err.errno not in _BY_VALUE:
+            raise
+        raise DamagedLogError(f'{what} ({reason(err)}), expected {expected}', advice) from err
+
+
+@contextmanager
+def sound_log(path: Path, expected: str, advice: str = 'copy it from the vehicle again'
+              ) -> Iterator[None]:
+    """Refuse damage as `damage_refused` does, and drop what a library prints."""
+    with damage_refused(f'{path} is damaged', expected, advice), redirect_stdout(
+            io.StringIO()), redirect_stderr(io.StringIO()), _silent_c():
+        yield
+
+
+@contextmanager
+def _silent_c() -> Iterator[None]:
+    """Drop what C code prints to standard error, which Python cannot redirect."""
+    try:
+        kept = os.dup(_STANDARD_ERROR)
+    except OSError:  # standard error is closed, so nothing is printed
+        yield
+        return
+    try:
+        with open(os.devnull, 'wb') as nowhere:
+            os.dup2(nowhere.fileno(), _STANDARD_ERROR)
+            yield
+    finally:
+        os.dup2(kept, _STANDARD_ERROR)
+        os.close(kept)
+
+
+# ------------------------------------------------------------------------------ tables
 
 @dataclass(frozen=True)
 class Member:

@@ -27,6 +27,7 @@ import re
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..table import ABOUT, Autopilot, Floats
@@ -151,18 +152,26 @@ class Layout:
     @property
     def words(self) -> list[str]:
         """Return what differs from a plain CSV table."""
-        words = (
-            (self.encoding not in ('utf-8', 'utf-8-sig'), self.encoding.upper()),
-            (self.dialect.delimiter != ',', _DELIMITER_WORDS.get(self.dialect.delimiter, '')),
-            (self.decimal == ',', 'decimal comma'),
-            (self.dialect.labelled, 'names before the numbers'),
-            (not self.header, 'no header'))
-        return [word for differs, word in words if differs]
+        words = ('' if self.encoding in ('utf-8', 'utf-8-sig') else self.encoding.upper(),
+                 _DELIMITER_WORDS.get(self.dialect.delimiter, ''),
+                 'decimal comma' if self.decimal == ',' else '',
+                 'names before the numbers' if self.dialect.labelled else '',
+                 '' if self.header else 'no header')
+        return list(filter(None, words))
 
     def name(self, column: int) -> str:
         """Return the name of a column, or its number from 1."""
         has_name = column < len(self.header) and self.header[column]
         return short(self.header[column]) if has_name else str(column + 1)
+
+
+@dataclass(frozen=True)
+class Cells:
+    """A block of rows: (n, k) numbers, k texts of n cells, and n row numbers from 1."""
+
+    numbers: Floats
+    texts: list[list[str]]
+    row: NDArray[np.int64]
 
 
 def split(line: str, delimiter: str) -> list[str]:
@@ -212,9 +221,12 @@ def _seconds(text: str) -> float | None:
         hour = hour % 12 + 12 * (half[0] in 'Pp')
     if day is None or not (hour < 24 and int(minute) < 60 and int(second or 0) <= 60):
         return None
-    fraction = float(f'0.{digits}') if digits else 0.0
+    fraction, offset = float(f'0.{digits or 0}'), 0.0
+    if zone not in (None, 'Z', 'UTC'):
+        size = int(zone[1:3]) * 3600.0 + int(zone[3:].lstrip(':') or 0) * 60.0
+        offset = -size if zone[0] == '-' else size
     whole = day + hour * 3600.0 + int(minute) * 60.0 + int(second or 0)
-    return whole - _offset(zone) + fraction  # all in s
+    return whole - offset + fraction  # all in s
 
 
 @lru_cache(maxsize=64)
@@ -227,14 +239,6 @@ def _day(date: str) -> float | None:
             continue
         return day.replace(tzinfo=timezone.utc).timestamp()
     return None
-
-
-@lru_cache(maxsize=64)
-def _offset(zone: str | None) -> float:
-    if zone in (None, 'Z', 'UTC'):
-        return 0.0
-    size = int(zone[1:3]) * 3600.0 + int(zone[3:].lstrip(':') or 0) * 60.0
-    return -size if zone[0] == '-' else size
 
 
 def first_label(head: Sequence[str]) -> str:
@@ -282,13 +286,17 @@ def layout_of(path: Path, head: Sequence[str], is_header: IsHeader, encoding: st
         [found.dialect.cells(head[k]) for k in numbers[:2]])
     if rate_hz is not None and len(numbers) > 2:
         start = numbers[2]
-    passed = [k for k in finder.plain if k < start and k != found.at]
+    passed = [short(head[k]) for k in finder.plain if k < start and k != found.at]
+    skipped = f'skipped {counted(len(passed), "line")} before the table'
+    notes = [f'{skipped}{":" if len(passed) == 1 else ", the first is"} {each!r}'
+             for each in passed[:1]]
     rows = [found.dialect.cells(head[k]) for k in finder.plain if k >= start]
-    return Layout(path, found.dialect, _decimal(rows[:_TRIED_LINES]), found.header,
+    decimal = {match[1] for row in rows[:_TRIED_LINES] for match in map(_DECIMAL.fullmatch, row)
+               if match}
+    return Layout(path, found.dialect, min(decimal, default=''), found.header,
                   finder.units_row(found, start), _width(found.header, rows), start, encoding,
-                  _about(path, [line for line in head if line[0] == '#']),
-                  _passed_over([head[k] for k in passed]), tuple(map(tuple, rows[:_SAMPLE_ROWS])),
-                  rate_hz or _stated_rate(head[:start]))
+                  _about(path, [line for line in head if line[0] == '#']), tuple(notes),
+                  tuple(map(tuple, rows[:_SAMPLE_ROWS])), rate_hz or _stated_rate(head[:start]))
 
 
 def _rate_below_start(rows: Sequence[Sequence[str]]) -> float | None:
@@ -342,10 +350,11 @@ class _Finder:
             for delimiter in DELIMITERS:
                 dialect = replace(self.dialect, delimiter=delimiter)
                 cells = self._names(k, dialect)
-                if (_are_names(cells) and self.is_header(cells)
-                        and (self._fits(k + 1, dialect, cells)
-                             or (delimiter and not is_comment(self.head[k])))):
-                    return _Found(dialect, tuple(cells), k + 1, k)
+                if _are_names(cells) and self.is_header(cells):
+                    following = [dialect.cells(self.head[j]) for j in self.plain if j > k][:1]
+                    fits = any(len(row) == len(cells) for row in following)
+                    if fits or (delimiter and not is_comment(self.head[k])):
+                        return _Found(dialect, tuple(cells), k + 1, k)
         return None
 
     def _names(self, k: int, dialect: Dialect) -> list[str]:
@@ -353,11 +362,6 @@ class _Finder:
         line = self.head[k].removeprefix(';Headers,')
         cells = dialect.cells(line.lstrip('#/% ') if is_comment(line) else line)
         return ['time', *cells[1:]] if dialect.monitor and is_clock(cells[0]) else cells
-
-    def _fits(self, start: int, dialect: Dialect, cells: Sequence[str]) -> bool:
-        """Return whether the next row has as many cells as a header."""
-        following = next((k for k in self.plain if k >= start), None)
-        return following is not None and len(cells) == len(dialect.cells(self.head[following]))
 
     def unnamed(self) -> _Found | None:
         """Return the dialect in which most lines are rows of numbers, and their names, if any."""
@@ -400,9 +404,8 @@ class _Finder:
         if not numbers:
             return None
         first = self.plain[0]
-        if numbers[0] == first:
-            return _Found(Dialect(','), (), first)
-        return _Found(Dialect(','), tuple(split(self.head[first], ',')), first + 1, first)
+        names = () if numbers[0] == first else tuple(split(self.head[first], ','))
+        return _Found(Dialect(','), names, first + bool(names), first if names else -1)
 
     def data_from(self, found: _Found) -> int:
         """Return the index of the first row; a line without numbers is none."""
@@ -413,9 +416,8 @@ class _Finder:
 
     def units_row(self, found: _Found, start: int) -> tuple[str, ...]:
         """Return the cells of a line between header and rows that can hold units."""
-        if found.at < 0:
-            return ()
-        between = (found.dialect.cells(self.head[k]) for k in self.plain if found.at < k < start)
+        between = (found.dialect.cells(self.head[k]) for k in self.plain
+                   if -1 < found.at < k < start)
         return next((tuple(cells) for cells in between if len(cells) == len(found.header)), ())
 
 
@@ -439,19 +441,6 @@ def _width(header: Sequence[str], rows: Sequence[Sequence[str]]) -> int:
     if rows and not header[-1] and all(len(row) == len(header) - 1 for row in rows):
         return len(header) - 1
     return len(header)
-
-
-def _decimal(rows: Sequence[Sequence[str]]) -> str:
-    found = (_DECIMAL.fullmatch(cell) for row in rows for cell in row)
-    marks = {match[1] for match in found if match}
-    return ',' if ',' in marks else '.' if marks else ''
-
-
-def _passed_over(lines: Sequence[str]) -> tuple[str, ...]:
-    if not lines:
-        return ()
-    mark = ':' if len(lines) == 1 else ', the first is'
-    return (f'skipped {counted(len(lines), "line")} before the table{mark} {short(lines[0])!r}',)
 
 
 def _stated_rate(lines: Sequence[str]) -> float | None:

@@ -37,7 +37,6 @@ text form (``.log``) has the same messages, one per line.
 from collections.abc import Mapping, Sequence
 import io
 from itertools import chain
-import math
 from pathlib import Path
 import re
 from typing import Any
@@ -46,9 +45,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .autopilot import (
-    ardupilot_correction, as_sensed, AsSensed, at, choose, Correction, finite, FlightLog, Message,
-    Parameters, px4_correction, px4_slot, sound, Stated, vectors)
-from .damage import sound_log
+    ardupilot_correction, as_sensed, AsSensed, at, choose, Correction, FlightLog, Message,
+    Parameters, px4_correction, px4_slot, sound, UnknownCorrectionError, vectors)
+from .containers import sound_log
 from .names import MICRO, PX4_FIELDS, PX4_SPANS
 from ..errors import InputError
 from ..table import Autopilot, Floats
@@ -117,21 +116,15 @@ def read_ulg(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
     device = _device(chosen, found)
     autopilot = Autopilot('px4', px4_slot(parameters, device), device or None,
                           px4_slot(parameters, device, 'TC_A'))
-    if chosen.name == _RAW:
-        sensed = AsSensed(columns, autopilot)
-    else:
-        sensed = as_sensed(columns, parameters, autopilot, lambda: _correction(
-            chosen, parameters, device, release), _PX4_ADVICE)
+
+    def correction() -> Correction:
+        if chosen.name == _FILTERED:
+            raise UnknownCorrectionError(f'{chosen.name} lacks the bias that PX4 estimates')
+        return px4_correction(parameters, device, release)
+
+    sensed = (AsSensed(columns, autopilot) if chosen.name == _RAW else
+              as_sensed(columns, parameters, autopilot, correction, _PX4_ADVICE))
     return choice.log('PX4 log', sensed, 'temperature of the sensor', (*notes, *invalid))
-
-
-def _correction(chosen: Message, parameters: Parameters, device: int,
-                release: tuple[int, int] | None) -> Correction:
-    """Return the correction of a message; raise InputError if it is not known."""
-    if chosen.name == _FILTERED:
-        raise InputError(f'{chosen.name} lacks the bias that PX4 estimates',
-                         'name another message with --topic')
-    return px4_correction(parameters, device, release)
 
 
 def _px4_messages(path: Path
@@ -150,10 +143,8 @@ def _px4_messages(path: Path
         lost = sum(dropout.duration for dropout in log.dropouts)
         notes.append(f'PX4 reports {counted(len(log.dropouts), "dropout")} of the log, {lost} ms')
     release = log.msg_info_dict.get('ver_sw_release')
-    stated = [*((-np.inf, *each) for each in log.initial_parameters.items()),
-              *((stamp * MICRO, *each) for stamp, *each in log.changed_parameters)]
-    return found, Parameters([
-        Stated(time, name, float(value)) for time, name, value in stated if _is_number(value)]), (
+    stated = chain(((0, *each) for each in log.initial_parameters.items()), log.changed_parameters)
+    return found, Parameters(stated, MICRO), (
         (release >> 24, release >> 16 & 0xff) if isinstance(release, int) else None), notes
 
 
@@ -200,9 +191,8 @@ def _px4_temperature(chosen: Message, time: Floats, found: Sequence[Message]) ->
         same = [message for message in sources if message.instance == chosen.instance]
     elif not same and len(sources) == 1:
         same = sources
-    if not same or not finite(same[0].fields['temperature']):
-        return {}
-    return {'temperature': at(time, same[0], same[0].fields['temperature'])}
+    return at(time, 'temperature', ((message, message.fields['temperature'])
+                                    for message in same[:1]))
 
 
 # --------------------------------------------------------------------------------- ArduPilot
@@ -210,7 +200,7 @@ def _px4_temperature(chosen: Message, time: Floats, found: Sequence[Message]) ->
 _READING, _RATES = ('AccX', 'AccY', 'AccZ'), ('GyrX', 'GyrY', 'GyrZ')
 _ARDUPILOT_ADVICE = 'take the log from the vehicle whole: it begins with all parameters'
 _MOST_SENSORS = 255
-_NAME = re.compile(r'(IMU|ACC|GYR)([1-9]?)')
+_NAME = re.compile(r'PARM|(IMU|ACC|GYR)([1-9]?)')
 DATAFLASH = b'\xa3\x95\x80'
 """First bytes of a binary log: the head of a message FMT."""
 
@@ -247,11 +237,17 @@ def read_dataflash(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
         'the reading is not a number')
     sources = (message for message in (chosen, *found) if message.instance == chosen.instance)
     columns |= choice.rates(columns['time'], sources, _RATES)
-    columns |= _ardupilot_temperature(chosen, columns['time'], found)
-    parameters = _parameters(tables.get('PARM', {}))
-    sensed = as_sensed(columns, parameters, _autopilot(parameters, chosen.instance + 1),
-                       lambda: ardupilot_correction(parameters, chosen.instance + 1),
-                       _ARDUPILOT_ADVICE)
+    columns |= at(columns['time'], 'temperature', (
+        (message, message.fields[name]) for message in found for name in ('T', 'Temp')
+        if (message.name, message.instance) == ('IMU', chosen.instance)
+        and np.any(message.fields.get(name, 0.0))))
+    parameters, number = _parameters(tables.get('PARM', {})), chosen.instance + 1
+    *_, (_, values) = parameters.spans()
+    device = values.get(f'INS_ACC{"" if number == 1 else number}_ID', 0.0)
+    warm = values.get(f'INS_TCAL{number}_ENABLE', 0.0) != 0.0
+    autopilot = Autopilot('ardupilot', number, int(device) or None, number if warm else None)
+    sensed = as_sensed(columns, parameters, autopilot,
+                       lambda: ardupilot_correction(parameters, number), _ARDUPILOT_ADVICE)
     return choice.log('ArduPilot log', sensed, 'temperature T', (*notes, *dropped))
 
 
@@ -263,67 +259,30 @@ def _ardupilot_messages(tables: Mapping[str, _Table]) -> list[Message]:
         match = _NAME.fullmatch(name)
         stamp = next((key for key in _STAMPS if key in table), '')
         needed = _RATES if name.startswith('GYR') else _READING
-        if not match or not stamp or not set(needed) <= set(table):
+        if not match or not match[1] or not stamp or not set(needed) <= set(table):
             continue
-        instances = _instances(table, len(table[stamp]), max(int(match[2] or 1) - 1, 0))
-        for instance in np.unique(instances).tolist():
-            of = instances == instance
+        numbers = table.get('I', np.full(len(table[stamp]), int(match[2] or 1) - 1))
+        instances = np.clip(np.nan_to_num(numbers.astype(float)), 0.0, _MOST_SENSORS)
+        for instance in np.unique(instances.astype(int)).tolist():
+            of = instances.astype(int) == instance
             fields = {key: values[of] for key, values in table.items()}
             found.append(Message(match[1], instance, fields,
                                  fields[stamp].astype(float) * _STAMPS[stamp]))
     return found
 
 
-def _instances(table: _Table, count: int, number: int) -> NDArray[np.int64]:
-    """Return the number of the sensor of each message; damaged numbers are 0."""
-    stated = table.get('I', np.full(count, number))
-    return np.clip(np.nan_to_num(stated.astype(float)), 0.0, _MOST_SENSORS).astype(np.int64)
-
-
-def _ardupilot_temperature(chosen: Message, time: Floats, found: Sequence[Message]
-                           ) -> dict[str, Floats]:
-    """Return the temperature that IMU of the same sensor reports."""
-    for message in found:
-        name = next((key for key in ('T', 'Temp') if key in message.fields), '')
-        if (message.name, message.instance) == ('IMU', chosen.instance) and name:
-            values = message.fields[name]
-            if finite(values) and np.any(values):
-                return {'temperature': at(time, message, values)}
-    return {}
-
-
-def _autopilot(parameters: Parameters, instance: int) -> Autopilot:
-    *_, (_, values) = parameters.spans()
-    device = values.get(f'INS_ACC{"" if instance == 1 else instance}_ID', 0.0)
-    warm = values.get(f'INS_TCAL{instance}_ENABLE', 0.0) != 0.0
-    return Autopilot('ardupilot', instance, int(device) or None, instance if warm else None)
-
-
 def _parameters(table: _Table) -> Parameters:
     """Return the messages PARM, in order; damaged ones are left out."""
     stamp = next((key for key in _STAMPS if key in table), '')
     if not stamp or not {'Name', 'Value'} <= set(table):
-        return Parameters([])
+        return Parameters((), 1.0)
     rows = zip(*(table[key].tolist() for key in (stamp, 'Name', 'Value')))
-    return Parameters([
-        Stated(float(time) * _STAMPS[stamp],
-               name.decode('latin-1') if isinstance(name, bytes) else str(name), float(value))
-        for time, name, value in rows if _is_number(time) and _is_number(value)])
+    return Parameters((
+        (time, name.decode('latin-1') if isinstance(name, bytes) else str(name), value)
+        for time, name, value in rows), _STAMPS[stamp])
 
 
-def _is_number(value: float | str | bytes) -> bool:
-    try:
-        return math.isfinite(float(value))
-    except ValueError:  # a damaged line of text, or a damaged parameter
-        return False
-
-
-def _wanted(name: str) -> bool:
-    return name == 'PARM' or bool(_NAME.fullmatch(name))
-
-
-def _indexed(path: Path) -> Any:
-    """Return the log of pymavlink, which knows where each message begins."""
+def _binary(path: Path) -> tuple[dict[str, _Table], list[str]]:
     from pymavlink.DFReader import DFReader_binary
 
     class Index(DFReader_binary):  # type: ignore[misc]
@@ -331,18 +290,15 @@ def _indexed(path: Path) -> Any:
             """Skip the search for a GPS time, which parses a whole log that has none."""
 
     with sound_log(path, 'an ArduPilot log (.bin)'):
-        log = Index(str(path))
+        log = Index(str(path))  # it knows where each message begins
         log.close()
-    return log
-
-
-def _binary(path: Path) -> tuple[dict[str, _Table], list[str]]:
-    log = _indexed(path)
     data = np.frombuffer(path.read_bytes(), np.uint8)
     tables, cut = {}, 0
     for number, form in log.formats.items():
         starts = np.array(log.offsets[number], dtype=np.int64) + 3
-        if not _wanted(form.name) or not len(starts) or not _is_sound(form):
+        is_sound = all(form.columns) and len(form.format) == len(form.columns) == len(
+            set(form.columns))  # one letter for each field, and a name of its own for each
+        if not _NAME.fullmatch(form.name) or not len(starts) or not is_sound:
             continue
         layout = np.dtype([(name, _TYPES[letter])
                            for name, letter in zip(form.columns, form.format)])
@@ -359,11 +315,6 @@ def _binary(path: Path) -> tuple[dict[str, _Table], list[str]]:
     return tables, notes
 
 
-def _is_sound(form: Any) -> bool:
-    """Return whether a message has one letter for each field, and a name of its own for each."""
-    return all(form.columns) and len(form.format) == len(form.columns) == len(set(form.columns))
-
-
 def _text(path: Path) -> tuple[dict[str, _Table], list[str]]:
     names: dict[str, list[str]] = {}
     lines: dict[str, list[str]] = {}
@@ -376,7 +327,7 @@ def _text(path: Path) -> tuple[dict[str, _Table], list[str]]:
             kind, _, rest = line.partition(',')
             if kind == 'FMT':
                 cells = [cell.strip() for cell in rest.split(',')]
-                if len(cells) > 4 and _wanted(cells[2]):
+                if len(cells) > 4 and _NAME.fullmatch(cells[2]):
                     names[cells[2]] = cells[4:]
             elif kind in names:
                 lines.setdefault(kind, []).append(rest)

@@ -12,7 +12,7 @@ name the program that converts it.
 
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager, ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
@@ -25,19 +25,18 @@ from typing import Any
 
 import numpy as np
 
-from . import arrays, containers, records
+from . import containers, records
 from .autopilot import FlightLog
 from .bag import open_bag
 from .bag_samples import context_of, imu_samples, rate_words
 from .columns import Chosen, chosen, is_log_header, LogOptions
-from .containers import Member, Stream
-from .damage import DamagedLogError, sound_log
-from .dialect import shown
+from .containers import DamagedLogError, Frame, Member, Piped, sound_log, Stream
+from .dialect import Cells, shown
 from .flight import DATAFLASH, read_dataflash, read_ulg
 from .names import meaning, READING, record_instead
-from .quantities import are_samples, are_untimed_samples, decided, Quantities
-from .text import Cells, open_text, PEEKED, TextTable
-from ..disk import FIRST_LINE
+from .quantities import are_samples, are_untimed_samples, decided
+from .text import open_text, PEEKED, TextTable
+from ..disk import check_regular, FIRST_LINE
 from ..errors import InputError, needing, saying
 from ..finding import Finding
 from ..table import check_units, check_values, concatenated, Poses, Recording
@@ -225,19 +224,28 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
         first, *rest = (Cells(each.numbers[::-1], [part[::-1] for part in each.texts],
                               each.row[::-1]) for each in [first, *cells][::-1])
         cells = iter(rest)
-    blocks = _converted(path, text.layout.about, chain((first,), cells), quantities)
-    poses = None
+
+    def converted() -> Iterator[Poses]:
+        for block in chain((first,), cells):
+            columns, row = quantities.columns(block)
+            check_values(columns, str(path))
+            yield Poses(columns, row, **{**text.layout.about, 'units': quantities.units.name})
+
+    blocks, poses = converted(), None
     samples: Iterator[Recording]
     with saying(quantities.read_as):
         head = next(blocks)
         check_units(head, quantities.units, str(path))
         if are_samples(head.columns):
             samples = (block.as_recording() for block in chain((head,), blocks))
-            count = _estimated(text, len(head))
+            count = len(head)
+            if text.more:  # the size of the file, and the rows of this block, tell about how many
+                width = 2 if text.layout.encoding.startswith('utf-16') else 1
+                count = max(count, int(text.size / width / max(text.characters, 1) * count))
         else:
             poses = concatenated([head, *blocks])
             lacking = [key for key in poses.quantities if not np.isfinite(poses[key]).all()]
-            poses = replace(poses.without_columns(*lacking), findings=quantities.all_findings)
+            poses = replace(poses.without_columns(*lacking), findings=tuple(quantities.findings))
             if lacking:
                 quantities.notes.append(
                     f'not used, because cells are not numbers: {some(lacking)}')
@@ -252,23 +260,7 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
     return OpenLog(samples, count, quantities.units, head.sensor,
                    ', '.join(filter(None, (quantities.read_as, rate))), poses,
                    noted=lambda: (*text.notes, *quantities.all_notes),
-                   findings=quantities.all_findings)
-
-
-def _converted(path: Path, about: Mapping[str, Any], cells: Iterator[Cells],
-               quantities: Quantities) -> Iterator[Poses]:
-    for block in cells:
-        columns, row = quantities.columns(block)
-        check_values(columns, str(path))
-        yield Poses(columns, row, **{**about, 'units': quantities.units.name})
-
-
-def _estimated(text: TextTable, count: int) -> int:
-    """Return the number of rows, from the size of the file and of the `count` of a block."""
-    if not text.more:
-        return count
-    width = 2 if text.layout.encoding.startswith('utf-16') else 1
-    return max(count, int(text.size / width / max(text.characters, 1) * count))
+                   findings=tuple(quantities.findings))
 
 
 def _as_samples(path: Path, poses: Poses) -> Iterator[Recording]:
@@ -325,7 +317,7 @@ FORMATS = (
     Format('an ArduPilot log as text', ('.log',), rb'(?:.*\n)?FMT, *\d+, *\d+, *\w+, *\w+',
            read_dataflash, opened=_flight),
     Format('a NumPy file', ('.npy', '.npz'), rb'\x93NUMPY|' + _ZIP + rb'.*\.npyPK',
-           arrays.of_numpy),
+           records.of_numpy),
     Format('an Excel file (.xlsx)', ('.xlsx', '.xlsm'), _ZIP + rb'.*xl/workbook\.xml',
            containers.sheets, 'openpyxl'),
     Format('an Excel file (.xls)', ('.xls',), rb'\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1',
@@ -333,8 +325,8 @@ FORMATS = (
     Format('an ActiGraph log', ('.gt3x',), _ZIP + rb'.*log\.bin',
            advice=f'{_EXPORT}ActiLife, or with pygt3x'),
     Format('a ZIP archive', ('.zip',), _ZIP, containers.archived),
-    Format('a MATLAB file', ('.mat',), rb'MATLAB 5\.0 MAT-file', arrays.matlab),
-    Format('an HDF5 file', ('.h5', '.hdf5'), rb'\x89HDF\r\n|MATLAB 7\.3 MAT-file', arrays.hdf5,
+    Format('a MATLAB file', ('.mat',), rb'MATLAB 5\.0 MAT-file', records.matlab),
+    Format('an HDF5 file', ('.h5', '.hdf5'), rb'\x89HDF\r\n|MATLAB 7\.3 MAT-file', records.hdf5,
            'h5py'),
     Format('a Parquet file', ('.parquet',), b'PAR1', partial(records.columnar, 'parquet'),
            'pyarrow'),
@@ -395,20 +387,50 @@ def is_bag(path: Path) -> bool:
     return path.is_dir() or path.suffix.lower() in BAG.suffixes
 
 
-@contextmanager
-def open_file(path: Path, options: LogOptions) -> Iterator[OpenLog]:
-    """Open a file in its format; errors as in `open_log`."""
-    known = BAG
-    if not is_bag(path):
-        with path.open('rb') as file:
-            head = file.read(_HEAD)
-            file.seek(max(file.tell(), path.stat().st_size - _TAIL))
-            known = recognised(path, head + file.read())
+def _format_of(path: Path) -> Format:
+    """Return the format of a file; InputError if it is none that is read."""
+    if is_bag(path):
+        return BAG
+    with path.open('rb') as file:
+        head = file.read(_HEAD)
+        file.seek(max(file.tell(), path.stat().st_size - _TAIL))
+        known = recognised(path, head + file.read())
     if known.advice:
         raise InputError(f'{path} is {known.name}, expected a log or a table that is read',
                          known.advice.format(path.name))
     if known.needs:
         with needing(known.needs, known.name):
             import_module(known.needs)
-    with known.opened(known, path, options) as log:
+    return known
+
+
+@contextmanager
+def open_log(path: Path | Piped | Frame, options: LogOptions = LogOptions()) -> Iterator[OpenLog]:
+    """
+    Open a log of any kind: text, a bag, a flight log of PX4 or ArduPilot, or a DataFrame.
+
+    Parameters
+    ----------
+    path : Path, Piped or Frame
+        The file, the folder of a rosbag2, standard input, or the DataFrame.
+    options : LogOptions
+        How to read it; by default it is recognised.
+
+    Raises
+    ------
+    InputError
+        If the log cannot be read, has no accelerometer or several, contradicts the options, or
+        holds no gravity; also while it is read.
+    OSError
+        If the file cannot be read.
+
+    """
+    if isinstance(path, Path):
+        if not path.is_dir():
+            check_regular(path)
+        known = _format_of(path)
+        opened = known.opened(known, path, options)
+    else:
+        opened = open_members(Path(str(path)), [path.table], options)
+    with opened as log, saying(log.read_as):
         yield log

@@ -41,18 +41,16 @@ RATE = COLUMNS['rate'].names
 OURS = tuple(name for column in COLUMNS.values() if not column.made for name in column.names)
 """Names that a user can give to a column."""
 
-WORDS: Mapping[str, tuple[str, ...]] = {
-    'reading': ('a', 'ac', 'acc', 'acce', 'accel', 'accl', 'acceleration', 'accelerations',
-                'accelerometer', 'accelero', 'accsmooth', 'accadc', 'xl', 'gforce', 'gf',
-                'beschleunigung', 'aceleracion', 'accelerazione', 'aceleracao'),
-    'rate': ('g', 'gy', 'gyr', 'gyro', 'gyroscope', 'gyroadc', 'omega', 'w', 'angvel',
-             'angularvelocity', 'angularrate', 'rotationrate', 'rotrate'),
-    'time': ('time', 'timestamp', 'timestamps', 't', 'ts', 'stamp', 'clock', 'date', 'datetime',
-             'epoch', 'gpst', 'elapsed', 'millis', 'micros', 'uptime', 'zeit', 'temps', 'tiempo',
-             'tempo'),
-    'temperature': ('temperature', 'temp', 'tmp', 'temperatur', 'temperatura'),
-    'supply_voltage': ('vdd', 'vcc', 'supply'),
-}
+_WORDS = {
+    'reading': 'a ac acc acce accel accl acceleration accelerations accelerometer accelero '
+               'accsmooth accadc xl gforce gf beschleunigung aceleracion accelerazione aceleracao',
+    'rate': 'g gy gyr gyro gyroscope gyroadc omega w angvel angularvelocity angularrate '
+            'rotationrate rotrate',
+    'time': 'time timestamp timestamps t ts stamp clock date datetime epoch gpst elapsed millis '
+            'micros uptime zeit temps tiempo tempo',
+    'temperature': 'temperature temp tmp temperatur temperatura',
+    'supply_voltage': 'vdd vcc supply'}
+WORDS: Mapping[str, tuple[str, ...]] = {key: tuple(text.split()) for key, text in _WORDS.items()}
 """Words that name a quantity, in lower case without accents."""
 
 PAIRS = {('angular', 'velocity'): 'angularvelocity', ('angular', 'rate'): 'angularrate',
@@ -91,40 +89,35 @@ TICKS = {'sampletimefine': {'ticks of 100 µs': 1e-4, 'µs': 1e-6}}
 """Units of clocks with a name of their own: of Xsens, by the model."""
 
 MICRO, MILLI, DEGREE = 1e-6, 1e-3, math.pi / 180.0
-UNITS: Mapping[str, Mapping[str, tuple[str, float]]] = {
+_UNITS = {
     'reading': {
-        **dict.fromkeys(('ms2', 'm/s2', 'm/s/s', 'ms-2', 'mps2', 'mss', 'mpss', 'mpsps', 'm/sec2',
-                         'm/ss', 'meter/s2', 'meters/s2'), ('m/s2', 1.0)),
-        **dict.fromkeys(('g', 'gee', 'gs', 'gn'), ('g', 1.0)),
-        **dict.fromkeys(('mg', 'millig'), ('g', 1e-3)),
-        **dict.fromkeys(('ug', 'microg'), ('g', 1e-6)),
-        **dict.fromkeys(('cm/s2', 'cms2', 'gal'), ('m/s2', 1e-2)),
-        **dict.fromkeys(('mm/s2', 'mms2'), ('m/s2', 1e-3)),
-        **dict.fromkeys(('ft/s2', 'fts2'), ('m/s2', 0.3048)),
-        **dict.fromkeys(('lsb', 'lsbs', 'count', 'counts', 'digit', 'digits', 'v', 'volt', 'volts',
-                         'mv'), ('native', 1.0))},
+        ('m/s2', 1.0): 'ms2 m/s2 m/s/s ms-2 mps2 mss mpss mpsps m/sec2 m/ss meter/s2 meters/s2',
+        ('g', 1.0): 'g gee gs gn',
+        ('g', 1e-3): 'mg millig',
+        ('g', 1e-6): 'ug microg',
+        ('m/s2', 1e-2): 'cm/s2 cms2 gal',
+        ('m/s2', 1e-3): 'mm/s2 mms2',
+        ('m/s2', 0.3048): 'ft/s2 fts2',
+        ('native', 1.0): 'lsb lsbs count counts digit digits v volt volts mv'},
     'rate': {
-        **dict.fromkeys(('rad/s', 'rads', 'radps', 'rad/sec', 'rads-1', 'rad', 'radsec',
-                         'radians/s'), ('rad/s', 1.0)),
-        **dict.fromkeys(('deg/s', 'degs', 'dps', 'degps', 'deg/sec', 'degs-1', 'deg', 'degrees/s',
-                         'degree/s', 'degsec', 'degrees/sec'), ('°/s', DEGREE)),
-        **dict.fromkeys(('mdps', 'mdeg/s'), ('m°/s', 1e-3 * DEGREE)),
-        'rpm': ('rpm', math.pi / 30.0)},
+        ('rad/s', 1.0): 'rad/s rads radps rad/sec rads-1 rad radsec radians/s',
+        ('°/s', DEGREE): 'deg/s degs dps degps deg/sec degs-1 deg degrees/s degree/s degsec '
+                         'degrees/sec',
+        ('m°/s', 1e-3 * DEGREE): 'mdps mdeg/s',
+        ('rpm', math.pi / 30.0): 'rpm'},
     'time': {
-        **dict.fromkeys(('s', 'sec', 'secs', 'second', 'seconds'), ('s', 1.0)),
-        **dict.fromkeys(('ms', 'msec', 'msecs', 'millis', 'milli', 'millisecond', 'milliseconds',
-                         'unixms'), ('ms', 1e-3)),
-        **dict.fromkeys(('us', 'usec', 'usecs', 'micros', 'micro', 'microsecond', 'microseconds'),
-                        ('µs', 1e-6)),
-        **dict.fromkeys(('ns', 'nsec', 'nsecs', 'nanos', 'nano', 'nanosec', 'nanosecs',
-                         'nanosecond', 'nanoseconds'), ('ns', 1e-9))},
+        ('s', 1.0): 's sec secs second seconds',
+        ('ms', 1e-3): 'ms msec msecs millis milli millisecond milliseconds unixms',
+        ('µs', 1e-6): 'us usec usecs micros micro microsecond microseconds',
+        ('ns', 1e-9): 'ns nsec nsecs nanos nano nanosec nanosecs nanosecond nanoseconds'},
     'temperature': {
-        **dict.fromkeys(('c', 'degc', 'celsius'), ('°C', 1.0)),
-        **dict.fromkeys(('f', 'degf', 'fahrenheit'), ('°F', 5.0 / 9.0)),
-        **dict.fromkeys(('k', 'kelvin'), ('K', 1.0))},
-    'supply_voltage': {'v': ('V', 1.0), 'mv': ('mV', 1e-3), 'volt': ('V', 1.0),
-                       'volts': ('V', 1.0)},
-}
+        ('°C', 1.0): 'c degc celsius',
+        ('°F', 5.0 / 9.0): 'f degf fahrenheit',
+        ('K', 1.0): 'k kelvin'},
+    'supply_voltage': {('V', 1.0): 'v volt volts', ('mV', 1e-3): 'mv'}}
+UNITS: Mapping[str, Mapping[str, tuple[str, float]]] = {
+    quantity: {text: unit for unit, texts in units.items() for text in texts.split()}
+    for quantity, units in _UNITS.items()}
 """Units in names: the unit in words, or of `UnitName`, and the factor to it."""
 
 ZEROS = {'°F': -160.0 / 9.0, 'K': -273.15}
@@ -262,10 +255,8 @@ def _quantity(words: Sequence[str], unit: str) -> str:
     found = found or ['time'] * (words[-1] == 't')  # inside a group: imu/t
     if 'time' in found and unit_of('temperature', unit):
         return 'temperature'
-    for first in ('time', 'temperature'):
-        if first in found:
-            return first
-    return found[0] if len(found) == 1 else ''
+    first = next((key for key in ('time', 'temperature') if key in found), '')
+    return first or (found[0] if len(found) == 1 else '')
 
 
 def _unit_in(quantity: str, words: list[str]) -> tuple[str, list[str]]:
@@ -464,15 +455,11 @@ _BLACKBOX_RATES = {' (deg/s)': DEGREE, ' (rad/s)': 1.0, '': 0.0}
 def _betaflight(time: str, unit: str, rate: str) -> LogFormat:
     """Return the layout with these units in the names of its columns."""
     columns = {'time': time, **_axes('accSmooth[{}]' + unit, names=_BY_NUMBER)}
-    scales = {'time': _BLACKBOX_TIMES[time]}
-    marks: tuple[str, ...] = ('loopIteration',)
-    if rate:
-        turns = _axes('gyroADC[{}]' + rate, RATE, _BY_NUMBER)
-        columns |= turns
-        scales |= dict.fromkeys(RATE, _BLACKBOX_RATES[rate])
-        marks = tuple(turns.values())
+    turns = _axes('gyroADC[{}]' + rate, RATE, _BY_NUMBER) if rate else {}
+    scales = {'time': _BLACKBOX_TIMES[time], **dict.fromkeys(turns, _BLACKBOX_RATES[rate])}
     note = '' if unit else 'Readings are counts, acc_1G of the header of the log to the g.'
-    return LogFormat('betaflight', columns, scales, _BLACKBOX_UNITS[unit], marks, note=note)
+    return LogFormat('betaflight', columns | turns, scales, _BLACKBOX_UNITS[unit],
+                     tuple(turns.values()) or ('loopIteration',), note=note)
 
 
 _BETAFLIGHT_FORMATS = tuple(_betaflight(time, unit, rate) for time in _BLACKBOX_TIMES
@@ -541,10 +528,9 @@ def record_instead(header: Sequence[str], path: Path) -> str:
     """
     given = {folded(name) for name in header}
     for layout in FORMATS:
-        marks = [folded(name) for name in layout.without_gravity if not name.endswith('.csv')]
-        if marks and given.issuperset(marks):
-            return layout.record
-        if layout.plain and layout.fits(header) and _is_named(path, layout.without_gravity):
+        marks = {folded(name) for name in layout.without_gravity if not name.endswith('.csv')}
+        if (marks and marks <= given) or (layout.plain and layout.fits(header)
+                                          and _is_named(path, layout.without_gravity)):
             return layout.record
     return ''
 

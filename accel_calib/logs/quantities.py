@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .columns import Chosen, LogOptions, unused
+from .dialect import Cells
 from .names import DEGREE, meaning, RATE, READING, record_instead, unit_of, ZEROS
-from .text import Cells
 from .times import Clock, clock_of
 from ..errors import InputError, saying
 from ..finding import Finding
@@ -119,7 +119,7 @@ class Quantities:
     factor to our unit and our value at 0, by column. `instance` is the number of the sensor whose
     rows are read, where rows of several alternate. `modulus` is 2ⁿ for columns whose numbers of n
     bits lost their sign. `said` is what is assumed, `notes` what is not used, and `findings` what
-    the values contradict.
+    the values contradict, and what is done about the times.
 
     """
 
@@ -135,11 +135,6 @@ class Quantities:
     findings: list[Finding] = field(default_factory=list)
 
     @property
-    def all_findings(self) -> tuple[Finding, ...]:
-        """Return what the values contradict, and what is done about the times."""
-        return (*self.findings, *self.clock.findings)
-
-    @property
     def read_as(self) -> str:
         """Return what is assumed, in one line."""
         return ', '.join(self.said)
@@ -148,11 +143,10 @@ class Quantities:
     def all_notes(self) -> tuple[str, ...]:
         """Return what is not used, and whether the counter of the clock started again."""
         starts = self.clock.starts
-        if not starts:
-            return tuple(self.notes)
         times = 'once' if starts == 1 else f'{starts} times'
-        return (*self.notes, f'the clock starts again {times} at the end of its range; its times '
-                'are continued')
+        again = (f'the clock starts again {times} at the end of its range; its times are '
+                 'continued',)
+        return (*self.notes, *(again if starts else ()))
 
     def columns(self, cells: Cells) -> tuple[dict[str, NDArray[Any]], NDArray[np.int64]]:
         """Return the columns of a block in our units, and its row numbers."""
@@ -239,6 +233,7 @@ def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
     if 'supply_voltage' in columns.sources:
         _convert_if_stated(made, 'supply_voltage', 'V')
     made.notes += unused(columns.layout, columns.sources)
+    made.findings += made.clock.findings
     return made
 
 
@@ -305,23 +300,30 @@ def _decide_reading(made: Quantities, first: Cells, options: LogOptions, *, samp
     """Decide the unit of the readings; raise InputError if what states it is contradicted."""
     columns = made.chosen
     named, factor = _named(columns)
-    stated = _stated(columns, options) or (not named and options.default_units) or ''
+    path, of_file = columns.layout.path, columns.layout.about.get('units', '')
+    if options.units and of_file and options.units != of_file:
+        raise InputError(f'{path} is in {of_file}, but --units is {options.units}',
+                         'remove --units, or correct the file')
+    stated = options.units or of_file or (not named and options.default_units) or ''
     if stated and stated != named:
         factor = 1.0
     rests = rests_of(made.three(first, READING) * factor, samples=samples)
     name, words = stated or named, compact(columns.names(READING))
     with saying(', '.join([*made.said, f'{words} in {name}' if name else words])):
-        _check_gravity(columns, rests, units_of(name, options.gravity) if name else None)
-        if name and not stated:
-            _check_named(columns, rests, units_of(name))
+        _check_rests(columns, rests, units_of(name, options.gravity) if name else None,
+                     stated=bool(stated))
+    own = columns.sources['ax'].name
     if not name:
-        name, factor = _at_rest(columns, rests)
+        is_si = own == 'ax' and not rests.unit and rests.near(STANDARD_GRAVITY, _STATED_FACTOR)
+        name, factor = ('m/s2', 1.0) if is_si else rests.unit or ('native', 1.0)
     made.units = units_of(name, options.gravity)
     made.scale(READING, factor)
     is_ours = columns.names(READING) == list(READING) and (stated or made.units.is_si)
     if made.said or not is_ours:
         made.said.append(_words(columns, rests, made.units, factor, stated=bool(stated)))
-    if made.units.is_native and _says_nothing(columns, options):
+    are_accelerations = (options.units or columns.maker or meaning(own).quantity
+                         or {*READING} & {*options.columns})
+    if made.units.is_native and not are_accelerations:
         made.notes.append('nothing in the file says what the numbers are: they are taken for '
                           'those of an accelerometer in counts or volts; a magnetometer looks '
                           'alike')
@@ -351,47 +353,29 @@ def _named(columns: Chosen) -> tuple[UnitName | Literal[''], float]:
     return cast(UnitName, name), factor
 
 
-def _stated(columns: Chosen, options: LogOptions) -> UnitName | Literal['']:
-    path, of_file = columns.layout.path, columns.layout.about.get('units', '')
-    if options.units and of_file and options.units != of_file:
-        raise InputError(f'{path} is in {of_file}, but --units is {options.units}',
-                         'remove --units, or correct the file')
-    return options.units or cast(UnitName, of_file)
-
-
-def _check_gravity(columns: Chosen, rests: Rests, units: Units | None) -> None:
-    """Check that gravity is in the readings; `units` is the stated unit, if any."""
-    per_g = None if units is None else units.per_g
-    if (units is not None and units.is_native) or not rests.lack_gravity(per_g):
+def _check_rests(columns: Chosen, rests: Rests, units: Units | None, *, stated: bool) -> None:
+    """Check that gravity is in the readings, and their unit, if the names or the maker tell it."""
+    if units is not None and units.is_native:
         return
-    layout = columns.layout
-    instead = record_instead(layout.header, layout.path)
-    raise InputError(f'{layout.path} holds linear acceleration, gravity removed: the readings at '
-                     f'rest have a length of {rests.length:.3g}, expected 1 g',
-                     instead or 'record the acceleration with gravity, often called raw or total '
-                     'acceleration')
-
-
-def _at_rest(columns: Chosen, rests: Rests) -> tuple[UnitName, float]:
-    own = columns.sources['ax'].name == 'ax'
-    if own and rests.unit is None and rests.near(STANDARD_GRAVITY, _STATED_FACTOR):
-        return 'm/s2', 1.0
-    return rests.unit or ('native', 1.0)
-
-
-def _check_named(columns: Chosen, rests: Rests, units: Units) -> None:
-    if units.is_native or (1.0 / _STATED_FACTOR <= rests.length / units.per_g
-                           <= _STATED_FACTOR):
+    layout, maker, likely = columns.layout, columns.maker, rests.unit
+    small = _SMALL if units is None else _SMALL_G * units.per_g
+    if rests.length < small and likely is None and math.isnan(rests.radius):
+        instead = record_instead(layout.header, layout.path)
+        raise InputError(f'{layout.path} holds linear acceleration, gravity removed: the readings '
+                         f'at rest have a length of {rests.length:.3g}, expected 1 g',
+                         instead or 'record the acceleration with gravity, often called raw or '
+                         'total acceleration')
+    if units is None or stated:
         return
-    likely = rests.unit
-    advice = (f'add --units {likely[0]}' if likely and likely[1] == 1.0 else
-              'correct the name, or add --units native')
-    maker = columns.maker
-    what = (f'the format {maker.name}' if maker is not None and maker.units else
-            f'the name {columns.sources["ax"].name!r}')
-    raise InputError(f'{columns.layout.path}: {what} states readings in {units.name}, but at rest '
-                     f'they have a length of {rests.length:.4g} {units.name}, expected about '
-                     f'{units.per_g:.4g}', advice)
+    per_g = units_of(units.name).per_g
+    if not 1.0 / _STATED_FACTOR <= rests.length / per_g <= _STATED_FACTOR:
+        advice = (f'add --units {likely[0]}' if likely and likely[1] == 1.0 else
+                  'correct the name, or add --units native')
+        what = (f'the format {maker.name}' if maker is not None and maker.units else
+                f'the name {columns.sources["ax"].name!r}')
+        raise InputError(f'{layout.path}: {what} states readings in {units.name}, but at rest '
+                         f'they have a length of {rests.length:.4g} {units.name}, expected about '
+                         f'{per_g:.4g}', advice)
 
 
 def _words(columns: Chosen, rests: Rests, units: Units, factor: float, *, stated: bool) -> str:
@@ -417,13 +401,6 @@ def compact(parts: Sequence[str]) -> str:
     if len(ends) > 1:
         return ', '.join(parts)
     return f'{parts[0][:start]}{"/".join(part[start] for part in parts)}{ends.pop()}'
-
-
-def _says_nothing(columns: Chosen, options: LogOptions) -> bool:
-    """Return whether neither names nor the user say that the readings are accelerations."""
-    named = meaning(columns.sources[READING[0]].name)
-    return not (options.units or columns.maker or named.quantity
-                or {*READING} & {*options.columns})
 
 
 # --------------------------------------------------------------------- rests, samples or poses
@@ -462,25 +439,17 @@ class Rests:
             return 'g', 1e-3
         return None
 
-    def lack_gravity(self, per_g: float | None) -> bool:
-        """Return whether the readings are small and on no sphere; `per_g` is 1 g if stated."""
-        small = _SMALL if per_g is None else _SMALL_G * per_g
-        return self.length < small and self.unit is None and math.isnan(self.radius)
-
 
 def rests_of(reading: Floats, *, samples: bool) -> Rests:
     """Return the rests in (n, 3) readings in the unit of the file; rows are samples or poses."""
-    still = _quiet(reading) if samples else reading
+    still, windows = reading, _windows(reading)
+    if samples and len(windows) >= 2:
+        still = windows[_quietest(windows)].mean(axis=1)
     with np.errstate(over='ignore', invalid='ignore'):
         length = float(np.median(np.linalg.norm(still, axis=1)))
         radius = _radius(still)
     whole = bool(np.all(reading[:1000] == np.round(reading[:1000])))
     return Rests(length, radius, whole)
-
-
-def _quiet(reading: Floats) -> Floats:
-    windows = _windows(reading)
-    return reading if len(windows) < 2 else np.asarray(windows[_quietest(windows)].mean(axis=1))
 
 
 def _windows(values: Floats) -> Floats:
@@ -549,9 +518,11 @@ def are_untimed_samples(columns: Mapping[str, NDArray[Any]]) -> bool:
 
 # ---------------------------------------------------------------------------------- context
 
-def _drop(made: Quantities, keys: Sequence[str]) -> None:
+def _leave_out(made: Quantities, keys: Sequence[str], why: str, advice: str) -> None:
     sources = {key: value for key, value in made.chosen.sources.items() if key not in keys}
     made.chosen = replace(made.chosen, sources=sources)
+    made.findings.append(Finding('columns', f'{why}, and {"is" if len(keys) == 1 else "are"} not '
+                                 'used', advice))
 
 
 def _decide_rate(made: Quantities, first: Cells) -> None:
@@ -569,10 +540,8 @@ def _decide_rate(made: Quantities, first: Cells) -> None:
     if stated is None and own and columns.layout.header and (not rests or 'rad/s' in rests):
         return
     if stated is None and (largest >= _LIKELY_RATE_DEG or rests == {}):
-        _drop(made, RATE)
-        made.findings.append(Finding(
-            'columns', f'the angular rates {words} at rest are those of no gyro in rad/s or °/s, '
-            'and are not used', 'state their unit in the names, such as gyroX_dps'))
+        _leave_out(made, RATE, f'the angular rates {words} at rest are those of no gyro in rad/s '
+                   'or °/s', 'state their unit in the names, such as gyroX_dps')
         return
     seen = next(iter(rests.items())) if rests and len(rests) == 1 else None
     unit, factor = stated or seen or (
@@ -620,11 +589,10 @@ def _decide_temperature(made: Quantities, first: Cells) -> None:
     middle = float(np.median(columns.numbers(first, 'temperature')))
     if _LIKELY_TEMPERATURE_C[0] <= middle <= _LIKELY_TEMPERATURE_C[1]:
         made.said.append(f'{source.name} in °C (assumed)')
-        return
-    _drop(made, ['temperature'])
-    made.findings.append(Finding(
-        'columns', f'the temperature {source.name} has values of about {middle:.4g} in a unit '
-        'that is not known, and is not used', 'state its unit in the name, such as temperature_K'))
+    else:
+        _leave_out(made, ['temperature'], f'the temperature {source.name} has values of about '
+                   f'{middle:.4g} in a unit that is not known',
+                   'state its unit in the name, such as temperature_K')
 
 
 def _convert_if_stated(made: Quantities, key: str, ours: str) -> bool:

@@ -2,17 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Reading of logs of all kinds, of lines from a serial port, and of our own tables.
+Our own tables, and lines from a serial port.
 
-A log is recognised by its first bytes. Our own tables have ``#`` comments, one header line, and
+Our own tables have ``#`` comments, one header line, and
 columns by name: those of `accel_calib.table.COLUMNS`; other columns of numbers are quantities.
 Three kinds of comments are read, with values in JSON: ``# units: "m/s2"``,
 ``# sensor: "imu_link"`` and ``# autopilot: {…}``.
 
 """
 
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 import csv
 from dataclasses import replace
 import json
@@ -23,13 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .columns import chosen, is_log_header, LogOptions
-from .containers import Frame, Piped
-from .dialect import layout_of
-from .formats import open_file, open_members, OpenLog
+from .dialect import Cells, layout_of
+from .formats import open_log
 from .quantities import decided
-from .text import Cells, TextTable
-from ..disk import check_regular, write_atomically
-from ..errors import InputError, saying
+from .text import TextTable
+from ..disk import write_atomically
+from ..errors import InputError
 from ..table import check_values, column_of, COLUMNS, concatenated, Poses, Recording, Table
 from ..text import counted
 
@@ -49,37 +47,6 @@ def read_recording(path: Path, topic: str = '', sensor: str = '') -> Recording:
     """Return all samples of a recording; `topic`, `sensor` and errors as in `open_log`."""
     with open_log(path, LogOptions(topic=topic, sensor=sensor)) as log:
         return concatenated(list(log.blocks))
-
-
-@contextmanager
-def open_log(path: Path | Piped | Frame, options: LogOptions = LogOptions()) -> Iterator[OpenLog]:
-    """
-    Open a log of any kind: text, a bag, a flight log of PX4 or ArduPilot, or a DataFrame.
-
-    Parameters
-    ----------
-    path : Path, Piped or Frame
-        The file, the folder of a rosbag2, standard input, or the DataFrame.
-    options : LogOptions
-        How to read it; by default it is recognised.
-
-    Raises
-    ------
-    InputError
-        If the log cannot be read, has no accelerometer or several, contradicts the options, or
-        holds no gravity; also while it is read.
-    OSError
-        If the file cannot be read.
-
-    """
-    if isinstance(path, Path) and not path.is_dir():
-        check_regular(path)
-    if isinstance(path, Path):
-        opened = open_file(path, options)
-    else:
-        opened = open_members(Path(str(path)), [path.table], options)
-    with opened as log, saying(log.read_as):
-        yield log
 
 
 # ---------------------------------------------------------------------------- writing of tables
@@ -161,7 +128,7 @@ class LineReader:
         rate = '' if timed else (f'no times, {rate_hz:.4g} Hz '
                                  f'({"stated" if options.rate else "measured"})')
         self.read_as = ', '.join(filter(None, (self._quantities.read_as, rate)))
-        self.first, self.findings = self._recording(first), self._quantities.all_findings
+        self.first, self.findings = self._recording(first), tuple(self._quantities.findings)
 
     def samples(self, lines: Sequence[str]) -> Recording | None:
         """Return the samples of the next complete lines; None if there are none."""

@@ -13,25 +13,22 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from functools import partial
 import io
 from itertools import chain, islice
-from operator import methodcaller
 from pathlib import Path
 import re
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .columns import Chosen
 from .dialect import (
-    first_label, is_clock, is_comment, is_number, IsHeader, Layout, layout_of, short, split)
+    Cells, first_label, is_clock, is_comment, is_number, IsHeader, Layout, layout_of, short, split)
 from ..errors import InputError
 from ..table import Floats
 from ..text import counted
-
-if TYPE_CHECKING:
-    from .columns import Chosen
 
 ROWS = 65536
 """Number of lines in a block."""
@@ -49,15 +46,6 @@ _BLANK = ' \t\r\n,;|'
 
 _QUOTED_LINES = 20
 """Largest number of lines of one quoted cell."""
-
-
-@dataclass(frozen=True)
-class Cells:
-    """A block of rows: (n, k) numbers, k texts of n cells, and n row numbers from 1."""
-
-    numbers: Floats
-    texts: list[list[str]]
-    row: NDArray[np.int64]
 
 
 @contextmanager
@@ -109,16 +97,15 @@ def _head(path: Path, file: io.TextIOWrapper) -> list[str]:
     """Return the first lines."""
     lines: list[str] = []
     characters = 0
-    while len(lines) < _HEAD_LINES and (characters < _HEAD_CHARACTERS or len(lines) < 2):
-        line = file.readline(_LONGEST_LINE)
-        if not line:
-            break
+    for line in islice(iter(partial(file.readline, _LONGEST_LINE), ''), _HEAD_LINES):
         if len(line) == _LONGEST_LINE:
             raise InputError(f'{path} has a line of more than {_LONGEST_LINE} characters, '
                              'expected a table with one line for each row',
                              'use a CSV table or a bag')
         lines.append(line)
         characters += len(line)
+        if characters >= _HEAD_CHARACTERS and len(lines) > 1:
+            break
     return lines
 
 
@@ -175,97 +162,73 @@ class TextTable:
 
     def read(self, lines: Sequence[str], *, last: bool = False) -> Cells:
         """Return the rows of the next lines; a row that is cut at the last line is left out."""
-        kept = list(filter(self.layout.dialect.is_row, lines))
+        dialect = self.layout.dialect
+        kept = list(filter(dialect.is_row, lines))
         rows_of = _joined_quotes(kept) if '"' in ''.join(kept) else kept
+        is_joined = len(rows_of) < len(kept)
         number = np.arange(self._row + 1, self._row + len(rows_of) + 1)
-        where = (self._line, lines) if len(rows_of) == len(kept) else (-1, lines)
-        self._line += len(lines)
         self._row += len(rows_of)
         if last and rows_of and self._row > 1:
-            rows_of = self._without_cut(rows_of)
-            number = number[:len(rows_of)]
+            line = rows_of[-1]
+            is_whole = line.endswith('\n') and len(dialect.cells(line)) >= self.layout.width
+            if self._fault(line) is not None and not is_whole:
+                words = f'is cut: {short(line)!r}' if short(line) else 'holds no text'
+                self._cut = f'left out the last line, which {words}'
+                rows_of, number = rows_of[:-1], number[:-1]
         values = self._parsed(rows_of)
         if values is None:
-            good = self._good(rows_of, number, where)
+            place = [k for k, line in enumerate(lines, self._line + 1) if dialect.is_row(line)]
+            good = self._good(rows_of, number, [] if is_joined else place)
             rows_of, number = [rows_of[k] for k in good], number[good]
             values = self._parsed(rows_of)
         if values is None and self._spare:
             self._numeric = self._needed
             values = self._parsed(rows_of)
         if values is not None and values.shape[1] < len(self._needed + self._spare):
-            values = np.hstack([values, self._spare_cells(rows_of)])
+            rows = (dialect.cells(line) for line in rows_of)
+            spare = [[row[k].replace(',', '.') for k in self._spare] for row in rows]
+            values = np.hstack([values, [[float(text) if is_number(text) else np.nan
+                                          for text in texts] for texts in spare]])
         if values is None:
             raise InputError(f'{self.layout.path} cannot be read, expected a CSV table',
                              'check it for stray characters')
-        texts = [[self.layout.dialect.cells(line)[k] for line in rows_of] for k in self._text]
+        self._line += len(lines)
+        texts = [[dialect.cells(line)[k] for line in rows_of] for k in self._text]
         return Cells(values, texts, number)
 
     def _parsed(self, lines: list[str]) -> Floats | None:
         """Return the numbers of rows, or None if a row has a fault."""
-        if not lines or not self._numeric:
+        layout, columns = self.layout, self._numeric
+        dialect, delimiter = layout.dialect, layout.dialect.delimiter
+        if not lines or not columns:
             sound = all(self._fault(line) is None for line in lines)
-            return np.zeros((len(lines), len(self._numeric))) if sound else None
-        plain = self._plain(lines)
-        cells = self.layout.dialect.cells
-        if plain is None or any(not is_clock(cells(line)[k])
-                                for k in self._dates for line in lines):
+            return np.zeros((len(lines), len(columns))) if sound else None
+        texts = lines
+        if dialect.monitor or dialect.labelled or dialect.prefix:
+            texts = list(map(dialect.plain, lines))
+        if '"' in ''.join(texts):  # lines without quotes, parted by tabs
+            rows = [split(line, delimiter) for line in texts]
+            cells = [[row[k] for k in columns] for row in rows if len(row) == layout.width]
+            texts = ['\t'.join(row) for row in cells]
+            delimiter, columns, breaks = '\t', tuple(range(len(columns))), len(columns) - 1
+        else:
+            breaks = layout.width - 1
+        if len(texts) < len(lines) or {line.count(delimiter) if delimiter else
+                                       len(line.split()) - 1 for line in texts} != {breaks}:
             return None
-        lines, delimiter, columns = plain
-        if delimiter != ',' and self.layout.decimal != '.':
-            lines = [line.replace(',', '.') for line in lines]
+        if any(not is_clock(dialect.cells(line)[k]) for k in self._dates for line in lines):
+            return None
+        if delimiter != ',' and layout.decimal != '.':
+            texts = [line.replace(',', '.') for line in texts]
         try:
-            values = np.loadtxt(lines, delimiter=delimiter, usecols=columns, ndmin=2,
+            values = np.loadtxt(texts, delimiter=delimiter or None, usecols=columns, ndmin=2,
                                 comments=None, quotechar=None)
         except ValueError:
             return None
         return values if len(values) == len(lines) and np.isfinite(values).all() else None
 
-    def _spare_cells(self, lines: list[str]) -> Floats:
-        """Return the numbers of spare columns, cell by cell; NaN for another cell."""
-        found = np.full((len(lines), len(self._spare)), np.nan)
-        for row, line in zip(found, lines, strict=True):
-            cells = self.layout.dialect.cells(line)
-            texts = [cells[k].replace(',', '.') for k in self._spare]
-            row[:] = [float(text) if is_number(text) else np.nan for text in texts]
-        return found
-
-    def _plain(self, lines: list[str]) -> tuple[list[str], str | None, Sequence[int]] | None:
-        """Return lines for loadtxt with their delimiter and columns, or None if ragged."""
-        dialect, width = self.layout.dialect, self.layout.width
-        if dialect.monitor or dialect.labelled or dialect.prefix:
-            lines = [dialect.plain(line) for line in lines]
-        if '"' in ''.join(lines):
-            return self._unquoted(lines)
-        delimiter = dialect.delimiter
-        counts = (map(methodcaller('count', delimiter), lines) if delimiter else
-                  (len(line.split()) - 1 for line in lines))
-        if set(counts) != {width - 1}:
-            return None
-        return lines, delimiter or None, self._numeric
-
-    def _unquoted(self, lines: list[str]) -> tuple[list[str], str, Sequence[int]] | None:
-        """Return lines without quotes, parted by tabs; or None if ragged."""
-        rows = [split(line, self.layout.dialect.delimiter) for line in lines]
-        if any(len(row) != self.layout.width for row in rows):
-            return None
-        cells = [[row[k] for k in self._numeric] for row in rows]
-        if any('\t' in cell or '\n' in cell for row in cells for cell in row):
-            return None
-        return ['\t'.join(row) for row in cells], '\t', range(len(self._numeric))
-
-    def _without_cut(self, lines: list[str]) -> list[str]:
-        """Return rows without a last one that is cut; note that it is left out."""
-        line = lines[-1]
-        cells = len(self.layout.dialect.cells(line))
-        fault = self._fault(line)
-        if fault is None or (line.endswith('\n') and cells >= self.layout.width):
-            return lines
-        words = f'is cut: {short(line)!r}' if short(line) else 'holds no text'
-        self._cut = f'left out the last line, which {words}'
-        return lines[:-1]
-
     def _good(self, lines: Sequence[str], rows: NDArray[np.int64],
-              where: tuple[int, Sequence[str]]) -> list[int]:
+              place: Sequence[int]) -> list[int]:
         """Return the indices of the sound rows; a bad row is an error, or is skipped."""
         good = []
         for k, line in enumerate(lines):
@@ -275,23 +238,12 @@ class TextTable:
             elif is_comment(line.lstrip()) or not line.replace('""', '').strip(_BLANK):
                 continue
             elif not self._skip_bad or not self._bad:
-                self._bad = f'{self._place(k, *where)}row {rows[k]}{fault}'
+                self._bad = f'{f"line {place[k]}: " if place else ""}row {rows[k]}{fault}'
                 if not self._skip_bad:
-                    raise self._error(self._bad)
+                    raise InputError(f'{self.layout.path}{"," if place else ":"} {self._bad}',
+                                     'correct the row or remove it, or add --skip-bad')
             self._bad_count += fault is not None
         return good
-
-    def _place(self, index: int, before: int, lines: Sequence[str]) -> str:
-        """Return the line number of a row among lines, in words; empty if it is not known."""
-        numbers = (before + k + 1 for k, line in enumerate(lines)
-                   if before >= 0 and self.layout.dialect.is_row(line))
-        number = next(islice(numbers, index, None), None)
-        return '' if number is None else f'line {number}: '
-
-    def _error(self, words: str) -> InputError:
-        mark = ',' if words.startswith('line') else ':'
-        return InputError(f'{self.layout.path}{mark} {words}',
-                          'correct the row or remove it, or add --skip-bad')
 
     def _fault(self, line: str) -> str | None:
         layout = self.layout

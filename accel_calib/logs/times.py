@@ -12,7 +12,6 @@ periods later, and those of the first stamp, which may lack some, end with it.
 
 """
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import math
 
@@ -20,9 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .columns import Chosen, FRACTION, LogOptions, rates_beside
-from .dialect import EPOCH_S, has_date, RATES_HZ, seconds_of
+from .dialect import Cells, EPOCH_S, has_date, RATES_HZ, seconds_of
 from .names import bare_name, COUNTERS, READING, TICKS, unit_of, UNITS
-from .text import Cells
 from ..errors import InputError
 from ..finding import Finding
 from ..table import Floats
@@ -205,34 +203,25 @@ def _unit_of_time(columns: Chosen, first: Cells, stamps: Floats) -> str:
     stated = unit_of('time', source.unit)
     if stated:
         return stated[0]
-    if layout.header and source.name == 'time' and (layout.about or 'count' in columns.sources
-                                                    or not _by_rate(columns, first, stamps)):
+    if layout.header and source.name == 'time' and (
+            layout.about or 'count' in columns.sources or (
+                columns.names(READING) == list(READING)
+                and not _is_dense(stamps, columns.three(first, READING)))):
         return 's'
+    # A unit with a plausible rate, best one that the file states; else s.
     units = TICKS.get(bare_name(source.name), _UNITS)
-    return _unit_by_rate(stamps, rates_beside(layout, source), units)
-
-
-def _by_rate(columns: Chosen, first: Cells, stamps: Floats) -> bool:
-    """Return whether the unit of a column ``time`` is found from the rate; by default it is s."""
-    return (columns.names(READING) != list(READING)
-            or _is_dense(stamps, columns.three(first, READING)))
-
-
-def _unit_by_rate(stamps: Floats, beside: Sequence[float], units: Mapping[str, float]
-                  ) -> str:
-    """Return the unit with a plausible rate, best one that the file states; else s."""
-    step = _step_of(stamps)
+    beside, step = rates_beside(layout, source), _step_of(stamps)
     if not step > 0.0:
         return 's'
     rates = {name: 1.0 / (step * unit) for name, unit in units.items()}
     plausible = [name for name, rate in rates.items() if RATES_HZ[0] * 0.9 <= rate
                  <= RATES_HZ[1] * 1.1]
-    stated = [name for name in rates if any(_agree(rates[name], rate) for rate in beside)]
+    agreeing = [name for name in rates if any(_agree(rates[name], rate) for rate in beside)]
     since_1970 = [name for name in plausible
                   if EPOCH_S[0] <= float(np.median(stamps)) * units[name] <= EPOCH_S[1]]
     if not np.all(stamps == np.round(stamps)) and 's' in plausible:
         plausible = ['s']
-    return min(stated or since_1970 or plausible, default='s',
+    return min(agreeing or since_1970 or plausible, default='s',
                key=lambda name: abs(math.log(rates[name] / _USUAL_HZ)))
 
 
