@@ -216,6 +216,7 @@ def test_readings_in_another_unit_are_refused_in_the_same_words(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.usefixtures('without_pages')
 @pytest.mark.parametrize('name', WITH_JSON)
 def test_in_the_unit_that_is_advised_the_results_are_equal(
         name: str, twins: Path, tmp_path: Path) -> None:
