@@ -50,8 +50,7 @@ def sensor(rng: np.random.Generator, *effects: str) -> Model:
              'misalignment': 0.01}
     names = effects or ('offset', 'axis_gain', 'cross_axis')
     widths = {'gain': 1}
-    return model_with({name: rng.normal(size=widths.get(name, 3)) * sizes[name]
-                       for name in names})
+    return model_with({name: rng.normal(size=widths.get(name, 3)) * sizes[name] for name in names})
 
 
 def with_effects(calibration: Calibration, values: Mapping[str, Any], variance: float = 1e-12,

@@ -123,8 +123,7 @@ def test_a_page_or_calibration_that_does_not_fit_on_the_disk_is_one_line(
         command, size_kb, status, left, recording, tmp_path):
     disk = tmp_path / 'disk'
     more = {'calibrate': ['--no-refine'], 'fit': ['--report', disk / 'c.html']}[command]
-    done, copy = run_on_small_disk(
-        disk, size_kb, command, recording, '-o', disk / 'c.yaml', *more)
+    done, copy = run_on_small_disk(disk, size_kb, command, recording, '-o', disk / 'c.yaml', *more)
     assert (done.returncode, done.stderr.count('\n')) == (status, 1 if status else 0)
     assert 'No space left' in (done.stderr if status else done.stdout)
     assert [each.name for each in copy.iterdir()] == left

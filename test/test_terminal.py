@@ -27,7 +27,6 @@ import pytest
 from rich.console import Console
 from shared import forked, python, random_directions, ROOT, run, run_json
 
-
 SIMULATE = ('simulate', '--recording', '--poses', '14', '--effect', 'offset=0.02,-0.01,0.03', '-o')
 
 
@@ -347,8 +346,7 @@ def pose_step(*signs: float) -> Progress:
         (replace(FITTED, step=step), words) for step, words in (
             ('refine', 'CALL REFINE'), ('level', 'SET LEVEL'), ('accept', 'ACCEPT'),
             ('done', 'DONE')))])
-def test_every_step_is_shown_in_the_largest_words_that_fit(progress: Progress, words: str
-                                                           ) -> None:
+def test_every_step_is_shown_in_the_largest_words_that_fit(progress: Progress, words: str) -> None:
     large = drawn(screen(NODE, progress))
     assert words not in large
     below = large[large.index('accuracy'):]
