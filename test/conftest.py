@@ -316,6 +316,12 @@ def defects_are_failures(temporary: Path, monkeypatch: pytest.MonkeyPatch) -> It
 
 
 @pytest.fixture
+def without_pages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let commands draw no page: that takes longer than all the rest."""
+    monkeypatch.setitem(sys.modules, 'matplotlib', None)
+
+
+@pytest.fixture
 def domain() -> Iterator[int]:
     """Yield a DDS domain of this test."""
     with own_domain() as number:

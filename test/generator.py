@@ -366,8 +366,7 @@ def _samples(values: Mapping[str, Floats], around: Around, traits: Traits) -> Fl
     return reading[:, :, np.newaxis] + around.shaking
 
 
-def _rail(wanted: float, values: Mapping[str, Floats], around: Around,
-          traits: Traits) -> Floats:
+def _rail(wanted: float, values: Mapping[str, Floats], around: Around, traits: Traits) -> Floats:
     """Return the (1,) limit at which saturation has a size [g]."""
     samples = _samples(values, around, traits)
     farthest = np.sort(np.max(np.abs(np.mean(samples, axis=2)), axis=1))

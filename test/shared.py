@@ -31,6 +31,10 @@ SENSOR = {'offset': [0.02, -0.01, 0.03], 'axis_gain': [0.01, -0.02, 0.005],
           'cross_axis': [0.004, 0.002, -0.003]}
 """Effects of a sensor that several tests simulate."""
 
+OPTIONS = [part for name, values in SENSOR.items()
+           for part in ('--effect', f'{name}={",".join(map(str, values))}')]
+"""Options of ``simulate`` for this sensor."""
+
 
 def data(name: str) -> Path:
     """Return the path of a real recording, or skip the test if it is missing."""
@@ -46,8 +50,7 @@ def sensor(rng: np.random.Generator, *effects: str) -> Model:
              'misalignment': 0.01}
     names = effects or ('offset', 'axis_gain', 'cross_axis')
     widths = {'gain': 1}
-    return model_with({name: rng.normal(size=widths.get(name, 3)) * sizes[name]
-                       for name in names})
+    return model_with({name: rng.normal(size=widths.get(name, 3)) * sizes[name] for name in names})
 
 
 def with_effects(calibration: Calibration, values: Mapping[str, Any], variance: float = 1e-12,

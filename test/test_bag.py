@@ -274,8 +274,7 @@ def test_a_copy_is_compressed_like_its_bag_unless_it_is_one_file(mode, tmp_path)
 
 
 @pytest.mark.parametrize('plugin', StoragePlugin)
-def test_a_file_becomes_a_file_or_a_folder_with_the_metadata_of_its_messages(
-        plugin, tmp_path):
+def test_a_file_becomes_a_file_or_a_folder_with_the_metadata_of_its_messages(plugin, tmp_path):
     path = rosbag2(plugin)(tmp_path, TOPICS, messages(7))
     file = next(item for item in path.iterdir() if item.suffix != '.yaml')
     correct_bag(file, a_calibration(), tmp_path / f'out{file.suffix}', ON_A)

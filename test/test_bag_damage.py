@@ -140,8 +140,7 @@ def test_a_file_that_the_metadata_do_not_list_is_noted(tmp_path: Path) -> None:
     assert 'does not list file later.mcap' in notes[0]
 
 
-def test_damaged_metadata_print_nothing(tmp_path: Path,
-                                        recwarn: pytest.WarningsRecorder) -> None:
+def test_damaged_metadata_print_nothing(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
     path = MAKES['mcap folder'](tmp_path)
     metadata = path / 'metadata.yaml'
     text = metadata.read_text()

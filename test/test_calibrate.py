@@ -10,10 +10,7 @@ from accel_calib.stored import read_calibration
 from inside import are_samples
 import numpy as np
 import pytest
-from shared import data, random_directions, run, run_on_small_disk
-
-OFFSET = (0.02, -0.01, 0.03)
-EFFECTS = ('--effect', 'offset=0.02,-0.01,0.03', '--effect', 'axis_gain=0.01,-0.02,0.005')
+from shared import data, OPTIONS, random_directions, run, run_on_small_disk, SENSOR
 
 
 def calibrated(capsys, *arguments):
@@ -27,7 +24,7 @@ def calibrated(capsys, *arguments):
 @pytest.fixture
 def recording(tmp_path):
     path = tmp_path / 'log.csv'
-    assert run('simulate', '-o', path, '--recording', '--poses', 14, '--dwell', 3, *EFFECTS,
+    assert run('simulate', '-o', path, '--recording', '--poses', 14, '--dwell', 3, *OPTIONS,
                '--mounting', 5, -3, 0) == 0
     return path
 
@@ -38,7 +35,7 @@ def test_a_recording_becomes_a_calibration_a_page_and_a_verdict(recording, tmp_p
     assert (status, result['rating']) == (0, 'GOOD')
     assert result['rating_reason']
     assert any(line.startswith('GOOD  ') for line in lines)
-    np.testing.assert_allclose(np.array(result['offset']) / 9.80665, OFFSET, atol=2e-3)
+    np.testing.assert_allclose(np.array(result['offset']) / 9.80665, SENSOR['offset'], atol=2e-3)
     stored = read_calibration(out)
     assert stored.is_levelled
     np.testing.assert_allclose(stored.apply(stored.poses.reading[0]), (0, 0, 9.80665), atol=0.05)
@@ -46,9 +43,10 @@ def test_a_recording_becomes_a_calibration_a_page_and_a_verdict(recording, tmp_p
     assert 'GOOD' in (tmp_path / 'c.html').read_text(encoding='utf-8')
 
 
+@pytest.mark.usefixtures('without_pages')
 def test_a_hidden_effect_is_added_unless_it_is_not_wanted(tmp_path, capsys):
     path = tmp_path / 'poses.csv'
-    run('simulate', '-o', path, '--poses', 60, *EFFECTS, '--effect',
+    run('simulate', '-o', path, '--poses', 60, *OPTIONS, '--effect',
         'quadratic=0.004,0.003,-0.004')
     _, found, lines = calibrated(capsys, path, '-o', tmp_path / 'c.yaml')
     assert found['refined'].startswith('refined with quadratic')
@@ -84,6 +82,7 @@ def test_what_the_gate_refuses_is_never_stored(tmp_path, capsys):
     assert (status, {*result}, out.exists()) == (2, {'file', 'error', 'advice'}, False)
 
 
+@pytest.mark.usefixtures('without_pages')
 @pytest.mark.parametrize(('flat', 'row'), [('last', 13), ('3', 2)])
 def test_the_flat_pose_is_the_first_the_last_or_a_row(flat, row, recording, tmp_path, capsys):
     out = tmp_path / 'c.yaml'
@@ -92,6 +91,7 @@ def test_the_flat_pose_is_the_first_the_last_or_a_row(flat, row, recording, tmp_
     np.testing.assert_allclose(stored.apply(stored.poses.reading[row]), (0, 0, 9.80665), atol=0.05)
 
 
+@pytest.mark.usefixtures('without_pages')
 @pytest.mark.parametrize('name', ['xsens_mti_counts', 'mpu9150_imu1'])
 def test_real_logs_become_good_calibrations_without_an_option(name, tmp_path, capsys):
     status, result, _ = calibrated(capsys, data(f'{name}.csv'), '-o', tmp_path / 'c.yaml',
@@ -123,8 +123,7 @@ def test_a_page_or_calibration_that_does_not_fit_on_the_disk_is_one_line(
         command, size_kb, status, left, recording, tmp_path):
     disk = tmp_path / 'disk'
     more = {'calibrate': ['--no-refine'], 'fit': ['--report', disk / 'c.html']}[command]
-    done, copy = run_on_small_disk(
-        disk, size_kb, command, recording, '-o', disk / 'c.yaml', *more)
+    done, copy = run_on_small_disk(disk, size_kb, command, recording, '-o', disk / 'c.yaml', *more)
     assert (done.returncode, done.stderr.count('\n')) == (status, 1 if status else 0)
     assert 'No space left' in (done.stderr if status else done.stdout)
     assert [each.name for each in copy.iterdir()] == left

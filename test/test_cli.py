@@ -5,7 +5,9 @@
 
 import dataclasses
 import json
+from pathlib import Path
 import re
+import shutil
 import sys
 
 from accel_calib.capture import CaptureSettings
@@ -14,26 +16,29 @@ from inside import (
     CALIBRATOR, COMMAND, COMMANDS, main, parser, rotation_from_rpy, spread_directions)
 import numpy as np
 import pytest
-from shared import forked, python, refused, ROOT, run, run_json
-
-EFFECTS = ['--effect', 'offset=0.02,-0.01,0.03', '--effect', 'axis_gain=0.01,-0.02,0.005',
-           '--effect', 'cross_axis=0.004,0.002,-0.003']
+from shared import forked, OPTIONS, python, refused, ROOT, run, run_json
 
 LOGS = ROOT / 'test' / 'data' / 'logs'
 
 
-@pytest.fixture
-def poses(tmp_path):
-    path = tmp_path / 'poses.csv'
-    assert run('simulate', '-o', path, *EFFECTS, '--poses', 24) == 0
-    return path
+@pytest.fixture(scope='module')
+def made(tmp_path_factory):
+    """Return a folder with poses and their calibration."""
+    folder = tmp_path_factory.mktemp('made')
+    poses = folder / 'poses.csv'
+    assert run('simulate', '-o', poses, *OPTIONS, '--poses', 24) == 0
+    assert run('fit', poses, '-o', folder / 'calibration.yaml', '--sensor', 'imu_link') == 0
+    return folder
 
 
 @pytest.fixture
-def calibration(poses, tmp_path):
-    path = tmp_path / 'calibration.yaml'
-    assert run('fit', poses, '-o', path, '--sensor', 'imu_link') == 0
-    return path
+def poses(made, tmp_path):
+    return Path(shutil.copy(made / 'poses.csv', tmp_path))
+
+
+@pytest.fixture
+def calibration(poses, made, tmp_path):
+    return Path(shutil.copy(made / 'calibration.yaml', tmp_path))
 
 
 @pytest.mark.parametrize('model', ['auto', '7', '9', '10'])
@@ -53,7 +58,7 @@ def test_fit_reports_the_next_pose_until_more_poses_no_longer_help(model, tmp_pa
 
 def test_flat_row_is_levelled_even_when_it_is_not_fitted(tmp_path, capsys):
     path = tmp_path / 'poses.csv'
-    run('simulate', '-o', path, *EFFECTS, '--mounting', 20, -30, 0, '--poses', 30)
+    run('simulate', '-o', path, *OPTIONS, '--mounting', 20, -30, 0, '--poses', 30)
     status, result = run_json(capsys, 'fit', path, '--rows', '2:30', '--flat', 1)
     assert (status, result['poses_used']) == (0, 29)
     expected = rotation_from_rpy(*np.radians((20, -30, 0)))[2]
@@ -64,7 +69,7 @@ def test_several_tables_return_a_list_in_their_order(tmp_path, capsys):
     folder = tmp_path / 'out'
     tables = [tmp_path / f'{name}.csv' for name in ('0', 'bad', '1', '2')]
     for seed, table in enumerate(tables):
-        run('simulate', '-o', table, *EFFECTS, '--seed', seed)
+        run('simulate', '-o', table, *OPTIONS, '--seed', seed)
     tables[1].write_text('ax,ay\n1,2\n')
     folder.mkdir()
     status, results = run_json(capsys, 'fit', *tables, '-o', folder)
@@ -181,39 +186,31 @@ def test_a_name_that_is_not_utf_8_is_refused_in_one_line(poses, tmp_path):
     assert not (tmp_path / 'new.yaml').exists()
 
 
-INTERRUPTED_AT = """
-import runpy, signal, sys
-signal.signal(signal.SIGINT, {handler})  # a shell lets background commands ignore it
+INTERRUPTED = """
+import atexit, runpy, signal, sys
+signal.signal(signal.SIGINT, signal.{handler})  # a shell lets background commands ignore it
 def interrupt(event, about):
     if event == 'import' and about[0] == {name!r}:
         signal.raise_signal(signal.SIGINT)
 sys.addaudithook(interrupt)
+if {name!r} == 'the end':  # the last handler is called first, before Python has ended anything
+    atexit.register(signal.raise_signal, signal.SIGINT)
 sys.argv = ['accel-calib', 'fit', {poses!r}]
 runpy.run_module({module!r}, run_name='__main__')
 """
 
 
-@pytest.mark.parametrize(('name', 'handler'), [*((name, 'default_int_handler') for name in (
-    'argparse', 'accel_calib.errors', 'numpy', 'numpy.linalg._umath_linalg', 'rich.console',
-    'scipy.special._ufuncs')), ('rich.console', 'SIG_IGN')])
-def test_ctrl_c_while_modules_load_ends_without_words_unless_it_is_ignored(name, handler, poses):
-    done = python('-c', INTERRUPTED_AT.format(
-        name=name, handler=f'signal.{handler}', poses=str(poses), module=COMMAND[1]))
-    is_ignored = handler == 'SIG_IGN'
-    assert (done.returncode, done.stderr) == (0 if is_ignored else 130, '')
-    assert ('Residual' in done.stdout) if is_ignored else not done.stdout
-
-
-def test_ctrl_c_while_python_ends_changes_nothing(poses):
-    """The last handler of atexit is called first, before Python has ended anything."""
-    done = python('-c', f"""
-import atexit, runpy, signal, sys
-signal.signal(signal.SIGINT, signal.default_int_handler)
-atexit.register(signal.raise_signal, signal.SIGINT)
-sys.argv = ['accel-calib', 'fit', {str(poses)!r}]
-runpy.run_module({COMMAND[1]!r}, run_name='__main__')
-""")
-    assert (done.returncode, done.stderr) == (0, '')
+@pytest.mark.parametrize(('name', 'handler', 'status'), [
+    *((name, 'default_int_handler', 130) for name in (
+        'argparse', 'accel_calib.errors', 'numpy', 'numpy.linalg._umath_linalg', 'rich.console',
+        'scipy.special._ufuncs')),
+    ('rich.console', 'SIG_IGN', 0), ('the end', 'default_int_handler', 0)])
+def test_ctrl_c_while_modules_load_ends_without_words_and_changes_nothing_later_or_if_ignored(
+        name, handler, status, poses):
+    done = python('-c', INTERRUPTED.format(
+        name=name, handler=handler, poses=str(poses), module=COMMAND[1]))
+    assert (done.returncode, done.stderr) == (status, '')
+    assert not done.stdout if status else 'Residual' in done.stdout
 
 
 @pytest.mark.parametrize('command', COMMANDS)
@@ -285,7 +282,7 @@ def test_a_defect_is_one_line_with_the_details_in_a_file(tmp_path, monkeypatch, 
 def test_a_refinement_is_printed_stored_and_drawn(tmp_path, capsys):
     pytest.importorskip('matplotlib')
     poses, stored, page = (tmp_path / name for name in ('poses.csv', 'refined.yaml', 'page.html'))
-    run('simulate', '-o', poses, *EFFECTS, '--effect', 'quadratic=0.006,-0.004,0.005', '--poses',
+    run('simulate', '-o', poses, *OPTIONS, '--effect', 'quadratic=0.006,-0.004,0.005', '--poses',
         60)
     assert run('refine', poses, '-o', stored, '--sensor', 'imu_link', '--report', page) == 0
     printed = capsys.readouterr().out

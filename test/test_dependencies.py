@@ -78,8 +78,7 @@ def test_a_package_has_the_same_bounds_in_all_extras(setup_py: dict[str, Any]) -
 
 
 @pytest.mark.parametrize('path', PINNED)
-def test_tested_versions_are_within_the_bounds(
-        path: str, setup_py: dict[str, Any]) -> None:
+def test_tested_versions_are_within_the_bounds(path: str, setup_py: dict[str, Any]) -> None:
     known = pins(path)
     for requirement in all_of(setup_py, *setup_py['extras_require']):
         version = known.get(normal(requirement.name))

@@ -52,8 +52,7 @@ def sensor_with(*groups, rotation=None, unit='m/s2', per_g=None, limits=RANGE):
                'previous': spread_directions(count)[rng.permutation(count)]}
     units = units_of(unit) if per_g is None else Units(unit, per_g)
     poses = simulate_poses(model, spread_directions(count), rng, noise_g=0.0005, context=context)
-    poses = poses.with_columns(reading=units.from_g(poses.reading),
-                               std=units.from_g(poses['std']))
+    poses = poses.with_columns(reading=units.from_g(poses.reading), std=units.from_g(poses['std']))
     return Calibration('10', 'ml', model, units, 'imu_link', 'ros', '2026-01-01T00:00:00+00:00',
                        1e-9 * np.eye(int(np.sum(model.stated))),
                        Quality(30.0, 0.1, 5.0, 0.02, 0.2, 0.1, 1.0, 1.0), poses, (), '', ())
@@ -329,8 +328,7 @@ def test_imu_calib_corrects_as_apply_does(name):
 @pytest.mark.parametrize('name', ['affine', 'in_g', 'counts', 'levelled'])
 def test_imucal_corrects_as_apply_does(name):
     imucal = pytest.importorskip('imucal')
-    gyro = GyroBias(np.array([0.01, -0.02, 0.005]), np.full(3, 1e-4), 12, np.nan, np.zeros(3),
-                    ())
+    gyro = GyroBias(np.array([0.01, -0.02, 0.005]), np.full(3, 1e-4), 12, np.nan, np.zeros(3), ())
     made = replace(HEADERS[name], gyro=gyro)
     reading, _, wanted = samples(made)
     found = imucal.FerrarisCalibrationInfo.from_json(text_of(made, 'imucal'))

@@ -327,6 +327,7 @@ def result_of(line, folder):
     return json.loads(target.read_text(encoding='utf-8'))
 
 
+@pytest.mark.usefixtures('without_pages')
 @pytest.mark.parametrize(('effects', 'kinds'), [
     (COMMON, ['level', 'done']), (HIDDEN, ['refine', 'level', 'done'])])
 @pytest.mark.parametrize('command', ['fit', 'calibrate --no-refine'])

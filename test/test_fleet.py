@@ -455,8 +455,7 @@ def killed(pattern: str, enough: int) -> Callable[[Site], None]:
     def disturb(site: Site) -> None:
         program = subprocess.Popen([sys.executable, *COMMAND,
                                     *site.on_cluster()], stdout=subprocess.DEVNULL)
-        wait(lambda: program.poll() is not None
-             or len([*site.results.glob(pattern)]) >= enough)
+        wait(lambda: program.poll() is not None or len([*site.results.glob(pattern)]) >= enough)
         program.kill()
         # After the last stage it may have been done.
         assert program.wait() == -signal.SIGKILL or pattern == 'sensors.parquet'
@@ -664,8 +663,7 @@ def test_a_recording_that_takes_too_long_is_a_row_with_its_error(
         client: Any, tmp_path: Path) -> None:
     good, store = write_poses(tmp_path / 'a.csv'), Store(tmp_path / 'out')
     long = tmp_path / 'long.csv'
-    long.write_text('time,ax,ay,az\n' + ''.join(
-        f'{k / 100},0,0,9.81\n' for k in range(200_000)))
+    long.write_text('time,ax,ay,az\n' + ''.join(f'{k / 100},0,0,9.81\n' for k in range(200_000)))
     run(client, found_in(good), QUICK, store)
     summary = run(client, found_in(good, long), QUICK, store, limit_s=0.05)
     assert summary.counts == {'skipped': 1, 'unread': 1}

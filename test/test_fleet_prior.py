@@ -5,7 +5,6 @@
 
 from dataclasses import replace
 from pathlib import Path
-import sys
 from typing import Any
 
 from accel_calib.calibrate import fit_poses, fit_with_fleet, FleetPrior
@@ -161,10 +160,9 @@ def test_a_refinement_with_the_fleet_finds_an_effect_beyond_it(fleet: FleetPrior
     assert rms((refined.model.vector - sensor.vector) / deviation) < 2.0
 
 
+@pytest.mark.usefixtures('without_pages')
 def test_the_command_line_refines_with_the_file_of_the_fleet(
-        fleet: FleetPrior, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-        capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setitem(sys.modules, 'matplotlib', None)  # no pages
+        fleet: FleetPrior, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rng = np.random.default_rng(11)
     write_priors(tmp_path / 'fleet.yaml', {name: replace(fleet, model=name) for name in 'AB'})
     for count, effects in ((6, []), (16, ['quadratic'])):

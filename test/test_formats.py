@@ -129,7 +129,7 @@ FRAME = b'\x55\x51' + bytes(8) + b'\x03' + b'\x55\x52' + bytes(8) + b'\x04'
 SHIMMER = bytearray(256)
 SHIMMER[30:37] = b'\0\x03\0\0\0\x02\0'
 NILSPOD = bytes([52, 20, 3, 0, 5, 0x40, 0, 1, 16, 16]) + bytes(300)
-BOMB = gzip.compress(b'time,ax,ay,az\n' + (b'0.01,0,0,9.8' + b' ' * 500 + b'\n') * 120_000)
+BOMB = gzip.compress(b'time,ax,ay,az\n' + (b'0.01,0,0,9.8' + b' ' * 5000 + b'\n') * 12_000)
 
 # Name, content, and words of the refusal.
 REFUSED: list[tuple[str, Any, str]] = [

@@ -276,5 +276,4 @@ def test_poses_of_a_noisier_time_are_marked_and_kept() -> None:
     assert 'doubtful' in calibration.rejected[0].reason
     needed = fit_poses(poses.take(slice(0, 13)), UNITS, model='10')
     assert not needed.rejected
-    assert [each.rows for each in needed.noted if each.kind == 'doubtful'] == [
-        tuple(range(1, 13))]
+    assert [each.rows for each in needed.noted if each.kind == 'doubtful'] == [tuple(range(1, 13))]

@@ -69,8 +69,7 @@ def samples(blocks: Iterator[Floats], count: int) -> Floats:
 
 def received(line: Callable[[int], str], count: int = 300, **options: Any) -> tuple[str, Floats]:
     """Return the unit and reading of the lines of a board, and so many of its samples."""
-    with (board(paced(line)) as port,
-          open_source(port, LogOptions(**options)) as source):
+    with (board(paced(line)) as port, open_source(port, LogOptions(**options)) as source):
         return f'{source.units.name}, {source.read_as}', samples(source.blocks, count)
 
 
@@ -134,8 +133,7 @@ def test_samples_of_a_board_that_starts_again_are_kept() -> None:
     found = received(lambda k: f'{5 * k - 1500 * (k >= 300)},{numbers(k)}\n', 500, columns={
         'time': '1', 'ax': '2', 'ay': '3', 'az': '4'})[1]
     assert np.sum(np.diff(found[:, 0]) < 0.0) == 1
-    assert abs(np.diff(found[:, 0])).sum() == pytest.approx(
-        1.495 + 0.005 * (len(found) - 2))
+    assert abs(np.diff(found[:, 0])).sum() == pytest.approx(1.495 + 0.005 * (len(found) - 2))
 
 
 def test_lines_without_times_get_the_stated_rate() -> None:
@@ -152,8 +150,7 @@ def test_a_rate_is_measured_also_if_lines_are_late_or_follow_a_boot(
         return ('rst:0x1, boot\r\n' * boots if k == 0 else '') + f'{numbers(k)}\n'
 
     monkeypatch.setattr(*HEAD_OF_A_PORT, 2.0)
-    with (board(paced(line, late)) as port,
-          open_source(port, LogOptions()) as source):
+    with (board(paced(line, late)) as port, open_source(port, LogOptions()) as source):
         found = samples(source.blocks, 450)
     assert '(measured)' in source.read_as
     assert np.mean(np.diff(found[:, 0])) == pytest.approx(1.0 / RATE_HZ, rel=0.1)
@@ -275,8 +272,7 @@ def follow(viewer: Viewer, sensor: TurnedSensor) -> None:
 
 def test_a_board_on_a_serial_port_is_calibrated(tmp_path: Path) -> None:
     sensor, stored = TurnedSensor(speed=5.0), tmp_path / 'board.yaml'
-    with (board(lines_of(sensor)) as port,
-          live(port, '-o', str(stored)) as (link, lines, run)):
+    with (board(lines_of(sensor)) as port, live(port, '-o', str(stored)) as (link, lines, run)):
         viewer = Viewer(link)
         follow(viewer, sensor)
         wait(lambda: viewer.of('progress')[-1]['up'])  # also before the zero is fitted

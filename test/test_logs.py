@@ -307,8 +307,7 @@ def test_names_in_a_comment_and_units_in_a_row_below_the_header_are_read(reads: 
     assert 'acc_x/y/z [m/s^2]' in log.read_as
     assert log.units.name == 'm/s2'
     made = samples(per_g=1000.0)
-    log = reads('ms,mg,mg,mg', made['time'] * 1e3, made['reading'],
-                before='time,accX,accY,accZ\n')
+    log = reads('ms,mg,mg,mg', made['time'] * 1e3, made['reading'], before='time,accX,accY,accZ\n')
     assert log.units.name == 'g'
     check(log, made['reading'] / 1e3)
     np.testing.assert_allclose(log.table['time'], made['time'], atol=1e-9)
@@ -454,8 +453,7 @@ def test_stamps_that_contradict_the_stated_rate_are_noted(reads: Reads) -> None:
 def test_the_clock_that_runs_finest_is_read(header: str, first: str, reads: Reads) -> None:
     made = samples()
     coarse = [first.format(f'{int(when) % 60:02d}') for when in made['time']]
-    log = reads(f'{header},accX,accY,accZ', coarse, np.round(made['time'] * 1e3),
-                made['reading'])
+    log = reads(f'{header},accX,accY,accZ', coarse, np.round(made['time'] * 1e3), made['reading'])
     np.testing.assert_allclose(log.table['time'], made['time'], atol=1e-3)
 
 

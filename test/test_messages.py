@@ -114,8 +114,7 @@ def test_a_message_is_corrected_for_the_context_of_its_time(calibration):
 def test_with_a_mounting_all_fields_are_in_one_frame(levelled):
     fields, rotation = fields_of(), levelled.model.rotation
     found = corrected(levelled, fields)
-    np.testing.assert_allclose(found[:, ANGULAR_VELOCITY],
-                               fields[:, ANGULAR_VELOCITY] @ rotation)
+    np.testing.assert_allclose(found[:, ANGULAR_VELOCITY], fields[:, ANGULAR_VELOCITY] @ rotation)
     for part in (ANGULAR_VELOCITY_COVARIANCE, ORIENTATION_COVARIANCE):
         turned, given = found[:, part].reshape(-1, 3, 3), fields[:, part].reshape(-1, 3, 3)
         np.testing.assert_allclose(rotation @ turned @ rotation.T, given, atol=1e-15)
@@ -322,8 +321,7 @@ def test_one_reading_and_its_covariance_are_corrected_as_arrays_are(names, unit,
         np.testing.assert_allclose(found, force[0] * scale, rtol=0, atol=1e-12)
         expected = calibration.force_covariance(force, known)[0] * scale ** 2
         spreads = here.with_spread(found, [0.0] * 9), here.with_spread(found, OWN)
-        np.testing.assert_allclose(np.reshape(spreads[0], (3, 3)), expected, rtol=1e-9,
-                                   atol=1e-18)
+        np.testing.assert_allclose(np.reshape(spreads[0], (3, 3)), expected, rtol=1e-9, atol=1e-18)
         np.testing.assert_allclose(np.subtract(*spreads), -np.array(OWN), atol=1e-18)
 
 

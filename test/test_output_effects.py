@@ -42,8 +42,7 @@ def found(recording, units):
 @pytest.mark.parametrize('limit', [9.0, 9.6])
 def test_a_clipped_recording_has_the_poses_of_the_recording_and_its_limit_is_detected(name, limit):
     recording = read_recording(data(name))
-    whole, poses = (found(each, MPS2)
-                    for each in (recording, limited(recording, -limit, limit)))
+    whole, poses = (found(each, MPS2) for each in (recording, limited(recording, -limit, limit)))
     limit_g = limit / STANDARD_GRAVITY
     assert len(poses) == len(whole) == 21
     free = np.all(np.abs(whole.reading) < limit_g - 0.03, axis=1)

@@ -90,8 +90,7 @@ def test_poses_that_tell_nothing_leave_the_spread_of_common_sensors():
     found = fit_partial(tilting(1, 1)[1], G)
     names = ('offset.x', 'offset.y', 'axis_gain.x', 'axis_gain.y', 'cross_axis.xy')
     which = [found.parameters.index(name) for name in names]
-    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance))[which], SPREAD[which],
-                               rtol=0.05)
+    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance))[which], SPREAD[which], rtol=0.05)
     along = 0.1 * 0.03 / np.hypot(0.1, 0.03)
     assert found.offset_sd[2] == pytest.approx(along, rel=0.1)
 

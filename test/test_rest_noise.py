@@ -35,8 +35,7 @@ def rests(seed, count=24, *, scatter=2e-4, noise=(0.003, 0.002, 0.005), samples=
     if warmth is not None:
         known['temperature'] = warmth
         known['rate'] = rate + np.outer(warmth - np.mean(warmth), slope)
-    return simulate_poses(Model({}), spread_directions(count), rng, samples=samples,
-                          context=known)
+    return simulate_poses(Model({}), spread_directions(count), rng, samples=samples, context=known)
 
 
 def found(poses: Poses) -> GyroBias:

@@ -38,8 +38,7 @@ def test_log_and_markers_report_that_more_poses_no_longer_help() -> None:
     markers = pose_markers(np.zeros((0, 3)), asked, 'imu').markers
     assert [m.text for m in markers if m.ns == 'next'] == [asked.words]
     few = plan_for(poses.take(slice(0, 8)), units_of('g'), 'auto').asked
-    arrow, text = [m for m in pose_markers(np.zeros((0, 3)), few, 'imu').markers
-                   if m.ns == 'next']
+    arrow, text = [m for m in pose_markers(np.zeros((0, 3)), few, 'imu').markers if m.ns == 'next']
     np.testing.assert_allclose([getattr(arrow.points[1], axis) for axis in 'xyz'], few.direction)
     assert text.text == few.words
 

@@ -133,8 +133,7 @@ def test_the_score_counts_values_shapes_choice_and_size():
     assert one.scores_beside[1] == pytest.approx(both.score)
     assert [both.without(block).blocks for block in both.blocks] == [(1,), (0,)]
     left_out = Set.of(linear, (), (0, 1))
-    assert left_out.score == pytest.approx(
-        expected(4.0, 2.0, 2.0 * (2.0 * math.log(40.0) + RARE)))
+    assert left_out.score == pytest.approx(expected(4.0, 2.0, 2.0 * (2.0 * math.log(40.0) + RARE)))
 
 
 NAMES = ('supply_ratio', 'quadratic', 'cubic', 'offset_drift', 'warm_up', 'gain_drift')
@@ -302,8 +301,7 @@ def test_a_pose_left_out_beside_a_walk_is_as_if_it_were_not_there():
 
 @pytest.mark.parametrize('chosen', [(), (0,)])
 @pytest.mark.parametrize('repeats', [1, 3])
-def test_a_held_out_residual_beside_a_walk_is_predicted_by_the_other_orientations(
-        chosen, repeats):
+def test_a_held_out_residual_beside_a_walk_is_predicted_by_the_other_orientations(chosen, repeats):
     rng, ratio = np.random.default_rng(6), 30.0
     base, axes = np.split(np.linalg.qr(rng.normal(size=(15, 5)))[0], [1], axis=1)
     process = Process(axes, 1.0 / np.arange(1, 5) ** 2)

@@ -122,8 +122,7 @@ def test_whatever_is_in_place_of_a_file_is_kept_and_replaced(
     found = kept(path)
     driver = Driver(calibration_file=str(store.calibration))
     assert path.name in driver.logged()
-    assert 'kept as' in driver.logged() or (
-        'is renamed when' in driver.logged() and not of_poses)
+    assert 'kept as' in driver.logged() or ('is renamed when' in driver.logged() and not of_poses)
     assert (driver.session.sensor.calibration is not None) is of_poses
     assert len(driver.session.sensor.live.book.poses()) == (0 if of_poses else 12)
     driver.session.close()

@@ -27,14 +27,19 @@ import pytest
 from rich.console import Console
 from shared import forked, python, random_directions, ROOT, run, run_json
 
+SIMULATE = ('simulate', '--recording', '--poses', '14', '--effect', 'offset=0.02,-0.01,0.03', '-o')
 
-@pytest.fixture
-def poses(tmp_path, capsys):
-    path = tmp_path / 'poses.csv'
-    assert run('simulate', '-o', path, '--effect', 'offset=0.02,-0.01,0.03', '--effect',
-               'axis_gain=0.01,-0.02,0.005', '--temperature', 20, 30) == 0
-    capsys.readouterr()
-    return path
+
+@pytest.fixture(scope='module')
+def files(tmp_path_factory):
+    """Return a folder with a recording, its poses, their calibration, and other poses."""
+    folder = tmp_path_factory.mktemp('files')
+    for line in ((*SIMULATE, folder / 'r.csv'),
+                 ('capture', folder / 'r.csv', '-o', folder / 'p.csv'),
+                 ('fit', folder / 'p.csv', '-o', folder / 'stored.yaml'),
+                 ('simulate', '-o', folder / 'other.csv', '--effect', 'offset=0.09,-0.01,0.03')):
+        assert run(*line) == 0
+    return folder
 
 
 @pytest.fixture
@@ -49,8 +54,9 @@ def printed(monkeypatch, capsys):
 
 
 @pytest.mark.parametrize('columns', [80, 60])
-def test_output_fits_the_width(columns, poses, printed, tmp_path):
-    stored, other, rest = (tmp_path / name for name in ('c.yaml', 'd.yaml', 'rest.csv'))
+def test_output_fits_the_width(columns, files, printed, tmp_path):
+    poses, (stored, other, rest) = files / 'p.csv', (
+        tmp_path / name for name in ('c.yaml', 'd.yaml', 'rest.csv'))
     printed('simulate', '-o', rest, '--recording', '--poses', '1', '--dwell', '600', '--rate',
             '20')
     text = ''.join(printed(*arguments, columns=columns) for arguments in (
@@ -91,10 +97,10 @@ def test_the_verdict_comes_first_and_then_at_most_five_notes(seed, tmp_path, mon
 
 
 @pytest.mark.parametrize('encoding', ['ascii', 'cp1252'])
-def test_output_of_an_old_encoding_has_replacements(encoding, poses, tmp_path, monkeypatch):
+def test_output_of_an_old_encoding_has_replacements(encoding, files, tmp_path, monkeypatch):
     written = io.BytesIO()
     monkeypatch.setattr(sys, 'stdout', io.TextIOWrapper(written, encoding))
-    assert run('fit', poses, '-o', tmp_path / 'c.yaml') == 0
+    assert run('fit', files / 'p.csv', '-o', tmp_path / 'c.yaml') == 0
     sys.stdout.flush()
     text = written.getvalue().decode(encoding)
     assert ('+-' if encoding == 'ascii' else '±') in text
@@ -162,21 +168,12 @@ def _all_of(terminal):
     return text
 
 
-@pytest.fixture
-def worse(poses, tmp_path):
-    """Return a stored calibration, and poses of another sensor."""
-    stored, other = tmp_path / 'c.yaml', tmp_path / 'other.csv'
-    assert run('fit', poses, '-o', stored) == 0
-    assert run('simulate', '-o', other, '--effect', 'offset=0.09,-0.01,0.03') == 0
-    return stored, other
-
-
 @pytest.mark.parametrize(('line', 'verdict', 'colour'), [
-    ('fit poses.csv', 'GOOD', 32), ('verify other.csv -c c.yaml', 'BAD', 31),
-    ('fit poses.csv poses.csv', 'GOOD', 32)])
-def test_the_verdict_has_a_colour_on_a_terminal_only(line, verdict, colour, worse, capsys,
-                                                     monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
+    ('fit p.csv', 'GOOD', 32), ('verify other.csv -c stored.yaml', 'BAD', 31),
+    ('fit p.csv p.csv', 'GOOD', 32)])
+def test_the_verdict_has_a_colour_on_a_terminal_only(line, verdict, colour, files, capsys,
+                                                     monkeypatch):
+    monkeypatch.chdir(files)
     monkeypatch.delenv('NO_COLOR', raising=False)
     assert f'\x1b[1;{colour}m{verdict}\x1b[0m' in on_a_terminal(*line.split())[1]
     _, plain = on_a_terminal(*line.split(), NO_COLOR='1')
@@ -189,16 +186,14 @@ def test_the_verdict_has_a_colour_on_a_terminal_only(line, verdict, colour, wors
     assert '\x1b' not in no_terminal
 
 
-def test_verify_says_why_it_ends_with_1(poses, worse, capsys, monkeypatch):
-    stored, other = worse
-    capsys.readouterr()
+def test_verify_says_why_it_ends_with_1(files, capsys, monkeypatch):
     monkeypatch.setenv('COLUMNS', '300')
-    limited = '-c', stored, '--max', 5
+    other, limited = files / 'other.csv', ('-c', files / 'stored.yaml', '--max', 5)
     status, found = run_json(capsys, 'verify', other, *limited)
     assert (status, found['max_mg'], found['above_max']) == (1, 5.0, True)
-    assert run('verify', poses, *limited) == 0
+    assert run('verify', files / 'p.csv', *limited) == 0
     assert 'above' not in capsys.readouterr().out
-    assert run('verify', poses, other, *limited) == 1
+    assert run('verify', files / 'p.csv', other, *limited) == 1
     why = 'mg is above --max 5 mg: exit status 1'
     lines = [line for line in capsys.readouterr().out.splitlines() if why in line]
     assert [line.split(':')[0] for line in lines] == [str(other)]
@@ -213,19 +208,6 @@ def piped(line, folder):
         env={**os.environ, 'PYTHONPATH': str(ROOT)})
     assert done.returncode == 0, done.stderr
     return done
-
-
-SIMULATE = ('simulate', '--recording', '--poses', '14', '--effect', 'offset=0.02,-0.01,0.03', '-o')
-
-
-@pytest.fixture(scope='module')
-def files(tmp_path_factory):
-    """Return a folder with a recording, its poses and their calibration."""
-    folder = tmp_path_factory.mktemp('files')
-    assert run(*SIMULATE, folder / 'r.csv') == 0
-    assert run('capture', folder / 'r.csv', '-o', folder / 'p.csv') == 0
-    assert run('fit', folder / 'p.csv', '-o', folder / 'stored.yaml') == 0
-    return folder
 
 
 def test_a_log_goes_through_pipes(files, tmp_path):
@@ -364,8 +346,7 @@ def pose_step(*signs: float) -> Progress:
         (replace(FITTED, step=step), words) for step, words in (
             ('refine', 'CALL REFINE'), ('level', 'SET LEVEL'), ('accept', 'ACCEPT'),
             ('done', 'DONE')))])
-def test_every_step_is_shown_in_the_largest_words_that_fit(progress: Progress, words: str
-                                                           ) -> None:
+def test_every_step_is_shown_in_the_largest_words_that_fit(progress: Progress, words: str) -> None:
     large = drawn(screen(NODE, progress))
     assert words not in large
     below = large[large.index('accuracy'):]

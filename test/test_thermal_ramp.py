@@ -39,11 +39,6 @@ from test_log_formats import make
 UNITS = units_of('m/s2')
 
 
-@pytest.fixture
-def without_pages(monkeypatch):
-    monkeypatch.setitem(sys.modules, 'matplotlib', None)
-
-
 def stretches(log: Recording) -> Ramp:
     return ramp_of(cells_of([log], UNITS))
 

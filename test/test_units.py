@@ -181,8 +181,7 @@ def twins(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write a recording in g as a bag and as a table, and its calibration for m/s²."""
     folder = tmp_path_factory.mktemp('twins')
     model = model_with({'offset': [0.03, -0.02, 0.04], 'axis_gain': [0.01, -0.02, 0.005]})
-    made = simulate_recording(model, spread_directions(12), np.random.default_rng(5),
-                              rate_hz=50.0)
+    made = simulate_recording(model, spread_directions(12), np.random.default_rng(5), rate_hz=50.0)
     # The helper writes the readings times 1 g.
     write_bag(folder / 'log', 'sqlite3', made.with_columns(
         reading=made.reading / GRAVITY, temperature=np.full(len(made), 25.0)))
@@ -216,6 +215,7 @@ def test_readings_in_another_unit_are_refused_in_the_same_words(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.usefixtures('without_pages')
 @pytest.mark.parametrize('name', WITH_JSON)
 def test_in_the_unit_that_is_advised_the_results_are_equal(
         name: str, twins: Path, tmp_path: Path) -> None:

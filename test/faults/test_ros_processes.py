@@ -85,8 +85,7 @@ def call_until_killed(bench: Any, node: Any, turned: Any, rng: np.random.Generat
         name = str(rng.choice(COMMANDS))
         client = bench.client(name)
         future = client.call_async(client.srv_type.Request())
-        send_until(bench, turned, lambda future=future: (
-            future.done() or time.monotonic() > ends))
+        send_until(bench, turned, lambda future=future: (future.done() or time.monotonic() > ends))
         if not future.done():
             bench.end(node, signal.SIGKILL)
             return after_kill(states, name)
