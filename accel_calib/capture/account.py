@@ -26,8 +26,8 @@ REASONS: Mapping[str, tuple[str, str]] = MappingProxyType({
     'turning': ('a turn, by the gyro', 'let go of the sensor in each pose'),
     'noisy': ('noise that does not exclude a slow turn', 'hold the sensor still three times as '
               'long in each pose'),
-    'length': ('a length that is not that of gravity', 'check the unit, or accept them with a wider '
-               '--still-norm-tolerance'),
+    'length': ('a length that is not that of gravity', 'check the unit, or accept them with a '
+               'wider --still-norm-tolerance'),
     'repeated': ('an earlier orientation', '')})
 """Why a rest is no pose, and what to do about it."""
 
