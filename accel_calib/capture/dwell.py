@@ -477,12 +477,8 @@ class Tracker:
             self._pause = 0
         chunks = chained(before, chunks)
         self._lead = _NONE
-        self._held = chunks[-1:]
-        return done + self._add(chunks[:-1])
-
-    def _add(self, chunks: Records) -> list[OngoingDwell]:
+        chunks, self._held = chunks[:-1], chunks[-1:]
         assert self._dwell is not None
-        done: list[OngoingDwell] = []
         while self._longest and self._dwell.chunks + len(chunks) >= self._longest:
             room = self._longest - self._dwell.chunks
             self._dwell.add(chunks[:room])
