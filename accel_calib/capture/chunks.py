@@ -158,11 +158,6 @@ def window_type(sums: np.dtype[Any]) -> np.dtype[Any]:
                      ('windows', float)])  # number of windows in that sum
 
 
-def blank(kind: np.dtype[Any], count: int) -> Records:
-    """Return records with all numbers NaN."""
-    return np.full(count * (kind.itemsize // 8), np.nan).view(kind)
-
-
 def chained(*parts: Records) -> Records:
     """Concatenate records; `numpy.concatenate` alone would copy them field by field."""
     filled = [part for part in parts if len(part)] or list(parts[:1])
@@ -188,11 +183,8 @@ def sums_of(samples: Floats, starts: Indices, epoch: float, origin: Floats, kind
     (more). `epoch` and `origin` (6,) are subtracted. Sums of a missing rate are NaN.
 
     """
-    sums = blank(kind, len(starts))
-    for name in ('context_count', 'context_sum', 'at_limit', 'repeats', 'zeros'):
-        sums[name] = 0.0
-    if not len(starts):
-        return sums
+    sums = np.zeros(len(starts), kind)
+    sums['first'] = sums['second'] = np.nan
     reading = samples[1:4]
     same = np.append(False, np.all(reading[:, 1:] == reading[:, :-1], axis=0))
     same[starts] = False
@@ -234,25 +226,17 @@ class Extremes:
 
     def repeated(self, reading: Floats, starts: Indices) -> Floats:
         """Return the (m, 3) samples of each chunk that repeat an extreme; update the extremes."""
-        found = np.zeros((len(starts), 3))
-        if not len(starts):
-            return found
-        highest = np.concatenate([reading.max(axis=1), -reading.min(axis=1)])
+        found, sizes = np.zeros((len(starts), 3)), np.diff(starts, append=reading.shape[1])
+        extreme = np.concatenate([reading.max(axis=1), -reading.min(axis=1)])
         # Most blocks reach no extreme; they need no more than the maximum and the minimum.
-        for k in np.flatnonzero(highest >= self._highest):
+        for k in np.flatnonzero(extreme >= self._highest):
             values = reading[k] if k < 3 else -reading[k - 3]
-            found[:, k % 3] += _repeats(values, starts, self._highest[k])
-        np.maximum(self._highest, highest, out=self._highest)
+            highest = np.maximum.reduceat(values, starts)
+            so_far = np.maximum.accumulate(np.append(self._highest[k], highest))
+            equal = (values == np.repeat(so_far[1:], sizes)).astype(float)
+            found[:, k % 3] += np.add.reduceat(equal, starts) - (highest > so_far[:-1])
+        np.maximum(self._highest, extreme, out=self._highest)
         return found
-
-
-def _repeats(values: Floats, starts: Indices, before: float) -> Floats:
-    """Return the (m,) numbers of values in chunks that repeat the maximum so far."""
-    highest = np.maximum.reduceat(values, starts)
-    so_far = np.maximum.accumulate(np.concatenate([[before], highest]))
-    sizes = np.diff(starts, append=len(values))
-    equal = np.add.reduceat((values == np.repeat(so_far[1:], sizes)).astype(float), starts)
-    return np.asarray(equal - (highest > so_far[:-1]))
 
 
 _LEARN = 16  # intervals from which the period is estimated
@@ -262,7 +246,6 @@ _MISSING_PERIODS = 5.0
 _BACK_SECONDS = 0.01  # a step back by less, or by less than _BACK_PERIODS, is jitter
 _BACK_PERIODS = 2.0
 _INTERRUPTIONS_MAX = 10_000
-_NONE: Floats = np.empty((4, 0))
 _PENDING_MAX = 200_000  # largest number of samples in a chunk; with more, the clock has stopped
 
 
@@ -323,16 +306,13 @@ class Chunker:
     def __init__(self, settings: CaptureSettings, columns: int) -> None:
         self._kind = sums_type(columns)
         self._shortest = settings.still_window / CHUNKS_PER_WINDOW
-        self._pending: Floats = _NONE
         self._least = [np.inf, np.inf]
         self._extremes = Extremes()
-        self._origin: Floats | None = None
-        self._period = -1.0
-        self._length = 0.0
-        self._epoch = 0.0
-        self._latest = 0.0
-        self.fresh = True  # the present segment has no chunk yet
+        self._origin: Floats = np.empty(0)
+        self._length = self._epoch = self._latest = self._period = 0.0
+        self._pending: Floats = np.empty(0)
         self.interruptions: deque[Interruption] = deque(maxlen=_INTERRUPTIONS_MAX)
+        self.restart()
 
     def feed(self, samples: Floats, last: bool) -> list[Chunks]:
         """
@@ -342,29 +322,32 @@ class Chunker:
 
         """
         pending = _joined(self._pending, samples)
-        if self._origin is None and pending.size:
+        if not self._origin.size and pending.size:
             first = np.nan_to_num(pending[1:7, 0])
             self._origin = np.pad(first, (0, 6 - len(first)))
         done: list[Chunks] = []
         while self._learned(pending[0], last):
             cut, in_order = self._first_break(pending[0])
-            chunks, rest = self._split(pending[:, :cut], in_order)
-            if len(chunks.begin):
-                done.append(chunks)
+            edges = self._edges(pending[0, :cut], in_order)
+            if edges[-1]:
+                done.append(self._chunks(pending[:, :edges[-1]], edges[:-1]))
                 self.fresh = False
             if cut == pending.shape[1]:
-                pending = rest
+                pending = pending[:, edges[-1]:]
                 break
             pending = pending[:, cut:]
             self.restart()
-        self._pending = self._bounded(pending)
+        self._pending = pending
+        if pending.shape[1] > _PENDING_MAX and self._period >= 0.0:
+            self.interruptions.append(Interruption(self._latest, 'stopped', 0.0))
+            self.restart()
         return done
 
     def restart(self) -> None:
         """Start a new segment with the next sample."""
-        self._pending = _NONE
+        self._pending = np.empty((4, 0))
         self._period = -1.0
-        self.fresh = True
+        self.fresh = True  # the present segment has no chunk yet
 
     def _learned(self, time: Floats, last: bool) -> bool:
         if self._period >= 0.0:
@@ -396,40 +379,27 @@ class Chunker:
             float(before[cut]), 'gap' if step[cut] > 0.0 else 'jump_back', float(step[cut])))
         return cut, False
 
-    def _split(self, samples: Floats, in_order: bool) -> tuple[Chunks, Floats]:
-        latest = samples[0]
+    def _edges(self, time: Floats, in_order: bool) -> Indices:
+        """Return the index of the first sample of each chunk; the last one is not complete."""
         if not in_order:
-            latest = np.maximum.accumulate(np.concatenate([[self._latest], latest]))[1:]
-        index = np.floor((latest - self._epoch) / self._length)
+            time = np.maximum.accumulate(np.append(self._latest, time))[1:]
+        index = np.floor((time - self._epoch) / self._length)
         edges = np.flatnonzero(index[1:] != index[:-1]) + 1
-        whole = int(edges[-1]) if len(edges) else 0
-        if whole:
-            self._latest = float(latest[whole - 1])
-        starts = np.concatenate([[0], edges])[:-1].astype(np.intp)
-        return self._chunks(samples[:, :whole], starts), samples[:, whole:]
+        if len(edges):
+            self._latest = float(time[edges[-1] - 1])
+        return np.append(0, edges)
 
     def _chunks(self, samples: Floats, starts: Indices) -> Chunks:
-        assert self._origin is not None
-        ends = np.append(starts[1:], samples.shape[1]) - 1 if len(starts) else starts
+        ends = np.append(starts[1:], samples.shape[1]) - 1
         sums = sums_of(samples, starts, self._epoch, self._origin, self._kind)
         sums['at_limit'] = self._extremes.repeated(samples[1:4], starts)
-        return Chunks(sums, samples[0, starts], samples[0, ends], self._steps(samples, starts),
-                      self._epoch, self._origin, self._length, self._period, self.fresh)
-
-    def _steps(self, samples: Floats, starts: Indices) -> Floats:
         step = np.full((2, len(starts)), np.inf)
         for which, rows in enumerate((slice(1, 4), slice(4, 7))):
-            if len(samples) >= rows.stop and len(starts):
+            if len(samples) >= rows.stop:
                 step[which] = smallest_steps(samples[rows], starts, self._least[which])
                 self._least[which] = min(self._least[which], float(step[which].min()))
-        return step
-
-    def _bounded(self, pending: Floats) -> Floats:
-        if pending.shape[1] <= _PENDING_MAX or self._period < 0.0:
-            return pending
-        self.interruptions.append(Interruption(self._latest, 'stopped', 0.0))
-        self.restart()
-        return _NONE
+        return Chunks(sums, samples[0, starts], samples[0, ends], step, self._epoch, self._origin,
+                      self._length, self._period, self.fresh)
 
 
 def _joined(one: Floats, other: Floats) -> Floats:

@@ -81,7 +81,9 @@ class StillDetector:
             be finite; NaN marks other missing values.
 
         """
-        found = self._last(self.add([_columns(samples)]))
+        known = np.any(~np.isnan(samples), axis=0)
+        rows = len(known) if known[MOTION:].any() else MOTION if known[4:MOTION].any() else 4
+        found = self._last(self.add([np.ascontiguousarray(samples[:, :rows].T)]))
         self._rule.least = self.least
         return found
 
@@ -227,13 +229,6 @@ class StillDetector:
             self._missing.append(Rest(begin, float(each['end']), kind))
 
 
-def _columns(samples: Floats) -> Floats:
-    """Return (n, 7 + k) samples as rows, without missing columns at the end."""
-    known: NDArray[np.bool_] = np.any(~np.isnan(samples), axis=0)
-    rows = len(known) if known[MOTION:].any() else MOTION if known[4:MOTION].any() else 4
-    return np.ascontiguousarray(samples[:, :rows].T)
-
-
 @dataclass(frozen=True)
 class Captured:
     """
@@ -305,12 +300,11 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
         reason='repeated') for each in every]
     interruptions = detector.interruptions
     seconds = times[-1] - times[0] if times else 0.0
-    poses = replace(poses_from(dwells, settings), **about)
-    return Captured(poses, sum(each.samples for each in dwells),
-                    detector.threshold, seconds - sum(each.seconds for each in interruptions),
-                    interruptions, recorded, detector.quietest,
-                    tuple(sorted((*rests, *detector.missing))), detector.lengths,
-                    detector.least)
+    return Captured(
+        replace(poses_from(dwells, settings), **about), sum(each.samples for each in dwells),
+        detector.threshold, seconds - sum(each.seconds for each in interruptions), interruptions,
+        recorded, detector.quietest, tuple(sorted((*rests, *detector.missing))), detector.lengths,
+        detector.least)
 
 
 def samples_of(recording: Recording, start: int, stop: int, context: Sequence[str] = CONTEXT
@@ -379,13 +373,18 @@ def select(dwells: Sequence[Dwell], settings: CaptureSettings, units: Units) -> 
     """Keep, merge or refuse repeated dwells, as set; doubtful dwells are kept."""
     if settings.repeated == 'keep':
         return list(dwells)
-    radius = _radius([each.mean for each in dwells], units)
-    kept: list[Dwell] = []
+    radius, kept = units.per_g, list[Dwell]()
+    if units.is_native and dwells:
+        radius = 0.5 * float(np.ptp([each.mean for each in dwells], axis=0).max())
+    reach = 2.0 * radius * np.sin(0.5 * settings.min_pose_angle)
     for dwell in dwells:
-        near = None if dwell.doubtful else _nearest(dwell, kept, radius, settings)
-        if near is None:
+        far = [float(np.linalg.norm(dwell.mean - each.mean))
+               if each.orientation != dwell.orientation and not each.doubtful else np.inf
+               for each in kept]
+        if dwell.doubtful or min(far, default=np.inf) >= reach:
             kept.append(dwell)
         elif settings.repeated == 'merge':
+            near = int(np.argmin(far))
             kept[near] = merged(kept[near], dwell, units)
     return kept
 
@@ -409,19 +408,3 @@ def merged(first: Dwell, second: Dwell, units: Units) -> Dwell:
     return replace(first, end=second.end, mean=mean, std=noise * np.sqrt(count), count=count,
                    time=share * first.time + (1.0 - share) * second.time,
                    samples=samples, context=context, rate_std=rate_std)
-
-
-def _radius(means: Sequence[Floats], units: Units) -> float:
-    if not units.is_native:
-        return units.per_g
-    return 0.5 * float(np.ptp(np.array(means), axis=0).max()) if means else 0.0
-
-
-def _nearest(dwell: Dwell, others: Sequence[Dwell], radius: float, settings: CaptureSettings
-             ) -> int | None:
-    """Return the index of the nearest other dwell within ``min_pose_angle``, or None."""
-    far = [float(np.linalg.norm(dwell.mean - each.mean))
-           if each.orientation != dwell.orientation and not each.doubtful else np.inf
-           for each in others]
-    reach = 2.0 * radius * np.sin(0.5 * settings.min_pose_angle)
-    return int(np.argmin(far)) if far and min(far) < reach else None

@@ -111,13 +111,6 @@ def figures(dwells: Sequence[OngoingDwell], *, known_units: bool) -> Records:
     return found
 
 
-def trend_of(found: Records) -> Trend:
-    """Return the slopes over whole dwells, with their significance."""
-    line = Line(found['slope'].T, found['square'].T, found['neighbours'].T, found['time_square'],
-                found['cells'])
-    return strength_of(line, found['spacing'], found['white'].T)
-
-
 def _add_noise(found: Records, dwells: Sequence[OngoingDwell], variance: Floats, level: Floats,
                known_units: bool) -> None:
     """Set the figures that depend on the means of cells."""
@@ -243,13 +236,16 @@ def judged(table: Records, rule: Rule, context: Sequence[str], first: int = 0) -
     All dwells of the table of `figures` are used. `context` names its columns of context.
 
     """
-    slopes, means = trend_of(table), table['mean'][:, :3]
+    line = Line(table['slope'].T, table['square'].T, table['neighbours'].T, table['time_square'],
+                table['cells'])
+    slopes, means = strength_of(line, table['spacing'], table['white'].T), table['mean'][:, :3]
     frozen = np.zeros(len(table), bool) if rule.repeats else np.all(
         table['std'] <= RELATIVE * np.linalg.norm(means, axis=1)[:, np.newaxis], axis=1)
     limit = rule.limit_of(rule.noise_of(table['mean'].T), DWELL_RATIO, DWELL_RATE_RATIO)
     turned = np.ptp(means, axis=0) > _STUCK * np.max(np.abs(means))  # else an axis is stuck
     usual = np.median(table['std'], axis=0)
-    quieter = (table['std'] < _QUIETER * usual) & (usual > rule.step)
+    step, rate_step = rule.steps
+    quieter = (table['std'] < _QUIETER * usual) & (usual > step)
     ends = np.any((table['at_limit'] > _AT_LIMIT) & turned & quieter, axis=1)
     reasons = {'short': table['short'], 'frozen': frozen,
                'shaking': np.any(limit < table['lowest'].T, axis=0),
@@ -264,7 +260,7 @@ def judged(table: Records, rule: Rule, context: Sequence[str], first: int = 0) -
     reasons['length'][good] = ~rule.reads_gravity(means[good])
     level = table['average'][quiet, :3].sum(axis=0) / (1.0 + quiet.sum())
     std, count = _counts(table[first:], excess[first:], level, rule)
-    rate_std = np.maximum(np.sqrt(table['average'][first:, 3:]), rule.rate_resolution)
+    rate_std = np.maximum(np.sqrt(table['average'][first:, 3:]), rate_step / math.sqrt(12.0))
     reason = np.select(list(reasons.values()), list(reasons), '')[first:].tolist()
     return [_dwell(context, *each) for each in zip(
         table[first:], std.T.copy(), count.tolist(), rate_std, reason, ends[first:].tolist(),
@@ -365,22 +361,19 @@ class OngoingDwell:
         self.begin = self.begin if self.chunks else float(chunks['begin'][0])
         self.end = float(chunks['end'][-1])
         self.chunks += len(chunks)
-        sums = chunks['sums'].copy()
-        while len(sums):
+        left = chunks['sums'].copy()
+        while len(left):
             room = (2 * CELLS - len(self.cells)) * self.size - len(self._partial)
-            self._append(sums[:room])
-            sums = sums[room:]
-
-    def _append(self, sums: Records) -> None:
-        if self.size > 1:
-            sums = chained(self._partial, sums)
-            whole = len(sums) // self.size * self.size
-            self._partial = sums[whole:]
-            sums = summed(sums[:whole], self.size) if whole else sums[:0]
-        self.cells = chained(self.cells, sums)
-        if len(self.cells) == 2 * CELLS:
-            self.cells = summed(self.cells, 2)
-            self.size *= 2
+            sums, left = left[:room], left[room:]
+            if self.size > 1:
+                sums = chained(self._partial, sums)
+                whole = len(sums) // self.size * self.size
+                self._partial = sums[whole:]
+                sums = summed(sums[:whole], self.size) if whole else sums[:0]
+            self.cells = chained(self.cells, sums)
+            if len(self.cells) == 2 * CELLS:
+                self.cells = summed(self.cells, 2)
+                self.size *= 2
 
     def total(self) -> Records:
         """Return the sum of all chunks, one record."""
@@ -484,12 +477,8 @@ class Tracker:
             self._pause = 0
         chunks = chained(before, chunks)
         self._lead = _NONE
-        self._held = chunks[-1:]
-        return done + self._add(chunks[:-1])
-
-    def _add(self, chunks: Records) -> list[OngoingDwell]:
+        chunks, self._held = chunks[:-1], chunks[-1:]
         assert self._dwell is not None
-        done: list[OngoingDwell] = []
         while self._longest and self._dwell.chunks + len(chunks) >= self._longest:
             room = self._longest - self._dwell.chunks
             self._dwell.add(chunks[:room])

@@ -159,7 +159,12 @@ def ramp_of(cells: Poses) -> Ramp:
     stretches, warm_rate = _averaged(cells.take(np.isfinite(cells['temperature']) & still))
     _check_jumps(stretches)
     slow = np.abs(warm_rate) * 60.0 <= FASTEST
-    _check_rate(stretches, warm_rate, slow)
+    if np.sum(slow) < _LEAST_STRETCHES or np.ptp(stretches['temperature'][slow]) < LEAST_RANGE:
+        raise InputError(
+            f'the ramp is too fast for the thermometer: the temperature changes by up to '
+            f'{np.max(np.abs(warm_rate)) * 60.0:.0f} °C/min, expected at most {FASTEST:g} °C/min '
+            f'over a range of {LEAST_RANGE:g} °C', 'put the board into a closed box while it '
+            'warms up')
     notes = []
     if not np.all(still):
         notes.append(f'{counted(int(np.sum(~still)), "second")} left out, in which the board '
@@ -219,20 +224,15 @@ def _averaged(cells: Poses) -> tuple[Poses, Floats]:
     noise = np.sqrt(np.median(bend ** 2, axis=0) / _MEDIAN_CHI2 / 6.0)
     columns = {'time': moment, 'reading': reading, 'temperature': warm, 'count': count,
                'std': noise * np.sqrt(count)[:, np.newaxis]}
-    return Poses(columns, numbered(columns), 'g', cells.sensor, cells.autopilot), _rate(
-        moment, warm)
+    step = max(round(_RATE_OVER_S / 2.0 / float(np.median(np.diff(moment)))), 1)
+    place = np.arange(len(moment))
+    low, high = np.maximum(place - step, 0), np.minimum(place + step, len(moment) - 1)
+    rate = (warm[high] - warm[low]) / (moment[high] - moment[low])
+    return Poses(columns, numbered(columns), 'g', cells.sensor, cells.autopilot), rate
 
 
 _MEDIAN_CHI2 = 0.4549
 """Median of the square of a normal variable."""
-
-
-def _rate(time: Floats, temperature: Floats) -> Floats:
-    """Return the rate of the temperature over about a minute, or two neighbours [°C/s]."""
-    step = max(round(_RATE_OVER_S / 2.0 / float(np.median(np.diff(time)))), 1)
-    low = np.maximum(np.arange(len(time)) - step, 0)
-    high = np.minimum(np.arange(len(time)) + step, len(time) - 1)
-    return np.asarray((temperature[high] - temperature[low]) / (time[high] - time[low]))
 
 
 def _check_jumps(stretches: Poses) -> None:
@@ -251,13 +251,3 @@ def _check_jumps(stretches: Poses) -> None:
         raise _moved(float(stretches['time'][at + k] - stretches['time'][0]),
                      f'the readings jump by {jump[at] * MG:.1f} mg, which the temperature does '
                      'not explain')
-
-
-def _check_rate(stretches: Poses, rate: Floats, slow: NDArray[np.bool_]) -> None:
-    warm = stretches['temperature'][slow]
-    if np.sum(slow) >= _LEAST_STRETCHES and np.ptp(warm) >= LEAST_RANGE:
-        return
-    raise InputError(
-        f'the ramp is too fast for the thermometer: the temperature changes by up to '
-        f'{np.max(np.abs(rate)) * 60.0:.0f} °C/min, expected at most {FASTEST:g} °C/min over a '
-        f'range of {LEAST_RANGE:g} °C', 'put the board into a closed box while it warms up')

@@ -50,8 +50,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .chunks import (
-    blank, CaptureSettings, chained, Chunks, CHUNKS_PER_WINDOW, Records, window_type)
+from .chunks import CaptureSettings, chained, Chunks, CHUNKS_PER_WINDOW, Records, window_type
 from .levels import Levels
 from .trend import (
     Columns, columns_of, oscillation, sliding_max, sliding_sum, Stretch, stretch, Trend, windows)
@@ -210,9 +209,10 @@ class Rule:
             self._lowest, self._highest, self._floor[:3]))
 
     @property
-    def step(self) -> float:
-        """Return the smallest step between successive readings, 0 before the first one."""
-        return float(self._step[0]) if math.isfinite(self._step[0]) else 0.0
+    def steps(self) -> tuple[float, float]:
+        """Return the smallest steps between successive readings, and rates; 0 before the first."""
+        reading, rate = np.where(np.isfinite(self._step), self._step, 0.0).tolist()
+        return reading, rate
 
     @property
     def _floor(self) -> Floats:
@@ -233,17 +233,11 @@ class Rule:
         samples over many dwells. The std is always above 0.
 
         """
-        step = self.step
+        step, _ = self.steps
         tiny = RELATIVE * np.sqrt(np.sum(mean**2, axis=0))
         resolution = np.maximum(step / math.sqrt(12.0), tiny)
         left = step**2 * rounding_left(level / step**2) if step > 0.0 else np.zeros(3)
         return resolution, np.maximum(left[:, np.newaxis], 1e-2 * tiny**2)
-
-    @property
-    def rate_resolution(self) -> float:
-        """Return the standard deviation of the rounding error of a rate; 0 without steps."""
-        step = float(self._step[1])
-        return step / math.sqrt(12.0) if math.isfinite(step) else 0.0
 
     def limit_of(self, noise: Floats, ratio: float = VARIANCE_RATIO,
                  rate_ratio: float = RATE_RATIO) -> Floats:
@@ -261,7 +255,8 @@ class Rule:
     def feed(self, chunks: Chunks) -> Records:
         """Apply the rule to consecutive chunks, and return records of a `judged_type`."""
         if chunks.fresh:
-            self._before = blank(chunks.sums.dtype, HORIZON - 1)
+            kind = chunks.sums.dtype
+            self._before = np.full((HORIZON - 1) * (kind.itemsize // 8), np.nan).view(kind)
         sums = chained(self._before, chunks.sums)
         self._before = sums[len(sums) - HORIZON + 1:].copy()
         if self._axes == 3 and np.isfinite(sums['first'][:, 3]).any():
@@ -276,20 +271,20 @@ class Rule:
         gaps = (zero, zero + equal, np.where(level[3:] == 0.0, 1.0, 0.0))
         noise, varied = self._learn(seen[LONG], mean, chunks.step, *(
             sliding_max(each, LONG - CHUNKS_PER_WINDOW + 1)[..., -size:] > 0.0 for each in gaps))
-        kind = np.where(zero[-size:] > 0.0, 1, np.where((equal[-size:] > 0.0) & varied, 2, 0))
+        missing = np.where(zero[-size:] > 0.0, 1, np.where((equal[-size:] > 0.0) & varied, 2, 0))
         quiet = np.all(QUIETER * recent[:3] < self._given[:3, np.newaxis], axis=0)
-        kind[quiet & (kind == 0) & np.any(recent[:3] > 0.0, axis=0)] = 3
-        missing = kind > 0
+        missing[quiet & (missing == 0) & np.any(recent[:3] > 0.0, axis=0)] = 3
+        measured = missing == 0
         self.quietest = float(np.fmin.reduce(
-            recent[:3].max(axis=0)[~missing], initial=self.quietest))
+            recent[:3].max(axis=0)[measured], initial=self.quietest))
         scale = self._scales(
-            mean, ~missing & np.all(recent <= self.limit_of(noise), axis=0), noise)
+            mean, measured & np.all(recent <= self.limit_of(noise), axis=0), noise)
         limit = self.limit_of(at_least_any(noise, scale))
         judged = judged_chunks(chunks, recent, limit)
-        judged['missing'] = kind
+        judged['missing'] = missing
         judged['trending'] = self._trending(seen, mean, limit, scale)
         judged['still'] = (self._quiet(mean, recent, limit) & (judged['trending'] == 0)
-                           & ~missing)
+                           & measured)
         return judged
 
     def moved(self, found: Trend, scale: Floats, variance: Floats,

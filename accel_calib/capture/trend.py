@@ -234,22 +234,19 @@ def excess_of_means(centred: Floats, sizes: Floats, white: Floats) -> Floats:
     """
     axes = white > 0.0
     scaled = centred / np.sqrt(np.where(axes, white, np.inf))[:, :, np.newaxis]
-    covariance = _autocovariance(scaled, sizes, np.maximum(axes.sum(axis=0), 1))
-    found = _long_run(covariance, sizes)
+    # The autocovariances are computed by a Fourier transform with zero padding.
+    length = centred.shape[2]
+    padded = 1 << (2 * length - 1).bit_length()
+    power = np.sum(np.abs(np.fft.rfft(scaled, padded, axis=2))**2, axis=0)
+    lags = np.arange(max(length // 2, 2))
+    terms = np.maximum(sizes[:, np.newaxis] - lags, 1.0) * np.maximum(
+        axes.sum(axis=0), 1)[:, np.newaxis]
+    found = _long_run(np.fft.irfft(power, padded, axis=1)[:, lags] / terms, sizes)
     return np.where(axes.any(axis=0) & (sizes >= 4), found, 1.0)
 
 
-def _autocovariance(centred: Floats, sizes: Floats, axes: Floats) -> Floats:
-    """Return (k, lags) autocovariances, by a Fourier transform with zero padding."""
-    length = centred.shape[2]
-    padded = 1 << (2 * length - 1).bit_length()
-    power = np.sum(np.abs(np.fft.rfft(centred, padded, axis=2))**2, axis=0)
-    lags = np.arange(max(length // 2, 2))
-    terms = np.maximum(sizes[:, np.newaxis] - lags, 1.0)
-    return np.asarray(np.fft.irfft(power, padded, axis=1)[:, lags] / (terms * axes[:, np.newaxis]))
-
-
 def _long_run(covariance: Floats, sizes: Floats) -> Floats:
+    """Return the sum of (k, lags) autocovariances; see the module."""
     pairs = covariance[:, 0:-1:2] + covariance[:, 1::2]
     usable = np.arange(pairs.shape[1]) < (sizes // 2 // 2)[:, np.newaxis]
     kept = np.logical_and.accumulate((pairs > 0.0) & usable, axis=1)

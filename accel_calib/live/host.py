@@ -21,7 +21,6 @@ from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache
-import math
 from queue import Empty, SimpleQueue
 import re
 from time import monotonic, time
@@ -38,7 +37,7 @@ from ..messages.one_reading import Triple
 from ..report import calibration_page, STORED
 from ..session import (
     Answer, BATCH, CalibratorSettings, CallSoon, checks, Commands, Compute, Event, Level, Log,
-    Result, Session, Severity, ShowPoses, state, Task, title, words_of_state, Worker)
+    LogFilter, Result, Session, Severity, ShowPoses, state, Task, title, words_of_state, Worker)
 from ..stored.exports import export, Exported
 from ..table import Floats
 
@@ -250,7 +249,7 @@ class Host:
         self._source, self._print = source, log
         self._tasks: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._waiting: list[Floats] = []
-        self._passed = self._ticked = self._shown = -math.inf
+        self._due = LogFilter()
         self.session = Session(settings, source.name)
         self.session.found = source.findings
         self.session.publishers = None
@@ -319,25 +318,16 @@ class Host:
                 self._tasks.get(timeout=wait)()
             while True:
                 self._tasks.get_nowait()()
-        now = monotonic()
-        if now - self._passed >= BATCH:
-            self._passed = now
+        if self._due.passes('batch', BATCH):
             self._flush()
-        if now - self._ticked >= _TICK:
-            self._ticked = now
+        if self._due.passes('tick', _TICK):
             if not self.exchange.problem:
                 self.session.tick()
                 self._worker.handle_events()
             self.exchange.show_state()
-        if now - self._shown >= PERIOD:
-            self._shown = now
-            self.exchange.show_progress(self._newest())
-
-    def _newest(self) -> Triple | None:
-        if not self._waiting:
-            return None
-        x, y, z = self._waiting[-1][-1, 1:4].tolist()
-        return x, y, z
+        if self._due.passes('progress', PERIOD):
+            self.exchange.show_progress(
+                tuple(self._waiting[-1][-1, 1:4].tolist()) if self._waiting else None)
 
     def _flush(self) -> None:
         if self._waiting:

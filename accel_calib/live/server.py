@@ -17,7 +17,6 @@ from __future__ import annotations
 import asyncio
 from collections import Counter, deque
 from concurrent.futures import Future
-from dataclasses import dataclass
 import hmac
 from ipaddress import ip_address
 from itertools import takewhile
@@ -112,23 +111,16 @@ class Board:
                             for key in ('time', 'length', 'corrected')}}
 
 
-@dataclass(frozen=True)
 class Address:
-    """The port, names and versions of IP by which a browser may call this server."""
+    """The port, names and versions of IP by which a browser may call what listens on sockets."""
 
-    port: int
-    hosts: frozenset[str]
-    versions: frozenset[int]
-
-    @classmethod
-    def of(cls, sockets: Iterable[socket.socket]) -> Address:
-        """Return the address of a server that listens on these sockets."""
+    def __init__(self, sockets: Iterable[socket.socket]) -> None:
         bound = [each.getsockname() for each in sockets]
         own = socket.gethostname().lower()
         names = {own, own.split('.')[0]}
-        return cls(bound[0][1],
-                   frozenset({'localhost', *names, *(f'{name}.local' for name in names)}),
-                   frozenset(ip_address(each[0].split('%')[0]).version for each in bound))
+        self.port: int = bound[0][1]
+        self._hosts = {'localhost', *names, *(f'{name}.local' for name in names)}
+        self._versions = {ip_address(each[0].split('%')[0]).version for each in bound}
 
     def refusal(self, request: web.BaseRequest) -> str:
         """Return why a request is refused by its Host or Origin; empty if it is not."""
@@ -149,9 +141,9 @@ class Address:
         if port != self.port or '@' in host or parts.path or parts.query or parts.fragment:
             return False
         try:
-            return ip_address(name).version in self.versions
+            return ip_address(name).version in self._versions
         except ValueError:
-            return name in self.hosts
+            return name in self._hosts
 
 
 class PageServer:
@@ -181,7 +173,6 @@ class PageServer:
         self._new: list[Viewer] = []
         self._connections: list[Connection] = []
         self._reported, self._filter = Counter[str](), LogFilter()
-        self._address = Address(port, frozenset(), frozenset())
         self._files = {f'/page/{each.name}': each for each in PAGE.parent.iterdir()
                        if each.suffix in _KINDS}
         self._files['/'] = PAGE
@@ -251,7 +242,7 @@ class PageServer:
         except Exception as error:  # `start` raises it, in its own thread
             started.set_exception(error)
             return
-        self._address = Address.of(listener.sockets)
+        self._address = Address(listener.sockets)
         self._port = self._address.port
         self._over = asyncio.Event()
         started.set_result(None)

@@ -342,17 +342,8 @@ def _alone(session: Session, step: Parse) -> Part[Any]:
 
 
 def _rest(session: Session) -> Dwell:
-    """Return the ongoing rest; InputError if there is none."""
-    _check_fresh(session)
-    rest = session.sensor.live.detector.current()
-    if rest is None:
-        raise _not_still(session)
-    return rest
-
-
-def _check_fresh(session: Session) -> None:
-    """Check that the last message is recent, and that its stamp is."""
-    statistics = session.statistics
+    """Return the ongoing rest; InputError if there is none, or no recent message."""
+    statistics, settings, live = session.statistics, session.settings, session.sensor.live
     if not statistics.messages:
         raise InputError('there is no Imu message yet', 'start the driver')
     if statistics.age > _OLD:
@@ -362,19 +353,19 @@ def _check_fresh(session: Session) -> None:
         raise InputError(f'the stamps have not changed for {statistics.stopped:.1f} s '
                          f'({statistics.stamp:.3f} s), expected the time of each reading',
                          'set header.stamp in the driver')
-
-
-def _not_still(session: Session) -> InputError:
-    least, length = session.settings.min_dwell, session.statistics.length_g(session.units)
-    if abs(length - 1.0) > session.settings.still_norm_tolerance:
-        return InputError(f'|a| is {length:.3g} g, expected about 1 g at rest',
-                          'hold the sensor still; if it is still, restart the node with the '
-                          'right units')
-    if not session.sensor.live.still:
-        return InputError('the sensor is not still', f'hold it still for {least:g} s, and '
-                          'check ~/still')
-    return InputError(f'the sensor has been still for less than {least:g} s',
-                      'hold it still for longer')
+    rest = live.detector.current()
+    if rest is not None:
+        return rest
+    length = statistics.length_g(session.units)
+    if abs(length - 1.0) > settings.still_norm_tolerance:
+        raise InputError(f'|a| is {length:.3g} g, expected about 1 g at rest',
+                         'hold the sensor still; if it is still, restart the node with the '
+                         'right units')
+    if not live.still:
+        raise InputError('the sensor is not still', f'hold it still for {settings.min_dwell:g} s, '
+                         'and check ~/still')
+    raise InputError(f'the sensor has been still for less than {settings.min_dwell:g} s',
+                     'hold it still for longer')
 
 
 # ----------------------------------------------------------------------------- computations

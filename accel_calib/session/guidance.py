@@ -15,6 +15,7 @@ therefore stays the same, although the average of its pose still changes.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 import math
 from typing import TYPE_CHECKING
@@ -74,7 +75,10 @@ def plan_for(poses: Poses, units: Units, model: str) -> Plan:
     were asked for. Otherwise the same pose would be asked for again.
 
     """
-    up = _poses_up(poses, units)
+    up: Floats = np.zeros((0, 3))
+    if not units.is_native or len(poses) >= _FEWEST_NATIVE:
+        with suppress(RefusedFitError):
+            up = directions_of(poses, units)
     noise, noise_g = pose_noise(poses.noise, up), None
     if noise is not None and len(noise) and not units.is_native:
         noise_g = float(np.median(units.to_g(noise)))
@@ -90,22 +94,18 @@ def plan_for(poses: Poses, units: Units, model: str) -> Plan:
                 coverage(up) if len(up) else 0.0, tuple(zero))
 
 
-def _poses_up(poses: Poses, units: Units) -> Floats:
-    """Return the `up` of a `Plan`."""
-    if units.is_native and len(poses) < _FEWEST_NATIVE:
-        return np.zeros((0, 3))
-    try:
-        return directions_of(poses, units)
-    except RefusedFitError:
-        return np.zeros((0, 3))
-
-
 class Guide:
-    """The next pose, and the lines about captured poses."""
+    """
+    The next pose, and the lines about captured poses.
+
+    `planned` are the poses of a refinement that are still asked for, () once all are taken; None:
+    the poses are for a fit.
+
+    """
 
     def __init__(self) -> None:
         self._plan: Plan | None = None
-        self._planned: tuple[PlannedPose, ...] | None = None  # of a refinement; none left: ()
+        self.planned: tuple[PlannedPose, ...] | None = None
         self._begun = 0
         self._count = 0
         self._new_at = math.inf
@@ -115,37 +115,32 @@ class Guide:
     @property
     def plan(self) -> Plan | None:
         """Return the next pose, or that of a followed refinement; None before the first choice."""
-        if self._plan is None or not self._planned:
+        if self._plan is None or not self.planned:
             return self._plan
-        first, plan = self._planned[0], self._plan
+        first, plan = self.planned[0], self._plan
         where = f' {first.conditions}' if first.conditions else ''
         return replace(plan, asked=NextPose(
             np.array(first.up), f'hold {first.words}{where}, {first.purpose}', plan.asked.error,
-            plan.poses + len(self._planned), fits=False))
+            plan.poses + len(self.planned), fits=False))
 
     @plan.setter
     def plan(self, plan: Plan | None) -> None:
         self._plan = plan
         if plan is None or plan.poses < self._begun:
-            self._planned = None
-        elif self._planned:
+            self.planned = None
+        elif self.planned:
             new = plan.up[self._begun:]
-            self._planned = tuple(
-                each for each in self._planned if not np.any(new @ each.up >= _TAKEN))
+            self.planned = tuple(
+                each for each in self.planned if not np.any(new @ each.up >= _TAKEN))
 
     def follow(self, planned: Sequence[PlannedPose]) -> None:
         """Ask for these poses of a refinement next; for none, ask for poses for a fit."""
-        self._planned, self._begun = tuple(planned) or None, self.poses
-
-    @property
-    def follows(self) -> bool:
-        """Whether the poses of a refinement are asked for, or have just been taken."""
-        return self._planned is not None
+        self.planned, self._begun = tuple(planned) or None, self.poses
 
     @property
     def action(self) -> Action:
         """Return what to do next with the poses; `NOT_KNOWN` before the first choice."""
-        if self._planned == ():
+        if self.planned == ():
             return _calling('refine', 'all poses of the plan are taken')
         plan = self.plan
         if plan is None:
@@ -214,6 +209,8 @@ class Action:
 
 
 NOT_KNOWN = Action('', '')
+_LEVEL = Action('level', 'place the robot level, hold it still and call ~/set_level; a sensor '
+                'alone is done', 'set_level')
 
 _SERVICES = {'fit': 'fit', 'refine': 'refine', 'level': 'set_level', 'save': 'save'}
 """Service for each kind of step that has one."""
@@ -270,7 +267,7 @@ def _within_reach(session: Session, action: Action) -> Action:
     if not is_partial(present):
         return action
     return (Action('done', f'use the calibration in these orientations; for others: '
-                   f'{action.words}') if present.is_levelled else _level_step())
+                   f'{action.words}') if present.is_levelled else _LEVEL)
 
 
 def _with_sensor(sensor: Sensor) -> Action:
@@ -288,7 +285,7 @@ def _with_sensor(sensor: Sensor) -> Action:
         return NOT_KNOWN
     if rating is not None and rating.name == 'GOOD':
         if sensor.calibration is not None and not sensor.calibration.is_levelled:
-            return _level_step()
+            return _LEVEL
         return Action('done', rating.next.text if rating.next.kind == 'done' else
                       'use the calibration')
     if rating is not None and rating.findings and rating.findings[0].kind == 'flat_pose':
@@ -296,11 +293,7 @@ def _with_sensor(sensor: Sensor) -> Action:
                       'call ~/set_level once more', 'set_level')
     if sensor.guide.refused_advice:
         return Action('poses', sensor.guide.refused_advice)
-    if rating is None or not sensor.all_fitted:
+    is_fitted = 0 < sensor.guide.poses == sensor.fitted_poses  # to all poses
+    if rating is None or not is_fitted or sensor.guide.planned is not None:
         return sensor.guide.action
     return _calling(rating.next.kind, rating.next.text)
-
-
-def _level_step() -> Action:
-    return Action('level', 'place the robot level, hold it still and call ~/set_level; a sensor '
-                  'alone is done', 'set_level')

@@ -156,17 +156,15 @@ def _bands(dwells: list[Dwell]) -> NDArray[np.int64]:
 def with_temperature(dwells: list[Dwell]) -> list[Dwell]:
     """Return dwells with missing temperatures set to that of the nearest one; tables need all."""
     known = [dwell for dwell in dwells if 'temperature' in dwell.context]
-    if not known:
-        return dwells
 
     def completed(dwell: Dwell) -> Dwell:
-        if 'temperature' in dwell.context:
+        if not known or 'temperature' in dwell.context:
             return dwell
         near = min(known, key=lambda other: abs(other.time - dwell.time))
         if abs(near.time - dwell.time) > _SAME_TEMPERATURE:
             return dwell
-        return replace(dwell, context={**dwell.context,
-                                       'temperature': near.context['temperature']})
+        return replace(dwell, context={
+            **dwell.context, 'temperature': near.context['temperature']})
 
     return [completed(dwell) for dwell in dwells]
 
@@ -340,7 +338,11 @@ class LiveCapture:
             self._rest = last
         # Rests end in order: an older provisional pose will not get a final average.
         doubted = self.book.doubt_held(lambda dwell: dwell.end < last.start)
-        doubted += self._judge_again()
+        threshold = self.detector.threshold
+        if threshold <= _NOISE_FELL * self._judged_at:
+            self._judged_at = threshold
+            doubted += self.book.doubt(
+                {each.start for each in self.detector.judged() if each.reason})
         return Change(last if latest else None, tuple(ended), bool(captured or doubted), doubted)
 
     def _doubt_held(self, time: float) -> Change | None:
@@ -353,14 +355,6 @@ class LiveCapture:
 
         count = self.book.doubt_held(is_over)
         return Change(poses=True, doubted=count) if count else None
-
-    def _judge_again(self) -> int:
-        """Mark poses as doubtful that are not still according to the noise known now."""
-        threshold = self.detector.threshold
-        if threshold > _NOISE_FELL * self._judged_at:
-            return 0
-        self._judged_at = threshold
-        return self.book.doubt({each.start for each in self.detector.judged() if each.reason})
 
 
 def _pieces(samples: Floats) -> list[Floats]:

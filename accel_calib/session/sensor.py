@@ -110,11 +110,6 @@ class Sensor:
         """Return the calibration that a command starts from: the offered one, or that in use."""
         return self.offered or self.calibration
 
-    @property
-    def all_fitted(self) -> bool:
-        """Whether the calibration in use, or the one that is offered, is a fit to all poses."""
-        return 0 < self.guide.poses == self.fitted_poses and not self.guide.follows
-
     def stillness(self, statistics: StreamStatistics) -> float:
         """Return the spread of the last samples relative to the largest of a still sensor."""
         arrived, stillness = self._stillness

@@ -78,20 +78,15 @@ def _converted(given: Field[Any], value: Any) -> Any:
     default = default_of(given)
     kind = type(default)
     if kind is list:
-        return _converted_list(default, value)
+        try:  # rclpy passes arrays and bytes
+            items = [type(default[0])(item) for item in value]
+        except (TypeError, ValueError):
+            return None
+        has_length = not isinstance(default[0], float) or len(items) == len(default)
+        return items if has_length else None
     if kind is bool or isinstance(value, bool):
         return value if type(value) is kind else None
     return kind(value) if isinstance(value, _ACCEPTED[kind]) else None
-
-
-def _converted_list(default: list[Any], value: Any) -> list[Any] | None:
-    """Return a list converted to the type of the default; rclpy passes arrays and bytes."""
-    try:
-        items = [type(default[0])(item) for item in value]
-    except (TypeError, ValueError):
-        return None
-    fixed_length = isinstance(default[0], float)
-    return None if fixed_length and len(items) != len(default) else items
 
 
 def expected(given: Field[Any]) -> str:

@@ -12,7 +12,7 @@ is played at another speed. They cover the last `_SPAN` seconds.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 import math
 from typing import NamedTuple, TYPE_CHECKING
 
@@ -288,27 +288,32 @@ _UNITS = (('g', 0.8, 1.2), ('m/s2', 8.0, 12.0))
 
 def stream_faults(session: Session) -> dict[str, str]:
     """Return by kind what is wrong with the messages, and what to do."""
-    statistics, topic, publishers = session.statistics, session.topic, session.publishers
-    silence = '' if session.mismatches else _silence(statistics, topic, publishers, session.imus)
+    statistics = session.statistics
     faults = {
-        'publishers': _publishers(topic, publishers), 'mismatches': '; '.join(session.mismatches),
-        'silence' if publishers else 'no_publisher': silence, 'stamps': statistics.stamp_fault,
-        **_dropped(statistics), 'unit': _wrong_unit(statistics, session.units)}
+        'publishers': _publishers(session), 'mismatches': '; '.join(session.mismatches),
+        'silence' if session.publishers else 'no_publisher': _silence(session),
+        'stamps': statistics.stamp_fault}
+    if statistics.dropped_ago < _DROPPED_SHOWN_FOR:
+        faults |= {kind: f'dropped {counted(statistics.dropped[kind], what)} {why}'
+                   for kind, (what, why) in _DROPPED.items() if statistics.dropped[kind]}
+    faults['unit'] = _wrong_unit(statistics, session.units)
     return {kind: words for kind, words in faults.items() if words}
 
 
-def _publishers(topic: str, names: Sequence[str] | None) -> str:
+def _publishers(session: Session) -> str:
+    names = session.publishers
     if names is None or len(names) < 2:
         return ''
     count = 'two' if len(names) == 2 else str(len(names))
-    return (f'{count} publishers on the topic {topic}: {", ".join(names)}; expected one sensor: '
-            'stop the others, or give each sensor its own topic; a driver that was killed '
+    return (f'{count} publishers on the topic {session.topic}: {", ".join(names)}; expected one '
+            'sensor: stop the others, or give each sensor its own topic; a driver that was killed '
             'disappears after about 20 s')
 
 
-def _silence(statistics: StreamStatistics, topic: str, publishers: Sequence[str] | None,
-             imus: Sequence[str]) -> str:
-    if min(statistics.age, statistics.dropped_ago) <= SILENT:
+def _silence(session: Session) -> str:
+    topic, publishers = session.topic, session.publishers
+    if session.mismatches or (
+            min(session.statistics.age, session.statistics.dropped_ago) <= SILENT):
         return ''
     if publishers is None:
         return (f'{topic} sends no samples: check the board, its cable and its program; the poses '
@@ -316,16 +321,9 @@ def _silence(statistics: StreamStatistics, topic: str, publishers: Sequence[str]
     if publishers:
         return (f'no Imu messages on {topic}, although {publishers[0]} publishes there: check '
                 'the driver')
-    there = f', such as {" or ".join(imus)}' if imus else ''
+    there = f', such as {" or ".join(session.imus)}' if session.imus else ''
     return (f'no Imu messages on {topic}, and no publisher: start the driver, or remap '
             f'imu/data_raw to its topic{there}')
-
-
-def _dropped(statistics: StreamStatistics) -> dict[str, str]:
-    if statistics.dropped_ago >= _DROPPED_SHOWN_FOR:
-        return {}
-    return {kind: f'dropped {counted(statistics.dropped[kind], what)} {why}'
-            for kind, (what, why) in _DROPPED.items() if statistics.dropped[kind]}
 
 
 def _wrong_unit(statistics: StreamStatistics, units: Units) -> str:
@@ -361,8 +359,14 @@ class Reports:
         """Report what is wrong with the messages now; to be called about once per second."""
         self._faults_of_stream()
         self._limits()
-        self._slow_turn()
-        self._thermometers()
+        session, turn = self._session, slow_turn(self._session)
+        if turn and session.settings.auto_capture:
+            session.log('info', f'no pose yet: {turn}', 'slow_turn', AGAIN)
+        if (session.thermometers and session.statistics.messages
+                and math.isnan(session.around.temperature)
+                and 'temperature' not in context_topics(session.settings)):
+            session.log('warning', f'no temperature arrives; {thermometer_words(session)}',
+                        'thermometers', 10.0 * _FAULT_AGAIN)
         self._context()
 
     def foreign(self, frame_id: str) -> None:
@@ -410,19 +414,6 @@ class Reports:
                     f'{each.range_words(each.least, each.most)}, and {USES_LIMIT}',
                     f'limits of {key}', _FAULT_AGAIN)
         self._left = frozenset(left)
-
-    def _slow_turn(self) -> None:
-        words = slow_turn(self._session)
-        if words and self._session.settings.auto_capture:
-            self._session.log('info', f'no pose yet: {words}', 'slow_turn', AGAIN)
-
-    def _thermometers(self) -> None:
-        session = self._session
-        if (session.thermometers and session.statistics.messages
-                and math.isnan(session.around.temperature)
-                and 'temperature' not in context_topics(session.settings)):
-            session.log('warning', f'no temperature arrives; {thermometer_words(session)}',
-                        'thermometers', 10.0 * _FAULT_AGAIN)
 
     def _context(self) -> None:
         """Log when a column of the context is missing or back, and that poses lack it."""

@@ -343,14 +343,14 @@ Event = Log | Mounting | Result | Still | ShowPoses | Task
 
 
 class LogFilter:
-    """Decide which lines are logged: of each kind, at most one within a time."""
+    """Decide what is due, such as log lines: of each kind, at most one within a time."""
 
     def __init__(self, clock: Callable[[], float] = monotonic) -> None:
         self._clock = clock
         self._last: dict[str, float] = {}
 
     def passes(self, kind: str, once_in: float) -> bool:
-        """Return whether to log a line of this kind, at most once in `once_in` [s]; note it."""
+        """Return whether one of this kind is due, at most once in `once_in` [s]; note it."""
         now = self._clock()
         if now - self._last.get(kind, -math.inf) < once_in:
             return False

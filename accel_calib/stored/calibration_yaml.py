@@ -37,7 +37,7 @@ from ..finding import Finding, KINDS, LEVELS, without
 from ..geometry import rms
 from ..table import (
     Autopilot, check_values, column_of, COLUMNS, Floats, is_quantity, LARGEST, Poses)
-from ..text import some
+from ..text import plain, some
 from ..units import FRAMES, MODEL_NAMES, UNIT_NAMES, Units
 
 # The first is eight times as fast, but not in every build of PyYAML.
@@ -164,19 +164,14 @@ def _rest_noise(gyro: GyroBias | None, noise: SampleNoise | None) -> dict[str, A
         content['gyro_bias'] = {
             'unit': 'rad/s, slope in rad/s/°C, temperatures in °C', 'bias': gyro.bias.tolist(),
             'sd': gyro.sd.tolist(), 'slope': gyro.slope.tolist(),
-            'temperature': _or_null(gyro.temperature),
+            'temperature': plain(float(gyro.temperature)),
             'temperatures': [float(each) for each in gyro.temperatures], 'rests': int(gyro.rests)}
     if noise is not None:
         content['noise'] = {
             'what': 'standard deviation of one sample; force in the unit of the readings, rate in '
                     'rad/s',
-            'force': [_or_null(each) for each in noise.force],
-            'rate': [_or_null(each) for each in noise.rate]}
+            'force': plain(noise.force), 'rate': plain(noise.rate)}
     return content
-
-
-def _or_null(value: float) -> float | None:
-    return None if np.isnan(value) else float(value)
 
 
 def calibration_from(data: bytes, name: str) -> Calibration:
@@ -199,7 +194,12 @@ def calibration_from(data: bytes, name: str) -> Calibration:
 
 def _checked(data: bytes, name: str) -> Calibration:
     """Return the calibration in a file after all checks; other errors are those of damage."""
-    text = _text_of(data, name)
+    if not data.strip(b'\0 \t\r\n'):
+        raise ValueError('it is empty')
+    if not data.startswith(FIRST_LINE.encode()):
+        raise StoredCalibrationError(f'{name} is not a calibration of accel_calib, expected the '
+                                     f'first line "{FIRST_LINE}"', 'use a file that fit wrote')
+    text = decoded(data)
     content = read_plain(text)
     _check_version(content, name)
     _check_known(content, name)
@@ -214,16 +214,6 @@ def _checked(data: bytes, name: str) -> Calibration:
     other = _other_correction(content, calibration)
     _check_keys(content, calibration)
     return replace(calibration, noted=(*calibration.noted, OF_FILE['edited'], *other))
-
-
-def _text_of(data: bytes, name: str) -> str:
-    """Return the text of a file of this format."""
-    if not data.strip(b'\0 \t\r\n'):
-        raise ValueError('it is empty')
-    if not data.startswith(FIRST_LINE.encode()):
-        raise StoredCalibrationError(f'{name} is not a calibration of accel_calib, expected the '
-                                     f'first line "{FIRST_LINE}"', 'use a file that fit wrote')
-    return decoded(data)
 
 
 def _check_known(content: Mapping[str, Any], name: str) -> None:
@@ -307,7 +297,8 @@ def _calibration(content: Mapping[str, Any]) -> Calibration:
         rejected=rejected, reason=value_at(content, 'reason', str),
         noted=tuple(map(_finding, values_at(content, 'findings', dict))),
         gyro=_optional(content, 'gyro_bias', _gyro_bias),
-        noise=_optional(content, 'noise', _sample_noise))
+        noise=_optional(content, 'noise', lambda stated: SampleNoise(*(
+            array_at(stated, key, (3,), finite=False) for key in ('force', 'rate')))))
 
 
 def _optional(content: Mapping[str, Any], key: str, make: Callable[[dict[str, Any]], T]
@@ -363,10 +354,6 @@ def _gyro_bias(stated: Mapping[str, Any]) -> GyroBias:
     limits = array_at(stated, 'temperatures', (len(value_at(stated, 'temperatures', list)),))
     return GyroBias(bias, sd, value_at(stated, 'rests', int), temperature, slope,
                     tuple(limits.tolist()))
-
-
-def _sample_noise(stated: Mapping[str, Any]) -> SampleNoise:
-    return SampleNoise(*(array_at(stated, key, (3,), finite=False) for key in ('force', 'rate')))
 
 
 def _poses(stated: Mapping[str, Any], autopilot: Autopilot | None) -> Poses:

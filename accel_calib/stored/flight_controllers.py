@@ -77,7 +77,10 @@ def _fit_by_axis(calibration: Calibration, options: Options, reference: float | 
     low, high = temperature_range(calibration) or (0.0, 0.0)
     middle, half = (low + high) / 2.0, (high - low) / 2.0
     reference = middle if reference is None else reference
-    grid, degree = steady_grid(calibration), _degree(calibration)
+    grid, degree = steady_grid(calibration), 0
+    if high > low:
+        vec_v = np.broadcast_to(steady_at(calibration, np.linspace(low, high, 9)).vec_v, (9, 3))
+        degree = len(polynomial(np.linspace(-1.0, 1.0, 9), vec_v, _EXACT_G, DEGREE)) - 1
     s = (grid.temperature - middle) / half if degree else grid.temperature
     columns = np.vander(s, degree + 1, increasing=True)
     inner = Polynomial([(reference - middle) / half, 1.0 / half] if degree else [0.0])
@@ -92,19 +95,9 @@ def _fit_by_axis(calibration: Calibration, options: Options, reference: float | 
     return ByAxis(offset[0], scale, offset[1:], reference, (low, high))
 
 
-def _degree(calibration: Calibration) -> int:
-    """Return the degree of the offset in the temperature: 0, or 1 to 3."""
-    low, high = temperature_range(calibration) or (0.0, 0.0)
-    if high <= low:
-        return 0
-    vec_v = np.broadcast_to(steady_at(calibration, np.linspace(low, high, 9)).vec_v, (9, 3))
-    return len(polynomial(np.linspace(-1.0, 1.0, 9), vec_v, _EXACT_G, DEGREE)) - 1
-
-
 def px4(calibration: Calibration, options: Options) -> Made:
     """Return the parameters of PX4."""
-    place, options = _place(calibration, options, 'px4')
-    instance = _instance(options, _PX4_INSTANCES, 'PX4')
+    place, instance, options = _place(calibration, options, 'px4', _PX4_INSTANCES, 'PX4')
     found = _fit_by_axis(calibration, options)
     prefix = f'CAL_ACC{instance}_'
     thermal = f'TC_A{instance if place.thermal is None else place.thermal}_'
@@ -125,8 +118,8 @@ def px4(calibration: Calibration, options: Options) -> Made:
 
 def ardupilot(calibration: Calibration, options: Options) -> Made:
     """Return the parameters of ArduPilot."""
-    place, options = _place(calibration, options, 'ardupilot')
-    instance = _instance(options, _ARDUPILOT_INSTANCES, 'ArduPilot')
+    place, instance, options = _place(
+        calibration, options, 'ardupilot', _ARDUPILOT_INSTANCES, 'ArduPilot')
     found = _fit_by_axis(calibration, options, ARDUPILOT_REFERENCE)
     prefix = f'INS_ACC{"" if instance == 1 else instance}'
     # The firmware adds the polynomial at CALTEMP, so that it is zero there.
@@ -144,17 +137,21 @@ def ardupilot(calibration: Calibration, options: Options) -> Made:
     return _made(rows, found, calibration, options, place)
 
 
-def _place(calibration: Calibration, options: Options, firmware: Firmware
-           ) -> tuple[Autopilot, Options]:
-    """Return the place that the log states, and the options with what they leave open from it."""
-    stated = calibration.poses.autopilot
-    if stated is None or stated.firmware != firmware:
-        return Autopilot(firmware), options
-    if options.instance not in (None, stated.instance):
-        return Autopilot(firmware, corrected=stated.corrected), options
-    return stated, replace(
-        options, instance=stated.instance,
-        device_id=stated.device_id if options.device_id is None else options.device_id)
+def _place(calibration: Calibration, options: Options, firmware: Firmware,
+           known: tuple[int, ...], label: str) -> tuple[Autopilot, int, Options]:
+    """Return the place that the log states, the instance, and the options completed from it."""
+    place, stated = Autopilot(firmware), calibration.poses.autopilot
+    if stated is not None and stated.firmware == firmware:
+        place = replace(place, corrected=stated.corrected)
+        if options.instance in (None, stated.instance):
+            place, options = stated, replace(
+                options, instance=stated.instance,
+                device_id=stated.device_id if options.device_id is None else options.device_id)
+    instance = known[0] if options.instance is None else options.instance
+    if instance not in known:
+        raise InputError(f'--instance is {instance}, but {label} has accelerometers '
+                         f'{known[0]} to {known[-1]}', 'use one of these numbers')
+    return place, instance, options
 
 
 def _made(rows: Parameters, found: ByAxis, calibration: Calibration, options: Options,
@@ -179,7 +176,10 @@ def counts(calibration: Calibration, options: Options, label: str, with_gain: bo
     smallest change of zero. InputError is raised for values that the program refuses.
 
     """
-    signs, units, per_g = _signs(options), calibration.units, _counts_per_g(calibration, options)
+    signs, units, per_g = _signs(options), calibration.units, options.counts_per_g
+    if per_g is None:  # a power of two near that of the readings
+        per_g = (float(2.0 ** np.round(np.log2(units.per_g))) if units.is_native
+                 else _COUNTS_PER_G)
     unit = register_per_g or per_g
     factor = unit / (per_g if units.is_native else STANDARD_GRAVITY if units.is_si else 1.0)
     grid = steady_grid(calibration)
@@ -203,24 +203,6 @@ def counts(calibration: Calibration, options: Options, label: str, with_gain: bo
     return Made(values, lambda reading, temperature: (
         reading * factor * signs - zero) * signs * gain / (_UNIT_GAIN * unit), False,
         (_AXES[options.axes], f'1 g = {unit:g} counts'), notes, rounded)
-
-
-def _counts_per_g(calibration: Calibration, options: Options) -> float:
-    """Return the counts per g of the readings: those asked for, or a power of two near them."""
-    if options.counts_per_g is not None:
-        return options.counts_per_g
-    if not calibration.units.is_native:
-        return _COUNTS_PER_G
-    return float(2.0 ** np.round(np.log2(calibration.units.per_g)))
-
-
-def _instance(options: Options, known: tuple[int, ...], label: str) -> int:
-    if options.instance is None:
-        return known[0]
-    if options.instance not in known:
-        raise InputError(f'--instance is {options.instance}, but {label} has accelerometers '
-                         f'{known[0]} to {known[-1]}', 'use one of these numbers')
-    return options.instance
 
 
 def _signs(options: Options) -> Floats:

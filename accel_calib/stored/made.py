@@ -374,14 +374,12 @@ def _environment() -> 'Environment':
     made = Environment(loader=PackageLoader('accel_calib.stored'), undefined=StrictUndefined,
                        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)
     made.policies['json.dumps_kwargs'] = {'allow_nan': False}
-    made.filters |= {'lines': _lines, 'yaml': _yaml, 'single': _single, 'literal': literal,
+    made.filters |= {'yaml': _yaml, 'single': _single, 'literal': literal,
+                     'lines': lambda lines, mark: '\n'.join(
+                         f'{mark} {line}'.rstrip() for line in lines),
                      'flat': lambda rows: np.ravel(rows).tolist(),
                      'transposed': lambda rows: np.transpose(rows).tolist()}
     return made
-
-
-def _lines(lines: Sequence[str], mark: str) -> str:
-    return '\n'.join(f'{mark} {line}'.rstrip() for line in lines)
 
 
 def _yaml(value: Any) -> str:

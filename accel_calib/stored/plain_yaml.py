@@ -108,13 +108,11 @@ class _Reader:
             return self._scalar(event) if event.implicit[0] else event.value
         if depth == MOST_DEPTH:
             raise self._refusal(event, f'it has more than {MOST_DEPTH} levels')
-        is_mapping = isinstance(event, yaml.MappingStartEvent)
-        return self._mapping(depth + 1) if is_mapping else self._list(depth + 1)
-
-    def _list(self, depth: int) -> list[Any]:
+        if isinstance(event, yaml.MappingStartEvent):
+            return self._mapping(depth + 1)
         content = []
         while not isinstance(event := next(self._events), yaml.SequenceEndEvent):
-            content.append(self._value(event, depth))
+            content.append(self._value(event, depth + 1))
         return content
 
     def _mapping(self, depth: int) -> dict[str, Any]:
