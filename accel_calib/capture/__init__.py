@@ -7,8 +7,8 @@ From samples to still poses. The node and recordings use the same rule.
 `chunks` sums the samples over short intervals of header time. `rule` decides whether the sensor is
 still in each chunk, from the arithmetic in `trend`. `dwell` joins still chunks to dwells, and
 accepts or rejects each, and `account` states why. `sensor` checks whether numbers can be those of
-a sensor. `detector` is the entry point, and makes the pose table. `ramp` makes the stretches of a
-still board whose temperature changes.
+a sensor, and `levels` what is too quiet for a rest. `detector` is the entry point, and makes the
+pose table. `ramp` makes the stretches of a still board whose temperature changes.
 
 """
 

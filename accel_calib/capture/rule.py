@@ -26,7 +26,8 @@ upper bound of the noise if the sensor is still, and far above it if the sensor 
 minimum so far is used. The noise is at least the variance that the resolution causes: a reading
 that alternates between two steps of height q has a variance of up to q²/4, and q is the smallest
 step so far. Nothing is learned from an axis at the limit of the sensor, whose samples scatter less
-(see `clipped`).
+(see `clipped`), nor from a gyro that does not vary. What is far quieter than all rests is none
+(`levels`).
 
 **Rounding.** Samples x = μ + n with noise n of the standard deviation σ are rounded to multiples
 of q. The error of the mean of many samples depends on μ. Over all μ its variance is
