@@ -37,10 +37,10 @@ OPTIONS: dict[str, dict[str, Any]] = {
 _PAGE = """\
 # What is said of logs
 
-Made by `python benchmarks/logs.py {command}`: each file in the folders `logs` (faults of sensors,
-drivers and clocks, real and simulated) and `real_logs` (71 logs of other makers, most of which
-were not recorded to calibrate a sensor) of the data beside the project, as
-`accel-calib calibrate FILE`. Packed binary files are unpacked first. *Refused* is a result, too:
+Made by `python benchmarks/logs.py {command}`:
+each file in the folders `logs` (faults of sensors, drivers and clocks, real and simulated) and
+`real_logs` (71 logs of other makers, most of which were not recorded to calibrate a sensor) of the
+data beside the project, as `accel-calib calibrate FILE`. Packed binary files are unpacked first. *Refused* is a result, too:
 the words say whether it is for the right reason.
 
 {rows}
@@ -55,11 +55,9 @@ def said(path: Path, options: LogOptions) -> tuple[str, str, str]:
             made = calibrated_log(path, options, found)
     except AccelCalibError as err:
         return 'refused', err.read_as, str(err)
-    rating = made.rating
-    figures = '' if rating.name == 'GOOD' else rating.reason
-    words = (*found.captured, figures, *(each.text for each in found.poses.findings),
-             *found.notes)
-    return rating.name, found.read_as, '; '.join(filter(None, words))
+    findings = [each.text for each in made.rating.findings
+                if each.level != 'GOOD' or each in found.poses.findings]
+    return made.rating.name, found.read_as, '; '.join([*found.captured, *findings, *found.notes])
 
 
 def rows_of(folder: Path, place: Path) -> list[tuple[str, str, str, str]]:
