@@ -40,8 +40,8 @@ _PAGE = """\
 Made by `python benchmarks/logs.py {command}`:
 each file in the folders `logs` (faults of sensors, drivers and clocks, real and simulated) and
 `real_logs` (71 logs of other makers, most of which were not recorded to calibrate a sensor) of the
-data beside the project, as `accel-calib calibrate FILE`. Packed binary files are unpacked first. *Refused* is a result, too:
-the words say whether it is for the right reason.
+data beside the project, as `accel-calib calibrate FILE`. Packed binary files are
+unpacked first. *Refused* is a result, too: the words say whether it is for the right reason.
 
 {rows}
 """
