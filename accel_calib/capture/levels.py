@@ -40,10 +40,14 @@ class Levels:
         self._counts = np.zeros((6, _BINS), np.int64)
         self._lowest = np.full((6, _BINS, 3), np.inf)
         self._highest = np.full((6, _BINS, 3), -np.inf)
+        self._found: Floats | None = np.zeros(6)
 
     def add(self, variance: Floats, reading: Floats) -> None:
         """Count (axes, n) variances of stretches, NaN if unknown, with (3, n) mean readings."""
         axis, which = np.nonzero(np.isfinite(variance))
+        if not len(axis):
+            return
+        self._found = None
         with np.errstate(divide='ignore'):
             level = np.floor(np.log2(variance[axis, which])) + _ZERO
         found = axis, np.clip(level, 0, _BINS - 1).astype(np.intp)
@@ -54,8 +58,10 @@ class Levels:
     @property
     def least(self) -> Floats:
         """Return the (6,) variances at rest where something was far quieter; 0 elsewhere."""
-        return np.array([self._least(*each) for each in zip(
-            self._counts, self._lowest, self._highest, strict=True)])
+        if self._found is None:
+            self._found = np.array([self._least(*each) for each in zip(
+                self._counts, self._lowest, self._highest, strict=True)])
+        return self._found
 
     def _least(self, counts: NDArray[np.int64], lowest: Floats, highest: Floats) -> float:
         near = np.convolve(counts, np.ones(2 * _NEAR + 1), 'same')
