@@ -3,7 +3,6 @@
 
 """The calibrator without ROS: files of each sensor, accepted messages and refusals."""
 
-from collections.abc import Callable
 from dataclasses import replace
 import errno
 from pathlib import Path
@@ -24,9 +23,8 @@ from inside import (
     spread_directions, store_of, StreamStatistics, writing_advice)
 import numpy as np
 import pytest
-from shared import python, ROOT, with_effects
+from shared import GRAVITY, python, Readings, ROOT, Stored, with_effects
 
-GRAVITY = 9.80665
 UP, LEFT, FORWARD = [0, 0, 1], [0, 1, 0], [1, 0, 0]
 NOSE_DOWN = [-0.6, 0.0, 0.8]
 MOTOR = 'motor_current:=/motor/current'
@@ -34,8 +32,6 @@ MOUNTING = rotation_from_rpy(*np.radians((5.0, -3.0, 40.0))).T
 
 pytestmark = pytest.mark.usefixtures('home')
 
-Readings = Callable[..., Any]
-Stored = Callable[..., Path]
 
 IDENTITIES = [
     Identity('imu_link', '/left/imu/data_raw'), Identity('imu_link', '/right/imu/data_raw'),
