@@ -6,7 +6,6 @@
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
-import shutil
 import sqlite3
 import struct
 from typing import Any
@@ -190,13 +189,6 @@ def check_refused(path: Path, words: str, topic: str = '') -> None:
             work()
         assert '\n' not in str(refusal.value)
     assert {*path.parent.iterdir()} == before
-
-
-def copied(path: Path, folder: Path) -> Path:
-    """Copy a bag, and return its new path."""
-    folder.mkdir(exist_ok=True)
-    target = folder / path.name
-    return Path(shutil.copytree(path, target) if path.is_dir() else shutil.copy(path, target))
 
 
 def execute(file: Path, statement: str, *values: Any) -> None:
