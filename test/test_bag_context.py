@@ -207,15 +207,10 @@ def calibration_in_g() -> Calibration:
                      units_of('g'))
 
 
-@pytest.fixture(scope='module')
-def thermal(calibration_in_g: Calibration) -> Calibration:
-    """Return a calibration in g that depends on the temperature."""
-    return with_effects(calibration_in_g, {'offset_temperature': (0.002, -0.001, 0.003)},
-                        temperature=np.linspace(10.0, 40.0, 16))
-
-
 def test_a_bag_is_corrected_with_a_named_temperature(
-        thermal: Calibration, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        calibration_in_g: Calibration, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    thermal = with_effects(calibration_in_g, {'offset_temperature': (0.002, -0.001, 0.003)},
+                           temperature=np.linspace(10.0, 40.0, 16))
     path, out = write(tmp_path, {'/imu/temp': ('std_msgs/msg/Float64', warming)}), tmp_path / 'out'
     with pytest.raises(InputError, match='looks like a temperature .* but the calibration depends '
                                          'on the temperature; name the topic with'):

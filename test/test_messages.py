@@ -299,15 +299,12 @@ KNOWN = {'temperature': 31.0, 'supply_voltage': 3.1, 'time': 4000.0, 'rate': (1.
 OWN = [4e-8, 1e-8, -1e-8, 1e-8, 5e-8, 2e-8, -1e-8, 2e-8, 6e-8]
 
 
-def several(seed):
-    return tuple(np.random.default_rng(seed).choice(OTHERS, size=4, replace=False))
-
-
 @pytest.mark.parametrize(('names', 'unit', 'scale', 'turned'), [
     *(((), *each, turned) for each in (('m/s2', 1.0), ('g', 9.80665), ('native', 9.81))
       for turned in (False, True)),
     *(((name,), 'm/s2', 1.0, True) for name in OTHERS),
-    *((several(seed), 'g', 9.80665, True) for seed in range(5))])
+    *((tuple(np.random.default_rng(seed).choice(OTHERS, size=4, replace=False)), 'g', 9.80665,
+       True) for seed in range(5))])
 def test_one_reading_and_its_covariance_are_corrected_as_arrays_are(names, unit, scale, turned):
     rng = np.random.default_rng(5)
     values = {name: values_of(name, rng.normal(size=18)) for name in names}
@@ -325,14 +322,16 @@ def test_one_reading_and_its_covariance_are_corrected_as_arrays_are(names, unit,
         np.testing.assert_allclose(np.subtract(*spreads), -np.array(OWN), atol=1e-18)
 
 
+def lagging():
+    """Return a calibration with a lag, and with 20 poses at 20 to 39 °C."""
+    return with_effects(calibration_of({'offset_temperature': [2e-3, -1e-3, 1e-3, 50.0, 1.0]}), {},
+                        temperature=20.0 + np.arange(20.0), time=100.0 * np.arange(20.0))
+
+
 def test_acting_temperature_is_limited_to_its_range_at_the_poses():
-    calibration = calibration_of({'offset_temperature': [2e-3, -1e-3, 1e-3, 50.0, 1.0]})
-    count = len(calibration.poses)
-    poses = calibration.poses.with_columns(temperature=20.0 + np.arange(count),
-                                           time=100.0 * np.arange(count))
-    calibration = replace(calibration, poses=poses)
+    calibration = lagging()
     low, high = calibration.ranges['temperature_of_offset']
-    assert (low, high) == pytest.approx((20.5, 19.5 + count), abs=0.02)
+    assert (low, high) == pytest.approx((20.5, 39.5), abs=0.02)
     assert 'time' not in calibration.ranges
     at = [calibration.apply([[0.0, 0.0, 9.8]] * 200, time=1e6 + np.arange(200.0),
                             temperature=np.full(200, each))[-1] for each in (high, 90.0, 25.0)]
@@ -341,10 +340,7 @@ def test_acting_temperature_is_limited_to_its_range_at_the_poses():
 
 
 def test_what_the_worker_has_computed_is_not_computed_again_after_levelling(tmp_path):
-    calibration = calibration_of({'offset_temperature': [2e-3, -1e-3, 1e-3, 50.0, 1.0]})
-    count = len(calibration.poses)
-    calibration = replace(calibration, poses=calibration.poses.with_columns(
-        temperature=20.0 + np.arange(count), time=100.0 * np.arange(count)))
+    calibration = lagging()
     assert calibration.ranges
     stored = tmp_path / 'calibration.pickle'
     stored.write_bytes(pickle.dumps(calibration))
@@ -362,8 +358,7 @@ def test_what_the_worker_has_computed_is_not_computed_again_after_levelling(tmp_
 
 def test_context_of_one_reading_is_limited_to_the_ranges():
     calibration = calibration_of({'offset_temperature': [2e-3, -1e-3, 1e-3]}, turned=True)
-    poses = calibration.poses.with_columns(temperature=np.linspace(20.0, 30.0, 20))
-    calibration = replace(calibration, poses=poses)
+    calibration = with_effects(calibration, {}, temperature=np.linspace(20.0, 30.0, 20))
     reader = OneReading(calibration)
     unknown = reader.at({'temperature': np.nan}).correct(1.0, 2.0, 9.0)
     assert np.linalg.norm(unknown) == pytest.approx(np.linalg.norm([1.0, 2.0, 9.0]), rel=0.1)
