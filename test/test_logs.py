@@ -775,7 +775,7 @@ def test_temperatures_become_degrees_celsius(name: str, factor: float, zero: flo
 def test_a_long_log_is_read_in_blocks_of_flat_memory_as_at_once(tmp_path: Path) -> None:
     block = rows_of(samples(per_g=1000.0, poses=10, rest=400, turn=100)['reading'], digits='.6g')
     peaks = []
-    for times in (20, 50):
+    for times in (40, 100):
         lines = [f'{10 * k},{",".join(row)}\n' for k, row in enumerate(block * times)]
         path = write(tmp_path, ''.join(['millis,accX,accY,accZ\n', *lines]))
         tracemalloc.start()
