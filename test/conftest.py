@@ -33,6 +33,8 @@ import numpy as np
 import pytest
 from shared import GRAVITY, ROOT
 
+sys.path.append(str(ROOT / 'benchmarks'))  # some tests are the short form of a benchmark
+
 UDP = ROOT / 'config' / 'fast_dds_udp.xml'
 """Profile of Fast DDS with the discovery range of LOCALHOST, and without shared memory."""
 

@@ -31,6 +31,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / 'shared' / 'data'
 LOGS = ROOT / 'test' / 'data' / 'logs'
 GRAVITY = 9.80665
+FACES = np.vstack([np.eye(3), -np.eye(3)])
 G, MPS2, NATIVE = map(units_of, ('g', 'm/s2', 'native'))
 
 Readings = Callable[..., Any]

@@ -18,9 +18,8 @@ from inside import (
     format_calibration, main, Model, model_with, number, parse_calibration, spread_directions)
 import numpy as np
 import pytest
-from shared import error_mg, G, MPS2, random_directions
+from shared import error_mg, FACES, G, MPS2, random_directions
 
-FACES = np.vstack([np.eye(3), -np.eye(3)])
 TIME = 20.0 * np.arange(30)
 WARM = 27.0 + 3.5 * np.sin(TIME / 60.0)
 COMMON = {'offset': [0.03, -0.02, 0.04], 'axis_gain': [0.01, -0.02, 0.015],

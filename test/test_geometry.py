@@ -12,9 +12,8 @@ from inside import (
     rotation_from_rpy, rows_of, simulate_poses, spread_directions, unit)
 import numpy as np
 import pytest
-from shared import G, random_directions
+from shared import FACES, G, random_directions
 
-FACES = np.vstack([np.eye(3), -np.eye(3)])
 TURN = 2.0 * np.pi * np.arange(12) / 12.0
 RING = np.column_stack([np.cos(TURN), np.sin(TURN), np.zeros(12)])
 
