@@ -12,7 +12,6 @@ condition and a time limit.
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
-from functools import cache
 from importlib.util import find_spec
 import os
 from pathlib import Path
@@ -24,14 +23,12 @@ import tempfile
 import time
 from typing import Any
 
-from accel_calib import simulate
-from accel_calib.calibrate import Calibration, fit_poses, level
+from accel_calib.calibrate import level
 from accel_calib.stored import write_calibration
-from accel_calib.units import units_of
-from inside import model_with, NODES, own_domain, simulate_recording, spread_directions
+from inside import model_with, NODES, own_domain, simulate_recording
 import numpy as np
 import pytest
-from shared import GRAVITY, ROOT
+from shared import GRAVITY, KNOWN, known, ROOT
 
 sys.path.append(str(ROOT / 'benchmarks'))  # some tests are the short form of a benchmark
 
@@ -388,29 +385,17 @@ def without_tf2(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', None)
 
 
-EFFECTS: Mapping[str, Any] = {'offset': np.array([0.03, -0.02, 0.04]),
-                              'axis_gain': np.array([0.012, -0.015, 0.008]),
-                              'cross_axis': np.array([0.006, -0.004, 0.003])}
-
-
 @pytest.fixture
 def readings() -> Callable[..., Any]:
     """Return a function that simulates readings of a sensor that is turned."""
     def make(directions: Any, *, dwell: float = 1.8, rotation: Any = None,
-             effects: Mapping[str, Any] = EFFECTS) -> Any:
+             effects: Mapping[str, Any] = KNOWN) -> Any:
         recording = simulate_recording(
             model_with(effects, rotation), np.array(directions, float), np.random.default_rng(7),
             noise_g=0.0005, rate_hz=RATE, dwell=dwell, turn=0.4)
         return recording.reading * GRAVITY
 
     return make
-
-
-@cache
-def known(unit: Any) -> Calibration:
-    """Return a calibration of known parameters."""
-    poses = simulate(EFFECTS, directions=spread_directions(20), units=unit, noise=0.0005, seed=3)
-    return fit_poses(poses, units_of(unit), model='10', date='2026-01-01T00:00:00+00:00')
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import cache
 import json
 import os
 from pathlib import Path
@@ -17,13 +18,14 @@ import time
 import tracemalloc
 from typing import Any
 
-from accel_calib.calibrate import Calibration
+from accel_calib import simulate
+from accel_calib.calibrate import Calibration, fit_poses
 from accel_calib.effects import effect_named
 from accel_calib.geometry import unit
 from accel_calib.session import Step
 from accel_calib.table import Floats
 from accel_calib.units import units_of
-from inside import COMMAND, main, Model, model_with, OVER_THE_SPHERE, predict
+from inside import COMMAND, main, Model, model_with, OVER_THE_SPHERE, predict, spread_directions
 import numpy as np
 import pytest
 
@@ -41,6 +43,10 @@ Stored = Callable[..., Path]
 SENSOR = {'offset': [0.02, -0.01, 0.03], 'axis_gain': [0.01, -0.02, 0.005],
           'cross_axis': [0.004, 0.002, -0.003]}
 """Effects of a sensor that several tests simulate."""
+
+KNOWN = {'offset': [0.03, -0.02, 0.04], 'axis_gain': [0.012, -0.015, 0.008],
+         'cross_axis': [0.006, -0.004, 0.003]}
+"""Effects of the sensor of `known`."""
 
 OPTIONS = [part for name, values in SENSOR.items()
            for part in ('--effect', f'{name}={",".join(map(str, values))}')]
@@ -62,6 +68,13 @@ def sensor(rng: np.random.Generator, *effects: str) -> Model:
     names = effects or ('offset', 'axis_gain', 'cross_axis')
     widths = {'gain': 1}
     return model_with({name: rng.normal(size=widths.get(name, 3)) * sizes[name] for name in names})
+
+
+@cache
+def known(unit: Any = 'm/s2') -> Calibration:
+    """Return a calibration of known effects, from 20 poses."""
+    poses = simulate(KNOWN, directions=spread_directions(20), units=unit, noise=0.0005, seed=3)
+    return fit_poses(poses, units_of(unit), model='10', date='2026-01-01T00:00:00+00:00')
 
 
 def with_effects(calibration: Calibration, values: Mapping[str, Any], variance: float = 1e-12,

@@ -17,8 +17,7 @@ from accel_calib.logs import read_recording
 from accel_calib.messages import correct_bag
 from accel_calib.stored import write_calibration
 from bag_files import (
-    a_calibration, COMPRESS, COUNT, execute, McapFile, messages, raw_messages,
-    rosbag2 as folder_of, TOPICS, zstd)
+    COMPRESS, COUNT, execute, McapFile, messages, raw_messages, rosbag2 as folder_of, TOPICS, zstd)
 from inside import check_regular, DECOMPRESSED, decompressed, largest, open_bag
 import pytest
 from rosbags import rosbag2
@@ -257,11 +256,11 @@ def test_correcting_leaves_a_database_as_it_is_and_refuses_a_copy_that_lacks_mes
         return {each: (each.read_bytes(), each.stat().st_mtime_ns) for each in path.iterdir()}
 
     before = state()
-    assert correct_bag(path, a_calibration(), tmp_path / 'whole') == COUNT
+    assert correct_bag(path, shared.known(), tmp_path / 'whole') == COUNT
     assert state() == before
     monkeypatch.setattr(rosbag2.Writer, 'write', losing)
     with pytest.raises(InputError, match='the copy holds 83 of 84 messages'):
-        correct_bag(path, a_calibration(), tmp_path / 'out')
+        correct_bag(path, shared.known(), tmp_path / 'out')
     assert sorted(each.name for each in tmp_path.iterdir()) == ['bag', 'whole']
 
 
@@ -304,7 +303,7 @@ def test_a_pipe_ends_every_command_in_one_line(
         capsys: pytest.CaptureFixture[str]) -> None:
     pipe, stored, out = tmp_path / f'pipe{suffix}', tmp_path / 'c.yaml', tmp_path / 'out'
     os.mkfifo(pipe)
-    write_calibration(stored, a_calibration())
+    write_calibration(stored, shared.known())
     given = [each.replace('{out}', str(out)).replace('{yaml}', str(stored)).replace(
         '{}', str(pipe)) for each in command]
     assert '(FIFO)' in shared.refused(capsys, *given).partition(str(pipe))[2]

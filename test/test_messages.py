@@ -16,7 +16,7 @@ import os
 import pickle
 import struct
 
-from accel_calib.calibrate import fit_poses, of_samples, thermal_stream
+from accel_calib.calibrate import of_samples, thermal_stream
 from accel_calib.effects import EFFECTS
 from accel_calib.errors import AccelCalibError, InputError
 from accel_calib.logs import (
@@ -24,14 +24,13 @@ from accel_calib.logs import (
     doubles_at, IMU_DOUBLES, joined, layout_of, LITTLE_ENDIAN, ORIENTATION, ORIENTATION_COVARIANCE,
     renamed, samples_of)
 from accel_calib.messages import corrected, output_frame, Rewriter
-from accel_calib.units import STANDARD_GRAVITY, units_of
+from accel_calib.units import STANDARD_GRAVITY
 from bag_files import swapped
-from inside import (
-    frame_ids, Model, OneReading, rotation_from_rpy, simulate_poses, spread_directions, stamps_of)
+from inside import frame_ids, Model, OneReading, rotation_from_rpy, stamps_of
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from shared import python, random_directions, sensor, values_of, with_effects
+from shared import known, python, random_directions, values_of, with_effects
 
 COUNT = int(os.environ.get('IMU_MESSAGES', '800'))
 COVARIANCES = ORIENTATION_COVARIANCE, ANGULAR_VELOCITY_COVARIANCE, ACCELERATION_COVARIANCE
@@ -57,10 +56,7 @@ CASES = {
 
 def calibration_of(effects, *, unit='m/s2', turned=False):
     """Return a linear fit with these effects, and a covariance of all values."""
-    rng, units = np.random.default_rng(1), units_of(unit)
-    poses = simulate_poses(sensor(rng), spread_directions(20), rng)
-    poses = poses.with_columns(reading=units.from_g(poses.reading), std=units.from_g(poses['std']))
-    fitted = fit_poses(poses, units, model='10')
+    rng, fitted = np.random.default_rng(1), known(unit)
     values = {**fitted.model.values,
               **{name: np.array(each, float) for name, each in effects.items()}}
     model = Model(values, rotation_from_rpy(0.3, -0.2, 1.0) if turned else np.eye(3))
@@ -138,12 +134,12 @@ def test_a_known_covariance_is_transformed_and_grows_by_that_of_the_calibration(
 @pytest.mark.parametrize('turned', [False, True])
 def test_the_bias_of_the_gyro_is_subtracted_before_the_rate_is_turned(turned):
     used, bias, fields = calibration_of({}, turned=turned), (0.01, -0.02, 0.03), fields_of(1)[0]
-    for first, known in ((4e-4, True), (-1.0, False)):
+    for first, is_known in ((4e-4, True), (-1.0, False)):
         fields[ANGULAR_VELOCITY_COVARIANCE.start] = first
         data = message(fields)
         rewriter = rewriter_of(data, used)
         rewriter.bias = bias
-        expected = fields[ANGULAR_VELOCITY] - np.array(bias) * known
+        expected = fields[ANGULAR_VELOCITY] - np.array(bias) * is_known
         np.testing.assert_allclose(doubles_of(rewriter(data, {}))[ANGULAR_VELOCITY],
                                    used.rotation.T @ expected, rtol=1e-12)
 

@@ -10,9 +10,8 @@ from accel_calib.errors import RefusedFitError
 from inside import calibrated_by, FitPlan, is_partial
 import numpy as np
 import pytest
-from shared import MPS2
+from shared import MPS2, SENSOR
 
-SENSOR = {'offset': [0.03, -0.02, 0.04], 'axis_gain': [0.01, -0.01, 0.005]}
 PLAN = FitPlan(model='10', refined=False)
 
 
