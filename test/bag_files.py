@@ -4,28 +4,24 @@
 """Messages and small sound bags of every kind; `McapFile` writes by the specification alone."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import cache
 from pathlib import Path
-import shutil
 import sqlite3
 import struct
 from typing import Any
 import zlib
 
-from accel_calib.calibrate import Calibration, fit_poses
 from accel_calib.errors import InputError
 from accel_calib.logs import IMU_DOUBLES, LogOptions, read_recording
 from accel_calib.messages import correct_bag
 from accel_calib.table import Recording
 from accel_calib.units import units_of
-from inside import simulate_poses, spread_directions
 import lz4.frame
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer as Writer2
 from rosbags.typesys import get_typestore, Stores
-from shared import sensor
+from shared import known
 
 try:
     from compression import zstd
@@ -171,32 +167,16 @@ MAKES: dict[str, Write] = {
     'ros1 lz4': ros1(Writer1.CompressionFormat.LZ4)}
 
 
-@cache
-def a_calibration() -> Calibration:
-    """Return a calibration for the readings of the bags."""
-    rng, units = np.random.default_rng(3), units_of('m/s2')
-    poses = simulate_poses(sensor(rng), spread_directions(16), rng)
-    return fit_poses(poses.with_columns(reading=units.from_g(poses.reading),
-                                        std=units.from_g(poses['std'])), units)
-
-
 def check_refused(path: Path, words: str, topic: str = '') -> None:
     """Check that reading and correcting a bag end in one line, and that nothing is written."""
     before = {*path.parent.iterdir()}
     for work in (lambda: read_recording(path, topic),
-                 lambda: correct_bag(path, a_calibration(), path.with_name('out'),
+                 lambda: correct_bag(path, known(), path.with_name('out'),
                                      LogOptions(topic=topic))):
         with pytest.raises(InputError, match=words) as refusal:
             work()
         assert '\n' not in str(refusal.value)
     assert {*path.parent.iterdir()} == before
-
-
-def copied(path: Path, folder: Path) -> Path:
-    """Copy a bag, and return its new path."""
-    folder.mkdir(exist_ok=True)
-    target = folder / path.name
-    return Path(shutil.copytree(path, target) if path.is_dir() else shutil.copy(path, target))
 
 
 def execute(file: Path, statement: str, *values: Any) -> None:

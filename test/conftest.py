@@ -11,6 +11,7 @@ condition and a time limit.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
 from importlib.util import find_spec
 import os
 from pathlib import Path
@@ -22,11 +23,15 @@ import tempfile
 import time
 from typing import Any
 
-from inside import own_domain
+from accel_calib.calibrate import level
+from accel_calib.stored import write_calibration
+from inside import model_with, NODES, own_domain, simulate_recording
 import numpy as np
 import pytest
+from shared import GRAVITY, KNOWN, known, ROOT
 
-ROOT = Path(__file__).parent.parent
+sys.path.append(str(ROOT / 'benchmarks'))  # some tests are the short form of a benchmark
+
 UDP = ROOT / 'config' / 'fast_dds_udp.xml'
 """Profile of Fast DDS with the discovery range of LOCALHOST, and without shared memory."""
 
@@ -42,7 +47,6 @@ start of a node and the answer of DDS take much longer than on an idle one.
 
 """
 
-GRAVITY = 9.80665
 RATE = 50.0
 _BATCH = 20
 
@@ -108,9 +112,8 @@ class Bench:
 
     def start(self, name: str, **parameters: Any) -> subprocess.Popen[str]:
         """Start a node of the package as a process."""
-        from inside import NODES
-        given = [part for key, value in parameters.items()
-                 for part in ('-p', f'{key}:={_yaml(value)}')]
+        given = [part for key, value in parameters.items() for part in (
+            '-p', f'{key}:={str(value).lower() if isinstance(value, bool) else value}')]
         return self.run(*NODES[name], '--ros-args', *given)
 
     def run(self, *arguments: str) -> subprocess.Popen[str]:
@@ -288,10 +291,6 @@ def _came(message: Any, heard: list[Any]) -> bool:
     return bool(heard) and heard[-1].header.stamp == message.header.stamp
 
 
-def _yaml(value: Any) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)
-
-
 @pytest.fixture(scope='session')
 def temporary() -> Iterator[Path]:
     """Yield a folder for temporary files, in which any user can write."""
@@ -386,18 +385,11 @@ def without_tf2(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', None)
 
 
-EFFECTS: Mapping[str, Any] = {'offset': np.array([0.03, -0.02, 0.04]),
-                              'axis_gain': np.array([0.012, -0.015, 0.008]),
-                              'cross_axis': np.array([0.006, -0.004, 0.003])}
-
-
 @pytest.fixture
 def readings() -> Callable[..., Any]:
     """Return a function that simulates readings of a sensor that is turned."""
-    from inside import model_with, simulate_recording
-
     def make(directions: Any, *, dwell: float = 1.8, rotation: Any = None,
-             effects: Mapping[str, Any] = EFFECTS) -> Any:
+             effects: Mapping[str, Any] = KNOWN) -> Any:
         recording = simulate_recording(
             model_with(effects, rotation), np.array(directions, float), np.random.default_rng(7),
             noise_g=0.0005, rate_hz=RATE, dwell=dwell, turn=0.4)
@@ -409,20 +401,9 @@ def readings() -> Callable[..., Any]:
 @pytest.fixture
 def stored(tmp_path: Path) -> Callable[..., Path]:
     """Return a function that stores a calibration of known parameters."""
-    from accel_calib.calibrate import fit_poses, level
-    from accel_calib.stored import write_calibration
-    from accel_calib.units import units_of
-    from inside import model_with, simulate_poses, spread_directions
-
     def make(name: str = 'known.yaml', *, sensor: str = '', unit: Any = 'm/s2',
              flat: Any = None) -> Path:
-        units = units_of(unit)
-        poses = simulate_poses(model_with(EFFECTS), spread_directions(20),
-                               np.random.default_rng(3), noise_g=0.0005)
-        poses = poses.with_columns(reading=units.from_g(poses.reading),
-                                   std=units.from_g(poses['std']))
-        calibration = fit_poses(poses, units, model='10', sensor=sensor,
-                                date='2026-01-01T00:00:00+00:00')
+        calibration = replace(known(unit), sensor=sensor)
         if flat is not None:
             reading = calibration.predict(np.array([flat], float) * calibration.force_per_g)[0]
             calibration = level(calibration, reading, 'ros')

@@ -8,7 +8,7 @@ from typing import Any
 
 from accel_calib.errors import AccelCalibError
 from accel_calib.session import (
-    answered, CalibratorSettings, checks, columns_of, Log, Result, Session, state, Task)
+    answered, CalibratorSettings, checks, columns_of, Log, Result, Session, ShowPoses, state, Task)
 from inside import next_action
 import numpy as np
 import pytest
@@ -25,6 +25,7 @@ class Driver:
         self.stamp = 1000.0
         self.log: list[Log] = []
         self.results: list[str] = []
+        self.shown: ShowPoses | None = None
         self.session = Session(CalibratorSettings(**parameters), topic, lambda: self.now)
         self.handle()
 
@@ -32,12 +33,17 @@ class Driver:
         while self.session.events:
             event = self.session.events.popleft()
             if isinstance(event, Generator):
-                words = self.done(event)
-                self.log += [Log('info', words)] if words else []
+                self.end(self.done(event))
             elif isinstance(event, Log):
                 self.log.append(event)
             elif isinstance(event, Result):
                 self.results.append(event.text)
+            elif isinstance(event, ShowPoses):
+                self.shown = event
+
+    def end(self, answer: str) -> None:
+        """Log the answer of a command that nobody asked for."""
+        self.log += [Log('info', answer)] if answer else []
 
     def done(self, task: Task) -> str:
         """Return the answer of a command."""

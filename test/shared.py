@@ -3,8 +3,10 @@
 
 """Helpers of several tests: recordings, sensors, commands, waits, and tasks of a session."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
+from functools import cache
 import json
 import os
 from pathlib import Path
@@ -13,23 +15,38 @@ import subprocess
 import sys
 from tempfile import TemporaryFile
 import time
+import tracemalloc
 from typing import Any
 
-from accel_calib.calibrate import Calibration
+from accel_calib import simulate
+from accel_calib.calibrate import Calibration, fit_poses
 from accel_calib.effects import effect_named
 from accel_calib.geometry import unit
 from accel_calib.session import Step
 from accel_calib.table import Floats
-from inside import COMMAND, main, Model, model_with, OVER_THE_SPHERE, predict
+from accel_calib.units import units_of
+from inside import COMMAND, main, Model, model_with, OVER_THE_SPHERE, predict, spread_directions
 import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / 'shared' / 'data'
+LOGS = ROOT / 'test' / 'data' / 'logs'
+GRAVITY = 9.80665
+FACES = np.vstack([np.eye(3), -np.eye(3)])
+G, MPS2, NATIVE = map(units_of, ('g', 'm/s2', 'native'))
+
+Readings = Callable[..., Any]
+Stored = Callable[..., Path]
+"""Types of the fixtures of these names."""
 
 SENSOR = {'offset': [0.02, -0.01, 0.03], 'axis_gain': [0.01, -0.02, 0.005],
           'cross_axis': [0.004, 0.002, -0.003]}
 """Effects of a sensor that several tests simulate."""
+
+KNOWN = {'offset': [0.03, -0.02, 0.04], 'axis_gain': [0.012, -0.015, 0.008],
+         'cross_axis': [0.006, -0.004, 0.003]}
+"""Effects of the sensor of `known`."""
 
 OPTIONS = [part for name, values in SENSOR.items()
            for part in ('--effect', f'{name}={",".join(map(str, values))}')]
@@ -51,6 +68,13 @@ def sensor(rng: np.random.Generator, *effects: str) -> Model:
     names = effects or ('offset', 'axis_gain', 'cross_axis')
     widths = {'gain': 1}
     return model_with({name: rng.normal(size=widths.get(name, 3)) * sizes[name] for name in names})
+
+
+@cache
+def known(unit: Any = 'm/s2') -> Calibration:
+    """Return a calibration of known effects, from 20 poses."""
+    poses = simulate(KNOWN, directions=spread_directions(20), units=unit, noise=0.0005, seed=3)
+    return fit_poses(poses, units_of(unit), model='10', date='2026-01-01T00:00:00+00:00')
 
 
 def with_effects(calibration: Calibration, values: Mapping[str, Any], variance: float = 1e-12,
@@ -172,6 +196,11 @@ def _status_of(arguments: Sequence[object]) -> int:
         return int(ended.code or 0)
 
 
+def text_of(page: str) -> str:
+    """Return the text of a page of this repository."""
+    return (ROOT / page).read_text(encoding='utf-8')
+
+
 def run_snippets(page: str, printed: Callable[[str], bool] = bool) -> dict[str, Any]:
     """
     Run the Python of a page in this folder, and return its names.
@@ -180,9 +209,9 @@ def run_snippets(page: str, printed: Callable[[str], bool] = bool) -> dict[str, 
     of a file is also written to this file.
 
     """
-    text, names = (ROOT / page).read_text(encoding='utf-8'), dict[str, Any]()
+    names = dict[str, Any]()
     pattern = r'^```python\n(.*?)^```(?:\n\n```text\n(.*?)^```)?'
-    for snippet, shown in re.findall(pattern, text, re.MULTILINE | re.DOTALL):
+    for snippet, shown in re.findall(pattern, text_of(page), re.MULTILINE | re.DOTALL):
         file = re.match(r'# (\w+\.py)\n', snippet)
         if file:
             Path(file[1]).write_text(snippet, encoding='utf-8')
@@ -224,6 +253,17 @@ def wait(until: Callable[[], Any], seconds: float = 300.0) -> None:
 def result(step: Step) -> Any:
     """Return the result of a step, computed in this process."""
     return step.run(lambda function, *given: function(*given))
+
+
+@contextmanager
+def little_memory(most: float = 150e6) -> Iterator[None]:
+    """Check that a block takes no more memory than this [bytes]."""
+    tracemalloc.start()
+    try:
+        yield
+        assert tracemalloc.get_traced_memory()[1] < most
+    finally:
+        tracemalloc.stop()
 
 
 def children(pid: int) -> list[int]:

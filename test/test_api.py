@@ -5,7 +5,6 @@
 
 from dataclasses import fields, replace
 import importlib
-from pathlib import Path
 import pickle
 
 import accel_calib as ac
@@ -13,7 +12,7 @@ from accel_calib.errors import AccelCalibError, InputError
 from accel_calib.logs import write_table
 import numpy as np
 import pytest
-from shared import python, SENSOR
+from shared import LOGS, python, SENSOR
 
 MATRIX = np.linalg.inv(np.eye(3) + np.diag(SENSOR['axis_gain']) + np.array(
     [[0.0, 0.004, 0.002], [0.004, 0.0, -0.003], [0.002, -0.003, 0.0]]))
@@ -38,12 +37,13 @@ def test_names_of_the_package_are_its_public_face():
 
 
 def test_functions_stay_when_a_folder_of_their_name_is_imported():
-    code = ('import accel_calib as ac, accel_calib.{0}; from accel_calib import {0} as one; '
-            'print(one is ac.{0} and callable(one))')
-    for name in ('calibrate', 'capture', 'compare', 'refine'):
+    names, code = ('calibrate', 'capture', 'compare', 'refine'), 'import accel_calib as ac\n'
+    for name in names:
         importlib.import_module(f'accel_calib.{name}')
         assert callable(getattr(ac, name))
-        assert python('-c', code.format(name)).stdout == 'True\n'
+        code += (f'import accel_calib.{name}; from accel_calib import {name} as one; '
+                 f'print(one is ac.{name} and callable(one))\n')
+    assert python('-c', code).stdout == 'True\n' * len(names)
 
 
 def test_what_is_slow_to_import_is_imported_when_it_is_used():
@@ -90,9 +90,6 @@ def test_a_recording_is_captured_from_a_file_and_from_memory(tmp_path):
     assert len(ac.capture(recording, min_dwell=2.0)) == 6
     with pytest.raises(InputError, match='has no still stretch'):
         ac.capture(recording, min_dwell=60.0, max_dwell=600.0)
-
-
-LOGS = Path(__file__).parent / 'data' / 'logs'
 
 
 @pytest.mark.parametrize('name', ['esp32/micros.csv', 'phyphox/semicolon_point.csv',

@@ -14,8 +14,8 @@ from accel_calib.logs import LogOptions, open_log, read_recording
 from accel_calib.messages import correct_bag
 from accel_calib.units import units_of
 from bag_files import (
-    a_calibration, check_refused, header, IMU, imu, MAKES, McapFile, RATE_NS, rosbag2, START,
-    STORE, STRING, TEMPERATURE, write_bag)
+    check_refused, header, IMU, imu, MAKES, McapFile, RATE_NS, rosbag2, START, STORE, STRING,
+    TEMPERATURE, write_bag)
 from inside import (
     BLOCK_OF_A_BAG, rotation_from_rpy, ROWS_OF_A_BAG, simulate_recording, spread_directions)
 import numpy as np
@@ -23,7 +23,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionMode, Reader, StoragePlugin
 from scipy.spatial.transform import Rotation
-from shared import sensor
+from shared import known, sensor
 import yaml
 
 UNITS, ON_A = units_of('m/s2'), LogOptions(topic='/imu/a')
@@ -240,15 +240,15 @@ def test_big_endian_messages_are_read_and_corrected(make, tmp_path):
     expected = deserialized(path)
     np.testing.assert_array_equal(np.column_stack([found['time'], found['rate'], found.reading]),
                                   expected)
-    correct_bag(path, a_calibration(), tmp_path / 'out', ON_A)
+    correct_bag(path, known(), tmp_path / 'out', ON_A)
     np.testing.assert_allclose(deserialized(tmp_path / 'out')[:, 4:],
-                               a_calibration().correct(expected[:, 4:]), atol=1e-12)
+                               known().correct(expected[:, 4:]), atol=1e-12)
 
 
 @pytest.mark.parametrize(('make', 'turned'), [
     *((make, True) for make in KINDS), ('mcap zstd', False), ('sqlite3', False)])
 def test_a_corrected_bag_keeps_all_other_content(make, turned, tmp_path):
-    calibration = a_calibration()
+    calibration = known()
     if turned:
         model = replace(calibration.model, rotation=rotation_from_rpy(0.2, -0.4, 1.0))
         calibration = replace(calibration, model=model)
@@ -266,7 +266,7 @@ def test_a_corrected_bag_keeps_all_other_content(make, turned, tmp_path):
 def test_a_copy_is_compressed_like_its_bag_unless_it_is_one_file(mode, tmp_path):
     path = rosbag2(StoragePlugin.MCAP, mode)(tmp_path, TOPICS, messages(4))
     for name, found in (('out', mode.name.lower()), ('out.mcap', None), ('out.db3', None)):
-        correct_bag(path, a_calibration(), tmp_path / name, ON_A)
+        correct_bag(path, known(), tmp_path / name, ON_A)
         assert len(deserialized(tmp_path / name)) == COUNT
         if found:
             with Reader(tmp_path / name) as copy:
@@ -277,9 +277,9 @@ def test_a_copy_is_compressed_like_its_bag_unless_it_is_one_file(mode, tmp_path)
 def test_a_file_becomes_a_file_or_a_folder_with_the_metadata_of_its_messages(plugin, tmp_path):
     path = rosbag2(plugin)(tmp_path, TOPICS, messages(7))
     file = next(item for item in path.iterdir() if item.suffix != '.yaml')
-    correct_bag(file, a_calibration(), tmp_path / f'out{file.suffix}', ON_A)
+    correct_bag(file, known(), tmp_path / f'out{file.suffix}', ON_A)
     assert (tmp_path / f'out{file.suffix}').is_file()
-    correct_bag(file, a_calibration(), tmp_path / 'out', ON_A)
+    correct_bag(file, known(), tmp_path / 'out', ON_A)
     expected, found = (yaml.safe_load((folder / 'metadata.yaml').read_text())[
         'rosbag2_bagfile_information'] for folder in (path, tmp_path / 'out'))
     for about in (expected, found):

@@ -7,19 +7,17 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from accel_calib.calibrate import Calibration, fit_poses
 from accel_calib.errors import InputError
 from accel_calib.logs import LogOptions, open_log
 from accel_calib.messages import correct_bag
 from accel_calib.stored import write_calibration
 from accel_calib.table import concatenated, Recording
-from accel_calib.units import units_of
 from bag_files import fill, header, IMU, imu, writer_of
-from inside import main, model_with, simulate_poses, spread_directions
+from inside import main
 import numpy as np
 import pytest
 from rosbags.typesys import get_types_from_msg
-from shared import with_effects
+from shared import known, with_effects
 
 COUNT, STEP = 400, 10 ** 7
 RECEIVED = 1_700_000_000 * 10 ** 9
@@ -200,22 +198,10 @@ def test_a_topic_without_a_temperature_is_refused(
         read(path, temperature_topic=asked)
 
 
-@pytest.fixture(scope='module')
-def calibration_in_g() -> Calibration:
-    rng = np.random.default_rng(1)
-    return fit_poses(simulate_poses(model_with({'offset': 0.01}), spread_directions(16), rng),
-                     units_of('g'))
-
-
-@pytest.fixture(scope='module')
-def thermal(calibration_in_g: Calibration) -> Calibration:
-    """Return a calibration in g that depends on the temperature."""
-    return with_effects(calibration_in_g, {'offset_temperature': (0.002, -0.001, 0.003)},
-                        temperature=np.linspace(10.0, 40.0, 16))
-
-
 def test_a_bag_is_corrected_with_a_named_temperature(
-        thermal: Calibration, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    thermal = with_effects(known('g'), {'offset_temperature': (0.002, -0.001, 0.003)},
+                           temperature=np.linspace(10.0, 40.0, 20))
     path, out = write(tmp_path, {'/imu/temp': ('std_msgs/msg/Float64', warming)}), tmp_path / 'out'
     with pytest.raises(InputError, match='looks like a temperature .* but the calibration depends '
                                          'on the temperature; name the topic with'):
@@ -236,9 +222,8 @@ def test_a_bag_is_corrected_with_a_named_temperature(
     assert 'corrected 400 samples' in capsys.readouterr().out
 
 
-def test_a_calibration_without_temperature_needs_no_topic(calibration_in_g: Calibration,
-                                                          tmp_path: Path) -> None:
+def test_a_calibration_without_temperature_needs_no_topic(tmp_path: Path) -> None:
     path = write(tmp_path, {'/imu/temp': ('std_msgs/msg/Float64', warming)})
     notes: list[str] = []
-    assert correct_bag(path, calibration_in_g, tmp_path / 'out', note=notes.append) == COUNT
+    assert correct_bag(path, known('g'), tmp_path / 'out', note=notes.append) == COUNT
     assert notes == []

@@ -13,14 +13,14 @@ from accel_calib.logs import open_log, read_recording
 from accel_calib.messages import correct_bag
 from accel_calib.stored import write_calibration
 from bag_files import (
-    a_calibration, by_hand, check_refused, COUNT, execute, header, IMU, imu, MAKES, raw_messages,
-    ros1, rosbag2, STORE)
+    by_hand, check_refused, COUNT, execute, header, IMU, imu, MAKES, raw_messages, ros1, rosbag2,
+    STORE)
 from faults.fuzz import ended, read_bag
 from faults.sample import sample
 import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin
-from shared import run_on_small_disk
+from shared import known, run_on_small_disk
 
 
 def check(path: Path) -> None:
@@ -100,7 +100,7 @@ def test_the_messages_in_the_journal_of_a_killed_recorder_are_read(tmp_path: Pat
         count, notes = read(each)
         assert count == 2 * COUNT
         assert 'its last messages are read from bag.db3-wal' in notes[0]
-    assert correct_bag(path, a_calibration(), tmp_path / 'out') == 2 * COUNT
+    assert correct_bag(path, known(), tmp_path / 'out') == 2 * COUNT
     assert {each.name: each.read_bytes() for each in path.iterdir()} == before
 
 
@@ -158,7 +158,7 @@ def test_lost_messages_are_noted(tmp_path: Path) -> None:
     assert said == (f'{COUNT - found} of {COUNT} messages on /imu are lost: the index of {path} '
                     'states them, but they are not in the bag',)
     notes: list[str] = []
-    assert correct_bag(path, a_calibration(), tmp_path / 'out', note=notes.append) == found
+    assert correct_bag(path, known(), tmp_path / 'out', note=notes.append) == found
     assert notes == [*said]
 
 
@@ -188,7 +188,7 @@ def test_a_long_name_of_a_sensor_is_not_shown_whole(tmp_path: Path) -> None:
     ('out', 8), ('out', 24), ('out.db3', 24), ('out.mcap', 8), ('out.bag', 24)])
 def test_a_copy_on_a_full_disk_is_one_line_and_nothing_stored(
         name: str, size_kb: int, tmp_path: Path) -> None:
-    write_calibration(tmp_path / 'c.yaml', a_calibration())
+    write_calibration(tmp_path / 'c.yaml', known())
     path = (ros1() if name.endswith('.bag') else rosbag2(StoragePlugin.SQLITE3))(tmp_path)
     disk = tmp_path / 'disk'
     done, copy = run_on_small_disk(

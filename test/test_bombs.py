@@ -10,7 +10,6 @@ import shutil
 import socket
 import sqlite3
 import struct
-import tracemalloc
 from typing import Any
 
 from accel_calib.errors import InputError
@@ -18,8 +17,7 @@ from accel_calib.logs import read_recording
 from accel_calib.messages import correct_bag
 from accel_calib.stored import write_calibration
 from bag_files import (
-    a_calibration, COMPRESS, copied, COUNT, execute, McapFile, messages, raw_messages,
-    rosbag2 as folder_of, TOPICS, zstd)
+    COMPRESS, COUNT, execute, McapFile, messages, raw_messages, rosbag2 as folder_of, TOPICS, zstd)
 from inside import check_regular, DECOMPRESSED, decompressed, largest, open_bag
 import pytest
 from rosbags import rosbag2
@@ -33,7 +31,7 @@ pytestmark = pytest.mark.usefixtures('in_time')
 BOMB_SIZE = 1 << 31
 ZSTD_BOMB = zstd.compress(bytes(1 << 26)) * (BOMB_SIZE >> 26)
 MOST_BYTES = 150e6
-"""Largest memory, and largest size of all that is decompressed, until a file is refused."""
+"""Largest size of all that is decompressed until a file is refused."""
 
 RAWS = raw_messages()
 
@@ -46,18 +44,12 @@ def refused(path: Path, words: str) -> None:
         sizes.append(len(data := decompressed(*given)))
         return data
 
-    tracemalloc.start()
-    try:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(*DECOMPRESSED, counted)
-            with pytest.raises(InputError, match=words) as found:
-                read_recording(path)
-        memory = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
+    with pytest.MonkeyPatch.context() as patch, shared.little_memory():
+        patch.setattr(*DECOMPRESSED, counted)
+        with pytest.raises(InputError, match=words) as found:
+            read_recording(path)
     assert str(path) in str(found.value)
     assert '\n' not in str(found.value)
-    assert memory < MOST_BYTES
     assert sum(sizes) < MOST_BYTES
 
 
@@ -264,11 +256,11 @@ def test_correcting_leaves_a_database_as_it_is_and_refuses_a_copy_that_lacks_mes
         return {each: (each.read_bytes(), each.stat().st_mtime_ns) for each in path.iterdir()}
 
     before = state()
-    assert correct_bag(path, a_calibration(), tmp_path / 'whole') == COUNT
+    assert correct_bag(path, shared.known(), tmp_path / 'whole') == COUNT
     assert state() == before
     monkeypatch.setattr(rosbag2.Writer, 'write', losing)
     with pytest.raises(InputError, match='the copy holds 83 of 84 messages'):
-        correct_bag(path, a_calibration(), tmp_path / 'out')
+        correct_bag(path, shared.known(), tmp_path / 'out')
     assert sorted(each.name for each in tmp_path.iterdir()) == ['bag', 'whole']
 
 
@@ -311,7 +303,7 @@ def test_a_pipe_ends_every_command_in_one_line(
         capsys: pytest.CaptureFixture[str]) -> None:
     pipe, stored, out = tmp_path / f'pipe{suffix}', tmp_path / 'c.yaml', tmp_path / 'out'
     os.mkfifo(pipe)
-    write_calibration(stored, a_calibration())
+    write_calibration(stored, shared.known())
     given = [each.replace('{out}', str(out)).replace('{yaml}', str(stored)).replace(
         '{}', str(pipe)) for each in command]
     assert '(FIFO)' in shared.refused(capsys, *given).partition(str(pipe))[2]
@@ -320,7 +312,7 @@ def test_a_pipe_ends_every_command_in_one_line(
 
 @pytest.mark.parametrize('name', ['bag.mcap', 'metadata.yaml'])
 def test_a_pipe_in_the_folder_of_a_bag_is_refused(name: str, tmp_path: Path) -> None:
-    path = copied(folder_of(StoragePlugin.MCAP)(tmp_path), tmp_path / 'copy')
+    path = folder_of(StoragePlugin.MCAP)(tmp_path)
     (path / name).unlink()
     os.mkfifo(path / name)
     refused(path, f'{name} is a pipe')

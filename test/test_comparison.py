@@ -19,9 +19,7 @@ from inside import (
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
-from shared import data, random_directions, sensor
-
-G = units_of('g')
+from shared import data, G, random_directions, sensor
 
 
 def attitudes(rng, count):

@@ -12,16 +12,14 @@ from accel_calib.effects import (
 from accel_calib.findings import rate
 from accel_calib.refine import refine
 from accel_calib.report import calibration_page
-from accel_calib.units import units_of
 from inside import (
     beginning, best_curve, export, fitted_state, format_calibration, Model, parse_calibration,
     predict, simulate_poses)
 import numpy as np
 import pytest
-from shared import random_directions, sensor
+from shared import G, random_directions, sensor
 
 COUNT = 100
-G = units_of('g')
 CURVES = {
     'empirical-offset.x-temperature-2-3': [4e-3, -2e-3, 15.0, 35.0],
     'empirical-gain-time-1-4': [*np.linspace(-4e-3, 5e-3, 6), 100.0, 3000.0],

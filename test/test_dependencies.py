@@ -4,13 +4,13 @@
 """What is imported is required, and requirements are bounded by what was tested."""
 
 from importlib.metadata import packages_distributions
-from pathlib import Path
 import re
 import sys
 from typing import Any
 from xml.etree import ElementTree
 
 import pytest
+from shared import ROOT
 import test_packaging
 from test_style import imports_of
 
@@ -18,7 +18,6 @@ requirements = pytest.importorskip('packaging.requirements')
 Requirement = requirements.Requirement
 package_xml, setup_py = test_packaging.package_xml, test_packaging.setup_py
 
-ROOT = Path(__file__).parent.parent
 PINNED = '.ci/ubuntu-24.04.txt', 'requirements-dev.txt'
 
 FOR_DEVELOPERS = {'dev', 'docs', 'test', 'test-fleet'}

@@ -16,17 +16,13 @@ from accel_calib.session import CalibratorSettings
 from faults.sample import FACTOR
 from inside import EXPORT_FORMATS, LOG_FORMATS, parser
 import pytest
-from shared import ROOT
+from shared import ROOT, text_of
 from test_policy import names_of_the_calibrator
 import yaml
 
 PAGES = ['README.md', 'CONTRIBUTING.md', 'QUALITY_DECLARATION.md', 'SECURITY.md', *(
     str(path.relative_to(ROOT)) for path in sorted((ROOT / 'docs').rglob('*.md')))]
 OWN_PAGES = [page for page in PAGES if 'figures' not in page]
-
-
-def text_of(page):
-    return (ROOT / page).read_text(encoding='utf-8')
 
 
 @pytest.fixture
@@ -132,20 +128,15 @@ def template(node):
     return None
 
 
-@pytest.fixture(scope='module')
-def templates():
-    texts = set()
+def test_each_quoted_message_is_in_the_code():
+    templates = set()
     for path in (ROOT / 'accel_calib').rglob('*.py'):
         nodes = list(ast.walk(ast.parse(path.read_text(encoding='utf-8'))))
         parts = {id(part) for node in nodes if isinstance(node, ast.JoinedStr)
                  for part in node.values}
         documented = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
-        texts |= {template(node) for node in nodes
-                  if id(node) not in parts | documented and template(node)}
-    return texts
-
-
-def test_each_quoted_message_is_in_the_code(templates):
+        templates |= {template(node) for node in nodes
+                      if id(node) not in parts | documented and template(node)}
     quoted = {*re.findall(r'^- \*\*`([^`]+)`\*\*', text_of('docs/troubleshooting.md'), re.M)}
     assert len(quoted) >= 35
     for quote in quoted - FOREIGN:

@@ -35,9 +35,8 @@ import numpy as np
 import pytest
 import ramps
 import shared
-from shared import python, ROOT, run_snippets
+from shared import LOGS, python, ROOT, run_snippets, text_of
 
-LOGS = ROOT / 'test' / 'data' / 'logs'
 PAGES = sorted(str(path.relative_to(ROOT)) for path in (
     ROOT / 'README.md', *(ROOT / 'docs').rglob('*.md')))
 OF_ROS = {'node', 'simulator', 'watch', 'demo', 'live'}
@@ -116,10 +115,6 @@ FILES = {
         ('calibration', 'monday', 'tuesday', 'wednesday'))},
 }
 """How to write the files that pages name; the names mean the same in all pages."""
-
-
-def text_of(page):
-    return (ROOT / page).read_text(encoding='utf-8')
 
 
 @pytest.mark.parametrize('page', sample([page for page in PAGES if any(

@@ -18,12 +18,10 @@ from inside import (
     rotation_from_rpy, simulate_poses, spread_directions, terms_of)
 import numpy as np
 import pytest
-from shared import refused, rms, run
+from shared import KNOWN as AFFINE, refused, rms, run
 import yaml
 
-AFFINE = {'offset': [0.03, -0.02, 0.04], 'axis_gain': [0.012, -0.015, 0.008],
-          'cross_axis': [0.006, -0.004, 0.003]}
-BY_AXIS = {'offset': [0.03, -0.02, 0.04], 'axis_gain': [0.012, -0.015, 0.008]}
+BY_AXIS = {name: AFFINE[name] for name in ('offset', 'axis_gain')}
 THERMAL = {'offset_temperature': [0.001, -0.0005, 0.0003],
            'offset_temperature_quadratic': [1e-5, -2e-5, 1e-5]}
 TEMPERATURE = {**THERMAL, 'gain_temperature': [0.0003, -0.0002, 0.0001]}
@@ -33,6 +31,7 @@ BENDING = {'quadratic': [0.003, -0.002, 0.001], 'cubic': [0.002, 0.001, -0.003],
 CURVES = {'empirical-offset-force-1-2': [0.001, 0.002, -0.001, 0.0005, 0.001, -0.002],
           'empirical-gain.z-temperature-1-2': [0.004, -0.002, 12.0, 38.0],
           'empirical-force-direction-3-4': np.linspace(-0.002, 0.003, 16)}
+GYRO = GyroBias(np.array([0.01, -0.02, 0.005]), np.full(3, 1e-4), 12, np.nan, np.zeros(3), ())
 TILTED = rotation_from_rpy(0.1, -0.2, 0.05)
 RANGE = (12.0, 38.0)
 HOSTILE = ['*/ int x; /*', 'a??/', 'b\\', 'c\n#error', '\u00fcber\u2028\x00', '/**/', '"%s', '']
@@ -328,12 +327,11 @@ def test_imu_calib_corrects_as_apply_does(name):
 @pytest.mark.parametrize('name', ['affine', 'in_g', 'counts', 'levelled'])
 def test_imucal_corrects_as_apply_does(name):
     imucal = pytest.importorskip('imucal')
-    gyro = GyroBias(np.array([0.01, -0.02, 0.005]), np.full(3, 1e-4), 12, np.nan, np.zeros(3), ())
-    made = replace(HEADERS[name], gyro=gyro)
+    made = replace(HEADERS[name], gyro=GYRO)
     reading, _, wanted = samples(made)
     found = imucal.FerrarisCalibrationInfo.from_json(text_of(made, 'imucal'))
     units = {'affine': 'm/s^2', 'levelled': 'm/s^2', 'in_g': 'g', 'counts': 'a.u.'}
-    forces, rates = found.calibrate(reading, np.tile(gyro.bias + np.eye(3)[2],
+    forces, rates = found.calibrate(reading, np.tile(GYRO.bias + np.eye(3)[2],
                                                      (len(reading), 1)), units[name], 'rad/s')
     factor = 9.80665 if name == 'counts' else 1.0
     np.testing.assert_allclose(forces, wanted * factor, rtol=1e-9, atol=1e-9)
@@ -426,17 +424,15 @@ def test_a_program_corrects_from_its_file_as_apply_does(user, unit, per_g, seed)
 
 
 def test_the_gyro_is_turned_where_the_file_says_so():
-    bias = np.array([0.01, -0.02, 0.005])
-    gyro = GyroBias(bias, np.full(3, 1e-4), 12, np.nan, np.zeros(3), ())
-    made, rate = replace(HEADERS['levelled'], gyro=gyro), np.array([0.1, 0.2, 0.3])
+    made, rate = replace(HEADERS['levelled'], gyro=GYRO), np.array([0.1, 0.2, 0.3])
     found = json.loads(text_of(made, 'realsense'))['imus'][0]['gyroscope']
-    turned = (bias + rate) @ np.reshape(found['scale_and_alignment'], (3, 3)) - found['bias']
+    turned = (GYRO.bias + rate) @ np.reshape(found['scale_and_alignment'], (3, 3)) - found['bias']
     np.testing.assert_allclose(turned, TILTED.T @ rate, atol=1e-12)
     matrix = re.search(r'gyroscopeMisalignment = {(.*)};', text_of(made, 'fusion'))[1]
     np.testing.assert_allclose(np.array(matrix.replace('f', '').split(','), float).reshape(3, 3),
                                TILTED.T, atol=1e-7)
     node = yaml.safe_load(text_of(made, 'dlio'))['/**']['ros__parameters']
-    np.testing.assert_array_equal(node['imu/intrinsics/gyro/bias'], bias)
+    np.testing.assert_array_equal(node['imu/intrinsics/gyro/bias'], GYRO.bias)
     assert any('rotation of' in line for line in export(made, 'dlio').losses)
 
 

@@ -117,15 +117,6 @@ def test_shape_at_its_usual_value_is_not_stored(values, text, calibration):
     assert format_calibration(parse_calibration(again, 'calibration.yaml')) == again
 
 
-@pytest.mark.parametrize('command', ['calibrate', 'fit', 'refine', 'verify', 'capture', 'apply'])
-def test_a_calibration_in_place_of_a_log_is_named(command, calibration, tmp_path, capsys):
-    path = tmp_path / 'calibration.yaml'
-    write_calibration(path, calibration)
-    used = ['-c', path] if command in ('verify', 'apply') else []
-    stored = [] if command == 'verify' else ['-o', tmp_path / 'other']
-    assert 'is a calibration' in refused(capsys, command, path, *used, *stored)
-
-
 @pytest.fixture(scope='module')
 def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp('made')
@@ -145,6 +136,14 @@ def here(made, tmp_path, monkeypatch):
     shutil.copytree(made, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+@pytest.mark.usefixtures('here')
+@pytest.mark.parametrize('command', ['calibrate', 'fit', 'refine', 'verify', 'capture', 'apply'])
+def test_a_calibration_in_place_of_a_log_is_named(command, capsys):
+    used = ['-c', 'cal.yaml'] if command in ('verify', 'apply') else []
+    stored = [] if command == 'verify' else ['-o', 'other']
+    assert 'is a calibration' in refused(capsys, command, 'cal.yaml', *used, *stored)
 
 
 def contents(folder):

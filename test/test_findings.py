@@ -14,15 +14,12 @@ from accel_calib.findings import (
     Expected, figures_of, GOOD_MG, rate, rate_comparison, rate_refinement, rate_verification)
 from accel_calib.logs import write_table
 from accel_calib.refine import refine
-from accel_calib.units import units_of
 from inside import (
     format_calibration, main, Model, model_with, number, parse_calibration, spread_directions)
 import numpy as np
 import pytest
-from shared import error_mg, random_directions
+from shared import error_mg, FACES, G, MPS2, random_directions
 
-G, MS2 = units_of('g'), units_of('m/s2')
-FACES = np.vstack([np.eye(3), -np.eye(3)])
 TIME = 20.0 * np.arange(30)
 WARM = 27.0 + 3.5 * np.sin(TIME / 60.0)
 COMMON = {'offset': [0.03, -0.02, 0.04], 'axis_gain': [0.01, -0.02, 0.015],
@@ -121,7 +118,7 @@ def test_the_figures_of_a_calibration_are_those_of_its_fields():
     effects = {**COMMON, 'quadratic': [0.004, -0.003, 0.005]}
     poses = simulated(effects, directions=random_directions(40, np.random.default_rng(4)),
                       noise=1e-4)
-    calibration = refine(poses, MS2).calibration
+    calibration = refine(poses, MPS2).calibration
     found = {figure.key: figure for figure in figures_of(calibration)}
     assert found['rms_after_mg'].value == calibration.quality.rms_after_mg
     assert found['max_before_mg'].value == 10.0 * calibration.quality.max_before_percent
@@ -261,7 +258,7 @@ def tilted():
 
 @pytest.mark.parametrize('fitted', [fit_partial, mounting_only])
 def test_what_a_robot_cannot_determine_is_stated_once(fitted):
-    kinds = [each.kind for each in rate(fitted(tilted(), MS2)).findings]
+    kinds = [each.kind for each in rate(fitted(tilted(), MPS2)).findings]
     assert 'open' in kinds
     assert not {'omitted', 'new_orientations', 'far_from_poses'} & {*kinds}
 

@@ -11,13 +11,11 @@ from accel_calib.calibrate import fit_poses, gated
 from accel_calib.errors import RefusedFitError
 from accel_calib.stored import OF_FILE, read_calibration
 from accel_calib.table import Poses
-from accel_calib.units import units_of
 from inside import format_calibration, Model, parse_calibration, simulate_poses, spread_directions
 import numpy as np
 import pytest
-from shared import sensor
+from shared import G, MPS2, sensor
 
-G, MPS2 = units_of('g'), units_of('m/s2')
 STORED = Path(__file__).parent / 'data'
 
 TWELVE = np.array([

@@ -7,16 +7,13 @@ import re
 from accel_calib.calibrate import dilution, error_left_in, fit_poses, identifiability, next_pose
 from accel_calib.errors import RefusedFitError
 from accel_calib.table import Poses
-from accel_calib.units import units_of
 from inside import (
     determines, missing_poses, model_with, poses_needed, predict, refuse_if_unfit,
     rotation_from_rpy, rows_of, simulate_poses, spread_directions, unit)
 import numpy as np
 import pytest
-from shared import random_directions
+from shared import FACES, G, random_directions
 
-G = units_of('g')
-FACES = np.vstack([np.eye(3), -np.eye(3)])
 TURN = 2.0 * np.pi * np.arange(12) / 12.0
 RING = np.column_stack([np.cos(TURN), np.sin(TURN), np.zeros(12)])
 

@@ -27,14 +27,21 @@ def warming(up: Any, temperature: float) -> Any:
     return healthy(up, temperature) + EFFECT * (temperature - 25.0)
 
 
+def followed(reading: Any = healthy, *, warms: float = 0.0, flat: Any = (0.0, 0.0, 1.0),
+             **parameters: Any) -> tuple[Driver, Person]:
+    """Return a session and a person who has followed it to the end."""
+    driver = Driver(**parameters)
+    person = Person(driver, reading, warming=warms, flat=flat)
+    assert person.follow() == 'done'
+    return driver, person
+
+
 def figures(driver: Driver) -> dict[str, Any]:
     return json.loads(driver.results[-1])
 
 
 def test_a_healthy_sensor_is_done_after_poses_fit_and_level() -> None:
-    driver = Driver()
-    person = Person(driver, healthy)
-    assert person.follow() == 'done'
+    driver, person = followed()
     assert list(dict.fromkeys(person.steps)) == ['poses', 'fit', 'level', 'done']
     assert driver.sensor.rating.name == 'GOOD'
     np.testing.assert_allclose(driver.calibration.offset / GRAVITY, OFFSET, atol=1e-3)
@@ -45,9 +52,7 @@ def test_a_healthy_sensor_is_done_after_poses_fit_and_level() -> None:
 
 
 def test_an_effect_of_temperature_leads_to_refine_and_is_kept_by_a_fit() -> None:
-    driver = Driver()
-    person = Person(driver, warming, warming=1.2)
-    assert person.follow() == 'done'
+    driver, person = followed(warming, warms=1.2)
     assert 'refine' in person.steps
     refined = driver.calibration
     assert 'offset_temperature' in refined.model.effects
@@ -57,6 +62,7 @@ def test_an_effect_of_temperature_leads_to_refine_and_is_kept_by_a_fit() -> None
     driver.ask('fit')
     again = driver.calibration
     assert again.model.effects == refined.model.effects
+    assert not np.array_equal(again.model.vector, refined.model.vector)
     assert len(again.poses) == len(driver.poses)
     np.testing.assert_allclose(again.model.values['offset_temperature'][:3], EFFECT, atol=5e-5)
     assert again.is_levelled
@@ -75,9 +81,7 @@ def test_without_messages_or_in_another_unit_the_stream_comes_first() -> None:
 
 def test_each_fit_refinement_and_levelling_is_reported_as_on_the_command_line(
         capsys: pytest.CaptureFixture[str]) -> None:
-    driver = Driver(sensor='arm')
-    person = Person(driver, warming, warming=1.2)
-    person.follow()
+    driver, person = followed(warming, warms=1.2, sensor='arm')
     kinds = [json.loads(text)['next']['kind'] for text in driver.results]
     assert kinds[-1] == 'done'
     assert {'refine', 'level'} <= set(kinds)
@@ -107,9 +111,7 @@ def test_each_fit_refinement_and_levelling_is_reported_as_on_the_command_line(
 
 
 def test_an_offered_calibration_waits_for_save_and_is_reported_as_not_in_use() -> None:
-    driver = Driver(confirm=True)
-    person = Person(driver, healthy)
-    assert person.follow() == 'done'
+    driver, person = followed(confirm=True)
     assert list(dict.fromkeys(person.steps)) == ['poses', 'fit', 'accept', 'level', 'done']
     person.rest(person.flat, 4.0)
     for command in ('calibrate_at_rest', 'set_level'):
@@ -161,18 +163,14 @@ def test_slow_motion_by_hand_is_named_while_a_pose_is_waited_for() -> None:
 
 
 def test_an_upside_down_sensor_is_asked_about_once_unless_its_mounting_is_given() -> None:
-    driver = Driver(sensor='arm')
-    person = Person(driver, healthy, flat=(0.0, 0.0, -1.0))
-    assert person.follow() == 'done'
+    driver, person = followed(flat=(0.0, 0.0, -1.0), sensor='arm')
     assert person.steps.count('level') == 2
     assert driver.sensor.rating.name == 'GOOD'
     driver.session.close()
     again = Driver(sensor='arm')
     assert again.calibration is not None
     assert not again.logged('warning')
-    given = Driver(mounting_rpy=[np.pi, 0.0, 0.0])
-    person = Person(given, healthy, flat=(0.0, 0.0, -1.0))
-    assert person.follow() == 'done'
+    given, person = followed(flat=(0.0, 0.0, -1.0), mounting_rpy=[np.pi, 0.0, 0.0])
     person.rest(person.flat, 4.0)
     given.ask('set_level')
     assert given.sensor.rating.name == 'GOOD'
@@ -202,9 +200,7 @@ def test_an_effect_far_beyond_those_of_parts_is_reported_and_not_used() -> None:
 
 
 def test_the_heading_by_a_raised_nose_is_questioned() -> None:
-    driver = Driver()
-    person = Person(driver, healthy)
-    assert person.follow() == 'done'
+    driver, person = followed()
     for questioned in (True, False):
         person.rest([0.5, 0.0, 0.8], 4.0)
         assert ('nose was up' in driver.ask('set_heading')) is questioned

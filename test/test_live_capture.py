@@ -3,9 +3,8 @@
 
 """Poses captured while samples arrive, and rests compared with the calibration in use."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from accel_calib.calibrate import fit_poses, level
@@ -18,12 +17,9 @@ from inside import (
     with_temperature)
 import numpy as np
 import pytest
+from shared import GRAVITY, MPS2, Readings, Stored
 
-UNITS = units_of('m/s2')
-GRAVITY = 9.80665
 FACES = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
-
-Readings = Callable[..., Any]
 
 
 def push_all(live: LiveCapture, readings: Any, *, start: float = 0.0, rate: float = 50.0,
@@ -37,9 +33,9 @@ def push_all(live: LiveCapture, readings: Any, *, start: float = 0.0, rate: floa
     return [change for block in blocks for change in live.push(block, capture)]
 
 
-def monitored(stored: Callable[..., Path]) -> tuple[Any, Any]:
+def monitored(stored: Stored) -> tuple[Any, Any]:
     """Return a calibration, and a sensor that uses it."""
-    calibration, sensor = read_calibration(stored()), Sensor(CalibratorSettings(), UNITS)
+    calibration, sensor = read_calibration(stored()), Sensor(CalibratorSettings(), MPS2)
     sensor.adopt(calibration)
     return calibration, sensor
 
@@ -51,7 +47,7 @@ def dwell(time: float, direction: Any, count: float = 50.0) -> Dwell:
 
 def test_a_mark_of_a_pose_outlives_a_restart() -> None:
     marked = replace(dwell(0.0, [0, 0, 1]), at_limit=True, doubtful=True)
-    book = PoseBook(CaptureSettings(), UNITS)
+    book = PoseBook(CaptureSettings(), MPS2)
     book.add_stored(poses_from([dwell(5.0, [0, 1, 0]), marked]))
     assert book.poses()['at_limit'].tolist() == book.poses()['doubtful'].tolist() == [0.0, 1.0]
 
@@ -75,14 +71,14 @@ def test_a_board_that_sends_counts_is_still_within_3_s(up: Any, noise: float, se
 
 
 def test_rest_counts_before_it_ends_and_its_final_average_replaces_it(readings: Readings) -> None:
-    live = LiveCapture(CaptureSettings(), UNITS)
+    live = LiveCapture(CaptureSettings(), MPS2)
     changes = push_all(live, readings([[0, 0, 1]], dwell=9.0))
     counts = [change.rest.samples for change in changes if change.poses]
     assert len(live.book.poses()) == 1
     assert counts == sorted(counts)
     assert counts[0] < 80
     assert counts[-1] > 150
-    live = LiveCapture(CaptureSettings(repeated='keep'), UNITS)
+    live = LiveCapture(CaptureSettings(repeated='keep'), MPS2)
     changes = push_all(live, readings(FACES, dwell=2.0))
     assert len(live.book.poses()) == 3
     assert sum(len(change.ended) for change in changes) >= 1
@@ -95,7 +91,7 @@ def test_rest_counts_before_it_ends_and_its_final_average_replaces_it(readings: 
     (25.0, 0.2, 1.5), (25.0, 5.0, 3.0), (25.0, 1.0, 10.0), (400.0, 0.2, 3.0), (400.0, 1.0, 1.5),
     (400.0, 5.0, 1.5)])
 def test_no_pose_of_a_turned_sensor_is_doubtful(dwell: float, turn: float, rate: float) -> None:
-    live = LiveCapture(CaptureSettings(), UNITS)
+    live = LiveCapture(CaptureSettings(), MPS2)
     recording = simulate_recording(
         model_with({}), np.array(FACES, float), np.random.default_rng(1), noise_g=0.002,
         rate_hz=rate, dwell=dwell, turn=turn)
@@ -106,7 +102,7 @@ def test_no_pose_of_a_turned_sensor_is_doubtful(dwell: float, turn: float, rate:
 
 
 def test_removed_pose_is_not_captured_again_in_the_same_rest(readings: Readings) -> None:
-    live, rest = LiveCapture(CaptureSettings(), UNITS), readings([[0, 0, 1]], dwell=12.0)
+    live, rest = LiveCapture(CaptureSettings(), MPS2), readings([[0, 0, 1]], dwell=12.0)
     push_all(live, rest[:150])
     assert live.undo()
     push_all(live, rest[150:], start=3.0)
@@ -115,7 +111,7 @@ def test_removed_pose_is_not_captured_again_in_the_same_rest(readings: Readings)
 
 
 def test_without_auto_capture_only_requested_poses_are_captured(readings: Readings) -> None:
-    live = LiveCapture(CaptureSettings(), UNITS)
+    live = LiveCapture(CaptureSettings(), MPS2)
     turned = readings(FACES, dwell=2.0)
     push_all(live, turned[:90], capture=False)
     rest = live.detector.current()
@@ -129,7 +125,7 @@ def test_without_auto_capture_only_requested_poses_are_captured(readings: Readin
 
 def book_of(rests: Iterable[Any], repeated: Any = 'merge') -> PoseBook:
     """Return the poses of rests, each with its time, direction and perhaps temperature."""
-    book = PoseBook(CaptureSettings(repeated=repeated), UNITS)
+    book = PoseBook(CaptureSettings(repeated=repeated), MPS2)
     for time, direction, *warm in rests:
         book.end(replace(dwell(time, direction), context=dict(zip(['temperature'], warm))))
     return book
@@ -160,8 +156,7 @@ def test_stored_poses_are_added_as_they_were() -> None:
         np.testing.assert_allclose(again.poses()[key], poses[key], err_msg=key)
 
 
-def test_change_is_reported_during_the_third_rest_and_survives_a_new_level(
-        stored: Callable[..., Path]) -> None:
+def test_change_is_reported_during_the_third_rest_and_survives_a_new_level(stored: Stored) -> None:
     calibration, sensor = monitored(stored)
 
     def rest(time: float, off: float) -> Dwell:
@@ -186,8 +181,7 @@ def test_change_is_reported_during_the_third_rest_and_survives_a_new_level(
     assert sensor.drift is None
 
 
-def test_rest_that_is_reported_late_does_not_hide_the_ongoing_rest(
-        stored: Callable[..., Path]) -> None:
+def test_rest_that_is_reported_late_does_not_hide_the_ongoing_rest(stored: Stored) -> None:
     _, sensor = monitored(stored)
     early, late = dwell(0.0, [0, 0, 1]), dwell(10.0, [0, 0, 1.01])
     sensor.update(early, 0.001)
@@ -215,9 +209,8 @@ def test_remainder_of_a_rest_is_what_came_after_its_part() -> None:
     assert rest.context['temperature'] == pytest.approx(26.0)
 
 
-def test_robot_that_stands_for_hours_is_monitored_all_the_time(
-        stored: Callable[..., Path]) -> None:
-    (calibration, sensor), live = monitored(stored), LiveCapture(CaptureSettings(), UNITS)
+def test_robot_that_stands_for_hours_is_monitored_all_the_time(stored: Stored) -> None:
+    (calibration, sensor), live = monitored(stored), LiveCapture(CaptureSettings(), MPS2)
     rng = np.random.default_rng(1)
     counts, left_at = [], 0.0
     base = calibration.predict(np.array([[0.0, 0.0, GRAVITY]]))[0]
@@ -253,7 +246,7 @@ def test_pose_at_another_temperature_is_not_repeated(repeated: Any, count: float
 
 def test_poses_of_a_noisier_time_are_marked_and_kept() -> None:
     rng = np.random.default_rng(3)
-    live = LiveCapture(CaptureSettings(repeated='keep'), UNITS)
+    live = LiveCapture(CaptureSettings(repeated='keep'), MPS2)
     start, changes = 0.0, []
     for noise in (0.004, 0.0004):
         for direction in spread_directions(12):
@@ -267,13 +260,13 @@ def test_poses_of_a_noisier_time_are_marked_and_kept() -> None:
     assert len(poses) == 24
     assert doubted == np.sum(poses['doubtful']) == 12
     assert np.all(poses['doubtful'][:12] == 1.0)
-    again = LiveCapture(CaptureSettings(), UNITS)
+    again = LiveCapture(CaptureSettings(), MPS2)
     again.book.add_stored(poses)
     np.testing.assert_array_equal(again.book.poses()['doubtful'], poses['doubtful'])
-    calibration = fit_poses(poses, UNITS, model='10')
+    calibration = fit_poses(poses, MPS2, model='10')
     assert [each.row for each in calibration.rejected] == list(range(1, 13))
     assert list(calibration.used_poses.row) == list(range(13, 25))
     assert 'doubtful' in calibration.rejected[0].reason
-    needed = fit_poses(poses.take(slice(0, 13)), UNITS, model='10')
+    needed = fit_poses(poses.take(slice(0, 13)), MPS2, model='10')
     assert not needed.rejected
     assert [each.rows for each in needed.noted if each.kind == 'doubtful'] == [tuple(range(1, 13))]

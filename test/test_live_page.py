@@ -7,9 +7,10 @@ from collections.abc import Iterator
 from pathlib import Path
 import re
 
+from accel_calib import simulate
 from accel_calib.logs import write_table
 from accel_calib.stored import read_calibration
-from inside import model_with, simulate_poses, spread_directions
+from inside import spread_directions
 from live_bench import GRAVITY, live_page, LivePage, SIZES, TRUTH, Viewers
 import numpy as np
 from playwright.sync_api import Browser, expect, Locator, Page
@@ -75,10 +76,8 @@ def live(tmp_path: Path) -> Iterator[LivePage]:
 @pytest.fixture
 def with_poses(tmp_path: Path) -> Iterator[LivePage]:
     """Serve the page of a sensor whose stored poses are enough for a fit."""
-    found = simulate_poses(model_with(TRUTH), spread_directions(14), np.random.default_rng(3),
-                           noise_g=0.002)
-    write_table(tmp_path / 'imu_poses.csv', found.with_columns(
-        reading=found.reading * GRAVITY, std=found['std'] * GRAVITY))
+    write_table(tmp_path / 'imu_poses.csv', simulate(
+        TRUTH, directions=spread_directions(14), noise=0.002, seed=3))
     with live_page(tmp_path) as served:
         yield served
 

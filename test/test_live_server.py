@@ -26,10 +26,9 @@ from inside import (
     STUCK)
 import numpy as np
 import pytest
-from shared import children, wait
+from shared import children, GRAVITY, wait
 from viewer import fetch, hosted, Viewer
 
-GRAVITY = 9.80665
 OFFSET = (0.03, -0.02, 0.04)
 PAUSE = 0.02
 UPGRADE = 'Upgrade: websocket\r\nConnection: Upgrade\r\n'

@@ -38,6 +38,7 @@ from shared import refused, wait
 from viewer import link_of, Viewer
 
 RATE_HZ = 200.0
+TIMED = {'time': '1', 'ax': '2', 'ay': '3', 'az': '4'}
 
 
 READINGS = [0.02, -0.01, 1.0] + 0.001 * np.random.default_rng(1).normal(size=(4000, 3))
@@ -84,8 +85,8 @@ def short_head(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_lines_of_a_board_become_samples_with_their_times_and_temperature() -> None:
-    read_as, found = received(lambda k: f'{5 * k},{numbers(k)},24.5\n', columns={
-        'time': '1', 'ax': '2', 'ay': '3', 'az': '4', 'temperature': '5'})
+    read_as, found = received(lambda k: f'{5 * k},{numbers(k)},24.5\n',
+                              columns={**TIMED, 'temperature': '5'})
     assert re.match('g, .*ms', read_as)
     assert np.allclose(np.diff(found[:, 0]), 0.005)
     first = round(found[0, 0] / 0.005)
@@ -123,15 +124,14 @@ def test_times_never_run_backwards_though_characters_are_lost(timed: bool, seed:
         cut = int(rng.integers(len(text) - 1))
         return text if k < 100 or k % 9 else text[:cut] + text[cut + int(rng.integers(1, 9)):]
 
-    columns = {'columns': {'time': '1', 'ax': '2', 'ay': '3', 'az': '4'}} if timed else {}
-    times = received(line, 400, **columns)[1][:, 0]
+    times = received(line, 400, columns=TIMED if timed else {})[1][:, 0]
     assert np.all(np.diff(times) >= 0.0)
     assert np.ptp(times) == pytest.approx(len(times) / RATE_HZ, rel=0.1) or not timed
 
 
 def test_samples_of_a_board_that_starts_again_are_kept() -> None:
-    found = received(lambda k: f'{5 * k - 1500 * (k >= 300)},{numbers(k)}\n', 500, columns={
-        'time': '1', 'ax': '2', 'ay': '3', 'az': '4'})[1]
+    found = received(lambda k: f'{5 * k - 1500 * (k >= 300)},{numbers(k)}\n', 500,
+                     columns=TIMED)[1]
     assert np.sum(np.diff(found[:, 0]) < 0.0) == 1
     assert abs(np.diff(found[:, 0])).sum() == pytest.approx(1.495 + 0.005 * (len(found) - 2))
 

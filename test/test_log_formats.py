@@ -16,8 +16,8 @@ from data.logs import make
 from inside import format_named, read_dataflash, read_log, read_ulg
 import numpy as np
 import pytest
+from shared import LOGS
 
-LOGS = Path(__file__).parent / 'data' / 'logs'
 WITHIN_SD = 5.0
 
 

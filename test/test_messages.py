@@ -16,7 +16,7 @@ import os
 import pickle
 import struct
 
-from accel_calib.calibrate import fit_poses, of_samples, thermal_stream
+from accel_calib.calibrate import of_samples, thermal_stream
 from accel_calib.effects import EFFECTS
 from accel_calib.errors import AccelCalibError, InputError
 from accel_calib.logs import (
@@ -24,14 +24,13 @@ from accel_calib.logs import (
     doubles_at, IMU_DOUBLES, joined, layout_of, LITTLE_ENDIAN, ORIENTATION, ORIENTATION_COVARIANCE,
     renamed, samples_of)
 from accel_calib.messages import corrected, output_frame, Rewriter
-from accel_calib.units import STANDARD_GRAVITY, units_of
+from accel_calib.units import STANDARD_GRAVITY
 from bag_files import swapped
-from inside import (
-    frame_ids, Model, OneReading, rotation_from_rpy, simulate_poses, spread_directions, stamps_of)
+from inside import frame_ids, Model, OneReading, rotation_from_rpy, stamps_of
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from shared import python, random_directions, sensor, values_of, with_effects
+from shared import known, python, random_directions, values_of, with_effects
 
 COUNT = int(os.environ.get('IMU_MESSAGES', '800'))
 COVARIANCES = ORIENTATION_COVARIANCE, ANGULAR_VELOCITY_COVARIANCE, ACCELERATION_COVARIANCE
@@ -57,10 +56,7 @@ CASES = {
 
 def calibration_of(effects, *, unit='m/s2', turned=False):
     """Return a linear fit with these effects, and a covariance of all values."""
-    rng, units = np.random.default_rng(1), units_of(unit)
-    poses = simulate_poses(sensor(rng), spread_directions(20), rng)
-    poses = poses.with_columns(reading=units.from_g(poses.reading), std=units.from_g(poses['std']))
-    fitted = fit_poses(poses, units, model='10')
+    rng, fitted = np.random.default_rng(1), known(unit)
     values = {**fitted.model.values,
               **{name: np.array(each, float) for name, each in effects.items()}}
     model = Model(values, rotation_from_rpy(0.3, -0.2, 1.0) if turned else np.eye(3))
@@ -138,12 +134,12 @@ def test_a_known_covariance_is_transformed_and_grows_by_that_of_the_calibration(
 @pytest.mark.parametrize('turned', [False, True])
 def test_the_bias_of_the_gyro_is_subtracted_before_the_rate_is_turned(turned):
     used, bias, fields = calibration_of({}, turned=turned), (0.01, -0.02, 0.03), fields_of(1)[0]
-    for first, known in ((4e-4, True), (-1.0, False)):
+    for first, is_known in ((4e-4, True), (-1.0, False)):
         fields[ANGULAR_VELOCITY_COVARIANCE.start] = first
         data = message(fields)
         rewriter = rewriter_of(data, used)
         rewriter.bias = bias
-        expected = fields[ANGULAR_VELOCITY] - np.array(bias) * known
+        expected = fields[ANGULAR_VELOCITY] - np.array(bias) * is_known
         np.testing.assert_allclose(doubles_of(rewriter(data, {}))[ANGULAR_VELOCITY],
                                    used.rotation.T @ expected, rtol=1e-12)
 
@@ -299,15 +295,12 @@ KNOWN = {'temperature': 31.0, 'supply_voltage': 3.1, 'time': 4000.0, 'rate': (1.
 OWN = [4e-8, 1e-8, -1e-8, 1e-8, 5e-8, 2e-8, -1e-8, 2e-8, 6e-8]
 
 
-def several(seed):
-    return tuple(np.random.default_rng(seed).choice(OTHERS, size=4, replace=False))
-
-
 @pytest.mark.parametrize(('names', 'unit', 'scale', 'turned'), [
     *(((), *each, turned) for each in (('m/s2', 1.0), ('g', 9.80665), ('native', 9.81))
       for turned in (False, True)),
     *(((name,), 'm/s2', 1.0, True) for name in OTHERS),
-    *((several(seed), 'g', 9.80665, True) for seed in range(5))])
+    *((tuple(np.random.default_rng(seed).choice(OTHERS, size=4, replace=False)), 'g', 9.80665,
+       True) for seed in range(5))])
 def test_one_reading_and_its_covariance_are_corrected_as_arrays_are(names, unit, scale, turned):
     rng = np.random.default_rng(5)
     values = {name: values_of(name, rng.normal(size=18)) for name in names}
@@ -325,14 +318,16 @@ def test_one_reading_and_its_covariance_are_corrected_as_arrays_are(names, unit,
         np.testing.assert_allclose(np.subtract(*spreads), -np.array(OWN), atol=1e-18)
 
 
+def lagging():
+    """Return a calibration with a lag, and with 20 poses at 20 to 39 °C."""
+    return with_effects(calibration_of({'offset_temperature': [2e-3, -1e-3, 1e-3, 50.0, 1.0]}), {},
+                        temperature=20.0 + np.arange(20.0), time=100.0 * np.arange(20.0))
+
+
 def test_acting_temperature_is_limited_to_its_range_at_the_poses():
-    calibration = calibration_of({'offset_temperature': [2e-3, -1e-3, 1e-3, 50.0, 1.0]})
-    count = len(calibration.poses)
-    poses = calibration.poses.with_columns(temperature=20.0 + np.arange(count),
-                                           time=100.0 * np.arange(count))
-    calibration = replace(calibration, poses=poses)
+    calibration = lagging()
     low, high = calibration.ranges['temperature_of_offset']
-    assert (low, high) == pytest.approx((20.5, 19.5 + count), abs=0.02)
+    assert (low, high) == pytest.approx((20.5, 39.5), abs=0.02)
     assert 'time' not in calibration.ranges
     at = [calibration.apply([[0.0, 0.0, 9.8]] * 200, time=1e6 + np.arange(200.0),
                             temperature=np.full(200, each))[-1] for each in (high, 90.0, 25.0)]
@@ -341,10 +336,7 @@ def test_acting_temperature_is_limited_to_its_range_at_the_poses():
 
 
 def test_what_the_worker_has_computed_is_not_computed_again_after_levelling(tmp_path):
-    calibration = calibration_of({'offset_temperature': [2e-3, -1e-3, 1e-3, 50.0, 1.0]})
-    count = len(calibration.poses)
-    calibration = replace(calibration, poses=calibration.poses.with_columns(
-        temperature=20.0 + np.arange(count), time=100.0 * np.arange(count)))
+    calibration = lagging()
     assert calibration.ranges
     stored = tmp_path / 'calibration.pickle'
     stored.write_bytes(pickle.dumps(calibration))
@@ -362,8 +354,7 @@ def test_what_the_worker_has_computed_is_not_computed_again_after_levelling(tmp_
 
 def test_context_of_one_reading_is_limited_to_the_ranges():
     calibration = calibration_of({'offset_temperature': [2e-3, -1e-3, 1e-3]}, turned=True)
-    poses = calibration.poses.with_columns(temperature=np.linspace(20.0, 30.0, 20))
-    calibration = replace(calibration, poses=poses)
+    calibration = with_effects(calibration, {}, temperature=np.linspace(20.0, 30.0, 20))
     reader = OneReading(calibration)
     unknown = reader.at({'temperature': np.nan}).correct(1.0, 2.0, 9.0)
     assert np.linalg.norm(unknown) == pytest.approx(np.linalg.norm([1.0, 2.0, 9.0]), rel=0.1)

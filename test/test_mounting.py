@@ -6,15 +6,13 @@
 from accel_calib.calibrate import fit_poses, flat_direction
 from accel_calib.errors import InputError
 from accel_calib.geometry import angle_of
-from accel_calib.units import FRAMES, units_of
+from accel_calib.units import FRAMES
 from inside import (
     axes_of, fault_of, MODELS, mounting, rotation_from_rpy, simulate_poses, spread_directions,
     with_heading, with_heading_of)
 import numpy as np
 import pytest
-from shared import random_directions, sensor
-
-G = units_of('g')
+from shared import G, random_directions, sensor
 
 
 @pytest.mark.parametrize('frame', FRAMES)

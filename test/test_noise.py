@@ -16,17 +16,16 @@ from accel_calib.findings import rate_noise
 from accel_calib.logs import write_table
 from accel_calib.noise import noise_of, NoiseFigures, to_json
 from accel_calib.table import Floats, numbered, Poses, Recording
-from accel_calib.units import STANDARD_GRAVITY, units_of
+from accel_calib.units import STANDARD_GRAVITY
 from inside import (
     ALLAN_COMPONENTS, allan_variances, fit_components, longest_rest, octaves, shares,
     spread_directions, spread_of)
 import numpy as np
 import pytest
-from shared import run, run_json
+from shared import G, run, run_json
 
 allantools = pytest.importorskip('allantools')
 
-G = units_of('g')
 RATE = 100.0
 UP = np.array([0.0, 0.0, 1.0])
 

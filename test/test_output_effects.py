@@ -7,14 +7,13 @@ from accel_calib.calibrate import fit_poses, in_g
 from accel_calib.capture import capture
 from accel_calib.logs import read_recording
 from accel_calib.table import Poses
-from accel_calib.units import STANDARD_GRAVITY, Units, units_of
+from accel_calib.units import STANDARD_GRAVITY, Units
 from inside import (
     clipped, grid_step, Model, off_grid, simulate_recording, spread_directions, unclipped)
 import numpy as np
 import pytest
-from shared import data, random_directions, sensor
+from shared import data, G, MPS2, NATIVE, random_directions, sensor
 
-G, MPS2, NATIVE = units_of('g'), units_of('m/s2'), units_of('native')
 COUNTS_PER_G = 4056.0
 IMU, COUNTS = 'mpu9150_imu0.csv', 'xsens_mti_counts.csv'
 

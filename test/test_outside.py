@@ -6,32 +6,25 @@
 from dataclasses import replace
 import tracemalloc
 
-from accel_calib.calibrate import fit_poses, of_samples, outside, SampleContext
+from accel_calib.calibrate import of_samples, outside, SampleContext
 from accel_calib.effects import empirical_name
 from accel_calib.logs import read_recording, write_blocks, write_table
 from accel_calib.stored import write_calibration
 from accel_calib.table import numbered, Recording
-from accel_calib.units import units_of
 from bag_files import write_bag
 from driven import Driver
-from inside import (
-    model_with, ROWS_OF_A_TEXT, simulate_poses, simulate_recording, spread_directions)
+from inside import model_with, ROWS_OF_A_TEXT, simulate_recording, spread_directions
 import numpy as np
 import pytest
-from shared import refused, run, sensor, with_effects
+from shared import known, MPS2, refused, run, with_effects
 
-UNITS = units_of('m/s2')
 LOW, HIGH = 20.0, 30.0
 
 
-def calibrated(values, **context):
+def calibrated(values):
     """Return a calibration of poses at 20 to 30 °C, with these further effects."""
-    rng = np.random.default_rng(3)
-    known = {'temperature': np.linspace(LOW, HIGH, 20), 'time': 100.0 + 30.0 * np.arange(20),
-             **context}
-    poses = simulate_poses(sensor(rng), spread_directions(20), rng, context=known)
-    poses = poses.with_columns(reading=UNITS.from_g(poses.reading), std=UNITS.from_g(poses['std']))
-    return with_effects(fit_poses(poses, UNITS, model='10'), values)
+    return with_effects(known(), values, temperature=np.linspace(LOW, HIGH, 20),
+                        time=100.0 + 30.0 * np.arange(20))
 
 
 TCO = {'offset_temperature': np.array([1e-3, 0.0, 0.0])}
@@ -47,7 +40,7 @@ def recording():
 
 def write_si(path, recording):
     """Write samples in g as a table in m/s²."""
-    columns = {key: UNITS.from_g(recording[key]) for key in ('reading', 'reference')}
+    columns = {key: MPS2.from_g(recording[key]) for key in ('reading', 'reference')}
     write_table(path, replace(recording.with_columns(**columns), units='m/s2'))
 
 

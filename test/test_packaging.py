@@ -57,6 +57,12 @@ def texts(element: ElementTree.Element, tag: str) -> list[str]:
     return [' '.join((child.text or '').split()) for child in element.findall(tag)]
 
 
+def sources(folder: str = '') -> list[str]:
+    """Return the texts of all modules in a folder of the package."""
+    return [path.read_text(encoding='utf-8')
+            for path in (ROOT / 'accel_calib' / folder).rglob('*.py')]
+
+
 def distributions(requirements: list[str]) -> set[str]:
     return {re.split(r'[^\w.-]', requirement)[0] for requirement in requirements}
 
@@ -96,13 +102,12 @@ def test_the_page_about_installation_lists_every_part_and_the_readme_those_that_
 
 
 def test_messages_name_packages_of_the_index(setup_py: dict[str, Any]) -> None:
-    sources = [path.read_text(encoding='utf-8') for path in (ROOT / 'accel_calib').rglob('*.py')]
-    asked = {name for source in sources for names in re.findall(r"needing\('([^']+)'", source)
+    asked = {name for source in sources() for names in re.findall(r"needing\('([^']+)'", source)
              for name in names.split()} | {each.needs for each in FORMATS} - {''}
     known = {name for extra in setup_py['extras_require'].values()
              for name in distributions(extra)}
     assert {'aiohttp', 'dask', 'pandas', 'pyulog'} <= asked <= known
-    assert not [each for each in sources if re.search(r'pip install .{0,4}accel_calib', each)]
+    assert not [each for each in sources() if re.search(r'pip install .{0,4}accel_calib', each)]
 
 
 def test_package_xml_lists_each_requirement_and_all_imports_of_the_nodes(
@@ -111,10 +116,8 @@ def test_package_xml_lists_each_requirement_and_all_imports_of_the_nodes(
     required = setup_py['install_requires'] + extras['report'] + extras['live']
     wanted = {ROSDEP_KEYS[name] for name in distributions(required)} - {''}
     assert wanted == {key for key in listed if key.startswith('python3-')}
-    sources = [path.read_text(encoding='utf-8')
-               for path in (ROOT / 'accel_calib' / 'ros').rglob('*.py')]
     pattern = re.compile(r'^\s*(?:from|import) (rclpy|\w+_(?:msgs|srvs|interfaces))\b', re.M)
-    assert {name for source in sources for name in pattern.findall(source)} <= listed
+    assert {name for source in sources('ros') for name in pattern.findall(source)} <= listed
 
 
 def test_all_shipped_files_exist(setup_py: dict[str, Any]) -> None:

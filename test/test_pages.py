@@ -38,9 +38,10 @@ VOID = {'meta', 'br', 'link', 'img', 'hr', 'input'}
 class Parsed(HTMLParser):
     """The tags of a page, with a check that every tag that opens is closed."""
 
-    def __init__(self):
+    def __init__(self, text):
         super().__init__()
         self.open, self.ids, self.tags, self.texts, self.marks = [], [], [], [], []
+        self.feed(text)
 
     def handle_starttag(self, tag, attrs):
         self.handle_startendtag(tag, attrs)
@@ -62,12 +63,6 @@ class Parsed(HTMLParser):
 
     def named(self, wanted):
         return [attrs for tag, attrs, _ in self.tags if tag == wanted]
-
-
-def parsed(text):
-    found = Parsed()
-    found.feed(text)
-    return found
 
 
 def simulated(seed=0, poses=24, units='m/s2', **options):
@@ -110,7 +105,7 @@ def rows_in(found, tag):
 
 
 def test_every_figure_has_a_text_and_every_pose_can_be_pointed_at(text, poses, calibration):
-    found = parsed(text)
+    found = Parsed(text)
     figures, live = found.named('svg'), found.named('figure')
     assert len(live) == len(figures) == 4
     assert all(each['role'] == 'img' and each['aria-label'] for each in figures)
@@ -132,7 +127,7 @@ def test_hostile_names_are_text(calibration, poses):
                       noted=(Finding('note', HOSTILE),))
     rating = Rating('GOOD', HOSTILE, HOSTILE, NextStep('done', HOSTILE))
     text = calibration_page(hostile, rating, HOSTILE, stored=HOSTILE, notes=(HOSTILE,))
-    found = parsed(text)
+    found = Parsed(text)
     assert not found.open
     assert text.count('<script>') == 1
     assert '<b onload' not in text
@@ -233,7 +228,7 @@ def test_left_out_poses_are_listed_and_drawn(poses):
     fitted = ac.fit(poses.with_columns(reading=reading))
     assert [each.row for each in fitted.rejected] == [11]
     text = calibration_page(fitted, rate(fitted), 'poses.csv')
-    found = parsed(text)
+    found = Parsed(text)
     assert '<h2>Poses left out</h2>' in text
     assert rows_in(found, 'use').count('11') == 1
     assert not [mark for mark in found.marks if re.match(r'row 11, [+−]', mark)]
@@ -245,7 +240,7 @@ def test_page_of_a_verification_shows_the_other_poses(calibration):
     checked = verify(calibration, other)
     text = calibration_page(calibration, rate_verification(checked, calibration), 'other.csv',
                             verification=(checked, other))
-    found = parsed(text)
+    found = Parsed(text)
     assert re.search(r'<h1>Check .* imu_link</h1>', text)
     assert rows_in(found, 'tr') == [str(row) for row in range(1, 10)]
     residuals = residuals_of(calibration, other)
@@ -327,7 +322,7 @@ def test_labels_of_a_history_are_its_dates_with_the_time_where_a_day_has_several
 
 def test_history_has_a_page(dated):
     text = history_page(history_of(dated), [Path(f'{k}.yaml') for k in range(5)], dated)
-    found = parsed(text)
+    found = Parsed(text)
     assert not found.open
     assert len(found.named('svg')) == 3
     assert len(found.marks) == 5 * 9
@@ -355,7 +350,7 @@ def warm():
 
 def test_page_is_complete_and_self_contained(warm):
     text = refinement_page(warm, '<b onload="x">&.csv')
-    found = parsed(text)
+    found = Parsed(text)
     assert not found.open
     assert len(found.ids) == len(set(found.ids))
     referred = set(re.findall(r'(?:href="|url\()#([^")]+)', text))
@@ -380,24 +375,17 @@ def test_before_and_after_have_one_scale(warm):
     assert maps[0].get_clim() == maps[1].get_clim()
 
 
-@pytest.fixture(scope='module')
-def bumpy():
-    """Return a refinement of an offset of z that is larger near 35 °C, and that bump."""
+def test_figure_of_a_curve_shows_the_truth_within_its_band():
+    def bump(warm):  # the offset of z is larger near 35 °C
+        return 0.004 * np.exp(-((warm - 35.0) / 5.0) ** 2)
+
     rng = np.random.default_rng(5)
     warm = rng.uniform(10.0, 50.0, 100)
     poses = simulate_poses(
         model_with({'offset': np.array([0.02, -0.01, 0.03])}), random_directions(100, rng), rng,
         noise_g=0.001, context={'time': np.arange(100) * 20.0, 'temperature': warm})
-    shift = np.zeros((100, 3))
-    shift[:, 2] = bump(warm)
-    return refine(poses.with_columns(reading=poses.reading + shift), Units('g', 1.0), base='10')
-
-
-def bump(warm):
-    return 0.004 * np.exp(-((warm - 35.0) / 5.0) ** 2)
-
-
-def test_figure_of_a_curve_shows_the_truth_within_its_band(bumpy):
+    shift = np.outer(bump(warm), [0.0, 0.0, 1.0])
+    bumpy = refine(poses.with_columns(reading=poses.reading + shift), Units('g', 1.0), base='10')
     step = bumpy.steps[-1]
     assert bumpy.verdict == 'described'
     assert step.effect == 'empirical'

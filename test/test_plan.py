@@ -10,15 +10,12 @@ import json
 from accel_calib.calibrate import NextPose
 from accel_calib.refine import PlannedPose, refine
 from accel_calib.table import Poses
-from accel_calib.units import units_of
 from generator import Setup, simulate, write_csv
 from inside import (
     attitude_words, Guide, levels_of, model_with, NOTHING_TO_PLAN, Plan, simulate_poses)
 import numpy as np
 import pytest
-from shared import random_directions, run, run_json
-
-G = units_of('g')
+from shared import G, random_directions, run, run_json
 
 
 def read_plan(path):

@@ -17,13 +17,12 @@ from inside import (
     spread_directions)
 import numpy as np
 import pytest
-from shared import context_of, random_directions, values_of
+from shared import context_of, G, random_directions, values_of
 
 hypothesis = pytest.importorskip('hypothesis')
 st = pytest.importorskip('hypothesis.strategies')
 given = hypothesis.given
 
-G = units_of('g')
 
 OUTPUT = [name for name, effect in EFFECTS.items() if effect.output]
 ADDED = [name for name in EFFECTS if name not in OUTPUT]

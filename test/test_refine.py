@@ -7,14 +7,12 @@ import re
 
 from accel_calib.logs import read_poses
 from accel_calib.refine import refine, values_of, verdict_words
-from accel_calib.units import units_of
 import generator
 from inside import LARGEST_SAMPLE, model_with, simulate_poses, spread_directions
 import numpy as np
 import pytest
-from shared import random_directions, sensor
+from shared import G, MPS2, random_directions, sensor
 
-MPS2, G = units_of('m/s2'), units_of('g')
 LADDER = ('offset', 'gain', 'axis_gain', 'cross_axis')
 WITHOUT_NAME = {'offset_wander', 'empirical'}
 """Steps that say where a gap is, and not what causes it."""
@@ -99,18 +97,15 @@ def test_nothing_is_named_where_nothing_is_hidden(seed, poses, taken):
     assert (found.verdict, names(found)) == ('no_gap', [])
 
 
-@pytest.mark.parametrize(('effect', 'seed'), [
-    ('offset_drift', 5), ('cross_coupling', 4), ('gain_drift', 4), ('offset_wander', 2)])
-def test_a_small_effect_is_named_where_few_poses_leave_a_gap_without_it(effect, seed, taken):
-    found = refine(taken([1, seed], {effect: 1.5}, poses=24)[0], MPS2, base='10')
-    assert names(found) == [effect]
-
-
-def test_two_hidden_effects_are_both_named(taken):
-    for seed, pair in ((0, ('quadratic', 'offset_temperature')),
-                       (2, ('hysteresis', 'supply_ratio'))):
-        found = refine(taken(seed, dict.fromkeys(pair, 6.0), poses=60)[0], MPS2, base='10')
-        assert sorted(names(found)) == sorted(pair)
+@pytest.mark.parametrize(('hidden', 'seed', 'poses'), [
+    *(({effect: 1.5}, [1, seed], 24) for effect, seed in (  # small, but without it is a gap
+        ('offset_drift', 5), ('cross_coupling', 4), ('gain_drift', 4), ('offset_wander', 2))),
+    ({'quadratic': 6.0, 'offset_temperature': 6.0}, 0, 60),
+    ({'hysteresis': 6.0, 'supply_ratio': 6.0}, 2, 60)])
+def test_a_small_effect_among_few_poses_is_named_and_both_of_two_effects(
+        hidden, seed, poses, taken):
+    found = refine(taken(seed, hidden, poses=poses)[0], MPS2, base='10')
+    assert sorted(names(found)) == sorted(hidden)
 
 
 def test_the_last_step_leaves_what_the_calibration_leaves(taken):

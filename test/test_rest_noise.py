@@ -17,11 +17,10 @@ from inside import (
     spread_directions)
 import numpy as np
 import pytest
-from shared import data
+from shared import data, G
 
 BIAS = np.array([0.01, -0.02, 0.03])
 TURNING = np.array([0.3, -0.2, 0.9])
-G = units_of('g')
 
 
 def rests(seed, count=24, *, scatter=2e-4, noise=(0.003, 0.002, 0.005), samples=300, warmth=None,

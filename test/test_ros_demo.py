@@ -93,17 +93,12 @@ def test_the_node_is_turned_by_its_services(bench: Any) -> None:
     bench.spin(lambda: up() == (0.0, 0.0, 9.80665))
 
 
-@pytest.fixture
-def own_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Restore what the demonstration sets."""
-    for name in ('ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_HOME', 'ROS_LOG_DIR'):
-        monkeypatch.setenv(name, '')
-
-
 @pytest.mark.parametrize('hidden', ('temperature',) if FACTOR == 1 else (None, *DEMO_CHOICES))
 def test_the_demonstration_calibrates_and_finds_what_is_hidden(
         hidden: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str],
-        own_environment: None) -> None:
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ('ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_HOME', 'ROS_LOG_DIR'):
+        monkeypatch.setenv(name, '')  # the demonstration sets them
     result = tmp_path / 'result.json'
     given = ['--hidden', hidden] if hidden else []
     assert main(['demo', *given, '--json', str(result)]) == 0

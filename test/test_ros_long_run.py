@@ -3,15 +3,10 @@
 
 """The short form of `benchmarks/long_run.py`: rounds of captures, fits and refinements."""
 
-from pathlib import Path
-import sys
-
-sys.path.append(str(Path(__file__).resolve().parents[1] / 'benchmarks'))
-
-from faults.sample import FACTOR  # noqa: E402
-from long_run import long_run  # noqa: E402
-import numpy as np  # noqa: E402
-import pytest  # noqa: E402
+from faults.sample import FACTOR
+from long_run import long_run
+import numpy as np
+import pytest
 
 ROUNDS, ROUND, INTERVAL = 2, 50.0, 10.0
 """A round of 50 s has a fit and a refinement [s]."""

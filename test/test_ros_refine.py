@@ -3,7 +3,6 @@
 
 """The node finds an effect that its calibration lacks, and corrects it."""
 
-from collections.abc import Callable
 from pathlib import Path
 import signal
 from typing import Any
@@ -15,11 +14,10 @@ from inside import spread_directions
 from inside_ros import force_of
 import numpy as np
 import pytest
-from sensor_msgs.msg import BatteryState, FluidPressure, Imu, Temperature
-from shared import with_effects
+from sensor_msgs.msg import BatteryState, FluidPressure, Temperature
+from shared import Readings, Stored, with_effects
 from std_msgs.msg import Float32, Float64
 
-Readings = Callable[..., Any]
 POSES = 26
 MOVES = np.array([0.002, -0.0015, 0.001])
 """Offset per ampere [g]."""
@@ -63,7 +61,6 @@ def test_an_own_effect_is_named_corrected_and_needed_by_the_node(
         bench: Any, readings: Readings, tmp_path: Path) -> None:
     (tmp_path / 'own.py').write_text(OWN, encoding='utf-8')
     about = {'sensor': 'arm', 'passthrough': True, 'context': ['motor_current:=motor/current']}
-    corrected = bench.listen(Imu, 'imu/data_calibrated')
     publisher = bench.node.create_publisher(Float64, 'motor/current', 10)
     first = bench.calibrator(**about, also=tmp_path / 'own.py')
     meet(bench, publisher, 25.0, 'motor_current')
@@ -78,8 +75,8 @@ def test_an_own_effect_is_named_corrected_and_needed_by_the_node(
         meet(bench, publisher, current, 'motor_current')
         shift = MOVES * abs(current - 25.0) * 9.80665
         bench.echo([bench.imu(reading + shift) for reading in readings([[0, 0, 1]])[:40]],
-                   corrected)
-        assert np.linalg.norm(np.mean([*map(force_of, corrected)], axis=0)) == pytest.approx(
+                   bench.came_out)
+        assert np.linalg.norm(np.mean([*map(force_of, bench.came_out)], axis=0)) == pytest.approx(
             9.80665, abs=0.02)
     assert bench.end(first, signal.SIGINT)[0] == 0
     bench.join_anew()
@@ -132,17 +129,16 @@ CURVE = [2e-3, -1e-3, 3e-3, 1e-3, 2e-3, -2e-3, 15.0, 35.0]
     (empirical_name('offset', 'temperature', (1, 2)), CURVE)],
     ids=['lag of the die', 'lag of the sensor', 'curve'])
 def test_messages_are_corrected_as_offline(bench: Any, readings: Readings, name: str,
-                                           values: list[float], stored: Callable[..., Path]
+                                           values: list[float], stored: Stored
                                            ) -> None:
     path = stored(sensor='imu_link')
-    corrected = bench.listen(Imu, 'imu/data_calibrated')
     publisher = bench.node.create_publisher(Temperature, 'temperature', 10)
     bench.calibrator(calibration_file=str(path))
     bench.spin(lambda: publisher.get_subscription_count() > 0)
     reading = readings([[0.0, 0.6, 0.8]])[0]
     # The node knows the temperatures before the calibration: a reload continues the lag.
     meet(bench, publisher, 20.0)
-    bench.exchange(corrected, lambda: bench.imu(reading))
+    bench.exchange(bench.came_out, lambda: bench.imu(reading))
     # So long after the messages so far that the temperature before does not matter.
     times, warm, found = bench.stamp + 1e5 + np.arange(60), 20.0 + 0.25 * np.arange(60), []
     for k in range(60):
@@ -156,7 +152,7 @@ def test_messages_are_corrected_as_offline(bench: Any, readings: Readings, name:
             answer = bench.call('load')
             assert answer.success, answer.message
         bench.stamp = times[k] - 0.02  # the next message has the next stamp
-        found += bench.echo([bench.imu(reading)], corrected)
+        found += bench.echo([bench.imu(reading)], bench.came_out)
     expected = calibration.apply(np.tile(reading, (60, 1)), time=times, temperature=warm)
     # The history has a point every 2 s, so that the rate of the past differs slightly.
     np.testing.assert_allclose([*map(force_of, found[30:])], expected[30:], atol=2e-3)

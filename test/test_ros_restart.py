@@ -4,7 +4,6 @@
 """Shutdown of the nodes by signals and by a kill, and restart."""
 
 from collections.abc import Callable
-from pathlib import Path
 import shutil
 import signal
 from typing import Any
@@ -18,9 +17,9 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 import pytest
 from sensor_msgs.msg import Imu
+from shared import Stored
 from std_srvs.srv import Trigger
 
-ROOT = Path(__file__).parent.parent
 BUSY = 10 if FACTOR > 1 else 4
 TROUBLE = ('Traceback', 'FATAL', 'ERROR', 'Fatal Python error', 'Failed to')
 """What no node may print at its end: of Python, of the log, and of the layers below."""
@@ -45,8 +44,7 @@ def send_many(bench: Any, publisher: Any) -> Callable[[], None]:
     return send
 
 
-def test_busy_nodes_end_with_status_0_and_without_words(
-        bench: Any, stored: Callable[..., Path]) -> None:
+def test_busy_nodes_end_with_status_0_and_without_words(bench: Any, stored: Stored) -> None:
     path = stored()
     write_table(path.with_name(f'{path.stem}_poses.csv'), read_calibration(path).poses)
     nodes, clients, heard = [], [], []

@@ -3,7 +3,6 @@
 
 """What a robot in the field meets: transforms, several drivers, QoS, a preview, signals."""
 
-from collections.abc import Callable
 import json
 import math
 from pathlib import Path
@@ -20,14 +19,13 @@ from inside import CALIBRATOR, NODES, rotation_from_rpy, spread_directions
 from inside_ros import force_of, publish_static
 import numpy as np
 import pytest
+from rcl_interfaces.msg import Log
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu, Temperature
+from shared import Readings, Stored
 from std_msgs.msg import Bool, String
 
 GRAVITY = 9.80665
-
-Readings = Callable[..., Any]
-Stored = Callable[..., Path]
 
 
 def test_the_mounting_comes_from_the_static_transforms_and_is_published(
@@ -146,7 +144,6 @@ def test_the_diagnostics_have_the_true_rate_and_the_resolved_names(
 
 def test_the_log_says_what_the_node_waits_for_the_likely_unit_and_what_it_does_not_know(
         bench: Any) -> None:
-    from rcl_interfaces.msg import Log
     lines = bench.listen(Log, '/rosout', latched=True)
     process = bench.calibrator(unit='g')
     bench.spin(lambda: any('although /bench publishes' in line.msg for line in lines))
@@ -161,7 +158,6 @@ def test_the_log_says_what_the_node_waits_for_the_likely_unit_and_what_it_does_n
 
 
 def test_topics_of_imus_and_thermometers_that_exist_are_named(bench: Any) -> None:
-    from rcl_interfaces.msg import Log
     lines = bench.listen(Log, '/rosout', latched=True)
     bench.node.create_publisher(Imu, '/arm/imu', 10)
     bench.node.create_publisher(Temperature, '/board/temperature', 10)

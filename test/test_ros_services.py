@@ -3,9 +3,7 @@
 
 """The services, the parameters, and all names of the nodes, as stated in files of config/."""
 
-from collections.abc import Callable
 from dataclasses import fields
-from pathlib import Path
 import re
 from typing import Any
 
@@ -19,12 +17,10 @@ from inside_ros import pose_markers, SimulatorSettings
 import numpy as np
 import pytest
 from sensor_msgs.msg import Imu
+from shared import Readings, Stored
 from std_msgs.msg import Bool
 from test_policy import granted, optional_elements, profile_of
 from visualization_msgs.msg import MarkerArray
-
-Readings = Callable[..., Any]
-Stored = Callable[..., Path]
 
 
 def count(markers: list[Any], namespace: str = 'poses') -> int:
@@ -88,14 +84,13 @@ def test_self_test_names_what_fails(bench: Any, stored: Stored) -> None:
     def moving() -> Imu:
         return bench.imu(np.array([0, 0, 9.8]) + 3.0 * rng.normal(size=3))
 
-    corrected = bench.listen(Imu, 'imu/data_calibrated')
     diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
     bench.calibrator(calibration_file=stored('good.yaml'))
     answer = bench.call('self_test')
     assert answer.passed == b'\x00'
     assert 'no Imu messages' in {status.name: status.message for status in answer.status}[
         'calibrator: stream']
-    bench.exchange(corrected, moving)
+    bench.exchange(bench.came_out, moving)
     diagnostics.clear()
 
     bench.send_until(moving, lambda: len(diagnostics) > 1)
@@ -156,17 +151,12 @@ Names = dict[str, set[str]]
 RIGHTS = {'publish': 'topics', 'subscribe': 'topics', 'reply': 'services', 'request': 'services'}
 
 
-def resolved(name: str, node: str) -> str:
-    """Return the full name of a topic or service of a node without a namespace."""
-    return name if name.startswith('/') else f'/{name.replace("~", node)}'
-
-
 def allowed(executable: str, *parameters: str) -> Names:
     """Return the full names by right, with the rights for these parameters."""
     profile = profile_of(executable)
     node = profile.get('node')
-    found = {right: {resolved(name, node) for name in granted(profile, tag, right)}
-             for right, tag in RIGHTS.items()}
+    found = {right: {name if name.startswith('/') else f'/{name.replace("~", node)}'
+                     for name in granted(profile, tag, right)} for right, tag in RIGHTS.items()}
     for parameter, block in optional_elements():
         if parameter in parameters:
             for right in block.attrib:

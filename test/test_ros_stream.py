@@ -3,11 +3,9 @@
 
 """Processing of messages between imu/data_raw and imu/data_calibrated."""
 
-from collections.abc import Callable
 from dataclasses import replace
 import math
 import os
-from pathlib import Path
 from typing import Any
 
 from accel_calib.stored import read_calibration
@@ -21,6 +19,7 @@ import pytest
 from rclpy.serialization import serialize_message
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
+from shared import Readings, Stored
 from std_msgs.msg import Bool
 
 GRAVITY = 9.80665
@@ -28,8 +27,6 @@ READING = np.array([1.0, -2.0, 9.3])
 RATE = np.array([0.1, 0.2, -0.3])
 KNOWN = np.array([4.0, 1.0, 0.0, 1.0, 5.0, 0.5, 0.0, 0.5, 6.0]) * 1e-3
 FLAT = np.array([0.2, -0.4, 0.8]) / np.sqrt(0.84)
-
-Stored = Callable[..., Path]
 
 
 def rate_of(message: Imu) -> Any:
@@ -61,7 +58,6 @@ def test_corrected_message_is_in_the_levelled_frame(bench: Any, stored: Stored, 
     calibration = replace(calibration, model=Model(calibration.model.values,
                                                    calibration.rotation @ axes))
     rotation = calibration.model.rotation
-    heard = bench.listen(Imu, 'imu/data_calibrated')
     bench.calibrator(calibration_file=path, output_frame_id='base_link', frame=frame)
     sent: list[Imu] = []
 
@@ -69,7 +65,7 @@ def test_corrected_message_is_in_the_levelled_frame(bench: Any, stored: Stored, 
         sent.append(full(bench, orientation_covariance=KNOWN))
         return sent[-1]
 
-    got = bench.exchange(heard, make)
+    got = bench.exchange(bench.came_out, make)
     assert got.header.frame_id == 'base_link'
     assert got.header.stamp in [message.header.stamp for message in sent]
     np.testing.assert_allclose(quaternion_of(got).as_matrix(),
@@ -84,9 +80,8 @@ def test_readings_in_g_are_published_in_si_and_without_rotation_in_the_frame_of_
         bench: Any, stored: Stored) -> None:
     path = stored(unit='g', flat=FLAT)
     calibration = read_calibration(path)
-    heard = bench.listen(Imu, 'imu/data_calibrated')
     bench.calibrator(calibration_file=path, units='g', rotate=False, output_frame_id='base_link')
-    got = bench.exchange(heard, lambda: full(
+    got = bench.exchange(bench.came_out, lambda: full(
         bench, READING / GRAVITY, angular_velocity_covariance=KNOWN,
         linear_acceleration_covariance=KNOWN))
     assert got.header.frame_id == 'imu_link'
@@ -99,7 +94,6 @@ def test_readings_in_g_are_published_in_si_and_without_rotation_in_the_frame_of_
 
 
 def test_nothing_is_published_before_a_calibration(bench: Any) -> None:
-    heard = bench.listen(Imu, 'imu/data_calibrated')
     diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
     bench.calibrator(use_sim_time=True)  # and nobody publishes /clock
 
@@ -108,12 +102,11 @@ def test_nothing_is_published_before_a_calibration(bench: Any) -> None:
         return any('no calibration yet' in array.status[0].message for array in diagnostics)
 
     bench.spin(reported)
-    assert not heard
+    assert not bench.came_out
 
 
 def test_raw_messages_are_published_with_passthrough_and_when_switched_off(
         bench: Any, stored: Stored) -> None:
-    heard = bench.listen(Imu, 'imu/data_calibrated')
     bench.calibrator(passthrough=True, calibration_file=stored().with_name('new.yaml'),
                      output_frame_id='base_link')
     sent: list[Imu] = []
@@ -122,25 +115,24 @@ def test_raw_messages_are_published_with_passthrough_and_when_switched_off(
         sent.append(full(bench, linear_acceleration_covariance=KNOWN))
         return sent[-1]
 
-    assert bench.exchange(heard, make) in sent
+    assert bench.exchange(bench.came_out, make) in sent
     stored('new.yaml', flat=FLAT)
     assert bench.call('load').success
-    bench.exchange(heard, make)
-    bench.spin(lambda: heard[-1].header.frame_id == 'base_link')
+    bench.exchange(bench.came_out, make)
+    bench.spin(lambda: bench.came_out[-1].header.frame_id == 'base_link')
     assert bench.call('enable', data=False).success
-    bench.exchange(heard, make)
-    bench.spin(lambda: heard[-1] in sent)
+    bench.exchange(bench.came_out, make)
+    bench.spin(lambda: bench.came_out[-1] in sent)
 
 
 def test_motion_is_the_force_without_the_gravity_of_the_last_rest(
-        bench: Any, stored: Stored, readings: Callable[..., Any]) -> None:
+        bench: Any, stored: Stored, readings: Readings) -> None:
     path = stored(flat=FLAT)
     calibration = read_calibration(path)
-    corrected = bench.listen(Imu, 'imu/data_calibrated')
     motion = bench.listen(Vector3Stamped, 'calibrator/linear_acceleration')
     still = bench.listen(Bool, 'calibrator/still', latched=True)
     bench.calibrator(calibration_file=path)
-    bench.exchange(corrected, lambda: bench.imu(READING))
+    bench.exchange(bench.came_out, lambda: bench.imu(READING))
     assert not motion
     bench.spin(lambda: still and not still[-1].data)
     rest = readings([FLAT], dwell=12.0)
@@ -159,18 +151,17 @@ def test_motion_is_the_force_without_the_gravity_of_the_last_rest(
 def test_messages_in_another_encoding_are_corrected_and_unusable_ones_dropped_and_reported(
         bench: Any, stored: Stored) -> None:
     calibration = read_calibration(path := stored(sensor='imu_link', flat=FLAT))
-    heard = bench.listen(Imu, 'imu/data_calibrated')
     diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
     bench.calibrator(calibration_file=path)
-    bench.exchange(heard, lambda: bench.imu(READING))
+    bench.exchange(bench.came_out, lambda: bench.imu(READING))
     message = full(bench, angular_velocity_covariance=KNOWN, linear_acceleration_covariance=KNOWN)
     data = serialize_message(message)
     for count, each in enumerate((data, swapped(data)), 1):
         bench.send(each)
-        bench.spin(lambda count=count: stamps(heard).count(message.header.stamp) == count)
-        np.testing.assert_allclose(force_of(heard[-1]), calibration.correct(READING[None])[0],
-                                   atol=1e-12)
-    heard.clear()
+        bench.spin(lambda count=count: stamps(bench.came_out).count(message.header.stamp) == count)
+        np.testing.assert_allclose(force_of(bench.came_out[-1]),
+                                   calibration.correct(READING[None])[0], atol=1e-12)
+    bench.came_out.clear()
     others = [bench.imu(READING) for _ in range(20)]
     for other in others:
         other.header.frame_id = 'another'
@@ -180,9 +171,9 @@ def test_messages_in_another_encoding_are_corrected_and_unusable_ones_dropped_an
         last = bench.imu(READING)
         for each in (*sent, last):
             bench.send(each)
-        bench.spin(lambda last=last: last.header.stamp in stamps(heard))
-    assert not [each for each in stamps([*unusable, *others]) if each in stamps(heard)]
-    assert {each.header.frame_id for each in heard} == {'imu_link_levelled'}
+        bench.spin(lambda last=last: last.header.stamp in stamps(bench.came_out))
+    assert not [each for each in stamps([*unusable, *others]) if each in stamps(bench.came_out)]
+    assert {each.header.frame_id for each in bench.came_out} == {'imu_link_levelled'}
     for words in ('dropped 5 messages with NaN', 'dropped 20 messages of another sensor',
                   'dropped 1 corrected message with implausible values'):
         bench.spin(lambda words=words: any(words in array.status[0].message

@@ -28,10 +28,9 @@ import numpy as np
 import pytest
 import rcl_interfaces.msg
 from sensor_msgs.msg import Imu
-from shared import wait
+from shared import Readings, Stored, wait
 from viewer import fetch, link_of, Viewer
 
-Readings = Callable[..., Any]
 WATCH = (*COMMAND, 'watch')
 ATTITUDES = ([0, 0, 1], [1, 0, 0], [0, 1, 0])
 
@@ -157,7 +156,7 @@ def viewer(bench: Any, tmp_path: Path) -> Iterator[Viewer]:
 
 
 def test_a_whole_calibration_through_the_commands_of_the_page(
-        bench: Any, viewer: Viewer, readings: Callable[..., Any], tmp_path: Path) -> None:
+        bench: Any, viewer: Viewer, readings: Readings, tmp_path: Path) -> None:
     path = tmp_path / 'c.yaml'
     refusal = bench.call('fit').message
     bench.spin(lambda: refusal in [line['words'] for line in viewer.of('log')])
@@ -209,7 +208,7 @@ def test_a_node_with_viewers_ends_cleanly_and_logs_no_token(bench: Any, viewer: 
 
 
 def test_a_node_whose_port_is_in_use_says_so_and_works_on(
-        bench: Any, readings: Callable[..., Any], tmp_path: Path) -> None:
+        bench: Any, readings: Readings, tmp_path: Path) -> None:
     with socket.create_server(('127.0.0.1', 0)) as taken:
         port = taken.getsockname()[1]
         node = bench.calibrator(calibration_file=tmp_path / 'c.yaml', web_port=port,
@@ -222,7 +221,7 @@ def test_a_node_whose_port_is_in_use_says_so_and_works_on(
 
 
 def test_the_managed_node_serves_the_page_while_it_is_configured(
-        bench: Any, stored: Callable[..., Path]) -> None:
+        bench: Any, stored: Stored) -> None:
     node = bench.start('calibrator_lifecycle', calibration_file=stored(), web_port=free_port())
     publisher = bench.node.create_publisher(Imu, 'imu/data_raw', 100)
     for _ in range(2):  # the second page is at the same port

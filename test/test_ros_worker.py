@@ -3,7 +3,7 @@
 
 """Services that answer later, in every executor, and the worker process."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 import math
 import os
 from pathlib import Path
@@ -25,7 +25,7 @@ import pytest
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.task import Future
-from shared import children
+from shared import children, Stored, wait
 
 TICKS = 20
 """Number of ticks of a timer for which the work of a service waits."""
@@ -36,11 +36,7 @@ def events_executor(context: Any) -> Any:
     return experimental.EventsExecutor(context=context)
 
 
-def single_threaded_executor(context: Any) -> Any:
-    return SingleThreadedExecutor(context=context)
-
-
-@pytest.mark.parametrize('make_executor', [single_threaded_executor, events_executor])
+@pytest.mark.parametrize('make_executor', [SingleThreadedExecutor, events_executor])
 def test_callbacks_continue_while_a_service_works(bench: Any, make_executor: Any) -> None:
     context = bench.node.context
     node = Node('calibrator', context=context)
@@ -70,7 +66,7 @@ def test_callbacks_continue_while_a_service_works(bench: Any, make_executor: Any
     for command in (fit, load, save):
         serve(node, command.__name__, command, worker)
     node.create_timer(0.005, lambda: ticks.append('another'))
-    executor, over = make_executor(context), Future()
+    executor, over = make_executor(context=context), Future()
     executor.add_node(node)
 
     def spin() -> None:
@@ -95,10 +91,10 @@ def test_callbacks_continue_while_a_service_works(bench: Any, make_executor: Any
         node.destroy_node()
 
 
-@pytest.mark.parametrize('make_executor', [single_threaded_executor, events_executor])
+@pytest.mark.parametrize('make_executor', [SingleThreadedExecutor, events_executor])
 def test_an_error_of_a_function_is_logged_and_the_executor_continues(
         bench: Any, make_executor: Any, capfd: pytest.CaptureFixture[str]) -> None:
-    executor = make_executor(bench.node.context)
+    executor = make_executor(context=bench.node.context)
     node = Node('calibrator', context=bench.node.context)
     executor.add_node(node)
     call_soon, over = in_executor(node), Future()
@@ -121,7 +117,7 @@ def process() -> Iterator[WorkerProcess]:
 
 
 def test_worker_process_computes_and_fails_as_this_process(
-        process: WorkerProcess, stored: Callable[..., Path]) -> None:
+        process: WorkerProcess, stored: Stored) -> None:
     calibration = read_calibration(stored())
     given = calibration.units, CalibratorSettings(model='10'), '', None
     found = process.call(fit_in_node, calibration.poses, *given).calibration
@@ -141,12 +137,8 @@ def test_worker_process_computes_and_fails_as_this_process(
 
 def test_the_worker_process_runs_only_while_the_processor_is_idle(process: WorkerProcess) -> None:
     process.start()  # a call could wait for idle time until it is restarted
-    started = Path(f'/proc/self/task/{threading.get_native_id()}/children')
-    pid = int(started.read_text().split()[-1])
-    end = time.monotonic() + 60.0
-    while os.sched_getscheduler(pid) != os.SCHED_IDLE and time.monotonic() < end:
-        time.sleep(0.01)
-    assert os.sched_getscheduler(pid) == os.SCHED_IDLE
+    pid = children(os.getpid())[-1]
+    wait(lambda: os.sched_getscheduler(pid) == os.SCHED_IDLE, 60.0)
 
 
 def test_process_that_waits_too_long_is_restarted_with_normal_priority(
@@ -189,8 +181,7 @@ def test_a_node_that_ends_does_not_wait_for_a_computation(process: WorkerProcess
 
 
 @pytest.mark.parametrize('number', sample([signal.SIGKILL, signal.SIGTERM, signal.SIGINT], 2))
-def test_no_process_outlives_the_node(bench: Any, stored: Callable[..., Path], number: int
-                                      ) -> None:
+def test_no_process_outlives_the_node(bench: Any, stored: Stored, number: int) -> None:
     path = stored()
     write_table(path.with_name(f'{path.stem}_poses.csv'), read_calibration(path).poses)
     node = bench.calibrator(calibration_file=path)

@@ -4,12 +4,9 @@
 """Faults of sensors are named, and never calibrated; `benchmarks/sensor_faults.py` counts them."""
 
 from pathlib import Path
-import sys
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / 'benchmarks'))
-
-import pytest  # noqa: E402
-from sensor_faults import counted, FAULTS, OF_TEXT, SURFACES  # noqa: E402
+import pytest
+from sensor_faults import counted, FAULTS, OF_TEXT, SURFACES
 
 CASES = [(name, surface) for k, name in enumerate(FAULTS) for j, surface in enumerate(SURFACES)
          if j in (k % 4, (k + 1) % 4) and not (name in OF_TEXT and surface in ('bag', 'node'))]

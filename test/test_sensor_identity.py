@@ -9,23 +9,19 @@ the user states (parameter or option `sensor`). An unnamed one fits every sensor
 
 """
 
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from accel_calib.errors import AccelCalibError
 from accel_calib.session import Mounting
 from accel_calib.stored import read_calibration
 from inside import main, spread_directions
 import pytest
-from shared import result
+from shared import Readings, result, Stored
 from test_session import Driver
 
 pytestmark = pytest.mark.usefixtures('home')
-
-Stored = Callable[..., Path]
-Readings = Callable[..., Any]
 
 
 @pytest.fixture(scope='module')

@@ -3,7 +3,6 @@
 
 """The calibrator without ROS: files of each sensor, accepted messages and refusals."""
 
-from collections.abc import Callable
 from dataclasses import replace
 import errno
 from pathlib import Path
@@ -24,9 +23,8 @@ from inside import (
     spread_directions, store_of, StreamStatistics, writing_advice)
 import numpy as np
 import pytest
-from shared import python, ROOT, with_effects
+from shared import GRAVITY, python, Readings, ROOT, Stored, with_effects
 
-GRAVITY = 9.80665
 UP, LEFT, FORWARD = [0, 0, 1], [0, 1, 0], [1, 0, 0]
 NOSE_DOWN = [-0.6, 0.0, 0.8]
 MOTOR = 'motor_current:=/motor/current'
@@ -34,8 +32,6 @@ MOUNTING = rotation_from_rpy(*np.radians((5.0, -3.0, 40.0))).T
 
 pytestmark = pytest.mark.usefixtures('home')
 
-Readings = Callable[..., Any]
-Stored = Callable[..., Path]
 
 IDENTITIES = [
     Identity('imu_link', '/left/imu/data_raw'), Identity('imu_link', '/right/imu/data_raw'),
@@ -420,8 +416,7 @@ def test_settings_that_contradict_each_other_are_refused(settings: Any, words: s
 
 def test_steps_back_are_kept_for_changes_only_and_have_a_limit(
         stored: Stored, monkeypatch: pytest.MonkeyPatch) -> None:
-    most = 3
-    monkeypatch.setattr(*LARGEST_NUMBER_OF_STEPS, most)
+    monkeypatch.setattr(*LARGEST_NUMBER_OF_STEPS, 3)
     path = stored(sensor='imu_link')
     store = SensorStore(path, Identity('imu_link', '/imu/data_raw'), 'm/s2')
     first = store.load_calibration()
@@ -429,11 +424,11 @@ def test_steps_back_are_kept_for_changes_only_and_have_a_limit(
     before = len(store.steps())
     store.write(store.prepared(first))
     assert len(store.steps()) == before
-    for k in range(most + 5):
+    for k in range(8):
         store.write(store.prepared(replace(first, date=f'{k}')))
-    assert len(store.steps()) == most
+    assert len(store.steps()) == 3
     shutil.copy(path, path.with_name(f'{path.name}.before999'))  # a write failed after this copy
-    for k in reversed(range(5, most + 4)):
+    for k in reversed(range(5, 7)):
         assert store.step_back().date == f'{k}'
 
 
@@ -466,8 +461,8 @@ def test_lag_of_the_temperature_is_followed_while_the_node_runs(
         read_calibration(path), {'offset_temperature': values}, 0.0,
         temperature=25.0 + 20.0 * np.sin(turn * 2.0), time=turn * 100.0))
     driver = Driver(calibration_file=str(path))
-    still = readings([UP], dwell=4.0)[:10]
-    warm = 20.0 + 0.02 * np.arange(900)  # 0.1 °C/s, for 180 s
+    still = readings([UP], dwell=4.0)[:20]
+    warm = 20.0 + 0.04 * np.arange(450)  # 0.1 °C/s, for 180 s
     for each in warm:
         driver.feed(still, temperature=each)
     calibration, time = driver.calibration, 1000.0 + np.arange(9000) / RATE
@@ -478,7 +473,7 @@ def test_lag_of_the_temperature_is_followed_while_the_node_runs(
             {**calibration.model.values, 'offset_temperature': np.array(lag)}))
 
     def offline(found: Any) -> Any:
-        return found.apply(np.tile(still, (900, 1)), time=time, temperature=np.repeat(warm, 10))
+        return found.apply(np.tile(still, (450, 1)), time=time, temperature=np.repeat(warm, 20))
 
     expected, plain = (offline(each)[during].mean(axis=0) for each in (
         calibration, with_values(*values[:3])))

@@ -17,9 +17,7 @@ import numpy as np
 import pytest
 from scipy.signal import butter, lfilter
 from scipy.spatial.transform import Rotation, Slerp
-from shared import data
-
-G = units_of('g')
+from shared import data, G
 
 
 def still(seed, seconds, rate=100.0, noise=2e-3):

@@ -18,12 +18,11 @@ from accel_calib.stored import read_calibration
 from inside import aside, Identity, Lock, MOST_BYTES, SensorStore, spread_directions, store_of
 import numpy as np
 import pytest
+from shared import Readings, Stored
 from test_session import Driver
 
 NOBODY = 65534
 IDENTITY = Identity('imu_link', '/imu/data_raw')
-
-Readings = Callable[..., Any]
 
 
 @pytest.fixture
@@ -77,7 +76,7 @@ OF_POSES: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.fixture
-def store(stored: Callable[..., Path]) -> SensorStore:
+def store(stored: Stored) -> SensorStore:
     """Return a store with a calibration and 12 poses."""
     made = SensorStore(stored(sensor='imu_link'), IDENTITY, 'm/s2')
     made.save_poses(read_calibration(made.calibration).poses.take(slice(0, 12)))

@@ -42,27 +42,20 @@ def files(tmp_path_factory):
     return folder
 
 
-@pytest.fixture
-def printed(monkeypatch, capsys):
-    """Return a function that runs a command on a terminal of this width, and returns its text."""
-    def on_width(*arguments, columns=80):
-        monkeypatch.setenv('COLUMNS', str(columns))
-        assert run(*arguments) == 0
-        return capsys.readouterr().out
-
-    return on_width
-
-
+@pytest.mark.usefixtures('without_pages')
 @pytest.mark.parametrize('columns', [80, 60])
-def test_output_fits_the_width(columns, files, printed, tmp_path):
-    poses, (stored, other, rest) = files / 'p.csv', (
-        tmp_path / name for name in ('c.yaml', 'd.yaml', 'rest.csv'))
-    printed('simulate', '-o', rest, '--recording', '--poses', '1', '--dwell', '600', '--rate',
-            '20')
-    text = ''.join(printed(*arguments, columns=columns) for arguments in (
-        ('fit', poses, '-o', stored), ('calibrate', poses, '-o', other),
-        ('history', stored, other), ('export', stored, '--to', 'px4'), ('noise', rest),
-        ('refine', poses), ('verify', poses, '-c', stored), ('compare', stored, stored), ()))
+def test_output_fits_the_width(columns, files, tmp_path, monkeypatch, capsys):
+    stored, other, rest = (tmp_path / name for name in ('c.yaml', 'd.yaml', 'rest.csv'))
+    run('simulate', '-o', rest, '--recording', '--poses', 1, '--dwell', 600, '--rate', 20)
+    capsys.readouterr()
+    poses = files / 'p.csv'
+    monkeypatch.setenv('COLUMNS', str(columns))
+    for arguments in (
+            ('fit', poses, '-o', stored), ('calibrate', poses, '-o', other),
+            ('history', stored, other), ('export', stored, '--to', 'px4'), ('noise', rest),
+            ('refine', poses), ('verify', poses, '-c', stored), ('compare', stored, stored), ()):
+        assert run(*arguments) == 0
+    text = capsys.readouterr().out
     wide = [line for line in text.splitlines() if len(line) > columns
             and str(tmp_path) not in line]
     assert len(text.splitlines()) > 100

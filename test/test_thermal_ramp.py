@@ -32,15 +32,13 @@ import numpy as np
 import pytest
 from ramps import BENT, G, LINE, offset_at, ramp, twelve_poses, TWISTED, UP, warming, write_ulog
 from scipy.signal import medfilt
-from shared import data, refused, run, run_json
+from shared import data, MPS2, refused, run, run_json
 from test_exports import ardupilot, qgroundcontrol
 from test_log_formats import make
 
-UNITS = units_of('m/s2')
-
 
 def stretches(log: Recording) -> Ramp:
-    return ramp_of(cells_of([log], UNITS))
+    return ramp_of(cells_of([log], MPS2))
 
 
 def curve(*logs: Recording) -> Curve:
@@ -49,7 +47,7 @@ def curve(*logs: Recording) -> Curve:
 
 def thermal(*logs: Recording | Intake):
     return thermally_calibrated([log if isinstance(log, Intake) else
-                                 RampIntake(stretches(log), UNITS) for log in logs])
+                                 RampIntake(stretches(log), MPS2) for log in logs])
 
 
 def px4_fit(log: Recording):
@@ -334,9 +332,9 @@ def test_logs_of_several_sensors_in_counts_or_with_poses_without_temperature_are
         thermal(*(replace(ramp(8), sensor=name) for name in ('left', 'right')))
     with pytest.raises(InputError, match='native units'):
         cells_of([ramp(8)], units_of('native'))
-    poses = capture(without_temperature(twelve_poses(1)), UNITS).poses
+    poses = capture(without_temperature(twelve_poses(1)), MPS2).poses
     with pytest.raises(InputError, match='the poses have no temperature'):
-        thermal(ramp(8), Intake(poses, UNITS))
+        thermal(ramp(8), Intake(poses, MPS2))
 
 
 def test_the_title_of_the_page_names_each_log():

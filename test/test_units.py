@@ -21,10 +21,8 @@ from golden.record import differences
 from inside import in_units_of, model_with, read_log, simulate_recording, spread_directions
 import numpy as np
 import pytest
-from shared import run
+from shared import run, SENSOR
 
-SENSOR = {'offset': (0.05, -0.03, 0.08), 'axis_gain': (0.02, -0.03, 0.01),
-          'cross_axis': (0.004, -0.003, 0.002)}
 METRIC = ('g', 'm/s2')
 
 

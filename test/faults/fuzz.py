@@ -39,12 +39,12 @@ from accel_calib.errors import AccelCalibError, InputError, StoredCalibrationErr
 from accel_calib.logs import LogOptions, write_table  # noqa: E402
 from accel_calib.messages import correct_bag  # noqa: E402
 from accel_calib.stored import read_calibration  # noqa: E402
-from bag_files import a_calibration  # noqa: E402
 from faults import inputs  # noqa: E402
 from faults.inputs import BAGS, EXTREME, Files  # noqa: E402
 from inside import (  # noqa: E402
     format_calibration, main as command_line, parse_calibration, poses_of, read_log)
 import numpy as np  # noqa: E402
+from shared import known  # noqa: E402
 
 Rng = np.random.Generator
 Make = Callable[[Rng], Files]
@@ -122,7 +122,7 @@ def read_bag(path: Path, rng: Rng) -> object:
     _remove(out)
     refused = None
     try:
-        correct_bag(path, a_calibration(), out)
+        correct_bag(path, known(), out)
     except InputError as err:
         refused = err
     if out.exists() is (refused is not None) or list(out.parent.glob('.*')):

@@ -20,10 +20,8 @@ HERE = Path(__file__).parent
 KILLED = -9
 
 
-@pytest.fixture(scope='module')
-def start(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return inputs, outputs of other inputs, and the files of a node after two fits."""
-    folder = tmp_path_factory.mktemp('start')
+def fill(folder: Path) -> None:
+    """Write inputs, outputs of other inputs, and the files of a node after two fits."""
     for seed, offset in ((2, 0.03), (1, 0.02)):
         run('simulate', '-o', folder / 'poses.csv', '--effect', f'offset={offset}', '--seed', seed)
         run('simulate', '-o', folder / 'recording.csv', '--recording', '--poses', 12, '--dwell', 2,
@@ -37,7 +35,6 @@ def start(tmp_path_factory: pytest.TempPathFactory) -> Path:
     store = SensorStore(folder / 'imu.yaml', Identity('imu', '/imu'), 'm/s2')
     store.write(store.prepared(read_calibration(folder / 'new.yaml')))
     store.write(store.prepared(read_calibration(folder / 'imu.yaml.before1')))
-    return folder
 
 
 def run(*arguments: object) -> None:
@@ -45,12 +42,13 @@ def run(*arguments: object) -> None:
 
 
 @pytest.fixture(scope='module')
-def trials(start: Path, tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
+def trials(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
     """Return the outcome of all trials."""
     compiler = shutil.which('cc')
     if compiler is None or not sys.platform.startswith('linux'):
         pytest.skip('the shim needs a C compiler and Linux')
-    folder = tmp_path_factory.mktemp('work')
+    start, folder = map(tmp_path_factory.mktemp, ('start', 'work'))
+    fill(start)
     shim = folder / 'shim.so'
     subprocess.run([compiler, '-shared', '-fPIC', '-o', shim, HERE / 'shim.c', '-ldl'], check=True)
     done = subprocess.run(

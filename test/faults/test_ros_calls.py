@@ -12,8 +12,7 @@ import sys
 from typing import Any
 
 from accel_calib.stored import read_calibration
-from faults.feed import send_until, start_poses
-from faults.logged import log_to_files
+from faults.nodes import log_to_files, send_until, start_poses
 from faults.order import Call, explained, State
 from faults.sample import FACTOR, sample
 from inside import spread_directions

@@ -13,8 +13,7 @@ from typing import Any
 
 from accel_calib.logs import read_poses
 from accel_calib.stored import read_calibration
-from faults.feed import send_until, start_poses
-from faults.logged import log_to_files
+from faults.nodes import log_to_files, send_until, start_poses
 from faults.order import AFTER, Call, State
 from faults.sample import FACTOR
 from inside import CALIBRATOR, is_partial, spread_directions

@@ -3,7 +3,7 @@
 
 """Golden results of what runs while samples arrive: sessions without ROS, and messages."""
 
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 import struct
 from typing import Any
@@ -12,9 +12,9 @@ import accel_calib as ac
 from accel_calib.calibrate import Calibration, fit_poses, level, SampleNoise
 from accel_calib.logs import doubles_at, joined, layout_of, renamed, samples_of
 from accel_calib.messages import corrected, motion_of, output_frame, Rewriter
-from accel_calib.session import (
-    answered, CalibratorSettings, checks, Log, Session, ShowPoses, state, Task)
+from accel_calib.session import checks, state
 from accel_calib.units import units_of
+from driven import Driver
 from golden.figures import attempt, those
 from golden.inputs import G, samples
 from inside import figures as health_figures, frame_ids, layout_with, Model, stamps_of
@@ -28,34 +28,21 @@ EFFECTS: dict[str, Any] = {
     'temperature_rate': np.array([0.02, 0.01, -0.03])}
 
 
-class _Driver:
-    """A session whose jobs are done at once, with its own clock; each step returns a result."""
+class _Driver(Driver):
+    """A session of which each step returns a result."""
+
+    def __init__(self) -> None:
+        """Wait for the first step, which is `start`."""
 
     def start(self, **settings: Any) -> None:
-        self.now, self.log, self.shown = 0.0, [], None
-        self.session = Session(CalibratorSettings(calibration_file='c.yaml', **settings), '/imu',
-                               lambda: self.now)
-        self._handle()
+        super().__init__('/imu', calibration_file='c.yaml', **settings)
 
-    def _handle(self) -> None:
-        while self.session.events:
-            event = self.session.events.popleft()
-            if isinstance(event, Generator):
-                self._done(event)
-            elif isinstance(event, Log):
-                self.log.append(f'{event.severity}: {event.words}')
-            elif isinstance(event, ShowPoses):
-                self.shown = event
-
-    def _done(self, task: Task) -> Any:
-        answer = answered(task)
-        self._handle()
-        return answer
+    def end(self, answer: str) -> None:
+        """Leave an answer that nobody asked for out of the log."""
 
     def ask(self, *names: str) -> Any:
         """Return the answers of commands, or their refusals."""
-        return [attempt(lambda name=name: self._done(getattr(self.session.commands, name)()))
-                for name in names]
+        return [attempt(super(_Driver, self).ask, name) for name in names]
 
     def feed(self, ups: Sequence[Any], at: float, t: float = np.nan, frame_id: str = 'imu',
              per_g: float = G, gain: float = 1.0, s: float = 2.4, **part: Any) -> None:
@@ -69,9 +56,9 @@ class _Driver:
                 rows[:, :7], rows[:, 7], rows[:, 0] = block, t, block[:, 0] + at
                 self.session.around.take('temperature', t)
                 self.session.push(rows, self.now)
-            self._handle()
+            self.handle()
         self.session.tick()
-        self._handle()
+        self.handle()
 
     def state(self) -> Any:
         """Return progress, diagnostics, checks and poses."""
@@ -82,7 +69,7 @@ class _Driver:
                     drift, 'repeats temperatures rests count scatter change since without')}]
 
     def lines(self) -> Any:
-        return self.log
+        return [f'{each.severity}: {each.words}' for each in self.log]
 
 
 def session(steps: Sequence[Any]) -> Any:
