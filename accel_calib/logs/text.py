@@ -267,11 +267,8 @@ def _joined_quotes(lines: list[str]) -> list[str]:
     joined: list[str] = []
     k = 0
     while k < len(lines):
-        end = k
-        if lines[k].count('"') % 2:
-            odd = (j for j in range(k + 1, min(k + _QUOTED_LINES, len(lines)))
-                   if lines[j].count('"') % 2)
-            end = next(odd, k)
+        last = min(k + _QUOTED_LINES, len(lines)) if lines[k].count('"') % 2 else k
+        end = next((j for j in range(k + 1, last) if lines[j].count('"') % 2), k)
         joined.append(''.join(lines[k:end + 1]))
         k = end + 1
     return joined
