@@ -275,25 +275,20 @@ def ardupilot_correction(parameters: Parameters, instance: int) -> Correction:
                                 for order in range(1, DEGREE + 1)]) / PER_MILLION
             limits = (values.get(f'{thermal_start}TMIN', 0.0),
                       values.get(f'{thermal_start}TMAX', 70.0))
-        found = ByAxis(offset, scale, thermal, ARDUPILOT_REFERENCE, limits,
-                       _ardupilot_rotation(parameters, values))
+        number = parameters.lookup(values, 'AHRS_ORIENTATION', 0.0)
+        names = _CUSTOM.get(int(number), ())
+        lacking = [name for name in names if name not in values]
+        if lacking:
+            raise UnknownCorrectionError(
+                f'AHRS_ORIENTATION is {number:.0f}, and the log lacks {lacking[0]}')
+        rotation = (_rotation([parameters.lookup(values, name, 0.0) for name in names]) if names
+                    else _numbered('AHRS_ORIENTATION', number, _OF_ARDUPILOT))
+        found = ByAxis(offset, scale, thermal, ARDUPILOT_REFERENCE, limits, rotation)
         # The firmware adds the polynomial at CALTEMP, so that it is zero there.
         at_offset = values.get(f'INS_ACC{instance}_CALTEMP', -300.0)
         return replace(found, offset=offset - found.moved(at_offset))
 
     return correction
-
-
-def _ardupilot_rotation(parameters: Parameters, values: Values) -> Floats:
-    number = parameters.lookup(values, 'AHRS_ORIENTATION', 0.0)
-    names = _CUSTOM.get(int(number))
-    if names is None:
-        return _numbered('AHRS_ORIENTATION', number, _OF_ARDUPILOT)
-    lacking = [name for name in names if name not in values]
-    if lacking:
-        raise UnknownCorrectionError(
-            f'AHRS_ORIENTATION is {number:.0f}, and the log lacks {lacking[0]}')
-    return _rotation([parameters.lookup(values, name, 0.0) for name in names])
 
 
 def _numbered(name: str, number: float, known: Mapping[int, Sequence[float]]) -> Floats:
@@ -404,18 +399,17 @@ class Choice:
     def _others(self) -> list[str]:
         """Return notes on the other sensors of the same message, and on other messages."""
         chosen, notes = self.message, []
-        usable = [message for message in self.found if len(message.time)]
-        rest = [message for message in usable
-                if message.name == chosen.name and message.instance != chosen.instance]
-        other = [message for message in usable
-                 if message.name in self.preferred and message.name != chosen.name]
+        usable = [each for each in self.found if len(each.time)]
+        rest = [each for each in usable
+                if each.name == chosen.name and each.instance != chosen.instance]
+        other = [each for each in usable if each.name in {*self.preferred} - {chosen.name}]
         if rest:
             notes.append(f'{chosen} is read; other sensors: {some(rest)} '
                          f'(--sensor {rest[0].instance})')
         if other:
-            names = ', '.join(dict.fromkeys(f'{message.name} ({message.rate_hz:.3g} Hz)'
-                                            for message in other
-                                            if message.instance == other[0].instance))
+            names = ', '.join(dict.fromkeys(
+                f'{each.name} ({each.rate_hz:.3g} Hz)' for each in other
+                if each.instance == other[0].instance))
             notes.append(f'not used: {names} (--topic {other[0].name})')
         return notes
 

@@ -275,10 +275,10 @@ def _with_clock_and_unit(topic: ContextTopic, imu: str, *, named: bool
                              f'{topic.quantity.words}', 'name another topic')
         return None, [f'there is no {topic.quantity.words}: {message}']
     notes = []
-    of_imu = topic.bag.first(imu, size=_PEEKED)
-    stamps = stamps_of(topic.bag.joined([raw for _, _, raw in of_imu], imu, 0)) if of_imu else 0.0
-    # The stamps of the first messages of the Imu after their receipt [s].
-    late = float(np.median(stamps - _received(of_imu))) if of_imu else 0.0
+    late = 0.0  # the stamps of the first messages of the Imu after their receipt [s]
+    if of_imu := topic.bag.first(imu, size=_PEEKED):
+        stamps = stamps_of(topic.bag.joined([raw for _, _, raw in of_imu], imu, 0))
+        late = float(np.median(stamps - _received(of_imu)))
     if not np.median(np.abs(time - _received(block) - late)) <= _SAME_CLOCK_S:
         topic = replace(topic, late=late)
         notes.append(f'the messages on {topic.what} have no stamp of the clock of the Imu: their '

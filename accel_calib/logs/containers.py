@@ -251,20 +251,16 @@ def old_sheets(path: Path, _: ExitStack) -> list[Member]:
 
 
 def _sheet(path: Path, rows: Callable[[], Iterator[Sequence[Any]]]) -> Bytes:
-    return csv_of(_padded(path, rows()))
-
-
-def _padded(path: Path, rows: Iterator[Sequence[Any]]) -> Iterator[list[Any]]:
-    """Yield the rows of a sheet; all rows have the same number of cells."""
+    """Yield the rows of a sheet as CSV; all rows have the same number of cells."""
     width = cells = rows_read = 0
-    most = min(_MOST_CELLS, most_numbers(path))
-    while block := [list(row) for row in islice(rows, ROWS)]:
+    most, left = min(_MOST_CELLS, most_numbers(path)), rows()
+    while block := [list(row) for row in islice(left, ROWS)]:
         width = max(width, *map(len, block))
         cells, rows_read = cells + (width + 1) * len(block), rows_read + len(block)
         if cells > most or rows_read > _MOST_ROWS:
             raise InputError(f'{path} has more than {_MOST_ROWS} rows or {most} cells, expected a '
                              'smaller Excel file', AGAIN)
-        yield from (row + [None] * (width - len(row)) for row in block)
+        yield from csv_of(row + [None] * (width - len(row)) for row in block)
 
 
 # ---------------------------------------------------------------- standard input, DataFrame

@@ -291,12 +291,16 @@ def layout_of(path: Path, head: Sequence[str], is_header: IsHeader, encoding: st
     notes = [f'{skipped}{":" if len(passed) == 1 else ", the first is"} {each!r}'
              for each in passed[:1]]
     rows = [found.dialect.cells(head[k]) for k in finder.plain if k >= start]
+    stated = {float(before or after) * (1000.0 if any(kilo) else 1.0) for line in head[:start]
+              for before, *kilo, after in _RATE.findall(line[:1000])}
+    if rate_hz is None and len(stated) == 1 and min(stated) > 0.0:
+        rate_hz = stated.pop()
     decimal = {match[1] for row in rows[:_TRIED_LINES] for match in map(_DECIMAL.fullmatch, row)
                if match}
     return Layout(path, found.dialect, min(decimal, default=''), found.header,
                   finder.units_row(found, start), _width(found.header, rows), start, encoding,
                   _about(path, [line for line in head if line[0] == '#']), tuple(notes),
-                  tuple(map(tuple, rows[:_SAMPLE_ROWS])), rate_hz or _stated_rate(head[:start]))
+                  tuple(map(tuple, rows[:_SAMPLE_ROWS])), rate_hz)
 
 
 def _rate_below_start(rows: Sequence[Sequence[str]]) -> float | None:
@@ -441,13 +445,6 @@ def _width(header: Sequence[str], rows: Sequence[Sequence[str]]) -> int:
     if rows and not header[-1] and all(len(row) == len(header) - 1 for row in rows):
         return len(header) - 1
     return len(header)
-
-
-def _stated_rate(lines: Sequence[str]) -> float | None:
-    """Return the rate of the samples that lines state [Hz]; None if they state none or several."""
-    found = {float(before or after) * (1000.0 if any(kilo) else 1.0)
-             for line in lines for before, *kilo, after in _RATE.findall(line[:1000])}
-    return found.pop() if len(found) == 1 and min(found) > 0.0 else None
 
 
 def _about(path: Path, comments: Sequence[str]) -> dict[str, Any]:

@@ -207,12 +207,6 @@ DATAFLASH = b'\xa3\x95\x80'
 _STAMPS = {'SampleUS': MICRO, 'TimeUS': MICRO, 'SampleMS': 1e-3, 'TimeMS': 1e-3}
 """Fields with the time of a sample, the best first, and their factors to seconds."""
 
-_SCALES = {'c': 1e-2, 'C': 1e-2, 'e': 1e-2, 'E': 1e-2, 'L': 1e-7}
-_TYPES = {'b': 'i1', 'B': 'u1', 'M': 'u1', 'h': '<i2', 'H': '<u2', 'c': '<i2', 'C': '<u2',
-          'i': '<i4', 'I': '<u4', 'L': '<i4', 'e': '<i4', 'E': '<u4', 'f': '<f4', 'd': '<f8',
-          'g': '<f2', 'q': '<i8', 'Q': '<u8', 'n': 'S4', 'N': 'S16', 'Z': 'S64', 'a': 'S64'}
-"""Types of the fields, from the letters of a message FMT [4]."""
-
 _Table = dict[str, NDArray[Any]]
 
 
@@ -283,7 +277,7 @@ def _parameters(table: _Table) -> Parameters:
 
 
 def _binary(path: Path) -> tuple[dict[str, _Table], list[str]]:
-    from pymavlink.DFReader import DFReader_binary
+    from pymavlink.DFReader import DFReader_binary, FORMAT_TO_STRUCT
 
     class Index(DFReader_binary):  # type: ignore[misc]
         def init_clock(self) -> None:
@@ -300,14 +294,17 @@ def _binary(path: Path) -> tuple[dict[str, _Table], list[str]]:
             set(form.columns))  # one letter for each field, and a name of its own for each
         if not _NAME.fullmatch(form.name) or not len(starts) or not is_sound:
             continue
-        layout = np.dtype([(name, _TYPES[letter])
-                           for name, letter in zip(form.columns, form.format)])
+        # Types and factors of the fields, from the letters of a message FMT [4].
+        fields = [(name, *FORMAT_TO_STRUCT[letter][:2])
+                  for name, letter in zip(form.columns, form.format)]
+        layout = np.dtype([(name, f'S{kind[:-1]}' if kind[-1] == 's' else f'<{kind}')
+                           for name, kind, _ in fields])
         whole = starts[starts + layout.itemsize <= len(data)]
         cut += len(starts) - len(whole)
         rows = data[whole[:, np.newaxis] + np.arange(layout.itemsize)]
         values = rows.view(layout)[:, 0]
-        tables[form.name] = {name: values[name] * _SCALES[letter] if letter in _SCALES
-                             else values[name] for name, letter in zip(form.columns, form.format)}
+        tables[form.name] = {name: values[name] * factor if factor else values[name]
+                             for name, _, factor in fields}
     notes = [f'{counted(cut, "message")} cut off at the end'] if cut else []
     known = sum(len(log.offsets[number]) * form.len for number, form in log.formats.items())
     if known < len(data):
@@ -336,21 +333,15 @@ def _text(path: Path) -> tuple[dict[str, _Table], list[str]]:
     for kind, rows in lines.items():
         sound = [row for row in rows if row.count(',') == len(names[kind]) - 1]
         bad += len(rows) - len(sound)
+        try:  # only the fields of PARM are not all numbers
+            table = (np.array([list(map(str.strip, row.split(','))) for row in sound], str)
+                     if kind == 'PARM' or not sound else
+                     np.loadtxt(sound, delimiter=',', ndmin=2, comments=None))
+        except ValueError as err:
+            raise InputError(f'{path}: message {kind}: {err}, expected numbers',
+                             'correct the line or remove it') from err
         if sound:
-            tables[kind] = _parsed(path, kind, names[kind], sound)
+            tables[kind] = dict(zip(names[kind], table.reshape(-1, len(names[kind])).T))
     if bad:
         notes.append(f'{counted(bad, "line")} of another length left out')
     return tables, notes
-
-
-def _parsed(path: Path, kind: str, names: Sequence[str], rows: Sequence[str]) -> _Table:
-    """Return the fields of the lines of one message; only those of PARM are not all numbers."""
-    if kind == 'PARM':
-        cells = [[cell.strip() for cell in row.split(',')] for row in rows]
-        return dict(zip(names, np.array(cells, dtype=str).reshape(-1, len(names)).T))
-    try:
-        numbers = np.loadtxt(rows, delimiter=',', ndmin=2, comments=None)
-    except ValueError as err:
-        raise InputError(f'{path}: message {kind}: {err}, expected numbers',
-                         'correct the line or remove it') from err
-    return dict(zip(names, numbers.reshape(-1, len(names)).T))

@@ -165,8 +165,7 @@ def unit_text(text: str) -> str:
     """Return the text of a unit in the spelling of `UNITS`."""
     text = unicodedata.normalize('NFKD', text.replace('°', 'deg').replace('º', 'deg')).casefold()
     text = text.replace('μ', 'u').replace('−', '-').replace('⁻', '-').replace('per', '/')
-    text = re.sub(r'[\s^*·.⋅_\ufffd]', '', text)
-    return text.replace('(', '').replace(')', '')
+    return re.sub(r'[\s^*·.⋅_()\ufffd]', '', text)
 
 
 def unit_of(quantity: str, text: str) -> tuple[str, float] | None:

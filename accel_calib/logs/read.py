@@ -110,7 +110,7 @@ class LineReader:
 
     def __init__(self, name: str, head: Sequence[str], interval: float, options: LogOptions
                  ) -> None:
-        lines = _ended(head)
+        lines = [f'{line}\n' for line in head]
         layout = layout_of(Path(name), lines, lambda cells: is_log_header(cells, options), 'utf-8')
         self._name = name
         columns = chosen(layout, options)
@@ -125,14 +125,13 @@ class LineReader:
         self._quantities = decided(columns, first, options if timed else
                                    replace(options, rate=rate_hz))
         self.units = self._quantities.units
-        rate = '' if timed else (f'no times, {rate_hz:.4g} Hz '
-                                 f'({"stated" if options.rate else "measured"})')
-        self.read_as = ', '.join(filter(None, (self._quantities.read_as, rate)))
+        rate = f'no times, {rate_hz:.4g} Hz ({"stated" if options.rate else "measured"})'
+        self.read_as = ', '.join(filter(None, (self._quantities.read_as, '' if timed else rate)))
         self.first, self.findings = self._recording(first), tuple(self._quantities.findings)
 
     def samples(self, lines: Sequence[str]) -> Recording | None:
         """Return the samples of the next complete lines; None if there are none."""
-        return self._recording(self._table.read(_ended(lines)))
+        return self._recording(self._table.read([f'{line}\n' for line in lines]))
 
     def _recording(self, cells: Cells) -> Recording | None:
         if not len(cells.row):
@@ -140,7 +139,3 @@ class LineReader:
         columns, row = self._quantities.columns(cells)
         check_values(columns, self._name)
         return Recording(columns, row, self.units.name) if len(row) else None
-
-
-def _ended(lines: Sequence[str]) -> list[str]:
-    return [f'{line}\n' for line in lines]

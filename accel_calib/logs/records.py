@@ -254,18 +254,14 @@ def _tables(path: Path, held: Mapping[str, _Held], advice: str) -> list[Member]:
     for name, (_, load) in plain.items():
         values = load()
         for field in values.dtype.names or ('',):  # of records
-            column = _upright(values[field] if field else values)
+            column = values[field] if field else values
+            if column.dtype.kind == 'M':  # dates in s since 1970
+                column = column.astype('M8[ns]').astype(np.int64) / 1e9
             if column.dtype.kind in 'iuf':
-                arrays['/'.join(filter(None, (name, field)))] = column
+                column = column if column.ndim == 2 else column[:, np.newaxis]
+                is_wide = column.shape[0] < column.shape[1]  # with one column per sample
+                arrays['/'.join(filter(None, (name, field)))] = column.T if is_wide else column
     return [_table(name, group) for name, group in _groups(arrays).items()]
-
-
-def _upright(values: Any) -> Any:
-    """Return an array of numbers with one row per sample; dates in s since 1970."""
-    if values.dtype.kind == 'M':
-        values = values.astype('M8[ns]').astype(np.int64) / 1e9
-    values = values if values.ndim == 2 else values[:, np.newaxis]
-    return values.T if values.shape[0] < values.shape[1] else values
 
 
 def _groups(arrays: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

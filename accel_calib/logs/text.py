@@ -137,11 +137,9 @@ class TextTable:
     @property
     def notes(self) -> tuple[str, ...]:
         """Return what has been skipped so far."""
-        notes = list(self.layout.notes)
-        if self._bad_count:
-            notes.append(f'skipped {counted(self._bad_count, "bad line")}'
-                         f'{", the first" if self._bad_count > 1 else ""}: {self._bad}')
-        return (*notes, self._cut) if self._cut else tuple(notes)
+        first = ', the first' if self._bad_count > 1 else ''
+        bad = f'skipped {counted(self._bad_count, "bad line")}{first}: {self._bad}'
+        return (*self.layout.notes, *filter(None, (bad if self._bad_count else '', self._cut)))
 
     def blocks(self) -> Iterator[Cells]:
         """Yield blocks of rows; InputError without rows, or for a bad cell or number of cells."""
@@ -267,11 +265,8 @@ def _joined_quotes(lines: list[str]) -> list[str]:
     joined: list[str] = []
     k = 0
     while k < len(lines):
-        end = k
-        if lines[k].count('"') % 2:
-            odd = (j for j in range(k + 1, min(k + _QUOTED_LINES, len(lines)))
-                   if lines[j].count('"') % 2)
-            end = next(odd, k)
+        last = min(k + _QUOTED_LINES, len(lines)) if lines[k].count('"') % 2 else k
+        end = next((j for j in range(k + 1, last) if lines[j].count('"') % 2), k)
         joined.append(''.join(lines[k:end + 1]))
         k = end + 1
     return joined
