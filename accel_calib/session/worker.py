@@ -197,7 +197,12 @@ def main() -> None:
         import_module(name)
     try:
         while True:
-            answers.write(pickle.dumps(_answer(calls.get())))
+            function, given = calls.get()
+            try:
+                answer = True, function(*given)
+            except Exception as error:  # raised again in the node, by `call`
+                answer = False, error
+            answers.write(pickle.dumps(answer))
             answers.flush()
     except BrokenPipeError:  # the node has ended
         os._exit(0)
@@ -213,14 +218,6 @@ def _read(stream: BinaryIO, calls: SimpleQueue[Any]) -> None:
             calls.put(pickle.loads(call))
     finally:
         os._exit(0)
-
-
-def _answer(call: Any) -> tuple[bool, Any]:
-    function, given = call
-    try:
-        return True, function(*given)
-    except Exception as error:  # raised again in the node, by `call`
-        return False, error
 
 
 def here(function: Callable[..., Found], *given: object) -> Found:
