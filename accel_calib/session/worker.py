@@ -381,8 +381,8 @@ class Worker:
         self._computation = ThreadPoolExecutor(1, 'accel_calib')
         self._process = WorkerProcess()
         self._steps: deque[tuple[Parse, Task, Answer]] = deque()
-        self._computed: deque[tuple[Task, Answer, Future[Any]]] = deque()
-        self._commands: deque[tuple[Task, Answer]] = deque()
+        self._computed: deque[tuple[Task, Answer, Future[Any] | None]] = deque()
+        self._commands: deque[tuple[Task, Answer, Future[Any] | None]] = deque()
         self.running: list[str] = []
         self._is_busy = self._closed = False
 
@@ -413,7 +413,7 @@ class Worker:
             answer(success, found)
 
         self.running.append(name)
-        self._commands.append((self._fresh(command), done))
+        self._commands.append((self._fresh(command), done, None))
         self._advance()
 
     def _fresh(self, command: Task) -> Task:
@@ -429,10 +429,8 @@ class Worker:
         while not self._is_busy and not self._closed:
             if self._steps:
                 self._use_files(*self._steps.popleft())
-            elif self._computed:
-                self._resume(*self._computed.popleft())
-            elif self._commands:
-                self._resume(*self._commands.popleft())
+            elif waiting := self._computed or self._commands:
+                self._resume(*waiting.popleft())
             else:
                 return
 
