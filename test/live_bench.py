@@ -54,7 +54,7 @@ class TurnedSensor:
 
     """
 
-    name = 'simulated'
+    name, findings = 'simulated', ()
     problem = str
 
     def __init__(self, speed: float = 20.0, sensor: str = 'imu_link') -> None:
