@@ -54,7 +54,7 @@ class TurnedSensor:
 
     """
 
-    name = 'simulated'
+    name, findings = 'simulated', ()
     problem = str
     findings = ()
 

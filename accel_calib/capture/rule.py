@@ -318,12 +318,11 @@ class Rule:
         """
         if not self.known:
             return np.ones(len(means), bool)
-        tolerance = self._settings.still_norm_tolerance
         lengths = common_lengths(means / self._per_g)
         if lengths is None:
             length = np.linalg.norm(means, axis=1) / self._per_g
             return np.asarray((length > PLAUSIBLE_G[0]) & (length < PLAUSIBLE_G[1]))
-        return np.asarray(np.abs(lengths - 1.0) <= tolerance)
+        return np.asarray(np.abs(lengths - 1.0) <= self._settings.still_norm_tolerance)
 
     def _trending(self, seen: Mapping[int, Stretch], mean: Floats, limit: Floats, scale: Floats
                   ) -> NDArray[np.intp]:

@@ -128,8 +128,7 @@ def _played(blocks: Iterator[Recording], speed: float) -> Iterator[Floats]:
     shift = last = -np.inf
     for block in blocks:
         rows = _rows(block)
-        due = np.maximum.accumulate(rows[:, 0]) / speed
-        done = 0
+        due, done = np.maximum.accumulate(rows[:, 0]) / speed, 0
         while done < len(rows):
             now = time.monotonic()
             if due[done] - last > _LONGEST_GAP_S / speed:
@@ -151,6 +150,10 @@ def _rows(recording: Recording) -> Floats:
 
 
 # ----------------------------------------------------------------------------- a serial port
+
+_RETURN = ('connect the sensor again; the page continues when it is back, and the poses are '
+           'kept')
+
 
 class _Port:
     """
@@ -204,16 +207,14 @@ class _Port:
                 try:
                     self._open()
                 except InputError as err:
-                    self.problem = (f'{err.message}: connect the sensor again; the page continues '
-                                    'when it is back, and the poses are kept')
+                    self.problem = f'{err.message}: {_RETURN}'
             return b''
         try:
             found: bytes = self._port.read(self._port.in_waiting or 1)
         except OSError as err:
             self.close()
             self._rest, self._is_cut = b'', True
-            self.problem = (f'{self._name} does not send any more ({err}): connect the sensor '
-                            'again; the page continues when it is back, and the poses are kept')
+            self.problem = f'{self._name} does not send any more ({err}): {_RETURN}'
             return b''
         return found
 

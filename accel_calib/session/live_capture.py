@@ -333,7 +333,7 @@ class LiveCapture:
         for dwell in captured:
             self.book.end(dwell)
         last, rest = ended[-1], self._rest
-        latest = rest is None or overlap(rest, last) or not rest.start > last.end
+        latest = rest is None or rest.start <= last.end
         if latest:
             self._rest = last
         # Rests end in order: an older provisional pose will not get a final average.

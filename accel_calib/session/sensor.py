@@ -382,20 +382,15 @@ class TemperatureHistory:
             due = self._points[-1][0] + _APART if self._points else -np.inf
             later = np.flatnonzero(time[begin:] >= due)
             end = begin + int(later[0]) + 1 if len(later) else len(time)
-            self._take(time[begin:end], temperature[begin:end], is_point=len(later) > 0)
+            now = float(time[end - 1])
+            followed = [(stream, columns) for stream, columns in self._followed.values() if stream]
+            for stream, _ in followed:
+                stream.add_all(time[begin:end], temperature[begin:end])
+            if len(later):
+                self._points.append((now, float(temperature[end - 1])))
+                for stream, columns in followed:
+                    columns.append((now, stream.value))
             begin = end
-
-    def _take(self, time: Floats, temperature: Floats, *, is_point: bool) -> None:
-        """Add successive samples; the last one may be a point of the history."""
-        now = float(time[-1])
-        if is_point:
-            self._points.append((now, float(temperature[-1])))
-        for stream, columns in self._followed.values():
-            if stream is None:
-                continue
-            stream.add_all(time, temperature)
-            if is_point:
-                columns.append((now, stream.value))
 
     def columns_of(self, model: Model) -> Mapping[str, float]:
         """Return the present columns of a model."""

@@ -208,8 +208,17 @@ class Check:
 
 def checks(session: Session) -> list[Check]:
     """Return the results of all checks, one for each concern."""
-    return [_stream(session), _calibration(session), _drift(session.sensor.drift),
-            _storage(session)]
+    faults = {**stream_faults(session), **missing_context(session)}
+    drift, store, path = session.sensor.drift, session.files.store, session.files.path
+    return [
+        Check('stream', Level.WARN, '; '.join(faults.values())) if faults else
+        Check('stream', Level.OK, f'{session.statistics.rate:.1f} Hz on {session.topic}'),
+        _calibration(session),
+        Check('drift', Level.OK, 'no calibration yet') if drift is None else
+        Check('drift', Level.OK if drift.change is None else Level.WARN, status(drift)),
+        Check('storage', Level.OK, path) if store is None or store.is_writable() else
+        Check('storage', Level.ERROR, f'{path} cannot be written: correct the permissions, or '
+              'restart the node with another calibration_file')]
 
 
 def worst(session: Session, found: Sequence[Check]) -> Check:
@@ -237,13 +246,6 @@ def words_of_state(session: Session) -> str:
             else 'no calibration, nothing is published')
 
 
-def _stream(session: Session) -> Check:
-    faults = {**stream_faults(session), **missing_context(session)}
-    if faults:
-        return Check('stream', Level.WARN, '; '.join(faults.values()))
-    return Check('stream', Level.OK, f'{session.statistics.rate:.1f} Hz on {session.topic}')
-
-
 def _calibration(session: Session) -> Check:
     sensor = session.sensor
     if session.problem:
@@ -265,20 +267,6 @@ def _calibration(session: Session) -> Check:
 
 def _advice(session: Session) -> str:
     return next_action(session).words or 'turn the sensor'
-
-
-def _drift(drift: Drift | None) -> Check:
-    if drift is None:
-        return Check('drift', Level.OK, 'no calibration yet')
-    return Check('drift', Level.OK if drift.change is None else Level.WARN, status(drift))
-
-
-def _storage(session: Session) -> Check:
-    store = session.files.store
-    if store is None or store.is_writable():
-        return Check('storage', Level.OK, session.files.path)
-    return Check('storage', Level.ERROR, f'{session.files.path} cannot be written: correct the '
-                 'permissions, or restart the node with another calibration_file')
 
 
 def figures(session: Session) -> Iterator[tuple[str, str]]:

@@ -197,7 +197,12 @@ def main() -> None:
         import_module(name)
     try:
         while True:
-            answers.write(pickle.dumps(_answer(calls.get())))
+            function, given = calls.get()
+            try:
+                answer = True, function(*given)
+            except Exception as error:  # raised again in the node, by `call`
+                answer = False, error
+            answers.write(pickle.dumps(answer))
             answers.flush()
     except BrokenPipeError:  # the node has ended
         os._exit(0)
@@ -213,14 +218,6 @@ def _read(stream: BinaryIO, calls: SimpleQueue[Any]) -> None:
             calls.put(pickle.loads(call))
     finally:
         os._exit(0)
-
-
-def _answer(call: Any) -> tuple[bool, Any]:
-    function, given = call
-    try:
-        return True, function(*given)
-    except Exception as error:  # raised again in the node, by `call`
-        return False, error
 
 
 def here(function: Callable[..., Found], *given: object) -> Found:
@@ -384,8 +381,8 @@ class Worker:
         self._computation = ThreadPoolExecutor(1, 'accel_calib')
         self._process = WorkerProcess()
         self._steps: deque[tuple[Parse, Task, Answer]] = deque()
-        self._computed: deque[tuple[Task, Answer, Future[Any]]] = deque()
-        self._commands: deque[tuple[Task, Answer]] = deque()
+        self._computed: deque[tuple[Task, Answer, Future[Any] | None]] = deque()
+        self._commands: deque[tuple[Task, Answer, Future[Any] | None]] = deque()
         self.running: list[str] = []
         self._is_busy = self._closed = False
 
@@ -416,7 +413,7 @@ class Worker:
             answer(success, found)
 
         self.running.append(name)
-        self._commands.append((self._fresh(command), done))
+        self._commands.append((self._fresh(command), done, None))
         self._advance()
 
     def _fresh(self, command: Task) -> Task:
@@ -432,10 +429,8 @@ class Worker:
         while not self._is_busy and not self._closed:
             if self._steps:
                 self._use_files(*self._steps.popleft())
-            elif self._computed:
-                self._resume(*self._computed.popleft())
-            elif self._commands:
-                self._resume(*self._commands.popleft())
+            elif waiting := self._computed or self._commands:
+                self._resume(*waiting.popleft())
             else:
                 return
 

@@ -27,7 +27,7 @@ from ..calibrate import Calibration, in_g, uncertainty_g, with_history
 from ..effects import (
     AtContext, Context, effect_named, formula_of, Model, NOMINAL_SUPPLY, REFERENCE_TEMPERATURE)
 from ..geometry import angle_of, OVER_THE_SPHERE, spread_directions
-from ..table import Floats
+from ..table import Floats, range_of
 from ..text import plain
 from ..units import MG, Units
 
@@ -340,10 +340,9 @@ def about(calibration: Calibration) -> list[str]:
     for name, values in calibration.model.values.items():
         formula = formula_of(name, values, calibration.deviations).replace('°C', 'degC')
         lines += map(plain_text, wrap(f'formula of {formula}', _LARGEST_TEXT) if formula else ())
-    temperature = poses['temperature'] if 'temperature' in poses else np.zeros(0)
-    if np.any(np.isfinite(temperature)):
-        lines.append(f'temperature of the poses: {np.nanmin(temperature):.1f} to '
-                     f'{np.nanmax(temperature):.1f} degC')
+    low, high = range_of(poses, 'temperature')
+    if np.isfinite(low):
+        lines.append(f'temperature of the poses: {low:.1f} to {high:.1f} degC')
     return lines
 
 
