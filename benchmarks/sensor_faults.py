@@ -20,6 +20,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+import multiprocessing
 from pathlib import Path
 import sys
 from tempfile import TemporaryDirectory
@@ -305,26 +306,28 @@ def counted(name: str, surface: str, sets: int, seed: int, folder: Path) -> Coun
     return counts
 
 
+def row(name: str, surface: str, sets: int, seed: int) -> tuple[object, ...]:
+    """Return a row of the table."""
+    with TemporaryDirectory() as folder:
+        found = counted(name, surface, sets, seed, Path(folder))
+    made = (name, surface, sets, found['named'] if FAULTS[name].words else '', found['calibrated'],
+            found['wrong'], found['false'] if name == 'none' else '')
+    print(made, file=sys.stderr, flush=True)
+    return made
+
+
 def main() -> None:
-    asked = parser(__doc__, sets=50, seed=2030)
+    asked = parser(__doc__, sets=50, seed=2030, jobs=2)
     asked.add_argument('--clean', type=int, default=125, help='sets without a fault')
     asked.add_argument('--only', default='', help='faults, separated by commas')
-    given = asked.parse_args()
-    rows = []
-    with TemporaryDirectory() as folder:
-        for name, fault in FAULTS.items():
-            for surface in SURFACES:
-                if (given.only and name not in given.only.split(',')) or (
-                        name in OF_TEXT and surface in ('bag', 'node')):
-                    continue
-                sets = given.clean if name == 'none' else given.sets
-                found = counted(name, surface, sets, given.seed, Path(folder))
-                rows.append((name, surface, sets, found['named'] if fault.words else '',
-                             found['calibrated'], found['wrong'],
-                             found['false'] if name == 'none' else ''))
-                print(rows[-1], file=sys.stderr)
-    command = ' '.join(sys.argv[1:])
-    publish(_PAGE.format(command=command, machine=machine(), rows=markdown(
+    given, about = asked.parse_args(), machine()
+    tasks = [(name, surface, given.clean if name == 'none' else given.sets, given.seed)
+             for name in FAULTS for surface in SURFACES
+             if (not given.only or name in given.only.split(','))
+             and not (name in OF_TEXT and surface in ('bag', 'node'))]
+    with multiprocessing.get_context('spawn').Pool(given.jobs) as pool:
+        rows = pool.starmap(row, tasks, chunksize=1)
+    publish(_PAGE.format(command=' '.join(sys.argv[1:]), machine=about, rows=markdown(
         ('fault', 'as', 'sets', 'named', 'calibrated', 'wrong', 'false findings'), rows)),
         given.markdown)
 
