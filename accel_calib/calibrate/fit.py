@@ -107,7 +107,6 @@ def fit_poses(poses: Poses, units: Units, *, model: str = 'auto', method: Method
                          f'{MODEL_NAMES} and one of {METHODS}')
     check_units(poses, units)
     sound, rejected = sound_rows(poses, units)
-    check_axes(sound.reading, units)
     if rejected and method == 'algebraic':
         raise RefusedFitError(f'row {rejected[0].row}: {rejected[0].reason}, but the method '
                               'algebraic uses every row', 'remove the row, or use the method ml')
@@ -149,7 +148,12 @@ def _fitted(poses: Poses, units: Units, model: str, method: Method) -> Calibrati
 
 
 def sound_rows(poses: Poses, units: Units) -> tuple[Poses, tuple[Rejected, ...]]:
-    """Separate plausible poses from rows that are no readings of an accelerometer at rest."""
+    """
+    Separate plausible poses from rows that are no readings of an accelerometer at rest.
+
+    RefusedFitError if an axis does not measure.
+
+    """
     if not len(poses):
         return poses, ()
     reading, noise = poses.reading, poses.noise
@@ -166,7 +170,9 @@ def sound_rows(poses: Poses, units: Units) -> tuple[Poses, tuple[Rejected, ...]]
     rejected = [Rejected(int(poses.row[k]), _why(reading[k]) if wild[k] else
                          f'the uncertainty of the mean is {largest[k]:.3g}, so the sensor was not '
                          'at rest') for k in np.flatnonzero(bad)]
-    return (poses.take(~bad), tuple(rejected)) if rejected else (poses, ())
+    sound = poses.take(~bad) if rejected else poses
+    check_axes(sound.reading, units)
+    return sound, tuple(rejected)
 
 
 def inside_rows(poses: Poses, units: Units
