@@ -22,7 +22,7 @@ from .figures import (
     TOO_EXACT, without_noise, WORST_ERROR)
 from ..calibrate import Calibration, directions_in, flat_direction, Verification
 from ..compare import LEVEL
-from ..effects import EMPIRICAL, kind_of, WANDER
+from ..effects import EMPIRICAL, kind_of, LADDER, WANDER
 from ..errors import TAKE_ALL_SIDES
 from ..finding import Finding, NextStep, ranked, rated, Rating, without
 from ..geometry import coverage, distinct
@@ -154,8 +154,9 @@ def _checked(expected: Expected) -> Iterator[Finding]:
     if expected.dof == 0:
         yield Finding('no_check', 'nothing checks the fit: there are only as many poses as values',
                       _more_poses(expected), 'USABLE')
-    elif (distinct(expected.directions) <= len(expected.poses) - expected.dof
-          and _is_beyond_noise(expected)):
+    elif (expected.quality.held_out_rms_mg is None and _is_beyond_noise(expected)
+          and {*expected.calibration.model.effects} <= {*LADDER}
+          and distinct(expected.directions) <= len(expected.poses) - expected.dof):
         yield Finding('no_check', 'the poses of one orientation differ by more than their noise, '
                       'and no orientation checks the others', _more_poses(expected), 'BAD')
     elif expected.noise_mg is None and expected.dof < TO_CHECK.value:
