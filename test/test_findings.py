@@ -369,3 +369,14 @@ def test_after_a_search_without_result_nobody_is_sent_to_search_again(noise_know
     assert (first['rating'], first['next']['kind']) == ('USABLE', 'refine')
     again = result_of(first['next']['command'], tmp_path)
     assert (again['rating'], again['next']['kind']) == ('USABLE', 'poses')
+
+
+@pytest.mark.parametrize(('apart', 'name'), [(0.0, 'USABLE'), (0.004, 'BAD')])
+def test_poses_that_disagree_in_orientations_of_which_none_checks_the_others_are_bad(apart, name):
+    corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / 3.0**0.5
+    poses = simulated({'offset': COMMON['offset']}, directions=np.repeat(corners, 2, axis=0),
+                      units='g')
+    rating = rate(fit_poses(moved(poses, (1, 3), apart), G, model='4'))
+    assert rating.name == name
+    found = [(each.kind, each.level) for each in rating.findings]
+    assert (('no_check', 'BAD') in found) == (name == 'BAD')
