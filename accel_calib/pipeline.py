@@ -152,10 +152,10 @@ def _captured(source: Source, log: OpenLog, options: LogOptions, settings: Mappi
     """Capture the poses of an open log; InputError without a still stretch."""
     asked = settings_from(settings, log.units)
     found = capture(log.watched(progress), log.units, asked)
-    if np.any(found.least):
+    if np.any(found.known.least):
         with _opened(source, options) as again:
-            found = capture(again.blocks, log.units, asked, found.least)
-    check_measured(found.poses.reading, found.lengths, log.units)
+            found = capture(again.blocks, log.units, asked, found.known)
+    check_measured(found.lengths, log.units)
     count, findings = len(found.poses), account_of(found.rests, asked)
     limit, more = _wider(source, found, log.units, options, settings) if count < _FEW else (0.0, 0)
     finds = f'{more} with still_std_max {limit:.3g}'
@@ -179,7 +179,7 @@ def _wider(source: Source, found: Captured, units: Units, options: LogOptions,
         if math.isfinite(limit) and tried[1] < _FEW:
             asked = settings_from({**settings, 'still_std_max': limit}, units)
             with _opened(source, options) as again:
-                count = len(capture(again.blocks, units, asked).poses)
+                count = len(capture(again.blocks, units, asked, found.known).poses)
             tried = max(tried, (limit, count), key=lambda each: each[1])
     return tried
 

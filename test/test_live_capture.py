@@ -8,9 +8,10 @@ from dataclasses import replace
 from typing import Any
 
 from accel_calib.calibrate import fit_poses, level
-from accel_calib.capture import CaptureSettings, Dwell, poses_from
+from accel_calib.capture import capture, CaptureSettings, Dwell, poses_from
 from accel_calib.session import CalibratorSettings
 from accel_calib.stored import read_calibration
+from accel_calib.table import numbered, Recording
 from accel_calib.units import units_of
 from inside import (
     LiveCapture, model_with, PoseBook, rest_after, Sensor, simulate_recording, spread_directions,
@@ -50,6 +51,22 @@ def test_a_mark_of_a_pose_outlives_a_restart() -> None:
     book = PoseBook(CaptureSettings(), MPS2)
     book.add_stored(poses_from([dwell(5.0, [0, 1, 0]), marked]))
     assert book.poses()['at_limit'].tolist() == book.poses()['doubtful'].tolist() == [0.0, 1.0]
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_the_first_poses_at_a_limit_are_marked_as_in_a_recording(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    ends = np.array([[0.0, 0, 1], [0.9, 0.1, 0.4], [0.1, 1.0, 0], [0.5, -0.6, 0.6],
+                     [-0.6, 0.5, 0.6], [0.6, 0.6, -0.5], [-0.6, -0.6, -0.5], [-0.6, 0.6, -0.5]])
+    up = np.repeat(ends / np.linalg.norm(ends, axis=1)[:, np.newaxis], 150, axis=0)
+    reading = np.minimum(GRAVITY * (up + 0.003 * rng.normal(size=up.shape)), 0.8 * GRAVITY)
+    live = LiveCapture(CaptureSettings(), MPS2)
+    push_all(live, reading)
+    columns = {'time': np.arange(len(reading)) / 50.0, 'reading': reading}
+    whole = capture(Recording(columns, numbered(columns)), MPS2).poses
+    poses = live.poses(())
+    assert poses['at_limit'].tolist() == whole['at_limit'][:len(poses)].tolist()
+    assert poses['at_limit'].tolist() == [1.0, 1.0, 1.0, *[0.0] * (len(poses) - 3)]
 
 
 @pytest.mark.parametrize(('up', 'noise'), [

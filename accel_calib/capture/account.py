@@ -33,6 +33,10 @@ REASONS: Mapping[str, tuple[str, str]] = MappingProxyType({
     'repeated': ('an earlier orientation', '')})
 """Why a rest is no pose, and what to do about it."""
 
+MISSING = ('', 'zeros', 'frozen', 'quiet')
+"""What stands in a log where samples are missing: zeros, the last reading again and again, or what
+is far quieter than the rests of the sensor."""
+
 
 class Rest(NamedTuple):
     """A rest from its first to its last stamp [s]; `reason` is one of `REASONS`, '' for a pose."""
@@ -53,9 +57,9 @@ def account_of(rests: Sequence[Rest], settings: CaptureSettings) -> tuple[Findin
     for each in rests:
         seconds.setdefault(each.reason, []).append(each.end - each.start)
     found = [Finding('missing', f'{sum(seconds[kind]):.3g} s are left out: {REASONS[kind][0]}',
-                     REASONS[kind][1]) for kind in ('zeros', 'frozen', 'quiet') if kind in seconds]
+                     REASONS[kind][1]) for kind in MISSING[1:] if kind in seconds]
     dropped = {reason: lengths for reason, lengths in seconds.items()
-               if reason not in ('', 'zeros', 'frozen', 'quiet', 'repeated')}
+               if reason not in (*MISSING, 'repeated')}
     count, taken = sum(map(len, dropped.values())), len(seconds.get('', ()))
     if count > taken:
         most = max(dropped, key=lambda reason: len(dropped[reason]))

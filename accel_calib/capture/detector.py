@@ -25,12 +25,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .account import Rest
+from .account import MISSING, Rest
 from .chunks import (
     CaptureSettings, chained, Chunker, Chunks, CHUNKS_PER_WINDOW, CONTEXT, Interruption, MOTION,
     Records, together)
 from .dwell import Dwell, figures, figures_type, judged, OngoingDwell, Tracker
-from .rule import MISSING, Rule
+from .levels import Known
+from .rule import Rule
+from .sensor import Lengths
 from ..errors import InputError
 from ..table import ABOUT, Floats, numbered, Poses, Recording
 from ..units import Units
@@ -50,21 +52,21 @@ class StillDetector:
 
     `keep` is the number of finished dwells to keep; None: all. `context` are the keys of the
     further columns of the samples: temperature, supply voltage, and quantities. `still` is whether
-    the sensor is still now, and `lengths` are the smallest |reading| above 0 and the largest one.
-    `refused` are the rests that ended in the last `push` or `close`, and are no poses. `least`
-    are variances below which nothing is a rest, as another detector of these samples found them.
+    the sensor is still now. `refused` are the rests that ended in the last `push` or `close`, and
+    are no poses. `known` is what another detector of these samples found.
 
     """
 
     def __init__(self, settings: CaptureSettings, units: Units, keep: int | None = 1000,
-                 context: Sequence[str] = CONTEXT, least: Floats = np.zeros(6)) -> None:
+                 context: Sequence[str] = CONTEXT, known: Known = Known()) -> None:
         self._settings, self._context = settings, context
         self._chunker = Chunker(settings, len(context))
-        self._rule = Rule(settings, units, least)
+        self._rule = Rule(settings, units, known)
         self._tracker: Tracker | None = None
         self._most = keep
         self._kept = np.empty(0, figures_type(len(context)))
-        self.still, self.lengths = False, (math.inf, 0.0)
+        self.still = False
+        self._least, self._largest = np.full(4, np.inf), np.full(4, -np.inf)  # x, y, z, |reading|²
         self.refused: tuple[Rest, ...] = ()
         self._mean = np.full(6, np.nan)
         self._number = 0
@@ -84,7 +86,7 @@ class StillDetector:
         known = np.any(~np.isnan(samples), axis=0)
         rows = len(known) if known[MOTION:].any() else MOTION if known[4:MOTION].any() else 4
         found = self._last(self.add([np.ascontiguousarray(samples[:, :rows].T)]))
-        self._rule.least = self.least
+        self._rule.least = self._rule.levels.least
         return found
 
     def add(self, blocks: Iterable[Floats]) -> int:
@@ -126,13 +128,19 @@ class StillDetector:
         return judged(self._kept, self._rule, self._context) if len(self._kept) else []
 
     @property
-    def least(self) -> Floats:
-        """Return the (6,) variances below which nothing is a rest, as known now; 0: not known."""
-        return self._rule.levels.least
+    def known(self) -> Known:
+        """Return what the samples so far show about the sensor."""
+        return Known(self._rule.levels.least, self._rule.repeats)
+
+    @property
+    def lengths(self) -> Lengths:
+        """Return the range of |reading| and that of the axis with the largest one."""
+        shortest, longest = np.sqrt([self._least[3], max(self._largest[3], 0.0)]).tolist()
+        return Lengths(shortest, longest, float(np.max(self._largest[:3] - self._least[:3])))
 
     @property
     def missing(self) -> tuple[Rest, ...]:
-        """Return the most recent times of zeros and of frozen readings, at most 10,000."""
+        """Return the most recent times at which samples are missing, at most 10,000."""
         return tuple(self._missing)
 
     @property
@@ -162,12 +170,7 @@ class StillDetector:
         whole = list[Chunks]()
         for block in blocks:
             whole += self._chunker.feed(block, last)
-            x, y, z = block[1:4]
-            square = x * x + y * y + z * z
-            if len(square):
-                low = square.min() or np.min(square, initial=np.inf, where=square > 0.0)
-                self.lengths = (min(self.lengths[0], math.sqrt(low)),
-                                max(self.lengths[1], math.sqrt(square.max())))
+            self._measure(block[1:4])
         for chunks in together(whole):
             if chunks.fresh:
                 found += self._leave()
@@ -181,6 +184,16 @@ class StillDetector:
         if self._chunker.fresh:  # the stamps were interrupted: what is known of the rest is over
             found += self._leave()
         return found
+
+    def _measure(self, reading: Floats) -> None:
+        """Note the ranges of (3, n) readings; zeros are missing samples."""
+        x, y, z = reading
+        square = x * x + y * y + z * z
+        if not np.all(square):
+            reading, square = reading[:, square > 0.0], square[square > 0.0]
+        if len(square):
+            self._least = np.minimum(self._least, np.append(reading.min(axis=1), square.min()))
+            self._largest = np.maximum(self._largest, np.append(reading.max(axis=1), square.max()))
 
     def _leave(self) -> list[OngoingDwell]:
         if self._tracker is None:
@@ -216,7 +229,7 @@ class StillDetector:
         return judged(chained(earlier, found), self._rule, self._context, len(earlier))
 
     def _miss(self, verdict: Records, length: float) -> None:
-        """Note the chunks of zeros, and the windows of one reading."""
+        """Note the chunks of zeros, and the windows in which samples are missing otherwise."""
         for each in verdict[verdict['missing'] > 0]:
             kind, begin = MISSING[each['missing']], float(each['begin'])
             if kind != 'zeros':
@@ -238,9 +251,9 @@ class Captured:
     `threshold` is the standard deviation below which a window is still, at the end, and `quietest`
     that of the quietest window, each of the axis with the largest one [unit of the readings].
     `seconds` is the duration of the recording without interruptions [s]. `rests` is the account of
-    every rest, in order of time. `lengths` are the smallest and the largest |reading|. `least` are
-    the (6,) variances below which nothing was a rest of the sensor: if one is not 0 and was not
-    given, the samples are to be captured again with them.
+    every rest, in order of time, and `lengths` the ranges of the readings. `known` is what the
+    samples show about the sensor: if one of its variances is not 0, and it was not given, the
+    samples are to be captured again with it.
 
     """
 
@@ -252,13 +265,12 @@ class Captured:
     recorded: int
     quietest: float
     rests: tuple[Rest, ...]
-    lengths: tuple[float, float]
-    least: Floats
+    lengths: Lengths
+    known: Known
 
 
 def capture(recording: Recording | Iterable[Recording], units: Units,
-            settings: CaptureSettings = CaptureSettings(), least: Floats = np.zeros(6)
-            ) -> Captured:
+            settings: CaptureSettings = CaptureSettings(), known: Known = Known()) -> Captured:
     """
     Find the still poses of a recording, in order of time.
 
@@ -271,8 +283,8 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
         Unit of the readings.
     settings : CaptureSettings
         Settings of the detector and of the poses.
-    least : (6,) array
-        Variances of readings and rates below which nothing is a rest (`Captured.least`).
+    known : Known
+        What an earlier capture of these samples found (`Captured.known`).
 
     Raises
     ------
@@ -283,7 +295,7 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
     parts = iter([recording] if isinstance(recording, Recording) else recording)
     first = next(parts, None)
     context = CONTEXT if first is None else (*CONTEXT, *first.quantities)
-    detector = StillDetector(settings, units, keep=None, context=context, least=least)
+    detector = StillDetector(settings, units, keep=None, context=context, known=known)
     times, recorded = list[float](), 0
     about: dict[str, Any] = {}
     for part in parts if first is None else chain((first,), parts):
@@ -304,7 +316,7 @@ def capture(recording: Recording | Iterable[Recording], units: Units,
         replace(poses_from(dwells, settings), **about), sum(each.samples for each in dwells),
         detector.threshold, seconds - sum(each.seconds for each in interruptions), interruptions,
         recorded, detector.quietest, tuple(sorted((*rests, *detector.missing))), detector.lengths,
-        detector.least)
+        detector.known)
 
 
 def samples_of(recording: Recording, start: int, stop: int, context: Sequence[str] = CONTEXT

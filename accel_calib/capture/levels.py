@@ -10,6 +10,8 @@ one orientation, while the rests of a sensor that is turned have one variance in
 
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,6 +33,19 @@ _TURNED = 0.3
 
 _ONE_WAY = 0.2
 """Largest range of the mean readings of what is quieter, relative to that at rest."""
+
+
+class Known(NamedTuple):
+    """
+    What all samples of a sensor show about it.
+
+    `least` are the (6,) variances of readings and rates below which nothing is a rest, 0 if they
+    are not known, and `repeats` is whether a rest can repeat one reading.
+
+    """
+
+    least: Floats = np.zeros(6)
+    repeats: bool = True
 
 
 class Levels:

@@ -52,7 +52,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .chunks import CaptureSettings, chained, Chunks, CHUNKS_PER_WINDOW, Records, window_type
-from .levels import Levels
+from .levels import Known, Levels
 from .trend import (
     Columns, columns_of, oscillation, sliding_max, sliding_sum, Stretch, stretch, Trend, windows)
 from ..table import Floats
@@ -122,10 +122,6 @@ STD_FLOOR_G = 3.3e-4
 AT_LIMIT = 0.1
 """Share of samples at a limit above which a variance is too small by a sixth or more."""
 
-MISSING = ('', 'zeros', 'frozen', 'quiet')
-"""What stands in a log where samples are missing: zeros, the last reading again and again, or what
-is far quieter than the rests of the sensor."""
-
 QUIETER = 8.0
 """Ratio of the variance at rest to that of what is no rest of this sensor."""
 
@@ -182,13 +178,13 @@ class Rule:
 
     `quietest` is the variance of the axis with the largest one, in the quietest window so far, and
     `repeats` whether a rest can repeat one reading, as that of a coarse sensor does. `least` are
-    the (6,) variances below which nothing is a rest of this sensor, 0 if they are not known.
+    the (6,) variances below which nothing is a rest of this sensor, 0 if they are not known. Only
+    what is `known` from the start marks samples as missing.
 
     """
 
-    def __init__(self, settings: CaptureSettings, units: Units, least: Floats = np.zeros(6)
-                 ) -> None:
-        self._settings, self._given, self.least = settings, least, least
+    def __init__(self, settings: CaptureSettings, units: Units, known: Known = Known()) -> None:
+        self._settings, self._given, self.least = settings, known, known.least
         self.levels = Levels()
         self.known = not units.is_native
         self._per_g = units.per_g
@@ -273,8 +269,8 @@ class Rule:
         noise, varied = self._learn(seen[LONG], mean, chunks.step, *(
             sliding_max(each, LONG - CHUNKS_PER_WINDOW + 1)[..., -size:] > 0.0 for each in gaps))
         missing = np.where(zero[-size:] > 0.0, 1, np.where((equal[-size:] > 0.0) & varied, 2, 0))
-        quiet = np.all(QUIETER * recent[:3] < self._given[:3, np.newaxis], axis=0)
-        missing[quiet & (missing == 0) & np.any(recent[:3] > 0.0, axis=0)] = 3
+        quiet = np.all(QUIETER * recent[:3] < self._given.least[:3, np.newaxis], axis=0)
+        missing[quiet & (missing == 0) & (equal[-size:] == 0.0)] = 3
         measured = missing == 0
         self.quietest = float(np.fmin.reduce(
             recent[:3].max(axis=0)[measured], initial=self.quietest))
@@ -393,6 +389,7 @@ class Rule:
         chance = same ** (seen.samples * CHUNKS_PER_WINDOW / LONG - 1.0)
         share = VARIED_SHARE * np.minimum(counts[1], MOST_REPEATED)
         varied = (counts[0] >= np.maximum(share, CHUNKS_PER_WINDOW)) & (chance < BY_CHANCE)
+        varied |= not self._given.repeats
         self._floors[:, :axes], self._step = floors[:, :, -1], steps[:, -1]
         self._counts, self._same, self.repeats = counts[:, -1], float(same[-1]), not varied[-1]
         noise = np.fmax(np.where(varied, floors[0], floors[1]), self.least[:axes, np.newaxis])

@@ -16,6 +16,7 @@ and gains of a sensor change that of what it measures.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,6 +32,9 @@ _ONE_DIRECTION = math.cos(math.radians(6.0))
 
 _ONE_LENGTH = 1e-3
 """Range of the lengths of samples below which they are computed, relative to their length."""
+
+_TURNED = 0.2
+"""Smallest range of the samples of an axis that shows a turn, relative to their length: 11°."""
 
 _FEWEST = 6
 """Fewest readings that determine a circle and check it."""
@@ -113,22 +117,28 @@ def is_one_direction(reading: Floats) -> bool:
     return bool(np.all(up @ up[:1].T > _ONE_DIRECTION))
 
 
-def check_measured(reading: Floats, lengths: tuple[float, float], units: Units) -> None:
+class Lengths(NamedTuple):
+    """Smallest |reading| above 0 and largest one, and range of the axis with the largest range."""
+
+    shortest: float
+    longest: float
+    spread: float
+
+
+def check_measured(lengths: Lengths, units: Units) -> None:
     """
     Raise RefusedFitError if a sensor that was turned always reads the same |reading|.
 
     Parameters
     ----------
-    reading : (n, 3) array
-        Means of rests, in the unit of the readings.
-    lengths : (float, float)
-        Smallest and largest |reading| of all samples.
+    lengths : Lengths
+        Ranges of all samples, in the unit of the readings.
     units : Units
         Unit of the readings, for the message.
 
     """
-    low, high = lengths
-    if high - low < _ONE_LENGTH * high and not is_one_direction(reading):
+    low, high, spread = lengths
+    if high - low < _ONE_LENGTH * high and spread > _TURNED * high:
         raise RefusedFitError(
             f'the readings have the same length of {short(high)} {units.name} in all directions, '
             f'to {short(100.0 * (high - low) / high)} %: they are computed, as the gravity of a '

@@ -16,7 +16,7 @@ pose is marked as doubtful, and the fit leaves it out if possible.
 
 """
 
-from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
 from operator import is_
@@ -129,6 +129,11 @@ class PoseBook:
         self._dwells = [replace(dwell, doubtful=True) if dwell.start in starts else dwell
                         for dwell in self._dwells]
         return len(new)
+
+    def limit(self, ends: Mapping[float, bool]) -> None:
+        """Take over by start time whether dwells are at a limit: the later ones show it, too."""
+        self._dwells = [dwell if ends.get(dwell.start, dwell.at_limit) is dwell.at_limit else
+                        replace(dwell, at_limit=not dwell.at_limit) for dwell in self._dwells]
 
     def undo(self) -> bool:
         """Remove the last pose; return whether there was one."""
@@ -285,11 +290,12 @@ class LiveCapture:
         RefusedFitError if no sensor measures so.
 
         """
-        rests = [*(each.rest for each in self.detector.judged()), *self.detector.missing]
+        check_measured(self.detector.lengths, self._units)
+        judged = self.detector.judged()
+        self.book.limit({each.start: each.at_limit for each in judged})
+        rests = [*(each.rest for each in judged), *self.detector.missing]
         own = [each for each in rests if each.start >= self._begun]
-        poses = replace(self.book.poses(), findings=(*found, *account_of(own, self._settings)))
-        check_measured(poses.reading, self.detector.lengths, self._units)
-        return poses
+        return replace(self.book.poses(), findings=(*found, *account_of(own, self._settings)))
 
     def capture(self, rest: Dwell) -> None:
         """Capture the ongoing rest as a pose."""
