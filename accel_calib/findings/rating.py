@@ -20,9 +20,9 @@ from .figures import (
     BAD_ERROR, BOUND, CHANGED, COVERED, degrees, depends_on, Expected, FAR_OFF, GOOD_ERROR, HIDDEN,
     LEFT_OUT, MANY_OUT, MATTERS, mg, NEAR_FLAT, number, PER_OUTLIER, SPAN, TILT, TO_CHECK,
     TOO_EXACT, without_noise, WORST_ERROR)
-from ..calibrate import Calibration, directions_in, flat_direction, Verification
+from ..calibrate import Calibration, directions_in, flat_direction, free_parameters, Verification
 from ..compare import LEVEL
-from ..effects import EMPIRICAL, kind_of, LADDER, WANDER
+from ..effects import EMPIRICAL, kind_of, WANDER
 from ..errors import TAKE_ALL_SIDES
 from ..finding import Finding, NextStep, ranked, rated, Rating, without
 from ..geometry import coverage, distinct
@@ -155,8 +155,7 @@ def _checked(expected: Expected) -> Iterator[Finding]:
         yield Finding('no_check', 'nothing checks the fit: there are only as many poses as values',
                       _more_poses(expected), 'USABLE')
     elif (expected.quality.held_out_rms_mg is None and _is_beyond_noise(expected)
-          and {*expected.calibration.model.effects} <= {*LADDER}
-          and distinct(expected.directions) <= len(expected.poses) - expected.dof):
+          and distinct(expected.directions) <= free_parameters(expected.calibration.name)):
         yield Finding('no_check', 'the poses of one orientation differ by more than their noise, '
                       'and no orientation checks the others', _more_poses(expected), 'BAD')
     elif expected.noise_mg is None and expected.dof < TO_CHECK.value:

@@ -34,7 +34,7 @@ from .containers import DamagedLogError, Frame, Member, Piped, sound_log, Stream
 from .dialect import Cells, shown
 from .flight import DATAFLASH, read_dataflash, read_ulg
 from .names import meaning, READING, record_instead
-from .quantities import are_samples, are_untimed_samples, decided
+from .quantities import are_samples, are_untimed_samples, decided, Quantities
 from .text import open_text, PEEKED, TextTable
 from ..disk import check_regular, FIRST_LINE
 from ..errors import InputError, needing, saying
@@ -243,24 +243,26 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
                 width = 2 if text.layout.encoding.startswith('utf-16') else 1
                 count = max(count, int(text.size / width / max(text.characters, 1) * count))
         else:
-            poses = concatenated([head, *blocks])
-            lacking = [key for key in poses.quantities if not np.isfinite(poses[key]).all()]
-            poses = replace(poses.without_columns(*lacking), findings=tuple(quantities.findings))
-            if lacking:
-                quantities.notes.append(
-                    f'not used, because cells are not numbers: {some(lacking)}')
-            if are_untimed_samples(poses.columns):
-                raise InputError(
-                    f'{path} has no times, but its {len(poses)} rows look like samples of a '
-                    'recording, expected a column time', 'state the samples per second with '
-                    '--rate HZ, or name the column with --columns time=NAME; if each row is a '
-                    'pose, add a column orientation')
+            poses = _pose_table(path, concatenated([head, *blocks]), quantities)
             samples, count = _as_samples(path, poses), len(poses)
     rate = '' if quantities.rate_hz is None else f'{quantities.rate_hz:g} Hz (stated)'
     return OpenLog(samples, count, quantities.units, head.sensor,
                    ', '.join(filter(None, (quantities.read_as, rate))), poses,
                    noted=lambda: (*text.notes, *quantities.all_notes),
                    findings=tuple(quantities.findings))
+
+
+def _pose_table(path: Path, poses: Poses, quantities: Quantities) -> Poses:
+    """Return rows as poses, without quantities that are not numbers; refuse samples."""
+    lacking = [key for key in poses.quantities if not np.isfinite(poses[key]).all()]
+    if lacking:
+        quantities.notes.append(f'not used, because cells are not numbers: {some(lacking)}')
+    if are_untimed_samples(poses.columns):
+        raise InputError(
+            f'{path} has no times, but its {len(poses)} rows look like samples of a recording, '
+            'expected a column time', 'state the samples per second with --rate HZ, or name the '
+            'column with --columns time=NAME; if each row is a pose, add a column orientation')
+    return replace(poses.without_columns(*lacking), findings=tuple(quantities.findings))
 
 
 def _as_samples(path: Path, poses: Poses) -> Iterator[Recording]:
