@@ -37,7 +37,7 @@ from ..messages.one_reading import Triple
 from ..report import calibration_page, STORED
 from ..session import (
     Answer, BATCH, CalibratorSettings, CallSoon, checks, Commands, Compute, Event, Level, Log,
-    LogFilter, Result, Session, Severity, ShowPoses, state, Task, title, words_of_state, Worker)
+    Result, Session, Severity, ShowPoses, state, Task, Throttle, title, words_of_state, Worker)
 from ..stored.exports import export, Exported
 from ..table import Floats
 
@@ -249,7 +249,7 @@ class Host:
         self._source, self._print = source, log
         self._tasks: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._waiting: list[Floats] = []
-        self._due = LogFilter()
+        self._due = Throttle()
         self.session = Session(settings, source.name)
         self.session.found = source.findings
         self.session.publishers = None

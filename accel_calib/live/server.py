@@ -34,7 +34,7 @@ from .viewer import (
     Viewer)
 from .. import __version__
 from ..report import policy
-from ..session import LogFilter
+from ..session import Throttle
 from ..stored.exports import CALIBRATION_ALONE, FORMATS
 from ..text import plain
 
@@ -172,7 +172,7 @@ class PageServer:
         self.viewers: list[Viewer] = []
         self._new: list[Viewer] = []
         self._connections: list[Connection] = []
-        self._reported, self._filter = Counter[str](), LogFilter()
+        self._reported, self._filter = Counter[str](), Throttle()
         self._files = {f'/page/{each.name}': each for each in PAGE.parent.iterdir()
                        if each.suffix in _KINDS}
         self._files['/'] = PAGE

@@ -21,11 +21,11 @@ from .settings import (
 from .state import Check, checks, figures, Level, Progress, words_of_state, worst
 from .store import ros_home
 from .worker import (
-    Answer, answered, CallSoon, Compute, Event, Files, Log, LogFilter, Mounting, nothing, Result,
-    Severity, ShowPoses, Step, Still, Task, Worker, WorkerProcess)
+    Answer, answered, CallSoon, Compute, Event, Files, Log, Mounting, nothing, Result, Severity,
+    ShowPoses, Step, Still, Task, Throttle, Worker, WorkerProcess)
 
 __all__ = ['BATCH', 'COMMANDS', 'WEB_PORT', 'Answer', 'CalibratorSettings', 'CallSoon', 'Check',
-           'Commands', 'Compute', 'Event', 'Files', 'Level', 'Log', 'LogFilter', 'Mounting',
+           'Commands', 'Compute', 'Event', 'Files', 'Level', 'Log', 'Throttle', 'Mounting',
            'Progress', 'Result', 'Session', 'Settings', 'Severity', 'ShowPoses', 'Step', 'Still',
            'Task', 'Worker', 'WorkerProcess', 'answered', 'changed', 'checks', 'columns_of',
            'context_topics', 'default_of', 'expected', 'figures', 'nothing', 'parameter',

@@ -30,8 +30,8 @@ from .settings import CalibratorSettings, own_effects
 from .store import SensorFiles, Store, tidied, unusable, writing_advice
 from .stream import AGAIN, Around, Reports, SILENT, StreamStatistics
 from .worker import (
-    answered, Compute, Event, Files, Log, LogFilter, Mounting, nothing, Parse, Result, Severity,
-    ShowPoses, Still, Task)
+    answered, Compute, Event, Files, Log, Mounting, nothing, Parse, Result, Severity, ShowPoses,
+    Still, Task, Throttle)
 from ..calibrate import (
     Calibration, in_frame, mounting_figures, mounting_of, mounting_words, on_topics,
     with_given_mounting)
@@ -124,7 +124,7 @@ class Session:
         self._given = mounting_of(settings.mounting_rpy) if any(settings.mounting_rpy) else None
         self._largest = (_LARGEST_NATIVE if self.units.is_native
                          else _LARGEST_G * self.units.per_g)
-        self.events, self._filter = deque[Event](), LogFilter(clock)
+        self.events, self._filter = deque[Event](), Throttle(clock)
         known = settings.sensor or settings.calibration_file
         if not known or not self._open(answered):
             self.show_poses(store=False)

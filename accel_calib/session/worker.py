@@ -339,7 +339,7 @@ Event = Log | Mounting | Result | Still | ShowPoses | Task
 """What a session reports: log lines, what to publish, and tasks to run."""
 
 
-class LogFilter:
+class Throttle:
     """Decide what is due, such as log lines: of each kind, at most one within a time."""
 
     def __init__(self, clock: Callable[[], float] = monotonic) -> None:
