@@ -47,7 +47,7 @@ KINDS: Mapping[str, str] = MappingProxyType({
     'doubtful': 'the sensor may have moved during poses that are used',
     'beyond_noise': 'the residuals are larger than the noise explains',
     'settling': 'the readings changed with time, and may change again',
-    'thermal_hysteresis': 'the readings differ between warming and cooling',
+    'thermal_step': 'the readings of a still board jump',
     'not_corrected': 'an effect cannot be corrected in single samples',
     'omitted': 'a smaller model omits what the poses do not determine',
     'limited': 'readings end at the limit of the sensor',
@@ -94,7 +94,7 @@ STEPS: Mapping[str, str] = MappingProxyType({
 
 _STEP_OF = {'flat_pose': 'level', 'mounting': 'level', 'changed': 'fit', 'edited': 'verify',
             **dict.fromkeys(('not_calibrated', 'unnamed', 'noisy', 'not_seen',
-                             'thermal_hysteresis'), 'record')}
+                             'thermal_step'), 'record')}
 """Step by kind of finding; for other kinds, poses are to be taken."""
 
 _RANKS = {kind: rank for rank, kind in enumerate(KINDS)}

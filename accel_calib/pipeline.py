@@ -12,7 +12,7 @@ refines and levels by a `Plan`; `calibrated_log` also recognises a still board t
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -28,7 +28,7 @@ from .calibrate import (
     SampleContext, thermal_alone, with_curve, without_curve)
 from .capture import (
     account_of, capture, Captured, CaptureSettings, cells_of, check_measured, is_one_direction,
-    is_turned_over, LEAST_RANGE, Ramp, ramp_of, settings_from)
+    is_turned_over, LEAST_RANGE, Ramp, ramp_of, rests_in_cells, settings_from)
 from .effects import Context, LADDER, Model, PROCESSES
 from .errors import InputError, RefusedFitError, saying
 from .finding import explained_by, Finding
@@ -233,17 +233,17 @@ def ramp_or_poses(source: Path | Piped | Frame, options: LogOptions = LogOptions
     """
     with open_log(source, options) as log, saying(
             ', '.join(filter(None, (log.read_as, *log.notes)))):
-        table = log.poses
-        # A recording of slow samples has the form of a pose table.
-        if table is not None and not ('time' in table and 'count' not in table
-                                      and is_one_direction(table.reading)):
-            return Intake(table, log.units, log.read_as, log.noted())
-        samples = log.watched(progress) if table is None else (Recording(
-            table.columns, table.row, table.units, table.sensor, table.autopilot),)
-        cells = cells_of(samples, log.units)
-        if not is_turned_over(cells):
+        cells = _cells(log, log.watched(progress))
+        if cells is not None and not is_turned_over(cells):
             return RampIntake(ramp_of(cells), log.units, log.read_as, log.notes)
     return poses_of(source, options, settings, progress)
+
+
+def _cells(log: OpenLog, samples: Iterable[Recording]) -> Poses | None:
+    """Return the samples of a log, or its rests, in cells; None if its poses are in many ways."""
+    if log.poses is None:
+        return cells_of(samples, log.units)
+    return rests_in_cells(log.poses, log.units) if is_one_direction(log.poses.reading) else None
 
 
 Flat = int | Literal['first', 'last'] | None
@@ -425,11 +425,11 @@ def calibrated_log(source: Source, options: LogOptions, found: Intake, plan: Pla
     spans `LEAST_RANGE`, the board was still while it warmed up.
 
     """
-    if found.captured and not found.units.is_native and is_one_direction(found.poses.reading):
+    if not found.units.is_native and is_one_direction(found.poses.reading):
         with _opened(source, options) as log:
-            cells = cells_of(log.blocks, log.units)
-            low, high = range_of(cells, 'temperature')
-            if high - low >= LEAST_RANGE:
+            cells = _cells(log, log.blocks)
+            low, high = (0.0, 0.0) if cells is None else range_of(cells, 'temperature')
+            if cells is not None and high - low >= LEAST_RANGE:
                 return thermally_calibrated([
                     RampIntake(ramp_of(cells), log.units, log.read_as, log.notes)], plan)
     return calibrated(found.poses, found.units, plan)

@@ -2,20 +2,25 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The offset as a polynomial in the temperature, from ramps of a still board.
+The effects of temperature on a still board, from ramps.
 
-A still board reads, by axis and with g = W ΔR force + V at the reference temperature R,
+A still board does not show offset, gain or tilt, but only what changes. With effects that add to
+the offset, it reads by axis
 
-    reading(T) = g + Σ_k c_k (T - R)^k,   k = 1 to degree.
+    reading = level + Σ_k c_k f_k(temperature, its rate, time)
 
-One orientation does not show offset, gain or tilt, but only the change with the temperature. It is
-attributed to the offset; a gain that changes with the temperature looks the same along gravity.
-R is 25 °C, or the end of the range that is nearest to it.
+with one level for each ramp and the factors f of the catalogue: powers of T - 25 °C up to
+`DEGREE`, the rate of the temperature or a lag, and a step. A gain that changes with the
+temperature looks the same along gravity. The curve is zero at 25 °C, or at the end of the range
+that is nearest to it.
 
-**Fit.** Least squares by axis, with one g for each ramp. If the temperature rises and falls, a
-term in its rate is fitted, too, and then left out: a thermometer that lags differs between warming
-and cooling, which must not bend the polynomial. `hysteresis_mg` is the mean difference between the
-two directions at equal temperatures, and `lag_s` the lag that explains it best.
+**Choice.** With the usual tests, a polynomial follows the wander of the offset. Here each of
+`_BLOCKS` contiguous parts of the log is predicted from a fit of the others. What predicts best is
+added, until nothing does so by `_BETTER`, in all and in `_MOST_BLOCKS` of the parts. Then each
+effect is dropped without which the prediction is as good, or whose values do not differ from 0 at
+`_LEVEL` (χ², for a step times the number of instants). A rate or a lag is tried only if the
+temperature does not replace it: if it only rises to that of the room, its rate is a straight line
+in the temperature.
 
 **Deviations.** A slow wander of the offset looks like a change with the temperature. The noise of
 a stretch of mean size is therefore white noise of variance σ² plus a random walk, which grows by
@@ -24,32 +29,29 @@ a stretch of mean size is therefore white noise of variance σ² plus a random w
     σ² (A + ρ B),   A of the white noise, B of the walk
 
 The generalised eigenvectors of B and A make it diagonal for each ρ. The restricted likelihood [1]_
-of all three axes weights a grid of ρ, each with its σ². The covariance of the values is that of
+of an axis weights a grid of ρ, each with its σ². The covariance of the values is that of
 least squares with this noise, averaged over the grid.
-
-**Degree.** With the usual tests, the degree would grow with the wander. Here each of `_BLOCKS`
-contiguous parts of the log is predicted from a fit of the others. The lowest degree is taken at
-which no higher one predicts better by `_BETTER`, in all and in `_MOST_BLOCKS` of the parts, with
-last coefficients that differ from 0 at `_LEVEL` (χ² over the axes).
 
 .. [1] D. A. Harville, Maximum likelihood approaches to variance component estimation, Journal of
    the American Statistical Association 72 (1977) 320.
 
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from math import comb
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 import scipy
 
-from .calibration import Calibration, PRIOR, Quality
+from .calibration import Calibration, PRIOR, Quality, with_history
 from .fit import only_norm
 from .quality import finished, gated, in_g, record_of
 from ..capture import Ramp
-from ..effects import effect_named, Model, OFFSET_POWERS, REFERENCE_TEMPERATURE, sensor_force
+from ..effects import (
+    Context, effect_named, EFFECTS, factors_of, Model, OFFSET_POWERS, REFERENCE_TEMPERATURE,
+    sensor_force)
 from ..errors import InputError
 from ..estimate import judge
 from ..finding import Finding
@@ -57,7 +59,10 @@ from ..geometry import coverage, rms, unit
 from ..table import Floats, numbered, Poses, range_of
 from ..units import MG, Units
 
-DEGREE = 3
+_POWERS = OFFSET_POWERS[1:]
+_LINEAR, _RATE, _STEP = _POWERS[0], 'temperature_rate', 'offset_step'
+
+DEGREE = len(_POWERS)
 """Largest degree; the autopilots store no more."""
 
 _WALKS = np.array([0.0, *np.geomspace(1e-4, 1e5, 64)])
@@ -67,79 +72,91 @@ _WHITE = 0.2
 """Prior probability that there is no walk: most sensors wander. All other ρ are equal."""
 
 _LEVEL = 0.001
-"""Probability that a coefficient that is zero is taken for one that is not."""
+"""Probability that a value that is zero is taken for one that is not."""
 
 _BLOCKS = 10
 _BETTER, _MOST_BLOCKS = 0.05, 0.6
-"""Share by which the error of held-out parts falls, and share of the parts in which it falls."""
+"""Share by which the error of held-out parts falls, without the noise, and share of the parts in
+which it falls."""
 
-_ROWS = 24
-"""Number of rows that stand for a ramp among the poses of a calibration."""
+_APART = 0.3
+"""Smallest part of a rate or lag that the other columns do not replace, as a size."""
 
-_MOVING, _OVERLAP = 0.1, 0.3
-"""Part of the largest rate above which the temperature changes; part of the range that warming and
-cooling must share for a hysteresis."""
+_BESIDE, _LEAST_G = 4, 0.001
+"""Number of stretches on each side of a step that show it, and smallest step [g]; smaller ones are
+as likely a bend that the effects lack."""
 
-_LEVELS = 10
-_MATTERS_MG = 1.0
-"""Hysteresis that is worth a finding [mg]."""
+_LAG_STEPS = 10
+"""Steps of the fit of a lag, from the best one of the catalogue."""
+
+_ROWS, _ROWS_OF_RATE = 24, 72
+"""Number of rows that stand for a ramp among the poses of a calibration; if the rate acts."""
+
+_UNCHANGED = Model({_LINEAR: np.zeros(3)})
+"""What is stored if the offset does not change."""
+
+Form = Mapping[str, Floats]
+"""Effects by name, with their shape."""
 
 
 @dataclass(frozen=True)
 class Curve:
     """
-    The offset over the temperature, relative to that at a reference.
+    The effects of temperature on the offset.
 
     Parameters
     ----------
     reference_c, range_c : float, tuple of float
         Temperature at which the curve is zero, and the lowest and highest temperature [°C].
-    values, covariance : (degree, 3) array, (3, degree, degree) array
-        c_1, c_2, … by axis [g/°C^k], and the covariance of those of each axis.
-    held_out_mg : tuple of float
-        Error of held-out parts for degree 0 to 3, RMS of the vector [mg].
-    hysteresis_mg, lag_s : float or None
-        Difference between warming and cooling [mg], and the lag of the thermometer that explains
-        it best [s]; None if the temperature only rises or only falls.
+    model : Model
+        The effects, zero at 25 °C.
+    covariance : (p, p) array
+        Covariance of ``model.vector`` [g²].
+    held_out_mg : mapping of str to float
+        Error of held-out parts, RMS of the vector [mg], with the effects in the order of the
+        search: without any, and with each sum of effects.
+    both : bool
+        Whether the temperature both rises and falls.
     stretches : Poses
         Stretches of all ramps [g]; rows of one ramp share their ``orientation``.
     change, left : (n, 3) array
-        Change of the reading of each stretch since the reference, and what the curve leaves [g].
-    warming : (n,) array of bool
-        Whether the temperature rises.
+        Change of the reading of each stretch since the reference, and what the effects leave [g].
 
     """
 
     reference_c: float
     range_c: tuple[float, float]
-    values: Floats
+    model: Model
     covariance: Floats
-    held_out_mg: tuple[float, ...]
-    hysteresis_mg: float | None
-    lag_s: float | None
+    held_out_mg: Mapping[str, float]
+    both: bool
     stretches: Poses
     change: Floats
     left: Floats
-    warming: NDArray[np.bool_]
 
     @property
     def degree(self) -> int:
-        """Return the degree of the polynomial."""
-        return len(self.values)
+        """Return the degree of the polynomial in the temperature."""
+        return sum(name in self.model.effects for name in _POWERS)
 
-    @property
-    def deviations(self) -> Floats:
-        """Return the standard deviations of `values`, (degree, 3)."""
-        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)).T
+    def _steady(self, temperature: Floats) -> Context:
+        """Return the context of a temperature that does not change, at the end of the ramps."""
+        time = np.full(len(temperature), np.max(self.stretches['time']))
+        return {'temperature': temperature, 'time': time, _RATE: np.zeros_like(temperature),
+                effect_named(_LINEAR).lagged: temperature}
 
     def at(self, temperature: Floats) -> Floats:
-        """Return the (n, 3) offset at temperatures, relative to the reference [g]."""
-        return _powers(temperature - self.reference_c, self.degree) @ self.values
+        """Return the (n, 3) offset at steady temperatures, relative to the reference [g]."""
+        every = np.append(temperature, self.reference_c)
+        found = np.zeros((len(every), 3)) + self.model.at(self._steady(every)).vec_v
+        return np.asarray(found[:-1] - found[-1])
 
     def deviation_at(self, temperature: Floats) -> Floats:
         """Return the (n, 3) standard deviation of `at` [g]."""
-        rows = _powers(temperature - self.reference_c, self.degree)
-        return np.sqrt(np.maximum(np.einsum('np,apq,nq->na', rows, self.covariance, rows), 0.0))
+        found = _basis(self.model, [self._steady(np.append(temperature, self.reference_c))])
+        moved = found[:-1] - found[-1]
+        return np.sqrt(np.maximum(np.einsum(
+            'nap,pq,naq->na', moved, self.covariance, moved), 0.0))
 
     @property
     def band_mg(self) -> float:
@@ -154,74 +171,250 @@ class Curve:
 
     @property
     def residual_mg(self) -> float:
-        """Return what the curve leaves of it, RMS of the vector [mg]."""
+        """Return what the effects leave of it, RMS of the vector [mg]."""
         return _rms_mg(self.left)
 
     @property
-    def effects(self) -> tuple[dict[str, Floats], Floats]:
-        """Return the effects with their values, and the covariance of these [g²]."""
-        shift = REFERENCE_TEMPERATURE - self.reference_c
-        degree = max(self.degree, 1)  # degree 0 is stored as a slope of zero
-        values, covariance = np.zeros((degree, 3)), np.zeros((3, degree, degree))
-        values[:self.degree], covariance[:, :self.degree, :self.degree] = (
-            self.values, self.covariance)
-        to = np.array([[comb(j, k) * shift ** (j - k) if j >= k else 0.0
-                        for j in range(1, degree + 1)] for k in range(degree + 1)])
-        first = 0 if shift else 1  # without a shift, the constant is zero
-        names = OFFSET_POWERS[first:degree + 1]
-        found = dict(zip(names, (to @ values)[first:]))
-        spread = np.einsum('kp,apq,lq->kla', to, covariance, to)[first:, first:]
-        full = np.zeros((len(names), 3, len(names), 3))
-        full[:, range(3), :, range(3)] = np.moveaxis(spread, 2, 0)
-        model = {name: effect_named(name).filled(each) for name, each in found.items()}
-        return model, full.reshape(3 * len(names), -1)
+    def calibrated(self) -> tuple[Model, Floats]:
+        """Return the effects of a calibration, zero at the reference, and their covariance."""
+        found = self.model if self.model.effects else _UNCHANGED
+        covariance = self.covariance if self.model.effects else np.zeros((len(found.vector),) * 2)
+        if self.reference_c == REFERENCE_TEMPERATURE:
+            return found, covariance
+        here = self._steady(np.array([self.reference_c]))
+        to = np.vstack([-_basis(found, [here])[0], np.eye(len(found.vector))])
+        offset = {'offset': -found.at(here).vec_v[0]}
+        return Model({**offset, **found.values}), to @ covariance @ to.T
+
+
+@dataclass(frozen=True)
+class _Board:
+    """Stretches of all ramps, the ramp of each, and the context of each ramp."""
+
+    stretches: Poses
+    group: NDArray[np.intp]
+    parts: NDArray[np.intp] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'parts', _parts(
+            self.stretches['time'], self.stretches['temperature']))
+
+    @cached_property
+    def levels(self) -> Floats:
+        """(n, r) array, which stretch belongs to which ramp."""
+        return np.eye(int(self.group.max()) + 1)[self.group]
+
+    @cached_property
+    def contexts(self) -> list[Context]:
+        """Columns by ramp."""
+        return [{key: self.stretches[key][self.group == k]
+                 for key in ('time', 'temperature', _RATE)} for k in range(self.levels.shape[1])]
+
+    def columns(self, form: Form) -> Floats:
+        """Return the (n, k) factors of effects."""
+        found = np.empty((len(self.group), len(form)))
+        for column, (name, shape) in zip(found.T, form.items(), strict=True):
+            column[:] = np.concatenate([factors_of(name, [shape], each)[0, 0]
+                                        for each in self.contexts])
+        return found
+
+    def errors(self, form: Form) -> Floats:
+        """
+        Return the mean squared error of each part, predicted from a fit of the others [g²].
+
+        With the orthonormal columns Q of the fit of all, the errors r of a part become
+        r + Q_b (I - Q_bᵀ Q_b)⁻¹ Q_bᵀ r.
+
+        """
+        basis = np.linalg.qr(np.column_stack([self.levels, self.columns(form)]))[0]
+        left = self.stretches.reading - basis @ (basis.T @ self.stretches.reading)
+        found = []
+        for part in np.unique(self.parts):
+            own = basis[self.parts == part]
+            rest = np.eye(basis.shape[1]) - own.T @ own
+            error = left[self.parts == part]
+            error = error + own @ (np.linalg.pinv(rest, hermitian=True) @ (own.T @ error))
+            found.append(np.mean(np.sum(error ** 2, axis=1)))
+        return np.array(found)
+
+    def is_better(self, one: Floats, other: Floats) -> bool:
+        """Return whether the first errors of held-out parts are clearly smaller."""
+        noise = 0.0 if self.stretches.noise is None else np.mean(
+            np.sum(self.stretches.noise ** 2, axis=1))
+        ours, theirs = (max(np.mean(each) - noise, 0.0) for each in (one, other))
+        return bool(ours < (1.0 - _BETTER) ** 2 * theirs and np.mean(one < other) >= _MOST_BLOCKS)
+
+    def shapes(self, name: str) -> list[Floats]:
+        """Return the shapes of an effect that can be tried, apart from the usual one."""
+        effect = EFFECTS[name]
+        if name == _STEP and len(self.contexts) > 1:
+            return []
+        found = [np.zeros(0)] if effect.shapes is None else effect.shapes(self.contexts[0])
+        return [shape for shape in found
+                if name == _STEP or effect.is_lagged(shape) or not effect.lagged]
+
+    def further(self, form: Form) -> Iterator[Form]:
+        """Yield what can be tried in place of a form."""
+        degree = sum(name in form for name in _POWERS)
+        for more in range(degree + 1, DEGREE + 1):
+            yield {**form, **{name: np.array(EFFECTS[name].usual)
+                              for name in _POWERS[degree:more]}}
+        steady = {name: shape for name, shape in form.items() if name != _RATE}
+        for name in (_RATE, _LINEAR):
+            if (name == _RATE and name not in form and not _lagged(form)) or (
+                    name == _LINEAR and degree):
+                for shape in self.shapes(name):
+                    if self._is_apart(self.columns({name: shape}), steady):
+                        yield {**steady, name: shape}
+        if _STEP not in form:
+            for shape in self.shapes(_STEP):
+                yield {**form, _STEP: shape}
+
+    def _is_apart(self, column: Floats, form: Form) -> bool:
+        """Return whether the levels, the temperature and a form do not replace a column."""
+        others = {_LINEAR: np.array(EFFECTS[_LINEAR].usual),
+                  **{name: shape for name, shape in form.items() if name in _POWERS}}
+        left = [column - basis @ (basis.T @ column) for basis in (
+            np.linalg.qr(np.column_stack([self.levels, self.columns(each)]))[0]
+            for each in ({}, others))]
+        moved, apart = map(np.linalg.norm, left)
+        return bool(apart > _APART * moved > 0.0)
+
+    def fitted(self, form: Form) -> tuple[Model, Floats]:
+        """Return effects fitted by least squares, and the covariance of their values."""
+        reading, count = self.stretches.reading, len(self.group)
+        solved = np.linalg.lstsq(np.column_stack([self.levels, self.columns(form)]), reading,
+                                 rcond=None)[0]
+        parts = dict(zip(form, solved[self.levels.shape[1]:], strict=True))
+        model = Model({name: np.concatenate([part, form[name]]) for name, part in parts.items()})
+        levels = np.kron(np.eye(3), self.levels).reshape(3, count, -1)
+        for _ in range(_LAG_STEPS if _lagged(form) else 1):
+            own = np.moveaxis(_basis(model, self.contexts)[..., model.fitted], 1, 0)
+            design = np.concatenate([levels, own], axis=2).reshape(3 * count, -1)
+            onto = np.linalg.pinv(design)
+            vector = model.vector.copy()
+            vector[model.fitted] += (onto @ (reading - self.predicted(model)).T.ravel())[
+                levels.shape[2]:]
+            model = _with_values(model, vector)
+        onto = onto[levels.shape[2]:].reshape(-1, 3, count)
+        covariance = np.zeros((len(model.vector),) * 2)
+        covariance[np.ix_(model.fitted, model.fitted)] = self._covariance(
+            np.column_stack([self.levels, self.columns(_form_of(model))]), onto)
+        return model, covariance
+
+    def is_seen(self, form: Form, name: str) -> bool:
+        """Return whether an effect of a form differs from 0; a step also shows as a jump."""
+        model, covariance = self.fitted(form)
+        values, first = model.values[name], model.terms.parts[model.effects.index(name)].start
+        size, own = values[:3], slice(first, first + 3)
+        chance = scipy.special.chdtrc(3, size @ np.linalg.solve(covariance[own, own], size))
+        if name != _STEP:
+            return bool(chance < _LEVEL)
+        left = self.stretches.reading - self.predicted(model)
+        left[self.columns({_STEP: values[3:]})[:, 0] > 0.0] += size
+        first = int(np.argmax(self.stretches['time'] >= values[3]))
+        jump = np.mean(left[first:first + _BESIDE], axis=0) - np.mean(
+            left[max(first - _BESIDE, 0):first], axis=0)
+        return bool(len(self.shapes(_STEP)) * chance < _LEVEL and np.linalg.norm(size) > _LEAST_G
+                    and jump @ size > 0.5 * size @ size)
+
+    def predicted(self, model: Model) -> Floats:
+        """Return the (n, 3) offset of each stretch [g]."""
+        if not model.effects:
+            return np.zeros((len(self.group), 3))
+        return np.concatenate([model.at(each).vec_v for each in self.contexts])
+
+    def _covariance(self, design: Floats, onto: Floats) -> Floats:
+        """Return the covariance of values that are `onto`, (q, 3, n), times the readings."""
+        time = self.stretches['time']
+        white = np.diag(np.mean(self.stretches['count']) / self.stretches['count'])
+        walk = np.zeros((len(time), len(time)))
+        for own in self.levels.T > 0.0:
+            since = time[own] - time[own][0]
+            walk[np.ix_(own, own)] = np.minimum.outer(since, since)
+        outside = np.linalg.qr(design, mode='complete')[0][:, design.shape[1]:]
+        ratio, axes = scipy.linalg.eigh(*(outside.T @ each @ outside for each in (walk, white)))
+        squares = (axes.T @ (outside.T @ self.stretches.reading)) ** 2
+        walks = _WALKS / np.median(np.diff(time))
+        spread = 1.0 + np.outer(walks, ratio)
+        variance = (1.0 / spread) @ squares / len(ratio)
+        likelihood = -0.5 * np.sum(np.log(spread), axis=1)[:, np.newaxis] - (
+            len(ratio) / 2.0 * np.log(variance + 1e-300))
+        share = np.exp(likelihood - np.max(likelihood, axis=0))
+        share *= np.where(walks == 0.0, _WHITE, (1.0 - _WHITE) / (len(walks) - 1))[:, np.newaxis]
+        sizes = share / np.sum(share, axis=0) * variance
+        found = np.zeros((len(onto), len(onto)))
+        for row, by_walk, own in zip(np.sum(sizes, axis=0), walks @ sizes, np.moveaxis(onto, 1, 0),
+                                     strict=True):
+            found += own @ (row * white + by_walk * walk) @ own.T
+        return found
+
+
+def _lagged(form: Form) -> bool:
+    return _LINEAR in form and EFFECTS[_LINEAR].is_lagged(form[_LINEAR])
+
+
+def _form_of(model: Model) -> Form:
+    return {name: effect_named(name).split(values)[1] for name, values in model.values.items()}
+
+
+def _with_values(model: Model, vector: Floats) -> Model:
+    """Return a model with other values; a lag stays positive."""
+    found = {name: vector[part] for name, part in zip(model.effects, model.terms.parts)}
+    if model.lags:
+        found[_LINEAR][3] = np.clip(found[_LINEAR][3], *(
+            np.array([0.5, 2.0]) * model.values[_LINEAR][3]))
+    return Model(found)
+
+
+def _basis(model: Model, contexts: Sequence[Context]) -> Floats:
+    """Return the (n, 3, p) derivative of the offset by all values."""
+    if not model.effects:
+        return np.zeros((sum(len(each['time']) for each in contexts), 3, 0))
+    return np.concatenate([model.basis(np.zeros((len(each['time']), 3)), each).full
+                           for each in contexts])
 
 
 def curve_of(ramps: Sequence[Ramp]) -> Curve:
-    """Return the offset over the temperature from the ramps of one board, of any orientation."""
-    stretches, group = _joined(ramps)
-    warm, rate = stretches['temperature'], np.concatenate([each.rate for each in ramps])
+    """Return the effects of temperature from the ramps of one board, of any orientation."""
+    board = _joined(ramps)
+    form: Form = {}
+    errors = board.errors(form)
+    held_out = {'': _held_out_mg(errors)}
+    while (found := _better_form(board, form, errors)) is not None:
+        form, errors = found
+        held_out[' + '.join(form)] = _held_out_mg(errors)
+    form, errors = _without_idle(board, form, errors)
+    held_out.pop(' + '.join(form), None)
+    held_out[' + '.join(form)] = _held_out_mg(errors)  # the last one
+    model, covariance = board.fitted(form)
+    stretches = board.stretches
     low, high = range_of(stretches, 'temperature')
     reference = float(np.clip(REFERENCE_TEMPERATURE, low, high))
-    limit = _MOVING * float(np.quantile(np.abs(rate), 0.95))
-    rising, falling = rate > limit, rate < -limit
-    both = bool(np.any(rising & _shared(warm, falling)))
-    powers = _powers(warm - reference, DEGREE)
-    beside = np.eye(len(ramps))[group]
-    if both:
-        beside = np.column_stack([beside, rate])
-    designs = [np.column_stack([beside, powers[:, :k]]) for k in range(DEGREE + 1)]
-    parts = _parts(stretches['time'], warm)
-    errors = [_held_out(stretches.reading, each, parts) for each in designs]
-    fits = [(_solved(each, stretches.reading), _covariance(stretches, group, each))
-            for each in designs]
-    degree, first = _lowest(errors, fits), beside.shape[1]
-    values, covariance = fits[degree][0][first:], fits[degree][1][:, first:, first:]
-    curve_g = powers[:, :degree] @ values
-    rest = np.array([np.mean((stretches.reading - curve_g)[group == k], axis=0)
-                     for k in range(len(ramps))])
-    change = stretches.reading - rest[group]
-    left = change - curve_g
-    hysteresis, lag = (_hysteresis(warm, rate, left, values, rising, falling) if both
-                       else (None, None))
-    return Curve(reference, (low, high), values, covariance,
-                 tuple(float(np.sqrt(np.mean(each))) * MG for each in errors), hysteresis, lag,
-                 stretches, change, left, rate >= 0.0)
+    offset = board.predicted(model)
+    rest = np.array([np.mean((stretches.reading - offset)[board.group == k], axis=0)
+                     for k in range(len(ramps))])[board.group]
+    left = stretches.reading - offset - rest
+    curve = Curve(reference, (low, high), model, covariance, held_out,
+                  any(each.both for each in ramps), stretches, np.zeros(3), left)
+    at_25 = curve.at(np.array([REFERENCE_TEMPERATURE]))
+    return replace(curve, change=left + offset + at_25)
 
 
-def _joined(ramps: Sequence[Ramp]) -> tuple[Poses, NDArray[np.intp]]:
-    """Return the stretches of all ramps, and the ramp of each."""
+def _joined(ramps: Sequence[Ramp]) -> _Board:
+    """Return the stretches of all ramps, one after the other in time."""
     group = np.repeat(np.arange(len(ramps)), [len(each.stretches) for each in ramps])
-    columns = {key: np.concatenate([each.stretches[key] for each in ramps])
-               for key in ramps[0].stretches.columns}
+    tables, end = [], -np.inf
+    for each in (ramp.stretches for ramp in ramps):
+        time = each['time']
+        if time[0] <= end:  # another clock
+            time = time - time[0] + end + np.ptp(time)
+        tables.append(each.with_columns(time=time))
+        end = float(time[-1])
+    columns = {key: np.concatenate([each[key] for each in tables]) for key in tables[0].columns}
     columns['orientation'] = -1.0 - group  # no number of a pose
-    first = ramps[0].stretches
-    return Poses(columns, numbered(columns), 'g', first.sensor, first.autopilot), group
-
-
-def _powers(warm: Floats, degree: int) -> Floats:
-    """Return the (n, degree) powers from 1 on."""
-    return np.asarray(warm[:, np.newaxis] ** np.arange(1, degree + 1))
+    first = tables[0]
+    return _Board(Poses(columns, numbered(columns), 'g', first.sensor, first.autopilot), group)
 
 
 def _parts(time: Floats, warm: Floats) -> NDArray[np.intp]:
@@ -231,92 +424,51 @@ def _parts(time: Floats, warm: Floats) -> NDArray[np.intp]:
     return np.minimum((share * _BLOCKS).astype(np.intp), _BLOCKS - 1)
 
 
-def _held_out(reading: Floats, design: Floats, parts: NDArray[np.intp]) -> Floats:
-    """Return the mean squared error of each part, predicted from a fit of the others [g²]."""
-    errors = []
-    for part in np.unique(parts):
-        out = parts == part
-        left = (reading - design @ _solved(design[~out], reading[~out]))[out]
-        errors.append(np.mean(np.sum(left ** 2, axis=1)))
-    return np.array(errors)
+def _held_out_mg(errors: Floats) -> float:
+    return float(np.sqrt(np.mean(errors))) * MG
 
 
-def _covariance(stretches: Poses, group: NDArray[np.intp], design: Floats) -> Floats:
-    """Return the covariance of the values of least squares by axis, (3, p, p)."""
-    count, time = stretches['count'], stretches['time']
-    white, walk = np.diag(np.mean(count) / count), np.zeros((len(time), len(time)))
-    for own in (group == k for k in np.unique(group)):
-        since = time[own] - time[own][0]
-        walk[np.ix_(own, own)] = np.minimum.outer(since, since)
-    outside = np.linalg.qr(design, mode='complete')[0][:, design.shape[1]:]
-    ratio, axes = scipy.linalg.eigh(*(outside.T @ each @ outside for each in (walk, white)))
-    squares = (axes.T @ (outside.T @ stretches.reading)) ** 2
-    walks = _WALKS / np.median(np.diff(time))
-    spread = 1.0 + np.outer(walks, ratio)
-    variance = (1.0 / spread) @ squares / len(ratio)
-    likelihood = -1.5 * np.sum(np.log(spread), axis=1) - len(ratio) / 2.0 * np.sum(
-        np.log(variance + 1e-300), axis=1)
-    share = np.exp(likelihood - np.max(likelihood))
-    share *= np.where(walks == 0.0, _WHITE, (1.0 - _WHITE) / (len(walks) - 1))
-    sizes = (share / np.sum(share))[:, np.newaxis] * variance
-    onto = np.linalg.pinv(design)
-    white, walk = (onto @ each @ onto.T for each in (white, walk))
-    return np.asarray(np.multiply.outer(np.sum(sizes, axis=0), white)
-                      + np.multiply.outer(walks @ sizes, walk))
+
+def _better_form(board: _Board, form: Form, errors: Floats) -> tuple[Form, Floats] | None:
+    """Return the form that predicts held-out parts best, if it is clearly better than one."""
+    tried = [(each, board.errors(each)) for each in board.further(form)]
+    better = [each for each in tried if board.is_better(each[1], errors)]
+    return min(better, key=lambda each: float(np.mean(each[1]))) if better else None
 
 
-def _lowest(errors: Sequence[Floats], fits: Sequence[tuple[Floats, Floats]]) -> int:
-    """Return the lowest degree at which no higher one is seen and predicts better."""
-    degree = 0
-    for higher in range(1, len(errors)):
-        one, other = errors[degree], errors[higher]
-        falls = np.sqrt(np.mean(other)) < (1.0 - _BETTER) * np.sqrt(np.mean(one))
-        values, covariance = fits[higher]
-        chi2 = np.sum(values[-1] ** 2 / covariance[:, -1, -1])
-        if (falls and np.mean(other < one) >= _MOST_BLOCKS
-                and scipy.special.chdtrc(len(covariance), chi2) < _LEVEL):
-            degree = higher
-    return degree
-
-
-def _solved(design: Floats, reading: Floats) -> Floats:
-    return np.asarray(np.linalg.lstsq(design, reading, rcond=None)[0])
-
-
-def _shared(warm: Floats, other: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which temperatures lie in the range of the other rows, if that is wide enough."""
-    if np.sum(other) < 2 or np.ptp(warm[other]) < _OVERLAP * np.ptp(warm):
-        return np.zeros(len(warm), bool)
-    return np.asarray((warm >= warm[other].min()) & (warm <= warm[other].max()))
-
-
-def _hysteresis(warm: Floats, rate: Floats, left: Floats, values: Floats,
-                rising: NDArray[np.bool_], falling: NDArray[np.bool_]
-                ) -> tuple[float, float | None]:
-    """Return the difference between warming and cooling [mg], and the lag that explains it [s]."""
-    level = np.digitize(warm, np.linspace(warm.min(), warm.max(), _LEVELS + 1)[1:-1])
-    apart = [left[rising & (level == k)].mean(axis=0) - left[falling & (level == k)].mean(axis=0)
-             for k in range(_LEVELS) if np.any(rising & (level == k))
-             and np.any(falling & (level == k))]
-    if not apart:
-        return 0.0, None
-    by_rate = _solved(rate[:, np.newaxis], left)[0]
-    slope = values[0] if len(values) else np.zeros(3)
-    lag = float(by_rate @ slope / (slope @ slope)) if np.any(slope) else None
-    return float(np.linalg.norm(np.mean(apart, axis=0))) * MG, lag
+def _without_idle(board: _Board, form: Form, errors: Floats) -> tuple[Form, Floats]:
+    """Return a form without what predicts nothing, or does not differ from 0."""
+    highest = sum(name in form for name in _POWERS)
+    tried = [name for name in (_RATE, _STEP, *_POWERS[max(highest - 1, 0):highest])
+             if name in form or (name == _RATE and _lagged(form))]
+    for name in tried:
+        fewer = {each: shape for each, shape in form.items() if each != name}
+        seen = form
+        if name == _RATE and _lagged(form):
+            fewer[_LINEAR] = np.array(EFFECTS[_LINEAR].usual)
+            seen = {**fewer, _RATE: np.zeros(0)}  # a lag acts as a rate does
+        own = board.errors(fewer)
+        if not (board.is_better(errors, own) and board.is_seen(seen, name)):
+            return _without_idle(board, fewer, own)
+    return form, errors
 
 
 def findings_of_curve(curve: Curve) -> tuple[Finding, ...]:
-    """Return what ramps of a still board leave open, and a hysteresis that matters."""
+    """Return what ramps of a still board leave open, and a step."""
     found = [Finding('open', 'a still board does not show a gain that changes with the '
                      'temperature: along gravity it counts as offset', 'to determine it, take '
                      'poses on all sides while cold and while warm, and run refine')]
-    if curve.hysteresis_mg is not None and curve.hysteresis_mg > _MATTERS_MG:
-        lag = '' if curve.lag_s is None else f', as if the thermometer lags by {curve.lag_s:.0f} s'
+    if not curve.both:
+        found.append(Finding('open', 'a lag of the thermometer is not known, because the '
+                             'temperature only rises or only falls', 'let the board cool again '
+                             'while recording'))
+    if _STEP in curve.model.effects:
+        *size, instant = curve.model.values[_STEP]
+        since = instant - float(curve.stretches['time'][0])
         found.append(Finding(
-            'thermal_hysteresis', f'between warming and cooling the readings differ by '
-            f'{curve.hysteresis_mg:.1f} mg at the same temperature{lag}',
-            'warm and cool the board more slowly, in a closed box', 'USABLE'))
+            'thermal_step', f'the readings jump by {np.linalg.norm(size) * MG:.1f} mg '
+            f'{since:.0f} s after the start', 'record again, with the board fixed; if the jump '
+            'comes again at the same temperature, calibrate on each side of it', 'USABLE'))
     return tuple(found)
 
 
@@ -324,13 +476,14 @@ def ramp_rows(curve: Curve, units: Units) -> Poses:
     """
     Return means of successive stretches that stand for the ramps, in the unit of the readings.
 
-    Their noise is the RMS of what the curve leaves, which includes the slow wander.
+    Their noise is the RMS of what the effects leave, which includes the slow wander.
 
     """
     stretches = curve.stretches
-    share = np.arange(len(stretches)) * _ROWS // len(stretches)
+    rows = _ROWS_OF_RATE if {_RATE, 'time'} & {*curve.model.over, *curve.model.needs} else _ROWS
+    share = np.arange(len(stretches)) * rows // len(stretches)
     warm = stretches['temperature']
-    share[[np.argmin(warm), np.argmax(warm)]] = _ROWS + np.arange(2)  # they state the range
+    share[[np.argmin(warm), np.argmax(warm)]] = rows + np.arange(2)  # they state the range
     _, place = np.unique(np.column_stack([stretches['orientation'], share]), axis=0,
                          return_inverse=True)
     members = (place.ravel() == np.arange(place.max() + 1)[:, np.newaxis]).astype(float)
@@ -348,24 +501,30 @@ def ramp_rows(curve: Curve, units: Units) -> Poses:
 
 def thermal_alone(curve: Curve, units: Units, *, sensor: str = '', date: str = '') -> Calibration:
     """
-    Return a calibration with the offset over the temperature alone, zero at the reference.
+    Return a calibration with the effects of temperature alone, zero at the reference.
 
     Its residuals are the changes of the reading with the temperature, before and after.
 
     """
-    values, covariance = curve.effects
+    model, covariance = curve.calibrated
     rows = ramp_rows(curve, units)
     noise = curve.stretches.noise
     floor = None if noise is None else _rms_mg(noise)
     before, after = (np.linalg.norm(each, axis=1) for each in (curve.change, curve.left))
     quality = Quality(
         curve.change_mg, curve.residual_mg, float(before.max()) * 100.0,
-        float(after.max()) * 100.0, curve.held_out_mg[curve.degree], floor, None,
+        float(after.max()) * 100.0, [*curve.held_out_mg.values()][-1], floor, None,
         coverage(unit(rows.reading)))
     return finished(Calibration(
-        'ideal', PRIOR, Model(values), units, rows.sensor, 'ros', '', covariance,
-        quality, rows, (), f'offset over temperature alone, of degree {curve.degree}, relative to '
-        f'{curve.reference_c:.1f} °C', findings_of_curve(curve)), sensor, date)
+        'ideal', PRIOR, model, units, rows.sensor, 'ros', '', covariance,
+        quality, rows, (), f'{_words(curve)} alone, relative to {curve.reference_c:.1f} °C',
+        findings_of_curve(curve)), sensor, date)
+
+
+def _words(curve: Curve) -> str:
+    """Return what a calibration has of a curve."""
+    others = [name for name in curve.model.effects if name not in _POWERS]
+    return ' and '.join([f'offset over temperature of degree {curve.degree}', *others])
 
 
 def _rms_mg(vectors: Floats) -> float:
@@ -379,7 +538,7 @@ def without_curve(curve: Curve, poses: Poses, units: Units) -> Poses:
     Raises
     ------
     InputError
-        If the poses have no temperature.
+        If the poses have no temperature, or no time while its rate acts.
 
     """
     if 'temperature' not in poses or not np.all(np.isfinite(poses['temperature'])):
@@ -390,39 +549,50 @@ def without_curve(curve: Curve, poses: Poses, units: Units) -> Poses:
     return poses.without_columns('reference', 'orientation').with_columns(reading=moved)
 
 
+def _of_poses(curve: Curve) -> Model:
+    """Return the effects that act on poses of another log, whose time is another one: no step."""
+    return Model({name: values for name, values in curve.model.values.items() if name != _STEP})
+
+
 def _added(curve: Curve, poses: Poses) -> Floats:
     """Return what the temperature adds to each pose, relative to 25 °C [g]."""
-    at_25 = curve.at(np.array([REFERENCE_TEMPERATURE]))
-    return np.asarray(curve.at(poses['temperature']) - at_25)
+    model = _of_poses(curve)
+    known = with_history(poses, model).columns
+    return np.zeros((len(poses), 3)) + model.at(known).vec_v
 
 
 def with_curve(fitted: Calibration, curve: Curve, poses: Poses) -> Calibration:
     """
-    Return a calibration of poses with the curve, and with the ramps among its poses.
+    Return a calibration of poses with the effects of temperature, and the ramps among its poses.
 
     `fitted` is that of `without_curve`. The uncertainty of the curve moves the values of the fit:
     by least squares, d values = -(J⁺ K) d curve, with J and K the derivatives of the equations of
     the poses.
 
     """
-    thermal, spread = curve.effects
-    powers = {name: values for name, values in thermal.items() if name in OFFSET_POWERS[1:]}
-    model, own = Model({**fitted.model.values, **powers}), len(fitted.model.vector)
-    used_g = in_g(fitted.used_poses, fitted.units)
+    thermal = _of_poses(curve)
+    if not thermal.effects:
+        thermal = _UNCHANGED
+    model, own = Model({**fitted.model.values, **thermal.values}), len(fitted.model.vector)
+    used_g = with_history(in_g(fitted.used_poses, fitted.units), model)
     moved = only_norm(used_g.with_columns(reading=used_g.reading + _added(curve, used_g)))
-    columns = judge(model, moved.with_columns(temperature=used_g['temperature'])).columns
+    known = {key: used_g[key] for key in ('time', 'temperature', _RATE) if key in used_g}
+    judged = judge(model, moved.with_columns(**known))
+    columns = judged.columns @ judged.ties.T
     move = -np.linalg.pinv(columns[:, :own]) @ columns[:, own:]
-    of_curve = spread[-3 * len(powers):, -3 * len(powers):]
+    of_curve = np.zeros((len(thermal.vector),) * 2)
+    rows = len(curve.model.vector) and len(of_curve)
+    of_curve[:rows, :rows] = curve.covariance[:rows, :rows]
     covariance = np.block([[fitted.covariance + move @ of_curve @ move.T, move @ of_curve],
                            [of_curve @ move.T, of_curve]])
     every = _together(poses, ramp_rows(curve, fitted.units))
     rejected = [each.row for each in fitted.rejected]
-    kept_g = in_g(every.take(~np.isin(every.row, rejected)), fitted.units)
+    kept_g = with_history(in_g(every.take(~np.isin(every.row, rejected)), fitted.units), model)
     made = record_of(
         judge(model, kept_g), every, fitted.units, unit(sensor_force(
             model, kept_g.reading, kept_g.columns)), fitted.name, fitted.method,
         covariance=covariance, rejected=fitted.rejected,
-        reason=f'{fitted.reason}; offset over temperature of degree {curve.degree}',
+        reason=f'{fitted.reason}; {_words(curve)}',
         noted=(*fitted.noted, *findings_of_curve(curve)))
     return gated(replace(made, gyro=fitted.gyro, noise=fitted.noise, sensor=fitted.sensor,
                          date=fitted.date))

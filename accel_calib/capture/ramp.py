@@ -14,36 +14,40 @@ A ramp is refused if it cannot show what temperature does:
 
 - there is no temperature, or it spans less than `LEAST_RANGE`;
 - the board was turned: its direction leaves the first one by more than `_TURNED`;
-- the board was shifted: the readings jump by more than `_JUMP_G` and their noise, while a
-  polynomial in the temperature does not. A slow tilt during a ramp looks like the temperature, and
-  is not seen;
-- the ramp is too fast for the thermometer. Stretches with a rate above `FASTEST` are left out, and
-  the others must span `LEAST_RANGE`. A thermometer in the package of the sensor lags by about
-  10 s. At 5 °C/min it is then 0.8 °C behind, which is 0.8 mg in a common part of 1 mg/°C.
+- the board was shifted: the readings jump across gravity by more than `_JUMP_G` and their noise,
+  which neither a polynomial in the temperature nor its rate explains. A jump along gravity is no
+  tilt, but a step of the sensor. A slow tilt during a ramp looks like the temperature, and is not
+  seen;
+- the ramp is too fast for the thermometer, and does not show its lag, because the temperature only
+  rises or only falls. Stretches with a rate above `FASTEST` are left out, and the others must span
+  `LEAST_RANGE`. A thermometer in the package of the sensor lags by about 10 s. At 5 °C/min it is
+  then 0.8 °C behind, which is 0.8 mg in a common part of 1 mg/°C.
+
+The rests of a table stand for the cells of a recording.
 
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .detector import check_finite
+from ..effects import rate_at
 from ..errors import InputError
 from ..geometry import unit
-from ..table import Floats, numbered, Poses, range_of, Recording
+from ..table import Floats, in_unit, numbered, Poses, range_of, Recording
 from ..text import counted
 from ..units import MG, Units
 
-LEAST_RANGE = 5.0
+LEAST_RANGE = 3.0
 """Smallest range of the temperature of a ramp [°C]; the autopilots ask for 10 °C or more."""
 
 FASTEST = 5.0
 """Largest rate of the temperature [°C/min]."""
 
 _STRETCHES, _LEAST_STRETCHES = 240, 30
-_RATE_OVER_S = 60.0
 _SHAKEN, _SHAKEN_G = 6.0, 0.005
 """A cell is shaken if its deviation is above both: relative to the median, and absolute [g]."""
 
@@ -57,6 +61,10 @@ _APART = np.radians(20.0)
 _JUMP_G, _JUMP_NOISES, _NEIGHBOURS = 0.003, 8.0, 4
 _DEGREE = 3
 
+_MOVING, _OVERLAP = 0.1, 0.3
+"""Part of the largest rate above which the temperature changes; part of the range that warming and
+cooling share if the temperature both rises and falls."""
+
 
 def cells_of(blocks: Iterable[Recording], units: Units) -> Poses:
     """
@@ -68,10 +76,7 @@ def cells_of(blocks: Iterable[Recording], units: Units) -> Poses:
         If there are no samples, one is not finite, or the readings are in native units.
 
     """
-    if units.is_native:
-        raise InputError('the readings are in native units, and a board in one orientation does '
-                         'not show their scale; expected readings in m/s2 or g',
-                         'convert the readings')
+    _check_scale(units)
     parts, sensor, autopilot = list[Floats](), '', None
     start = 0.0
     zero: Floats = np.zeros(3)
@@ -98,6 +103,27 @@ def cells_of(blocks: Iterable[Recording], units: Units) -> Poses:
     return Poses(columns, numbered(columns), 'g', sensor, autopilot)
 
 
+def rests_in_cells(poses: Poses, units: Units) -> Poses:
+    """Return the rests of a board as the cells of a ramp; errors as in `cells_of`."""
+    _check_scale(units)
+    if 'time' not in poses:
+        raise InputError('the rests have no time, expected that of each', 'add a column time')
+    check_finite(np.vstack([poses['time'], poses.reading.T]), poses.row)
+    cells = in_unit(poses, units.to_g)
+    cells = cells.take(np.argsort(cells['time'], kind='stable'))
+    kept = ('time', 'temperature', 'count', 'reading', 'std')
+    columns = {'count': np.ones(len(cells)), 'temperature': np.full(len(cells), np.nan),
+               **{key: cells[key] for key in kept if key in cells}}
+    return replace(cells, columns=columns)
+
+
+def _check_scale(units: Units) -> None:
+    if units.is_native:
+        raise InputError('the readings are in native units, and a board in one orientation does '
+                         'not show their scale; expected readings in m/s2 or g',
+                         'convert the readings')
+
+
 def _sums(block: Recording, units: Units, start: float, zero: Floats) -> Floats:
     """Return (11, m): the number of each cell, and the sums of its samples."""
     reading, time = units.to_g(block.reading) - zero, block['time'] - start
@@ -111,7 +137,7 @@ def _sums(block: Recording, units: Units, start: float, zero: Floats) -> Floats:
 
 def _is_still(cells: Poses) -> NDArray[np.bool_]:
     """Return in which cells the board does not shake."""
-    size = np.max(cells['std'], axis=1)
+    size = np.max(cells['std'], axis=1) if 'std' in cells else np.zeros(len(cells))
     return np.asarray(size <= max(_SHAKEN * float(np.median(size)), _SHAKEN_G))
 
 
@@ -131,14 +157,14 @@ class Ramp:
     """
     Stretches of a still board whose temperature changes, in order of time.
 
-    `stretches` are means [g] with time, temperature, std and count; std/√count is the noise of a
-    mean. `rate` (n,) is that of the temperature [°C/s], and `seconds` the duration of the log [s].
-    `notes` state what was left out.
+    `stretches` are means [g] with time, temperature, its rate, std and count; std/√count is the
+    noise of a mean. `both` is whether the temperature both rises and falls, and `seconds` the
+    duration of the log [s]. `notes` state what was left out.
 
     """
 
     stretches: Poses
-    rate: Floats
+    both: bool
     seconds: float
     notes: tuple[str, ...] = ()
 
@@ -156,9 +182,10 @@ def ramp_of(cells: Poses) -> Ramp:
     still = _is_still(cells)
     _check_range(cells)
     _check_direction(cells, still)
-    stretches, warm_rate = _averaged(cells.take(np.isfinite(cells['temperature']) & still))
+    stretches = _averaged(cells.take(np.isfinite(cells['temperature']) & still))
     _check_jumps(stretches)
-    slow = np.abs(warm_rate) * 60.0 <= FASTEST
+    warm_rate, both = stretches['temperature_rate'], _rises_and_falls(stretches)
+    slow = (np.abs(warm_rate) * 60.0 <= FASTEST) | both
     if np.sum(slow) < _LEAST_STRETCHES or np.ptp(stretches['temperature'][slow]) < LEAST_RANGE:
         raise InputError(
             f'the ramp is too fast for the thermometer: the temperature changes by up to '
@@ -172,8 +199,19 @@ def ramp_of(cells: Poses) -> Ramp:
     if not np.all(slow):
         notes.append(f'{int(np.sum(~slow))} of {len(slow)} stretches left out, in which the '
                      f'temperature changes by more than {FASTEST:g} °C/min')
-    return Ramp(stretches.take(slow), warm_rate[slow],
+    return Ramp(stretches.take(slow), both,
                 float(cells['time'][-1] - cells['time'][0]), tuple(notes))
+
+
+def _rises_and_falls(stretches: Poses) -> bool:
+    """Return whether the temperature rises and falls over a range that both share."""
+    warm, rate = stretches['temperature'], stretches['temperature_rate']
+    limit = _MOVING * float(np.quantile(np.abs(rate), 0.95))
+    rising, falling = warm[rate > limit], warm[rate < -limit]
+    if not len(rising) or not len(falling):
+        return False
+    shared = min(rising.max(), falling.max()) - max(rising.min(), falling.min())
+    return bool(shared >= _OVERLAP * np.ptp(warm))
 
 
 def _check_range(cells: Poses) -> None:
@@ -205,7 +243,7 @@ def _moved(seconds: float, what: str) -> InputError:
                       'record again, or cut the log there')
 
 
-def _averaged(cells: Poses) -> tuple[Poses, Floats]:
+def _averaged(cells: Poses) -> Poses:
     """Return the stretches with their noise, and the rate of the temperature in each [°C/s]."""
     time = cells['time'] - cells['time'][0]
     length = max(float(time[-1]) / _STRETCHES, 1.0)
@@ -224,11 +262,8 @@ def _averaged(cells: Poses) -> tuple[Poses, Floats]:
     noise = np.sqrt(np.median(bend ** 2, axis=0) / _MEDIAN_CHI2 / 6.0)
     columns = {'time': moment, 'reading': reading, 'temperature': warm, 'count': count,
                'std': noise * np.sqrt(count)[:, np.newaxis]}
-    step = max(round(_RATE_OVER_S / 2.0 / float(np.median(np.diff(moment)))), 1)
-    place = np.arange(len(moment))
-    low, high = np.maximum(place - step, 0), np.minimum(place + step, len(moment) - 1)
-    rate = (warm[high] - warm[low]) / (moment[high] - moment[low])
-    return Poses(columns, numbered(columns), 'g', cells.sensor, cells.autopilot), rate
+    columns['temperature_rate'] = rate_at(columns)
+    return Poses(columns, numbered(columns), 'g', cells.sensor, cells.autopilot)
 
 
 _MEDIAN_CHI2 = 0.4549
@@ -239,12 +274,14 @@ def _check_jumps(stretches: Poses) -> None:
     """Refuse a board that was shifted between two stretches."""
     warm, reading = stretches['temperature'], stretches.reading
     scaled = (warm - warm.mean()) / max(float(np.ptp(warm)), 1e-9)
-    powers = scaled[:, np.newaxis] ** np.arange(_DEGREE + 1)
+    powers = np.column_stack([scaled[:, np.newaxis] ** np.arange(_DEGREE + 1),
+                              stretches['temperature_rate']])
     left = reading - powers @ np.linalg.lstsq(powers, reading, rcond=None)[0]
     sums = np.cumsum(np.vstack([np.zeros(3), left]), axis=0)
     k = _NEIGHBOURS
-    means = (sums[k:] - sums[:-k]) / k
-    jump = np.linalg.norm(means[k:] - means[:-k], axis=1)
+    means, up = (sums[k:] - sums[:-k]) / k, unit(np.mean(reading, axis=0)[np.newaxis])[0]
+    jumps = means[k:] - means[:-k]
+    jump = np.linalg.norm(jumps - np.outer(jumps @ up, up), axis=1)
     noise = float(np.linalg.norm(np.median(stretches.noise, axis=0)))  # type: ignore[arg-type]
     at = int(np.argmax(jump))
     if jump[at] > max(_JUMP_G, _JUMP_NOISES * noise * np.sqrt(2.0 / k)):

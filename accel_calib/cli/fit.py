@@ -18,7 +18,7 @@ from .frame import (
     console, Done, FAILED, given, intake, log_options, prior, rows_between, settings,
     stored_calibration)
 from .output import error_line, progress, short_if_known, table, Verdict, working
-from ..calibrate import Calibration, Curve, NORM_MODELS, outlook
+from ..calibrate import Calibration, NORM_MODELS, outlook
 from ..effects import AXES, effect_named
 from ..errors import InputError
 from ..findings import (
@@ -91,30 +91,27 @@ def _thermal_done(args: argparse.Namespace, logs: Sequence[Path], outcome: Therm
     return Done(
         {'file': list(logs), **calibration_json(calibration, outlook(calibration, 'auto')),
          'read_as': outcome.read_as, 'read_lines': lines, 'thermal': curve_json(outcome.curve)},
-        [*_curve_lines(outcome.curve),
+        [*_curve_lines(outcome),
          *(_tables(calibration) if is_whole and args.verbose else ()), *left_out],
         outcome.rating, status_of(outcome), stored,
         partial(thermal_page, outcome, list(map(str, logs)), stored=str(args.output), notes=lines),
         notes=_fit_notes(calibration, *lines))
 
 
-def _curve_lines(curve: Curve) -> Iterator[Any]:
-    """Yield the curve as a table and lines."""
+def _curve_lines(outcome: ThermalOutcome) -> Iterator[Any]:
+    """Yield the effects of temperature as a table, and lines."""
+    curve, values = outcome.curve, Table(title='Effects of temperature', show_header=False)
     low, high = curve.range_c
-    if curve.degree:
-        yield table(f'Offset over T - {curve.reference_c:.1f} °C', ('', *AXES), (
-            (f'mg/°C{"" if k == 1 else "²³"[k - 2]}',
-             *(with_sd(value * MG, sd * MG) for value, sd in zip(values, deviations)))
-            for k, (values, deviations) in enumerate(zip(curve.values, curve.deviations), 1)))
+    for each in effect_figures(outcome.calibration):
+        values.add_row(each.label, with_sd(each.value, each.sd), each.unit)
+    if curve.model.effects:
+        yield values
     else:
         yield 'the offset does not change with the temperature'
     yield (f'degree {curve.degree} from {low:.1f} to {high:.1f} °C: {short(curve.change_mg)} -> '
            f'{short(curve.residual_mg)} mg, uncertainty up to {short(curve.band_mg)} mg')
-    if curve.hysteresis_mg is None:
-        yield 'hysteresis: not known, because the temperature only rises or only falls'
-    else:
-        lag = '' if curve.lag_s is None else f', a lag of {curve.lag_s:.0f} s'
-        yield f'hysteresis: {short(curve.hysteresis_mg)} mg between warming and cooling{lag}'
+    yield 'held out [mg]: ' + ', '.join(
+        f'{name or "without"} {short(error)}' for name, error in curve.held_out_mg.items())
 
 
 def status_of(outcome: Outcome | ThermalOutcome) -> int:

@@ -466,7 +466,7 @@ def included(names: Iterable[str]) -> set[str]:
     return {each for name in names for each in effect_named(name).includes}
 
 
-_IN_MILLI = ('g', 'g/g', 'g/g²', 'g/g³', 'g/°C', 'g/h')
+_IN_MILLI = ('g', 'g/g', 'g/g²', 'g/g³', 'g/°C', 'g/°C²', 'g/°C³', 'g/h')
 _WITHOUT_UNIT = ('of_sensor', 'form')
 """Constants of a shape that select one of two forms."""
 

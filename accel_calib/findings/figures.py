@@ -199,14 +199,12 @@ def refinement_json(result: Refinement) -> dict[str, Any]:
 
 
 def curve_json(curve: Curve) -> dict[str, Any]:
-    """Return the offset over temperature for JSON; values of order k are in mg/°C^k."""
+    """Return the effects of temperature for JSON."""
     return {
         'reference_c': curve.reference_c, 'range_c': curve.range_c, 'degree': curve.degree,
-        'coefficients': dict(zip(AXES, (curve.values * MG).T, strict=True)),
-        'coefficients_sd': dict(zip(AXES, (curve.deviations * MG).T, strict=True)),
-        'band_mg': curve.band_mg, 'change_mg': curve.change_mg, 'residual_mg': curve.residual_mg,
-        'held_out_mg': curve.held_out_mg, 'hysteresis_mg': curve.hysteresis_mg,
-        'lag_s': curve.lag_s}
+        'effects': list(curve.model.effects), 'band_mg': curve.band_mg,
+        'change_mg': curve.change_mg, 'residual_mg': curve.residual_mg,
+        'held_out_mg': curve.held_out_mg}
 
 
 def rating_json(rating: Rating, kind: str, text: str, command: str) -> dict[str, Any]:

@@ -65,12 +65,11 @@ _HOW_TO_READ = (
 _HOW_TO_READ_THERMAL = (
     'Each marker is the mean of a short stretch of the log, minus that of the board at the '
     'reference temperature. One orientation shows only this change, not the offset itself.',
-    'The degree is the lowest one at which no higher one predicts parts of the log better that '
-    'were held out.',
-    'Deviations include a slow wander of the offset, whose size is estimated from what the curve '
-    'leaves. Bands are 95 % intervals.',
-    'Hysteresis is the difference between warming and cooling at the same temperature. A lag of '
-    'the thermometer causes it; a slower ramp reduces it.')
+    'An effect is added if parts of the log that were held out are predicted better with it.',
+    'Deviations include a slow wander of the offset, whose size is estimated from what the '
+    'effects leave. Bands are 95 % intervals.',
+    'The curve is that of a steady temperature. Warming and cooling differ by a lag, or by the '
+    'rate of the temperature.')
 _HOW_TO_READ_STEPS = (
     'If the held-out residual decreases together with the residual, the effect is in the sensor '
     'and not an artefact of the fit.',
@@ -172,20 +171,16 @@ def thermal_page(outcome: ThermalOutcome, sources: Sequence[str], *, stored: str
     names = ', '.join(Path(source).name or source for source in sources)
     title = f'Offset over temperature of {calibration.sensor or names}'
     low, high = curve.range_c
-    hysteresis = ('not known' if curve.hysteresis_mg is None
-                  else f'{short(curve.hysteresis_mg)} mg')
     body = [numbers([('range', f'{low:.1f} to {high:.1f} °C'), ('degree', str(curve.degree)),
                      ('change', f'{short(curve.change_mg)} mg'),
                      ('residual', f'{short(curve.residual_mg)} mg'),
-                     ('uncertainty up to', f'{short(curve.band_mg)} mg'),
-                     ('hysteresis', hysteresis)]),
+                     ('uncertainty up to', f'{short(curve.band_mg)} mg')]),
             section('Offset over temperature', figures(
                 _of_axis(curve, axis) for axis in range(3)), HINT),
-            _coefficients(curve), values_section(calibration),
+            values_section(calibration),
             section('Held out', scroll_table(
-                'Error of held-out parts by degree',
-                ('degree', 'error of parts that were held out [mg]'),
-                [(str(degree), short(error)) for degree, error in enumerate(curve.held_out_mg)]),
+                'Error of held-out parts', ('effects', 'error of parts that were held out [mg]'),
+                [(name or 'none', short(error)) for name, error in curve.held_out_mg.items()]),
                 kind='half'),
             section('Warnings', listing(calibration.warnings)),
             section('Use it', *(block(name, text) for name, text in snippets(
@@ -205,8 +200,8 @@ def _of_axis(curve: Curve, axis: int) -> Drawing:
     with drawn(HEIGHT_INCHES, f'{AXES[axis]}: change of the offset') as (figure, (panel,)):
         panel.set(xlabel='temperature [°C]', ylabel='change [mg]')
         add_band(panel, grid, line - band, line + band, INK)
-        for label, which, colour in (('warming', curve.warming, ACCENT),
-                                     ('cooling', ~curve.warming, AFTER)):
+        warming = curve.stretches['temperature_rate'] >= 0.0
+        for label, which, colour in (('warming', warming, ACCENT), ('cooling', ~warming, AFTER)):
             if np.any(which):
                 warm = curve.stretches['temperature'][which]
                 change_mg = curve.change[which, axis] * MG
@@ -219,17 +214,6 @@ def _of_axis(curve: Curve, axis: int) -> Drawing:
     ends = f'{short(float(line[0]))} to {short(float(line[-1]))} mg'
     return Drawing(f'thermal_{AXES[axis]}', f'Change of the offset {AXES[axis]} over the '
                    f'temperature: {ends}', figure, hover)
-
-
-def _coefficients(curve: Curve) -> str:
-    """Return the table of the coefficients by axis."""
-    rows = [(f'(T − {curve.reference_c:.1f} °C)' + ('', '', '²', '³')[k], *(
-        signed(value * MG, sd * MG, f'mg/°C{("", "", "²", "³")[k]}')
-        for value, sd in zip(values, deviations)))
-        for k, (values, deviations) in enumerate(zip(curve.values, curve.deviations), 1)]
-    return section('Coefficients', scroll_table(
-        'Coefficients by axis', ('', *AXES), rows, 'whole-cells values'), paragraph(
-        'The sum over the powers is added to the reading.', 'soft'), kind='half') if rows else ''
 
 
 def _is_refined(calibration: Calibration, refinement: Refinement | None) -> bool:
