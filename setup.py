@@ -45,10 +45,7 @@ setup(
     python_requires='>=3.10',
     # The bounds exclude what no test has run with; CONTRIBUTING.md has the rule.
     install_requires=['numpy>=1.26,<2.5', 'scipy>=1.11,<1.18', 'PyYAML>=6.0.1,<7',
-                      'rosbags>=0.11.9,<0.12', 'rich>=13.7.1,<16', 'Jinja2>=3.1.2,<4',
-                      # What bags are compressed with and stored in.
-                      'apsw>=3.45.1,<4', 'lz4>=4.0.2,<5',
-                      'backports.zstd>=1.0,<2; python_version < "3.14"'],
+                      'rosbags>=0.11.9,<0.12', 'rich>=13.7.1,<16', 'Jinja2>=3.1.2,<4'],
     extras_require={
         # ROS itself, where there is no ROS installation.
         'ros': [

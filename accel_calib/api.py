@@ -218,7 +218,8 @@ def read_poses(path: Source) -> Poses:
     return read_pose_table(Path(path))
 
 
-def read_recording(path: Source, *, topic: str = '', sensor: str = '') -> Recording:
+def read_recording(path: Source, *, topic: str = '', sensor: str = '', in_child: bool = True
+                   ) -> Recording:
     """
     Read a recording.
 
@@ -232,6 +233,8 @@ def read_recording(path: Source, *, topic: str = '', sensor: str = '') -> Record
         Imu topic, for a bag with several Imu topics.
     sensor : str
         frame_id of the messages to read, for a topic with several sensors.
+    in_child : bool
+        Whether a binary file is read in a child process, which damaged bytes may end.
 
     Returns
     -------
@@ -246,7 +249,7 @@ def read_recording(path: Source, *, topic: str = '', sensor: str = '') -> Record
         If the file cannot be read.
 
     """
-    return read_whole_recording(Path(path), topic, sensor)
+    return read_whole_recording(Path(path), topic, sensor, in_child=in_child)
 
 
 def capture(recording: Source | Recording | Data, *, units: UnitName | None = None,

@@ -57,6 +57,10 @@ class InputError(AccelCalibError):
     """A file, a column or a number is not valid."""
 
 
+class DamagedLogError(InputError):
+    """A library cannot read a log."""
+
+
 @contextmanager
 def needing(libraries: str, what: str) -> Iterator[None]:
     """Turn the ImportError of an optional library, or of several, into an InputError."""

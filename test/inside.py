@@ -13,6 +13,7 @@ name that is not clear without its file has another one here.
 
 from dataclasses import dataclass
 from importlib.util import find_spec
+import os
 from pathlib import Path
 
 from accel_calib.api import in_units_of
@@ -60,9 +61,7 @@ from accel_calib.geometry import (
     unit, words_of)
 from accel_calib.live import sources
 from accel_calib.live.sources import _interval as interval_of_lines, is_port, open_source, Source
-from accel_calib.logs import (
-    bag_samples, bounded_bags, containers, layout_with, LogOptions, open_bag, open_log, text)
-from accel_calib.logs.bounded_bags import decompressed, largest
+from accel_calib.logs import bag_samples, child, layout_with, LogOptions, open_bag, open_log, text
 from accel_calib.logs.flight import read_dataflash, read_ulg
 from accel_calib.logs.names import format_named, meaning, NAMES as LOG_FORMATS, unit_of
 from accel_calib.logs.quantities import are_samples
@@ -150,6 +149,19 @@ def read_log(path: Path, options: LogOptions = LogOptions()) -> Log:
         return Log(table, log.units, log.read_as, log.notes)
 
 
+def open_log_parts(path: Path, *, in_child: bool) -> list[object]:
+    """Return all that is known of a log."""
+    with open_log(path, LogOptions(in_child=in_child)) as log:
+        return [concatenated(list(log.blocks)), log.samples, log.units, log.sensor, log.read_as,
+                log.poses, log.notes, log.findings]
+
+
+def server_of_children() -> int:
+    """Return the id of the process that forks the children that read files."""
+    process = child._server(os.getpid())._process
+    return process.pid if process else 0
+
+
 PAGE_FOLDER = Path(sources.__file__).parent / 'page'
 """Files of the live page."""
 
@@ -167,7 +179,7 @@ CLOCK_OF_A_SOURCE = sources, 'time'
 PATIENCE_OF_A_WORKER = worker, '_PATIENCE'
 LARGEST_SAMPLE = refine_base, 'MOST'
 LARGEST_NUMBER_OF_STEPS = session_store, 'MOST_STEPS'
-DECOMPRESSED = bounded_bags, 'decompressed'
+PATIENCE_WITH_A_CHILD = child, '_PATIENCE_S'
 
 if find_spec('aiohttp'):  # what the live page needs is not installed everywhere
     from accel_calib.live import server, viewer

@@ -79,7 +79,7 @@ def test_what_is_not_a_bag_is_refused_in_one_line(file, tmp_path):
     with pytest.raises(FileNotFoundError):
         read_recording(tmp_path / file)
     (tmp_path / file).write_bytes(b'not a bag at all')
-    with pytest.raises(InputError, match='is damaged or not a bag'):
+    with pytest.raises(InputError, match='is damaged'):
         read_recording(tmp_path / file)
 
 
@@ -323,7 +323,7 @@ def test_poses_do_not_depend_on_the_size_of_blocks(recording, tmp_path, monkeypa
     whole = capture(read_recording(path), UNITS)
     monkeypatch.setattr(*ROWS_OF_A_BAG, 50)
     monkeypatch.setattr(*BLOCK_OF_A_BAG, 20)
-    with open_log(path, LogOptions()) as stream:
+    with open_log(path, LogOptions(in_child=False)) as stream:
         assert stream.samples == len(recording)
         assert re.search(r'/\S+.* \d+ Hz.*m/s2$', stream.read_as)
         found = capture(stream.blocks, UNITS)

@@ -23,8 +23,8 @@ PINNED = '.ci/ubuntu-24.04.txt', 'requirements-dev.txt'
 FOR_DEVELOPERS = {'dev', 'docs', 'test', 'test-fleet'}
 """Extras that users do not install. The extra `ros` has exact versions."""
 
-WITHOUT_DISTRIBUTION = {'_typeshed', 'compression'}
-"""Modules that only type checkers have, or only newer versions of Python."""
+WITHOUT_DISTRIBUTION = {'_typeshed', 'compression', 'backports'}
+"""Modules that only type checkers have, or newer versions of Python; rosbags needs the last."""
 
 
 def normal(name: str) -> str:
@@ -59,7 +59,7 @@ def test_what_is_imported_is_required(
     paths = (*(ROOT / 'accel_calib').rglob('*.py'), *(ROOT / 'launch').glob('*.py'))
     imported = {name.partition('.')[0] for path in paths for name in imports_of(path)}
     others = imported - sys.stdlib_module_names - WITHOUT_DISTRIBUTION - of_ros - {'accel_calib'}
-    assert {'numpy', 'lz4'} < others
+    assert {'numpy', 'rosbags'} < others
     assert not [module for module in others if not required & {
         normal(each) for each in distributions.get(module, ())}]
 

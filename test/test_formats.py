@@ -128,7 +128,6 @@ FRAME = b'\x55\x51' + bytes(8) + b'\x03' + b'\x55\x52' + bytes(8) + b'\x04'
 SHIMMER = bytearray(256)
 SHIMMER[30:37] = b'\0\x03\0\0\0\x02\0'
 NILSPOD = bytes([52, 20, 3, 0, 5, 0x40, 0, 1, 16, 16]) + bytes(300)
-BOMB = gzip.compress(b'time,ax,ay,az\n' + (b'0.01,0,0,9.8' + b' ' * 5000 + b'\n') * 12_000)
 
 # Name, content, and words of the refusal.
 REFUSED: list[tuple[str, Any, str]] = [
@@ -143,15 +142,8 @@ REFUSED: list[tuple[str, Any, str]] = [
     ('log.mat.gz', gzip.compress(b'MATLAB 5.0 MAT-file'), 'holds log.mat, a MATLAB file.*unpack'),
     ('log.zip', partial(archive, a_mat=b'MATLAB 5.0 MAT-file'), 'holds a.mat, a MATLAB file'),
     ('log.csv.gz', gzip.compress(TABLE)[:-30], 'is damaged'),
-    ('log.csv.zst', zstd.compress(TABLE)[:900], 'is damaged'), ('log.gz', BOMB, 'unpacks to more'),
+    ('log.csv.zst', zstd.compress(TABLE)[:900], 'is damaged'),
     ('log.npy', partial(np.save, arr=np.array([{}]), allow_pickle=True), 'holds object, .*plain'),
-    ('log.npz', lambda path: np.savez_compressed(path, a=np.zeros((10 ** 7, 3))), 'at most 2'),
-    ('log.h5', lambda path: h5py.File(path, 'w').create_dataset(
-        'acc', (10 ** 8, 3), 'f8', compression='gzip'), 'plain arrays of at most'),
-    ('log.parquet', lambda path: parquet.write_table(
-        pa.table({name: np.zeros(10 ** 6) for name in 'txyz'}), path), 'holds 4000000 numbers'),
-    ('log.feather', lambda path: feather.write_feather(
-        pa.table({name: np.zeros(10 ** 6) for name in 'txyz'}), str(path), 'zstd'), 'holds 4'),
     ('log.json', b'[{"a": 1}]' + bytes(1 << 25), 'JSON file of at most'),
     ('deep.json', b'[[1, ' + b'[' * 100_000, 'is damaged'),
     ('cut.json', b'[{"a": 1}, {', 'is damaged'),

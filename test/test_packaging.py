@@ -17,14 +17,10 @@ from shared import ROOT
 
 EXECUTABLES = ('accel-calib', 'calibrator', 'calibrator_lifecycle', 'simulator')
 
-# pip installs apsw, backports.zstd and lz4 with rosbags.
 ROSDEP_KEYS = {
     'Jinja2': 'python3-jinja2',
     'PyYAML': 'python3-yaml',
     'aiohttp': 'python3-aiohttp',
-    'apsw': 'python3-rosbags-pip',
-    'backports.zstd': 'python3-rosbags-pip',
-    'lz4': 'python3-rosbags-pip',
     'matplotlib': 'python3-matplotlib',
     'numpy': 'python3-numpy',
     'pyserial': 'python3-serial',

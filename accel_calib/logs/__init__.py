@@ -11,11 +11,12 @@ the fields in serialized messages.
 """
 
 from .autopilot import ARDUPILOT_REFERENCE, ByAxis, DEGREE, PER_MILLION
-from .bag import Bag, damage_as_input_error, open_bag
-from .bag_samples import context_of, ContextTopics
+from .bag import imus_of, open_bag
+from .bag_samples import messages_of, Track
+from .child import parts_of
 from .columns import LogOptions
 from .containers import Frame, Piped
-from .formats import FORMATS, is_bag, open_log, OpenLog, Progress, SUFFIXES
+from .formats import BAG, FORMATS, is_bag, open_log, OpenLog, Progress, SUFFIXES
 from .names import NAMES
 from .quantities import are_untimed_samples
 from .read import LineReader, read_poses, read_recording, write_blocks, write_table
@@ -26,11 +27,11 @@ from .serialized import (
     STAMP_AT, THREE)
 
 __all__ = ['ACCELERATION', 'ACCELERATION_COVARIANCE', 'ANGULAR_VELOCITY',
-           'ANGULAR_VELOCITY_COVARIANCE', 'ARDUPILOT_REFERENCE', 'DEGREE', 'FORMATS',
+           'ANGULAR_VELOCITY_COVARIANCE', 'ARDUPILOT_REFERENCE', 'BAG', 'DEGREE', 'FORMATS',
            'IMU_DOUBLES', 'LITTLE_ENDIAN', 'NAMES', 'NAME_AT', 'NINE', 'ORIENTATION',
            'ORIENTATION_COVARIANCE', 'PER_MILLION', 'STAMP', 'STAMP_AT',
-           'SUFFIXES', 'THREE', 'Bag', 'ByAxis', 'ContextTopics', 'Frame', 'Layout', 'LineReader',
-           'LogOptions', 'Messages', 'OpenLog', 'Piped', 'Progress', 'are_untimed_samples',
-           'context_of', 'damage_as_input_error', 'doubles_at', 'is_bag', 'joined', 'layout_of',
-           'layout_with', 'open_bag', 'open_log', 'put_doubles', 'read_poses', 'read_recording',
+           'SUFFIXES', 'THREE', 'ByAxis', 'Frame', 'Layout', 'LineReader', 'LogOptions',
+           'Messages', 'OpenLog', 'Piped', 'Progress', 'Track', 'are_untimed_samples',
+           'doubles_at', 'imus_of', 'is_bag', 'joined', 'layout_of', 'layout_with', 'messages_of',
+           'open_bag', 'open_log', 'parts_of', 'put_doubles', 'read_poses', 'read_recording',
            'renamed', 'samples_of', 'write_blocks', 'write_table']

@@ -4,31 +4,34 @@
 """
 Open bags without ROS: rosbag2 (folder, mcap, db3) and ROS 1.
 
-Damaged bytes cause many kinds of errors in `rosbags`, also long after the bag is open.
-`damage_as_input_error` is the only place that converts them.
+Damaged bytes cause many kinds of errors in `rosbags`, also long after the bag is open, and can
+take much memory and time. `accel_calib.logs.child` limits and converts them.
+
+A recorder that was killed leaves the last messages of a db3 file in a second file, the journal of
+SQLite (``-wal`` or ``-journal``). `rosbags` ignores it. SQLite joins both files, in a copy.
 
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, ExitStack
+from contextlib import closing, contextmanager, ExitStack
 from dataclasses import dataclass
-from functools import cache, partial
-from itertools import islice
+from functools import cache
 from pathlib import Path
+import shutil
+import sqlite3
+from tempfile import TemporaryDirectory
 from typing import Any, TYPE_CHECKING
-import warnings
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .containers import damage_refused
 from .serialized import frame_ids, IMU_DOUBLES, joined, Messages, samples_of
 from ..disk import check_regular
 from ..errors import InputError
 from ..table import Floats
-from ..text import some
+from ..text import listed, some
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -44,8 +47,9 @@ LARGEST = 1e6
 """Larger accelerations [m/s²] and rates [rad/s] are those of damaged bytes."""
 
 _BLOCK_BYTES = 1 << 24
-_AT_ONCE = 64
-"""Number of bytes above which a block ends, and of messages after which they are counted."""
+"""Number of bytes above which a block ends."""
+
+_JOURNALS = ('-wal', '-journal')
 
 NUMBERS = ('float32', 'float64', 'int8', 'uint8', 'int16', 'uint16', 'int32', 'uint32', 'int64',
            'uint64')
@@ -92,13 +96,19 @@ class Bag:
         """
         Yield blocks of messages, in order of receipt; by default those of all connections.
 
-        A block has at most `size` messages; large messages make it shorter. A damaged bag is an
-        InputError.
+        A block has at most `size` messages; large messages make it shorter.
 
         """
-        sound = damage_as_input_error(self.path)
-        messages = sound(self.reader.messages)(connections)
-        yield from iter(sound(partial(_next_block, messages, size)), [])
+        block: list[Received] = []
+        left = _BLOCK_BYTES
+        for message in self.reader.messages(connections):
+            block.append(message)
+            left -= len(message[2])
+            if left < 0 or len(block) == size:
+                yield block
+                block, left = [], _BLOCK_BYTES
+        if block:
+            yield block
 
     def first(self, topic: str, msgtype: str = IMU, size: int = 1) -> list[Received]:
         return next(self.blocks(self.connections(topic, msgtype), size), [])
@@ -110,34 +120,32 @@ class Bag:
 
     def fields(self, msgtype: str, field: str, block: Sequence[Received]) -> list[tuple[Any, Any]]:
         """Return stamp of the header (or None) and value of a field such as ``status.voltage``."""
-        with damage_as_input_error(self.path):
-            store = _types(block[0][0], ros2=self.ros2)
-            read = store.deserialize_cdr if self.ros2 else store.deserialize_ros1
-            rows = []
-            for _, _, raw in block:
-                value: Any = read(raw, msgtype)
-                stamp = getattr(getattr(value, 'header', None), 'stamp', None)
-                for name in field.split('.'):
-                    value = getattr(value, name)
-                rows.append((stamp, value))
-            return rows
+        store = _types(block[0][0], ros2=self.ros2)
+        read = store.deserialize_cdr if self.ros2 else store.deserialize_ros1
+        rows = []
+        for _, _, raw in block:
+            value: Any = read(raw, msgtype)
+            stamp = getattr(getattr(value, 'header', None), 'stamp', None)
+            for name in field.split('.'):
+                value = getattr(value, name)
+            rows.append((stamp, value))
+        return rows
 
     def numbers(self, connection: Connection) -> tuple[str, ...]:
         """Return the paths of the single numbers of a message, without headers and times."""
         from rosbags.interfaces import Nodetype
 
-        with damage_as_input_error(self.path):
-            types = _types(connection, ros2=self.ros2).fielddefs
+        types = _types(connection, ros2=self.ros2).fielddefs
 
-            def below(msgtype: str, path: tuple[str, ...]) -> Iterator[str]:
-                for name, (kind, about) in types[msgtype][1]:
-                    if kind == Nodetype.BASE and str(about[0]) in NUMBERS:
-                        yield '.'.join((*path, name))
-                    elif kind == Nodetype.NAME and str(about) not in _TIMES:
-                        yield from below(str(about), (*path, name))
+        def below(msgtype: str, path: tuple[str, ...]) -> Iterator[str]:
+            for name, (kind, about) in types[msgtype][1]:
+                if kind == Nodetype.BASE and str(about[0]) in NUMBERS:
+                    yield '.'.join((*path, name))
+                elif kind == Nodetype.NAME and str(about) not in _TIMES:
+                    yield from below(str(about), (*path, name))
 
-            known = connection.msgtype in types
-            return tuple(below(connection.msgtype, ())) if known else ()
+        known = connection.msgtype in types
+        return tuple(below(connection.msgtype, ())) if known else ()
 
     # -------------------------------------------------------------------------- Imu messages
 
@@ -162,39 +170,6 @@ class Bag:
                              'record while the sensor publishes')
         return frame_ids(self.joined([block[0][2]], topic, 0))[0]
 
-    def imus(self, raws: Sequence[bytes], topic: str, before: int, sensor: str, *,
-             chosen: bool = False) -> tuple[Messages, dict[str, Floats], NDArray[np.bool_]]:
-        """
-        Return Imu messages as arrays and as columns of a recording, and which are of a sensor.
-
-        Messages of another sensor are an InputError unless the user chose the sensor. So are an
-        acceleration that is not finite, and a number beyond any sensor.
-
-        """
-        messages = self.joined(raws, topic, before)
-        names = frame_ids(messages)
-        same = np.array([name == sensor for name in names])
-        if not chosen and not np.all(same):
-            first = int(np.argmin(same))
-            raise InputError(f'{self.path}, {topic}: message {before + first + 1} is from the '
-                             f'sensor {names[first]!r}, expected {sensor!r} as before',
-                             'capture and refine choose one with --sensor; apply needs a topic '
-                             'for each sensor')
-        columns = samples_of(messages)
-        self._check_plausible(columns['reading'], 'acceleration', before)
-        self._check_plausible(np.nan_to_num(columns['rate']), 'angular velocity', before)
-        return messages, columns, np.broadcast_to(same, len(messages))
-
-    def _check_plausible(self, values: Floats, what: str, before: int) -> None:
-        sound = np.all(np.abs(values) < LARGEST, axis=1)
-        if not np.all(sound):
-            first = int(np.argmin(sound))
-            found = ('contains NaN or infinity' if not np.all(np.isfinite(values[first])) else
-                     f'has the {what} {np.max(np.abs(values[first])):.3g}')
-            raise InputError(f'{self.path}: Imu message {before + first + 1} {found}, expected '
-                             f'finite numbers below {LARGEST:g}',
-                             'fix the driver, or record again')
-
     def lost(self, topic: str, found: int) -> list[str]:
         """Return a note if fewer messages of a topic were found than the bag states."""
         stated = self.count(topic)
@@ -203,79 +178,53 @@ class Bag:
                 ] if found < stated else []
 
 
+def imus_of(messages: Messages, name: str, before: int, sensor: str, *, chosen: bool = False
+            ) -> tuple[dict[str, Floats], NDArray[np.bool_]]:
+    """
+    Return Imu messages as columns of a recording, and which are of a sensor.
+
+    For errors, `name` is the bag and the topic, and `before` the number of earlier messages.
+    Messages of another sensor are an InputError unless the user chose the sensor. So are an
+    acceleration that is not finite, and a number beyond any sensor.
+
+    """
+    names = frame_ids(messages)
+    same = np.array([each == sensor for each in names])
+    if not chosen and not np.all(same):
+        first = int(np.argmin(same))
+        raise InputError(f'{name}: message {before + first + 1} is from the sensor '
+                         f'{names[first]!r}, expected {sensor!r} as before',
+                         'capture and refine choose one with --sensor; apply needs a topic for '
+                         'each sensor')
+    columns = samples_of(messages)
+    for key, what in (('reading', 'acceleration'), ('rate', 'angular velocity')):
+        values = columns[key] if key == 'reading' else np.nan_to_num(columns[key])
+        sound = np.all(np.abs(values) < LARGEST, axis=1)
+        if not np.all(sound):
+            first = int(np.argmin(sound))
+            found = ('contains NaN or infinity' if not np.all(np.isfinite(values[first])) else
+                     f'has the {what} {np.max(np.abs(values[first])):.3g}')
+            raise InputError(f'{name}: Imu message {before + first + 1} {found}, expected finite '
+                             f'numbers below {LARGEST:g}', 'fix the driver, or record again')
+    return columns, np.broadcast_to(same, len(messages))
+
+
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
     """
-    Open a bag for reading.
+    Open a bag for reading; for a bag of somebody else, in a child process.
 
-    Raises
-    ------
-    InputError
-        If the bag is damaged; also later, while it is read.
+    Damage raises errors of any class, also later, while the bag is read.
 
     """
-    from .bounded_bags import readable, Reader1, Reader2
+    from rosbags.rosbag1 import Reader as Reader1
+    from rosbags.rosbag2 import Reader as Reader2
 
-    if not path.is_dir():
-        check_regular(path)
     ros2 = path.suffix != '.bag'
     with ExitStack() as stack:
-        with damage_as_input_error(path):
-            source, notes = readable(path, stack)
-            with warnings.catch_warnings():
-                warnings.simplefilter('ignore')  # of the YAML of damaged metadata
-                reader = (Reader2 if ros2 else Reader1)(source)
-                reader.open()
-            stack.callback(damage_as_input_error(path)(reader.close))
-            _check(reader)
+        source, notes = _readable(path, stack)
+        reader: Any = stack.enter_context((Reader2 if ros2 else Reader1)(source))
         yield Bag(path, reader, ros2, tuple(notes))
-
-
-@contextmanager
-def damage_as_input_error(path: Path) -> Iterator[None]:
-    """Convert errors of `rosbags` to InputError; only calls of `rosbags` belong inside."""
-    inside = ' or the .mcap or .db3 file inside it' if path.is_dir() else ''
-    with damage_refused(f'{path} is damaged or not a bag', 'a rosbag2 folder, .mcap, .db3 or .bag',
-                        f'use another file{inside}; ros2 bag reindex may repair this one'):
-        yield
-
-
-def _check(reader: Any) -> None:
-    """Check the types of what `rosbags` reads from YAML or SQLite as stored."""
-    files = getattr(getattr(reader, 'storage', None), 'files', [])
-    if not isinstance(files, list):  # `rosbags` clears this list when it closes the bag
-        raise ValueError(f'files in metadata.yaml is {files!r}')
-    for connection in reader.connections:
-        topic, msgtype, count = connection.topic, connection.msgtype, connection.msgcount
-        if not (isinstance(topic, str) and isinstance(msgtype, str)):
-            raise ValueError(f'a topic has the name {topic!r} and the type {msgtype!r}')
-        if not isinstance(count, int) or count < 0:
-            raise ValueError(f'topic {topic} has {count!r} messages')
-
-
-def _next_block(messages: Iterator[Received], size: int) -> list[Received]:
-    """Return the next messages: at most `size`, and not many more bytes than `_BLOCK_BYTES`."""
-    block: list[Received] = []
-    left = _BLOCK_BYTES
-    while left > 0 and len(block) < size:
-        part = list(islice(messages, min(_AT_ONCE, size - len(block))))
-        _check_messages(part)
-        if not part:
-            break
-        block += part
-        left -= sum(len(raw) for _, _, raw in part)
-    return block
-
-
-def _check_messages(block: Sequence[tuple[Any, Any, Any]]) -> None:
-    """Check the types of messages, which SQLite returns as stored."""
-    for kinds, position, what in (((int,), 1, 'time of receipt'),
-                                  ((bytes, memoryview, bytearray), 2, 'content')):
-        if not {type(message[position]) for message in block} <= {*kinds}:
-            bad = next(message for message in block if type(message[position]) not in kinds)
-            cell = bad[position]
-            raise ValueError(f'a message on {bad[0].topic} has the {what} '
-                             f'{cell[:20] if isinstance(cell, (str, bytes)) else cell!r}')
 
 
 def _types(connection: Connection, *, ros2: bool) -> Typestore:
@@ -302,3 +251,60 @@ def _defined(kind: str, text: str, msgtype: str) -> Typestore:
         types.update(get_types_from_idl(part))
     store.register(types)
     return store
+
+
+# ----------------------------------------------------------------------------- files of a bag
+
+def _readable(path: Path, stack: ExitStack) -> tuple[Path, list[str]]:
+    """Return the path to read, in a copy if SQLite cannot read it as it is, and notes."""
+    stored, notes = [path], []
+    if path.is_dir():
+        for each in path.iterdir():
+            if each.exists() and not each.is_dir():  # `rosbags` would wait for a pipe
+                check_regular(each)
+        stored = sorted(each for each in path.iterdir() if each.suffix in ('.mcap', '.db3'))
+        metadata = path / 'metadata.yaml'
+        if metadata.exists():
+            text = metadata.read_text(encoding='utf-8', errors='replace')
+            lost = [each.name for each in stored if each.name not in text]
+            if 0 < len(lost) < len(stored):
+                notes = [f'metadata.yaml of {path} does not list {listed("file", lost)}: the '
+                         'messages there are not read; ros2 bag reindex lists all files']
+        elif not stored:
+            raise InputError(f'{path} is a folder without a bag, expected a rosbag2 folder or a '
+                             'file', 'choose a file in it')
+        elif len(stored) == 1:
+            notes = [f'{path} has no metadata.yaml, as after a recorder was killed; '
+                     f'{stored[0].name} is read without it']
+            path, = stored
+    databases = [each for each in stored if each.suffix == '.db3']
+    journals = [journal for each in databases for suffix in _JOURNALS
+                if (journal := each.with_name(each.name + suffix)).is_file()
+                and journal.stat().st_size]
+    if journals:
+        notes.append('the recorder was killed; its last messages are read from '
+                     f'{", ".join(each.name for each in journals)}')
+    return _copied(path, databases, journals, stack) if databases else path, notes
+
+
+def _copied(path: Path, databases: Sequence[Path], journals: Sequence[Path], stack: ExitStack
+            ) -> Path:
+    """
+    Return a bag in a temporary folder: databases joined with their journals, and links.
+
+    The name of a db3 file there has no letters that `rosbags` would have to escape in a URI.
+
+    """
+    made = Path(stack.enter_context(TemporaryDirectory(prefix='accel_calib_'))) / 'bag.db3'
+    if path.is_dir():
+        made.mkdir()
+    for each in path.iterdir() if path.is_dir() else [path, *journals]:
+        copy = Path(f'{made}{str(each).removeprefix(str(path))}')
+        if journals and each in (*databases, *journals):
+            shutil.copyfile(each, copy)
+        elif not each.name.endswith('-shm'):
+            copy.symlink_to(each.absolute())
+    for each in databases if journals else ():
+        with closing(sqlite3.connect(f'{made}{str(each).removeprefix(str(path))}')) as database:
+            database.execute('PRAGMA journal_mode = DELETE').fetchone()
+    return made

@@ -18,14 +18,15 @@ first messages of the Imu, converts this time to that of the stamps.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 import re
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from .bag import Bag, BLOCK, NUMBERS, Received
+from .bag import Bag, BLOCK, imus_of, NUMBERS, open_bag, Received
 from .serialized import doubles_at, frame_ids, stamps_of
 from ..errors import InputError
 from ..table import concatenated, Floats, Recording
@@ -338,7 +339,7 @@ def _looks_like(connection: Connection, quantity: Quantity) -> bool:
 def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool, context: ContextTopics,
                 notes: list[str]) -> Iterator[Recording]:
     """
-    Yield the samples of an Imu topic in blocks; the first four parameters are as in `Bag.imus`.
+    Yield the samples of an Imu topic in blocks; `sensor` and `chosen` are as in `imus_of`.
 
     A note about lost messages is added to `notes` at the end. A message that is damaged, contains
     NaN, or is from another sensor is an InputError.
@@ -348,8 +349,8 @@ def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool, context: Con
     parts: list[Recording] = []
     before = 0
     for block in bag.blocks(bag.connections(topic), BLOCK):
-        _, columns, which = bag.imus([raw for _, _, raw in block], topic, before, sensor,
-                                     chosen=chosen)
+        messages = bag.joined([raw for _, _, raw in block], topic, before)
+        columns, which = imus_of(messages, f'{bag.path}, {topic}', before, sensor, chosen=chosen)
         columns |= {key: track.at(columns['time']) for key, track in tracks.items()}
         samples = Recording(columns, before + np.arange(len(block)) + 1, 'm/s2', sensor)
         parts.append(samples if np.all(which) else samples.take(which))
@@ -360,3 +361,41 @@ def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool, context: Con
     if parts:
         yield concatenated(parts)
     notes += bag.lost(topic, before)
+
+
+# ---------------------------------------------------------------------------------- messages
+
+def messages_of(path: Path, options: LogOptions, needs: Collection[str]) -> Generator[Any]:
+    """
+    Yield what a corrected copy of a bag needs: what is known first, the messages, the notes.
+
+    The options are those of the Imu topic and of the context, of which only the `needs` of a
+    calibration are read. Messages come in blocks, with the number of their connection, the time of
+    receipt [ns] and the size of each, and their bytes.
+
+    """
+    from rosbags.rosbag2.metadata import dump_qos_v9
+
+    with open_bag(path) as bag:
+        topic = bag.imu_topic(options.topic)
+        sensor = bag.first_frame_id(topic)
+        context = context_of(bag, topic, sensor, options).needed(bag, needs)
+        connections = bag.reader.connections
+        number = {id(each): k for k, each in enumerate(connections)}
+        imu = [number[id(each)] for each in bag.connections(topic)]
+        yield {'topic': topic, 'sensor': sensor, 'count': bag.count(topic), 'imu': imu,
+               'tracks': {key: vars(track) for key, track in context.tracks().items()},
+               'compression': getattr(bag.reader, 'compression_mode', None),
+               'connections': [{
+                   'topic': each.topic, 'msgtype': each.msgtype, 'msgdef': each.msgdef.data,
+                   'digest': each.digest, 'ext': [
+                       dump_qos_v9(part) if isinstance(part, list) else part for part in each.ext]
+               } for each in connections]}
+        found = 0
+        for block in bag.blocks():
+            which = np.array([number[id(connection)] for connection, _, _ in block])
+            found += int(np.count_nonzero(np.isin(which, imu)))
+            yield {'connection': which, 'stamp': np.array([stamp for _, stamp, _ in block]),
+                   'size': np.array([len(raw) for _, _, raw in block]),
+                   'data': np.frombuffer(b''.join(raw for _, _, raw in block), np.uint8)}
+        yield [*bag.notes, *context.notes, *bag.lost(topic, found)]

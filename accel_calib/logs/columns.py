@@ -67,6 +67,8 @@ class LogOptions:
         frame_id of the messages of a bag, or number of the sensor of a flight log.
     temperature_topic, supply_topic : str
         Topics of temperature and supply voltage of a bag, ``TOPIC`` or ``TOPIC:FIELD``.
+    in_child : bool
+        Whether a binary file is read in a child process with limits, rather than in this one.
 
     """
 
@@ -81,6 +83,7 @@ class LogOptions:
     sensor: str = ''
     temperature_topic: str = ''
     supply_topic: str = ''
+    in_child: bool = True
 
     @property
     def instance(self) -> str:

@@ -47,7 +47,6 @@ from numpy.typing import NDArray
 from .autopilot import (
     ardupilot_correction, as_sensed, AsSensed, at, choose, Correction, FlightLog, Message,
     Parameters, px4_correction, px4_slot, sound, UnknownCorrectionError, vectors)
-from .containers import sound_log
 from .names import MICRO, PX4_FIELDS, PX4_SPANS
 from ..errors import InputError
 from ..table import Autopilot, Floats
@@ -132,7 +131,7 @@ def _px4_messages(path: Path
     """Return the messages and parameters that matter, the release of PX4, and notes on damage."""
     from pyulog import ULog
 
-    with _WholeReads(io.FileIO(path)) as file, sound_log(path, 'a PX4 log (.ulg)'):
+    with _WholeReads(io.FileIO(path)) as file:
         log = ULog(file, [*PX4_MESSAGES, *_ALSO])
         found = [Message(data.name, data.multi_id, data.data, _px4_time(data.data))
                  for data in log.data_list if len(data.data['timestamp'])]
@@ -283,9 +282,8 @@ def _binary(path: Path) -> tuple[dict[str, _Table], list[str]]:
         def init_clock(self) -> None:
             """Skip the search for a GPS time, which parses a whole log that has none."""
 
-    with sound_log(path, 'an ArduPilot log (.bin)'):
-        log = Index(str(path))  # it knows where each message begins
-        log.close()
+    log = Index(str(path))  # it knows where each message begins
+    log.close()
     data = np.frombuffer(path.read_bytes(), np.uint8)
     tables, cut = {}, 0
     for number, form in log.formats.items():

@@ -12,11 +12,11 @@ name the program that converts it.
 
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager, ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
-from importlib import import_module
+from importlib.util import find_spec
 import io
 from itertools import chain
 from pathlib import Path
@@ -29,15 +29,16 @@ from . import containers, records
 from .autopilot import FlightLog
 from .bag import open_bag
 from .bag_samples import context_of, imu_samples, rate_words
+from .child import LogFile, parts_of
 from .columns import Chosen, chosen, is_log_header, LogOptions
-from .containers import DamagedLogError, Frame, Member, Piped, sound_log, Stream
+from .containers import Frame, Member, Piped, Stream
 from .dialect import Cells, shown
 from .flight import DATAFLASH, read_dataflash, read_ulg
 from .names import meaning, READING, record_instead
 from .quantities import are_samples, are_untimed_samples, decided, Quantities
 from .text import open_text, PEEKED, TextTable
 from ..disk import check_regular, FIRST_LINE
-from ..errors import InputError, needing, saying
+from ..errors import DamagedLogError, InputError, needing, saying
 from ..finding import Finding
 from ..table import check_units, check_values, concatenated, Poses, Recording
 from ..text import some
@@ -128,34 +129,64 @@ def _checked(path: Path, blocks: Iterator[Recording], units: Units) -> Iterator[
         yield from blocks
 
 
+# ------------------------------------------------------------------------------- binary files
+
+@contextmanager
+def _binary(known: 'Format', path: Path, options: LogOptions) -> Iterator[OpenLog]:
+    """Open a binary file in a child process."""
+    with parts_of(known.file(path), _parts, options, in_child=options.in_child) as parts:
+        head = next(parts)
+        notes, findings = list(head.pop('noted')), tuple(head.pop('findings'))
+
+        def blocks() -> Iterator[Recording]:
+            for block in parts:
+                if isinstance(block, Recording):
+                    yield block
+                else:
+                    notes[:] = block
+
+        yield OpenLog(blocks(), **head, noted=lambda: tuple(notes), findings=findings)
+
+
+def _parts(path: Path, options: LogOptions) -> Generator[Any]:
+    """Yield the fields of an `OpenLog`, its blocks, and its notes at the end."""
+    known = _format_of(path)
+    with known.opened(known, path, options) as log, saying(log.read_as):
+        head = {**vars(log), 'noted': log.noted()}
+        del head['blocks']
+        yield head
+        yield from log.blocks
+        yield log.noted()
+
+
 # ------------------------------------------------------------------------------------- tables
 
 @contextmanager
 def _tables(known: 'Format', path: Path, options: LogOptions) -> Iterator[OpenLog]:
     with ExitStack() as stack:
-        with sound_log(path, known.name, containers.AGAIN):
+        with known.file(path).refused():
             members = known.read(path, stack)
-        with open_members(path, members, options, known.name) as log:
+        with open_members(path, members, options, known) as log:
             yield log
 
 
 @contextmanager
-def open_members(path: Path, members: Sequence[Member], options: LogOptions, expected: str = ''
-                 ) -> Iterator[OpenLog]:
+def open_members(path: Path, members: Sequence[Member], options: LogOptions,
+                 known: 'Format | None' = None) -> Iterator[OpenLog]:
     """Open the one of the tables of a file that has the accelerometer, and note why it is."""
-    member, why = _member_of(path, members, options, expected)
-    with _opened(path, member, options, expected) as text:
+    file = (known or TEXT).file(path)
+    member, why = _member_of(file, members, options)
+    with _opened(file, member, options) as text:
         log = _text(path / member.name, text, options)
         yield replace(log, read_as=', '.join(filter(None, (member.name, log.read_as))),
                       noted=lambda: (*why, *log.noted()))
 
 
 @contextmanager
-def _opened(path: Path, member: Member, options: LogOptions, expected: str
-            ) -> Iterator[TextTable]:
+def _opened(file: LogFile, member: Member, options: LogOptions) -> Iterator[TextTable]:
     """Open a table as text; InputError if its bytes are of another format."""
-    with closing(member.parts()) as parts, io.BufferedReader(
-            Stream(path, expected, parts), PEEKED) as raw:
+    path = file.path
+    with closing(member.parts()) as parts, io.BufferedReader(Stream(file, parts), PEEKED) as raw:
         name = member.name or (path.stem if path.suffix in containers.PACKED else path.name)
         inside = recognised(Path(name), raw.peek())
         if inside is not TEXT:
@@ -166,7 +197,7 @@ def _opened(path: Path, member: Member, options: LogOptions, expected: str
             yield text
 
 
-def _member_of(path: Path, members: Sequence[Member], options: LogOptions, expected: str
+def _member_of(file: LogFile, members: Sequence[Member], options: LogOptions
                ) -> tuple[Member, tuple[str, ...]]:
     """
     Return the table with the accelerometer, and a note on why if there are others.
@@ -175,7 +206,7 @@ def _member_of(path: Path, members: Sequence[Member], options: LogOptions, expec
     acceleration come last, and tables whose names say that they are of an accelerometer first.
 
     """
-    names = [member.name for member in members]
+    path, names = file.path, [member.name for member in members]
     if names == ['']:
         return members[0], ()
     wanted = [member for member in members if options.topic in ('', member.name)]
@@ -189,7 +220,7 @@ def _member_of(path: Path, members: Sequence[Member], options: LogOptions, expec
     refused: list[InputError] = []
     for member in wanted:
         try:
-            with _opened(path, member, options, expected) as text:
+            with _opened(file, member, options) as text:
                 tables[member] = chosen(text.layout, options)
         except InputError as err:
             refused.append(err)
@@ -297,6 +328,12 @@ class Format:
         What to do with a file that is not read; ``{}`` stands for its name.
     opened : function
         Function of the format, a path and `LogOptions` that opens a log.
+    again : str
+        What to do with a damaged file.
+    plain : bool
+        Whether it is text, which needs no child process.
+    module : str
+        Module that reads it, by default `needs`, which the server of the children imports.
 
     """
 
@@ -307,17 +344,26 @@ class Format:
     needs: str = ''
     advice: str = ''
     opened: Callable[..., AbstractContextManager[OpenLog]] = _tables
+    again: str = 'copy it again, or export the log as CSV'
+    plain: bool = False
+    module: str = ''
+
+    def file(self, path: Path) -> LogFile:
+        return LogFile(path, self.name, self.again, self.module or self.needs)
 
 
-_EXPORT = 'export it as CSV with '
+_EXPORT, _VEHICLE = 'export it as CSV with ', 'copy it from the vehicle again'
 _ZIP = rb'PK\x03\x04'
 
 FORMATS = (
-    Format('a bag', ('.mcap', '.db3', '.bag'), b'', opened=_bag),
-    Format('a PX4 log', ('.ulg',), rb'ULog\x01\x12\x35', read_ulg, 'pyulog', opened=_flight),
-    Format('an ArduPilot log', ('.bin',), DATAFLASH, read_dataflash, 'pymavlink', opened=_flight),
+    Format('a bag', ('.mcap', '.db3', '.bag'), b'', opened=_bag, module='rosbags.rosbag2',
+           again='use another bag, or one file of it; ros2 bag reindex may repair this one'),
+    Format('a PX4 log', ('.ulg',), rb'ULog\x01\x12\x35', read_ulg, 'pyulog', opened=_flight,
+           again=_VEHICLE),
+    Format('an ArduPilot log', ('.bin',), DATAFLASH, read_dataflash, 'pymavlink', opened=_flight,
+           again=_VEHICLE),
     Format('an ArduPilot log as text', ('.log',), rb'(?:.*\n)?FMT, *\d+, *\d+, *\w+, *\w+',
-           read_dataflash, opened=_flight),
+           read_dataflash, opened=_flight, plain=True),
     Format('a NumPy file', ('.npy', '.npz'), rb'\x93NUMPY|' + _ZIP + rb'.*\.npyPK',
            records.of_numpy),
     Format('an Excel file (.xlsx)', ('.xlsx', '.xlsm'), _ZIP + rb'.*xl/workbook\.xml',
@@ -327,7 +373,8 @@ FORMATS = (
     Format('an ActiGraph log', ('.gt3x',), _ZIP + rb'.*log\.bin',
            advice=f'{_EXPORT}ActiLife, or with pygt3x'),
     Format('a ZIP archive', ('.zip',), _ZIP, containers.archived),
-    Format('a MATLAB file', ('.mat',), rb'MATLAB 5\.0 MAT-file', records.matlab),
+    Format('a MATLAB file', ('.mat',), rb'MATLAB 5\.0 MAT-file', records.matlab,
+           module='scipy.io'),
     Format('an HDF5 file', ('.h5', '.hdf5'), rb'\x89HDF\r\n|MATLAB 7\.3 MAT-file', records.hdf5,
            'h5py'),
     Format('a Parquet file', ('.parquet',), b'PAR1', partial(records.columnar, 'parquet'),
@@ -335,12 +382,12 @@ FORMATS = (
     Format('a Feather file', ('.feather', '.arrow'), b'ARROW1', partial(records.columnar, 'ipc'),
            'pyarrow'),
     Format('JSON lines', ('.jsonl', '.ndjson'), rb'\s*\{[^\n]*\}\s*\n\s*\{',
-           partial(records.lines, records.json_line)),
+           partial(records.lines, records.json_line), plain=True),
     Format('a JSON file', ('.json',), rb'\s*(?:\{\s*"|\[\s*(?:\{|\[\s*[-"\d]))',
-           records.json_document),
+           records.json_document, plain=True),
     Format('lines of InfluxDB', ('.lp',), rb'(?:#[^\n]*\n)*[^\s,=]+(?:,[^\s=]+=[^\s]+)* '
            rb'[^\s=]+=[-\d.]+[iu]?(?:,[^\s=]+=[^\s]+)* \d{9,19}\s', partial(
-               records.lines, records.influx_line)),
+               records.lines, records.influx_line), plain=True),
     Format('a log of the Betaflight blackbox', ('.bbl', '.bfl'),
            b'H Product:Blackbox flight data recorder', advice='decode it with blackbox_decode {}'),
     Format('a telemetry log of MAVLink', ('.tlog',), b'', advice='use the .bin log of the '
@@ -363,8 +410,7 @@ FORMATS = (
            'made from; most commands take a calibration with -c'),
     Format('a packed file', tuple(containers.PACKED),
            b'|'.join(first for first, _ in containers.PACKED.values()), containers.text),
-    Format('text', ('.csv', '.tsv', '.txt', '.log'), b'',
-           containers.text))
+    Format('text', ('.csv', '.tsv', '.txt', '.log'), b'', containers.text, plain=True))
 """The formats; of several that fit, the first one counts."""
 
 BAG, TEXT = FORMATS[0], FORMATS[-1]
@@ -400,9 +446,9 @@ def _format_of(path: Path) -> Format:
     if known.advice:
         raise InputError(f'{path} is {known.name}, expected a log or a table that is read',
                          known.advice.format(path.name))
-    if known.needs:
+    if known.needs and find_spec(known.needs) is None:
         with needing(known.needs, known.name):
-            import_module(known.needs)
+            raise ImportError(f'no module {known.needs}')
     return known
 
 
@@ -431,7 +477,7 @@ def open_log(path: Path | Piped | Frame, options: LogOptions = LogOptions()) -> 
         if not path.is_dir():
             check_regular(path)
         known = _format_of(path)
-        opened = known.opened(known, path, options)
+        opened = (known.opened if known.plain else _binary)(known, path, options)
     else:
         opened = open_members(Path(str(path)), [path.table], options)
     with opened as log, saying(log.read_as):

@@ -43,9 +43,10 @@ def read_poses(path: Path) -> Poses:
                          ', expected a pose table', 'use capture')
 
 
-def read_recording(path: Path, topic: str = '', sensor: str = '') -> Recording:
-    """Return all samples of a recording; `topic`, `sensor` and errors as in `open_log`."""
-    with open_log(path, LogOptions(topic=topic, sensor=sensor)) as log:
+def read_recording(path: Path, topic: str = '', sensor: str = '', *, in_child: bool = True
+                   ) -> Recording:
+    """Return all samples of a recording; options as in `LogOptions`, errors as in `open_log`."""
+    with open_log(path, LogOptions(topic=topic, sensor=sensor, in_child=in_child)) as log:
         return concatenated(list(log.blocks))
 
 

@@ -24,7 +24,6 @@ from functools import partial
 import io
 from itertools import chain, islice
 import json
-import math
 from pathlib import Path
 import re
 from typing import Any
@@ -34,7 +33,7 @@ import numpy as np
 import scipy
 
 from .columns import is_log_header, LogOptions
-from .containers import Bytes, CELL_BYTES, csv_of, Member, most_numbers, ROWS
+from .containers import Bytes, CELL_BYTES, csv_of, Member, ROWS
 from .dialect import shown
 from ..errors import InputError
 
@@ -161,10 +160,6 @@ def columnar(kind: str, path: Path, _: ExitStack) -> list[Member]:
              if types.is_primitive(field.type) or types.is_struct(field.type)]
     dates = [field.name for field in held.schema
              if types.is_timestamp(field.type) and field.name.startswith('__index')]  # of pandas
-    count, most = held.count_rows() * len(names), most_numbers(path)
-    if count > most:
-        raise InputError(f'{path} holds {count} numbers, expected at most {most} for its size',
-                         'export the log as CSV')
 
     def parts() -> Bytes:
         batches = held.to_batches(columns=names, batch_size=ROWS, use_threads=False)
@@ -242,16 +237,15 @@ def of_numpy(path: Path, stack: ExitStack) -> list[Member]:
 
 
 def _tables(path: Path, held: Mapping[str, _Held], advice: str) -> list[Member]:
-    """Return arrays as tables; InputError without plain arrays, or if they are too large."""
-    plain = {name: (shape, load) for name, (shape, kind, load) in held.items()
+    """Return arrays as tables; InputError without plain arrays."""
+    plain = {name: load for name, (shape, kind, load) in held.items()
              if _NUMBERS.fullmatch(kind) and 0 < len(shape) <= 2 and max(shape) > 1}
-    most = most_numbers(path)
-    if not 0 < sum(math.prod(shape) for shape, _ in plain.values()) <= most:
+    if not plain:
         kinds = shown([f'{kind} {name}' for name, (_, kind, _) in held.items()])
         raise InputError(f'{path} holds {kinds or "timetables or other objects"}, expected plain '
-                         f'arrays of at most {most} numbers', advice)
+                         'arrays of numbers', advice)
     arrays = {}
-    for name, (_, load) in plain.items():
+    for name, load in plain.items():
         values = load()
         for field in values.dtype.names or ('',):  # of records
             column = values[field] if field else values

@@ -11,7 +11,7 @@ Correction of a bag: a copy with a corrected Imu topic; all other messages are u
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 import errno
@@ -28,10 +28,11 @@ import numpy as np
 
 from .correction import corrected, output_frame, output_scale
 from ..calibrate import Calibration, on_topics
+from ..disk import check_regular
 from ..errors import InputError
 from ..logs import (
-    Bag, context_of, damage_as_input_error, doubles_at, IMU_DOUBLES, LogOptions, Messages,
-    open_bag, Progress, put_doubles, renamed)
+    BAG, doubles_at, IMU_DOUBLES, imus_of, joined, LogOptions, Messages, messages_of, open_bag,
+    parts_of, Progress, put_doubles, renamed, Track)
 from ..pipeline import Correction
 from ..table import check_units, Recording
 from ..units import Units, units_of
@@ -85,28 +86,26 @@ def correct_bag(path: Path, calibration: Calibration, out: Path,
     """
     if out.exists():
         raise InputError(f'{out} exists, expected a new file', 'choose another name')
-    with open_bag(path) as bag:
-        _check_kind(bag, out)
-        name = bag.imu_topic(options.topic)
-        sensor = bag.first_frame_id(name)
-        units = units_of(options.units or 'm/s2', options.gravity)
-        correction = Correction(on_topics(calibration, calibration.frame), units.name, sensor)
-        context = context_of(bag, name, sensor, options).needed(bag, calibration.model.needs)
-        with _new(out) as folder:
-            imus = _Topic(bag, name, sensor, context.tracks(), correction, units,
-                          output_scale(correction.calibration, options.gravity))
-            count = _copy(bag, folder, out, imus, progress)
-        for line in (*bag.notes, *context.notes, *bag.lost(name, count), *correction.notes):
-            note(line)
-        return count
-
-
-def _check_kind(bag: Bag, out: Path) -> None:
-    """Check that the name of the copy is that of a bag of the same kind."""
-    if (out.suffix == '.bag') is bag.ros2:
-        kind, names = ((2, '.mcap or .db3, or the name of a folder') if bag.ros2 else (1, '.bag'))
-        raise InputError(f'{bag.path} is a ROS {kind} bag, but {out} is not the name of one',
+    ros2 = path.suffix != '.bag'
+    if (out.suffix == '.bag') is ros2:
+        kind, names = (2, '.mcap or .db3, or the name of a folder') if ros2 else (1, '.bag')
+        raise InputError(f'{path} is a ROS {kind} bag, but {out} is not the name of one',
                          f'choose a name that ends in {names}')
+    if not path.is_dir():
+        check_regular(path)
+    with parts_of(BAG.file(path), messages_of, options, calibration.model.needs,
+                  in_child=options.in_child) as parts:
+        known = next(parts)
+        units = units_of(options.units or 'm/s2', options.gravity)
+        correction = Correction(on_topics(calibration, calibration.frame), units.name,
+                                known['sensor'])
+        imus = _Imus(path, known, correction, units,
+                     output_scale(correction.calibration, options.gravity))
+        with _new(out) as folder:
+            notes = _copy(imus, parts, folder, out, progress)
+    for line in (*notes, *correction.notes):
+        note(line)
+    return imus.done
 
 
 @contextmanager
@@ -124,56 +123,65 @@ def _new(out: Path) -> Iterator[Path]:
 
 
 @dataclass
-class _Topic:
-    """The messages of one Imu topic, with the context over time; `units` are those recorded."""
+class _Imus:
+    """The messages of an Imu topic: what `messages_of` says first, and the units recorded."""
 
-    bag: Bag
-    name: str
-    sensor: str
-    tracks: Mapping[str, Any]
+    path: Path
+    known: Mapping[str, Any]
     correction: Correction
     units: Units
     scale: float
     done: int = 0
 
-    def corrected(self, raws: list[bytes]) -> Messages:
+    @property
+    def ros2(self) -> bool:
+        return self.path.suffix != '.bag'
+
+    def corrected(self, raws: Sequence[memoryview]) -> Messages:
         """Return corrected messages in a new buffer."""
-        own = self.correction.calibration
-        messages, columns, _ = self.bag.imus(raws, self.name, self.done, self.sensor)
+        own, sensor = self.correction.calibration, self.known['sensor']
+        name = f'{self.path}, {self.known["topic"]}'
+        messages = joined(raws, IMU_DOUBLES, name, ros2=self.ros2, before=self.done)
+        columns, _ = imus_of(messages, name, self.done, sensor)
         samples = Recording(columns, np.arange(len(messages)))
         if not self.done:
-            check_units(samples, self.units, str(self.bag.path))
-        known = self.correction.context(samples.with_columns(
-            **{key: track.at(columns['time']) for key, track in self.tracks.items()}))
+            check_units(samples, self.units, str(self.path))
+        known = self.correction.context(samples.with_columns(**{
+            key: Track(**track).at(columns['time'])
+            for key, track in self.known['tracks'].items()}))
         doubles = doubles_at(messages, slice(0, IMU_DOUBLES))
         with np.errstate(over='ignore', invalid='ignore'):  # damaged numbers become infinite
             put_doubles(messages, corrected(own, doubles, known, scale=self.scale))
         self.done += len(messages)
-        return renamed(messages, output_frame(own, self.sensor)) if own.is_levelled else messages
+        return renamed(messages, output_frame(own, sensor)) if own.is_levelled else messages
 
 
-def _copy(bag: Bag, folder: Path, out: Path, imus: _Topic, progress: Progress) -> int:
-    """Copy all messages, and correct those of the Imu topic."""
+def _copy(imus: _Imus, parts: Iterator[Any], folder: Path, out: Path, progress: Progress
+          ) -> list[str]:
+    """Copy all messages, correct those of the Imu topic, and return the notes about the bag."""
     target = folder / (out.stem if out.suffix in ('.mcap', '.db3') else out.name)
-    count = bag.count(imus.name)
-    imu = {id(connection) for connection in bag.connections(imus.name)}
-    written = 0
-    writer = _writer(bag, target, out.suffix)
+    imu, written, notes = {*imus.known['imu']}, 0, list[str]()
+    writer = _writer(imus, target, out.suffix)
     with _full_disk(out), writer:
-        with damage_as_input_error(bag.path):
-            outputs = _added(bag, writer)
-        for block in bag.blocks():
-            which = [k for k, (connection, _, _) in enumerate(block) if id(connection) in imu]
-            new = imus.corrected([block[k][2] for k in which]).each() if which else ()
+        with BAG.file(imus.path).refused():
+            outputs = _added(imus, writer)
+        for block in parts:
+            if isinstance(block, list):
+                notes = block
+                continue
+            ends = np.cumsum(block['size']).tolist()
+            raws = [block['data'].data[start:end] for start, end in zip([0, *ends], ends)]
+            connections = block['connection'].tolist()
+            which = [k for k, connection in enumerate(connections) if connection in imu]
+            new = imus.corrected([raws[k] for k in which]).each() if which else ()
             changed = dict(zip(which, new, strict=True))
-            with damage_as_input_error(bag.path), _full_disk(out):  # a stamp can be out of range
-                for k, (connection, stamp, raw) in enumerate(block):
-                    writer.write(outputs[id(connection)], stamp, changed.get(k, raw))
-            written += len(block)
-            progress(imus.done, count)
-    _check_copy(bag, target, written)
+            for k, (connection, stamp) in enumerate(zip(connections, block['stamp'].tolist())):
+                writer.write(outputs[connection], stamp, changed.get(k, raws[k]))
+            written += len(raws)
+            progress(imus.done, imus.known['count'])
+    _check_copy(imus.path, target, written)
     (target if target.name == out.name else next(target.glob(f'*{out.suffix}'))).rename(out)
-    return imus.done
+    return notes
 
 
 @contextmanager
@@ -188,65 +196,63 @@ def _full_disk(out: Path) -> Iterator[None]:
         raise
 
 
-def _check_copy(bag: Bag, target: Path, written: int) -> None:
+def _check_copy(path: Path, target: Path, written: int) -> None:
     """Check that a copy can be read back, and that its files hold all messages."""
     try:
-        with open_bag(target) as copy:
+        with BAG.file(target).refused(), open_bag(target) as copy:
             found = copy.stored
     except InputError as err:
         what = err.message.removeprefix(f'{target} ')
-        raise InputError(f'{bag.path} cannot be copied: the copy {what}', 'use a bag whose topics '
+        raise InputError(f'{path} cannot be copied: the copy {what}', 'use a bag whose topics '
                          'have valid names, types and formats') from err
     if found != written:
-        raise InputError(f'{bag.path}: the copy holds {found} of {written} messages, expected '
+        raise InputError(f'{path}: the copy holds {found} of {written} messages, expected '
                          'all', 'check the disk, and try again')
 
 
-def _writer(bag: Bag, target: Path, suffix: str) -> Any:
+def _writer(imus: _Imus, target: Path, suffix: str) -> Any:
     """Return a writer for the kind of bag that the suffix names, otherwise for the same kind."""
-    if not bag.ros2:
+    if not imus.ros2:
         from rosbags.rosbag1 import Writer as Writer1
 
         return Writer1(target)
-    from rosbags.rosbag2 import (
-        CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer as Writer2)
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
     mcap = suffix == '.mcap' or (suffix != '.db3' and (
-        bag.path.suffix == '.mcap' or any(bag.path.glob('*.mcap*'))))
-    writer = Writer2(target, version=9, storage_plugin=StoragePlugin.MCAP if mcap
-                     else StoragePlugin.SQLITE3)
-    mode = bag.reader.compression_mode if isinstance(bag.reader, Reader) else None
+        imus.path.suffix == '.mcap' or any(imus.path.glob('*.mcap*'))))
+    writer = Writer(target, version=9, storage_plugin=StoragePlugin.MCAP if mcap
+                    else StoragePlugin.SQLITE3)
+    mode = imus.known['compression']
     if mode and suffix not in ('.mcap', '.db3'):  # a lone file has no metadata to tell it
         writer.set_compression(CompressionMode[mode.upper()], CompressionFormat.ZSTD)
     return writer
 
 
-def _added(bag: Bag, writer: Any) -> dict[int, Any]:
-    """Add the connections of a bag to a writer; return the new ones by the id of the old ones."""
-    about = _about_in_2 if bag.ros2 else _about_in_1
-    made: dict[tuple[Any, ...], Any] = {}
-    outputs = {}
-    for each in bag.reader.connections:
-        key = (each.topic, each.msgtype, each.msgdef.data, str(each.ext))
+def _added(imus: _Imus, writer: Any) -> list[Any]:
+    """Add the connections of a bag to a writer, and return the new ones."""
+    made: dict[str, Any] = {}
+    outputs = []
+    for each in imus.known['connections']:
+        key = str([each[name] for name in ('topic', 'msgtype', 'msgdef', 'ext')])
         if key not in made:
-            made[key] = writer.add_connection(each.topic, each.msgtype, **about(each))
-        outputs[id(each)] = made[key]
+            made[key] = writer.add_connection(each['topic'], each['msgtype'], **(
+                _about_in_2 if imus.ros2 else _about_in_1)(**each))
+        outputs.append(made[key])
     return outputs
 
 
-def _about_in_1(connection: Any) -> dict[str, Any]:
-    return {'msgdef': connection.msgdef.data, 'md5sum': connection.digest,
-            'callerid': connection.ext.callerid, 'latching': connection.ext.latching}
+def _about_in_1(msgdef: str, digest: str, ext: Sequence[Any], **_: str) -> dict[str, Any]:
+    return {'msgdef': msgdef, 'md5sum': digest, **dict(zip(('callerid', 'latching'), ext))}
 
 
-def _about_in_2(connection: Any) -> dict[str, Any]:
+def _about_in_2(msgtype: str, msgdef: str, digest: str, ext: Sequence[Any], **_: str
+                ) -> dict[str, Any]:
+    from rosbags.rosbag2.metadata import parse_qos
     from rosbags.typesys import get_typestore, Stores
 
-    msgdef, digest, msgtype = connection.msgdef.data, connection.digest, connection.msgtype
     known = get_typestore(Stores.ROS2_JAZZY)
     if msgtype in known.types:
         msgdef = msgdef or known.generate_msgdef(msgtype, ros_version=2)[0]
         digest = digest or known.hash_rihs01(msgtype)
-    return {'msgdef': msgdef, 'rihs01': digest or _NO_HASH,
-            'serialization_format': connection.ext.serialization_format,
-            'offered_qos_profiles': connection.ext.offered_qos_profiles}
+    return {'msgdef': msgdef, 'rihs01': digest or _NO_HASH, 'serialization_format': ext[0],
+            'offered_qos_profiles': parse_qos(ext[1])}

@@ -212,7 +212,7 @@ KINDS: dict[str, tuple[Callable[[], Make], Read]] = {
     'yaml': (lambda: damage('yaml'), _used),
     'poses': (lambda: damage('poses'), _fitted),
     **{kind: (lambda kind=kind: damage(kind), read_bag if kind in BAGS else _log)  # type: ignore
-       for kind in ('csv', 'ulg', 'bin', *BAGS)},
+       for kind in ('csv', 'ulg', 'bin', 'container', *BAGS)},
     'table': (lambda: inputs.random_table, _log),
     'tree': (inputs.random_trees, _used),
     'messages': (inputs.random_messages, read_bag),

@@ -19,6 +19,8 @@ from accel_calib.stored import write_calibration
 import bag_files as bags
 from inside import read_log
 import numpy as np
+import test_containers as containers
+import test_formats as formats
 import yaml
 
 STORED = Path(__file__).parents[1] / 'data'
@@ -76,6 +78,8 @@ def sound(kind: str) -> list[Files]:
             return _calibrations(folder)
         if kind == 'poses':
             return _tables(folder)
+        if kind == 'container':
+            return _containers(folder)
         suffixes = {'csv': ('.csv', '.log', '.txt'), 'ulg': ('.ulg',), 'bin': ('.bin',)}[kind]
         paths = sorted(path for path in LOGS.rglob('*') if path.suffix in suffixes)
         return [_beginning(path, folder) if kind == 'csv' else files_at(path) for path in paths]
@@ -84,6 +88,20 @@ def sound(kind: str) -> list[Files]:
 def _bag(make: str, folder: Path) -> Files:
     (folder / make).mkdir()
     return files_at(bags.MAKES[make](folder / make))
+
+
+def _containers(folder: Path) -> list[Files]:
+    """Return packed text, arrays, archives and sheets."""
+    of_text = ('.json', '.jsonl', '.log', '.lp', '.txt', '.csv')
+    paths = [formats.written(folder, name, content) for name, content, _ in formats.READ
+             if not name.endswith(of_text)]
+    tables, reading = containers.tables_of('phyphox')
+    few = {name: '\n'.join(text.splitlines()[:300]) for name, text in tables.items()}
+    for kind in (*containers.PACKED, 'xlsx'):
+        (folder / kind).mkdir()
+        paths.append(containers.written(kind, folder / kind, few))
+    paths.append(containers.matlab(folder, {'acc': reading[:300], 'gyr': reading[:300]}))
+    return [files_at(path) for path in (*paths, LOGS / 'phyphox' / 'export.xls')]
 
 
 def _calibrations(folder: Path) -> list[Files]:
