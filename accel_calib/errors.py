@@ -57,6 +57,10 @@ class InputError(AccelCalibError):
     """A file, a column or a number is not valid."""
 
 
+class OwnEffectError(InputError):
+    """A function of a user fails, or returns what is no function of its arguments."""
+
+
 @contextmanager
 def needing(libraries: str, what: str) -> Iterator[None]:
     """Turn the ImportError of an optional library, or of several, into an InputError."""

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from .closed_form import along_quadrics
 from .equations import belief_in, Equations, equations, measured, variance_factor
-from ..effects import CHANGES, fitted_places, LADDER, Model, parameter_names, with_vector
+from ..effects import CHANGES, Context, fitted_places, LADDER, Model, parameter_names, with_vector
 from ..errors import RefusedFitError
 from ..geometry import orientations_of, unit
 from ..table import Poses
@@ -205,6 +205,11 @@ class Fit:
     def noise_known(self) -> bool:
         """Whether the noise of the poses was measured."""
         return self.equations.noise_known
+
+    @property
+    def context(self) -> Context:
+        """Columns of the poses, with the force u of the equations [g]."""
+        return {**self.poses_g.columns, 'force': self.equations.force}
 
     @cached_property
     def dof(self) -> int:
@@ -484,7 +489,9 @@ def _bounds(start: Model, poses_g: Poses) -> tuple[Floats, Floats]:
             size = np.max(np.linalg.norm(basis[:, :, :len(effect.parameters)], axis=1), axis=0)
             most = effect.plausible_g / np.maximum(size, effect.plausible_g * _SMALLEST)
             limits[:, :len(most)] = -most, most
-            places = fitted_places(effect, effect.split(values)[1])
+            if effect.bounds:
+                limits[:, len(most):] = np.transpose(effect.bounds)
+            places = () if effect.bounds else fitted_places(effect, effect.split(values)[1])
             shapes = [*effect.shapes(poses_g.columns)] if effect.shapes and places else []
             for k in places:
                 tried = [shape[k] for shape in shapes if k in fitted_places(effect, shape)]

@@ -249,10 +249,10 @@ def _is_coincidence(found: Found, name: str) -> bool:
 
     """
     state, values, entry = found.final, found.final.model.values, effect_named(name)
-    if entry.factor is None or name not in values or (found.walk is None and state.is_noise):
+    if not entry.needs or name not in values or (found.walk is None and state.is_noise):
         return False
     shape = entry.split(values[name])[1]
-    factor, = factors_of(name, [shape], state.poses_g.columns)
+    factor, = factors_of(name, [shape], state.fit.context)
     factors = _at_other_times(factor, state.poses_g)
     if len(factors) < 2:
         return False
