@@ -23,7 +23,7 @@ from accel_calib.calibrate import Calibration, fit_poses
 from accel_calib.effects import effect_named
 from accel_calib.geometry import unit
 from accel_calib.session import Step
-from accel_calib.table import Floats
+from accel_calib.table import Floats, Poses
 from accel_calib.units import units_of
 from inside import COMMAND, main, Model, model_with, OVER_THE_SPHERE, predict, spread_directions
 import numpy as np
@@ -112,6 +112,13 @@ def context_of(rng: np.random.Generator, count: int) -> dict[str, Floats]:
 def random_directions(count: int, rng: np.random.Generator) -> Floats:
     """Return (count, 3) unit vectors, uniformly distributed over the sphere."""
     return unit(rng.normal(size=(count, 3)))
+
+
+def changed(poses: Poses, rows: Any, by: Callable[[Any], Any], key: str = 'reading') -> Poses:
+    """Return poses with these rows of a column changed."""
+    values = poses[key].copy()
+    values[rows] = by(values[rows])
+    return poses.with_columns(**{key: values})
 
 
 def rms(values: Any, axis: int | None = None) -> Any:

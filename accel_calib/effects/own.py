@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from inspect import Parameter, signature
 from itertools import product
+import math
 from pathlib import Path
 import re
 from typing import Any
@@ -27,7 +28,7 @@ from .model import terms_of
 from .thermal import rate_at
 from ..disk import check_regular
 from ..errors import AccelCalibError, InputError, OwnEffectError
-from ..table import column_of, Floats, is_quantity
+from ..table import column_of, Floats, is_quantity, read_only
 
 _NAME = re.compile(r'[a-z][a-z0-9_]{0,63}')
 
@@ -37,22 +38,21 @@ _SLOPE_ERROR = 1e-3
 """Forces at which the slope of a form is compared with differences, and the largest error."""
 
 _SAME = 1e-9
-"""Relative difference between two answers of a function that count as the same."""
+"""Relative difference of two answers of a function that count as the same."""
 
 _ALL = 'all'
 _COLUMNS = ('force', 'previous', 'rate', 'std', 'supply_voltage', 'temperature',
             'temperature_rate', 'time')
 """Columns that a function can take, besides quantities."""
 
-_NEEDS = {'force': (), 'temperature_rate': ('time', 'temperature')}
+_NEEDS: dict[str, tuple[str, ...]] = {'force': (), 'temperature_rate': ('time', 'temperature')}
 """Columns from which a column is computed."""
 
 _TRIED = 60
 _WIDE = 10.0
-_SPREAD = (0.618034, 0.414214, 0.732051)
+_STEPS = (0.618034, 0.414214, 0.732051)
 """Number of starts of the constants; ratio of bounds above which they are spread by ratio; steps
 of the further constants, irrational, so that few starts cover their ranges."""
-
 
 _LONGEST = 300
 """Longest quoted message of an error [characters]."""
@@ -78,20 +78,19 @@ class OwnEffect:
     unit : str
         Unit of k.
     form, slope : callable, optional
-        Function of the force u along the axis [g], and its derivative by u, which is only
-        compared with the form. Both take and return arrays. Without a form, it is 1.
+        Function of the force u along the axis [g], from array to array, and its derivative by u,
+        with which the form is compared. Without a form, it is 1.
     variable : str
         Column x that the effect is a function of; empty: of the force alone.
     change : callable
         Function of this column, from array to array; by default x itself.
     function : callable, optional
-        Function whose arguments are named as columns or as `constants`. Columns are (n,) arrays,
-        or (n, 3) for ``force`` [g], ``previous``, ``rate`` [rad/s] and ``std`` [g]; any other
-        column of numbers is one, too. It returns an (n,) array, or (n, 3) for each axis.
-    constants : mapping of str to (float, float)
-        Lowest and highest value of each constant of `function`, which the fit finds.
-    starts : mapping of str to sequence of float
-        Values of constants from which the search starts; by default they are spread evenly.
+        Function whose arguments have the names of columns and of `constants`. A column is an (n,)
+        array, or (n, 3) for ``force`` [g], ``previous``, ``rate`` [rad/s] and ``std`` [g]; any
+        other column of numbers can be used, too. It returns an (n,) array, or (n, 3) by axis.
+    constants : mapping of str to sequence of float
+        Lowest and highest value of each constant of `function`, which the fit finds. Further
+        numbers are values from which the search starts; by default they are spread evenly.
     axes : str
         The axes that have the effect, each with its k, such as ``xy``; ``all``: with one k.
 
@@ -111,141 +110,124 @@ class OwnEffect:
     variable: str = ''
     change: Callable[[Any], Any] = _same
     function: Callable[..., Any] | None = None
-    constants: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    starts: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    constants: Mapping[str, Sequence[float]] = field(default_factory=dict)
     axes: str = ''.join(AXES)
 
     def __post_init__(self) -> None:
-        columns = ', '.join(_COLUMNS)
-        if not _NAME.fullmatch(str(self.name)):
-            raise self._refused('has no usable name, expected small letters, digits and _')
-        if not 0.0 < self.typical < np.inf:
-            raise self._refused(f'has the typical size {self.typical}, expected a number above 0')
-        if self.function is not None and (self.form is not None or self.variable):
-            raise self._refused('has a function beside a form or a variable, expected one of them')
-        if self.axes != _ALL and self.axes not in ('x', 'y', 'z', 'xy', 'xz', 'yz', 'xyz'):
-            raise self._refused(f'has the axes {self.axes!r}, expected such as xyz, xy, z, or all')
-        for key in self._columns:
-            if key not in _COLUMNS and not is_quantity(key):
-                raise self._refused(f'is a function of {key!r}, expected one of {columns}, the '
-                                    'name of another column, or a constant')
-        for name, bounds in self.constants.items():
-            if name not in self._arguments or name in (*_COLUMNS, *AXES, _ALL):
-                raise self._refused(f'has a constant {name!r}, which is no argument of its '
-                                    'function, or the name of a column')
-            if len(bounds) != 2 or not -np.inf < bounds[0] < bounds[1] < np.inf:
-                raise self._refused(f'has the bounds {bounds} of {name}, expected two numbers, '
-                                    'the lower one first')
-        for name, starts in self.starts.items():
-            low, high = self.constants.get(name, (np.nan, np.nan))
-            if not len(starts) or not all(low <= start <= high for start in starts):
-                raise self._refused(f'has the starts {starts} of {name}, expected numbers within '
-                                    'the bounds of a constant')
-        if self.function is not None and not self._columns:
-            raise self._refused(f'has a function of no column, expected one of {columns}, or '
-                                'the name of another column')
-        if len(self.constants) > len(_SPREAD) + 1:
-            raise self._refused(f'has {len(self.constants)} constants, expected at most 4')
-        if self.slope is not None:
-            self._check_slope(self.slope)
+        simple, taken = self.form is not None or self.variable, (*_COLUMNS, *AXES, _ALL)
+        self._check(bool(_NAME.fullmatch(self.name)),
+                    'has no usable name, expected small letters, digits and _')
+        self._check(0.0 < self.typical < np.inf,
+                    f'has the typical size {self.typical}, expected a number above 0')
+        self._check(not (self.function and simple), 'has both a function and a form or variable, '
+                    'expected one of them')
+        self._check(self.slope is None or self.form is not None,
+                    'has only one of form and slope, expected both or the form')
+        self._check(self.axes == _ALL or [*self.axes] == [each for each in AXES
+                                                          if each in self.axes] != [],
+                    f'has the axes {self.axes!r}, expected axes such as xyz or z, or all')
+        for name in self._columns:
+            self._check(name in _COLUMNS or is_quantity(name), f'is a function of {name!r}, '
+                        f'expected a constant, one of {", ".join(_COLUMNS)}, or another column')
+        self._check(self.function is None or len(self._columns) > 0,
+                    'has a function without a column, expected an argument such as temperature')
+        self._check(len(self.constants) <= len(_STEPS) + 1, 'has too many constants, expected 4')
+        for name, numbers in self.constants.items():
+            self._check(name in self._arguments and name not in taken, 'has a constant '
+                        f'{name!r}, expected an argument of its function that is no column')
+            self._check(len(numbers) > 1 and -np.inf < numbers[0] < numbers[1] < np.inf
+                        and all(numbers[0] <= start <= numbers[1] for start in numbers[2:]),
+                        f'has {numbers} for {name}, expected the lowest and the highest value, '
+                        'then starts between them')
+        if self.form is not None and self.slope is not None:
+            above, below, slope = (self._guarded(what, function, (_PROBED_G + step,))[:, 0]
+                                   for what, function, step in (
+                ('form', self.form, _PROBE_STEP_G), ('form', self.form, -_PROBE_STEP_G),
+                ('slope', lambda u: np.broadcast_to(self.slope(u), u.shape), 0.0)))
+            real = (above - below) / (2.0 * _PROBE_STEP_G)
+            error = np.abs(slope - real) / np.maximum(np.abs(real), 1.0)
+            worst = int(np.argmax(error))
+            self._check(bool(error[worst] < _SLOPE_ERROR), f'has the slope {slope[worst]:.4g} at '
+                        f'{_PROBED_G[worst]:.3g} g, expected {real[worst]:.4g}, the derivative of '
+                        'its form')
 
-    def _check_slope(self, slope: Callable[[Any], Any]) -> None:
-        if self.form is None:
-            raise self._refused('has only one of form and slope, expected both or the form')
-        near = np.stack([_PROBED_G + _PROBE_STEP_G, _PROBED_G - _PROBE_STEP_G])
-        above, below = self._guarded('form', self.form, [near.ravel()]).reshape(near.shape)
-        real = (above - below) / (2.0 * _PROBE_STEP_G)
-        stated = self._guarded('slope', lambda u: np.broadcast_to(slope(u), u.shape),
-                               [_PROBED_G])[:, 0]
-        error = np.abs(stated - real) / np.maximum(np.abs(real), 1.0)
-        worst = int(np.argmax(error))
-        if not error[worst] < _SLOPE_ERROR:
-            raise self._refused(f'has the slope {stated[worst]:.4g} at {_PROBED_G[worst]:.3g} g, '
-                                f'expected {real[worst]:.4g}, the derivative of its form')
+    def _check(self, is_sound: bool, else_: str) -> None:
+        if not is_sound:
+            raise InputError(f'the effect {self.name!r} {else_}', 'correct its definition')
 
-    def _refused(self, what: str) -> InputError:
-        return InputError(f'the effect {self.name!r} {what}', 'correct its definition')
+    @cached_property
+    def _calls(self) -> tuple[tuple[str, Callable[..., Any], tuple[str, ...]], ...]:
+        """Return the factors of the effect: kind, function, names of its arguments."""
+        if self.function is None:
+            return tuple((what, function, (name,)) for what, function, name in (
+                ('form', self.form, 'force'), ('change', self.change, self.variable))
+                if function is not None and name)
+        try:
+            given = signature(self.function).parameters.values()
+        except (TypeError, ValueError):
+            given = ()
+        names = tuple(each.name for each in given if each.default is Parameter.empty and each.kind
+                      in (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD))
+        return (('function', self.function, names),)
 
     @cached_property
     def _arguments(self) -> tuple[str, ...]:
-        """Names of columns and constants, in the order in which `function` takes them."""
-        if self.function is None:
-            return (*(() if self.form is None else ('force',)), *filter(None, [self.variable]))
-        try:
-            given = signature(self.function).parameters.values()
-        except (TypeError, ValueError) as err:
-            raise self._refused('has a function whose arguments have no names, expected '
-                                ' such as lambda temperature: …') from err
-        required = [each for each in given if each.default is Parameter.empty]
-        if any(each.kind not in (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
-               for each in required):
-            raise self._refused('has a function with arguments that cannot be given by position, '
-                                'expected names of columns and constants')
-        return tuple(each.name for each in required)
+        return tuple(name for _, _, names in self._calls for name in names)
 
     @cached_property
     def _columns(self) -> tuple[str, ...]:
         return tuple(name for name in self._arguments if name not in self.constants)
 
+    @cached_property
+    def _places(self) -> list[int]:
+        return [k for k, axis in enumerate(AXES) if axis in self.axes or self.axes == _ALL]
+
     def entry(self) -> Effect:
         """Return the effect as the catalogue has them."""
-        names = (_ALL,) if self.axes == _ALL else tuple(self.axes)
         over = tuple(key for key in self._columns if key != 'force')
         return Effect(
-            self.words, 'own effect', names, self.unit, self.typical, 0.5,
-            tuple(Term(0 if self.axes == _ALL else k, axis, ONE)
-                  for k, axis in enumerate(self._places)),
+            self.words, 'own effect', (_ALL,) if self.axes == _ALL else tuple(self.axes),
+            self.unit, self.typical, 0.5,
+            tuple(Term(k * (self.axes != _ALL), axis, ONE) for k, axis in enumerate(self._places)),
             self._factor if self._columns else None,
             tuple(dict.fromkeys(need for key in over for need in _NEEDS.get(key, (key,)))),
             tuple(self.constants), self._shapes if self.constants else None, over=over,
-            bounds=tuple(self.constants.values()), of_force='force' in self._columns, own=True)
-
-    @cached_property
-    def _places(self) -> list[int]:
-        """Return the axes of the terms."""
-        return [0, 1, 2] if self.axes == _ALL else [AXES.index(axis) for axis in self.axes]
+            bounds=tuple((low, high) for low, high, *_ in self.constants.values()),
+            of_force='force' in self._columns, own=True)
 
     def _shapes(self, context: Context) -> Iterator[Floats]:
-        """Yield values of the constants: each of the starts, with the others spread evenly."""
-        given = [*product(*self.starts.values())]
-        free = [name for name in self.constants if name not in self.starts]
-        count = max(_TRIED // len(given), 1) if free else 1
-        shares = np.outer(np.arange(count) + 0.5, [1.0 / count, *_SPREAD]) % 1.0
-        for share, start in product(shares.tolist(), given):
-            chosen = dict(zip(self.starts, start))
-            for name, part in zip(free, share):
-                low, high = self.constants[name]
-                chosen[name] = (low * (high / low) ** part if 0.0 < low * _WIDE < high
-                                else low + part * (high - low))
-            yield np.array([chosen[name] for name in self.constants], float)
+        """Yield values of the constants: the starts, with the other constants spread evenly."""
+        given = [starts or [None] for _, _, *starts in self.constants.values()]
+        count = max(_TRIED // math.prod(map(len, given)), 1) if [None] in given else 1
+        for row, starts in product(range(count), product(*given)):
+            steps, shape = iter((1.0 / count, *_STEPS)), []
+            for start, (low, high, *_) in zip(starts, self.constants.values(), strict=True):
+                if start is None:
+                    share = (row + 0.5) * next(steps) % 1.0
+                    start = (low * (high / low) ** share if 0.0 < low * _WIDE < high
+                             else low + share * (high - low))
+                shape.append(start)
+            yield np.array(shape, float)
 
     def _factor(self, context: Mapping[str, Any], shape: Floats) -> Any:
-        """Return the function of a context, as `form.Factor`; NaN where its context is NaN."""
-        one = np.ndim(context[self._columns[0]]) < self._width(self._columns[0])
-        known: dict[str, Any] = dict(zip(self.constants, map(float, shape)))
+        """Return the product of the functions, as `form.Factor`; NaN where an argument is NaN."""
+        known: dict[str, Any] = dict(zip(self.constants, shape.tolist()
+                                         if isinstance(shape, np.ndarray) else shape))
         for key in self._columns:
             value = rate_at(context) if key == 'temperature_rate' else context[key]
-            known[key] = np.array(value, float, ndmin=self._width(key))
-        if self.function is not None:
-            found = self._guarded('function', self.function, [*map(known.get, self._arguments)])
-        else:
-            found = np.ones((1, 1))
-            if self.form is not None:
-                found = self._guarded('form', self.form, [known['force'].ravel()]).reshape(-1, 3)
-            if self.variable:
-                found = found * self._guarded('change', self.change, [known[self.variable]])
+            width = 2 if key == 'force' or len(column_of(key).names) > 1 else 1
+            one = np.ndim(value) < width
+            known[key] = np.array(value, float, ndmin=width)
+        found = np.ones((1, 1))
+        for what, function, names in self._calls:
+            found = found * self._guarded(what, function, [known[name] for name in names])
         factor = found[:, 0] if found.shape[1] == 1 else found.T[self._places]
         return factor[..., 0] if one else factor
 
-    def _width(self, key: str) -> int:
-        """Return the number of dimensions of a column."""
-        return 2 if key == 'force' or len(column_of(key).names) > 1 else 1
-
     def _guarded(self, what: str, function: Callable[..., Any], given: Sequence[Any]) -> Floats:
         """Return the (n, 1) or (n, 3) numbers of a function, NaN where an argument is NaN."""
-        columns = [each for each in given if isinstance(each, np.ndarray)]
-        sound = np.all([np.isfinite(each.reshape(len(each), -1)).all(axis=1) for each in columns],
-                       axis=0)
+        sound = np.all([np.isfinite(each).reshape(len(each), -1).all(axis=1)
+                        for each in given if np.ndim(each)], axis=0)
         if not np.any(sound):
             return np.full((len(sound), 1), np.nan)
         rows = _rows(given, sound)
@@ -259,12 +241,11 @@ class OwnEffect:
         return found
 
     def _called(self, what: str, function: Callable[..., Any], given: Sequence[Any]) -> Floats:
-        """Return the finite (n, 1) or (n, 3) numbers of a function for copies of these rows."""
-        copies = _rows(given, slice(None))
-        count = max(np.shape(each)[0] for each in copies if np.ndim(each))
+        """Return the finite (n, 1) or (n, 3) numbers of a function for these rows."""
+        count = next(len(each) for each in given if np.ndim(each))
         try:
             with np.errstate(all='ignore'):  # what is not finite is refused below
-                found = function(*copies)
+                found = function(*given)
                 values = np.asarray(found)
         except (Exception, SystemExit) as err:
             raise self._wrong(what, f'raises {_said(err)}', 'numbers, and its arguments '
@@ -277,7 +258,7 @@ class OwnEffect:
         values = np.array(values.reshape(count, -1), float)
         lacking = np.flatnonzero(~np.isfinite(values).all(axis=1))
         if len(lacking):
-            shown = ', '.join(map(str, _rows(copies, lacking[0])))
+            shown = ', '.join(map(str, _rows(given, lacking[0])))
             raise self._wrong(what, f'returns {values[lacking[0]]} for {shown}', 'a finite number')
         return values
 
@@ -288,10 +269,7 @@ class OwnEffect:
 
 def _rows(given: Sequence[Any], which: Any) -> list[Any]:
     """Return read-only copies of rows of the columns among arguments, and the constants."""
-    found = [np.array(each[which]) if np.ndim(each) else each for each in given]
-    for each in found:
-        np.asarray(each).setflags(write=False)
-    return found
+    return [read_only(np.array(each[which])) if np.ndim(each) else each for each in given]
 
 
 def _said(error: BaseException) -> str:

@@ -51,6 +51,9 @@ _NEAR_ENOUGH = 1e-3
 """If rounding or a kink prevents this, this part of the cost per degree of freedom is accepted: a
 change of the values by 0.03 standard deviations."""
 
+_NEAR_A_KINK = 0.1
+"""The same for constants of own effects, which may end where a pose is at a kink: 0.3 of them."""
+
 _ROUNDING = 1e-20
 """Decreases of the cost below this are rounding errors [noise²]."""
 
@@ -325,6 +328,7 @@ class Point:
     columns: Floats
     source: Any = None
     singular: float = _SINGULAR_STEP
+    near: float = _NEAR_ENOUGH
 
     @cached_property
     def normal(self) -> Floats:
@@ -384,15 +388,15 @@ def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upp
             break
         else:
             damping = max(10.0 * damping, first)
-    if not _is_near(now, _step(now, _free(values, now, lower, upper), 0.0)[1]):
+    if not _is_near(now, _step(now, _free(values, now, lower, upper), 0.0)[1], now.near):
         raise NotConvergedError
     return values, now
 
 
-def _is_near(now: Point, fall: float) -> bool:
+def _is_near(now: Point, fall: float, enough: float = _NEAR_ENOUGH) -> bool:
     """Return whether the predicted fall of the cost is negligible beside the noise."""
     spare = max(len(now.residual) - len(now.downhill), 1)
-    return fall <= _NEAR_ENOUGH * now.cost / spare + _ROUNDING
+    return fall <= enough * now.cost / spare + _ROUNDING
 
 
 def _free(values: Floats, now: Point, lower: Floats, upper: Floats) -> NDArray[np.bool_]:
@@ -452,6 +456,8 @@ def estimate(start: Model, poses_g: Poses, prior: Prior | None = None,
     if not np.any(start.fitted):
         return judge(start, poses_g)
     fitted, vector, poses = start.fitted, start.vector.copy(), measured(poses_g)
+    kinked = any(effect.own and effect.shape for effect in start.terms.effects)
+    enough = _NEAR_A_KINK if kinked else _NEAR_ENOUGH
     weight = np.sqrt(1.0 if factor is None else factor)
 
     def model_at(values: Floats) -> Model:
@@ -463,7 +469,7 @@ def estimate(start: Model, poses_g: Poses, prior: Prior | None = None,
         near = equations(model, poses)
         columns = near.columns(model)[:, fitted]
         if prior is None:
-            return Point(near.residual, columns, near)
+            return Point(near.residual, columns, near, near=enough)
         rows = prior.whitening * weight
         return Point(np.concatenate([near.residual, rows @ (prior.mean - values)]),
                      np.vstack([columns, rows]), near, _SINGULAR_WITH_PRIOR)
