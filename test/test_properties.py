@@ -290,7 +290,7 @@ def test_two_poses_that_alone_check_each_other_are_both_named(seed, wrong, knock
        axis=st.integers(0, 2), value=st.sampled_from([np.nan, np.inf, -np.inf]))
 def test_a_number_that_is_not_finite_is_refused_with_its_row(
         errors, count, seed, place, axis, value):
-    readings = poses_of(errors, count, seed, (0.0, 0.0, 0.0)).reading
+    readings = poses_of(errors, count, seed, (0.0, 0.0, 0.0)).reading.copy()
     readings[int(place * count), axis] = value
     with pytest.raises(InputError, match=f'row {int(place * count) + 1} of ax, ay, az'):
         ac.fit(readings, units='g', model='10')

@@ -113,8 +113,10 @@ class OneReading:
     def _spread_rows(self) -> tuple[Floats, Floats]:
         """Return the (m, t) monomial of each row of the basis, and its (t, 3 p) part of a root."""
         model, covariance = self._calibration.model, self._calibration.covariance
-        variances, axes = np.linalg.eigh(covariance)
-        root = model.rows.to_value.T @ (axes * np.sqrt(np.maximum(variances, 0.0)))
+        size = np.sqrt(np.maximum(np.diag(covariance), 1e-300))  # constants have other units
+        variances, axes = np.linalg.eigh(covariance / size / size[:, np.newaxis])
+        root = model.rows.to_value.T @ (axes * size[:, np.newaxis] * np.sqrt(
+            np.maximum(variances, 0.0)))
         of_axis = np.eye(3)[model.rows.axis][:, :, np.newaxis]
         monomials = np.take(model.terms.monomials, model.rows.place)
         return (np.equal.outer(self.monomials, monomials).astype(float),
