@@ -198,8 +198,7 @@ class Table(Record):
     Parameters
     ----------
     columns : mapping of str to array
-        Keys of `COLUMNS`, and quantities; each array has n rows and is read-only. ``reading`` is
-        always present.
+        Keys of `COLUMNS`, and quantities: read-only arrays of n rows, always with ``reading``.
     row : (n,) array of int
         Row numbers in the source, from 1.
     units : {'m/s2', 'g', 'native', ''}

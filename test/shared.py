@@ -114,11 +114,11 @@ def random_directions(count: int, rng: np.random.Generator) -> Floats:
     return unit(rng.normal(size=(count, 3)))
 
 
-def changed(poses: Poses, rows: Any, by: Callable[[Any], Any], key: str = 'reading') -> Poses:
-    """Return poses with these rows of a column changed."""
-    values = poses[key].copy()
-    values[rows] = by(values[rows])
-    return poses.with_columns(**{key: values})
+def changed(poses: Poses, rows: Any, times: Any = 1.0, plus: Any = 0.0) -> Poses:
+    """Return poses with the readings of these rows changed."""
+    reading = poses.reading.copy()
+    reading[rows] = reading[rows] * times + plus
+    return poses.with_columns(reading=reading)
 
 
 def rms(values: Any, axis: int | None = None) -> Any:

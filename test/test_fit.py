@@ -75,7 +75,7 @@ def test_a_knocked_pose_is_named_and_left_out(count, limit_mg):
     errors = []
     for seed in range(10):
         model, poses = simulated(seed, count)
-        poses = changed(poses, 4, lambda each: each * (0.95, 1.05)[seed % 2])
+        poses = changed(poses, 4, (0.95, 1.05)[seed % 2])
         calibration = fit_poses(poses, G, model='10')
         assert [rejected.row for rejected in calibration.rejected] == [5]
         errors.append(error_mg(calibration, model))
@@ -240,7 +240,9 @@ def test_badly_placed_orientations_are_replaced_by_a_fit_of_the_norm(model):
 
 def test_one_misplaced_pose_is_named_and_does_not_rotate_the_axes():
     truth, poses = placed(3, 0.0)
-    poses = changed(poses, 4, lambda each: rotation_from_rpy(0.0, 0.0, 0.2) @ each, 'reference')
+    reference = poses['reference'].copy()
+    reference[4] = rotation_from_rpy(0.0, 0.0, 0.2) @ reference[4]
+    poses = poses.with_columns(reference=reference)
     calibration = fit_poses(poses, G)
     assert ' row 5 (' in calibration.reason
     np.testing.assert_allclose(calibration.correct(predict(truth, np.eye(3), {})), np.eye(3),
@@ -369,7 +371,7 @@ def knocked(seed, count, bad):
     rng = np.random.default_rng(seed)
     poses = simulate_poses(sensor(rng), spread_directions(count), rng)
     by = 1.0 + rng.choice([-0.05, 0.05], (bad, 1))
-    return changed(poses, slice(bad), lambda each: each * by)
+    return changed(poses, slice(bad), by)
 
 
 def left_out(poses):
@@ -394,7 +396,7 @@ def test_all_knocked_poses_are_left_out_but_at_most_a_quarter(count):
     poses = knocked(7, count, count // 5)
     assert left_out(poses) == set(poses.row[:count // 5].tolist())
     # A third agrees with another offset.
-    shifted = changed(knocked(8, count, 0), np.s_[::3], lambda each: each + [0.1, 0.0, 0.0])
+    shifted = changed(knocked(8, count, 0), np.s_[::3], plus=[0.1, 0.0, 0.0])
     assert len(left_out(shifted)) <= count // 4
 
 
@@ -403,7 +405,7 @@ def test_all_knocked_poses_are_left_out_but_at_most_a_quarter(count):
     ('10', 1000, np.linspace(0.6, 0.95, 240))])
 def test_the_poses_that_agree_best_are_those_that_are_not_knocked(name, count, factors):
     poses, bad = simulated(19, count, *MODELS[name].effects)[1], len(factors)
-    poses = changed(poses, slice(bad), lambda each: (each.T * factors).T)
+    poses = changed(poses, slice(bad), np.array(factors)[:, np.newaxis])
     assert list(agreeing(name, poses, bad)) == list(range(bad, count))
 
 
@@ -429,7 +431,7 @@ def test_a_pose_that_explains_a_third_of_the_mistake_of_another_is_found(seed, w
     up = random_directions(around, rng)
     close = unit(up[[3]] + 0.15 * rng.normal(size=(beside, 3)))
     poses = simulate_poses(sensor(rng), np.vstack([up, close]), rng)
-    poses = changed(poses, wrong, lambda each: each * 1.03)
+    poses = changed(poses, wrong, 1.03)
     kept = np.delete(np.arange(len(poses)), wrong)
     fit = estimate(start_of('10', poses.take(kept).reading), poses.take(kept))
     assert list(look_alikes(fit, kept, np.array([wrong]), poses))
@@ -451,7 +453,7 @@ def test_copies_of_a_pose_make_no_pose_an_outlier(copies, lacks, apart):
         poses = simulate_poses(model, spread_directions(12), rng, noise_g=1e-4, context={
             'temperature': rng.uniform(15.0, 45.0, 12)}).without_columns(*lacks)
         by = apart * rng.normal(size=(len(copies), 3))
-        again = changed(with_copies(poses, copies), slice(12, None), lambda each: each + by)
+        again = changed(with_copies(poses, copies), slice(12, None), plus=by)
         once, found = (fit_poses(each, G, model='10') for each in (poses, again))
         assert {each.row for each in found.rejected if each.row <= 12} == {
             each.row for each in once.rejected}
@@ -464,7 +466,7 @@ def test_copies_of_a_pose_make_no_pose_an_outlier(copies, lacks, apart):
 def test_readings_that_were_measured_again_are_not_copies():
     poses = knocked(5, 18, 0)
     by = np.random.default_rng(5).normal(size=(18, 3)) * 3e-4
-    again = changed(with_copies(poses, range(18)), slice(18, None), lambda each: each + by)
+    again = changed(with_copies(poses, range(18)), slice(18, None), plus=by)
     once, found = (fit_poses(each, G, model='10') for each in (poses, again))
     assert not [line for line in found.warnings if 'equal' in line]
     assert np.trace(found.covariance) < 0.75 * np.trace(once.covariance)
@@ -487,7 +489,7 @@ def test_a_region_that_only_outliers_cover_is_named():
     up = spread_directions(60)
     up = np.vstack([up[up[:, 2] < -0.2], [[0.0, 0.0, 1.0]]])
     poses = ac.simulate({'offset': [0.03, -0.02, 0.04]}, directions=up, units='g')
-    poses = changed(poses, -1, lambda each: each * 1.2)
+    poses = changed(poses, -1, 1.2)
     found = fit_poses(poses, G, model='10')
     assert [each.row for each in found.rejected] == [len(up)]
     assert has(found.noted, 'not_covered')

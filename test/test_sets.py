@@ -30,8 +30,7 @@ def poses_of(hidden, seed=1, knocked=(), oriented=False, **context):
     model = Model({**sensor(rng).values,
                    **{name: np.array(values, float) for name, values in hidden.items()}})
     poses = simulate_poses(model, directions, rng, context=known)
-    poses = changed(poses, list(knocked), lambda each: each + 0.02 * directions[list(knocked)])
-    return poses
+    return changed(poses, list(knocked), plus=0.02 * directions[list(knocked)])
 
 
 def problem_of(poses, *names):

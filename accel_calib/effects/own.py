@@ -58,16 +58,10 @@ _LONGEST = 300
 """Longest quoted message of an error [characters]."""
 
 
-def _same(u: Any) -> Any:
-    return u
-
-
 @dataclass(frozen=True)
 class OwnEffect:
     """
-    An effect of a user: each axis reads k times a function more, with one k for each axis.
-
-    The function is `function`, or in the simple form, form(u) · change(x).
+    An effect of a user: each axis reads k · function more, or k · form(u) · change(x).
 
     Parameters
     ----------
@@ -79,20 +73,20 @@ class OwnEffect:
         Unit of k.
     form, slope : callable, optional
         Function of the force u along the axis [g], from array to array, and its derivative by u,
-        with which the form is compared. Without a form, it is 1.
+        with which it is compared; by default 1.
     variable : str
         Column x that the effect is a function of; empty: of the force alone.
     change : callable
         Function of this column, from array to array; by default x itself.
     function : callable, optional
-        Function whose arguments have the names of columns and of `constants`. A column is an (n,)
-        array, or (n, 3) for ``force`` [g], ``previous``, ``rate`` [rad/s] and ``std`` [g]; any
-        other column of numbers can be used, too. It returns an (n,) array, or (n, 3) by axis.
+        Function whose arguments are named as columns or `constants`. A column is an (n,) array,
+        or (n, 3) for ``force`` [g], ``previous``, ``rate`` [rad/s] and ``std`` [g]. It returns an
+        (n,) array, or (n, 3) by axis.
     constants : mapping of str to sequence of float
-        Lowest and highest value of each constant of `function`, which the fit finds. Further
-        numbers are values from which the search starts; by default they are spread evenly.
+        Lowest and highest value of each constant, which the fit finds; then starts of the search,
+        by default spread evenly.
     axes : str
-        The axes that have the effect, each with its k, such as ``xy``; ``all``: with one k.
+        The axes with the effect, each with its k, such as ``xy``; ``all``: with one k.
 
     Raises
     ------
@@ -108,7 +102,7 @@ class OwnEffect:
     form: Callable[[Any], Any] | None = None
     slope: Callable[[Any], Any] | None = None
     variable: str = ''
-    change: Callable[[Any], Any] = _same
+    change: Callable[[Any], Any] | None = None
     function: Callable[..., Any] | None = None
     constants: Mapping[str, Sequence[float]] = field(default_factory=dict)
     axes: str = ''.join(AXES)
@@ -160,8 +154,8 @@ class OwnEffect:
         """Return the factors of the effect: kind, function, names of its arguments."""
         if self.function is None:
             return tuple((what, function, (name,)) for what, function, name in (
-                ('form', self.form, 'force'), ('change', self.change, self.variable))
-                if function is not None and name)
+                ('form', self.form, 'force'),
+                ('change', self.change or np.positive, self.variable)) if function and name)
         try:
             given = signature(self.function).parameters.values()
         except (TypeError, ValueError):
@@ -182,7 +176,7 @@ class OwnEffect:
     def _places(self) -> list[int]:
         return [k for k, axis in enumerate(AXES) if axis in self.axes or self.axes == _ALL]
 
-    def entry(self) -> Effect:
+    def _entry(self) -> Effect:
         """Return the effect as the catalogue has them."""
         over = tuple(key for key in self._columns if key != 'force')
         return Effect(
@@ -289,7 +283,7 @@ def know(effects: Iterable[OwnEffect]) -> tuple[str, ...]:
     for own in effects:
         if is_effect(own.name) and own.name not in OWN:
             raise InputError(f'the effect {own.name!r} is in the catalogue', 'choose another name')
-        OWN[own.name] = own.entry()
+        OWN[own.name] = own._entry()
         names.append(own.name)
     effect_named.cache_clear()
     parameter_names.cache_clear()

@@ -87,8 +87,8 @@ class Found:
     random walk of the offset; they are listed at the end of a search. `taken_back` are effects
     that were removed because they explain too little, or no more than by chance. Poses at the
     limit of the sensor are left out: they are `clipped`, and `with_clipped` is the base fitted to
-    all poses. `grid_g` is the step of the grid of the readings [g], if it is relevant. `also` are the
-    names of own effects that were asked for.
+    all poses. `grid_g` is the step of the grid of the readings [g], if it is relevant. `also`
+    are the names of own effects that were asked for.
 
     """
 
