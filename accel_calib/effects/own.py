@@ -15,7 +15,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from inspect import Parameter, signature
 from itertools import product
-import math
 from pathlib import Path
 import re
 from typing import Any
@@ -45,7 +44,7 @@ _COLUMNS = ('force', 'previous', 'rate', 'std', 'supply_voltage', 'temperature',
             'temperature_rate', 'time')
 """Columns that a function can take, besides quantities."""
 
-_NEEDS: dict[str, tuple[str, ...]] = {'force': (), 'temperature_rate': ('time', 'temperature')}
+_NEEDS = {'temperature_rate': ('time', 'temperature')}
 """Columns from which a column is computed."""
 
 _TRIED = 60
@@ -157,9 +156,9 @@ class OwnEffect:
                 ('form', self.form, 'force'),
                 ('change', self.change or np.positive, self.variable)) if function and name)
         try:
-            given = signature(self.function).parameters.values()
+            given = [*signature(self.function).parameters.values()]
         except (TypeError, ValueError):
-            given = ()
+            given = []
         names = tuple(each.name for each in given if each.default is Parameter.empty and each.kind
                       in (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD))
         return (('function', self.function, names),)
@@ -191,17 +190,15 @@ class OwnEffect:
 
     def _shapes(self, context: Context) -> Iterator[Floats]:
         """Yield values of the constants: the starts, with the other constants spread evenly."""
-        given = [starts or [None] for _, _, *starts in self.constants.values()]
-        count = max(_TRIED // math.prod(map(len, given)), 1) if [None] in given else 1
-        for row, starts in product(range(count), product(*given)):
-            steps, shape = iter((1.0 / count, *_STEPS)), []
-            for start, (low, high, *_) in zip(starts, self.constants.values(), strict=True):
-                if start is None:
-                    share = (row + 0.5) * next(steps) % 1.0
-                    start = (low * (high / low) ** share if 0.0 < low * _WIDE < high
-                             else low + share * (high - low))
-                shape.append(start)
-            yield np.array(shape, float)
+        numbers = self.constants.values()
+        low, high = np.array([[*each[:2]] for each in numbers], float).T
+        starts = np.array([*product(*(each[2:] or (np.nan,) for each in numbers))], float)
+        count = max(_TRIED // len(starts), 1) if np.any(np.isnan(starts)) else 1
+        share = np.outer(np.arange(count) + 0.5, [1.0 / count, *_STEPS][:len(low)]) % 1.0
+        wide = (low > 0.0) & (high > _WIDE * low)
+        first, last = np.where(wide, [low, high], 1.0)
+        spread = np.where(wide, first * (last / first) ** share, low + share * (high - low))
+        yield from np.where(np.isnan(starts), spread[:, np.newaxis], starts).reshape(-1, len(low))
 
     def _factor(self, context: Mapping[str, Any], shape: Floats) -> Any:
         """Return the product of the functions, as `form.Factor`; NaN where an argument is NaN."""

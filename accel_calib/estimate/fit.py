@@ -51,8 +51,8 @@ _NEAR_ENOUGH = 1e-3
 """If rounding or a kink prevents this, this part of the cost per degree of freedom is accepted: a
 change of the values by 0.03 standard deviations."""
 
-_NEAR_A_KINK = 0.1
-"""The same for constants of own effects, which may end where a pose is at a kink: 0.3 of them."""
+_AT_A_KINK = 1e3
+"""Damping at which constants of own effects are held: they end where a pose is at a kink."""
 
 _ROUNDING = 1e-20
 """Decreases of the cost below this are rounding errors [noise²]."""
@@ -322,13 +322,18 @@ class NotConvergedError(RefusedFitError):
 
 @dataclass(frozen=True)
 class Point:
-    """The (m,) residuals and (m, q) derivative at some values, and the object they are from."""
+    """
+    The (m,) residuals and (m, q) derivative at some values, and the object they are from.
+
+    The residuals may have kinks as functions of the values in the (q,) mask `kinked`.
+
+    """
 
     residual: Floats
     columns: Floats
     source: Any = None
     singular: float = _SINGULAR_STEP
-    near: float = _NEAR_ENOUGH
+    kinked: NDArray[np.bool_] | None = None
 
     @cached_property
     def normal(self) -> Floats:
@@ -368,11 +373,14 @@ def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upp
 
     values = np.clip(start, lower, upper)
     now, damping = tried_at(values), 0.0
+    held = np.zeros(len(values), bool)
     first = _FIRST_DAMPING * now.singular
     if not np.isfinite(now.cost):
         raise NotConvergedError
     for _ in range(_MOST_STEPS):
-        free = _free(values, now, lower, upper)
+        if now.kinked is not None and damping > _AT_A_KINK and not np.all(held == now.kinked):
+            held, damping = now.kinked, 0.0
+        free = _free(values, now, lower, upper) & ~held
         full, fall = _step(now, free, 0.0)
         if fall <= _NEAR * now.cost or fall < _ROUNDING or damping > _LARGEST_DAMPING:
             break
@@ -388,15 +396,15 @@ def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upp
             break
         else:
             damping = max(10.0 * damping, first)
-    if not _is_near(now, _step(now, _free(values, now, lower, upper), 0.0)[1], now.near):
+    if not _is_near(now, _step(now, _free(values, now, lower, upper) & ~held, 0.0)[1]):
         raise NotConvergedError
     return values, now
 
 
-def _is_near(now: Point, fall: float, enough: float = _NEAR_ENOUGH) -> bool:
+def _is_near(now: Point, fall: float) -> bool:
     """Return whether the predicted fall of the cost is negligible beside the noise."""
     spare = max(len(now.residual) - len(now.downhill), 1)
-    return fall <= enough * now.cost / spare + _ROUNDING
+    return fall <= _NEAR_ENOUGH * now.cost / spare + _ROUNDING
 
 
 def _free(values: Floats, now: Point, lower: Floats, upper: Floats) -> NDArray[np.bool_]:
@@ -456,8 +464,8 @@ def estimate(start: Model, poses_g: Poses, prior: Prior | None = None,
     if not np.any(start.fitted):
         return judge(start, poses_g)
     fitted, vector, poses = start.fitted, start.vector.copy(), measured(poses_g)
-    kinked = any(effect.own and effect.shape for effect in start.terms.effects)
-    enough = _NEAR_A_KINK if kinked else _NEAR_ENOUGH
+    kinked = np.array([effect.own and part in effect.shape for effect in start.terms.effects
+                       for part in effect.values], bool)[fitted]
     weight = np.sqrt(1.0 if factor is None else factor)
 
     def model_at(values: Floats) -> Model:
@@ -469,7 +477,7 @@ def estimate(start: Model, poses_g: Poses, prior: Prior | None = None,
         near = equations(model, poses)
         columns = near.columns(model)[:, fitted]
         if prior is None:
-            return Point(near.residual, columns, near, near=enough)
+            return Point(near.residual, columns, near, kinked=kinked)
         rows = prior.whitening * weight
         return Point(np.concatenate([near.residual, rows @ (prior.mean - values)]),
                      np.vstack([columns, rows]), near, _SINGULAR_WITH_PRIOR)
