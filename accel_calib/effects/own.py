@@ -223,6 +223,8 @@ class OwnEffect:
             return np.full((len(sound), 1), np.nan)
         rows = _rows(given, sound)
         values = self._called(what, function, rows)
+        if len(sound) == 1:  # a message, for which a second answer takes too long
+            return values
         again = self._called(what, function, _rows(rows, slice(None, None, 2)))
         if not np.allclose(again, values[::2], _SAME, _SAME * float(np.max(np.abs(values)))):
             raise self._wrong(what, 'returns other numbers for the same rows in another call',

@@ -378,8 +378,7 @@ def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upp
     if not np.isfinite(now.cost):
         raise NotConvergedError
     for _ in range(_MOST_STEPS):
-        if now.kinked is not None and damping > _AT_A_KINK and not np.all(held == now.kinked):
-            held, damping = now.kinked, 0.0
+        held, damping = _held(now, held, damping)
         free = _free(values, now, lower, upper) & ~held
         full, fall = _step(now, free, 0.0)
         if fall <= _NEAR * now.cost or fall < _ROUNDING or damping > _LARGEST_DAMPING:
@@ -399,6 +398,14 @@ def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upp
     if not _is_near(now, _step(now, _free(values, now, lower, upper) & ~held, 0.0)[1]):
         raise NotConvergedError
     return values, now
+
+
+def _held(now: Point, held: NDArray[np.bool_], damping: float
+          ) -> tuple[NDArray[np.bool_], float]:
+    """Return the values that are held, at a kink those of `Point.kinked`, and the damping."""
+    if now.kinked is None or damping <= _AT_A_KINK or np.all(held == now.kinked):
+        return held, damping
+    return now.kinked, 0.0
 
 
 def _is_near(now: Point, fall: float) -> bool:
