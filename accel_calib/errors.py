@@ -61,6 +61,10 @@ class DamagedLogError(InputError):
     """A library cannot read a log."""
 
 
+class OwnEffectError(InputError):
+    """A function of a user fails, or returns what is no function of its arguments."""
+
+
 @contextmanager
 def needing(libraries: str, what: str) -> Iterator[None]:
     """Turn the ImportError of an optional library, or of several, into an InputError."""

@@ -104,6 +104,13 @@ def column_of(key: str) -> Column:
     return COLUMNS.get(key) or Column((key,), '', key.replace('_', ' '))
 
 
+def read_only(values: NDArray[Any]) -> NDArray[Any]:
+    """Return a view of an array through which it cannot be changed."""
+    found = values.view()
+    found.setflags(write=False)
+    return found
+
+
 class Record:
     """
     Base of frozen records with arrays, which are equal if all values that they compare are.
@@ -191,7 +198,7 @@ class Table(Record):
     Parameters
     ----------
     columns : mapping of str to array
-        Keys of `COLUMNS`, and quantities; each array has n rows. ``reading`` is always present.
+        Keys of `COLUMNS`, and quantities: read-only arrays of n rows, always with ``reading``.
     row : (n,) array of int
         Row numbers in the source, from 1.
     units : {'m/s2', 'g', 'native', ''}
@@ -215,6 +222,8 @@ class Table(Record):
     def __post_init__(self) -> None:
         if 'reading' not in self.columns:
             raise ValueError('the table has no readings, expected the column reading')
+        object.__setattr__(self, 'columns', {key: read_only(values)
+                                             for key, values in self.columns.items()})
         for key, values in self.columns.items():
             width = len(column_of(key).names)
             shape = (len(self.row),) if width == 1 else (len(self.row), width)

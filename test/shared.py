@@ -23,7 +23,7 @@ from accel_calib.calibrate import Calibration, fit_poses
 from accel_calib.effects import effect_named
 from accel_calib.geometry import unit
 from accel_calib.session import Step
-from accel_calib.table import Floats
+from accel_calib.table import Floats, Poses
 from accel_calib.units import units_of
 from inside import COMMAND, main, Model, model_with, OVER_THE_SPHERE, predict, spread_directions
 import numpy as np
@@ -112,6 +112,13 @@ def context_of(rng: np.random.Generator, count: int) -> dict[str, Floats]:
 def random_directions(count: int, rng: np.random.Generator) -> Floats:
     """Return (count, 3) unit vectors, uniformly distributed over the sphere."""
     return unit(rng.normal(size=(count, 3)))
+
+
+def changed(poses: Poses, rows: Any, times: Any = 1.0, plus: Any = 0.0) -> Poses:
+    """Return poses with the readings of these rows changed."""
+    reading = poses.reading.copy()
+    reading[rows] = reading[rows] * times + plus
+    return poses.with_columns(reading=reading)
 
 
 def rms(values: Any, axis: int | None = None) -> Any:

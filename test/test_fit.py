@@ -22,7 +22,7 @@ from inside import (
     spread_directions, unit)
 import numpy as np
 import pytest
-from shared import error_mg, G, random_directions, sensor
+from shared import changed, error_mg, G, random_directions, sensor
 
 
 def simulated(seed, count, *effects, known=False):
@@ -75,7 +75,7 @@ def test_a_knocked_pose_is_named_and_left_out(count, limit_mg):
     errors = []
     for seed in range(10):
         model, poses = simulated(seed, count)
-        poses.reading[4] *= (0.95, 1.05)[seed % 2]
+        poses = changed(poses, 4, (0.95, 1.05)[seed % 2])
         calibration = fit_poses(poses, G, model='10')
         assert [rejected.row for rejected in calibration.rejected] == [5]
         errors.append(error_mg(calibration, model))
@@ -240,7 +240,9 @@ def test_badly_placed_orientations_are_replaced_by_a_fit_of_the_norm(model):
 
 def test_one_misplaced_pose_is_named_and_does_not_rotate_the_axes():
     truth, poses = placed(3, 0.0)
-    poses['reference'][4] = rotation_from_rpy(0.0, 0.0, 0.2) @ poses['reference'][4]
+    reference = poses['reference'].copy()
+    reference[4] = rotation_from_rpy(0.0, 0.0, 0.2) @ reference[4]
+    poses = poses.with_columns(reference=reference)
     calibration = fit_poses(poses, G)
     assert ' row 5 (' in calibration.reason
     np.testing.assert_allclose(calibration.correct(predict(truth, np.eye(3), {})), np.eye(3),
@@ -368,8 +370,8 @@ def knocked(seed, count, bad):
     """Return poses of which the first `bad` are shifted by 50 mg, outwards or inwards."""
     rng = np.random.default_rng(seed)
     poses = simulate_poses(sensor(rng), spread_directions(count), rng)
-    poses.reading[:bad] *= 1.0 + rng.choice([-0.05, 0.05], (bad, 1))
-    return poses
+    by = 1.0 + rng.choice([-0.05, 0.05], (bad, 1))
+    return changed(poses, slice(bad), by)
 
 
 def left_out(poses):
@@ -393,9 +395,9 @@ def test_clean_poses_are_kept_even_if_their_noise_is_underestimated(count, state
 def test_all_knocked_poses_are_left_out_but_at_most_a_quarter(count):
     poses = knocked(7, count, count // 5)
     assert left_out(poses) == set(poses.row[:count // 5].tolist())
-    changed = knocked(8, count, 0)
-    changed.reading[::3] += [0.1, 0.0, 0.0]  # a third agrees with another offset
-    assert len(left_out(changed)) <= count // 4
+    # A third agrees with another offset.
+    shifted = changed(knocked(8, count, 0), np.s_[::3], plus=[0.1, 0.0, 0.0])
+    assert len(left_out(shifted)) <= count // 4
 
 
 @pytest.mark.parametrize(('name', 'count', 'factors'), [
@@ -403,7 +405,7 @@ def test_all_knocked_poses_are_left_out_but_at_most_a_quarter(count):
     ('10', 1000, np.linspace(0.6, 0.95, 240))])
 def test_the_poses_that_agree_best_are_those_that_are_not_knocked(name, count, factors):
     poses, bad = simulated(19, count, *MODELS[name].effects)[1], len(factors)
-    poses.reading[:bad] *= np.array(factors)[:, np.newaxis]
+    poses = changed(poses, slice(bad), np.array(factors)[:, np.newaxis])
     assert list(agreeing(name, poses, bad)) == list(range(bad, count))
 
 
@@ -429,7 +431,7 @@ def test_a_pose_that_explains_a_third_of_the_mistake_of_another_is_found(seed, w
     up = random_directions(around, rng)
     close = unit(up[[3]] + 0.15 * rng.normal(size=(beside, 3)))
     poses = simulate_poses(sensor(rng), np.vstack([up, close]), rng)
-    poses.reading[wrong] *= 1.03
+    poses = changed(poses, wrong, 1.03)
     kept = np.delete(np.arange(len(poses)), wrong)
     fit = estimate(start_of('10', poses.take(kept).reading), poses.take(kept))
     assert list(look_alikes(fit, kept, np.array([wrong]), poses))
@@ -450,8 +452,8 @@ def test_copies_of_a_pose_make_no_pose_an_outlier(copies, lacks, apart):
         model = Model({**sensor(rng).values, 'offset_temperature': 0.0005 * rng.normal(size=3)})
         poses = simulate_poses(model, spread_directions(12), rng, noise_g=1e-4, context={
             'temperature': rng.uniform(15.0, 45.0, 12)}).without_columns(*lacks)
-        again = with_copies(poses, copies)
-        again.reading[12:] += apart * rng.normal(size=(len(copies), 3))
+        by = apart * rng.normal(size=(len(copies), 3))
+        again = changed(with_copies(poses, copies), slice(12, None), plus=by)
         once, found = (fit_poses(each, G, model='10') for each in (poses, again))
         assert {each.row for each in found.rejected if each.row <= 12} == {
             each.row for each in once.rejected}
@@ -463,8 +465,8 @@ def test_copies_of_a_pose_make_no_pose_an_outlier(copies, lacks, apart):
 
 def test_readings_that_were_measured_again_are_not_copies():
     poses = knocked(5, 18, 0)
-    again = with_copies(poses, range(18))
-    again.reading[18:] += np.random.default_rng(5).normal(size=(18, 3)) * 3e-4
+    by = np.random.default_rng(5).normal(size=(18, 3)) * 3e-4
+    again = changed(with_copies(poses, range(18)), slice(18, None), plus=by)
     once, found = (fit_poses(each, G, model='10') for each in (poses, again))
     assert not [line for line in found.warnings if 'equal' in line]
     assert np.trace(found.covariance) < 0.75 * np.trace(once.covariance)
@@ -487,7 +489,7 @@ def test_a_region_that_only_outliers_cover_is_named():
     up = spread_directions(60)
     up = np.vstack([up[up[:, 2] < -0.2], [[0.0, 0.0, 1.0]]])
     poses = ac.simulate({'offset': [0.03, -0.02, 0.04]}, directions=up, units='g')
-    poses.reading[-1] *= 1.2
+    poses = changed(poses, -1, 1.2)
     found = fit_poses(poses, G, model='10')
     assert [each.row for each in found.rejected] == [len(up)]
     assert has(found.noted, 'not_covered')

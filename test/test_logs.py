@@ -38,7 +38,7 @@ def samples(seed: int = 1, per_g: float = G, *, poses: int = 12, rest: int = 200
         model_with({'offset': OFFSET, 'axis_gain': GAIN - 1.0}),
         spread_directions(poses)[rng.permutation(poses)], rng, noise_g=NOISE, rate_hz=RATE_HZ,
         dwell=rest / RATE_HZ, turn=turn / RATE_HZ, gyro_noise=0.001)
-    return {'time': made['time'], 'reading': per_g * made.reading, 'rate': made['rate']}
+    return {'time': made['time'].copy(), 'reading': per_g * made.reading, 'rate': made['rate']}
 
 
 def rows_of(*columns: np.ndarray | list[str], digits: str = '.9g') -> list[list[str]]:

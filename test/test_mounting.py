@@ -12,7 +12,7 @@ from inside import (
     with_heading, with_heading_of)
 import numpy as np
 import pytest
-from shared import G, random_directions, sensor
+from shared import changed, G, random_directions, sensor
 
 
 @pytest.mark.parametrize('frame', FRAMES)
@@ -97,5 +97,5 @@ def test_correct_wiring_causes_no_warning(seed):
 
 def test_a_knocked_pose_does_not_hide_the_fault():
     poses = wired(np.diag([1.0, -1, 1]))
-    poses.reading[3] += 0.3
+    poses = changed(poses, 3, plus=0.3)
     assert 'y reads -y' in fit_poses(poses, G).warnings[0]

@@ -8,6 +8,9 @@ The poses of columns are simulated with numpy alone.
 
 """
 
+from dataclasses import replace
+import re
+
 import accel_calib as ac
 from accel_calib.effects import AXES, by_axis, Effect, EFFECTS, ONE
 from accel_calib.errors import InputError
@@ -15,12 +18,12 @@ from accel_calib.logs import layout_of
 from accel_calib.messages import Rewriter
 from accel_calib.report import refinement_page
 from bag_files import header, IMU, imu
-from inside import COMMAND
+from inside import COMMAND, OneReading
 import numpy as np
 import pandas as pd
 import pytest
 from rosbags.typesys import get_typestore, Stores
-from shared import python, random_directions, refused, run, run_json, SENSOR
+from shared import python, random_directions, refused, run, run_json, run_snippets, SENSOR
 
 NEW = Effect('offset that grows with the cube of temperature', 'third-order TCO', AXES, 'g',
              0.005, 0.5, by_axis(ONE),
@@ -172,12 +175,132 @@ def test_an_own_effect_is_simulated_named_stored_and_needed(tmp_path, capsys):
 
 @pytest.mark.parametrize(('wrong', 'message'), [
     ({'name': 'Two Words'}, 'no usable name'), ({'typical': 0.0}, 'typical size 0'),
-    ({'form': np.square}, 'only one of form and slope'),
+    ({'slope': np.square}, 'only one of form and slope'), ({'axes': 'yx'}, "axes 'yx'"),
     ({'form': np.square, 'slope': lambda u: u}, 'the derivative of its form'),
-    ({'variable': 'std'}, "a function of 'std'")])
+    ({'variable': 'label'}, "a function of 'label'"),
+    ({'variable': 'time', 'function': lambda time: time}, 'both a function and'),
+    ({'function': lambda *columns: columns[0]}, 'without a column'),
+    ({'function': lambda a_z, knee: a_z, 'constants': {'kne': (1, 2)}}, "a constant 'kne'"),
+    *(({'function': lambda temperature, knee: temperature, 'constants': {'knee': numbers}},
+       'the lowest and the highest value') for numbers in [(2,), (2, 1), (0, np.inf), (0, 1, 2)])])
 def test_an_own_effect_that_cannot_work_is_refused_when_it_is_made(wrong, message):
     with pytest.raises(InputError, match=message):
         ac.Effect(**{'name': 'own', 'words': 'own effect', 'typical': 0.001, **wrong})
+
+
+BAD = {'1 / 0': 'raises ZeroDivisionError', 'None': 'returns NoneType', '"text"': 'returns str',
+       'x[1:]': 'of shape', 'np.log(x - 25)': r'returns \[nan', 'x + 1j': 'complex128',
+       'np.multiply(x, 2, out=x)': 'read-only',
+       'x * np.random.rand()': 'other numbers', 'x - np.mean(x)': 'other numbers',
+       'calls.append(1) or x * len(calls)': 'other numbers', 'sys.exit(0)': 'raises SystemExit',
+       'exec("raise ValueError(chr(10) + chr(27))")': 'raises ValueError:', '[x, 1]': 'raises'}
+
+
+@pytest.mark.parametrize('bad', BAD)
+@pytest.mark.parametrize('given', [
+    "variable='temperature', change=lambda x: {}", 'form=lambda x: {}',
+    "function=lambda temperature, k: (lambda x: {})(temperature), constants={{'k': (1, 2)}}"])
+def test_a_function_that_is_none_of_its_arguments_is_refused_in_one_line(
+        bad, given, tmp_path, capsys):
+    own, poses = tmp_path / 'own.py', still(np.random.default_rng(11), 30,
+                                            temperature=np.linspace(10.0, 40.0, 30))
+    poses.to_csv(tmp_path / 'poses.csv', index=False)
+    own.write_text('import sys\nimport accel_calib as ac\nimport numpy as np\ncalls = []\n'
+                   f'own = ac.Effect("own", "own effect", 0.01, {given.format(bad)})\n')
+    line = refused(capsys, 'refine', tmp_path / 'poses.csv', '--units', 'g', '--also', own)
+    assert "of the effect 'own'" in line
+    assert re.search(BAD[bad], line), line
+    assert line.strip().isprintable()
+
+
+def test_poses_are_read_only():
+    with pytest.raises(ValueError, match='read-only'):
+        ac.simulate().reading[0] = 0.0
+
+
+def turned(count, seed):
+    """Return directions, and the context of own effects in this order of poses."""
+    rng = np.random.default_rng([12, seed])
+    up = random_directions(count, rng)
+    back = np.diff(up, axis=0, prepend=up[:1])
+    previous = -back / np.maximum(np.linalg.norm(back, axis=1), 1e-9)[:, np.newaxis]
+    return up, {'temperature': rng.uniform(10.0, 50.0, count), 'previous': previous,
+                'since_turn': rng.uniform(3.0, 200.0, count), 'time': np.arange(count) * 30.0,
+                'motor_current': rng.uniform(0.0, 9.0, count), 'spin': rng.normal(size=count),
+                'supply_voltage': rng.uniform(3.0, 3.6, count)}
+
+
+FIELD = ac.Effect(
+    'field_across', 'field of the motor', typical=1e-3, axes='xz', unit='g/√A',
+    function=lambda motor_current, force, supply_voltage: (
+        (supply_voltage / 3.3 * np.sqrt(motor_current))[:, np.newaxis] * force[:, [1, 2, 0]]))
+COMMON = ac.Effect('spin_gain', 'gain that grows with the rate', typical=1e-3, axes='all',
+                   function=lambda force, spin: force * spin[:, np.newaxis] ** 2)
+TONE = ac.Effect(
+    'own_tone', 'periodic error', typical=1e-3,
+    function=lambda time, period, phase: np.sin(2.0 * np.pi * time / period + phase),
+    constants={'period': (200, 900), 'phase': (0, 3.1)})
+TRUTH = {'thermal_knee': [2e-4, -3e-4, 2.5e-4, 31.0], 'dead_band': [0.01, -0.008, 0.012, 0.12],
+         'turn_creep': [4e-3, -5e-3, 3e-3, 80.0], 'field_across': [4e-3, -3e-3],
+         'spin_gain': [1e-3], 'own_tone': [4e-3, -3e-3, 2e-3, 420.0, 1.0]}
+
+
+@pytest.fixture
+def own_effects(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = run_snippets('docs/effects.md')
+    return {each.name: each for each in (*names.values(), FIELD, COMMON, TONE)
+            if isinstance(each, ac.Effect)}
+
+
+@pytest.mark.parametrize('name', TRUTH)
+def test_an_own_effect_is_found_with_its_constants_stored_and_corrected(
+        name, own_effects, tmp_path):
+    own, (up, context) = own_effects[name], turned(72, 3)
+    poses = ac.simulate({**SENSOR, name: TRUTH[name]}, directions=up, seed=5, units='g',
+                        also=[own], **context)
+    found = ac.refine(poses, also=[own])
+    step, = found.steps
+    assert (found.verdict, step.effect) == ('explained', name)
+    errors = np.subtract([*step.parameters.values()], TRUTH[name])
+    deviations = np.array([*step.parameters_sd.values()])
+    assert np.all(deviations > 0.0)
+    assert np.all(np.abs(errors) < 4.0 * deviations)
+    assert own.words.capitalize() in refinement_page(found, 'poses')
+
+    found.calibration.save(tmp_path / 'calibration.yaml')
+    calibration = ac.load(tmp_path / 'calibration.yaml', also=[own])
+    assert calibration == found.calibration
+    forces = calibration.correct(poses.reading, context)
+    here, there = OneReading(calibration), calibration.force_covariance(forces, context)
+    for k in range(5):  # as the node does, one by one
+        at = here.at({key: values[k].tolist() for key, values in context.items()})
+        np.testing.assert_allclose(at.correct(*poses.reading[k].tolist()), forces[k], atol=1e-11)
+        np.testing.assert_allclose(np.ravel(at.with_spread(forces[k].tolist(), [0.0] * 9)),
+                                   there[k].ravel(), rtol=1e-6)
+    np.testing.assert_allclose(calibration.predict(forces, context), poses.reading, atol=1e-9)
+
+
+def test_firmware_has_what_depends_on_columns_and_is_refused_for_functions_of_the_force(
+        own_effects, capsys):
+    for name, status in (('thermal_knee', 0), ('dead_band', 2)):
+        up, context = turned(72, 4)
+        poses = ac.simulate({**SENSOR, name: TRUTH[name]}, directions=up, units='g',
+                            also=[own_effects[name]], **context)
+        ac.refine(poses, also=[own_effects[name]]).calibration.save('own.yaml')
+        assert run('export', 'own.yaml', '--to', 'c', '-o', 'own.h') == status
+        assert ('of the force (dead_band)' in capsys.readouterr().err) == (status == 2)
+
+
+def test_an_own_effect_that_cannot_be_tested_or_ends_at_a_bound_is_named(own_effects):
+    own, (up, context) = own_effects['thermal_knee'], turned(72, 5)
+    poses = ac.simulate({**SENSOR, own.name: TRUTH[own.name]}, directions=up, units='g',
+                        also=[own], **context)
+    narrow = replace(own, constants={'knee': (36, 45)})
+    assert [line for line in ac.refine(poses, also=[narrow]).advice
+            if 'its constant knee ends at its bound 36' in line]
+    lacking = ac.refine(poses.without_columns('since_turn'), also=[own_effects['turn_creep']])
+    assert dict(lacking.not_testable)['turn_creep'] == 'since_turn'
 
 
 def test_an_own_effect_does_not_hide_one_of_the_catalogue():
@@ -187,7 +310,8 @@ def test_an_own_effect_does_not_hide_one_of_the_catalogue():
 
 @pytest.mark.parametrize(('text', 'message'), [
     ('import accel_calib\n', 'defines no effect'), ('1 / 0\n', 'ZeroDivisionError'),
-    ('def\n', 'SyntaxError')])
+    ('def\n', 'SyntaxError'),
+    ('import sys\nsys.exit(0)\n', 'SystemExit: 0')])
 def test_a_file_without_own_effects_is_refused(text, message, tmp_path, capsys):
     (tmp_path / 'own.py').write_text(text)
     assert message in refused(capsys, 'refine', 'poses.csv', '--also', tmp_path / 'own.py')

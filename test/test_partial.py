@@ -18,7 +18,7 @@ from inside import (
     spread_directions, unit, with_vector)
 import numpy as np
 import pytest
-from shared import G, NATIVE, rms
+from shared import changed, G, NATIVE, rms
 
 UP, Z = spread_directions(200), np.array([[0.0, 0.0, 1.0]])
 SPREAD = np.sqrt(np.diag(common_sensors().covariance))
@@ -120,7 +120,7 @@ def test_clean_poses_are_kept_and_a_knocked_pose_is_left_out():
     for seed in sample(range(10), 5):
         model, poses = tilting((seed, 3), 9, 15.0)
         assert not fit_partial(poses, G).rejected
-        poses.reading[4] *= 1.05
+        poses = changed(poses, 4, 1.05)
         found = fit_partial(poses, G)
         assert [each.row for each in found.rejected] == [5]
         error, stated = errors(found, model, UP)
@@ -168,7 +168,7 @@ def test_native_readings_and_a_sensor_that_was_never_at_rest_are_refused(make):
 def test_a_reading_of_another_length_is_left_out_and_named():
     _, poses = tilting(10)
     expected = fit_partial(poses.take(poses.row != 3), G)
-    poses.reading[2] = 0.0
+    poses = changed(poses, 2, 0.0)
     found = fit_partial(poses, G)
     assert [each.row for each in found.rejected] == [3]
     assert ' 0 g' in found.rejected[0].reason

@@ -17,7 +17,7 @@ from inside import (
     spread_directions)
 import numpy as np
 import pytest
-from shared import context_of, G, random_directions, values_of
+from shared import changed, context_of, G, random_directions, values_of
 
 hypothesis = pytest.importorskip('hypothesis')
 st = pytest.importorskip('hypothesis.strategies')
@@ -129,7 +129,7 @@ def test_correct_undoes_a_saturation_below_its_limit(errors, limit, seed):
 @given(errors=ERRORS, count=COUNTS, seed=SEEDS, angles=ANGLES, knock=st.floats(-0.1, 0.1))
 def test_fit_does_not_depend_on_the_order_of_the_poses(model, errors, count, seed, angles, knock):
     poses = poses_of(errors, count, seed, angles, known=model == '12')
-    poses.reading[0] *= 1.0 + knock
+    poses = changed(poses, 0, 1.0 + knock)
     mixed = poses.take(np.random.default_rng(seed).permutation(count))  # rows keep their number
     expected = fit_poses(poses, G, model=model)
     found = fit_poses(mixed, G, model=model)
@@ -222,7 +222,7 @@ def error_of(calibration: Calibration, sensor: Model) -> float:
 def test_a_bad_row_does_not_move_the_result_silently(
         model, bad, errors, count, seed, angles, place):
     poses, row = poses_of(errors, count, seed, angles, known=model == '12'), int(place * count)
-    poses.reading[row] = BAD[bad](poses.reading[row])
+    poses = changed(poses, row, 0.0, BAD[bad](poses.reading[row]))
     try:
         found = fit_poses(poses, G, model=model)
     except RefusedFitError:
@@ -244,7 +244,7 @@ def is_silent(model, bad, seed):
     poses = poses_of(errors, int(rng.integers(*FEW)), seed, rng.uniform(-3.0, 3.0, 3),
                      known=model == '12')
     row = int(rng.integers(len(poses)))
-    poses.reading[row] = KNOCKED[bad](poses.reading[row])
+    poses = changed(poses, row, 0.0, KNOCKED[bad](poses.reading[row]))
     try:
         found = fit_poses(poses, G, model=model)
     except RefusedFitError:
@@ -277,7 +277,7 @@ def test_two_poses_that_alone_check_each_other_are_both_named(seed, wrong, knock
     up = np.vstack([np.eye(3), -np.eye(3)])[[0, 1, 2, 3, 4] * 3 + [5, 5]]
     sensor = model_with({'offset': np.array([0.03, -0.02, 0.04])})
     poses = simulate_poses(sensor, up, np.random.default_rng(seed), noise_g=1e-3)
-    poses.reading[wrong] *= 1.0 + knock
+    poses = changed(poses, wrong, 1.0 + knock)
     found = fit_poses(poses, G, model='7')
     doubt = next(each for each in found.noted if each.kind == 'outlier_not_certain')
     assert {16, 17} <= {*doubt.rows}
@@ -290,7 +290,7 @@ def test_two_poses_that_alone_check_each_other_are_both_named(seed, wrong, knock
        axis=st.integers(0, 2), value=st.sampled_from([np.nan, np.inf, -np.inf]))
 def test_a_number_that_is_not_finite_is_refused_with_its_row(
         errors, count, seed, place, axis, value):
-    readings = poses_of(errors, count, seed, (0.0, 0.0, 0.0)).reading
+    readings = poses_of(errors, count, seed, (0.0, 0.0, 0.0)).reading.copy()
     readings[int(place * count), axis] = value
     with pytest.raises(InputError, match=f'row {int(place * count) + 1} of ax, ay, az'):
         ac.fit(readings, units='g', model='10')

@@ -15,7 +15,7 @@ from inside import (
 import numpy as np
 import pytest
 from scipy.optimize import brentq
-from shared import random_directions, sensor
+from shared import changed, random_directions, sensor
 
 COUNT = 60
 BASE = ('offset', 'axis_gain', 'cross_axis')
@@ -30,8 +30,7 @@ def poses_of(hidden, seed=1, knocked=(), oriented=False, **context):
     model = Model({**sensor(rng).values,
                    **{name: np.array(values, float) for name, values in hidden.items()}})
     poses = simulate_poses(model, directions, rng, context=known)
-    poses.reading[list(knocked)] += 0.02 * directions[list(knocked)]
-    return poses
+    return changed(poses, list(knocked), plus=0.02 * directions[list(knocked)])
 
 
 def problem_of(poses, *names):

@@ -25,8 +25,8 @@ from numpy.typing import ArrayLike
 
 from .rest_noise import GyroBias, SampleNoise
 from ..effects import (
-    acting_temperature, AXES, Context, correct, Model, ModelForm, MODELS, parameter_names, predict,
-    rate_at, ThermalStream, variable_of)
+    acting_temperature, AXES, Context, correct, effect_named, Model, ModelForm, MODELS,
+    parameter_names, predict, rate_at, ThermalStream, variable_of)
 from ..errors import InputError, StoredCalibrationError
 from ..finding import Finding
 from ..geometry import over_axes, unit
@@ -595,7 +595,7 @@ class SampleContext:
         context = of_samples(known, count, model, self._thermal)
         self.lacking = ''
         if lacking := [key for key in model.neutral if key not in known]:
-            names = [name for name in model.effects if variable_of(name) in lacking]
+            names = [name for name in model.effects if {*effect_named(name).needs} & {*lacking}]
             self.lacking = (f'the samples have no {" and ".join(lacking)}: {" and ".join(names)} '
                             f'{"is" if len(names) == 1 else "are"} not corrected')
         for key, block in outside(self._calibration, context).items():

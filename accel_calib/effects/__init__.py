@@ -42,7 +42,7 @@ from .formula import formula_of
 from .model import (
     AtContext, check_context, CONVERGED_G, correct, EachShape, factors_of, LARGEST_FORCE_G,
     LARGEST_ITERATIONS, length_rows, linear_model, linear_values, Model, ModelForm, MODELS,
-    predict, reading_of, sensor_force, times, too_large, with_vector)
+    own_slope, predict, reading_of, sensor_force, times, too_large, with_vector)
 from .own import know, know_code, know_file, KNOWN_CODE, OwnEffect
 from .simulate import model_with, parse_effect, simulate_poses, simulate_recording, turn_between
 from .thermal import acting_temperature, rate_at, ThermalStream
@@ -57,6 +57,7 @@ __all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CHANGES', 'CONVERGED_G', 'COVARIATES',
            'difference', 'effect_named', 'empirical_name', 'empirical_parts', 'factors_of',
            'fitted_places', 'formula_of', 'included', 'is_effect', 'kind_of', 'know', 'know_code',
            'know_file', 'length_rows', 'linear_model', 'linear_values', 'model_with', 'modes_of',
-           'parameter_names', 'parse_effect', 'predict', 'rate_at', 'reading_of', 'sensor_force',
-           'simulate_poses', 'simulate_recording', 'times', 'too_large', 'turn_between', 'unit_of',
-           'value_unit', 'variable_of', 'variable_words', 'with_vector']
+           'own_slope', 'parameter_names', 'parse_effect', 'predict', 'rate_at', 'reading_of',
+           'sensor_force', 'simulate_poses', 'simulate_recording', 'times', 'too_large',
+           'turn_between', 'unit_of', 'value_unit', 'variable_of', 'variable_words',
+           'with_vector']

@@ -477,7 +477,7 @@ def value_unit(effect_name: str, value_name: str) -> tuple[str, float]:
         return '', 1.0
     effect, variable = effect_named(effect_name), variable_of(effect_name)
     if value_name not in effect.parameters:
-        return unit_of(variable) if variable else 's', 1.0
+        return unit_of(variable) if variable else '' if effect.own else 's', 1.0
     unit = curve_unit(effect_name) if kind_of(effect_name) == EMPIRICAL else effect.unit
     if value_name.endswith('_square'):
         unit = f'{unit}²'

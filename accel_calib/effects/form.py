@@ -3,7 +3,7 @@
 
 """The form of an effect: the sum of terms that `accel_calib.effects` describes."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any, Literal, NamedTuple
@@ -133,8 +133,7 @@ MONOMIALS: list[Monomial] = [
     *(monomial for zone in ZONES for monomial in zone.monomials()),
 ]
 """1; u_i; u_i²; u_i³; u_i|u_i|; |u_i|; u_x u_y, u_x u_z, u_y u_z; cos(k π (u_i + 1) / 2) for each
-k, constant beyond ±1 g; u_i P(c) for each of `ZONES`. The first four are affine. Those of a user's
-own effects follow."""
+k, constant beyond ±1 g; u_i P(c) for each of `ZONES`. The first four are affine."""
 
 ONE, FORCE, SQUARE, CUBE, ODD_SQUARE, SIZE, PRODUCT, WAVE = 0, 1, 4, 7, 10, 13, 16, 19
 ZONAL = WAVE + 3 * MODES
@@ -189,6 +188,8 @@ class Effect:
         Names of the s constants in which the effect is not linear; shapes that the search tries.
     usual : tuple of float
         Shape if none is stated, and the first that the search tries; empty: it must be stated.
+    bounds : tuple of (float, float)
+        Lowest and highest value of each shape constant; empty: those of `shapes`, widened.
     lagged : str
         Column of the temperature that acts, for the shape ``lag``, ``of_sensor``; else empty.
     family : {'', 'force', 'time'}
@@ -205,7 +206,9 @@ class Effect:
         (n, 3) readings, (p,) values -> (n, 3) readings, for an effect on the whole reading, which
         cannot be corrected.
     own : bool
-        Whether a user has defined the effect (`OwnEffect`).
+        Whether a user has defined the effect (`OwnEffect`). A fit changes all of its shape.
+    of_force : bool
+        Whether the factor is a function of the force, too: of the column ``force`` of its context.
     scales : bool
         Whether its first parameter k scales the gains of the other effects, too: it adds k W u.
 
@@ -223,6 +226,7 @@ class Effect:
     shape: tuple[str, ...] = ()
     shapes: Shapes | None = None
     usual: tuple[float, ...] = ()
+    bounds: tuple[tuple[float, float], ...] = ()
     over: tuple[str, ...] = ()
     lagged: str = ''
     family: Family = ''
@@ -232,6 +236,7 @@ class Effect:
     repeatable_g: float = np.inf
     output: Callable[[Floats, Floats], Floats] | None = None
     own: bool = False
+    of_force: bool = False
     scales: bool = False
 
     @cached_property
@@ -259,7 +264,7 @@ class Effect:
     @cached_property
     def bends(self) -> bool:
         """Whether the effect is not affine in the force."""
-        return any(term.monomial >= AFFINE for term in self.terms)
+        return self.of_force or any(term.monomial >= AFFINE for term in self.terms)
 
     def split(self, values: Floats) -> tuple[Floats, Floats]:
         """Split (p + s,) values into parameters and shape."""
@@ -291,25 +296,27 @@ class Effect:
 
 
 _FITTED_SHAPES = ('tau', 'lag')
-"""Shape constants that a fit changes; the others are found once from the data."""
+"""Shape constants of the catalogue that a fit changes; the others are found once."""
 
 _SHAPE_STEP = 1e-4
-"""Relative step of the numerical derivative by a shape constant; all others are analytic."""
+"""Step of the numerical derivative by a shape constant, relative to its size or its bounds."""
 
 
-def difference(factor: Factor, context: Context, shape: Floats, place: int) -> Floats:
-    """Return the numerical derivative of a factor by one shape constant."""
-    step = np.zeros(len(shape))
-    step[place] = _SHAPE_STEP * max(abs(shape[place]), 1.0)
-    change = factor(context, shape + step) - factor(context, shape - step)
-    return change / (2.0 * step[place])
+def difference(factor: Factor, context: Context, shape: Floats, place: int,
+               bounds: Sequence[tuple[float, float]] = ()) -> Floats:
+    """Return the numerical derivative of a factor by one shape constant, inside its bounds."""
+    low, high = bounds[place] if bounds else (-np.inf, np.inf)
+    step = _SHAPE_STEP * (high - low if bounds else max(abs(shape[place]), 1.0))
+    ends = np.array([shape, shape])
+    ends[:, place] = np.clip([shape[place] - step, shape[place] + step], low, high)
+    return (factor(context, ends[1]) - factor(context, ends[0])) / np.ptp(ends[:, place])
 
 
 def fitted_places(effect: Effect, shape: Floats) -> list[int]:
     """Return the indices of the shape constants that a fit changes: none at its usual value."""
     usual = dict(enumerate(effect.usual))
     return [place for place, name in enumerate(effect.shape)
-            if name in _FITTED_SHAPES and usual.get(place) != shape[place]]
+            if (effect.own or name in _FITTED_SHAPES) and usual.get(place) != shape[place]]
 
 
 def by_axis(first: int) -> tuple[Term, ...]:

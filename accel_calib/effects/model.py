@@ -14,7 +14,7 @@ readings are in g; `accel_calib.units` converts them.
 
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from itertools import accumulate
@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .catalogue import effect_named, EFFECTS, is_effect, PROCESSES
-from .form import AFFINE, Context, difference, Effect, Factor, fitted_places, FORCE, MONOMIALS, ONE
+from .form import AFFINE, Context, difference, Effect, fitted_places, FORCE, MONOMIALS, ONE
 from .thermal import Lag
 from ..errors import InputError
 from ..geometry import unit
@@ -53,6 +53,7 @@ class Terms:
 
     """
 
+    names: tuple[str, ...]
     effects: tuple[Effect, ...]
     parts: tuple[slice, ...]
     rows: tuple[slice, ...]
@@ -108,6 +109,11 @@ class Terms:
         """Whether all terms are independent of the context."""
         return all(effect.factor is None for effect in self.effects)
 
+    @cached_property
+    def of_force(self) -> tuple[str, ...]:
+        """Names of the own effects that are functions of the force, too."""
+        return tuple(name for name, effect in zip(self.names, self.effects) if effect.of_force)
+
     def monomials_at(self, u: Floats) -> Floats:
         """Return the (m, n) monomials of (n, 3) forces."""
         x, y, z = u.T
@@ -156,8 +162,8 @@ def terms_of(names: tuple[str, ...]) -> Terms:
     place, axis, value, weight = np.array([
         (used.index(term.monomial), term.axis, part.start + term.parameter, term.weight)
         for effect, part in zip(effects, parts) for term in effect.terms]).reshape(-1, 4).T
-    return Terms(effects, parts, rows, tuple(used), place.astype(np.intp), axis.astype(np.intp),
-                 value.astype(np.intp), weight)
+    return Terms(names, effects, parts, rows, tuple(used), place.astype(np.intp),
+                 axis.astype(np.intp), value.astype(np.intp), weight)
 
 
 def _consecutive(sizes: Iterable[int]) -> tuple[slice, ...]:
@@ -211,7 +217,8 @@ class AtContext:
     A model with its context fixed, for each of n poses or in common for all poses.
 
     W is (n, 3, 3) or (3, 3), V (n, 3) or (3,) [g]; `bend` (b, n) or (b, 1) are the coefficients of
-    the bending terms among `terms`.
+    the bending terms among `terms`. `own` returns what own effects of the force add to the reading
+    at (n, 3) forces, None: there are none.
 
     """
 
@@ -219,30 +226,37 @@ class AtContext:
     vec_v: Floats
     terms: Terms
     bend: Floats
+    own: Callable[[Floats], Floats] | None = None
+
+    @cached_property
+    def bends(self) -> bool:
+        """Whether the reading is not affine in the force."""
+        return bool(len(self.bend)) or self.own is not None
 
     def _bend(self, u: Floats) -> Floats:
-        """Return the (n, 3) reading that the bending terms add."""
+        """Return the (n, 3) reading beyond V + W u."""
         terms = self.terms
         values = terms.monomials_at(u)[terms.place[terms.bending]] * self.bend
-        return (terms.bends_to_axis @ values).T
+        found = (terms.bends_to_axis @ values).T
+        return found if self.own is None else found + self.own(u)
 
     def reading(self, u: Floats) -> Floats:
         """Return the (n, 3) reading for the (n, 3) force u in the sensor axes [g]."""
         found = self.vec_v + times(self.mat_w, u)
-        return found + self._bend(u) if len(self.bend) else found
+        return found + self._bend(u) if self.bends else found
 
     def slope(self, u: Floats) -> Floats:
         """Return the (n, 3, 3) derivative of the reading by the force u."""
         found = np.broadcast_to(self.mat_w, (len(u), 3, 3))
-        if not len(self.bend):
-            return found
-        terms = self.terms
-        parts = terms.gradients_at(u)[terms.place[terms.bending]] * self.bend[:, np.newaxis]
-        return found + np.einsum('it,tjn->nij', terms.bends_to_axis, parts)
+        if len(self.bend):
+            terms = self.terms
+            parts = terms.gradients_at(u)[terms.place[terms.bending]] * self.bend[:, np.newaxis]
+            found = found + np.einsum('it,tjn->nij', terms.bends_to_axis, parts)
+        return found if self.own is None else found + own_slope(self.own, u)
 
     def inverse_slope(self, u: Floats) -> Floats:
         """Return the inverse of `slope`, (n, 3, 3), or (3, 3) if it is the same for all poses."""
-        return np.linalg.inv(self.slope(u)) if len(self.bend) else self._inverse
+        return np.linalg.inv(self.slope(u)) if self.bends else self._inverse
 
     @cached_property
     def _inverse(self) -> Floats:
@@ -251,7 +265,7 @@ class AtContext:
     def force(self, reading: Floats) -> Floats:
         """Return the (n, 3) force u for a reading [g]; NaN where the iteration diverges."""
         affine = times(self._inverse, reading - self.vec_v)
-        if not len(self.bend):
+        if not self.bends:
             return affine
         u = affine
         for _ in range(LARGEST_ITERATIONS):
@@ -265,6 +279,16 @@ class AtContext:
         return u
 
 
+_FORCE_STEP_G = 1e-5
+"""Step of the numerical derivative of own effects by the force [g]."""
+
+
+def own_slope(own: Callable[[Floats], Floats], u: Floats) -> Floats:
+    """Return the (n, 3, 3) numerical derivative of a function of (n, 3) forces."""
+    return np.stack([own(u + step) - own(u - step) for step in _FORCE_STEP_G * _IDENTITY],
+                    axis=2) / (2.0 * _FORCE_STEP_G)
+
+
 def times(matrix: Floats, vectors: Floats) -> Floats:
     """Return matrix times vector for (n, 3) vectors and (3, 3) or (n, 3, 3) matrices."""
     if matrix.ndim == 2:
@@ -274,23 +298,24 @@ def times(matrix: Floats, vectors: Floats) -> Floats:
 
 class _Change(NamedTuple):
     """
-    A value that changes the factors of the terms `rows`: at a `place` of the shape of a factor.
+    A value that changes the factors of the terms `rows`: at a `place` of the shape of an effect.
 
-    Without a `factor`, it scales them by the term at `place`.
+    Without an `effect`, it scales them by the term at `place`.
 
     """
 
     rows: slice | Indices
     value: int
-    factor: Factor | None
+    effect: Effect | None
     shape: Floats
     place: int
 
     def of_factors(self, alone: Floats, scales: Floats, context: Context) -> Floats:
         """Return the derivative of the factors by the value; arguments from `Model`."""
-        if self.factor is None:
+        if self.effect is None or self.effect.factor is None:
             return alone[self.rows] * alone[self.place]
-        change = difference(self.factor, context, self.shape, self.place)
+        change = difference(self.effect.factor, context, self.shape, self.place,
+                            self.effect.bounds)
         return np.nan_to_num(change) * scales[self.rows]
 
 
@@ -353,7 +378,7 @@ class Model(Record):
     @cached_property
     def neutral(self) -> Mapping[str, float]:
         """Value of each quantity that counts as no change, where it is not recorded; NaN: none."""
-        return {key: float(np.mean(shape)) if len(shape) else np.nan
+        return {key: float(np.mean(shape)) if len(shape) and not effect.own else np.nan
                 for effect, shape in self._by_effect for key in effect.needs if is_quantity(key)}
 
     @cached_property
@@ -402,8 +427,12 @@ class Model(Record):
         """Return the model at columns of n rows; raise InputError if a needed one is missing."""
         if self.terms.fixed:
             return self._without_context
-        alone = self._alone(context)
-        return self._at(alone * self._scales(alone))
+        alone = self._alone(context, None)
+        found = self._at(alone * self._scales(alone))
+        if not self.terms.of_force:
+            return found
+        own = Model({name: self.values[name] for name in self.terms.of_force})
+        return replace(found, own=lambda u: own._at(own._alone(context, u)).vec_v)
 
     def _scales(self, alone: Floats) -> Floats:
         """Return by what another effect scales the terms, (t, n), or (t, 1) if none does."""
@@ -414,14 +443,22 @@ class Model(Record):
         found[scaled] += self.vector[value] * alone[term]
         return found
 
-    def _alone(self, context: Context) -> Floats:
-        """Return the (t, n) factors of each effect alone; 0 where its context is NaN."""
+    def _alone(self, context: Context, u: Floats | None) -> Floats:
+        """
+        Return the (t, n) factors of each effect alone; 0 where its context is NaN.
+
+        Without (n, 3) forces u, those of own effects of the force are 0, too.
+
+        """
         check_context(self, context)
-        count = len(np.asarray(context[self.needs[0]])) if self.needs else 1
+        known = context if u is None else {**context, 'force': u}
+        of_force = u is not None and self.terms.of_force
+        count = len(known['force' if of_force else self.needs[0]]) if of_force or self.needs else 1
         found = np.ones((len(self.terms.weight), count))
         for rows, (effect, shape) in zip(self.terms.rows, self._by_effect, strict=True):
             if effect.factor is not None:
-                found[rows] = effect.factor(context, shape)
+                skipped = effect.of_force and u is None
+                found[rows] = 0.0 if skipped else effect.factor(known, shape)
         return np.nan_to_num(found, copy=False)
 
     def _at(self, factors: Floats) -> AtContext:
@@ -444,13 +481,13 @@ class Model(Record):
         along this direction of the force.
 
         """
-        return self.basis_of(self.terms.plain(u, direction), context)
+        return self.basis_of(self.terms.plain(u, direction), context, u)
 
-    def basis_of(self, plain: Floats, context: Context) -> Basis:
+    def basis_of(self, plain: Floats, context: Context, u: Floats) -> Basis:
         """Return the same from the (t, n) terms for values and factors of 1."""
         if self.terms.fixed:
             return replace(self.rows, terms=plain)
-        alone = self._alone(context)
+        alone, context = self._alone(context, u), {**context, 'force': u}
         scales = self._scales(alone)
         found = [plain * (alone * scales)]
         for each in self._changes:
@@ -472,7 +509,7 @@ class Model(Record):
     def _changes(self) -> tuple[_Change, ...]:
         """Values that change factors: fitted shape constants, and a gain that scales others."""
         terms = self.terms
-        found = [_Change(rows, part.stop - len(shape) + place, effect.factor, shape, place)
+        found = [_Change(rows, part.stop - len(shape) + place, effect, shape, place)
                  for part, rows, (effect, shape) in zip(terms.parts, terms.rows, self._by_effect)
                  if effect.factor is not None and np.any(self.vector[terms.value[rows]])
                  for place in fitted_places(effect, shape)]
@@ -493,17 +530,23 @@ class EachShape:
     def terms(self) -> Terms:
         return terms_of((self.name,))
 
-    def basis_of(self, plain: Floats, context: Context) -> Basis:
+    def basis_of(self, plain: Floats, context: Context, u: Floats) -> Basis:
         """Return the derivative of the reading by the parameters; see `Model.basis_of`."""
         terms, parameters = self.terms, len(self.terms.effects[0].parameters)
         return Basis(plain * self.factors, terms.place, terms.axis, terms.to_value[:parameters])
 
 
 def factors_of(name: str, shapes: Iterable[Floats], context: Context) -> Floats:
-    """Return the (s, t or 1, n) factors of the terms of an effect with s shapes."""
+    """
+    Return the (s, t or 1, n) factors of the terms of an effect with s shapes, at poses in g.
+
+    Without a column ``force`` [g], the force is that of the readings.
+
+    """
     factor = effect_named(name).factor
     if factor is None:
         return np.ones((1, 1, 1))
+    context = {'force': context['reading'], **context}
     return np.nan_to_num([np.atleast_2d(factor(context, shape)) for shape in shapes])
 
 

@@ -47,8 +47,9 @@ def _values_of(name: str, given: ArrayLike, text: str = '') -> Floats:
     effect = effect_named(name)
     values, names = np.atleast_1d(np.asarray(given, float)), effect.values
     least = len(effect.parameters) if effect.usual else len(names)
-    if not np.all(np.isfinite(values)) or values.shape not in ((1,), (least,), (len(names),)):
-        count = ' or '.join(map(str, dict.fromkeys((1, least, len(names)))))
+    counts = sorted({least, len(names), 1 if least == len(effect.parameters) else least})
+    if not np.all(np.isfinite(values)) or values.shape not in [(count,) for count in counts]:
+        count = ' or '.join(map(str, counts))
         raise InputError(f'effect {name} has values {text or values.tolist()}, expected {count} '
                          f'{"number" if len(names) == 1 else "numbers"} ({", ".join(names)}) in '
                          f'{effect.unit}', f'write for example {name}='

@@ -25,7 +25,8 @@ with the exact derivative. A value that adds B(u) to the reading changes (|u| - 
     e = |u| - 1,  g = A⁻¹ N a / σ²,  h = A⁻ᵀ(I - ûûᵀ)g / |u|
 
 where N is the covariance of the reading, and B'(u)g is the derivative of B along g. (The change of
-A with u, by bending terms, is neglected: it is of the order of e times these terms.)
+A with u, by bending terms, and B' of own effects are neglected: they are of the order of e times
+these terms.)
 
 **Copies.** Rows of a table that are one measurement, entered several times, count as one pose.
 As separate poses, they would make the noise seem smaller than it is, and the other poses would
@@ -327,7 +328,7 @@ class _Alone:
     def columns(self, model: Model | EachShape) -> Floats:
         plain = model.terms.along(self._rows, self._at)
         plain -= model.terms.along(self._rows_along, self._at, self._along)
-        return model.basis_of(plain, self._context).summed
+        return model.basis_of(plain, self._context, self._at).summed
 
 
 class _Known:
@@ -341,7 +342,7 @@ class _Known:
         self.residual = (poses.reading - reading).ravel() / self._sigma
 
     def columns(self, model: Model | EachShape) -> Floats:
-        basis = model.basis_of(model.terms.plain(self.force), self._context).full
+        basis = model.basis_of(model.terms.plain(self.force), self._context, self.force).full
         return basis.reshape(len(self._sigma), basis.shape[2]) / self._sigma[:, np.newaxis]
 
 
@@ -389,7 +390,7 @@ class _Shared:
         return rows - self._turn @ onto[self._group]
 
     def columns(self, model: Model | EachShape) -> Floats:
-        basis = model.basis_of(model.terms.plain(self.force), self._context).full
+        basis = model.basis_of(model.terms.plain(self.force), self._context, self.force).full
         rows = self._projected(basis / self._sigma[:, :, np.newaxis])
         return rows.reshape(len(self.pose), basis.shape[2])
 

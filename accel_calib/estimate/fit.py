@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from .closed_form import along_quadrics
 from .equations import belief_in, Equations, equations, measured, variance_factor
-from ..effects import CHANGES, fitted_places, LADDER, Model, parameter_names, with_vector
+from ..effects import CHANGES, Context, fitted_places, LADDER, Model, parameter_names, with_vector
 from ..errors import RefusedFitError
 from ..geometry import orientations_of, unit
 from ..table import Poses
@@ -50,6 +50,9 @@ _NEAR = 1e-12
 _NEAR_ENOUGH = 1e-3
 """If rounding or a kink prevents this, this part of the cost per degree of freedom is accepted: a
 change of the values by 0.03 standard deviations."""
+
+_AT_A_KINK = 1e3
+"""Damping at which constants of own effects are held: they end where a pose is at a kink."""
 
 _ROUNDING = 1e-20
 """Decreases of the cost below this are rounding errors [noise²]."""
@@ -206,6 +209,11 @@ class Fit:
         """Whether the noise of the poses was measured."""
         return self.equations.noise_known
 
+    @property
+    def context(self) -> Context:
+        """Columns of the poses, with the force u of the equations [g]."""
+        return {**self.poses_g.columns, 'force': self.equations.force}
+
     @cached_property
     def dof(self) -> int:
         """Return the number of independent equations minus that of free, determined values."""
@@ -314,12 +322,18 @@ class NotConvergedError(RefusedFitError):
 
 @dataclass(frozen=True)
 class Point:
-    """The (m,) residuals and (m, q) derivative at some values, and the object they are from."""
+    """
+    The (m,) residuals and (m, q) derivative at some values, and the object they are from.
+
+    The residuals may have kinks as functions of the values in the (q,) mask `kinked`.
+
+    """
 
     residual: Floats
     columns: Floats
     source: Any = None
     singular: float = _SINGULAR_STEP
+    kinked: NDArray[np.bool_] | None = None
 
     @cached_property
     def normal(self) -> Floats:
@@ -359,11 +373,13 @@ def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upp
 
     values = np.clip(start, lower, upper)
     now, damping = tried_at(values), 0.0
+    held = np.zeros(len(values), bool)
     first = _FIRST_DAMPING * now.singular
     if not np.isfinite(now.cost):
         raise NotConvergedError
     for _ in range(_MOST_STEPS):
-        free = _free(values, now, lower, upper)
+        held, damping = _held(now, held, damping)
+        free = _free(values, now, lower, upper) & ~held
         full, fall = _step(now, free, 0.0)
         if fall <= _NEAR * now.cost or fall < _ROUNDING or damping > _LARGEST_DAMPING:
             break
@@ -379,9 +395,17 @@ def solve(point_at: Callable[[Floats], Point], start: Floats, lower: Floats, upp
             break
         else:
             damping = max(10.0 * damping, first)
-    if not _is_near(now, _step(now, _free(values, now, lower, upper), 0.0)[1]):
+    if not _is_near(now, _step(now, _free(values, now, lower, upper) & ~held, 0.0)[1]):
         raise NotConvergedError
     return values, now
+
+
+def _held(now: Point, held: NDArray[np.bool_], damping: float
+          ) -> tuple[NDArray[np.bool_], float]:
+    """Return the values that are held, at a kink those of `Point.kinked`, and the damping."""
+    if now.kinked is None or damping <= _AT_A_KINK or np.all(held == now.kinked):
+        return held, damping
+    return now.kinked, 0.0
 
 
 def _is_near(now: Point, fall: float) -> bool:
@@ -447,6 +471,8 @@ def estimate(start: Model, poses_g: Poses, prior: Prior | None = None,
     if not np.any(start.fitted):
         return judge(start, poses_g)
     fitted, vector, poses = start.fitted, start.vector.copy(), measured(poses_g)
+    kinked = np.array([effect.own and part in effect.shape for effect in start.terms.effects
+                       for part in effect.values], bool)[fitted]
     weight = np.sqrt(1.0 if factor is None else factor)
 
     def model_at(values: Floats) -> Model:
@@ -458,7 +484,7 @@ def estimate(start: Model, poses_g: Poses, prior: Prior | None = None,
         near = equations(model, poses)
         columns = near.columns(model)[:, fitted]
         if prior is None:
-            return Point(near.residual, columns, near)
+            return Point(near.residual, columns, near, kinked=kinked)
         rows = prior.whitening * weight
         return Point(np.concatenate([near.residual, rows @ (prior.mean - values)]),
                      np.vstack([columns, rows]), near, _SINGULAR_WITH_PRIOR)
@@ -484,7 +510,9 @@ def _bounds(start: Model, poses_g: Poses) -> tuple[Floats, Floats]:
             size = np.max(np.linalg.norm(basis[:, :, :len(effect.parameters)], axis=1), axis=0)
             most = effect.plausible_g / np.maximum(size, effect.plausible_g * _SMALLEST)
             limits[:, :len(most)] = -most, most
-            places = fitted_places(effect, effect.split(values)[1])
+            if effect.bounds:
+                limits[:, len(most):] = np.transpose(effect.bounds)
+            places = () if effect.bounds else fitted_places(effect, effect.split(values)[1])
             shapes = [*effect.shapes(poses_g.columns)] if effect.shapes and places else []
             for k in places:
                 tried = [shape[k] for shape in shapes if k in fitted_places(effect, shape)]

@@ -23,7 +23,7 @@ import numpy as np
 from ..calibrate import Calibration
 from ..effects import (
     AFFINE, check_context, CONVERGED_G, Effect, FORCE, LARGEST_FORCE_G, LARGEST_ITERATIONS,
-    MONOMIALS, ONE, too_large)
+    MONOMIALS, ONE, own_slope, too_large)
 from ..table import Floats
 
 Triple = tuple[float, float, float]
@@ -63,7 +63,7 @@ class OneReading:
         for effect, values in zip(model.terms.effects, model.values.values(), strict=True):
             size, shape = effect.split(values)
             terms = [(each.axis, each.monomial, each.weight * float(size[each.parameter]))
-                     for each in effect.terms]
+                     for each in effect.terms if not effect.of_force]
             if effect.factor is not None:
                 self._varying.append((effect, shape.tolist(), terms))
             else:
@@ -88,29 +88,35 @@ class OneReading:
         """Return the calibration at a context; a quantity that is missing is an InputError."""
         if not self._varying:
             return self._without_context
-        check_context(self._calibration.model, known)
+        model = self._calibration.model
+        check_context(model, known)
         ranges = self._calibration.ranges
         if ranges:  # effects are not extrapolated
             known = {**known, **{key: min(max(known[key], low), high)
                                  for key, (low, high) in ranges.items() if key in known}}
         affine, bends = list(self._fixed), list(self._bends)
         for effect, shape, terms in self._varying:
+            if not terms:
+                continue
             factor = _factor(effect, known, shape)
             if effect.scales:  # all other gains are there
                 affine[3:] = [part * (1.0 + terms[0][2] * factor) for part in affine[3:]]
             self._add(terms, factor, affine, bends)
-        return AtReading(self, affine, bends, known)
+        own = model.at(_one_row(known)).own if model.terms.of_force else None
+        return AtReading(self, affine, bends, known, own)
 
     @cached_property
     def _without_context(self) -> AtReading:
-        return AtReading(self, self._fixed, self._bends, {})
+        return AtReading(self, self._fixed, self._bends, {}, None)
 
     @cached_property
     def _spread_rows(self) -> tuple[Floats, Floats]:
         """Return the (m, t) monomial of each row of the basis, and its (t, 3 p) part of a root."""
         model, covariance = self._calibration.model, self._calibration.covariance
-        variances, axes = np.linalg.eigh(covariance)
-        root = model.rows.to_value.T @ (axes * np.sqrt(np.maximum(variances, 0.0)))
+        size = np.sqrt(np.maximum(np.diag(covariance), 1e-300))  # constants have other units
+        variances, axes = np.linalg.eigh(covariance / size / size[:, np.newaxis])
+        root = model.rows.to_value.T @ (axes * size[:, np.newaxis] * np.sqrt(
+            np.maximum(variances, 0.0)))
         of_axis = np.eye(3)[model.rows.axis][:, :, np.newaxis]
         monomials = np.take(model.terms.monomials, model.rows.place)
         return (np.equal.outer(self.monomials, monomials).astype(float),
@@ -122,13 +128,17 @@ class OneReading:
         used = self._calibration.model.terms.monomials
         return (*range(AFFINE), *(index for index in used if index >= AFFINE))
 
-    def spread_basis(self, known: Known) -> Floats:
+    def spread_basis(self, known: Known, u: Triple) -> Floats:
         """Return the (m, 3 p) basis of each monomial times a root of the covariance."""
         model = self._calibration.model
-        context = {key: np.asarray(value, float)[np.newaxis] for key, value in known.items()}
-        basis = model.basis_of(model.terms.weight[:, np.newaxis], context)
+        basis = model.basis_of(model.terms.weight[:, np.newaxis], _one_row(known),
+                               np.array([u]))
         which, rows = self._spread_rows
         return np.asarray((which * basis.terms[:, 0]) @ rows)
+
+
+def _one_row(known: Known) -> dict[str, Floats]:
+    return {key: np.asarray(value, float)[np.newaxis] for key, value in known.items()}
 
 
 def _factor(effect: Effect, known: Known, shape: Any) -> Any:
@@ -154,13 +164,13 @@ class AtReading:
     """
 
     def __init__(self, owner: OneReading, affine: Sequence[float], bends: list[_Bend],
-                 known: Known) -> None:
-        self._owner, self._bends, self._known = owner, bends, known
+                 known: Known, own: Callable[[Floats], Floats] | None) -> None:
+        self._owner, self._bends, self._known, self._own = owner, bends, known, own
         a, b, c, d, e, f, g, h, i = affine[3:]
         self._gain = (a + 1.0, b, c, d, e + 1.0, f, g, h, i + 1.0)
         inverse = _inverse(self._gain)
         offset = _times(inverse, *affine[:3])
-        if bends:
+        if bends or own:
             self.correct = self._solving(inverse, offset)
         else:
             matrix = _product(owner.turn, inverse)
@@ -206,6 +216,8 @@ class AtReading:
         added = [0.0, 0.0, 0.0]
         for axis, size, value, _ in self._bends:
             added[axis] += size * value(x, y, z)
+        if self._own is not None:
+            return [*map(add, added, self._own(np.array([[x, y, z]]))[0].tolist())]
         return added
 
     def _slope_at(self, u: Triple) -> Matrix:
@@ -214,6 +226,8 @@ class AtReading:
         for axis, size, _, gradient in self._bends:
             for at, part in enumerate(gradient(*u), 3 * axis):
                 slope[at] += size * float(part)
+        if self._own is not None:
+            return [*map(add, slope, own_slope(self._own, np.array([u])).ravel().tolist())]
         return slope
 
     def with_spread(self, force: Triple, own: Sequence[float]) -> Sequence[float]:
@@ -223,11 +237,13 @@ class AtReading:
         `own` is the covariance of the force from the noise of the reading, row by row.
 
         """
-        if self._bends:
+        if self._bends or self._own:
             u = _times(self._owner.back, *force)
             monomials = [MONOMIALS[index].value(*u) for index in self._owner.monomials]
             to_force = np.reshape(_product(self._owner.turn, _inverse(self._slope_at(u))), (3, 3))
-            moved = to_force @ np.dot(monomials, self._basis).reshape(3, -1)
+            basis = (self._basis if self._own is None
+                     else self._owner.spread_basis(self._known, u))
+            moved = to_force @ np.dot(monomials, basis).reshape(3, -1)
             added = (moved @ moved.T).ravel().tolist()
         else:
             xx, xy, xz, yy, yz, zz = [form(*force) for form in self._forms]
@@ -237,7 +253,7 @@ class AtReading:
     @cached_property
     def _forms(self) -> list[Callable[[float, float, float], float]]:
         """Entries of the covariance as quadratic forms of the force; the upper triangle."""
-        basis = self._owner.spread_basis(self._known).reshape(AFFINE, 3, -1)
+        basis = self._basis.reshape(AFFINE, 3, -1)
         moved = np.reshape(_product(self._owner.turn, _inverse(self._gain)), (3, 3)) @ basis
         moved[1:] = np.einsum('ij,ikp->jkp', np.reshape(self._owner.back, (3, 3)), moved[1:])
         each = np.einsum('mip,njp->mnij', moved, moved).reshape(AFFINE, AFFINE, 9)
@@ -248,7 +264,7 @@ class AtReading:
 
     @cached_property
     def _basis(self) -> Floats:
-        return self._owner.spread_basis(self._known)
+        return self._owner.spread_basis(self._known, (0.0, 0.0, 0.0))
 
 
 def _affine(matrix: Matrix, less: Triple) -> Callable[[float, float, float], Triple]:

@@ -288,8 +288,8 @@ def one_curve(state: State) -> tuple[str, ...]:
 
 
 def _by_axis(names: Iterable[str]) -> list[str]:
-    """Return the nonlinearities with one value for each axis."""
-    return [name for name in names if (effect := effect_named(name)).bends
+    """Return the nonlinearities of the catalogue with one value for each axis."""
+    return [name for name in names if (effect := effect_named(name)).family == 'force'
             and effect.parameters == AXES]
 
 

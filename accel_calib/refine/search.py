@@ -87,7 +87,8 @@ class Found:
     random walk of the offset; they are listed at the end of a search. `taken_back` are effects
     that were removed because they explain too little, or no more than by chance. Poses at the
     limit of the sensor are left out: they are `clipped`, and `with_clipped` is the base fitted to
-    all poses. `grid_g` is the step of the grid of the readings [g], if it is relevant.
+    all poses. `grid_g` is the step of the grid of the readings [g], if it is relevant. `also`
+    are the names of own effects that were asked for.
 
     """
 
@@ -102,6 +103,7 @@ class Found:
     clipped: Clipped | None = None
     grid_g: float | None = None
     with_clipped: State | None = None
+    also: tuple[str, ...] = ()
 
     @cached_property
     def one_curve(self) -> tuple[str, ...]:
@@ -127,7 +129,7 @@ def search(poses_g: Poses, base: Model, also: tuple[str, ...] = ()) -> Found:
         found = again(found, poses_g, base, also)
     found = replace(found, base=_weighted(found.base), final=_weighted(found.final))
     return replace(found, outliers=everyone[found.outliers], clipped=clip, grid_g=grid,
-                   with_clipped=whole)
+                   with_clipped=whole, also=also)
 
 
 def _with_own_noise(found: Found, poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
@@ -249,10 +251,10 @@ def _is_coincidence(found: Found, name: str) -> bool:
 
     """
     state, values, entry = found.final, found.final.model.values, effect_named(name)
-    if entry.factor is None or name not in values or (found.walk is None and state.is_noise):
+    if not entry.needs or name not in values or (found.walk is None and state.is_noise):
         return False
     shape = entry.split(values[name])[1]
-    factor, = factors_of(name, [shape], state.poses_g.columns)
+    factor, = factors_of(name, [shape], state.fit.context)
     factors = _at_other_times(factor, state.poses_g)
     if len(factors) < 2:
         return False

@@ -78,7 +78,9 @@ class Candidate:
         return effect_named(self.name)
 
     def beside(self, present: Floats | None, context: Context) -> Candidate:
-        """Return the candidate with the shape of its values in a model, too."""
+        """Return the candidate at a force, with the shape of its values in a model, too."""
+        if self.entry.of_force:
+            self = Candidate.of(self.name, self.every, self.places, context)
         if present is None or len(self.shapes) < 2:
             return self
         shape = self.entry.split(present)[1]
@@ -140,7 +142,7 @@ def linearised(fit: Fit, base: tuple[str, ...], tried: Iterable[Candidate] = (),
         residual = residual + near.columns(further) @ _amplitudes(further)
     onto = orthonormal(np.hstack([near.columns(held)[:, held.fitted], near.columns(beside)]))
     residual = residual - onto @ (onto.T @ residual)
-    blocks, every, sizes = _blocks(near, onto, fit.poses_g.columns, further, tuple(tried))
+    blocks, every, sizes = _blocks(near, onto, fit.context, further, tuple(tried))
     every[-1] = residual
     kinds = len({kind_of(block.effect) for block in blocks})
     return Linear(onto, near.pose, blocks, every, sizes, WORTH if near.noise_known else 0.0,

@@ -24,7 +24,7 @@ from .curves import LEAST, nearest_effects, probabilities
 from .linear import is_seen, Set
 from .search import Found
 from .settle import ladder_set
-from .state import fitted_state, is_noise, State, with_effect
+from .state import candidates, fitted_state, is_noise, linearised, State, with_effect
 from ..effects import (
     CHANGES, COVARIATES, effect_named, EFFECTS, EMPIRICAL, empirical_parts, formula_of, included,
     is_effect, kind_of, Model, parameter_names, PROCESSES, TO_SEPARATE, unit_of, value_unit,
@@ -394,22 +394,23 @@ def untestable(found: Found, steps: Sequence[Step]) -> tuple[tuple[str, str], ..
             testable[block.effect] = max(math.sqrt(square) * block.entry.typical,
                                          testable.get(block.effect, 0.0))
     present = (*found.final.model.effects, *(rival for step in steps for rival in step.rivals))
-    return not_testable(found.final.poses_g, testable, present)
+    return not_testable(found.final.poses_g, testable, present, found.also)
 
 
-def not_testable(poses_g: Poses, testable: Mapping[str, float], present: tuple[str, ...]
-                 ) -> tuple[tuple[str, str], ...]:
+def not_testable(poses_g: Poses, testable: Mapping[str, float], present: tuple[str, ...],
+                 also: tuple[str, ...] = ()) -> tuple[tuple[str, str], ...]:
     """
     Return the effects that these poses cannot show, with the data to record.
 
     `testable` are the effects that the poses distinguish from the model, and how visible they
-    are; `present` are the effects of the model and their rivals.
+    are; `present` are the effects of the model and their rivals, `also` own effects.
 
     """
     missing = []
     unknown = not len(kinds(poses_g)[0])
     passed = {*present, *included(present)}
-    for name, effect in {**EFFECTS, **PROCESSES}.items():
+    own = {name: effect_named(name) for name in also}
+    for name, effect in {**EFFECTS, **PROCESSES, **own}.items():
         if name in passed or effect.output is not None or passed & {*effect.includes}:
             continue
         if name in testable and (effect.needs or testable[name] > _LEAST_VISIBLE):
@@ -454,6 +455,8 @@ def advice_for(found: Found, steps: tuple[Step, ...], untestable: tuple[tuple[st
                      '1 g is known; take poses of known orientation (ref_x, ref_y, ref_z) with '
                      'both')
     lines += [_separating(step) for step in steps if step.rivals]
+    lines += [line for name in found.also if name not in found.final.model.values
+              for line in _at_bounds(name, found)]
     for step in steps:
         times, effect = times_typical(step), effect_named(step.name)
         if times > _FAR:
@@ -473,6 +476,27 @@ def advice_for(found: Found, steps: tuple[Step, ...], untestable: tuple[tuple[st
     if unexplained:
         lines += _unexplained(found, untestable)
     return tuple(lines)
+
+
+def _at_bounds(name: str, found: Found) -> list[str]:
+    """Return a line for each constant of an own effect that would help, but ends at a bound."""
+    effect, final, curve = effect_named(name), found.final, found.curve
+    before = final if curve is None else fitted_state(Model({
+        each: part for each, part in final.model.values.items() if each != curve.name}),
+        final.poses_g)
+    tried = () if before is None else tuple(candidates((name,), final.poses_g))
+    if before is None or not tried or not effect.bounds:
+        return []
+    alone = Set.of(linearised(before.fit, before.model.effects, tried))
+    grown = alone.extended(best := alone.best_of(name))
+    after = None if grown.score <= 0.0 else fitted_state(Model(with_effect(
+        before.model.values, name, np.concatenate(
+            [grown.values[best], alone.linear.blocks[best].shape]))), final.poses_g)
+    shape = () if after is None else effect.split(after.model.values[name])[1].tolist()
+    return [f'{name} is not used, because its constant {constant} ends at its bound {value:.4g}: '
+            'widen the bounds in its definition, or use another function'
+            for constant, value, bounds in zip(effect.shape, shape, effect.bounds)
+            if value in bounds]
 
 
 def _unexplained(found: Found, untestable: tuple[tuple[str, str], ...]) -> list[str]:

@@ -146,10 +146,9 @@ def _with_steps(header: Header, calibration: Calibration) -> Header:
 
 def header(calibration: Calibration, options: Options) -> Made:
     """Return the values of a header for C99 and C++, or for a sketch."""
-    own = [effect.words for effect in calibration.model.terms.effects if effect.own]
-    if own:
-        raise InputError(f'the calibration has an effect of the user ({own[0]}), which has no '
-                         'code in C', 'refine without --also, or write this correction by hand')
+    if own := calibration.model.terms.of_force:
+        raise InputError(f'the calibration has an own effect of the force ({own[0]}), which has '
+                         'no code in C', 'refine without --also, or write this correction by hand')
     made, name = _header_of(calibration), name_of(calibration, options)
     degrees = sorted({ZONES[(index - ZONAL) // 3].degree
                       for index in made.monomial.tolist() if index >= ZONAL})

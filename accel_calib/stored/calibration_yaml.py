@@ -26,12 +26,14 @@ from .plain_yaml import (
 from .. import __version__
 from ..calibrate import (
     Calibration, FleetPrior, gated, GyroBias, in_g, LARGEST_OFFSET_G, mounting_figures, Quality,
-    Rejected, RejectedKind, SampleNoise, STORED_METHODS)
+    Rejected, RejectedKind, SampleNoise, STORED_METHODS, with_history)
 from ..disk import check_regular, FIRST_LINE, FORMAT, write_atomically
 from ..effects import (
-    CHANGES, Effect, effect_named, is_effect, Model, MODELS, parameter_names, PROCESSES)
+    CHANGES, Effect, effect_named, factors_of, is_effect, Model, MODELS, parameter_names,
+    PROCESSES)
 from ..errors import (
-    AccelCalibError, DamagedCalibrationError, InputError, RefusedFitError, StoredCalibrationError)
+    AccelCalibError, DamagedCalibrationError, InputError, OwnEffectError, RefusedFitError,
+    StoredCalibrationError)
 from ..estimate import Prior
 from ..finding import Finding, KINDS, LEVELS, without
 from ..geometry import rms
@@ -127,7 +129,7 @@ def _content(calibration: Calibration) -> dict[str, Any]:
         'units': {'readings': units.name, 'per_g': float(units.per_g)},
         'model': calibration.name, 'method': calibration.method, 'reason': calibration.reason,
         'effects': {name: {'what': effect.words, 'unit': effect.unit, **effect.shown(values),
-                           **({'own_rms': _own_rms(name, poses, units)} if effect.own else {})}
+                           **({'own_rms': _own_rms(calibration, name)} if effect.own else {})}
                     for (name, values), effect in zip(model.values.items(), model.terms.effects,
                                                       strict=True)},
         'frame': calibration.frame, 'rotation': model.rotation.tolist(),
@@ -150,11 +152,11 @@ def _content(calibration: Calibration) -> dict[str, Any]:
     }
 
 
-def _own_rms(name: str, poses: Poses, units: Units) -> float:
+def _own_rms(calibration: Calibration, name: str) -> float:
     """Return the RMS over the poses of what the values of an own effect are multiplied by."""
-    poses_g, values = in_g(poses, units), np.zeros(len(effect_named(name).values))
-    basis = Model({name: values}).basis(poses_g.reading, poses_g.columns)
-    return rms(basis.terms)
+    shape = effect_named(name).split(calibration.model.values[name])[1]
+    poses_g = with_history(in_g(calibration.poses, calibration.units), calibration.model)
+    return rms(factors_of(name, [shape], poses_g.columns))
 
 
 def _rest_noise(gyro: GyroBias | None, noise: SampleNoise | None) -> dict[str, Any]:
@@ -178,7 +180,7 @@ def calibration_from(data: bytes, name: str) -> Calibration:
     """Return the calibration in a file; with ``edited`` if its checksum does not match."""
     try:
         return _checked(data, name)
-    except StoredCalibrationError:
+    except (StoredCalibrationError, OwnEffectError):
         raise
     except RefusedFitError as err:
         raise DamagedCalibrationError(f'{name} contains an implausible calibration: {err.message}',
@@ -232,7 +234,7 @@ def _check_own(calibration: Calibration, content: Mapping[str, Any], name: str) 
     model = calibration.model
     for each, effect in zip(model.effects, model.terms.effects, strict=True):
         if effect.own and not np.isclose(
-                _own_rms(each, calibration.poses, calibration.units),
+                _own_rms(calibration, each),
                 number_at(content['effects'][each], 'own_rms'), _SAME_OWN, 0.0):
             raise StoredCalibrationError(
                 f'{name} needs the effect {shown(each)} as it was when it was fitted, found '
