@@ -1,0 +1,42 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The way on which each pose was reached, from the forces of successive poses."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ..geometry import unit
+from ..table import Floats
+
+_MOVED = np.radians(3.0)
+"""Smallest change of direction of a move [rad]; less may be noise or settling."""
+
+_NO_MOTION_G = 0.002
+"""Motion along an axis that has either sign [g]."""
+
+
+def way_to(force: Floats, known: Mapping[str, Any], signs: Floats = np.zeros((1, 3))) -> Floats:
+    """
+    Return (n, 3) unit vectors towards the previous pose, in order of the known time, or of rows.
+
+    The last motion counts for all successive poses of one orientation; before the first motion the
+    vector is zero. `force` are (c, n, 3) forces [g], for a motion with each of (c, 3) signs; 0 is
+    any. Of the motions that have their signs, the one counts whose force is nearest to 1 g.
+
+    """
+    previous, away = np.zeros(force.shape[1:]), np.abs(np.linalg.norm(force, axis=2) - 1.0)
+    force, towards = unit(force), np.zeros(3)
+    order = np.argsort(known['time'], kind='stable') if 'time' in known else np.arange(len(away.T))
+    resting = np.mean(force[:, order[:1]], axis=(0, 1))  # no motion leads to the first pose
+    for here in order[1:]:
+        steps = resting - force[:, here]
+        best = int(np.argmin(away[:, here] + np.any(signs * steps < -_NO_MOTION_G, axis=1)))
+        step = np.where(signs[best], np.copysign(steps[best], signs[best]), steps[best])
+        length = float(np.linalg.norm(step))
+        if length > _MOVED:
+            towards, resting = step / length, force[best, here]
+        previous[here] = towards
+    return previous
