@@ -126,6 +126,21 @@ def test_a_hysteresis_of_any_size_leaves_the_noise_in_new_poses(size, form):
     assert ac.verify(fresh, found.calibration).rms_after_mg < 0.45  # the noise is 0.3
 
 
+@pytest.mark.parametrize('lasting', [False, True])
+def test_a_relaxation_after_turns_is_named_with_its_time_constant(lasting):
+    rng, tables = np.random.default_rng(3), []
+    for count in (50, 120):
+        waits = rng.lognormal(3.4, 1.0, count)  # from turn to turn, about 30 s
+        known = {'time': np.cumsum(waits)} if not lasting else {
+            'time': np.cumsum(waits) - waits / 2.0, 'duration': waits}
+        tables.append(ac.simulate({**SENSOR, 'creep': [0.02, -0.01, 0.02, 40.0]}, seed=count,
+                                  poses=count, **known))
+    found = ac.refine(tables[0], base='10')
+    assert names(found) == ['creep']
+    assert found.steps[0].parameters['tau'] == pytest.approx(40.0, abs=4.0)
+    assert ac.verify(tables[1], found.calibration).rms_after_mg < 0.5
+
+
 @pytest.mark.parametrize('seed', range(3))
 def test_a_supply_that_scales_gains_that_differ_leaves_no_gap(seed, taken):
     hidden = {'supply_ratio': 100.0, 'offset_temperature': 3.0}

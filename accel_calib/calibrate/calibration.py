@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 from .rest_noise import GyroBias, SampleNoise
 from ..effects import (
     acting_temperature, AXES, Context, correct, Model, ModelForm, MODELS, parameter_names, predict,
-    rate_at, ThermalStream, variable_of, way_to)
+    rate_at, ThermalStream, variable_of, way_to, with_turns)
 from ..errors import InputError, StoredCalibrationError
 from ..finding import Finding
 from ..geometry import over_axes
@@ -474,35 +474,41 @@ def with_history(poses_g: Poses, model: Model) -> Poses:
     """
     Return poses in g with the context that comes from the poses before and after.
 
-    That is ``temperature_rate`` and ``previous``, the unit vector towards the previous pose in
-    order of time, or of rows; columns of the table are kept. The directions are those that the
-    model corrects. If it needs ``previous`` for that, both are iterated; for a model that depends
-    on its signs alone, all signs are compared.
+    That is ``temperature_rate``, ``since_turn``, and ``previous``, the unit vector towards the
+    previous pose in order of time, or of rows; columns of the table are kept. The directions are
+    those that the model corrects. If it needs ``previous`` for that, both are iterated; for a
+    model that depends on its signs alone, all signs are compared.
 
     """
     if 'time' in poses_g and 'temperature' in poses_g and 'temperature_rate' not in poses_g:
         poses_g = poses_g.with_columns(temperature_rate=rate_at(poses_g.columns))
-    if 'previous' in poses_g:
-        return poses_g
+    if 'previous' not in poses_g:
+        poses_g = poses_g.with_columns(previous=_way_to(poses_g, model))
+    return replace(poses_g, columns=with_turns(poses_g.columns))
+
+
+def _way_to(poses_g: Poses, model: Model) -> Floats:
+    """Return the (n, 3) unit vectors towards the previous pose, by the forces of a model."""
     mat_w, vec_v = model.linear_part
     force = (poses_g.reading - vec_v) @ np.linalg.inv(mat_w).T
-    found = poses_g.with_columns(previous=way_to(force[np.newaxis], poses_g.columns))
-    if 'previous' not in model.needs or any(key not in found for key in model.needs):
-        return found
+    way, known = way_to(force[np.newaxis], poses_g.columns), poses_g.columns
+    if 'previous' not in model.needs or any(
+            key not in known for key in model.needs if key != 'previous'):
+        return way
 
     def forces(previous: Floats) -> Floats:
-        return model.at({**found.columns, 'previous': previous}).force(poses_g.reading)
+        turns = with_turns({**known, 'previous': way})
+        return model.at({**turns, 'previous': previous}).force(poses_g.reading)
 
-    way = found['previous']
     if np.array_equal(forces(way), forces(np.sign(way))):
         both = [forces(np.broadcast_to(each, force.shape)) for each in _SIGNS]
-        return found.with_columns(previous=way_to(np.array(both), poses_g.columns, _SIGNS))
+        return way_to(np.array(both), known, _SIGNS)
     for _ in range(_MOST_WAYS):
         before, force = force, forces(way)
-        way = way_to(force[np.newaxis], poses_g.columns)
+        way = way_to(force[np.newaxis], known)
         if np.max(np.abs(force - before), initial=0.0) < _SAME_G:
             break
-    return found.with_columns(previous=way)
+    return way
 
 
 def check_sensor(calibration: Calibration, sensor: str) -> None:

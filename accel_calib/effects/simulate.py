@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from .catalogue import CHANGES, effect_named, EFFECTS, is_effect, PROCESSES
 from .form import Context
 from .model import Model, predict
-from .way import way_to
+from .way import way_to, with_turns
 from ..errors import InputError
 from ..table import Floats, numbered, Poses, Recording
 from ..units import Indices
@@ -85,7 +85,7 @@ def simulate_poses(model: Model, directions: Floats, rng: np.random.Generator, *
     """
     known = {'std': np.full_like(directions, noise_g), **(context or {})}
     way = way_to((directions @ model.rotation.T)[np.newaxis], known)
-    reading = predict(model, directions, {'previous': way, **known})
+    reading = predict(model, directions, with_turns({'previous': way, **known}))
     reading = reading + rng.normal(size=reading.shape) * noise_g / np.sqrt(samples)
     columns = {**known, 'reading': reading, 'count': np.full(len(directions), float(samples))}
     return Poses(columns, numbered(columns))
@@ -146,7 +146,8 @@ def simulate_recording(model: Model, directions: Floats, rng: np.random.Generato
     if temperatures:
         columns['temperature'] = np.linspace(temperatures[0], temperatures[-1], count)
     way = way_to((directions @ model.rotation.T)[np.newaxis], {})
-    known = {'std': np.full((count, 3), noise_g), 'previous': way[place], **columns}
+    known = {'std': np.full((count, 3), noise_g), 'previous': way[place], **columns,
+             'since_turn': columns['time'] - columns['time'][np.searchsorted(place, place)]}
     reading = predict(model, force, known)
     columns['reading'] = reading + rng.normal(size=(count, 3)) * noise_g
     columns['rate'] = rate @ model.rotation.T + rng.normal(size=(count, 3)) * gyro_noise

@@ -1,13 +1,18 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The way on which each pose was reached, from the forces of successive poses."""
+"""
+The way on which each pose was reached, and when, from the forces of successive poses.
 
-from collections.abc import Mapping
-from typing import Any
+A table states the mean time of a pose. With its duration, the turn before it ends where the pose
+begins. Otherwise the time since the turn counts from the last pose before it: between a turn and
+the poses on both sides are unknown times, which only change the size of an exponential.
+
+"""
 
 import numpy as np
 
+from .form import Context
 from ..geometry import unit
 from ..table import Floats
 
@@ -18,7 +23,7 @@ _NO_MOTION_G = 0.002
 """Motion along an axis that has either sign [g]."""
 
 
-def way_to(force: Floats, known: Mapping[str, Any], signs: Floats = np.zeros((1, 3))) -> Floats:
+def way_to(force: Floats, known: Context, signs: Floats = np.zeros((1, 3))) -> Floats:
     """
     Return (n, 3) unit vectors towards the previous pose, in order of the known time, or of rows.
 
@@ -40,3 +45,16 @@ def way_to(force: Floats, known: Mapping[str, Any], signs: Floats = np.zeros((1,
             towards, resting = step / length, force[best, here]
         previous[here] = towards
     return previous
+
+
+def with_turns(known: Context) -> Context:
+    """Return context with the time from the last turn to the start of each pose, if known [s]."""
+    if 'time' not in known:
+        return known
+    order = np.argsort(known['time'], kind='stable')
+    start = (known['time'] - known.get('duration', 0.0) / 2.0)[order]
+    turned = np.any(np.diff(known['previous'][order], axis=0, prepend=np.nan), axis=1)
+    first = np.maximum.accumulate(np.where(turned, np.arange(len(order)), 0))
+    if 'duration' not in known:
+        first = np.maximum(first - 1, 0)
+    return {**known, 'since_turn': (start - start[first])[np.argsort(order)]}
