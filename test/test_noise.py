@@ -209,7 +209,7 @@ def test_steps_of_a_coarse_output_do_not_end_a_rest_but_a_motion_does(size: floa
     moved = rest + 0.03 * (np.arange(90_000) > 60_000)[:, np.newaxis]
     for reading, samples in ((rest, 90_000), (moved, 60_000)):
         found = longest_rest(sampled(np.round(reading / 0.0033) * 0.0033), G)
-        assert found.samples == pytest.approx(samples, rel=0.01)
+        assert found.samples == pytest.approx(samples, rel=0.02)
 
 
 def test_a_coarse_output_and_a_change_of_temperature_are_noted() -> None:

@@ -106,6 +106,9 @@ _BLOCK_S = 1.0
 _NEAR_STEP = 2.0
 """Noise in units of the step below which steps can look like motions."""
 
+_AROUND, _MOVED = 5, 3.0
+"""Number of blocks before and after a motion, and its least size in steps."""
+
 _DISTURBED = 12.0
 """Variance of the samples of a disturbed block, in units of the usual one or of a step."""
 
@@ -287,7 +290,7 @@ def _averaged(recording: Recording) -> Iterator[tuple[Recording, Recording]]:
 
     Where the noise is small beside the step of the output, single steps look like motions. Means
     over a block with an added noise of one step do not show them. They would not show a knock
-    either, but its scatter does.
+    or a small turn either, but the scatter in a block and the change between blocks do.
 
     """
     if not len(recording):
@@ -303,10 +306,14 @@ def _averaged(recording: Recording) -> Iterator[tuple[Recording, Recording]]:
     reading = recording.reading - recording.reading[:1]
     variance = np.maximum(means(reading ** 2) - means(reading) ** 2, 0.0)
     usual = np.median(variance, axis=0)
-    step = max(coarse_step(*each) for each in zip(reading.T, np.sqrt(usual) / _NEAR_STEP))
+    step = min(filter(None, map(coarse_step, reading.T, np.sqrt(usual) / _NEAR_STEP)), default=0.0)
     if step == 0.0:
         return
     calm = np.all(variance <= _DISTURBED * np.maximum(usual, step ** 2 / 4.0), axis=1)
+    sums = np.cumsum(means(reading), axis=0)
+    change = sums[2 * _AROUND:] - 2.0 * sums[_AROUND:-_AROUND] + sums[:-2 * _AROUND]
+    calm[1 + _AROUND:1 + _AROUND + len(change)] &= np.all(
+        np.abs(change) <= _AROUND * _MOVED * step, axis=1)
     known = {key: means(recording[key])[calm] for key in ('time', 'reading', 'rate')
              if key in recording}
     known['reading'] += np.random.default_rng(0).normal(size=known['reading'].shape) * step
