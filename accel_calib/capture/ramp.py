@@ -236,7 +236,7 @@ def _averaged(cells: Poses) -> tuple[Poses, Floats]:
     return Poses(columns, numbered(columns), 'g', cells.sensor, cells.autopilot), rate
 
 
-_PLAUSIBLE = 1.0
+_PLAUSIBLE = 5.0
 """Largest rate of the temperature of a board [°C/s]."""
 
 _MEDIAN_CHI2 = 0.4549
