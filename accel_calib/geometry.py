@@ -106,8 +106,8 @@ def over_axes(values: Floats) -> Floats:
 
 
 def unit(vectors: Floats) -> Floats:
-    """Return (n, 3) vectors scaled to length 1; zero vectors stay zero."""
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
+    """Return (…, 3) vectors scaled to length 1; zero vectors stay zero."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300)
 
 
 ATTITUDES = unit(np.array(sorted((signs for signs in product((0.0, 1.0, -1.0), repeat=3)

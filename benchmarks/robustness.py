@@ -191,7 +191,7 @@ def of_recording(job: Job) -> Floats:
     correlation, seed = job
     rng = np.random.default_rng([seed, int(1000 * correlation)])
     sensor = draw_sensor(rng, '10')
-    force, _ = path(spread(16, rng), RATE, 4.0, 1.0)
+    force, _, _ = path(spread(16, rng), RATE, 4.0, 1.0)
     white = 3e-3 * rng.normal(size=force.shape)
     kept = np.exp(-1.0 / (RATE * correlation)) if correlation else 0.0
     noise = lfilter([np.sqrt(1.0 - kept ** 2)], [1.0, -kept], white, axis=0)

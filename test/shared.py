@@ -105,7 +105,7 @@ def context_of(rng: np.random.Generator, count: int) -> dict[str, Floats]:
     return {'temperature': rng.uniform(-20, 60, count), 'std': rng.uniform(0, 0.2, (count, 3)),
             'time': 1000.0 + np.sort(rng.uniform(0, 7200, count)),
             'supply_voltage': rng.uniform(3, 3.6, count), 'rate': rng.normal(size=(count, 3)),
-            'previous': random_directions(count, rng),
+            'previous': random_directions(count, rng), 'since_turn': rng.uniform(0, 900, count),
             'temperature_rate': rng.uniform(-0.1, 0.1, count)}
 
 

@@ -5,13 +5,14 @@
 
 import re
 
+import accel_calib as ac
 from accel_calib.logs import read_poses
 from accel_calib.refine import refine, values_of, verdict_words
 import generator
 from inside import LARGEST_SAMPLE, model_with, simulate_poses, spread_directions
 import numpy as np
 import pytest
-from shared import G, MPS2, random_directions, sensor
+from shared import G, MPS2, random_directions, SENSOR, sensor
 
 LADDER = ('offset', 'gain', 'axis_gain', 'cross_axis')
 WITHOUT_NAME = {'offset_wander', 'empirical'}
@@ -112,6 +113,32 @@ def test_the_last_step_leaves_what_the_calibration_leaves(taken):
     found = refine(taken(2, {'hysteresis': 30.0}, poses=60)[0], MPS2, base='10')
     assert names(found) == ['hysteresis']
     assert found.steps[-1].gap_after_mg == pytest.approx(found.remaining_gap_mg, rel=1e-6)
+
+
+@pytest.mark.parametrize('form', [0.0, 1.0])
+@pytest.mark.parametrize('size', [0.003, 0.07])
+def test_a_hysteresis_of_any_size_leaves_the_noise_in_new_poses(size, form):
+    hidden = {'hysteresis': [size, -size, 0.7 * size, form]}
+    poses, fresh = (ac.simulate({**SENSOR, **hidden}, seed=count, poses=count)
+                    for count in (48, 200))
+    found = ac.refine(poses, base='10')
+    assert (found.verdict, names(found)) == ('explained', ['hysteresis'])
+    assert ac.verify(fresh, found.calibration).rms_after_mg < 0.45  # the noise is 0.3
+
+
+@pytest.mark.parametrize('lasting', [False, True])
+def test_a_relaxation_after_turns_is_named_with_its_time_constant(lasting):
+    rng, tables = np.random.default_rng(3), []
+    for count in (50, 120):
+        waits = rng.lognormal(3.4, 1.0, count)  # from turn to turn, about 30 s
+        known = {'time': np.cumsum(waits)} if not lasting else {
+            'time': np.cumsum(waits) - waits / 2.0, 'duration': waits}
+        tables.append(ac.simulate({**SENSOR, 'creep': [0.02, -0.01, 0.02, 40.0]}, seed=count,
+                                  poses=count, **known))
+    found = ac.refine(tables[0], base='10')
+    assert names(found) == ['creep']
+    assert found.steps[0].parameters['tau'] == pytest.approx(40.0, abs=4.0)
+    assert ac.verify(tables[1], found.calibration).rms_after_mg < 0.5
 
 
 @pytest.mark.parametrize('seed', range(3))

@@ -14,8 +14,7 @@ determine, and plans the next pose. `thermal` is for a still board whose tempera
 
 from .calibration import (
     Calibration, check_sensor, FLEET, of_samples, Outside, outside, PRIOR, Quality, Rejected,
-    RejectedKind, SampleContext, STORED_METHODS, thermal_stream, USES_LIMIT, with_history,
-    with_previous)
+    RejectedKind, SampleContext, STORED_METHODS, thermal_stream, USES_LIMIT, with_history)
 from .fit import (
     CLIPPED, directions_of, fit_poses, fit_unknown, only_norm, rejected_by, sound_rows, sure_rows)
 from .mounting import (
@@ -45,5 +44,4 @@ __all__ = ['CLIPPED', 'FLEET', 'LARGEST_DILUTION', 'LARGEST_OFFSET_G', 'NORM_MOD
            'outlook', 'outside', 'posterior', 'quality_of', 'record_of', 'refuse_if_unfit',
            'rejected_by', 'sample_noise_of', 'set_heading', 'sound_rows', 'stated_uncertainty',
            'sure_rows', 'thermal_alone', 'thermal_stream', 'uncertainty_g', 'verify', 'with_curve',
-           'with_given_mounting', 'with_history', 'with_previous', 'with_rest_noise',
-           'without_curve']
+           'with_given_mounting', 'with_history', 'with_rest_noise', 'without_curve']

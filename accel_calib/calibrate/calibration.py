@@ -18,6 +18,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from html import escape
+from itertools import product
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -26,10 +27,10 @@ from numpy.typing import ArrayLike
 from .rest_noise import GyroBias, SampleNoise
 from ..effects import (
     acting_temperature, AXES, Context, correct, effect_named, Model, ModelForm, MODELS,
-    parameter_names, predict, rate_at, ThermalStream, variable_of)
+    parameter_names, predict, rate_at, ThermalStream, variable_of, way_to, with_turns)
 from ..errors import InputError, StoredCalibrationError
 from ..finding import Finding
-from ..geometry import over_axes, unit
+from ..geometry import over_axes
 from ..table import column_of, Floats, in_unit, Poses, Record, Table
 from ..text import counted, table, with_sd
 from ..units import FrameName, METHODS, MG, UnitName, Units, units_of
@@ -52,8 +53,13 @@ _THERMAL = ('temperature_rate', 'temperature_of_offset', 'temperature_of_gain')
 _HELD = ('time', 'temperature', *_THERMAL, 'supply_voltage')
 """Context that is limited to the range of the poses, as quantities are."""
 
-_MOVED = np.radians(3.0)
-"""Smallest change of direction of a move [rad]; less may be noise or settling."""
+_MOST_WAYS = 30
+_SAME_G = 1e-7
+"""Largest number of iterations of the ways between poses, and the change of the forces [g] below
+which they end."""
+
+_SIGNS = np.array(list(product((-1.0, 1.0), repeat=3)))
+"""Signs of a motion along the axes."""
 
 USES_LIMIT = 'the correction uses the limit of the range'
 
@@ -468,32 +474,41 @@ def with_history(poses_g: Poses, model: Model) -> Poses:
     """
     Return poses in g with the context that comes from the poses before and after.
 
-    That is ``temperature_rate`` and ``previous``, the unit vector towards the previous pose in
-    order of time, or of rows; columns of the table are kept. The last motion counts for all
-    successive poses of one orientation; before the first motion, ``previous`` is zero.
+    That is ``temperature_rate``, ``since_turn``, and ``previous``, the unit vector towards the
+    previous pose in order of time, or of rows; columns of the table are kept. The directions are
+    those that the model corrects. If it needs ``previous`` for that, both are iterated; for a
+    model that depends on its signs alone, all signs are compared.
 
     """
     if 'time' in poses_g and 'temperature' in poses_g and 'temperature_rate' not in poses_g:
         poses_g = poses_g.with_columns(temperature_rate=rate_at(poses_g.columns))
-    if 'previous' in poses_g:
-        return poses_g
+    if 'previous' not in poses_g:
+        poses_g = poses_g.with_columns(previous=_way_to(poses_g, model))
+    return replace(poses_g, columns=with_turns(poses_g.columns))
+
+
+def _way_to(poses_g: Poses, model: Model) -> Floats:
+    """Return the (n, 3) unit vectors towards the previous pose, by the forces of a model."""
     mat_w, vec_v = model.linear_part
-    return with_previous(poses_g, unit((poses_g.reading - vec_v) @ np.linalg.inv(mat_w).T))
+    force = (poses_g.reading - vec_v) @ np.linalg.inv(mat_w).T
+    way, known = way_to(force[np.newaxis], poses_g.columns), poses_g.columns
+    if 'previous' not in model.needs or any(
+            key not in known for key in model.needs if key != 'previous'):
+        return way
 
+    def forces(previous: Floats) -> Floats:
+        turns = with_turns({**known, 'previous': way})
+        return model.at({**turns, 'previous': previous}).force(poses_g.reading)
 
-def with_previous(poses_g: Poses, force: Floats) -> Poses:
-    """Return poses with the unit vector towards the previous pose, given (n, 3) unit forces."""
-    order = (np.argsort(poses_g['time'], kind='stable') if 'time' in poses_g
-             else np.arange(len(poses_g)))
-    previous = np.zeros_like(force)
-    towards, resting = np.zeros(3), order[0] if len(order) else 0
-    for here in order:
-        step = force[resting] - force[here]
-        length = float(np.linalg.norm(step))
-        if length > _MOVED:
-            towards, resting = step / length, here
-        previous[here] = towards
-    return poses_g.with_columns(previous=previous)
+    if np.array_equal(forces(way), forces(np.sign(way))):
+        both = [forces(np.broadcast_to(each, force.shape)) for each in _SIGNS]
+        return way_to(np.array(both), known, _SIGNS)
+    for _ in range(_MOST_WAYS):
+        before, force = force, forces(way)
+        way = way_to(force[np.newaxis], known)
+        if np.max(np.abs(force - before), initial=0.0) < _SAME_G:
+            break
+    return way
 
 
 def check_sensor(calibration: Calibration, sensor: str) -> None:

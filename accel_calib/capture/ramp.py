@@ -246,7 +246,12 @@ def _moved(seconds: float, what: str) -> InputError:
 def _averaged(cells: Poses) -> Poses:
     """Return the stretches with their noise, and the rate of the temperature in each [°C/s]."""
     time = cells['time'] - cells['time'][0]
-    length = max(float(time[-1]) / _STRETCHES, 1.0)
+    warmed, length = float(np.ptp(cells['temperature'])), max(float(time[-1]) / _STRETCHES, 1.0)
+    if warmed > _PLAUSIBLE * time[-1]:
+        raise InputError(f'the temperature changes by {warmed:.0f} °C in {float(time[-1]):.3g} s, '
+                         f'expected at most {_PLAUSIBLE:g} °C/s', 'the times are probably in a '
+                         'unit that is 1000 or 1e6 times as long: name their column time_s, '
+                         'time_ms or time_us')
     _, place, cell_count = np.unique(np.floor(time / length), return_inverse=True,
                                      return_counts=True)
     if len(cell_count) < _LEAST_STRETCHES:
@@ -265,6 +270,9 @@ def _averaged(cells: Poses) -> Poses:
     columns['temperature_rate'] = rate_at(columns)
     return Poses(columns, numbered(columns), 'g', cells.sensor, cells.autopilot)
 
+
+_PLAUSIBLE = 5.0
+"""Largest rate of the temperature of a board [°C/s]."""
 
 _MEDIAN_CHI2 = 0.4549
 """Median of the square of a normal variable."""

@@ -46,6 +46,7 @@ from .model import (
 from .own import know, know_code, know_file, KNOWN_CODE, OwnEffect
 from .simulate import model_with, parse_effect, simulate_poses, simulate_recording, turn_between
 from .thermal import acting_temperature, rate_at, ThermalStream
+from .way import way_to, with_turns
 
 __all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CHANGES', 'CONVERGED_G', 'COVARIATES', 'CUBE', 'EFFECTS',
            'EMPIRICAL', 'FORCE', 'KNOWN_CODE', 'LADDER', 'LARGEST_FORCE_G', 'LARGEST_ITERATIONS',
@@ -59,5 +60,5 @@ __all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CHANGES', 'CONVERGED_G', 'COVARIATES',
            'know_file', 'length_rows', 'linear_model', 'linear_values', 'model_with', 'modes_of',
            'own_slope', 'parameter_names', 'parse_effect', 'predict', 'rate_at', 'reading_of',
            'sensor_force', 'simulate_poses', 'simulate_recording', 'times', 'too_large',
-           'turn_between', 'unit_of', 'value_unit', 'variable_of', 'variable_words',
-           'with_vector']
+           'turn_between', 'unit_of', 'value_unit', 'variable_of', 'variable_words', 'way_to',
+           'with_turns', 'with_vector']

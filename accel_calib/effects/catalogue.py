@@ -117,6 +117,25 @@ def _motion(context: Mapping[str, Any], shape: Floats) -> Floats:
     return np.sign(towards) if shape[0] else towards
 
 
+def _creep(context: Mapping[str, Any], shape: Floats) -> Floats:
+    """Return the way times the mean over the pose of what is left of the relaxation."""
+    tau = max(shape[0], 1e-9)
+    ends = context.get('duration', 0.0) / tau
+    left = np.exp(-context.get('since_turn', 0.0) / tau) * np.where(
+        ends > 0.0, -np.expm1(-ends) / np.maximum(ends, 1e-300), 1.0)
+    return np.asarray(context['previous'], float).T * left
+
+
+def _relaxations(context: Context) -> Iterator[Floats]:
+    """Yield time constants, if poses differ in the time since the turn."""
+    if 'since_turn' not in context:
+        return
+    times = np.nan_to_num(context['since_turn'] + context.get('duration', 0.0))
+    if np.ptp(times) > 0.0:
+        for tau in np.geomspace(max(np.ptp(times) / 60.0, 0.1), np.ptp(times) * 1.5, _TAUS):
+            yield np.array([tau])
+
+
 def _since(context: Mapping[str, Any], shape: Floats) -> Any:
     return (context['time'] - shape[0]) / HOUR
 
@@ -218,6 +237,9 @@ EFFECTS: dict[str, Effect] = {
     'hysteresis': Effect('offset that depends on the previous pose', 'hysteresis', AXES, 'g',
                          0.001, 0.5, by_axis(ONE), _motion, ('previous',), ('form',),
                          lambda context: iter(np.array([[0.0], [1.0]])), usual=(0.0,)),
+    'creep': Effect('offset that relaxes after a turn', 'creep', AXES, 'g', 0.001, 0.5,
+                    by_axis(ONE), _creep, ('time', 'previous'), ('tau',), _relaxations,
+                    over=('since_turn',)),
     'lever_arm': Effect('centripetal force away from the axis of rotation', 'size effect', AXES,
                         'm', 0.1, 5.0, _LEVER, _centripetal, ('rate',)),
     'saturation': Effect(

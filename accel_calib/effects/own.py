@@ -40,8 +40,8 @@ _SAME = 1e-9
 """Relative difference of two answers of a function that count as the same."""
 
 _ALL = 'all'
-_COLUMNS = ('force', 'previous', 'rate', 'std', 'supply_voltage', 'temperature',
-            'temperature_rate', 'time')
+_COLUMNS = ('duration', 'force', 'previous', 'rate', 'since_turn', 'std', 'supply_voltage',
+            'temperature', 'temperature_rate', 'time')
 """Columns that a function can take, besides quantities."""
 
 _NEEDS = {'temperature_rate': ('time', 'temperature')}

@@ -17,8 +17,10 @@ from numpy.typing import ArrayLike
 from .catalogue import CHANGES, effect_named, EFFECTS, is_effect, PROCESSES
 from .form import Context
 from .model import Model, predict
+from .way import way_to, with_turns
 from ..errors import InputError
 from ..table import Floats, numbered, Poses, Recording
+from ..units import Indices
 
 
 def parse_effect(text: str) -> tuple[str, Floats]:
@@ -83,7 +85,8 @@ def simulate_poses(model: Model, directions: Floats, rng: np.random.Generator, *
 
     """
     known = {'std': np.full_like(directions, noise_g), **(context or {})}
-    reading = predict(model, directions, known)
+    way = way_to((directions @ model.rotation.T)[np.newaxis], known)
+    reading = predict(model, directions, with_turns({'previous': way, **known}))
     reading = reading + rng.normal(size=reading.shape) * noise_g / np.sqrt(samples)
     columns = {**known, 'reading': reading, 'count': np.full(len(directions), float(samples))}
     return Poses(columns, numbered(columns))
@@ -106,11 +109,13 @@ def turn_between(start: Floats, end: Floats, seconds: float, count: int
     return force, np.cross(change, force)
 
 
-def path(directions: Floats, rate_hz: float, dwell: float, turn: float) -> tuple[Floats, Floats]:
+def path(directions: Floats, rate_hz: float, dwell: float, turn: float
+         ) -> tuple[Floats, Floats, Indices]:
     """
     Return force [g] and angular rate [rad/s] along a path, (m, 3) each, in the levelled frame.
 
     The sensor rests in each of the (n, 3) directions for `dwell` [s]. Each turn takes `turn` [s].
+    The third result are the (m,) indices of the last direction.
 
     """
     resting, turning = max(1, round(dwell * rate_hz)), max(1, round(turn * rate_hz))
@@ -120,7 +125,8 @@ def path(directions: Floats, rate_hz: float, dwell: float, turn: float) -> tuple
             parts.append(turn_between(directions[k - 1], direction, turn, turning))
         parts.append((np.tile(direction, (resting, 1)), np.zeros((resting, 3))))
     forces, rates = zip(*parts)
-    return np.concatenate(forces), np.concatenate(rates)
+    force = np.concatenate(forces)
+    return force, np.concatenate(rates), np.arange(len(force)) // (resting + turning)
 
 
 def simulate_recording(model: Model, directions: Floats, rng: np.random.Generator, *,
@@ -135,12 +141,15 @@ def simulate_recording(model: Model, directions: Floats, rng: np.random.Generato
     time, from the first to the last of `temperatures` [°C].
 
     """
-    force, rate = path(directions, rate_hz, dwell, turn)
+    force, rate, place = path(directions, rate_hz, dwell, turn)
     count = len(force)
     columns = {'time': np.arange(count) / rate_hz, 'reference': force}
     if temperatures:
         columns['temperature'] = np.linspace(temperatures[0], temperatures[-1], count)
-    reading = predict(model, force, {**columns, 'std': np.full((count, 3), noise_g)})
+    way = way_to((directions @ model.rotation.T)[np.newaxis], {})
+    known = {'std': np.full((count, 3), noise_g), 'previous': way[place], **columns,
+             'since_turn': columns['time'] - columns['time'][np.searchsorted(place, place)]}
+    reading = predict(model, force, known)
     columns['reading'] = reading + rng.normal(size=(count, 3)) * noise_g
     columns['rate'] = rate @ model.rotation.T + rng.normal(size=(count, 3)) * gyro_noise
     return Recording(columns, numbered(columns))

@@ -44,7 +44,13 @@ _AGREES = 1.25
 _MOST_BACK = 0.1
 """Share of steps back in time above which a column is no time."""
 
-_USUAL_HZ = 100.0
+_USUAL_HZ, _POSES_HZ = 100.0, 1.0 / 30.0
+_FAR_S, _POSES_FAR_S = 1e3, 1e5
+"""Usual rates of samples and of poses, and intervals of theirs that are not in s."""
+
+_FASTEST = 1.0
+_ENDS = 8
+"""Largest rate of the temperature of a board [°C/s], from the first to the last of these parts."""
 
 _GAP = 3.0
 """Steps above this ratio to the median are interruptions."""
@@ -203,14 +209,16 @@ def _unit_of_time(columns: Chosen, first: Cells, stamps: Floats) -> str:
     stated = unit_of('time', source.unit)
     if stated:
         return stated[0]
-    if layout.header and source.name == 'time' and (
-            layout.about or 'count' in columns.sources or (
+    step, of_poses = _step_of(stamps), 'count' in columns.sources
+    if layout.header and source.name == 'time' and step < (
+            _POSES_FAR_S if of_poses else _FAR_S) and (
+            layout.about or of_poses or (
                 columns.names(READING) == list(READING)
                 and not _is_dense(stamps, columns.three(first, READING)))):
         return 's'
     # A unit with a plausible rate, best one that the file states; else s.
     units = TICKS.get(bare_name(source.name), _UNITS)
-    beside, step = rates_beside(layout, source), _step_of(stamps)
+    beside = rates_beside(layout, source)
     if not step > 0.0:
         return 's'
     rates = {name: 1.0 / (step * unit) for name, unit in units.items()}
@@ -221,8 +229,16 @@ def _unit_of_time(columns: Chosen, first: Cells, stamps: Floats) -> str:
                   if EPOCH_S[0] <= float(np.median(stamps)) * units[name] <= EPOCH_S[1]]
     if not np.all(stamps == np.round(stamps)) and 's' in plausible:
         plausible = ['s']
+    usual = _USUAL_HZ
+    if of_poses:
+        plausible, usual = [*rates], _POSES_HZ
+    elif 'temperature' in columns.sources:
+        ends = np.array_split(columns.numbers(first, 'temperature'), _ENDS)
+        change = abs(float(np.nanmedian(ends[-1]) - np.nanmedian(ends[0])))
+        plausible = [name for name in plausible
+                     if change * rates[name] <= _FASTEST * len(stamps)] or plausible
     return min(agreeing or since_1970 or plausible, default='s',
-               key=lambda name: abs(math.log(rates[name] / _USUAL_HZ)))
+               key=lambda name: abs(math.log(rates[name] / usual)))
 
 
 def _agree(one: float, two: float) -> bool:

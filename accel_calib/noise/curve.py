@@ -64,7 +64,7 @@ from numpy.typing import NDArray
 
 from ..capture import CaptureSettings, StillDetector
 from ..errors import InputError
-from ..table import concatenated, Floats, Recording
+from ..table import concatenated, Floats, numbered, Recording
 from ..text import counted
 from ..units import Units
 
@@ -94,6 +94,23 @@ _MOST_MISSING = 0.02
 
 _UNEVEN = 0.1
 """Standard deviation of the intervals that is worth a note, in units of the mean interval."""
+
+_COARSE = 1.0
+"""Noise in units of the step of the output below which rounding changes the noise."""
+
+_MOST_STEPS = 4096
+
+_BLOCK_S = 1.0
+"""Length of the averages in which a coarse record is searched for a rest [s]."""
+
+_NEAR_STEP = 2.0
+"""Noise in units of the step below which steps can look like motions."""
+
+_AROUND, _MOVED = 5, 3.0
+"""Number of blocks before and after a motion, and its least size in steps."""
+
+_DISTURBED = 12.0
+"""Variance of the samples of a disturbed block, in units of the usual one or of a step."""
 
 _SECOND = np.array([1.0, -2.0, 1.0])
 _FLICKER = np.array([[0.0], [0.0], [1.0], [0.0]])
@@ -245,25 +262,74 @@ class LongRest:
 
 def longest_rest(recording: Recording, units: Units) -> LongRest:
     """Return the longest rest without an interruption; raise InputError if it is too short."""
-    time = recording['time']
-    best, seconds = (0, 0), 0.0
-    detector = StillDetector(CaptureSettings(), units, keep=None)
-    detector.add_recording(recording)
-    detector.close()
-    for dwell in sorted(detector.dwells(), key=lambda dwell: dwell.start - dwell.end):
-        if dwell.end - dwell.start <= seconds:
-            break
-        for part in _uninterrupted(time, dwell.start, dwell.end):
-            length = float(time[part[1] - 1] - time[part[0]])
-            best, seconds = (part, length) if length > seconds else (best, seconds)
-    count = best[1] - best[0]
+    best, seconds = recording.take(slice(0)), 0.0
+    for samples, seen in ((recording, recording), *_averaged(recording)):
+        detector = StillDetector(CaptureSettings(), units, keep=None)
+        detector.add_recording(seen)
+        detector.close()
+        for dwell in sorted(detector.dwells(), key=lambda dwell: dwell.start - dwell.end):
+            if dwell.end - dwell.start <= seconds:
+                break
+            for part in _uninterrupted(samples['time'], dwell.start, dwell.end):
+                length = float(samples['time'][part[1] - 1] - samples['time'][part[0]])
+                if length > seconds:
+                    best, seconds = samples.take(slice(*part)), length
+    count, time = len(best), recording['time']
     if count < LEAST_SAMPLES:
         recorded = float(np.ptp(time)) if len(time) else 0.0
         found = counted(count, 'sample') if count else 'no sample'
         raise InputError(f'the longest rest in {recorded:.3g} s has {found}, expected at least '
                          f'{LEAST_SAMPLES}', 'record the sensor for some minutes to hours while '
                          'nothing touches it')
-    return _regular(recording.take(slice(*best)), units)
+    return _regular(best, units)
+
+
+def _averaged(recording: Recording) -> Iterator[tuple[Recording, Recording]]:
+    """
+    Yield the samples of a coarse record without disturbed blocks, and the means of the blocks.
+
+    Where the noise is small beside the step of the output, single steps look like motions. Means
+    over a block with an added noise of one step do not show them. They would not show a knock
+    or a small turn either, but the scatter in a block and the change between blocks do.
+
+    """
+    if not len(recording):
+        return
+    block = np.floor((recording['time'] - recording['time'][:1]) / _BLOCK_S)
+    starts = np.flatnonzero(np.diff(block, prepend=np.nan))
+    count = np.diff(starts, append=len(block))[:, np.newaxis]
+
+    def means(values: Floats) -> Floats:
+        sums: Floats = np.add.reduceat(values.reshape(len(block), -1), starts) / count
+        return sums.reshape(len(starts), *values.shape[1:])
+
+    reading = recording.reading - recording.reading[:1]
+    variance = np.maximum(means(reading ** 2) - means(reading) ** 2, 0.0)
+    usual = np.median(variance, axis=0)
+    step = min(filter(None, map(coarse_step, reading.T, np.sqrt(usual) / _NEAR_STEP)), default=0.0)
+    if step == 0.0:
+        return
+    calm = np.all(variance <= _DISTURBED * np.maximum(usual, step ** 2 / 4.0), axis=1)
+    sums = np.cumsum(means(reading), axis=0)
+    change = sums[2 * _AROUND:] - 2.0 * sums[_AROUND:-_AROUND] + sums[:-2 * _AROUND]
+    calm[1 + _AROUND:1 + _AROUND + len(change)] &= np.all(
+        np.abs(change) <= _AROUND * _MOVED * step, axis=1)
+    known = {key: means(recording[key])[calm] for key in ('time', 'reading', 'rate')
+             if key in recording}
+    known['reading'] += np.random.default_rng(0).normal(size=known['reading'].shape) * step
+    yield recording.take(np.repeat(calm, count[:, 0])), Recording(known, numbered(known))
+
+
+def coarse_step(values: Floats, noise: float) -> float:
+    """Return the step of the output if the noise of a sample is smaller, otherwise 0."""
+    levels = np.unique(values[:1_000_000])
+    if len(levels) > _MOST_STEPS:
+        return 0.0
+    gaps = np.diff(levels)
+    # Rounding of a computation leaves gaps that are not steps.
+    gaps = gaps[gaps > 1e-9 * max(float(np.max(np.abs(levels))), noise)]
+    step = float(np.min(gaps)) if len(gaps) else 0.0
+    return step if noise < _COARSE * step else 0.0
 
 
 def _uninterrupted(time: Floats, start: float, end: float) -> Iterator[tuple[int, int]]:

@@ -27,8 +27,8 @@ from .components import (
     AxisNoise, COMPONENTS, FIGURES, fit_components, Fitted, Kind, KINDS, LEVEL, NoiseFigures,
     shown_unit)
 from .curve import (
-    allan_variances, check_allantools, Counts, FLAT, longest_rest, LongRest, octaves, shares,
-    Spread, spread_of)
+    allan_variances, check_allantools, coarse_step, Counts, FLAT, longest_rest, LongRest, octaves,
+    shares, Spread, spread_of)
 from ..table import Floats, Recording
 from ..units import is_native, STANDARD_GRAVITY, Units
 
@@ -200,11 +200,6 @@ _POWERS = {'quantisation': 1.0, 'noise_density': 0.5, 'bias_instability': 0.0,
 _MOST_RATE = 0.03
 """Noise density that no gyro in rad/s has [rad/s/√Hz]: 100 times that of a cheap one."""
 
-_COARSE = 1.0
-"""Noise in units of the step of the output below which rounding changes the noise."""
-
-_MOST_STEPS = 4096
-
 _LEAST_VARIANCE = 1e-18
 """Allan variance that is only rounding, for samples with the standard deviation 1."""
 
@@ -277,7 +272,7 @@ def _axis(kind: Kind, axis: str, unit: str, values: Floats, rate: float, spread:
         {name: each.times(size * (1.0 / rate) ** _POWERS[name])
          for name, each in zip(COMPONENTS, fitted.components, strict=True)},
         (float(tau[fitted.first]), float(tau[fitted.last])), fitted.p_value,
-        _coarse_step(values, size * float(np.sqrt(variances[0]))))
+        coarse_step(values, size * float(np.sqrt(variances[0]))))
 
 
 def _band(variances: Floats, lengths: Counts, fitted: Fitted, spread: Spread
@@ -292,18 +287,6 @@ def _band(variances: Floats, lengths: Counts, fitted: Fitted, spread: Spread
     low, high = (np.sqrt(variances * freedom / scipy.stats.chi2.ppf(part, freedom))
                  for part in (1.0 - tail, tail))
     return low, high
-
-
-def _coarse_step(values: Floats, noise: float) -> float:
-    """Return the step of the output if the noise of a sample is smaller, otherwise 0."""
-    levels = np.unique(values[:1_000_000])
-    if len(levels) > _MOST_STEPS:
-        return 0.0
-    gaps = np.diff(levels)
-    # Rounding of a computation leaves gaps that are not steps.
-    gaps = gaps[gaps > 1e-9 * max(float(np.max(np.abs(levels))), noise)]
-    step = float(np.min(gaps)) if len(gaps) else 0.0
-    return step if noise < _COARSE * step else 0.0
 
 
 def _temperatures(rest: LongRest) -> tuple[float, float] | None:

@@ -343,15 +343,16 @@ def off_grid(poses_g: Poses, base: Model) -> tuple[Poses, float | None]:
     return on_grid, step
 
 
-def beside_stored(poses_g: Poses, calibration: Calibration) -> Poses:
+def beside_stored(poses_g: Poses, calibration: Calibration, model: Model) -> Poses:
     """
     Return new poses in g followed by those of a stored calibration, with the column ``new``.
 
+    The ways between the poses of the calibration are those that `model` corrects.
     Return only the new poses, without this column, if the calibration has no effects or no poses,
     or was fitted to some of the new poses and still agrees with them.
 
     """
-    stored = with_history(in_g(calibration.poses, calibration.units), calibration.model)
+    stored = with_history(in_g(calibration.poses, calibration.units), model)
     stored = stored.take(np.isin(stored.row, calibration.used_poses.row))
     if not len(stored) or not calibration.model.effects:
         return poses_g

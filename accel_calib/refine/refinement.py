@@ -18,6 +18,7 @@ are listed as not testable.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from html import escape
 
@@ -48,6 +49,12 @@ _LEAST_POSES = 4
 
 _ROUNDS = 6
 """Largest number of fits after which outliers are left out."""
+
+_SEARCHES = 3
+"""Largest number of further searches along ways between poses that the one before corrects."""
+
+_SAME_WAY_G = 1e-5
+"""Largest difference of the readings along two ways that are the same [g]."""
 
 _NAMED = 4
 """Largest number of undetermined values that are named."""
@@ -237,13 +244,20 @@ def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Un
                               f'{_LEAST_POSES} to find an effect', 'take 24 poses or more')
     stored = base if isinstance(base, Calibration) else None
     calibration = stored or base_of(poses, units, str(base), sensor=sensor, date=date)
-    poses_g = with_history(in_g(sound, calibration.units), calibration.model)
-    if stored is not None:
-        poses_g = beside_stored(poses_g, stored)
-    total, poses_g = len(poses_g), sampled(poses_g)
-    model = Model(calibration.model.values)
+
+    def at(model: Model) -> Poses:
+        known = with_history(in_g(sound, calibration.units), model)
+        return known if stored is None else beside_stored(known, stored, model)
+
+    every, model = at(calibration.model), Model(calibration.model.values)
+    total, poses_g = len(every), sampled(every)
     try:
         found = search(poses_g, model, also)
+        for _ in range(_SEARCHES if 'previous' in found.final.model.needs else 0):
+            before, poses_g = poses_g, _along_ways(found.final, at)
+            if _is_same_way(found.final.model, before, poses_g):
+                break
+            found = search(poses_g, model, also)
     except NotConvergedError:
         raise RefusedFitError(f'the base {calibration.name} cannot be fitted to these poses, '
                               'expected a fit that converges', 'check the poses for mistakes, or '
@@ -259,6 +273,30 @@ def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Un
     note = (*(poses.findings if stored else ()), *((sample,) if len(poses_g) < total else ()))
     given = Given(poses, poses_g, stored is not None, (*rejected, *unsound), note)
     return _record(calibration, found, given, sensor or poses.sensor, date)
+
+
+def _along_ways(final: State, at: Callable[[Model], Poses]) -> Poses:
+    """
+    Return the poses at a model that is fitted in turn with the ways from its corrected poses.
+
+    A large hysteresis distorts the directions from which the ways between poses are computed.
+
+    """
+    state, poses_g = final, sampled(at(with_changes(final.model)[0]))
+    for _ in range(_ROUNDS):
+        kept = poses_g['previous'][np.isin(poses_g.row, final.poses_g.row)]
+        fitted = fitted_state(state.model, final.poses_g.with_columns(previous=kept))
+        state, before = fitted or state, poses_g
+        poses_g = sampled(at(with_changes(state.model)[0]))
+        if fitted is None or _is_same_way(state.model, before, poses_g):
+            break
+    return poses_g
+
+
+def _is_same_way(model: Model, *ways: Poses) -> bool:
+    """Return whether the readings of a model along two ways between poses are the same."""
+    one, other = (model.at(poses_g.columns).vec_v for poses_g in ways)
+    return bool(np.max(np.abs(one - other), initial=0.0) < _SAME_WAY_G)
 
 
 def _record(calibration: Calibration, found: Found, given: Given, sensor: str, date: str

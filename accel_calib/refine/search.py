@@ -40,12 +40,10 @@ from .curves import (
 from .linear import LEVEL, Set
 from .settle import fit_without, make_sound, settle
 from .state import beginning, Candidate, fitted_state, linearised, State, without
-from ..calibrate import with_previous
 from ..effects import (
     CHANGES, covariate_names, effect_named, EFFECTS, empirical_parts, factors_of, included, LADDER,
     linear_values, Model, parameter_names, WANDER)
-from ..estimate import beside_scatter, judge, kinds, scatter_of, stated
-from ..geometry import unit
+from ..estimate import beside_scatter, kinds, scatter_of, stated
 from ..table import Floats, Poses
 
 _TIMED = 30.0
@@ -207,13 +205,6 @@ def _search(poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
     names = (*_visible(begun, LADDER), *(name for name in EFFECTS if name not in LADDER),
              *also, *covariate_names(causes(poses_g)), *_visible(begun, CHANGES))
     state, near, trial = settle(begun, poses_g, fixed, names)
-    if 'hysteresis' in near.names:  # a large one has distorted the directions
-        force = judge(state.model, poses_g).equations.force
-        turned = with_previous(poses_g, unit(force))
-        again = judge(state.model, turned)
-        if np.all(np.isfinite(again.residual)):  # else it is far from that of any sensor
-            poses_g = turned
-            state, near, trial = settle(State(again), poses_g, fixed, names)
     begun = fit_without(begun, poses_g, near.chosen.out)
     taken_back: tuple[str, ...] = ()
     if near.names and near.walk is None and not _explains(begun, state):

@@ -39,6 +39,7 @@ CONTEXT: dict[str, Any] = {
     'supply_voltage': 3.3 + 0.1 * np.cos(K), 'temperature_rate': np.cos(K) / 60.0,
     'rate': np.column_stack([np.sin(K), np.cos(K), 0.1 * K]),
     'std': 2e-3 * (1.0 + np.column_stack([K % 3, K % 4, K % 5])),
+    'since_turn': 40.0 * (K % 4),
     'previous': unit(np.column_stack([np.sin(K), np.cos(2 * K), np.sin(3 * K)]))}
 
 
