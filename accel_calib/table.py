@@ -66,8 +66,8 @@ COLUMNS: dict[str, Column] = {
     'previous': Column(('from_x', 'from_y', 'from_z'), '', 'unit vector towards the previous '
                        'pose; computed from the order of the poses'),
     'duration': Column(('duration',), 's', 'time from the first to the last sample of a pose'),
-    'since_turn': Column(('since_turn',), 's', 'time from the last turn to the start of a pose',
-                         made=True),
+    'since_turn': Column(('since_turn',), 's', 'time from the last turn to the start of a pose; '
+                         'computed from the times'),
     'temperature_rate': Column(('temperature_rate',), '°C/s', 'rate of the temperature',
                                made=True),
     'temperature_of_offset': Column(('temperature_of_offset',), '°C', 'temperature that acts on '

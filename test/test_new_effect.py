@@ -241,7 +241,7 @@ TONE = ac.Effect(
     function=lambda time, period, phase: np.sin(2.0 * np.pi * time / period + phase),
     constants={'period': (200, 900), 'phase': (0, 3.1)})
 TRUTH = {'thermal_knee': [2e-4, -3e-4, 2.5e-4, 31.0], 'dead_band': [0.01, -0.008, 0.012, 0.12],
-         'turn_creep': [4e-3, -5e-3, 3e-3, 80.0], 'field_across': [4e-3, -3e-3],
+         'turn_gain': [4e-3, -5e-3, 3e-3, 80.0], 'field_across': [4e-3, -3e-3],
          'spin_gain': [1e-3], 'own_tone': [4e-3, -3e-3, 2e-3, 420.0, 1.0]}
 
 
@@ -299,8 +299,9 @@ def test_an_own_effect_that_cannot_be_tested_or_ends_at_a_bound_is_named(own_eff
     narrow = replace(own, constants={'knee': (36, 45)})
     assert [line for line in ac.refine(poses, also=[narrow]).advice
             if 'its constant knee ends at its bound 36' in line]
-    lacking = ac.refine(poses.without_columns('since_turn'), also=[own_effects['turn_creep']])
-    assert dict(lacking.not_testable)['turn_creep'] == 'since_turn'
+    untimed = poses.without_columns('since_turn', 'time')
+    lacking = ac.refine(untimed, also=[own_effects['turn_gain']])
+    assert dict(lacking.not_testable)['turn_gain'] == 'since_turn'
 
 
 def test_an_own_effect_does_not_hide_one_of_the_catalogue():

@@ -205,7 +205,7 @@ def test_a_low_pass_filter_is_noted_and_the_density_is_that_of_long_times() -> N
 @pytest.mark.parametrize('size', [0.3e-3, 1e-3, 3e-3])
 def test_steps_of_a_coarse_output_do_not_end_a_rest_but_a_motion_does(size: float) -> None:
     rest = resting(26, 90_000, 1e-6, walk=size / 10.0, mean=(0.01, 0.02, 1.0)).reading
-    rest += size * np.sin(np.arange(90_000) / 2000.0)[:, np.newaxis]
+    rest = rest + size * np.sin(np.arange(90_000) / 2000.0)[:, np.newaxis]
     moved = rest + 0.03 * (np.arange(90_000) > 60_000)[:, np.newaxis]
     for reading, samples in ((rest, 90_000), (moved, 60_000)):
         found = longest_rest(sampled(np.round(reading / 0.0033) * 0.0033), G)

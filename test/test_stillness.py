@@ -428,6 +428,7 @@ def test_merged_poses_lie_on_the_sphere_and_are_less_noisy():
 
 def test_a_number_that_is_not_finite_is_refused_with_its_row():
     time, reading = visited(FACES)
+    reading = reading.copy()
     reading[70, 1] = np.nan
     with pytest.raises(InputError, match='row 71 .* remove that row'):
         captured(time, reading)

@@ -546,7 +546,8 @@ def factors_of(name: str, shapes: Iterable[Floats], context: Context) -> Floats:
     factor = effect_named(name).factor
     if factor is None:
         return np.ones((1, 1, 1))
-    context = {'force': context['reading'], **context}
+    if 'reading' in context:
+        context = {'force': context['reading'], **context}
     return np.nan_to_num([np.atleast_2d(factor(context, shape)) for shape in shapes])
 
 

@@ -48,8 +48,8 @@ def way_to(force: Floats, known: Context, signs: Floats = np.zeros((1, 3))) -> F
 
 
 def with_turns(known: Context) -> Context:
-    """Return context with the time from the last turn to the start of each pose, if known [s]."""
-    if 'time' not in known:
+    """Return context with the time from the last turn to the start of each pose [s], if known."""
+    if 'time' not in known or 'since_turn' in known:
         return known
     order = np.argsort(known['time'], kind='stable')
     start = (known['time'] - known.get('duration', 0.0) / 2.0)[order]

@@ -233,8 +233,9 @@ def _unit_of_time(columns: Chosen, first: Cells, stamps: Floats) -> str:
     if of_poses:
         plausible, usual = [*rates], _POSES_HZ
     elif 'temperature' in columns.sources:
-        ends = np.array_split(columns.numbers(first, 'temperature'), _ENDS)
-        change = abs(float(np.nanmedian(ends[-1]) - np.nanmedian(ends[0])))
+        warm = columns.numbers(first, 'temperature')
+        ends = np.array_split(warm[np.isfinite(warm)], _ENDS)
+        change = abs(float(np.median(ends[-1]) - np.median(ends[0]))) if len(ends[-1]) else 0.0
         plausible = [name for name in plausible
                      if change * rates[name] <= _FASTEST * len(stamps)] or plausible
     return min(agreeing or since_1970 or plausible, default='s',

@@ -312,7 +312,8 @@ def _columns(poses_g: Poses, force: Floats, shown: Sequence[Mapping[str, float]]
              ) -> dict[str, NDArray[Any]]:
     """Return the columns of candidates, without their readings."""
     count, found = len(force), {}
-    for key in ('std', 'count', 'temperature', 'supply_voltage', 'rate', *poses_g.quantities):
+    for key in ('std', 'count', 'temperature', 'supply_voltage', 'rate', 'duration', 'since_turn',
+                *poses_g.quantities):
         if key in poses_g:
             usual = np.nanmedian(poses_g[key], axis=0)
             found[key] = np.tile(usual, (count, 1)) if usual.ndim else np.full(count, usual)
