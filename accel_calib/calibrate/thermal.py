@@ -428,7 +428,6 @@ def _held_out_mg(errors: Floats) -> float:
     return float(np.sqrt(np.mean(errors))) * MG
 
 
-
 def _better_form(board: _Board, form: Form, errors: Floats) -> tuple[Form, Floats] | None:
     """Return the form that predicts held-out parts best, if it is clearly better than one."""
     tried = [(each, board.errors(each)) for each in board.further(form)]
