@@ -38,7 +38,7 @@ least squares with this noise, averaged over the grid.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -193,11 +193,14 @@ class _Board:
 
     stretches: Poses
     group: NDArray[np.intp]
-    parts: NDArray[np.intp] = field(init=False)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, 'parts', _parts(
-            self.stretches['time'], self.stretches['temperature']))
+    @cached_property
+    def parts(self) -> NDArray[np.intp]:
+        """(n,) array, the part of each, with equal shares of time and way of the temperature."""
+        warm = self.stretches['temperature']
+        way = np.abs(np.diff(warm, prepend=warm[0]))
+        share = np.cumsum(way / max(float(way.sum()), 1e-9) + 1.0 / len(warm)) / 2.0
+        return np.minimum((share * _BLOCKS).astype(np.intp), _BLOCKS - 1)
 
     @cached_property
     def levels(self) -> Floats:
@@ -228,14 +231,13 @@ class _Board:
         """
         basis = np.linalg.qr(np.column_stack([self.levels, self.columns(form)]))[0]
         left = self.stretches.reading - basis @ (basis.T @ self.stretches.reading)
-        found = []
-        for part in np.unique(self.parts):
-            own = basis[self.parts == part]
-            rest = np.eye(basis.shape[1]) - own.T @ own
-            error = left[self.parts == part]
-            error = error + own @ (np.linalg.pinv(rest, hermitian=True) @ (own.T @ error))
-            found.append(np.mean(np.sum(error ** 2, axis=1)))
-        return np.array(found)
+        rows = [self.parts == part for part in np.unique(self.parts)]
+        own = [basis[each] for each in rows]
+        rest = np.linalg.pinv(np.eye(basis.shape[1]) - np.array([each.T @ each for each in own]),
+                              hermitian=True)
+        return np.array([
+            np.mean(np.sum((left[row] + each @ (more @ (each.T @ left[row]))) ** 2, axis=1))
+            for row, each, more in zip(rows, own, rest, strict=True)])
 
     def is_better(self, one: Floats, other: Floats) -> bool:
         """Return whether the first errors of held-out parts are clearly smaller."""
@@ -260,12 +262,11 @@ class _Board:
             yield {**form, **{name: np.array(EFFECTS[name].usual)
                               for name in _POWERS[degree:more]}}
         steady = {name: shape for name, shape in form.items() if name != _RATE}
-        for name in (_RATE, _LINEAR):
-            if (name == _RATE and name not in form and not _lagged(form)) or (
-                    name == _LINEAR and degree):
-                for shape in self.shapes(name):
-                    if self._is_apart(self.columns({name: shape}), steady):
-                        yield {**steady, name: shape}
+        for name in (*([] if _RATE in form or _lagged(form) else [_RATE]),
+                     *([_LINEAR] if degree else [])):
+            for shape in self.shapes(name):
+                if self._is_apart(self.columns({name: shape}), steady):
+                    yield {**steady, name: shape}
         if _STEP not in form:
             for shape in self.shapes(_STEP):
                 yield {**form, _STEP: shape}
@@ -415,13 +416,6 @@ def _joined(ramps: Sequence[Ramp]) -> _Board:
     columns['orientation'] = -1.0 - group  # no number of a pose
     first = tables[0]
     return _Board(Poses(columns, numbered(columns), 'g', first.sensor, first.autopilot), group)
-
-
-def _parts(time: Floats, warm: Floats) -> NDArray[np.intp]:
-    """Return the part of each stretch, with equal shares of time and way of the temperature."""
-    way = np.abs(np.diff(warm, prepend=warm[0]))
-    share = np.cumsum(way / max(float(way.sum()), 1e-9) + 1.0 / len(time)) / 2.0
-    return np.minimum((share * _BLOCKS).astype(np.intp), _BLOCKS - 1)
 
 
 def _held_out_mg(errors: Floats) -> float:
