@@ -87,9 +87,10 @@ def some(items: Iterable[object], most: int = 12) -> str:
     return ', '.join(words[:most]) + more
 
 
-def reason(error: Exception) -> str:
-    """Return why a library refuses damaged bytes, in one line of limited length."""
-    said = ' '.join(str(error)[:_LONGEST_REASON].split())
+def reason(error: BaseException) -> str:
+    """Return why foreign code raises an error, in one printable line of limited length."""
+    text = str(error)[:_LONGEST_REASON]
+    said = ' '.join(''.join(each if each.isprintable() else ' ' for each in text).split())
     return said if ' ' in said else f'{type(error).__name__} {said}'.strip()
 
 

@@ -12,11 +12,13 @@ from dataclasses import replace
 import re
 
 import accel_calib as ac
-from accel_calib.effects import AXES, by_axis, Effect, EFFECTS, ONE
+from accel_calib.effects import AXES, by_axis, correct, Effect, EFFECTS, Model, ONE
 from accel_calib.errors import InputError
 from accel_calib.logs import layout_of
 from accel_calib.messages import Rewriter
+from accel_calib.pipeline import Correction
 from accel_calib.report import refinement_page
+from accel_calib.table import Recording
 from bag_files import header, IMU, imu
 from inside import COMMAND, OneReading
 import numpy as np
@@ -188,12 +190,12 @@ def test_an_own_effect_that_cannot_work_is_refused_when_it_is_made(wrong, messag
         ac.Effect(**{'name': 'own', 'words': 'own effect', 'typical': 0.001, **wrong})
 
 
-BAD = {'1 / 0': 'raises ZeroDivisionError', 'None': 'returns NoneType', '"text"': 'returns str',
+BAD = {'1 / 0': 'fails .division by zero', 'None': 'returns NoneType', '"text"': 'returns str',
        'x[1:]': 'of shape', 'np.log(x - 25)': r'returns \[nan', 'x + 1j': 'complex128',
        'np.multiply(x, 2, out=x)': 'read-only',
        'x * np.random.rand()': 'other numbers', 'x - np.mean(x)': 'other numbers',
-       'calls.append(1) or x * len(calls)': 'other numbers', 'sys.exit(0)': 'raises SystemExit',
-       'exec("raise ValueError(chr(10) + chr(27))")': 'raises ValueError:', '[x, 1]': 'raises'}
+       'calls.append(1) or x * len(calls)': 'other numbers', 'sys.exit(0)': 'fails .SystemExit 0.',
+       'exec("raise ValueError(chr(10) + chr(27))")': 'fails .ValueError.', '[x, 1]': 'fails'}
 
 
 @pytest.mark.parametrize('bad', BAD)
@@ -302,6 +304,20 @@ def test_an_own_effect_that_cannot_be_tested_or_ends_at_a_bound_is_named(own_eff
     untimed = poses.without_columns('since_turn', 'time')
     lacking = ac.refine(untimed, also=[own_effects['turn_gain']])
     assert dict(lacking.not_testable)['turn_gain'] == 'since_turn'
+
+
+def test_samples_are_corrected_without_what_only_poses_have(own_effects):
+    own, (up, context) = own_effects['turn_gain'], turned(72, 6)
+    poses = ac.simulate({**SENSOR, own.name: TRUTH[own.name]}, directions=up, units='g',
+                        also=[own], **context)
+    calibration = ac.refine(poses, also=[own]).calibration
+    correction = Correction(calibration, 'g', '')
+    samples = Recording({'time': poses['time'], 'reading': poses.reading}, poses.row, 'g')
+    expected = Model({name: calibration.model.values[name] for name in SENSOR})
+    np.testing.assert_allclose(correction(samples).reading, correct(expected, poses.reading, {}))
+    assert any('since_turn' in note for note in correction.notes)
+    one = OneReading(calibration).at({**calibration.model.neutral})
+    np.testing.assert_allclose(one.correct(*poses.reading[3]), correction(samples).reading[3])
 
 
 def test_an_own_effect_does_not_hide_one_of_the_catalogue():

@@ -330,7 +330,9 @@ class Calibration(Record):
     def typical_context(self, count: int) -> Context:
         """Return the middle of `ranges` for `count` samples, without motion and vibration."""
         none = np.zeros((count, 3))
-        middle = {key: np.full(count, sum(limits) / 2.0) for key, limits in self.ranges.items()}
+        typical = {**self.model.neutral, **{key: sum(limits) / 2.0
+                                            for key, limits in self.ranges.items()}}
+        middle = {key: np.full(count, value) for key, value in typical.items()}
         return {'std': none, 'previous': none, 'rate': none, 'time': np.zeros(count), **middle}
 
     def held(self, known: _Known) -> _Known:

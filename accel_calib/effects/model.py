@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from .catalogue import effect_named, EFFECTS, is_effect, PROCESSES
 from .form import AFFINE, Context, difference, Effect, fitted_places, FORCE, MONOMIALS, ONE
 from .thermal import Lag
+from .way import AT_POSES
 from ..errors import InputError
 from ..geometry import unit
 from ..table import column_of, Floats, is_quantity, Record
@@ -377,9 +378,15 @@ class Model(Record):
 
     @cached_property
     def neutral(self) -> Mapping[str, float]:
-        """Value of each quantity that counts as no change, where it is not recorded; NaN: none."""
+        """
+        Value that counts as no change of each column that samples may lack; NaN: none.
+
+        These are the quantities, and what only poses have.
+
+        """
         return {key: float(np.mean(shape)) if len(shape) and not effect.own else np.nan
-                for effect, shape in self._by_effect for key in effect.needs if is_quantity(key)}
+                for effect, shape in self._by_effect for key in effect.needs
+                if is_quantity(key) or key in AT_POSES}
 
     @cached_property
     def lags(self) -> Mapping[str, Lag]:

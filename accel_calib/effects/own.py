@@ -28,6 +28,7 @@ from .thermal import rate_at
 from ..disk import check_regular
 from ..errors import AccelCalibError, InputError, OwnEffectError
 from ..table import column_of, Floats, is_quantity, read_only
+from ..text import reason
 
 _NAME = re.compile(r'[a-z][a-z0-9_]{0,63}')
 
@@ -52,9 +53,6 @@ _WIDE = 10.0
 _STEPS = (0.618034, 0.414214, 0.732051)
 """Number of starts of the constants; ratio of bounds above which they are spread by ratio; steps
 of the further constants, irrational, so that few starts cover their ranges."""
-
-_LONGEST = 300
-"""Longest quoted message of an error [characters]."""
 
 
 @dataclass(frozen=True)
@@ -241,8 +239,8 @@ class OwnEffect:
                 found = function(*given)
                 values = np.asarray(found)
         except (Exception, SystemExit) as err:
-            raise self._wrong(what, f'raises {_said(err)}', 'numbers, and its arguments '
-                              'left as they are') from err
+            raise self._wrong(what, f'fails ({reason(err)})', 'numbers, and its arguments left as '
+                              'they are') from err
         if values.dtype.kind not in 'fiub' or values.shape not in ((count,), (count, 3)):
             kind = (f'{values.dtype} of shape {values.shape}' if isinstance(found, np.ndarray)
                     else type(found).__name__)
@@ -263,12 +261,6 @@ class OwnEffect:
 def _rows(given: Sequence[Any], which: Any) -> list[Any]:
     """Return read-only copies of rows of the columns among arguments, and the constants."""
     return [read_only(np.array(each[which])) if np.ndim(each) else each for each in given]
-
-
-def _said(error: BaseException) -> str:
-    """Return kind and message of an error in code of a user, as one line."""
-    text = f'{type(error).__name__}: {error}'[:_LONGEST]
-    return ' '.join(''.join(each if each.isprintable() else ' ' for each in text).split())
 
 
 def know(effects: Iterable[OwnEffect]) -> tuple[str, ...]:
@@ -312,8 +304,8 @@ def know_code(name: str, code: bytes) -> tuple[str, ...]:
     except (AccelCalibError, OSError):
         raise
     except (Exception, SystemExit) as err:
-        raise InputError(f'{name} cannot be executed ({_said(err)}), expected '
-                         ' Python with own effects', 'correct it') from err
+        raise InputError(f'{name} cannot be executed ({reason(err)}), expected '
+                         'Python with own effects', 'correct it') from err
     found = {id(each): each for each in defined.values() if isinstance(each, OwnEffect)}
     if not found:
         raise InputError(f'{name} defines no effect, expected at least one accel_calib.Effect',

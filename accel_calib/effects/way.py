@@ -16,6 +16,9 @@ from .form import Context
 from ..geometry import unit
 from ..table import Floats
 
+AT_POSES = ('since_turn', 'duration')
+"""Columns that only poses have."""
+
 _MOVED = np.radians(3.0)
 """Smallest change of direction of a move [rad]; less may be noise or settling."""
 

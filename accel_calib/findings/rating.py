@@ -218,7 +218,7 @@ def _not_corrected(expected: Expected) -> Iterator[Finding]:
     for name, size in expected.not_corrected:
         if size > MATTERS.value:
             short = 'a curve' if kind_of(name) == EMPIRICAL else name
-            if 'time' in depends_on(name):
+            if 'time' in depends_on(name) and 'since_turn' not in depends_on(name):
                 yield Finding('settling', f'the readings changed with time by {mg(size)} '
                               f'({short}), and may change again', 'let the sensor settle, and '
                               'take the poses again', 'USABLE')
