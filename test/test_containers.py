@@ -182,7 +182,7 @@ FLIGHTS = ({'flight': 'ULog\x01\x12\x35'},
     (zipped, {'gyro': f'{GYRO}\n0,0,0,0\n', 'baro': 't,p\n0,1\n'},
      'gyro.csv, baro.csv, expected one of an acc'),
     (zipped, {'meta/time': 'a,b\n'}, 'holds 0 tables'),
-    (encrypted, ONE, 'password required'),
+    (encrypted, ONE, 'needs a password'),
     *((write, flight, 'holds flight.csv, an? .* log.*unpack it')
       for write in (zipped, stored) for flight in FLIGHTS),
     (matlab, {'log': {'acc': np.ones((9, 3))}},

@@ -33,6 +33,7 @@ import zipfile
 import numpy as np
 
 from .child import LogFile
+from ..errors import InputError
 from ..table import ABOUT
 
 ROWS = 500
@@ -41,7 +42,7 @@ ROWS = 500
 CELL_BYTES = 18
 """Bytes of a number as text, about."""
 
-_PIECE = 1 << 16
+_PIECE, _ENCRYPTED = 1 << 16, 1
 _MAGIC = 10
 
 
@@ -119,6 +120,8 @@ def text(path: Path, _: ExitStack) -> list[Member]:
 def archived(path: Path, stack: ExitStack) -> list[Member]:
     """Return the files of a ZIP archive."""
     archive = stack.enter_context(zipfile.ZipFile(path))
+    if any(info.flag_bits & _ENCRYPTED for info in archive.infolist()):
+        raise InputError(f'{path} needs a password, expected a ZIP archive without one', UNPACK)
     return [Member(info.filename, info.file_size, partial(_pieces, partial(archive.open, info)))
             for info in archive.infolist() if not info.is_dir() and not any(
                 part.startswith(('.', '__MACOSX')) or part == 'meta'  # phyphox: about the phone
