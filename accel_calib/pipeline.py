@@ -28,7 +28,7 @@ from .calibrate import (
     SampleContext, thermal_alone, with_curve, without_curve)
 from .capture import (
     account_of, capture, Captured, CaptureSettings, cells_of, check_measured, is_one_direction,
-    is_turned_over, LEAST_RANGE, Ramp, ramp_of, rests_in_cells, settings_from)
+    is_turned_over, LEAST_RANGE, LEAST_RESTS, Ramp, ramp_of, rests_in_cells, settings_from)
 from .effects import Context, LADDER, Model, PROCESSES
 from .errors import InputError, RefusedFitError, saying
 from .finding import explained_by, Finding
@@ -421,18 +421,19 @@ def calibrated_log(source: Source, options: LogOptions, found: Intake, plan: Pla
     """
     Calibrate the poses that `poses_of` found in a log, or its ramp if it is of a still board.
 
-    Poses in one direction do not determine a calibration. If the temperature of their recording
-    spans `LEAST_RANGE`, the board was still while it warmed up.
+    Poses in one direction do not determine a calibration. If the temperature of their recording,
+    or of `LEAST_RESTS` poses, spans `LEAST_RANGE`, the board was still while it warmed up.
 
     """
-    if not found.units.is_native and is_one_direction(found.poses.reading):
+    poses = found.poses
+    if (not found.units.is_native and {'time', 'temperature'} <= {*poses.columns}
+            and (found.captured or len(poses) >= LEAST_RESTS) and is_one_direction(poses.reading)):
         with _opened(source, options) as log:
             cells = _cells(log, log.blocks)
-            low, high = (0.0, 0.0) if cells is None else range_of(cells, 'temperature')
-            if cells is not None and high - low >= LEAST_RANGE:
+            if cells is not None and np.ptp(range_of(cells, 'temperature')) >= LEAST_RANGE:
                 return thermally_calibrated([
                     RampIntake(ramp_of(cells), log.units, log.read_as, log.notes)], plan)
-    return calibrated(found.poses, found.units, plan)
+    return calibrated(poses, found.units, plan)
 
 
 def thermally_calibrated(logs: Sequence[Intake | RampIntake], plan: Plan = Plan()

@@ -306,8 +306,8 @@ class _Board:
     def is_seen(self, form: Form, name: str) -> bool:
         """Return whether an effect of a form differs from 0; a step also shows as a jump."""
         model, covariance = self.fitted(form)
-        values, first = model.values[name], model.terms.parts[model.effects.index(name)].start
-        size, own = values[:3], slice(first, first + 3)
+        part, values = model.terms.parts[model.effects.index(name)], model.values[name]
+        size, own = values[:3], slice(part.start, part.start + 3)
         chance = scipy.special.chdtrc(3, size @ np.linalg.solve(covariance[own, own], size))
         if name != _STEP:
             return bool(chance < _LEVEL)

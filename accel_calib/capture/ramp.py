@@ -47,7 +47,10 @@ LEAST_RANGE = 3.0
 FASTEST = 5.0
 """Largest rate of the temperature [°C/min]."""
 
-_STRETCHES, _LEAST_STRETCHES = 240, 30
+LEAST_RESTS = 30
+"""Smallest number of stretches, which are 1 s or longer, or of rests."""
+
+_STRETCHES = 240
 _SHAKEN, _SHAKEN_G = 6.0, 0.005
 """A cell is shaken if its deviation is above both: relative to the median, and absolute [g]."""
 
@@ -186,7 +189,7 @@ def ramp_of(cells: Poses) -> Ramp:
     _check_jumps(stretches)
     warm_rate, both = stretches['temperature_rate'], _rises_and_falls(stretches)
     slow = (np.abs(warm_rate) * 60.0 <= FASTEST) | both
-    if np.sum(slow) < _LEAST_STRETCHES or np.ptp(stretches['temperature'][slow]) < LEAST_RANGE:
+    if np.sum(slow) < LEAST_RESTS or np.ptp(stretches['temperature'][slow]) < LEAST_RANGE:
         raise InputError(
             f'the ramp is too fast for the thermometer: the temperature changes by up to '
             f'{np.max(np.abs(warm_rate)) * 60.0:.0f} °C/min, expected at most {FASTEST:g} °C/min '
@@ -254,9 +257,9 @@ def _averaged(cells: Poses) -> Poses:
                          'time_ms or time_us')
     _, place, cell_count = np.unique(np.floor(time / length), return_inverse=True,
                                      return_counts=True)
-    if len(cell_count) < _LEAST_STRETCHES:
-        raise InputError(f'the board lies still for {float(time[-1]):.0f} s, expected at least '
-                         f'{_LEAST_STRETCHES} s', 'record while the board warms up, for half an '
+    if len(cell_count) < LEAST_RESTS:
+        raise InputError(f'found {counted(len(cell_count), "rest")} of 1 s or longer, expected at '
+                         f'least {LEAST_RESTS}', 'record while the board warms up, for half an '
                          'hour')
     count = np.bincount(place, cells['count'])
     moment, warm, *axes = (

@@ -110,8 +110,8 @@ def _curve_lines(outcome: ThermalOutcome) -> Iterator[Any]:
         yield 'the offset does not change with the temperature'
     yield (f'degree {curve.degree} from {low:.1f} to {high:.1f} °C: {short(curve.change_mg)} -> '
            f'{short(curve.residual_mg)} mg, uncertainty up to {short(curve.band_mg)} mg')
-    yield 'held out [mg]: ' + ', '.join(
-        f'{name or "without"} {short(error)}' for name, error in curve.held_out_mg.items())
+    errors = [*curve.held_out_mg.values()]
+    yield f'held-out parts of the log: {short(errors[0])} -> {short(errors[-1])} mg'
 
 
 def status_of(outcome: Outcome | ThermalOutcome) -> int:
