@@ -326,9 +326,9 @@ def test_an_own_effect_does_not_hide_one_of_the_catalogue():
 
 
 @pytest.mark.parametrize(('text', 'message'), [
-    ('import accel_calib\n', 'defines no effect'), ('1 / 0\n', 'ZeroDivisionError'),
-    ('def\n', 'SyntaxError'),
-    ('import sys\nsys.exit(0)\n', 'SystemExit: 0')])
+    ('import accel_calib\n', 'defines no effect'), ('1 / 0\n', 'division by zero'),
+    ('def\n', 'invalid syntax'),
+    ('import sys\nsys.exit(0)\n', 'SystemExit 0')])
 def test_a_file_without_own_effects_is_refused(text, message, tmp_path, capsys):
     (tmp_path / 'own.py').write_text(text)
     assert message in refused(capsys, 'refine', 'poses.csv', '--also', tmp_path / 'own.py')

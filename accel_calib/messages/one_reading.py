@@ -60,12 +60,14 @@ class OneReading:
         self._fixed = [0.0] * 12
         self._bends: list[_Bend] = []
         self._varying: list[tuple[Effect, list[float], list[_Term]]] = []
+        self.of_force: list[tuple[Effect, list[float], list[_Term]]] = []
         for effect, values in zip(model.terms.effects, model.values.values(), strict=True):
             size, shape = effect.split(values)
             terms = [(each.axis, each.monomial, each.weight * float(size[each.parameter]))
-                     for each in effect.terms if not effect.of_force]
+                     for each in effect.terms]
             if effect.factor is not None:
-                self._varying.append((effect, shape.tolist(), terms))
+                kept = self.of_force if effect.of_force else self._varying
+                kept.append((effect, shape.tolist(), terms))
             else:
                 self._add(terms, None, self._fixed, self._bends)
         self._varying.sort(key=lambda each: each[0].scales)
@@ -86,28 +88,24 @@ class OneReading:
 
     def at(self, known: Known) -> AtReading:
         """Return the calibration at a context; a quantity that is missing is an InputError."""
-        if not self._varying:
+        if not self._varying and not self.of_force:
             return self._without_context
-        model = self._calibration.model
-        check_context(model, known)
+        check_context(self._calibration.model, known)
         ranges = self._calibration.ranges
         if ranges:  # effects are not extrapolated
             known = {**known, **{key: min(max(known[key], low), high)
                                  for key, (low, high) in ranges.items() if key in known}}
         affine, bends = list(self._fixed), list(self._bends)
         for effect, shape, terms in self._varying:
-            if not terms:
-                continue
             factor = _factor(effect, known, shape)
             if effect.scales:  # all other gains are there
                 affine[3:] = [part * (1.0 + terms[0][2] * factor) for part in affine[3:]]
             self._add(terms, factor, affine, bends)
-        own = model.at(_one_row(known)).own if model.terms.of_force else None
-        return AtReading(self, affine, bends, known, own)
+        return AtReading(self, affine, bends, known)
 
     @cached_property
     def _without_context(self) -> AtReading:
-        return AtReading(self, self._fixed, self._bends, {}, None)
+        return AtReading(self, self._fixed, self._bends, {})
 
     @cached_property
     def _spread_rows(self) -> tuple[Floats, Floats]:
@@ -164,13 +162,13 @@ class AtReading:
     """
 
     def __init__(self, owner: OneReading, affine: Sequence[float], bends: list[_Bend],
-                 known: Known, own: Callable[[Floats], Floats] | None) -> None:
-        self._owner, self._bends, self._known, self._own = owner, bends, known, own
+                 known: Known) -> None:
+        self._owner, self._bends, self._known = owner, bends, known
         a, b, c, d, e, f, g, h, i = affine[3:]
         self._gain = (a + 1.0, b, c, d, e + 1.0, f, g, h, i + 1.0)
         inverse = _inverse(self._gain)
         offset = _times(inverse, *affine[:3])
-        if bends or own:
+        if bends or owner.of_force:
             self.correct = self._solving(inverse, offset)
         else:
             matrix = _product(owner.turn, inverse)
@@ -216,18 +214,21 @@ class AtReading:
         added = [0.0, 0.0, 0.0]
         for axis, size, value, _ in self._bends:
             added[axis] += size * value(x, y, z)
-        if self._own is not None:
-            return [*map(add, added, self._own(np.array([[x, y, z]]))[0].tolist())]
+        for effect, shape, terms in self._owner.of_force:
+            factor = _factor(effect, {**self._known, 'force': (x, y, z)}, shape)
+            for k, (axis, _, size) in enumerate(terms):
+                added[axis] += size * (factor[k] if isinstance(factor, list) else factor)
         return added
 
     def _slope_at(self, u: Triple) -> Matrix:
         """Return the slope of the reading at a force."""
+        if self._owner.of_force:
+            bent = own_slope(lambda at: np.array([self._bend(*at[0])]), np.array([u]))
+            return [*map(add, self._gain, bent.ravel().tolist())]
         slope = list(self._gain)
         for axis, size, _, gradient in self._bends:
             for at, part in enumerate(gradient(*u), 3 * axis):
                 slope[at] += size * float(part)
-        if self._own is not None:
-            return [*map(add, slope, own_slope(self._own, np.array([u])).ravel().tolist())]
         return slope
 
     def with_spread(self, force: Triple, own: Sequence[float]) -> Sequence[float]:
@@ -237,12 +238,12 @@ class AtReading:
         `own` is the covariance of the force from the noise of the reading, row by row.
 
         """
-        if self._bends or self._own:
+        if self._bends or self._owner.of_force:
             u = _times(self._owner.back, *force)
             monomials = [MONOMIALS[index].value(*u) for index in self._owner.monomials]
             to_force = np.reshape(_product(self._owner.turn, _inverse(self._slope_at(u))), (3, 3))
-            basis = (self._basis if self._own is None
-                     else self._owner.spread_basis(self._known, u))
+            basis = (self._owner.spread_basis(self._known, u) if self._owner.of_force
+                     else self._basis)
             moved = to_force @ np.dot(monomials, basis).reshape(3, -1)
             added = (moved @ moved.T).ravel().tolist()
         else:
