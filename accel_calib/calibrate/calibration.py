@@ -18,7 +18,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from html import escape
-from itertools import product
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -27,7 +26,7 @@ from numpy.typing import ArrayLike
 from .rest_noise import GyroBias, SampleNoise
 from ..effects import (
     acting_temperature, AXES, Context, correct, effect_named, Model, ModelForm, MODELS,
-    parameter_names, predict, rate_at, ThermalStream, variable_of, way_to, with_turns)
+    parameter_names, predict, rate_at, ThermalStream, variable_of, way_of, with_turns)
 from ..errors import InputError, StoredCalibrationError
 from ..finding import Finding
 from ..geometry import over_axes
@@ -52,14 +51,6 @@ _THERMAL = ('temperature_rate', 'temperature_of_offset', 'temperature_of_gain')
 
 _HELD = ('time', 'temperature', *_THERMAL, 'supply_voltage')
 """Context that is limited to the range of the poses, as quantities are."""
-
-_MOST_WAYS = 30
-_SAME_G = 1e-7
-"""Largest number of iterations of the ways between poses, and the change of the forces [g] below
-which they end."""
-
-_SIGNS = np.array(list(product((-1.0, 1.0), repeat=3)))
-"""Signs of a motion along the axes."""
 
 USES_LIMIT = 'the correction uses the limit of the range'
 
@@ -485,32 +476,8 @@ def with_history(poses_g: Poses, model: Model) -> Poses:
     if 'time' in poses_g and 'temperature' in poses_g and 'temperature_rate' not in poses_g:
         poses_g = poses_g.with_columns(temperature_rate=rate_at(poses_g.columns))
     if 'previous' not in poses_g:
-        poses_g = poses_g.with_columns(previous=_way_to(poses_g, model))
+        poses_g = poses_g.with_columns(previous=way_of(poses_g, model))
     return replace(poses_g, columns=with_turns(poses_g.columns))
-
-
-def _way_to(poses_g: Poses, model: Model) -> Floats:
-    """Return the (n, 3) unit vectors towards the previous pose, by the forces of a model."""
-    mat_w, vec_v = model.linear_part
-    force = (poses_g.reading - vec_v) @ np.linalg.inv(mat_w).T
-    way, known = way_to(force[np.newaxis], poses_g.columns), poses_g.columns
-    if 'previous' not in model.needs or any(
-            key not in known for key in model.needs if key != 'previous'):
-        return way
-
-    def forces(previous: Floats) -> Floats:
-        turns = with_turns({**known, 'previous': way})
-        return model.at({**turns, 'previous': previous}).force(poses_g.reading)
-
-    if np.array_equal(forces(way), forces(np.sign(way))):
-        both = [forces(np.broadcast_to(each, force.shape)) for each in _SIGNS]
-        return way_to(np.array(both), known, _SIGNS)
-    for _ in range(_MOST_WAYS):
-        before, force = force, forces(way)
-        way = way_to(force[np.newaxis], known)
-        if np.max(np.abs(force - before), initial=0.0) < _SAME_G:
-            break
-    return way
 
 
 def check_sensor(calibration: Calibration, sensor: str) -> None:

@@ -300,7 +300,9 @@ class _Board:
         onto = onto[levels.shape[2]:].reshape(-1, 3, count)
         covariance = np.zeros((len(model.vector),) * 2)
         covariance[np.ix_(model.fitted, model.fitted)] = self._covariance(
-            np.column_stack([self.levels, self.columns(_form_of(model))]), onto)
+            np.column_stack([self.levels, self.columns({
+                name: effect_named(name).split(values)[1]
+                for name, values in model.values.items()})]), onto)
         return model, covariance
 
     def is_seen(self, form: Form, name: str) -> bool:
@@ -353,10 +355,6 @@ class _Board:
 
 def _lagged(form: Form) -> bool:
     return _LINEAR in form and EFFECTS[_LINEAR].is_lagged(form[_LINEAR])
-
-
-def _form_of(model: Model) -> Form:
-    return {name: effect_named(name).split(values)[1] for name, values in model.values.items()}
 
 
 def _with_values(model: Model, vector: Floats) -> Model:

@@ -6,7 +6,8 @@ Effects: what each adds to the reading, and its properties.
 
 `form` defines what an effect is, `catalogue` lists those with a known cause and makes curves
 without one, which `formula` states for a paper or for firmware. `own` adds those of a user, and
-`model` computes with a list of them. `simulate` makes poses and recordings.
+`model` computes with a list of them. `way` finds how each pose was reached, `thermal` how the
+temperature lags, and `simulate` makes poses and recordings.
 
 An effect is one entry in `EFFECTS`. Simulation, fit, correction, search, report and documentation
 read it from there, so an effect that is added here works in all of them. Its contribution to the
@@ -46,7 +47,7 @@ from .model import (
 from .own import know, know_code, know_file, KNOWN_CODE, OwnEffect
 from .simulate import model_with, parse_effect, simulate_poses, simulate_recording, turn_between
 from .thermal import acting_temperature, rate_at, ThermalStream
-from .way import way_to, with_turns
+from .way import way_of, with_turns
 
 __all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CHANGES', 'CONVERGED_G', 'COVARIATES', 'CUBE', 'EFFECTS',
            'EMPIRICAL', 'FORCE', 'KNOWN_CODE', 'LADDER', 'LARGEST_FORCE_G', 'LARGEST_ITERATIONS',
@@ -60,5 +61,5 @@ __all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CHANGES', 'CONVERGED_G', 'COVARIATES',
            'know_file', 'length_rows', 'linear_model', 'linear_values', 'model_with', 'modes_of',
            'own_slope', 'parameter_names', 'parse_effect', 'predict', 'rate_at', 'reading_of',
            'sensor_force', 'simulate_poses', 'simulate_recording', 'times', 'too_large',
-           'turn_between', 'unit_of', 'value_unit', 'variable_of', 'variable_words', 'way_to',
+           'turn_between', 'unit_of', 'value_unit', 'variable_of', 'variable_words', 'way_of',
            'with_turns', 'with_vector']

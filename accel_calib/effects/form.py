@@ -295,6 +295,9 @@ class Effect:
         return (self.lagged,) if self.is_lagged(shape) else self.over or self.needs
 
 
+AT_POSES = ('since_turn', 'duration')
+"""Columns that only poses have."""
+
 _FITTED_SHAPES = ('tau', 'lag')
 """Shape constants of the catalogue that a fit changes; the others are found once."""
 

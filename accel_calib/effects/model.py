@@ -25,9 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .catalogue import effect_named, EFFECTS, is_effect, PROCESSES
-from .form import AFFINE, Context, difference, Effect, fitted_places, FORCE, MONOMIALS, ONE
+from .form import (
+    AFFINE, AT_POSES, Context, difference, Effect, fitted_places, FORCE, MONOMIALS, ONE)
 from .thermal import Lag
-from .way import AT_POSES
 from ..errors import InputError
 from ..geometry import unit
 from ..table import column_of, Floats, is_quantity, Record

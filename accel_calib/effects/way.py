@@ -10,20 +10,28 @@ the poses on both sides are unknown times, which only change the size of an expo
 
 """
 
+from itertools import product
+
 import numpy as np
 
 from .form import Context
+from .model import Model
 from ..geometry import unit
-from ..table import Floats
-
-AT_POSES = ('since_turn', 'duration')
-"""Columns that only poses have."""
+from ..table import Floats, Poses
 
 _MOVED = np.radians(3.0)
 """Smallest change of direction of a move [rad]; less may be noise or settling."""
 
 _NO_MOTION_G = 0.002
 """Motion along an axis that has either sign [g]."""
+
+_MOST_WAYS = 30
+_SAME_G = 1e-7
+"""Largest number of iterations of the ways between poses, and the change of the forces [g] below
+which they end."""
+
+_SIGNS = np.array(list(product((-1.0, 1.0), repeat=3)))
+"""Signs of a motion along the axes."""
 
 
 def way_to(force: Floats, known: Context, signs: Floats = np.zeros((1, 3))) -> Floats:
@@ -48,6 +56,30 @@ def way_to(force: Floats, known: Context, signs: Floats = np.zeros((1, 3))) -> F
             towards, resting = step / length, force[best, here]
         previous[here] = towards
     return previous
+
+
+def way_of(poses_g: Poses, model: Model) -> Floats:
+    """Return the (n, 3) unit vectors towards the previous pose, by the forces of a model."""
+    mat_w, vec_v = model.linear_part
+    force = (poses_g.reading - vec_v) @ np.linalg.inv(mat_w).T
+    way, known = way_to(force[np.newaxis], poses_g.columns), poses_g.columns
+    if 'previous' not in model.needs or any(
+            key not in known for key in model.needs if key != 'previous'):
+        return way
+
+    def forces(previous: Floats) -> Floats:
+        turns = with_turns({**known, 'previous': way})
+        return model.at({**turns, 'previous': previous}).force(poses_g.reading)
+
+    if np.array_equal(forces(way), forces(np.sign(way))):
+        both = [forces(np.broadcast_to(each, force.shape)) for each in _SIGNS]
+        return way_to(np.array(both), known, _SIGNS)
+    for _ in range(_MOST_WAYS):
+        before, force = force, forces(way)
+        way = way_to(force[np.newaxis], known)
+        if np.max(np.abs(force - before), initial=0.0) < _SAME_G:
+            break
+    return way
 
 
 def with_turns(known: Context) -> Context:

@@ -5,8 +5,8 @@
 Reader of logs: text of any dialect, bags, flight logs of PX4 and ArduPilot, and DataFrames.
 
 `open_log` recognises the format, the columns and the units. What it assumed is one line,
-`OpenLog.read_as`, and what it left out is in `OpenLog.notes`. `serialized` defines the places of
-the fields in serialized messages.
+`OpenLog.read_as`, and what it left out is in `OpenLog.notes`. `child` reads binary files in a
+process with limits. `serialized` defines the places of the fields in serialized messages.
 
 """
 
