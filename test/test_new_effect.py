@@ -16,11 +16,10 @@ from accel_calib.effects import AXES, by_axis, correct, Effect, EFFECTS, Model, 
 from accel_calib.errors import InputError
 from accel_calib.logs import layout_of
 from accel_calib.messages import Rewriter
-from accel_calib.pipeline import Correction
 from accel_calib.report import refinement_page
 from accel_calib.table import Recording
 from bag_files import header, IMU, imu
-from inside import COMMAND, OneReading
+from inside import COMMAND, Correction, OneReading
 import numpy as np
 import pandas as pd
 import pytest

@@ -26,7 +26,7 @@ from ..effects import EMPIRICAL, kind_of, WANDER
 from ..errors import TAKE_ALL_SIDES
 from ..finding import Finding, NextStep, ranked, rated, Rating, without
 from ..geometry import coverage, distinct
-from ..table import Poses, range_of
+from ..table import is_quantity, Poses, range_of
 from ..text import counted, listed
 from ..units import MG
 
@@ -223,7 +223,8 @@ def _not_corrected(expected: Expected) -> Iterator[Finding]:
                               f'({short}), and may change again', 'let the sensor settle, and '
                               'take the poses again', 'USABLE')
             else:
-                columns = ' and '.join(depends_on(name) & {*expected.calibration.model.neutral})
+                columns = ' and '.join(filter(
+                    is_quantity, depends_on(name) & {*expected.calibration.model.neutral}))
                 where = f'without the column {columns}' if columns else 'in single samples'
                 yield Finding('not_corrected', f'{short} of {mg(size)} cannot be corrected '
                               f'{where}', level='USABLE')
