@@ -410,22 +410,23 @@ class Expected:
 
     @cached_property
     def not_corrected(self) -> tuple[tuple[str, float], ...]:
-        """Return effects that the correction of a later sample cannot use, with size [mg]."""
-        values = self.calibration.model.values
-        sizes = ((name, self._size_mg(Model({name: values[name]}))) for name in values
-                 if depends_on(name) & {*_ONLY_AT_POSES, *self.calibration.model.neutral})
-        return tuple(sorted(sizes, key=lambda each: -each[1]))
+        """
+        Return effects that the correction of a later sample cannot use, the largest first.
 
-    def _size_mg(self, model: Model) -> float:
-        """Return the contribution of an effect along the force, RMS over the poses [mg]."""
+        Their size is that along the force, RMS over the poses [mg].
+
+        """
         calibration, up = self.calibration, self.directions
-        context = {**self.poses.columns, 'previous': up}
-        if any(key not in context for key in model.needs):
-            return 0.0
+        context, sizes = {**self.poses.columns, 'previous': up}, dict[str, float]()
         if 'std' in self.poses:
             context['std'] = calibration.units.to_g(self.poses['std'])
-        along = np.sum((predict(model, up, context) - up) * up, axis=1)
-        return rms(along) * MG
+        for name, values in calibration.model.values.items():
+            if depends_on(name) & {*_ONLY_AT_POSES, *calibration.model.neutral}:
+                alone = Model({name: values})
+                known = all(key in context for key in alone.needs)
+                along = np.sum((predict(alone, up, context) - up) * up, axis=1) if known else up
+                sizes[name] = rms(along) * MG if known else 0.0
+        return tuple(sorted(sizes.items(), key=lambda each: -each[1]))
 
     @cached_property
     def error_mg(self) -> float:

@@ -244,8 +244,10 @@ def _constant_step(poses_g: Poses) -> float | None:
     smallest = np.quantile(apart, np.linspace(0.0, 0.7, 15), method='nearest')
     steps = np.unique(np.concatenate([smallest / part for part in (1, 2, 3)]))[::-1]
     for step in (*stated, *steps):
-        if _FINEST_G < step <= _COARSEST_G and _on_grid(np.concatenate(values), step) >= _ON_GRID:
-            return float(step)
+        if _FINEST_G < step <= _COARSEST_G:
+            number = np.concatenate(values) / step
+            if np.mean(np.abs(number - np.round(number)) < _OFF_GRID) >= _ON_GRID:
+                return float(step)
     return None
 
 
@@ -286,12 +288,6 @@ def _correlations(mean: Floats, variance: Floats, tried: Floats) -> Floats:
     spread, away = squares - cosines ** 2 / count, variance - np.mean(variance)
     return summed(coarse * away, fine) / np.sqrt(
         np.maximum(spread, 1e-12 * count) * np.sum(away ** 2))
-
-
-def _on_grid(values: Floats, step: float) -> float:
-    """Return the share of readings that are multiples of the step."""
-    steps = values / step
-    return float(np.mean(np.abs(steps - np.round(steps)) < _OFF_GRID))
 
 
 def unclipped(poses_g: Poses, base: Model) -> tuple[State | None, Clipped | None]:

@@ -35,7 +35,7 @@ differences are less certain: c is the share of the degrees of freedom that the 
 
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import combinations, product
 import math
@@ -122,7 +122,12 @@ def best_curve(state: State, poses_g: Poses, out: tuple[int, ...], *, least: flo
     plain = linearised(fit, state.model.effects, beside=left_open(state))
     if plain.dof < _LEAST_DOF:
         return None
-    families, best = list(_families(poses_g)), None
+    families, best = list[_Family](), None
+    for carrier, variable in curve_pairs(causes(poses_g)):
+        effect = effect_named(empirical_name(carrier, variable, modes_of(variable)))
+        if set(effect.needs) <= set(poses_g.columns):
+            shapes = [np.zeros(0)] if effect.shapes is None else effect.shapes(poses_g.columns)
+            families += (_Family(carrier, variable, effect, shape) for shape in shapes)
     tried = sum(len(family.parts) for family in families)
     most = least + 2.0 * math.log(tried)
     for family in families:
@@ -138,16 +143,6 @@ def best_curve(state: State, poses_g: Poses, out: tuple[int, ...], *, least: flo
                 if grown.score > most:
                     best, most = Set.of(problem, grown.blocks, out), grown.score
     return None if best is None else _accepted(most - 2.0 * math.log(tried), best, tried)
-
-
-def _families(poses_g: Poses) -> Iterator[_Family]:
-    """Yield the curves that the columns of poses allow."""
-    for carrier, variable in curve_pairs(causes(poses_g)):
-        effect = effect_named(empirical_name(carrier, variable, modes_of(variable)))
-        if set(effect.needs) <= set(poses_g.columns):
-            shapes = iter([np.zeros(0)]) if effect.shapes is None else effect.shapes(
-                poses_g.columns)
-            yield from (_Family(carrier, variable, effect, shape) for shape in shapes)
 
 
 def _whole(plain: Linear, fit: Fit, family: _Family) -> Linear:

@@ -357,7 +357,8 @@ def _chosen(contests: Sequence[_Contest]) -> list[tuple[int, _Contest]]:
 def _in_words(contests: Sequence[_Contest], up: Floats, shown: Sequence[Mapping[str, float]],
               chosen: Sequence[tuple[int, _Contest]]) -> PosePlan:
     """Return the plan of the chosen candidates, in the order to take them."""
-    ordered = sorted(chosen, key=lambda each: _effort(shown[each[0]]))
+    ordered = sorted(chosen, key=lambda each: [  # by time, and then by what must be set
+        shown[each[0]].get(key, 0.0) for key in ('time', *VARIED, *sorted(shown[each[0]]))])
     taken = [index for index, _ in ordered]
     poses = tuple(
         PlannedPose(tuple(up[index].tolist()), attitude_words(up[index]), shown[index],
@@ -366,26 +367,16 @@ def _in_words(contests: Sequence[_Contest], up: Floats, shown: Sequence[Mapping[
     lines: list[str] = []
     for contest in contests:
         own = [pose for pose, (_, why) in zip(poses, ordered, strict=True) if why is contest]
-        lines += _lines_about(contest, own, contest.expected(taken))
+        odds, after = ', '.join(map(percent, contest.weights.tolist())), contest.expected(taken)
+        what = f'to separate {versus(contest.names)} ({odds})'
+        end = f'the expected probability of the right one is then {percent(after)}'
+        if own:
+            lines += f'{what}, take these poses:', *_held(own), end
+        elif after >= ENOUGH:
+            lines.append(f'{what}, the same poses are enough: {end}')
+        else:
+            lines.append(f'{what}, poses at 1 g do not help; apply other forces (a centrifuge)')
     return PosePlan(poses, tuple(lines))
-
-
-def _effort(shown: Mapping[str, float]) -> tuple[float, ...]:
-    """Return the key that sorts poses by time, and then by what must be set."""
-    return (shown.get('time', 0.0), *(shown.get(key, 0.0) for key in VARIED if key != 'time'),
-            *(value for key, value in sorted(shown.items()) if is_quantity(key)))
-
-
-def _lines_about(contest: _Contest, poses: Sequence[PlannedPose], expected: float) -> list[str]:
-    """Return the lines about a contest, its poses, and the probability after the whole plan."""
-    odds = ', '.join(percent(weight) for weight in contest.weights.tolist())
-    what = f'to separate {versus(contest.names)} ({odds})'
-    end = f'the expected probability of the right one is then {percent(expected)}'
-    if poses:
-        return [f'{what}, take these poses:', *_held(poses), end]
-    if expected >= ENOUGH:
-        return [f'{what}, the same poses are enough: {end}']
-    return [f'{what}, poses at 1 g do not help; apply other forces (a centrifuge)']
 
 
 def _held(poses: Sequence[PlannedPose]) -> Iterator[str]:

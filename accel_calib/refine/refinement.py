@@ -312,7 +312,12 @@ def _record(calibration: Calibration, found: Found, given: Given, sensor: str, d
         alone = given.poses_g.take(np.isin(given.poses_g.row, calibration.used_poses.row))
         advice = advice_for(found, steps, missing, len(calibration.rejected))
         return _of_fit(calibration, alone, missing, (*advice, *plan.advice))
-    rejected = _rejected(found, given)
+    of_search = [*rejected_by(found.final.model, given.poses_g.take(found.outliers))]
+    if found.clipped is not None:
+        of_search += [Rejected(int(row), CLIPPED, 'clipped')
+                      for row in given.poses_g.row[found.clipped.poses]]
+    rejected = tuple(sorted((*given.rejected, *(
+        each for each in of_search if each.row in given.poses.row)), key=lambda each: each.row))
     outliers = tuple(each.row for each in rejected if each.kind != 'clipped')
     refined, refusal = refined_calibration(calibration, final, found.added, given, rejected)
     refined = replace(refined, sensor=sensor or refined.sensor, date=date or refined.date)
@@ -325,15 +330,6 @@ def _record(calibration: Calibration, found: Found, given: Given, sensor: str, d
         verdict, final.floor_mg, start.gap_mg(start.fit.residual), final.gap_mg(final.residual),
         steps, outliers, missing, (*advice, *plan.advice), refined, refusal, final.poses_g,
         final.fit.equations.force, stages, plan, undecided, found.one_curve)
-
-
-def _rejected(found: Found, given: Given) -> tuple[Rejected, ...]:
-    rejected = [*rejected_by(found.final.model, given.poses_g.take(found.outliers))]
-    if found.clipped is not None:
-        rejected += [Rejected(int(row), CLIPPED, 'clipped')
-                     for row in given.poses_g.row[found.clipped.poses]]
-    new = [each for each in rejected if each.row in given.poses.row]
-    return tuple(sorted((*given.rejected, *new), key=lambda each: each.row))
 
 
 def _refine_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, sensor: str, date: str,

@@ -207,7 +207,9 @@ def _search(poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
     state, near, trial = settle(begun, poses_g, fixed, names)
     begun = fit_without(begun, poses_g, near.chosen.out)
     taken_back: tuple[str, ...] = ()
-    if near.names and near.walk is None and not _explains(begun, state):
+    share = 1.0 - (state.rss - state.dof) / max(begun.rss - begun.dof, 1e-300)
+    explains = not state.fit.noise_known or state.is_noise or share >= _LEAST_SHARE
+    if near.names and near.walk is None and not explains:
         taken_back, state = near.names, begun
         near = replace(near, chosen=near.chosen.instead(()))
     out = near.chosen.out
@@ -373,12 +375,6 @@ def _visible(state: State, names: Iterable[str]) -> tuple[str, ...]:
     unknown = not len(kinds(state.poses_g)[0])
     return tuple(name for name in names if name not in present
                  and not (unknown and effect_named(name).known_orientation))
-
-
-def _explains(before: State, after: State) -> bool:
-    """Return whether the residual is noise, or far less above it than before."""
-    share = 1.0 - (after.rss - after.dof) / max(before.rss - before.dof, 1e-300)
-    return not after.fit.noise_known or after.is_noise or share >= _LEAST_SHARE
 
 
 def _of_a_turn(state: State) -> set[str]:

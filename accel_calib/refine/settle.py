@@ -120,7 +120,10 @@ def settle(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterable
             continue
         seen += asked, near.key
         process = None if near.walk is None else near.walk.process
-        settled, predicted = (near.names, near.chosen.out, process), _is_predicted(near, after)
+        settled = near.names, near.chosen.out, process
+        # Were the equations linear enough, near the fit the same would be found.
+        error, variance = abs(near.beside.rss - after.rss), after.rss / max(after.dof, 1)
+        predicted = after.dof > 0 and error < _EXACT * max(variance, 1.0)
         del near, linear  # before the next columns are made
         state, linear = after, trial.near(after)
         if predicted:
@@ -128,12 +131,6 @@ def settle(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterable
     if settled is None and len(state.poses_g) < len(poses_g):  # the set has all poses
         state = fit_without(state, poses_g, ())
     return state, _at(linear, *(settled or ((), (), None)), trial), trial
-
-
-def _is_predicted(near: Near, fitted: State) -> bool:
-    """Return whether the equations were linear enough: near the fit, the same would be found."""
-    error, variance = abs(near.beside.rss - fitted.rss), fitted.rss / max(fitted.dof, 1)
-    return fitted.dof > 0 and error < _EXACT * max(variance, 1.0)
 
 
 def _best_fit(near: Near, state: State, trial: Trial) -> tuple[Near, State | None]:

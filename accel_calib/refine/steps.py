@@ -454,7 +454,12 @@ def advice_for(found: Found, steps: tuple[Step, ...], untestable: tuple[tuple[st
         lines.append('a mount that has turned since the calibration cannot show: only |force| = '
                      '1 g is known; take poses of known orientation (ref_x, ref_y, ref_z) with '
                      'both')
-    lines += [_separating(step) for step in steps if step.rivals]
+    for step in (step for step in steps if step.rivals):
+        families = {effect_named(name).family for name in (step.name, *step.rivals)
+                    if is_effect(name)}
+        family = families.pop() if len(families) == 1 else ''
+        lines.append(f'{step.effect} cannot be distinguished from {", ".join(step.rivals)} here: '
+                     f'{TO_SEPARATE[family]}')
     lines += [line for name in found.also if name not in found.final.model.values
               for line in _at_bounds(name, found)]
     for step in steps:
@@ -526,13 +531,6 @@ def _other_sensor(found: Found) -> list[str]:
     return [f'this is probably another sensor: its {CHANGES[name].base} differs from the stored '
             f'one by {changes[name]:.2g} {CHANGES[name].unit}, which is too much for one sensor; '
             'fit a new calibration from its own poses']
-
-
-def _separating(step: Step) -> str:
-    families = {effect_named(name).family for name in (step.name, *step.rivals) if is_effect(name)}
-    family = families.pop() if len(families) == 1 else ''
-    return (f'{step.effect} cannot be distinguished from {", ".join(step.rivals)} here: '
-            f'{TO_SEPARATE[family]}')
 
 
 def times_typical(step: Step) -> float:

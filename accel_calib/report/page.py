@@ -125,7 +125,9 @@ def calibration_page(calibration: Calibration, rating: Rating, source: str, *,
     """
     checked, poses = verification or (None, None)
     residuals = residuals_of(calibration, poses)
-    used = refinement if _is_refined(calibration, refinement) else None
+    own, refined = calibration.model, refinement and refinement.calibration.model
+    used = refinement if (refined and own.effects == refined.effects  # perhaps levelled since
+                          and np.array_equal(own.vector, refined.vector)) else None
     what = 'Calibration' if checked is None else 'Check of the calibration'
     name = calibration.sensor or Path(source).name
     title = f'{what} of {name}' if name else what
@@ -140,7 +142,11 @@ def calibration_page(calibration: Calibration, rating: Rating, source: str, *,
             section('Before and after', figures([of_before_after(
                 residuals, (checked or calibration.quality).noise_floor_mg)], 'wide'),
                 kind='half'),
-            *_remarks(calibration, residuals, used),
+            section('Warnings', listing((
+                *(() if used is None else refusal_lines(used)), *calibration.warnings))),
+            section('What to do', listing(() if used is None else used.advice)),
+            section('Poses left out', listing(
+                f'row {row}: {reason}' for row, reason in sorted(residuals.reasons.items()))),
             section('What remains', figures(of_remainder(residuals))),
             *(() if first else searched),
             _pose_table(residuals, calibration),
@@ -216,14 +222,6 @@ def _of_axis(curve: Curve, axis: int) -> Drawing:
                    f'temperature: {ends}', figure, hover)
 
 
-def _is_refined(calibration: Calibration, refinement: Refinement | None) -> bool:
-    """Return whether a calibration is that of a refinement, perhaps levelled since."""
-    if refinement is None:
-        return False
-    own, refined = calibration.model, refinement.calibration.model
-    return own.effects == refined.effects and np.array_equal(own.vector, refined.vector)
-
-
 # ----------------------------------------------------------------------------- the calibration
 
 def _key_numbers(calibration: Calibration, residuals: Residuals, checked: Verification | None
@@ -248,16 +246,6 @@ def _covered(calibration: Calibration, residuals: Residuals, *, plan: bool) -> s
     return section('Coverage of the sphere', figures(
         [of_coverage(residuals, coverage(residuals.force), direction)], 'wide'),
         paragraph(words), HINT, kind='half')
-
-
-def _remarks(calibration: Calibration, residuals: Residuals, used: Refinement | None
-             ) -> Iterator[str]:
-    """Yield the sections with warnings, advice and the poses left out."""
-    refusal, advice = ((), ()) if used is None else (refusal_lines(used), used.advice)
-    yield section('Warnings', listing((*refusal, *calibration.warnings)))
-    yield section('What to do', listing(advice))
-    yield section('Poses left out', listing(
-        f'row {row}: {reason}' for row, reason in sorted(residuals.reasons.items())))
 
 
 def values_section(calibration: Calibration) -> str:
@@ -287,19 +275,15 @@ def axis_figures(vec: Floats, effects: tuple[str, ...]) -> Floats:
     return np.concatenate([vec_v, length, np.degrees(np.arccos(cosines))])
 
 
-def _with_deviations(calibration: Calibration) -> tuple[Floats, Floats]:
-    """Return `axis_figures` of a calibration and their standard deviations."""
+def _linear_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
+    """Yield offsets, sensitivities (one row if they are equal) and angles with usual values."""
     effects, vec = calibration.model.effects, calibration.model.vector
     slope = np.array([(axis_figures(vec + step, effects) - axis_figures(vec - step, effects))
                       / (2.0 * _STEP) for step in _STEP * np.eye(len(vec))]).reshape(-1, 9)
     variance = np.einsum('pi,pq,qi->i', slope, calibration.covariance, slope)
-    deviation = np.sqrt(np.maximum(variance, 0.0))
-    return axis_figures(vec, effects), np.where(deviation > _SAME, deviation, 0.0)
-
-
-def _linear_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
-    """Yield offsets, sensitivities (one row if they are equal) and angles with usual values."""
-    found, deviation = (part.reshape(3, 3) for part in _with_deviations(calibration))
+    deviation = np.sqrt(np.maximum(variance, 0.0)).reshape(3, 3)
+    deviation[deviation <= _SAME] = 0.0
+    found = axis_figures(vec, effects).reshape(3, 3)
     native, per_g = calibration.units.is_native, calibration.units.per_g
     scale, unit = (per_g, 'native') if native else (MG, 'mg')
     for axis, value, sd in zip(AXES, found[0], deviation[0], strict=True):
