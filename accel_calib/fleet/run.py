@@ -292,16 +292,26 @@ def _row_of_killed(item: Input, options: Options, error: Exception) -> Row:
 
 def mapped(client: Client, function: Callable[..., Any], items: Iterable[_Item], *others: Any
            ) -> Iterator[tuple[_Item, Any]]:
-    """Yield each item with the result of a function, or its exception, as they are done."""
+    """
+    Yield each item with the result of a function, or its exception, as they are done.
+
+    A worker that dies takes all of its tasks with it. Which item ended it shows where nothing else
+    runs: those of its tasks are suspects, and are tried again one by one.
+
+    """
     from distributed import as_completed, KilledWorker
 
-    rest, alone, pace = iter(items), list[_Item](), _Pace()
+    rest, suspects, pace = iter(items), list[_Item](), _Pace()
     waiting: dict[Any, list[_Item]] = {}
     done, workers = as_completed(loop=client.loop), _Workers(client)
     limit = _AHEAD * max(sum(client.nthreads().values()), 1)
+    alone = False
     while True:
-        while len(waiting) < limit and (batch := [alone.pop()] if alone else
-                                        list(islice(rest, pace.size))):
+        if not waiting:
+            alone = bool(suspects)
+        most = 1 if alone else 0 if suspects else limit
+        while len(waiting) < most and (batch := [suspects.pop()] if alone else
+                                       list(islice(rest, pace.size))):
             future = client.submit(_each, KNOWN_CODE, function, batch, *others, pure=False)
             waiting[future] = batch
             done.add(future)
@@ -316,8 +326,8 @@ def mapped(client: Client, function: Callable[..., Any], items: Iterable[_Item],
         try:
             results, seconds = _result_of(client, future, workers)
         except KilledWorker as err:
-            if len(batch) > 1:  # find out which one
-                alone += batch
+            if not alone:
+                suspects += batch
                 continue
             results, seconds = [err], 0.0
         del future  # so that the scheduler forgets it
