@@ -6,6 +6,7 @@
 import re
 
 import accel_calib as ac
+from accel_calib.effects import between_steps
 from accel_calib.logs import read_poses
 from accel_calib.refine import refine, values_of, verdict_words
 import generator
@@ -139,6 +140,32 @@ def test_a_relaxation_after_turns_is_named_with_its_time_constant(lasting):
     assert names(found) == ['creep']
     assert found.steps[0].parameters['tau'] == pytest.approx(40.0, abs=4.0)
     assert ac.verify(tables[1], found.calibration).rms_after_mg < 0.5
+
+
+@pytest.mark.parametrize('warming', [lambda t: 12.0 * t, lambda t: 16.0 - 16.0 * np.exp(-3.0 * t)])
+@pytest.mark.parametrize('seed', range(2))
+def test_a_thermometer_with_steps_beside_a_ramp_does_not_hide_the_cause(seed, warming):
+    share = np.sort(np.random.default_rng(seed).uniform(size=60))
+    temperature = 20.3 + warming(share)
+    poses = ac.simulate({**SENSOR, 'offset_temperature': [2e-3, -1e-3, 1e-3]}, poses=60, seed=seed,
+                        time=3600.0 * share, temperature=temperature)
+    found = ac.refine(poses.with_columns(temperature=np.round(2.0 * temperature) / 2.0), base='10')
+    assert (found.verdict, names(found)) == ('explained', ['offset_temperature'])
+    assert found.remaining_gap_mg < 0.35  # the noise is 0.3, the steps are as much
+
+
+@pytest.mark.parametrize('step', [0.0, 0.01, 0.5, 5.0])
+def test_a_temperature_in_steps_is_estimated_within_half_a_step(step):
+    rng = np.random.default_rng(5)
+    time = np.sort(rng.uniform(0.0, 3600.0, 60))
+    for true, left in ((20.0 + time / 500.0, 0.5), (rng.uniform(20.0, 40.0, 60), 1.1)):
+        stated = np.round(true / step) * step if step else true
+        found = between_steps(time, stated)
+        assert np.max(np.abs(found - stated)) <= step / 2.0
+        if step == 0.5:
+            assert np.std(found - true) < left * np.std(stated - true)
+        else:  # exact, or the temperatures of a chamber
+            np.testing.assert_allclose(found, stated, atol=0.01)
 
 
 @pytest.mark.parametrize('seed', range(3))

@@ -25,8 +25,8 @@ from numpy.typing import ArrayLike
 
 from .rest_noise import GyroBias, SampleNoise
 from ..effects import (
-    acting_temperature, AXES, Context, correct, effect_named, Model, ModelForm, MODELS,
-    parameter_names, predict, rate_at, ThermalStream, variable_of, way_of, with_turns)
+    acting_temperature, AXES, between_steps, Context, correct, effect_named, Model, ModelForm,
+    MODELS, parameter_names, predict, rate_at, ThermalStream, variable_of, way_of, with_turns)
 from ..errors import InputError, StoredCalibrationError
 from ..finding import Finding
 from ..geometry import over_axes
@@ -468,12 +468,15 @@ def with_history(poses_g: Poses, model: Model) -> Poses:
     Return poses in g with the context that comes from the poses before and after.
 
     That is ``temperature_rate``, ``since_turn``, and ``previous``, the unit vector towards the
-    previous pose in order of time, or of rows; columns of the table are kept. The directions are
+    previous pose in order of time, or of rows; columns of the table are kept. A temperature in
+    steps is estimated between them. The directions are
     those that the model corrects. If it needs ``previous`` for that, both are iterated; for a
     model that depends on its signs alone, all signs are compared.
 
     """
     if 'time' in poses_g and 'temperature' in poses_g and 'temperature_rate' not in poses_g:
+        poses_g = poses_g.with_columns(
+            temperature=between_steps(poses_g['time'], poses_g['temperature']))
         poses_g = poses_g.with_columns(temperature_rate=rate_at(poses_g.columns))
     if 'previous' not in poses_g:
         poses_g = poses_g.with_columns(previous=way_of(poses_g, model))
