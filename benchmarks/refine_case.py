@@ -62,8 +62,8 @@ CARRIER: dict[str, Carried] = {
             'quintic', 'dead_zone'), ('offset', 'force'), ('gain', 'force'), ('force', 'force')),
     **_all(('cross_coupling',), ('cross_axis', 'force')),
     **_all(('oblique_cubic', 'oblique_hinge'), ('force', 'direction')),
-    **_all(('offset_temperature', 'offset_temperature_quadratic', 'offset_temperature_knee'),
-           ('offset', 'temperature')),
+    **_all(('offset_temperature', 'offset_temperature_quadratic', 'offset_temperature_cubic',
+            'offset_temperature_knee'), ('offset', 'temperature')),
     **_all(('temperature_rate',), ('offset', 'temperature_rate')),
     **_all(('gain_temperature', 'gain_temperature_quadratic', 'gain_temperature_steep'),
            ('gain', 'temperature')),
@@ -74,7 +74,7 @@ CARRIER: dict[str, Carried] = {
             'wander_1f'), ('offset', 'time')),
     **_all(('gain_drift', 'gain_step', 'gain_periodic'), ('gain', 'time')),
     **_all(('vibration_rectification',), ('offset', 'vibration')),
-    **_all(('hysteresis', 'lever_arm', 'saturation', 'quantisation', 'repeatability')),
+    **_all(('hysteresis', 'creep', 'lever_arm', 'saturation', 'quantisation', 'repeatability')),
 }
 """
 What each effect changes, and with what: pairs of carrier and variable.

@@ -111,7 +111,7 @@ def honest(outcome: Outcome) -> bool:
     if _described(outcome) and not truths and not outcome.case.setup.dropped:
         return False
     return ((_described(outcome) or outcome.verdict == 'unexplained')
-            and all(truths & set(CARRIER[name]) for name in outcome.names))
+            and all(truths & set(CARRIER.get(name, ())) for name in outcome.names))
 
 
 def found(outcome: Outcome) -> bool:

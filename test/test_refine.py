@@ -154,6 +154,23 @@ def test_a_thermometer_with_steps_beside_a_ramp_does_not_hide_the_cause(seed, wa
     assert found.remaining_gap_mg < 0.35  # the noise is 0.3, the steps are as much
 
 
+@pytest.mark.parametrize('other', ['humidity', 'temperature'])
+def test_a_product_of_two_columns_is_named_and_stored(other, tmp_path):
+    rng = np.random.default_rng(8)
+    known = {'pressure': rng.normal(1000.0, 8.0, 160), other: rng.normal(30.0, 5.0, 160)}
+    poses = ac.simulate(SENSOR, poses=160, seed=1, time=np.arange(160) * 60.0, **known)
+    product = (known['pressure'] - 1000.0) * (known[other] - 30.0) / 40.0
+    poses = poses.with_columns(reading=poses.reading + np.outer(product, [0.03, -0.02, 0.04]))
+    taken, fresh = poses.take(slice(60)), poses.take(slice(60, None))
+    found = ac.refine(taken, base='10')
+    assert f'offset_covariate-{"*".join(sorted(["pressure", other]))}' in {
+        step.name for step in found.steps}
+    found.calibration.save(tmp_path / 'c.yaml')
+    stored = ac.load(tmp_path / 'c.yaml')
+    assert stored.parameters == found.calibration.parameters
+    assert ac.verify(fresh, stored).rms_after_mg < 0.45  # the noise is 0.3
+
+
 @pytest.mark.parametrize('step', [0.0, 0.01, 0.5, 5.0])
 def test_a_temperature_in_steps_is_estimated_within_half_a_step(step):
     rng = np.random.default_rng(5)

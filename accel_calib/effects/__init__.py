@@ -35,8 +35,8 @@ are those of IEEE 1293 (model equation of a linear accelerometer) and of data sh
 from .catalogue import (
     CARRIERS, CHANGES, covariate_names, COVARIATES, curve_pairs, curve_unit, effect_named, EFFECTS,
     EMPIRICAL, empirical_name, empirical_parts, included, is_effect, kind_of, LADDER, modes_of,
-    NOMINAL_SUPPLY, OFFSET_POWERS, parameter_names, PROCESSES, REFERENCE_TEMPERATURE, unit_of,
-    value_unit, variable_of, variable_words, VARIABLES, WANDER)
+    NOMINAL_SUPPLY, OFFSET_POWERS, parameter_names, PROCESSES, product_names,
+    REFERENCE_TEMPERATURE, unit_of, value_unit, variable_of, variable_words, VARIABLES, WANDER)
 from .form import (
     AFFINE, AXES, by_axis, Context, CUBE, difference, Effect, fitted_places, FORCE, MODES,
     MONOMIALS, ODD_SQUARE, ONE, PRODUCT, SIZE, SQUARE, TO_SEPARATE, WAVE, ZONAL, ZONES)
@@ -62,7 +62,7 @@ __all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CHANGES', 'CONVERGED_G', 'COVARIATES',
            'empirical_name', 'empirical_parts', 'factors_of', 'fitted_places', 'formula_of',
            'included', 'is_effect', 'kind_of', 'know', 'know_code', 'know_file', 'length_rows',
            'linear_model', 'linear_values', 'model_with', 'modes_of', 'own_slope',
-           'parameter_names', 'parse_effect', 'predict', 'rate_at', 'reading_of', 'sensor_force',
-           'simulate_poses', 'simulate_recording', 'times', 'too_large', 'turn_between',
-           'unit_of', 'value_unit', 'variable_of', 'variable_words', 'way_of', 'with_turns',
-           'with_vector']
+           'parameter_names', 'parse_effect', 'predict', 'product_names', 'rate_at', 'reading_of',
+           'sensor_force', 'simulate_poses', 'simulate_recording', 'times', 'too_large',
+           'turn_between', 'unit_of', 'value_unit', 'variable_of', 'variable_words', 'way_of',
+           'with_turns', 'with_vector']

@@ -14,6 +14,8 @@ from collections import ChainMap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
+from itertools import combinations
+import math
 from typing import Any
 
 import numpy as np
@@ -290,7 +292,7 @@ VARIABLES: dict[str, str] = {
 
 def variable_words(variable: str) -> str:
     """Return the words of the variable of a curve: of `VARIABLES`, or the name of a quantity."""
-    return VARIABLES.get(variable) or column_of(variable).meaning
+    return VARIABLES.get(variable) or column_of(variable).meaning.replace('*', ' times ')
 
 
 _CARRIED = {'offset': by_axis(ONE), 'gain': by_axis(FORCE), 'cross_axis': CROSS, 'force': ALL_AXES}
@@ -395,7 +397,9 @@ COVARIATES = {'offset_covariate': ('offset', ONE, 'g/unit'),
               'gain_covariate': ('gain of each axis', FORCE, '1/unit')}
 """What a covariate changes in proportion to a quantity: words, monomial, unit of its values."""
 
-_CURVED = '2'
+_CURVED, _TIMES = '2', '*'
+_WITH_OTHERS = ('temperature', 'supply_voltage')
+"""Columns with effects of their own, whose products with others are covariates."""
 
 
 def covariate_names(quantities: Iterable[str]) -> Iterator[str]:
@@ -412,6 +416,17 @@ def covariate_names(quantities: Iterable[str]) -> Iterator[str]:
             yield f'{kind}-{quantity}-{_CURVED}'
 
 
+def product_names(columns: Iterable[str]) -> Iterator[str]:
+    """
+    Yield the names of covariates of a product, such as ``offset_covariate-humidity*pressure``.
+
+    It adds k (humidity - zero) (pressure - zero), by axis: what neither column does alone.
+
+    """
+    for pair in combinations(sorted(columns), 2):
+        yield from (f'{kind}-{_TIMES.join(pair)}' for kind in COVARIATES)
+
+
 def kind_of(name: str) -> str:
     """Return the name of an effect without the variable, for one made from its name."""
     return name.partition('-')[0]
@@ -426,8 +441,11 @@ def variable_of(name: str) -> str:
 
 def _covariate(name: str) -> Effect:
     kind, _, rest = name.partition('-')
-    quantity, *curved = rest.split('-')
-    if not is_quantity(quantity) or curved not in ([], [_CURVED]):
+    variable, *curved = rest.split('-')
+    columns = tuple(variable.split(_TIMES))
+    known = [is_quantity(column) or column in _WITH_OTHERS for column in columns]
+    if not (len(columns) == 2 and all(known) and columns[0] < columns[1] and not curved) and not (
+            is_quantity(variable) and curved in ([], [_CURVED])):
         raise KeyError(name)
     what, monomial, unit = COVARIATES[kind]
     terms = by_axis(monomial)
@@ -436,23 +454,25 @@ def _covariate(name: str) -> Effect:
         terms += tuple(term._replace(parameter=3 + term.parameter) for term in terms)
         names += tuple(f'{axis}_square' for axis in AXES)
     return Effect(
-        f'{what} that changes with {column_of(quantity).meaning}', f'coefficient of {quantity}',
-        names, unit, np.inf, 0.5, terms, partial(_departure, quantity, bool(curved)), (quantity,),
-        ('zero',), partial(_mean, quantity, 3 if curved else 2), (0.0,),
-        includes=(f'{kind}-{quantity}',) if curved else ())
+        f'{what} that changes with {variable_words(variable)}', f'coefficient of {variable}',
+        names, unit, np.inf, 0.5, terms, partial(_departure, columns, bool(curved)), columns,
+        ('zero',) if not columns[1:] else tuple(f'zero_{column}' for column in columns),
+        partial(_means, columns, 3 if curved else 2), (0.0,) * len(columns),
+        includes=(f'{kind}-{variable}',) if curved else ())
 
 
-def _departure(quantity: str, curved: bool, context: Mapping[str, Any], shape: Floats) -> Any:
-    """Return quantity - zero, and for a curved covariate its square for the later terms."""
-    away = context[quantity] - shape[0]
+def _departure(columns: Sequence[str], curved: bool, context: Mapping[str, Any], shape: Floats
+               ) -> Any:
+    """Return the product of all column - zero; for a curved covariate its square, too."""
+    away = math.prod(context[column] - zero for column, zero in zip(columns, shape, strict=True))
     return np.array([away] * 3 + [away ** 2] * 3) if curved else away
 
 
-def _mean(quantity: str, least: int, context: Context) -> Iterator[Floats]:
-    """Yield the mean of a quantity that has at least this number of different values."""
-    values = context[quantity][np.isfinite(context[quantity])]
-    if len(np.unique(values)) >= least:
-        yield np.array([np.mean(values)])
+def _means(columns: Sequence[str], least: int, context: Context) -> Iterator[Floats]:
+    """Yield the means of columns that have at least this number of different values."""
+    known = [context[column][np.isfinite(context[column])] for column in columns]
+    if all(len(np.unique(values)) >= least for values in known):
+        yield np.array([np.mean(values) for values in known])
 
 
 OWN: dict[str, Effect] = {}
@@ -499,7 +519,8 @@ def value_unit(effect_name: str, value_name: str) -> tuple[str, float]:
         return '', 1.0
     effect, variable = effect_named(effect_name), variable_of(effect_name)
     if value_name not in effect.parameters:
-        return unit_of(variable) if variable else '' if effect.own else 's', 1.0
+        column = value_name.removeprefix('zero_') if _TIMES in variable else variable
+        return unit_of(column) if variable else '' if effect.own else 's', 1.0
     unit = curve_unit(effect_name) if kind_of(effect_name) == EMPIRICAL else effect.unit
     if value_name.endswith('_square'):
         unit = f'{unit}²'

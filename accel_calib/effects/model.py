@@ -384,9 +384,14 @@ class Model(Record):
         These are the quantities, and what only poses have.
 
         """
-        return {key: float(np.mean(shape)) if len(shape) and not effect.own else np.nan
-                for effect, shape in self._by_effect for key in effect.needs
-                if is_quantity(key) or key in AT_POSES}
+        found = dict[str, float]()
+        for effect, shape in self._by_effect:
+            zeros = shape if len(shape) == len(effect.needs) else (
+                [np.mean(shape) if len(shape) else np.nan] * len(effect.needs))
+            found.update((key, np.nan if effect.own else float(zero))
+                         for key, zero in zip(effect.needs, zeros, strict=True)
+                         if is_quantity(key) or key in AT_POSES)
+        return found
 
     @cached_property
     def lags(self) -> Mapping[str, Lag]:
