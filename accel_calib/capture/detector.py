@@ -341,8 +341,7 @@ def samples_of(recording: Recording, start: int, stop: int, context: Sequence[st
     for row, name in enumerate(context, start=MOTION):
         if name in recording:
             samples[row] = recording[name][which]
-    if not np.isfinite(samples[:4].sum()):
-        check_finite(samples[:4], recording.row[which])
+    check_finite(samples[:4], recording.row[which])
     return samples
 
 

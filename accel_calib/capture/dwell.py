@@ -55,9 +55,10 @@ from numpy.typing import NDArray
 
 from .account import Rest
 from .chunks import (
-    CaptureSettings, chained, Chunks, CHUNKS_PER_WINDOW, Records, summed, sums_type, window_type)
-from .rule import DWELL_SLOPE_G, HORIZON, judged_type, RELATIVE, Rule, STRENGTH, WEAK_STRENGTH
-from .trend import excess_of_means, Line, lines_through, strength_of, Trend
+    CaptureSettings, chained, chunk_type, Chunks, CHUNKS_PER_WINDOW, Records, summed)
+from .rule import (
+    DWELL_SLOPE_G, HORIZON, RELATIVE, rounding_left, Rule, STRENGTH, SURE, TURN_G, WEAK_STRENGTH)
+from .trend import excess_of_means, lines_through, strength_of
 from ..table import Floats
 
 _FIGURES = [
@@ -65,10 +66,7 @@ _FIGURES = [
     ('average', float, 6),    # mean variance of the windows
     ('mean', float, 6),       # reading and rate
     ('std', float, 3),        # of the samples
-    ('slope', float, 3), ('square', float, 3), ('neighbours', float, 3),  # see `trend.Line`
-    ('time_square', float), ('cells', float),
-    ('white', float, 3),      # variance of a cell mean for independent samples
-    ('spacing', float),       # time between cells [s]
+    ('slope', float, 3), ('strength', float), ('error', float),  # see `trend.Trend`
     ('begin', float), ('end', float), ('time', float),  # first, last and mean stamp [s]
     ('samples', float),
     ('excess', float),        # variance of the mean over that of independent samples
@@ -78,7 +76,7 @@ _FIGURES = [
     ('at_limit', float, 3),   # share of samples that repeat the extreme of an axis so far
     ('orientation', np.intp),
     ('part_slope', float, 3), ('part_strength', float, 3)]  # first, middle and last half
-"""Means and variances in the unit of the readings, slopes per cell, `part_slope` per second."""
+"""Means and variances in the unit of the readings, slopes per second."""
 
 
 def figures_type(columns: int) -> np.dtype[Any]:
@@ -123,13 +121,18 @@ def _add_noise(found: Records, dwells: Sequence[OngoingDwell], variance: Floats,
     per_cell = count.sum(axis=1) / sizes
     means = sums / np.maximum(count, 1.0)
     centred = (means - means.sum(axis=2, keepdims=True) / sizes[:, np.newaxis]) * (count > 0.0)
-    line = lines_through(centred, sizes)
     spacing = np.array([dwell.size * dwell.length for dwell in dwells])
-    for name in ('slope', 'square', 'neighbours'):
-        found[name] = getattr(line, name).T
-    found['white'], found['spacing'] = (level / per_cell).T, spacing
-    found['time_square'], found['cells'] = line.time_square, sizes
-    _add_parts(found, centred, sizes, level / per_cell, spacing)
+    trend = strength_of(lines_through(centred, sizes), spacing, level / per_cell)
+    found['slope'], found['strength'], found['error'] = trend.slope.T, trend.strength, trend.error
+    half = sizes // 2
+    inside = np.arange(int(half.max())) < half[:, np.newaxis]
+    for k, start in enumerate((0.0 * half, (sizes - half) // 2, sizes - half)):
+        index = start[:, np.newaxis] + np.arange(inside.shape[1])
+        part = np.take_along_axis(centred, index.astype(np.intp)[np.newaxis], axis=2) * inside
+        part -= inside * (part.sum(axis=2) / half)[:, :, np.newaxis]
+        trend = strength_of(lines_through(part, half), spacing, level / per_cell)
+        found['part_slope'][:, k] = np.sqrt(np.sum(trend.slope ** 2, axis=0))
+        found['part_strength'][:, k] = trend.strength
     white = variance / per_cell
     found['excess'] = found['along'] = excess_of_means(centred, sizes, white)
     if known_units:
@@ -137,20 +140,6 @@ def _add_noise(found: Records, dwells: Sequence[OngoingDwell], variance: Floats,
         up = mean / np.maximum(np.linalg.norm(mean, axis=0), 1e-300)
         along = np.einsum('ak,akt->kt', up, centred)[np.newaxis]
         found['along'] = excess_of_means(along, sizes, np.sum(up ** 2 * white, axis=0)[np.newaxis])
-
-
-def _add_parts(found: Records, centred: Floats, sizes: Floats, white: Floats, spacing: Floats
-               ) -> None:
-    """Set slopes and strengths of first, middle and last half, to detect a turn in a part."""
-    half = sizes // 2
-    inside = np.arange(int(half.max())) < half[:, np.newaxis]
-    for k, start in enumerate((0.0 * half, (sizes - half) // 2, sizes - half)):
-        index = start[:, np.newaxis] + np.arange(inside.shape[1])
-        part = np.take_along_axis(centred, index.astype(np.intp)[np.newaxis], axis=2) * inside
-        part -= inside * (part.sum(axis=2) / half)[:, :, np.newaxis]
-        trend = strength_of(lines_through(part, half), spacing, white)
-        found['part_slope'][:, k] = np.sqrt(np.sum(trend.slope ** 2, axis=0))
-        found['part_strength'][:, k] = trend.strength
 
 
 DWELL_RATIO = 3.2
@@ -236,51 +225,58 @@ def judged(table: Records, rule: Rule, context: Sequence[str], first: int = 0) -
     All dwells of the table of `figures` are used. `context` names its columns of context.
 
     """
-    line = Line(table['slope'].T, table['square'].T, table['neighbours'].T, table['time_square'],
-                table['cells'])
-    slopes, means = strength_of(line, table['spacing'], table['white'].T), table['mean'][:, :3]
-    frozen = np.zeros(len(table), bool) if rule.repeats else np.all(
-        table['std'] <= RELATIVE * np.linalg.norm(means, axis=1)[:, np.newaxis], axis=1)
-    limit = rule.limit_of(rule.noise_of(table['mean'].T), DWELL_RATIO, DWELL_RATE_RATIO)
+    means, std, (step, rate_step) = table['mean'][:, :3], table['std'], rule.steps
+    tiny = RELATIVE * np.sqrt(np.sum(means.T**2, axis=0))
+    quiet, excess, reason = _reasons(table, rule, tiny)
     turned = np.ptp(means, axis=0) > _STUCK * np.max(np.abs(means))  # else an axis is stuck
-    usual = np.median(table['std'], axis=0)
-    step, rate_step = rule.steps
-    quieter = (table['std'] < _QUIETER * usual) & (usual > step)
-    ends = np.any((table['at_limit'] > _AT_LIMIT) & turned & quieter, axis=1)
-    reasons = {'short': table['short'], 'frozen': frozen,
-               'shaking': np.any(limit < table['lowest'].T, axis=0),
-               'slope': _sloping(table, slopes, rule)}
-    quiet = ~np.any(list(reasons.values()), axis=0)
-    across, along = (_excess(table[name], quiet) for name in ('excess', 'along'))
-    excess = np.minimum(across, along)
-    turning, sure = _by_gyro(table, quiet, rule)
-    reasons |= {'turning': turning, 'noisy': ~sure & ~rule.rests(slopes, across)}
-    good = ~np.any(list(reasons.values()), axis=0)
-    reasons['length'] = np.zeros(len(table), bool)
-    reasons['length'][good] = ~rule.reads_gravity(means[good])
+    usual = np.median(std, axis=0)
+    ends = np.any((table['at_limit'] > _AT_LIMIT) & turned
+                  & (std < _QUIETER * usual) & (usual > step), axis=1)
+    # The noise of samples and means with rounding; see `rule`.
     level = table['average'][quiet, :3].sum(axis=0) / (1.0 + quiet.sum())
-    std, count = _counts(table[first:], excess[first:], level, rule)
-    rate_std = np.maximum(np.sqrt(table['average'][first:, 3:]), rate_step / math.sqrt(12.0))
-    reason = np.select(list(reasons.values()), list(reasons), '')[first:].tolist()
-    return [_dwell(context, *each) for each in zip(
-        table[first:], std.T.copy(), count.tolist(), rate_std, reason, ends[first:].tolist(),
-        strict=True)]
+    left = step**2 * rounding_left(level / step**2) if step > 0.0 else np.zeros(3)
+    rounded = np.maximum(std.T, np.maximum(step / math.sqrt(12.0), tiny))
+    variance = (rounded**2 * excess / table['samples']
+                + np.maximum(left[:, np.newaxis], 1e-2 * tiny**2))
+    count = np.sum(rounded**2, axis=0) / np.sum(variance, axis=0)
+    rate_std = np.maximum(np.sqrt(table['average'][:, 3:]), rate_step / math.sqrt(12.0))
+    return [_dwell(context, *each) for each in zip(*(part[first:] for part in (
+        table, rounded.T.copy(), count, rate_std, reason, ends)), strict=True)]
+
+
+def _reasons(table: Records, rule: Rule, tiny: Floats
+             ) -> tuple[NDArray[np.bool_], Floats, NDArray[np.str_]]:
+    """
+    Return which dwells are quiet, the excess of their noise, and why they are no poses.
+
+    `tiny` is the standard deviation of each below which it repeats one reading.
+
+    """
+    mean, slope, scale = table['mean'].T, table['slope'].T, rule.scale
+    limit = rule.limit_of(rule.noise_of(mean), DWELL_RATIO, DWELL_RATE_RATIO)
+    sloping = rule.is_steep(slope, np.asarray(scale), table['average'].T[:3], DWELL_SLOPE_G)
+    sloping &= table['strength'] > np.where(table['beside_slope'], WEAK_STRENGTH, STRENGTH)
+    sloping |= (scale > 0.0) & np.any((table['part_slope'] > PART_SLOPE_G * scale)
+                                      & (table['part_strength'] > PART_STRENGTH), axis=1)
+    found = {'short': table['short'],
+             'frozen': np.all(table['std'] <= tiny[:, np.newaxis], axis=1)
+             & (not rule.repeats),
+             'shaking': np.any(limit < table['lowest'].T, axis=0), 'slope': sloping}
+    quiet = ~np.any(list(found.values()), axis=0)
+    across, along = (_excess(table[name], quiet) for name in ('excess', 'along'))
+    found['turning'], sure = _by_gyro(table, quiet, rule)
+    turn = np.sqrt(np.sum(slope**2, axis=0)) + SURE * table['error'] * np.sqrt(across)
+    found['noisy'] = ~sure & ~((turn < TURN_G * scale) | (scale == 0.0))
+    good = ~np.any(list(found.values()), axis=0)
+    found['length'] = np.zeros(len(table), bool)
+    found['length'][good] = ~rule.reads_gravity(table['mean'][:, :3][good])
+    return quiet, np.minimum(across, along), np.select(list(found.values()), list(found), '')
 
 
 def _excess(own: Floats, quiet: NDArray[np.bool_]) -> Floats:
     """Return the excess of the noise of each mean, estimated from all dwells."""
     common = float(np.median(own[quiet])) if quiet.any() else 1.0
     return np.asarray(np.maximum(max(1.0, common), own / _OWN_EXCESS))
-
-
-def _sloping(table: Records, slopes: Trend, rule: Rule) -> NDArray[np.bool_]:
-    """Return which dwells have a slope."""
-    strength = np.where(table['beside_slope'], WEAK_STRENGTH, STRENGTH)
-    moved = rule.moved(slopes, np.asarray(rule.scale), table['average'].T[:3], strength,
-                       DWELL_SLOPE_G)
-    turned = np.any((table['part_slope'] > PART_SLOPE_G * rule.scale)
-                    & (table['part_strength'] > PART_STRENGTH), axis=1)
-    return np.asarray(moved | (turned & (rule.scale > 0.0)))
 
 
 def _by_gyro(table: Records, quiet: NDArray[np.bool_], rule: Rule
@@ -305,14 +301,6 @@ def _by_gyro(table: Records, quiet: NDArray[np.bool_], rule: Rule
     return known & (tilting > max(_GYRO_RATE, 2.0 * _SPREADS * spread)), sure
 
 
-def _counts(table: Records, excess: Floats, level: Floats, rule: Rule) -> tuple[Floats, Floats]:
-    """Return (3, k) standard deviations and (k,) independent samples, including rounding."""
-    resolution, left = rule.rounding(table['mean'].T[:3], level)
-    std = np.maximum(table['std'].T, resolution)
-    variance = std**2 * excess / table['samples'] + left
-    return std, np.asarray(np.sum(std**2, axis=0) / np.sum(variance, axis=0))
-
-
 def _dwell(context: Sequence[str], found: Any, std: Floats, count: float, rate_std: Floats,
            reason: str, at_limit: bool) -> Dwell:
     known: dict[str, float | Floats] = {
@@ -322,8 +310,8 @@ def _dwell(context: Sequence[str], found: Any, std: Floats, count: float, rate_s
     if np.isfinite(mean).all():
         known['rate'] = mean[3:]
     return Dwell(float(found['begin']), float(found['end']), float(found['time']), mean[:3], std,
-                 count, int(found['samples']), known, int(found['orientation']),
-                 rate_std=rate_std, reason=reason, at_limit=at_limit)
+                 float(count), int(found['samples']), known, int(found['orientation']),
+                 rate_std=rate_std, reason=str(reason), at_limit=bool(at_limit))
 
 
 CELLS = 256
@@ -347,7 +335,7 @@ class OngoingDwell:
         self.epoch = chunks.epoch
         self.origin = chunks.origin
         self.length = chunks.length
-        self.cells = self._partial = np.empty(0, window_type(chunks.sums.dtype))
+        self.cells = self._partial = np.empty(0, chunks.records.dtype['sums'])
         self.size = 1
         self.begin = self.end = 0.0
         self.chunks = 0
@@ -355,7 +343,7 @@ class OngoingDwell:
         self.orientation = orientation
 
     def add(self, chunks: Records) -> None:
-        """Add consecutive chunks, of a `judged_type`."""
+        """Add consecutive chunks, of a `chunk_type`."""
         if not len(chunks):
             return
         self.begin = self.begin if self.chunks else float(chunks['begin'][0])
@@ -403,7 +391,7 @@ _LEAD = CHUNKS_PER_WINDOW - 2
 """Chunks before the first still window that belong to the dwell."""
 
 
-_NONE = np.empty(0, judged_type(sums_type(0)))
+_NONE = np.empty(0, chunk_type(0))
 """No chunks, of any type."""
 
 
@@ -424,7 +412,7 @@ class Tracker:
         self.number = number
 
     def feed(self, chunks: Records) -> list[OngoingDwell]:
-        """Return the dwells that end with these chunks, of a `judged_type`."""
+        """Return the dwells that end with these chunks, of a `chunk_type`."""
         self._waiting = chained(self._waiting, chunks)
         return self._decide(last=False)
 
