@@ -92,15 +92,18 @@ from accel_calib.report.sheet import sheet
 from accel_calib.report.stability import comparison_page, history_page
 from accel_calib.ros.run import own_domain
 from accel_calib.session import store as session_store, worker
-from accel_calib.session.commands import fit as fit_in_node
-from accel_calib.session.guidance import Guide, next_action, Plan, plan_for
+from accel_calib.session.commands import (
+    due as automatic_fits_due, fit as fit_in_node, poses_changed)
+from accel_calib.session.guidance import next_action
+from accel_calib.session.guide import Guide, Plan, plan_for
 from accel_calib.session.live_capture import LiveCapture, PoseBook, with_temperature
-from accel_calib.session.sensor import rest_after, Sensor, TemperatureHistory
+from accel_calib.session.sensor import rest_after, Sensor
 from accel_calib.session.settings import capture_settings, changed, default_of
 from accel_calib.session.state import figures
 from accel_calib.session.store import (
     aside, Identity, Lock, MOST_STEPS, Store as SensorStore, store_of, writing_advice)
-from accel_calib.session.stream import StreamStatistics
+from accel_calib.session.stream import StreamStatistics, TemperatureHistory
+from accel_calib.session.use import adopt as use_calibration
 from accel_calib.session.worker import Worker, WorkerProcess
 from accel_calib.stored import calibration_yaml, plain_yaml
 from accel_calib.stored.calibration_yaml import (

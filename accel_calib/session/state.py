@@ -15,14 +15,16 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, MISSING
 from enum import IntEnum
 import math
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
+from .core import State
+from .faults import missing_context, stream_faults, thermometer_words
 from .guidance import next_action
 from .sensor import title
 from .settings import context_topics
-from .stream import missing_context, SILENT, stream_faults, thermometer_words
+from .stream import SILENT
 from ..calibrate import USES_LIMIT
 from ..compare import Drift, status
 from ..errors import InputError
@@ -32,9 +34,6 @@ from ..pipeline import is_partial
 from ..table import column_of
 from ..text import counted
 from ..units import MG
-
-if TYPE_CHECKING:
-    from .session import Session
 
 
 def _figure(name: str, write: Callable[[Any], str], read: Callable[[str], Any],
@@ -138,7 +137,7 @@ Newest = tuple[tuple[float, ...], float, float]
 _NOT_KNOWN: Newest = (), math.nan, math.nan
 
 
-def progress(session: Session, reading: Triple | None = None) -> Progress:
+def progress(session: State, reading: Triple | None = None) -> Progress:
     """Return the progress; `reading` is the newest one, by default the last that was pushed."""
     sensor, statistics = session.sensor, session.statistics
     plan, silent = sensor.guide.plan, statistics.age > SILENT
@@ -147,7 +146,8 @@ def progress(session: Session, reading: Triple | None = None) -> Progress:
     direction = None if plan is None or action.kind != 'poses' else plan.asked.direction
     return Progress(
         still=session.still and not silent,
-        stillness=math.nan if silent else sensor.stillness(statistics),
+        stillness=math.nan if silent else (
+            statistics.spread / sensor.live.detector.threshold),
         dwell=statistics.stamp - session.still_since if session.still else 0.0,
         min_dwell=session.settings.min_dwell, poses=sensor.guide.poses,
         total=0 if plan is None else plan.asked.total,
@@ -158,7 +158,7 @@ def progress(session: Session, reading: Triple | None = None) -> Progress:
         up=up, length=length, corrected=corrected, temperature=session.around.temperature)
 
 
-def _accuracy(session: Session) -> float:
+def _accuracy(session: State) -> float:
     """Return the expected error of |a| [g]; NaN if it is not known, or not the noise alone."""
     plan, rating = session.sensor.guide.plan, session.sensor.rating
     if plan is None or (rating is not None and has(rating.findings, 'beyond_noise')):
@@ -166,7 +166,7 @@ def _accuracy(session: Session) -> float:
     return plan.asked.error * plan.noise_g
 
 
-def _newest(session: Session, reading: Triple | None) -> Newest:
+def _newest(session: State, reading: Triple | None) -> Newest:
     """Describe the newest reading; a native one has a direction only if its zero is known."""
     sensor, newest = session.sensor, session.statistics.newest
     if reading is None:
@@ -206,7 +206,7 @@ class Check:
     words: str
 
 
-def checks(session: Session) -> list[Check]:
+def checks(session: State) -> list[Check]:
     """Return the results of all checks, one for each concern."""
     faults = {**stream_faults(session), **missing_context(session)}
     drift, store, path = session.sensor.drift, session.files.store, session.files.path
@@ -221,14 +221,14 @@ def checks(session: Session) -> list[Check]:
               'restart the node with another calibration_file')]
 
 
-def worst(session: Session, found: Sequence[Check]) -> Check:
+def worst(session: State, found: Sequence[Check]) -> Check:
     """Return the most severe of the checks, or the state of the session if all are OK."""
     severest = max(found, key=lambda check: check.level)
     words = words_of_state(session) if severest.level == Level.OK else severest.words
     return Check('state', severest.level, words)
 
 
-def words_of_state(session: Session) -> str:
+def words_of_state(session: State) -> str:
     """Return whether messages are corrected, and why not."""
     calibration = session.sensor.calibration
     if session.files.problem:
@@ -246,7 +246,7 @@ def words_of_state(session: Session) -> str:
             else 'no calibration, nothing is published')
 
 
-def _calibration(session: Session) -> Check:
+def _calibration(session: State) -> Check:
     sensor = session.sensor
     if session.problem:
         return Check('calibration', Level.ERROR, session.problem)
@@ -265,11 +265,11 @@ def _calibration(session: Session) -> Check:
     return Check('calibration', Level.OK, title(sensor.calibration))
 
 
-def _advice(session: Session) -> str:
+def _advice(session: State) -> str:
     return next_action(session).words or 'turn the sensor'
 
 
-def figures(session: Session) -> Iterator[tuple[str, str]]:
+def figures(session: State) -> Iterator[tuple[str, str]]:
     """Yield names and values for the diagnostics."""
     sensor, counts = session.sensor, session.statistics
     yield 'state', words_of_state(session)
@@ -311,7 +311,7 @@ def _drift_figures(drift: Drift | None) -> Iterator[tuple[str, str]]:
         yield 'temperature when calibrated [°C]', f'{low:.1f} to {high:.1f}'
 
 
-def _pose_figures(session: Session) -> Iterator[tuple[str, str]]:
+def _pose_figures(session: State) -> Iterator[tuple[str, str]]:
     live = session.sensor.live
     poses, breaks = live.book.poses(), live.detector.interruptions
     doubtful = int(np.sum(poses['doubtful'])) if 'doubtful' in poses else 0
@@ -325,7 +325,7 @@ def _pose_figures(session: Session) -> Iterator[tuple[str, str]]:
         f'{sum(each.end - each.start for each in live.detector.missing):.1f}')
 
 
-def _sensor_figures(session: Session) -> Iterator[tuple[str, str]]:
+def _sensor_figures(session: State) -> Iterator[tuple[str, str]]:
     calibration, gyro, noise = (
         session.sensor.calibration, session.sensor.gyro, session.sensor.noise)
     yield 'mounting', session.mounting_words(calibration) or 'not known'
