@@ -101,7 +101,8 @@ from accel_calib.session.sensor import rest_after, Sensor
 from accel_calib.session.settings import capture_settings, changed, default_of
 from accel_calib.session.state import figures
 from accel_calib.session.store import (
-    aside, Identity, Lock, MOST_STEPS, Store as SensorStore, store_of, writing_advice)
+    aside, Identity, lock as lock_files, MOST_STEPS, Store as SensorStore, store_of,
+    writing_advice)
 from accel_calib.session.stream import StreamStatistics, TemperatureHistory
 from accel_calib.session.use import adopt as use_calibration
 from accel_calib.session.worker import Worker, WorkerProcess

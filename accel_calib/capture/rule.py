@@ -52,8 +52,7 @@ from numpy.typing import NDArray
 
 from .chunks import CaptureSettings, chained, Chunks, CHUNKS_PER_WINDOW, Records
 from .levels import Known, Levels
-from .trend import (
-    Columns, columns_of, oscillation, sliding_max, sliding_sum, Stretch, stretch, windows)
+from .trend import Columns, columns_of, oscillation, sliding_max, sliding_sum, Stretch, stretch
 from ..table import Floats
 from ..units import Units
 
@@ -221,14 +220,12 @@ class Rule:
         self._before = sums[len(sums) - HORIZON + 1:].copy()
         if self._axes == 3 and np.isfinite(sums['first'][:, 3]).any():
             self._axes = 6
-        axes, size, columns = self._axes, len(judged), columns_of(sums, self._axes)
-        mean, level = windows(columns)
-        mean += chunks.origin[:axes, np.newaxis]
-        zero, equal = windows_without_readings(columns, mean[:3], level[:3])
-        mean, recent = mean[:, -size:], level[:, -size:]
-        seen = {length: stretch(columns, level, length, size, chunks.length)
-                for length in SLOPE_CHUNKS}
-        gaps = (zero, zero + equal, np.where(level[3:] == 0.0, 1.0, 0.0))
+        axes, size = self._axes, len(judged)
+        columns = columns_of(sums, axes, chunks.origin)
+        mean, recent = columns.mean[:, -size:], columns.level[:, -size:]
+        seen = {length: stretch(columns, length, size, chunks.length) for length in SLOPE_CHUNKS}
+        zero, equal = windows_without_readings(columns)
+        gaps = (zero, zero + equal, np.where(columns.level[3:] == 0.0, 1.0, 0.0))
         noise, varied = self._learn(seen[LONG], mean, judged['step'].T, *(
             sliding_max(each, LONG - CHUNKS_PER_WINDOW + 1)[..., -size:] > 0.0 for each in gaps))
         missing = np.where(zero[-size:] > 0.0, 1, np.where((equal[-size:] > 0.0) & varied, 2, 0))
@@ -383,18 +380,12 @@ def _half_range(low: Floats, high: Floats, noise: Floats) -> Floats:
     return np.where(turned, half, 0.0)
 
 
-def windows_without_readings(sums: Columns, mean: Floats, level: Floats
-                             ) -> tuple[Floats, Floats]:
-    """
-    Return the (n,) windows that have samples of zeros, and those of one repeated reading, as 1.
-
-    `mean` and `level` are the (3, n) mean and variance of the windows.
-
-    """
+def windows_without_readings(sums: Columns) -> tuple[Floats, Floats]:
+    """Return the (n,) windows that have samples of zeros, and those of one reading, as 1."""
     zero = sliding_max(sums.zeros, CHUNKS_PER_WINDOW)
     constant = (sums.repeats == sums.count - 1.0).astype(float)
     equal = ((sliding_sum(constant, CHUNKS_PER_WINDOW) == CHUNKS_PER_WINDOW)
-             & np.all(level <= _tiny(mean), axis=0))
+             & np.all(sums.level[:3] <= _tiny(sums.mean[:3]), axis=0))
     return zero, equal.astype(float)
 
 

@@ -262,35 +262,38 @@ _DIGITS = 1e-14
 @dataclass(frozen=True)
 class Columns:
     """
-    Sums of n chunks as contiguous arrays, (axes, n) of reading and rate.
+    Sums of n chunks as contiguous arrays, and the windows that end with them.
 
-    `repeats` (n,) are the samples that repeat the one before; `zeros` is 1 for chunks with zeros.
+    `first` (axes, n) are those of reading and rate. `repeats` (n,) are the samples that repeat the
+    one before; `zeros` is 1 for chunks with zeros. `mean` and `level`, (axes, m), are the means
+    and variances of the m windows.
 
     """
 
     count: Floats
     first: Floats
-    second: Floats
     at_limit: Floats
     repeats: Floats
     zeros: Floats
+    mean: Floats
+    level: Floats
 
 
-def columns_of(sums: Records, axes: int) -> Columns:
-    """Return the sums of n chunks for the reading (3 axes), or reading and rate (6)."""
+def columns_of(sums: Records, axes: int, origin: Floats) -> Columns:
+    """
+    Return the sums of n chunks for the reading (3 axes), or reading and rate (6).
+
+    They are relative to the `origin` (6,), which is added to the means.
+
+    """
     first, second = (np.ascontiguousarray(sums[name].T[:axes]) for name in ('first', 'second'))
     count = sums['count'].copy()
-    return Columns(count, first, second, np.ascontiguousarray(sums['at_limit'].T),
-                   sums['repeats'].copy(), (sums['zeros'] > 0.0).astype(float))
-
-
-def windows(sums: Columns) -> tuple[Floats, Floats]:
-    """Return mean and variance of the windows that end with each chunk, (axes, n)."""
-    count = sliding_sum(sums.count, CHUNKS_PER_WINDOW)
-    first = sliding_sum(sums.first, CHUNKS_PER_WINDOW)
-    mean = first / count
-    power = sliding_sum(sums.second, CHUNKS_PER_WINDOW) - first * mean
-    return mean, np.maximum(power, 0.0) / (count - 1.0)
+    inside, total = (sliding_sum(each, CHUNKS_PER_WINDOW) for each in (count, first))
+    mean = total / inside
+    power = np.maximum(sliding_sum(second, CHUNKS_PER_WINDOW) - total * mean, 0.0)
+    return Columns(count, first, np.ascontiguousarray(sums['at_limit'].T), sums['repeats'].copy(),
+                   (sums['zeros'] > 0.0).astype(float), mean + origin[:axes, np.newaxis],
+                   power / (inside - 1.0))
 
 
 @dataclass(frozen=True)
@@ -320,12 +323,12 @@ class Stretch:
     white: Floats
 
 
-def stretch(sums: Columns, level: Floats, length: int, size: int, spacing: float) -> Stretch:
+def stretch(sums: Columns, length: int, size: int, spacing: float) -> Stretch:
     """Return the figures over `length` chunks that end at each of the last `size` chunks."""
     start = len(sums.count) - size - length + 1
     counts, first = sums.count[start:], sums.first[:, start:]
     inner = length - CHUNKS_PER_WINDOW + 1
-    level = level[:, level.shape[1] - size - inner + 1:]
+    level = sums.level[:, sums.level.shape[1] - size - inner + 1:]
     variance = sliding_sum(level, inner) / inner
     count = sliding_sum(counts, length)
     cells = first / counts

@@ -13,33 +13,30 @@ from .stream import AGAIN, SILENT, StreamStatistics
 from ..calibrate import USES_LIMIT
 from ..effects import Model
 from ..errors import AccelCalibError
-from ..table import Floats, is_quantity
+from ..table import is_quantity
 from ..text import counted
 from ..units import Units
 
 
 def missing_context(session: State) -> dict[str, str]:
     """Return by column of the context why it is missing, and what follows."""
-    calibration = session.sensor.calibration
+    calibration, found = session.sensor.calibration, dict[str, str]()
     model = Model({}) if calibration is None else calibration.model
     wanted = [*context_topics(session.settings), *(
         key for key in model.needs if is_quantity(key) or key == 'supply_voltage')]
-    return {column: _missing_words(session, model, column) for column in dict.fromkeys(wanted)
-            if session.around.is_missing(column)}
-
-
-def _missing_words(session: State, model: Model, column: str) -> str:
-    why = session.missing.get(column) or (
-        'the samples do not have it' if session.publishers is None else
-        f"start the node with context:=['{column}:=TOPIC'], and its topic")
-    names = [name for name in model.effects if column in Model({name: model.values[name]}).needs]
-    if column in session.around.values:
-        follows = '; the last value holds'
-    elif names and is_quantity(column):
-        follows = f'; {" and ".join(names)} {"is" if len(names) == 1 else "are"} left out'
-    else:
+    for column in filter(session.around.is_missing, dict.fromkeys(wanted)):
+        why = session.missing.get(column) or (
+            'the samples do not have it' if session.publishers is None else
+            f"start the node with context:=['{column}:=TOPIC'], and its topic")
+        names = [name for name in model.effects
+                 if column in Model({name: model.values[name]}).needs]
         follows = ''
-    return f'no {column} arrives: {why}{follows}'
+        if column in session.around.values:
+            follows = '; the last value holds'
+        elif names and is_quantity(column):
+            follows = f'; {" and ".join(names)} {"is" if len(names) == 1 else "are"} left out'
+        found[column] = f'no {column} arrives: {why}{follows}'
+    return found
 
 
 def thermometer_words(session: State) -> str:
@@ -83,9 +80,13 @@ _UNITS = (('g', 0.8, 1.2), ('m/s2', 8.0, 12.0))
 
 def stream_faults(session: State) -> dict[str, str]:
     """Return by kind what is wrong with the messages, and what to do."""
-    statistics = session.statistics
+    statistics, names = session.statistics, session.publishers or ()
     faults = {
-        'publishers': _publishers(session), 'mismatches': '; '.join(session.mismatches),
+        'publishers': '' if len(names) < 2 else (
+            f'{"two" if len(names) == 2 else len(names)} publishers on the topic {session.topic}: '
+            f'{", ".join(names)}; expected one sensor: stop the others, or give each sensor its '
+            'own topic; a driver that was killed disappears after about 20 s'),
+        'mismatches': '; '.join(session.mismatches),
         'silence' if session.publishers else 'no_publisher': _silence(session),
         'stamps': statistics.stamp_fault}
     if statistics.dropped_ago < _DROPPED_SHOWN_FOR:
@@ -93,16 +94,6 @@ def stream_faults(session: State) -> dict[str, str]:
                    for kind, (what, why) in _DROPPED.items() if statistics.dropped[kind]}
     faults['unit'] = _wrong_unit(statistics, session.units)
     return {kind: words for kind, words in faults.items() if words}
-
-
-def _publishers(session: State) -> str:
-    names = session.publishers
-    if names is None or len(names) < 2:
-        return ''
-    count = 'two' if len(names) == 2 else str(len(names))
-    return (f'{count} publishers on the topic {session.topic}: {", ".join(names)}; expected one '
-            'sensor: stop the others, or give each sensor its own topic; a driver that was killed '
-            'disappears after about 20 s')
 
 
 def _silence(session: State) -> str:
@@ -133,7 +124,7 @@ def _wrong_unit(statistics: StreamStatistics, units: Units) -> str:
             f'units:={likely}')
 
 
-_FAULT_AGAIN = 60.0
+FAULT_AGAIN = 60.0
 """Shortest time between two equal log lines about another fault of the stream [s]."""
 
 
@@ -158,23 +149,8 @@ class Reports:
                 and math.isnan(session.around.temperature)
                 and 'temperature' not in context_topics(session.settings)):
             session.log('warning', f'no temperature arrives; {thermometer_words(session)}',
-                        'thermometers', 10.0 * _FAULT_AGAIN)
+                        'thermometers', 10.0 * FAULT_AGAIN)
         self._context()
-
-    def foreign(self, frame_id: str) -> None:
-        """Count a message of another sensor."""
-        self._session.statistics.drop('foreign')
-        self._session.log('error', f'an Imu message has frame_id {frame_id!r}, expected '
-                          f'{self._session.frame_id!r}; it is dropped: use a separate topic for '
-                          'each sensor', 'foreign', AGAIN)
-
-    def absurd(self, readings: Floats, largest: float) -> None:
-        """Count readings that are not of a sensor."""
-        reading = tuple(readings[0].tolist())
-        self._session.statistics.drop('not_finite', len(readings))
-        self._session.log('warning', f'an Imu message has the linear_acceleration {reading}, '
-                          f'expected three finite numbers up to {largest:.3g}; it is dropped: '
-                          'check the driver', 'absurd', AGAIN)
 
     def unreadable(self, size: int) -> None:
         """Count an unreadable message of this size [bytes]."""
@@ -187,15 +163,6 @@ class Reports:
         self._session.statistics.drop('implausible')
         self._session.log('error', f'messages are not corrected: {error}', 'uncorrected', AGAIN)
 
-    def jump(self, seconds: float, since: float) -> None:
-        """Log a jump of the stamps, unless no messages arrived for as long [s]."""
-        if abs(seconds - since) > SILENT:
-            where = 'back' if seconds < 0.0 else 'ahead'
-            self._session.log('warning', f'the stamps jumped {where} by {abs(seconds):.1f} s; the '
-                              'rest before it has ended, and the poses are kept: unless a '
-                              'recording is played, check the clock of the driver',
-                              f'jump {where}', _FAULT_AGAIN)
-
     def _limits(self) -> None:
         left = self._session.sensor.limits_left(self._session.context)
         for key, each in left.items():
@@ -204,7 +171,7 @@ class Reports:
                     'warning', f'{each.name} has left the range of the calibration, '
                     f'{each.range_words(each.low, each.high)}: it is '
                     f'{each.range_words(each.least, each.most)}, and {USES_LIMIT}',
-                    f'limits of {key}', _FAULT_AGAIN)
+                    f'limits of {key}', FAULT_AGAIN)
         self._left = frozenset(left)
 
     def _context(self) -> None:
@@ -212,7 +179,7 @@ class Reports:
         session, missing = self._session, missing_context(self._session)
         for column, words in missing.items():
             if column not in self._missing:
-                session.log('warning', words, f'missing {column}', _FAULT_AGAIN)
+                session.log('warning', words, f'missing {column}', FAULT_AGAIN)
         for column in sorted(self._missing - missing.keys()):
             session.log('info', f'{column} arrives')
         self._missing = frozenset(missing)
@@ -221,13 +188,13 @@ class Reports:
             if lack and have:
                 session.log('warning', f'{lack} of {counted(lack + have, "pose")} have no '
                             f'{column}, so that ~/refine cannot use it: call ~/reset, and take '
-                            'the poses again', f'poses without {column}', 10.0 * _FAULT_AGAIN)
+                            'the poses again', f'poses without {column}', 10.0 * FAULT_AGAIN)
 
     def _faults_of_stream(self) -> None:
         """Log a fault of the stream when it appears, and again while it lasts."""
         session, statistics = self._session, self._session.statistics
         faults = stream_faults(session)
-        limit = AGAIN if statistics.age > SILENT else _FAULT_AGAIN
+        limit = AGAIN if statistics.age > SILENT else FAULT_AGAIN
         again = session.clock() - self._faults_at >= limit
         kinds = (frozenset(faults), session.mismatches)
         if faults and (again or kinds != self._faults):

@@ -254,18 +254,6 @@ class Sensor:
         except InputError:
             return None  # a quantity is not known yet, or the reading is out of range
 
-    def rest_ago(self, stamp: float) -> float:
-        """Return the time since the last rest, by header stamps [s]; NaN: no rest yet."""
-        if self.rest is None:
-            return math.nan
-        return 0.0 if self.live.still else max(0.0, stamp - self.rest.end)
-
-    @property
-    def residual(self) -> float:
-        """Return |a| - 1 g at the last rest [g]; NaN if not known."""
-        gravity = self.gravity
-        return math.nan if gravity is None else float(np.linalg.norm(gravity)) / self._g - 1.0
-
 
 def gyro_bias_of_rest(rest: Dwell) -> GyroBias | None:
     """Return the bias of the gyro from one rest; None without a plausible angular rate."""

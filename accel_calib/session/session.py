@@ -18,7 +18,7 @@ import numpy as np
 
 from .commands import Commands, due, poses_changed
 from .core import State
-from .faults import Reports
+from .faults import FAULT_AGAIN, Reports
 from .guidance import next_action
 from .live_capture import Change
 from .sensor import Sensor
@@ -108,7 +108,9 @@ class Session(State):
             self._switch_to(frame_id)
             return True
         self._change(self.sensor.live.interrupt(self.settings.auto_capture))
-        self.reports.foreign(frame_id)
+        self.statistics.drop('foreign')
+        self.log('error', f'an Imu message has frame_id {frame_id!r}, expected {self.frame_id!r}; '
+                 'it is dropped: use a separate topic for each sensor', 'foreign', AGAIN)
         return False
 
     def push(self, samples: Floats, arrived: float) -> None:
@@ -125,7 +127,11 @@ class Session(State):
         """
         good = (np.abs(samples[:, 1:4]) <= self._largest).all(axis=1)  # and no NaN
         if not np.all(good):
-            self.reports.absurd(samples[~good, 1:4], self._largest)
+            self.statistics.drop('not_finite', int(np.sum(~good)))
+            reading = tuple(samples[~good, 1:4][0].tolist())
+            self.log('warning', f'an Imu message has the linear_acceleration {reading}, expected '
+                     f'three finite numbers up to {self._largest:.3g}; it is dropped: check the '
+                     'driver', 'absurd', AGAIN)
             samples = samples[good]
         if len(samples):
             since = arrived - self.statistics.arrived
@@ -135,8 +141,12 @@ class Session(State):
             before = live.detector.interruptions[-1:]
             self._change(live.push(samples, self.settings.auto_capture))
             last = live.detector.interruptions[-1:]
-            if last != before:
-                self.reports.jump(last[0].seconds, since)
+            if last != before and abs(last[0].seconds - since) > SILENT:
+                where = 'back' if last[0].seconds < 0.0 else 'ahead'
+                self.log('warning', f'the stamps jumped {where} by {abs(last[0].seconds):.1f} s; '
+                         'the rest before it has ended, and the poses are kept: unless a '
+                         'recording is played, check the clock of the driver',
+                         f'jump {where}', FAULT_AGAIN)
 
     def _change(self, changes: Iterable[Change]) -> None:
         sensor, least = self.sensor, self.settings.drift_warn / self.settings.gravity
