@@ -85,38 +85,30 @@ class StillDetector:
         """
         known = np.any(~np.isnan(samples), axis=0)
         rows = len(known) if known[MOTION:].any() else MOTION if known[4:MOTION].any() else 4
-        found = self._last(self.add([np.ascontiguousarray(samples[:, :rows].T)]))
+        found = self._ended(self._feed([np.ascontiguousarray(samples[:, :rows].T)], last=False))
         self._rule.least = self._rule.levels.least
         return found
-
-    def add(self, blocks: Iterable[Floats]) -> int:
-        """
-        Add samples as (k, n) arrays, and return how many dwells ended.
-
-        The rows are the columns of `push`, without those at the end that are not known.
-
-        """
-        return self._keep(self._feed(blocks, last=False))
 
     def add_recording(self, recording: Recording) -> None:
         """Add the samples of a recording; raise InputError if one is not finite."""
         for start in range(0, len(recording), _AT_ONCE):
             stop = min(start + _AT_ONCE, len(recording))
-            self.add(samples_of(recording, begin, min(begin + _BLOCK, stop), self._context)
-                     for begin in range(start, stop, _BLOCK))
+            self._keep(self._feed((
+                samples_of(recording, begin, min(begin + _BLOCK, stop), self._context)
+                for begin in range(start, stop, _BLOCK)), last=False))
 
     def close(self) -> list[Dwell]:
         """End the ongoing dwell, because the stream is interrupted; return it if it is still."""
-        count = self._keep(self._feed([np.empty((4, 0))], last=True) + self._leave())
+        found = self._feed([np.empty((4, 0))], last=True) + self._leave()
         self._chunker.restart()
-        return self._last(count)
+        return self._ended(found)
 
     def current(self) -> Dwell | None:
         """Return the ongoing dwell so far, or None if it is too short or not still."""
         dwell = None if self._tracker is None else self._tracker.current()
         if dwell is None:
             return None
-        found, = self._beside(figures([dwell], known_units=self._rule.known), self._kept)
+        found, = self._beside(figures(dwell, known_units=self._rule.known), self._kept)
         return None if found.reason else found
 
     def dwells(self) -> list[Dwell]:
@@ -209,17 +201,16 @@ class StillDetector:
         self.refused = tuple(Rest(each.begin, each.end, 'short') for each in found if each.short)
         if self._most is not None:  # only the account of a recording has the short ones
             found = [each for each in found if not each.short]
-        if found:
-            new = figures(found, known_units=self._rule.known)
-            every = chained(self._kept, new)
-            self._kept = every if self._most is None else every[-self._most:]
+        every = chained(self._kept, *(
+            figures(each, known_units=self._rule.known) for each in found))
+        self._kept = every if self._most is None else every[-self._most:]
         return len(found)
 
-    def _last(self, count: int) -> list[Dwell]:
-        """Return the last dwells that are still, tested together with earlier dwells."""
+    def _ended(self, found: list[OngoingDwell]) -> list[Dwell]:
+        """Store these dwells; return those that are still, tested together with earlier ones."""
+        count = min(self._keep(found), len(self._kept))
         if not count:
             return []
-        count = min(count, len(self._kept))
         every = self._beside(self._kept[-count:], self._kept[:-count])
         self.refused += tuple(each.rest for each in every if each.reason)
         return [each for each in every if not each.reason]

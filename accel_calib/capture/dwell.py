@@ -84,62 +84,46 @@ def figures_type(columns: int) -> np.dtype[Any]:
     return np.dtype([*_FIGURES, ('around', float, (columns,))])
 
 
-def figures(dwells: Sequence[OngoingDwell], *, known_units: bool) -> Records:
-    """Return one record of figures per dwell; with known units the mean is nearly vertical."""
-    total = chained(*(dwell.total() for dwell in dwells))
-    found = np.empty(len(dwells), figures_type(total['context_sum'].shape[1]))
-    count = total['count'][:, np.newaxis]
+def figures(dwell: OngoingDwell, *, known_units: bool) -> Records:
+    """Return the record of figures of a dwell; with known units its mean is nearly vertical."""
+    total = dwell.total()[0]
+    found = np.empty(1, figures_type(len(total['context_sum'])))
+    count = total['count']
     shift = total['first'] / count
     square = np.maximum(total['second'] - total['first'] * shift, 0.0)
-    variance = square[:, :3] / np.maximum(count - 1.0, 1.0)
-    level = total['level'] / np.maximum(total['windows'], 1.0)[:, np.newaxis]
-    found['mean'] = shift + [dwell.origin for dwell in dwells]
-    found['std'] = np.sqrt(variance)
-    _add_noise(found, dwells, variance.T, level[:, :3].T, known_units)
-    spread = np.sqrt((1.0 + np.maximum(found['excess'], 1.0)) / total['count'])
-    found['lowest'] = level * np.exp(-2.0 * spread)[:, np.newaxis]
-    found['average'] = level
+    variance = square[:3] / max(count - 1.0, 1.0)
+    level = total['level'] / max(total['windows'], 1.0)
+    mean = shift + dwell.origin
+    found['mean'], found['std'], found['average'] = mean, np.sqrt(variance), level
     for name in ('begin', 'end', 'orientation', 'beside_slope', 'short'):
-        found[name] = [getattr(dwell, name) for dwell in dwells]
-    found['time'] = [dwell.epoch for dwell in dwells] + total['time'] / total['count']
-    found['samples'] = total['count']
-    found['at_limit'] = total['at_limit'] / count
+        found[name] = getattr(dwell, name)
+    found['time'] = dwell.epoch + total['time'] / count
+    found['samples'], found['at_limit'] = count, total['at_limit'] / count
     known = total['context_count']
     found['around'] = np.where(known > 0.0, total['context_sum'], np.nan) / np.maximum(known, 1.0)
-    return found
 
-
-def _add_noise(found: Records, dwells: Sequence[OngoingDwell], variance: Floats, level: Floats,
-               known_units: bool) -> None:
-    """Set the figures that depend on the means of cells."""
-    sizes = np.array([len(dwell.cells) for dwell in dwells], dtype=float)
-    count = np.zeros((len(dwells), int(sizes.max())))
-    sums = np.zeros((3, *count.shape))
-    for k, dwell in enumerate(dwells):
-        count[k, :len(dwell.cells)] = dwell.cells['count']
-        sums[:, k, :len(dwell.cells)] = dwell.cells['first'][:, :3].T
-    per_cell = count.sum(axis=1) / sizes
-    means = sums / np.maximum(count, 1.0)
-    centred = (means - means.sum(axis=2, keepdims=True) / sizes[:, np.newaxis]) * (count > 0.0)
-    spacing = np.array([dwell.size * dwell.length for dwell in dwells])
-    trend = strength_of(lines_through(centred, sizes), spacing, level / per_cell)
-    found['slope'], found['strength'], found['error'] = trend.slope.T, trend.strength, trend.error
-    half = sizes // 2
-    inside = np.arange(int(half.max())) < half[:, np.newaxis]
-    for k, start in enumerate((0.0 * half, (sizes - half) // 2, sizes - half)):
-        index = start[:, np.newaxis] + np.arange(inside.shape[1])
-        part = np.take_along_axis(centred, index.astype(np.intp)[np.newaxis], axis=2) * inside
-        part -= inside * (part.sum(axis=2) / half)[:, :, np.newaxis]
-        trend = strength_of(lines_through(part, half), spacing, level / per_cell)
-        found['part_slope'][:, k] = np.sqrt(np.sum(trend.slope ** 2, axis=0))
-        found['part_strength'][:, k] = trend.strength
+    cells, spacing = dwell.cells, dwell.size * dwell.length
+    size, per_cell = len(cells), cells['count'].sum() / len(cells)
+    centred = cells['first'][:, :3].T / cells['count']
+    centred -= centred.sum(axis=1, keepdims=True) / size
+    white = level[:3] / per_cell
+    trend = strength_of(lines_through(centred), spacing, white)
+    found['slope'], found['strength'], found['error'] = trend.slope, trend.strength, trend.error
+    half = size // 2
+    parts = np.stack([centred[:, start:start + half]
+                      for start in (0, (size - half) // 2, size - half)], axis=1)
+    parts -= parts.sum(axis=2, keepdims=True) / half
+    trend = strength_of(lines_through(parts), spacing, white[:, np.newaxis])
+    found['part_slope'], found['part_strength'] = (
+        np.sqrt(np.sum(trend.slope ** 2, axis=0)), trend.strength)
     white = variance / per_cell
-    found['excess'] = found['along'] = excess_of_means(centred, sizes, white)
+    excess = along = excess_of_means(centred, white)
     if known_units:
-        mean = found['mean'][:, :3].T
-        up = mean / np.maximum(np.linalg.norm(mean, axis=0), 1e-300)
-        along = np.einsum('ak,akt->kt', up, centred)[np.newaxis]
-        found['along'] = excess_of_means(along, sizes, np.sum(up ** 2 * white, axis=0)[np.newaxis])
+        up = mean[:3] / max(float(np.linalg.norm(mean[:3])), 1e-300)
+        along = excess_of_means((up @ centred)[np.newaxis], np.sum(up ** 2 * white, keepdims=True))
+    found['excess'], found['along'] = excess, along
+    found['lowest'] = level * math.exp(-2.0 * math.sqrt((1.0 + max(excess, 1.0)) / count))
+    return found
 
 
 DWELL_RATIO = 3.2
