@@ -25,7 +25,7 @@ from accel_calib.calibrate.partial import carried, common_sensors, without_knock
 from accel_calib.calibrate.pose_planning import (
     missing_poses, poses_needed, rows_of, shape_words, unseen)
 from accel_calib.capture import rounding_left
-from accel_calib.capture.chunks import Extremes
+from accel_calib.capture.chunks import repeated_extremes
 from accel_calib.capture.trend import (
     _long_run as long_run, excess_of_means, lines_through, oscillation)
 from accel_calib.cli.commands import COMMANDS, HIDDEN as DEMO_CHOICES, parser

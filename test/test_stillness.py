@@ -12,7 +12,8 @@ from accel_calib.logs import read_recording
 from accel_calib.table import numbered, Recording
 from accel_calib.units import units_of
 from inside import (
-    excess_of_means, Extremes, lines_through, long_run, Model, oscillation, simulate_recording)
+    excess_of_means, lines_through, long_run, Model, oscillation, repeated_extremes,
+    simulate_recording)
 import numpy as np
 import pytest
 from scipy.signal import butter, lfilter
@@ -233,12 +234,13 @@ def test_a_knock_separates_dwells_whose_means_differ_by_more_than_the_noise(nois
 
 
 def test_samples_that_repeat_an_extreme_of_an_axis_are_counted_over_blocks():
-    extremes, starts = Extremes(), np.array([0, 4])
+    starts = np.array([0, 4])
     first = np.array([[1, 1, 0, 1, 1, 0, 0, 0], [-2, 0, -2, 0, -3, -3, -1, 0],
                       [5, 6, 6, 7, 7, 7, 0, 0.0]])
-    np.testing.assert_array_equal(extremes.repeated(first, starts), [[2, 2, 0], [4, 2, 3]])
+    found, highest = repeated_extremes(first, starts, np.full(6, -np.inf))
+    np.testing.assert_array_equal(found, [[2, 2, 0], [4, 2, 3]])
     later = np.array([[1, 0, 0, 1], [-3, 0, -3, -3], [8, 8, 0, 0.0]])
-    np.testing.assert_array_equal(extremes.repeated(later, starts[:1]), [[4, 4, 3]])
+    np.testing.assert_array_equal(repeated_extremes(later, starts[:1], highest)[0], [[4, 4, 3]])
 
 
 def shaken(seed, frequency, size=0.1, seconds=12.0, rate=100.0, noise=2e-3):

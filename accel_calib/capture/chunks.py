@@ -228,25 +228,24 @@ def smallest_steps(values: Floats, starts: Indices, least: float) -> Floats:
     return np.asarray(np.where(found < least, found, np.inf))
 
 
-class Extremes:
-    """The largest and the smallest reading of each axis so far."""
+def repeated_extremes(reading: Floats, starts: Indices, highest: Floats) -> tuple[Floats, Floats]:
+    """
+    Return the (m, 3) samples of each chunk that repeat the extreme of their axis so far.
 
-    def __init__(self) -> None:
-        self._highest = np.full(6, -np.inf)
+    `highest` (6,) are the largest readings before, and the smallest ones with the other sign.
+    Those after the chunks are returned, too.
 
-    def repeated(self, reading: Floats, starts: Indices) -> Floats:
-        """Return the (m, 3) samples of each chunk that repeat an extreme; update the extremes."""
-        found, sizes = np.zeros((len(starts), 3)), np.diff(starts, append=reading.shape[1])
-        extreme = np.concatenate([reading.max(axis=1), -reading.min(axis=1)])
-        # Most blocks reach no extreme; they need no more than the maximum and the minimum.
-        for k in np.flatnonzero(extreme >= self._highest):
-            values = reading[k] if k < 3 else -reading[k - 3]
-            highest = np.maximum.reduceat(values, starts)
-            so_far = np.maximum.accumulate(np.append(self._highest[k], highest))
-            equal = (values == np.repeat(so_far[1:], sizes)).astype(float)
-            found[:, k % 3] += np.add.reduceat(equal, starts) - (highest > so_far[:-1])
-        np.maximum(self._highest, extreme, out=self._highest)
-        return found
+    """
+    found, sizes = np.zeros((len(starts), 3)), np.diff(starts, append=reading.shape[1])
+    extreme = np.concatenate([reading.max(axis=1), -reading.min(axis=1)])
+    # Most blocks reach no extreme; they need no more than the maximum and the minimum.
+    for k in np.flatnonzero(extreme >= highest):
+        values = reading[k] if k < 3 else -reading[k - 3]
+        here = np.maximum.reduceat(values, starts)
+        so_far = np.maximum.accumulate(np.append(highest[k], here))
+        equal = (values == np.repeat(so_far[1:], sizes)).astype(float)
+        found[:, k % 3] += np.add.reduceat(equal, starts) - (here > so_far[:-1])
+    return found, np.maximum(highest, extreme)
 
 
 _LEARN = 16  # intervals from which the period is estimated
@@ -309,7 +308,7 @@ class Chunker:
         self._kind = chunk_type(columns)
         self._shortest = settings.still_window / CHUNKS_PER_WINDOW
         self._least = [np.inf, np.inf]
-        self._extremes = Extremes()
+        self._highest = np.full(6, -np.inf)
         self._origin: Floats = np.empty(0)
         self._length = self._epoch = self._latest = self._period = 0.0
         self._pending: Floats = np.empty(0)
@@ -393,7 +392,8 @@ class Chunker:
 
     def _chunks(self, samples: Floats, starts: Indices) -> Chunks:
         found = sums_of(samples, starts, self._epoch, self._origin, self._kind)
-        found['sums']['at_limit'] = self._extremes.repeated(samples[1:4], starts)
+        found['sums']['at_limit'], self._highest = repeated_extremes(
+            samples[1:4], starts, self._highest)
         for which, rows in enumerate((slice(1, 4), slice(4, 7))):
             if len(samples) >= rows.stop:
                 step = smallest_steps(samples[rows], starts, self._least[which])

@@ -16,10 +16,10 @@ pose is marked as doubtful, and the fit leaves it out if possible.
 
 """
 
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
-from operator import is_
+from operator import is_, is_not
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,12 +108,8 @@ class PoseBook:
     def end(self, dwell: Dwell) -> None:
         """Add a rest that ended, in place of its provisional pose."""
         self.held = [each for each in self.held if not overlap(dwell, each)]
-        self._add(dwell)
-
-    def _add(self, dwell: Dwell) -> None:
-        if self._has(dwell):
-            return
-        self._dwells.append(dwell)
+        if not self._has(dwell):
+            self._dwells.append(dwell)
         if len(self._dwells) > _SEPARATE:
             self._earlier = self._selected([*self._earlier, self._dwells.pop(0)])
 
@@ -122,20 +118,13 @@ class PoseBook:
         over = [each for each in self.held if is_over(each)]
         self.held = [each for each in self.held if not is_over(each)]
         for dwell in over:
-            self._add(replace(dwell, doubtful=True))
+            self.end(replace(dwell, doubtful=True))
         return len(over)
 
-    def doubt(self, starts: Container[float]) -> int:
-        """Mark the dwells with these start times as doubtful; return the number of new marks."""
-        new = [dwell for dwell in self._dwells if dwell.start in starts and not dwell.doubtful]
-        self._dwells = [replace(dwell, doubtful=True) if dwell.start in starts else dwell
-                        for dwell in self._dwells]
-        return len(new)
-
-    def limit(self, ends: Mapping[float, bool]) -> None:
-        """Take over by start time whether dwells are at a limit: the later ones show it, too."""
-        self._dwells = [dwell if ends.get(dwell.start, dwell.at_limit) is dwell.at_limit else
-                        replace(dwell, at_limit=not dwell.at_limit) for dwell in self._dwells]
+    def mark(self, marked: Callable[[Dwell], Dwell]) -> int:
+        """Replace dwells by marked ones, or keep them; return the number of new ones."""
+        before, self._dwells = self._dwells, list(map(marked, self._dwells))
+        return sum(map(is_not, before, self._dwells))
 
     def undo(self) -> bool:
         """Remove the last pose; return whether there was one."""
@@ -284,7 +273,8 @@ class LiveCapture:
         """
         check_measured(self.detector.lengths, self._units)
         judged = self.detector.judged()
-        self.book.limit({each.start: each.at_limit for each in judged})
+        ends = {each.start: each.at_limit for each in judged}  # the later ones show it, too
+        self.book.mark(lambda each: replace(each, at_limit=ends.get(each.start, each.at_limit)))
         rests = [*(each.rest for each in judged), *self.detector.missing]
         own = [each for each in rests if each.start >= self._begun]
         return replace(self.book.poses(), findings=(*found, *account_of(own, self._settings)))
@@ -349,8 +339,9 @@ class LiveCapture:
         threshold = self.detector.threshold
         if threshold <= _NOISE_FELL * self._judged_at:
             self._judged_at = threshold
-            doubted += self.book.doubt(
-                {each.start for each in self.detector.judged() if each.reason})
+            moved = {each.start for each in self.detector.judged() if each.reason}
+            doubted += self.book.mark(lambda each: replace(each, doubtful=True) if (
+                each.start in moved and not each.doubtful) else each)
         return Change(last if latest else None, tuple(ended), bool(captured or doubted), doubted)
 
     def _doubt_held(self, time: float) -> Change | None:

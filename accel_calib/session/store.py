@@ -311,11 +311,10 @@ def writing_advice(error: OSError) -> str:
     """Return what to do about a file that cannot be written."""
     if is_full(error):
         return FREE_SPACE
-    if error.errno in _OTHER_PLACE:
-        return 'restart the node with another calibration_file'
+    another = 'restart the node with another calibration_file'
     if error.errno == errno.EROFS:
         return 'mount the file system for writing, or restart the node with calibration_file'
-    return 'correct the permissions, or restart the node with another calibration_file'
+    return another if error.errno in _OTHER_PLACE else f'correct the permissions, or {another}'
 
 
 _TO_LOCK = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK

@@ -165,16 +165,12 @@ class StreamStatistics:
         messages, zero, repeated, backward = np.sum([each[4:] for each in self._batches], axis=0)
         if messages < _FEWEST:
             return ''
-        if zero > _FEW * messages:
-            return ('the stamps are zero, expected the time of each reading: set header.stamp in '
-                    'the driver')
-        if repeated > _FEW * messages:
-            return (f'the stamps are constant ({self.stamp:.3f} s), expected the time of each '
-                    'reading: set header.stamp in the driver')
-        if backward > 1:
-            return (f'the stamps are out of order in {backward} of the last {messages} '
-                    'messages, expected increasing stamps: check that only one driver publishes')
-        return ''
+        driver = 'expected the time of each reading: set header.stamp in the driver'
+        return next((f'the stamps are {words}' for holds, words in (
+            (zero > _FEW * messages, f'zero, {driver}'),
+            (repeated > _FEW * messages, f'constant ({self.stamp:.3f} s), {driver}'),
+            (backward > 1, f'out of order in {backward} of the last {messages} messages, expected '
+             'increasing stamps: check that only one driver publishes')) if holds), '')
 
 
 AGAIN = 10.0
