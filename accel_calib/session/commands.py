@@ -62,17 +62,18 @@ class ChangedError(AccelCalibError):
     """The calibration changed during a fit or a refinement."""
 
 
+@dataclass(frozen=True)
 class Commands:
     """The commands of a session; those with `offers` only offer a new calibration."""
 
-    def __init__(self, session: State, *, offers: bool = False) -> None:
-        self._session, self._offers = session, offers
+    session: State
+    offers: bool = False
 
     # Poses
 
     def capture_pose(self) -> Task:
         """Capture the ongoing rest as a pose."""
-        session, sensor, dwell = self._session, self._session.sensor, _rest(self._session)
+        session, sensor, dwell = self.session, self.session.sensor, _rest(self.session)
         session.files.usable()
         sensor.live.capture(dwell)
         sensor.guide.is_new_rest(dwell.start)  # the answer is the line about this pose
@@ -90,7 +91,7 @@ class Commands:
 
     def undo_pose(self) -> Task:
         """Remove the last pose."""
-        session = self._session
+        session = self.session
         if session.files.store is not None:
             session.files.usable()
         if not session.sensor.live.undo():
@@ -104,11 +105,11 @@ class Commands:
 
     def fit(self) -> Task:
         """Fit the poses; use and store the calibration, or only offer it."""
-        return (yield from self._use((yield from _fit(self._session))))
+        return (yield from self._use((yield from _fit(self.session))))
 
     def refine(self) -> Task:
         """Refine the calibration; use and store the refined calibration, or only offer it."""
-        session = self._session
+        session = self.session
         fitted = yield from _sound(session, 'refine', refined, session.units, session.name,
                                    session.sensor.present, thermometer_words(session),
                                    session.own)
@@ -120,7 +121,7 @@ class Commands:
 
     def set_level(self) -> Task:
         """Level the mounting from the ongoing rest; without a calibration, the mounting alone."""
-        session, rest = self._session, _rest(self._session)
+        session, rest = self.session, _rest(self.session)
         calibration = session.sensor.present
         if calibration is None:
             calibration = session.with_given(mounting_only(
@@ -130,7 +131,7 @@ class Commands:
 
     def set_heading(self) -> Task:
         """Set the heading of the mounting from the ongoing rest, with the nose down."""
-        session, calibration = self._session, self._session.sensor.present
+        session, calibration = self.session, self.session.sensor.present
         if calibration is None or not calibration.is_levelled:
             raise InputError('the mounting is not levelled', 'place the robot flat and call '
                              '~/set_level first, then tilt its nose down')
@@ -144,7 +145,7 @@ class Commands:
 
     def calibrate_at_rest(self) -> Task:
         """Take mounting, gyro bias and the offset along gravity from the ongoing level rest."""
-        session, rest = self._session, _rest(self._session)
+        session, rest = self.session, _rest(self.session)
         before = session.sensor.present
         calibration = session.with_given(at_rest(rest, session.units, session.name, before))
         words = (calibration.reason if before is None or is_partial(before)
@@ -156,7 +157,7 @@ class Commands:
 
     def _use_mounting(self, calibration: Calibration, words: str) -> Part[str]:
         """Use or offer a calibration with a new mounting; return the answer."""
-        sensor = self._session.sensor
+        sensor = self.session.sensor
         details = [change_words(sensor.present, calibration), *(
             each.words for each in calibration.noted if each.kind in ('flat_pose', 'heading'))]
         return (yield from self._use(Fitted(
@@ -164,13 +165,13 @@ class Commands:
             refinement=sensor.refinement)))
 
     def _use(self, fitted: Fitted) -> Part[str]:
-        return _use(self._session, fitted, offers=self._offers)
+        return _use(self.session, fitted, offers=self.offers)
 
     # Files
 
     def save(self) -> Task:
         """Use the offered calibration if there is one; store calibration and poses."""
-        session, sensor, store = self._session, self._session.sensor, self._session.files.usable()
+        session, sensor, store = self.session, self.session.sensor, self.session.files.usable()
         calibration = sensor.present
         if calibration is None:
             raise InputError('there is no calibration', 'capture poses and call ~/fit first')
@@ -183,7 +184,7 @@ class Commands:
 
     def load(self) -> Task:
         """Read the stored calibration again; if it is refused, the calibration in use is kept."""
-        session, store = self._session, self._session.files.usable()
+        session, store = self.session, self.session.files.usable()
         calibration = yield from _alone(session, Parse(store.load_calibration))
         if calibration is None:
             raise StoredCalibrationError(f'{store.calibration} does not exist',
@@ -193,7 +194,7 @@ class Commands:
 
     def undo(self) -> Task:
         """Discard the offered calibration, or return to the one before the last stored one."""
-        session = self._session
+        session = self.session
         if session.sensor.offered is not None:
             session.sensor.fitted_poses = 0
             session.sensor.offer(None)
@@ -210,7 +211,7 @@ class Commands:
 
     def reset(self) -> Task:
         """Remove poses and calibration; the stored files are renamed."""
-        session, store = self._session, self._session.files.usable()
+        session, store = self.session, self.session.files.usable()
         kept = yield from _alone(session, Files(store.set_aside, Parse(store.is_good)))
         session.sensor.live.clear()
         adopt(session, None)
@@ -221,7 +222,7 @@ class Commands:
 
     def enable(self, on: bool) -> str:
         """Switch the correction on or off."""
-        session = self._session
+        session = self.session
         session.enabled = on
         if not on:
             return 'the correction is off: raw messages are published unchanged'

@@ -115,7 +115,14 @@ class Sensor:
         """Use this calibration; the drift monitor restarts unless only the mounting differs."""
         self.offer(None)
         self.unsaved = False
-        if not _only_levelled(self.calibration, calibration):
+        before = self.calibration
+        only_levelled = (
+            before is not None and calibration is not None
+            and before.model.effects == calibration.model.effects
+            and np.array_equal(before.model.vector, calibration.model.vector)
+            and np.array_equal(before.covariance, calibration.covariance)
+            and not np.array_equal(before.model.rotation, calibration.model.rotation))
+        if not only_levelled:
             self._past = None if calibration is None else Drift(calibration)
             self._counted = self.rest
         self.calibration, self.drift = calibration, self._past
@@ -285,14 +292,6 @@ def rest_after(part: Dwell, whole: Dwell) -> Dwell:
 def _as_noisy_as(part: Dwell, rest: Dwell) -> Dwell:
     """Return a rest with the noise of a part of it, because a slow change is not noise."""
     return replace(rest, std=part.std, count=part.count / part.samples * rest.samples)
-
-
-def _only_levelled(before: Calibration | None, after: Calibration | None) -> bool:
-    return (before is not None and after is not None
-            and before.model.effects == after.model.effects
-            and np.array_equal(before.model.vector, after.model.vector)
-            and np.array_equal(before.covariance, after.covariance)
-            and not np.array_equal(before.model.rotation, after.model.rotation))
 
 
 def title(calibration: Calibration) -> str:

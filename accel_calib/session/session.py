@@ -102,12 +102,26 @@ class Session(State):
         if frame_id == self.frame_id:
             return True
         if self.frame_id is None:
-            self._bind(frame_id)
+            self.log('info', f'Imu messages arrive on {self.topic}, frame_id {frame_id!r}'
+                     if frame_id else f'samples arrive from {self.topic}')
+            self.frame_id = frame_id
+            self._show_frame()
+            if self.files.store is None or self.sensor.owners - {self.name}:
+                self._begin_again()
+            elif not self.settings.sensor:
+                self.files.take(self.name)
             return True
-        if self.statistics.age > SILENT:
-            self._switch_to(frame_id)
-            return True
+        is_replaced = self.statistics.age > SILENT
+        if is_replaced:
+            self.log('warning', f'the messages now have frame_id {frame_id!r} instead of '
+                     f'{self.frame_id!r}: switching to this sensor')
         self._change(self.sensor.live.interrupt(self.settings.auto_capture))
+        if is_replaced:
+            self.frame_id = frame_id
+            if not self.settings.sensor:  # otherwise the user has set the sensor
+                self._begin_again()
+            self._show_frame()
+            return True
         self.statistics.drop('foreign')
         self.log('error', f'an Imu message has frame_id {frame_id!r}, expected {self.frame_id!r}; '
                  'it is dropped: use a separate topic for each sensor', 'foreign', AGAIN)
@@ -181,26 +195,6 @@ class Session(State):
             self.events.append(Still(self.still))
 
     # The sensor and its files
-
-    def _bind(self, frame_id: str) -> None:
-        """Set the sensor from the first message."""
-        self.frame_id = frame_id
-        self.log('info', f'Imu messages arrive on {self.topic}, frame_id {frame_id!r}' if frame_id
-                 else f'samples arrive from {self.topic}')
-        self._show_frame()
-        if self.files.store is None or self.sensor.owners - {self.name}:
-            self._begin_again()
-        elif not self.settings.sensor:
-            self.files.take(self.name)
-
-    def _switch_to(self, frame_id: str) -> None:
-        self.log('warning', f'the messages now have frame_id {frame_id!r} instead of '
-                 f'{self.frame_id!r}: switching to this sensor')
-        self._change(self.sensor.live.interrupt(self.settings.auto_capture))
-        self.frame_id = frame_id
-        if not self.settings.sensor:  # otherwise the user has set the sensor
-            self._begin_again()
-        self._show_frame()
 
     def _show_frame(self) -> None:
         """Show poses and mounting in the frame of the sensor, which was not known before."""
