@@ -147,9 +147,15 @@ class Commands:
         """Take mounting, gyro bias and the offset along gravity from the ongoing level rest."""
         session, rest = self.session, _rest(self.session)
         before = session.sensor.present
-        calibration = session.with_given(at_rest(rest, session.units, session.name, before))
-        words = (calibration.reason if before is None or is_partial(before)
-                 else 'offset and gain of the fit are kept')
+        if before is not None and not is_partial(before):
+            found, words = before, 'offset and gain of the fit are kept'
+        else:
+            found = fit_partial(poses_from([rest]), session.units, sensor=session.name, date=now())
+            rotation = np.eye(3) if before is None else before.rotation
+            found = replace(found, model=Model(found.model.values, rotation))
+            words = found.reason
+        calibration = session.with_given(replace(
+            found, gyro=gyro_bias_of_rest(rest) or found.gyro))
         if calibration.gyro is not None:
             bias = ', '.join(f'{np.degrees(part):+.3f}' for part in calibration.gyro.bias)
             words += f', gyro bias ({bias}) °/s'
@@ -459,33 +465,15 @@ def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None,
     details += [*calibration.warnings, *refinement.advice]
     if not refinement.refusal:
         details.append(change_words(before, calibration))
-    return Fitted(calibration, f'{rating.name}: {_verdict(refinement)}, {rating.figures}', details,
-                  rating, refinement, refusal=refinement.refusal or _refusal(rating))
-
-
-def _verdict(refinement: Refinement) -> str:
     names = [shown_name(step.name) + (f' (or {", ".join(step.likely_rivals)})' if step.rivals
                                       else '') for step in refinement.steps]
     found, verb = ' and '.join(names), 's' if len(names) == 1 else ''
-    return {'no_gap': 'no gap beyond the noise', 'explained': f'{found} explain{verb} the gap',
-            'described': f'{found} describe{verb} the gap',
-            'drifts': 'the offset drifts'}.get(
-        refinement.verdict, f'a gap remains beyond {found}' if names else 'a gap remains that no '
-        'effect explains')
-
-
-def at_rest(rest: Dwell, units: Units, sensor: str, before: Calibration | None) -> Calibration:
-    """
-    Return a calibration from one rest: the offset along gravity, and the bias of the gyro.
-
-    The offset and gain of a full fit before are kept.
-
-    """
-    if before is None or is_partial(before):
-        rotation = np.eye(3) if before is None else before.rotation
-        found = fit_partial(poses_from([rest]), units, sensor=sensor, date=now())
-        before = replace(found, model=Model(found.model.values, rotation))
-    return replace(before, gyro=gyro_bias_of_rest(rest) or before.gyro)
+    verdict = {'no_gap': 'no gap beyond the noise', 'explained': f'{found} explain{verb} the gap',
+               'described': f'{found} describe{verb} the gap', 'drifts': 'the offset drifts',
+               'unexplained': f'a gap remains beyond {found}' if names else
+               'a gap remains that no effect explains'}[refinement.verdict]
+    return Fitted(calibration, f'{rating.name}: {verdict}, {rating.figures}', details, rating,
+                  refinement, refusal=refinement.refusal or _refusal(rating))
 
 
 def change_words(before: Calibration | None, after: Calibration) -> str:
