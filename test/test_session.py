@@ -211,27 +211,19 @@ def test_nothing_of_a_rest_before_a_silence_is_used_after_it(readings: Readings)
 
 
 @pytest.mark.parametrize(('jump', 'words'), [
-    (-3600.0, 'jumped back by 3600'), (86400.0, 'jumped ahead by 864')])
+    (-3600.0, 'jumped back by 3600'), (86400.0, 'jumped ahead by 864'), (None, 'jumped back by')])
 def test_a_jump_of_the_clock_is_logged_and_no_pose_counts_twice(
-        jump: float, words: str, readings: Readings) -> None:
+        jump: float | None, words: str, readings: Readings) -> None:
     driver = Driver()
     driver.stamp = 10_000.0
     turned = readings([UP, LEFT, FORWARD, UP], dwell=2.5)
     for _ in range(3):
         driver.feed(turned)
-        driver.stamp += jump
+        driver.stamp = 10_000.0 if jump is None else driver.stamp + jump  # a recording in a loop
     assert captured(driver) == [UP, LEFT, FORWARD]
     assert driver.logged('warning').count(words) == 1  # of two within a minute
     assert len(driver.sensor.live.detector.interruptions) == 2
-
-
-def test_poses_of_a_recording_that_is_played_in_a_loop_count_once(readings: Readings) -> None:
-    driver, turned = Driver(), readings([UP, LEFT, FORWARD], dwell=2.5)
-    for _ in range(3):
-        driver.stamp = 10_000.0
-        driver.feed(turned)
-    assert captured(driver) == [UP, LEFT, FORWARD]
-    assert np.all(driver.poses['count'] < 2.5 * RATE * 1.1)
+    assert jump or np.all(driver.poses['count'] < 2.0 * 2.5 * RATE * 1.1)
 
 
 def test_a_rest_is_not_used_while_the_stamps_stand(readings: Readings) -> None:

@@ -243,8 +243,7 @@ def _reasons(table: Records, rule: Rule, tiny: Floats
     sloping |= (scale > 0.0) & np.any((table['part_slope'] > PART_SLOPE_G * scale)
                                       & (table['part_strength'] > PART_STRENGTH), axis=1)
     found = {'short': table['short'],
-             'frozen': np.all(table['std'] <= tiny[:, np.newaxis], axis=1)
-             & (not rule.repeats),
+             'frozen': np.all(tiny >= table['std'].T, axis=0) & (not rule.repeats),
              'shaking': np.any(limit < table['lowest'].T, axis=0), 'slope': sloping}
     quiet = ~np.any(list(found.values()), axis=0)
     across, along = (_excess(table[name], quiet) for name in ('excess', 'along'))
@@ -300,7 +299,6 @@ def _dwell(context: Sequence[str], found: Any, std: Floats, count: float, rate_s
 
 CELLS = 256
 
-
 _AGREE_G = 2e-3
 """Largest change of the mean by a knock [g], in addition to the noise, at equal orientation."""
 
@@ -337,12 +335,10 @@ class OngoingDwell:
         while len(left):
             room = (2 * CELLS - len(self.cells)) * self.size - len(self._partial)
             sums, left = left[:room], left[room:]
-            if self.size > 1:
-                sums = chained(self._partial, sums)
-                whole = len(sums) // self.size * self.size
-                self._partial = sums[whole:]
-                sums = summed(sums[:whole], self.size) if whole else sums[:0]
-            self.cells = chained(self.cells, sums)
+            sums = chained(self._partial, sums)
+            whole = len(sums) // self.size * self.size
+            self._partial = sums[whole:]
+            self.cells = chained(self.cells, summed(sums[:whole], self.size))
             if len(self.cells) == 2 * CELLS:
                 self.cells = summed(self.cells, 2)
                 self.size *= 2
