@@ -315,9 +315,9 @@ class Chunker:
         self.interruptions: deque[Interruption] = deque(maxlen=_INTERRUPTIONS_MAX)
         self.restart()
 
-    def feed(self, samples: Floats, last: bool) -> list[Chunks]:
+    def feed(self, samples: Floats, last: bool) -> Iterator[Chunks]:
         """
-        Return the chunks that samples complete: time [s], reading, rate and context as rows.
+        Yield the chunks that samples complete: time [s], reading, rate and context as rows.
 
         If they are the last ones, the period is estimated from few samples, too.
 
@@ -326,12 +326,11 @@ class Chunker:
         if not self._origin.size and pending.size:
             first = np.nan_to_num(pending[1:7, 0])
             self._origin = np.pad(first, (0, 6 - len(first)))
-        done: list[Chunks] = []
         while self._learned(pending[0], last):
             cut, in_order = self._first_break(pending[0])
             edges = self._edges(pending[0, :cut], in_order)
             if edges[-1]:
-                done.append(self._chunks(pending[:, :edges[-1]], edges[:-1]))
+                yield self._chunks(pending[:, :edges[-1]], edges[:-1])
                 self.fresh = False
             if cut == pending.shape[1]:
                 pending = pending[:, edges[-1]:]
@@ -342,7 +341,6 @@ class Chunker:
         if pending.shape[1] > _PENDING_MAX and self._period >= 0.0:
             self.interruptions.append(Interruption(self._latest, 'stopped', 0.0))
             self.restart()
-        return done
 
     def restart(self) -> None:
         """Start a new segment with the next sample."""

@@ -16,7 +16,7 @@ is moved outwards by this distance.
 """
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 import math
@@ -99,7 +99,7 @@ class StillDetector:
 
     def close(self) -> list[Dwell]:
         """End the ongoing dwell, because the stream is interrupted; return it if it is still."""
-        found = self._feed([np.empty((4, 0))], last=True) + self._leave()
+        found = [*self._feed([np.empty((4, 0))], last=True), *self._leave()]
         self._chunker.restart()
         return self._ended(found)
 
@@ -157,25 +157,24 @@ class StillDetector:
         """Return the most recent interruptions of the stamps, at most 10,000."""
         return tuple(self._chunker.interruptions)
 
-    def _feed(self, blocks: Iterable[Floats], last: bool) -> list[OngoingDwell]:
-        found: list[OngoingDwell] = []
+    def _feed(self, blocks: Iterable[Floats], last: bool) -> Iterator[OngoingDwell]:
+        """Yield the dwells that end with these samples."""
         whole = list[Chunks]()
         for block in blocks:
             whole += self._chunker.feed(block, last)
             self._measure(block[1:4])
         for chunks in together(whole):
             if chunks.fresh:
-                found += self._leave()
+                yield from self._leave()
             verdict = self._rule.feed(chunks)
             if self._tracker is None:
                 self._tracker = Tracker(self._settings, self._rule, chunks, self._number)
             self._miss(verdict, chunks.length)
-            found += self._tracker.feed(verdict)
+            yield from self._tracker.feed(verdict)
             self.still = bool(verdict['still'][-1])
             self._mean = chunks.origin
         if self._chunker.fresh:  # the stamps were interrupted: what is known of the rest is over
-            found += self._leave()
-        return found
+            yield from self._leave()
 
     def _measure(self, reading: Floats) -> None:
         """Note the ranges of (3, n) readings; zeros are missing samples."""
@@ -196,8 +195,9 @@ class StillDetector:
         self.still = False
         return found
 
-    def _keep(self, found: list[OngoingDwell]) -> int:
+    def _keep(self, ended: Iterable[OngoingDwell]) -> int:
         """Store the figures of these dwells, and return their number."""
+        found = list(ended)
         self.refused = tuple(Rest(each.begin, each.end, 'short') for each in found if each.short)
         if self._most is not None:  # only the account of a recording has the short ones
             found = [each for each in found if not each.short]
@@ -206,7 +206,7 @@ class StillDetector:
         self._kept = every if self._most is None else every[-self._most:]
         return len(found)
 
-    def _ended(self, found: list[OngoingDwell]) -> list[Dwell]:
+    def _ended(self, found: Iterable[OngoingDwell]) -> list[Dwell]:
         """Store these dwells; return those that are still, tested together with earlier ones."""
         count = min(self._keep(found), len(self._kept))
         if not count:

@@ -44,7 +44,7 @@ dwell is rejected in three cases:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 import copy
 from dataclasses import dataclass, field
 import math
@@ -394,11 +394,11 @@ class Tracker:
     def feed(self, chunks: Records) -> list[OngoingDwell]:
         """Return the dwells that end with these chunks, of a `chunk_type`."""
         self._waiting = chained(self._waiting, chunks)
-        return self._decide(last=False)
+        return list(self._decide(last=False))
 
     def close(self) -> list[OngoingDwell]:
         """End the ongoing dwell because no chunk follows, and return all dwells that end."""
-        return self._decide(last=True) + self._end()
+        return [*self._decide(last=True), *self._end()]
 
     def current(self) -> OngoingDwell | None:
         """Return the ongoing dwell as if it ended now, or None if it is too short."""
@@ -406,41 +406,39 @@ class Tracker:
             return None
         twin = copy.copy(self)
         twin._dwell = copy.copy(self._dwell)
-        twin._decide(last=True)
+        list(twin._decide(last=True))
         found = twin._finished()
         return None if found is None or found.short else found
 
-    def _decide(self, last: bool) -> list[OngoingDwell]:
+    def _decide(self, last: bool) -> Iterator[OngoingDwell]:
+        """Yield the dwells that end with the chunks whose verdict is final."""
         waiting = self._waiting
         verdict = _verdict(waiting, last)
-        done: list[OngoingDwell] = []
         edges = np.flatnonzero(np.diff(verdict)) + 1
         for start, stop in zip([0, *edges], [*edges, len(verdict)]):
             if stop > start:
                 part = waiting[start:stop]
-                done += self._extend(part) if verdict[start] else self._skip(part)
+                yield from self._extend(part) if verdict[start] else self._skip(part)
         self._waiting = waiting[len(verdict):]
-        return done
 
-    def _skip(self, chunks: Records) -> list[OngoingDwell]:
+    def _skip(self, chunks: Records) -> Iterator[OngoingDwell]:
         self._pause += len(chunks)
         self._lead = chained(self._lead, chunks[-_LEAD:])[-_LEAD:]
         self._held = _NONE
         sloping = bool((chunks['trending'] > 0).any())
         self._beside_slope |= sloping
-        done = self._end() if self._pause > KNOCK or sloping else []
+        if self._pause > KNOCK or sloping:
+            yield from self._end()
         self._beside_slope = sloping or (self._beside_slope and self._dwell is not None)
-        return done
 
-    def _extend(self, chunks: Records) -> list[OngoingDwell]:
-        done: list[OngoingDwell] = []
+    def _extend(self, chunks: Records) -> Iterator[OngoingDwell]:
         before = self._held
         if self._pause or self._dwell is None:
             before = self._lead.copy()  # without its windows, which are not still
             before['sums']['level'] = before['sums']['windows'] = 0.0
             if (self._dwell is None or not self._dwell.chunks or not self._dwell.continued_by(
                     chained(before, chunks[:1])['sums'], self._rule.scale)):
-                done = self._end()
+                yield from self._end()
                 self._dwell = OngoingDwell(self._chunks, self.number)
             self._pause = 0
         chunks = chained(before, chunks)
@@ -450,19 +448,19 @@ class Tracker:
         while self._longest and self._dwell.chunks + len(chunks) >= self._longest:
             room = self._longest - self._dwell.chunks
             self._dwell.add(chunks[:room])
-            done.append(self._dwell)
+            yield self._dwell
             self._dwell = OngoingDwell(self._chunks, self.number)
             chunks = chunks[room:]
         self._dwell.add(chunks)
-        return done
 
-    def _end(self) -> list[OngoingDwell]:
+    def _end(self) -> Iterator[OngoingDwell]:
         found = self._finished()
+        if found is not None:
+            yield found
         if self._dwell is not None:
             self.number += 1
         self._dwell = None
         self._held = _NONE
-        return [] if found is None else [found]
 
     def _finished(self) -> OngoingDwell | None:
         least = min(max(_LEAST_REST * self._shortest, CHUNKS_PER_WINDOW), self._shortest)
