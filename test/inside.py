@@ -25,7 +25,7 @@ from accel_calib.calibrate.partial import carried, common_sensors, without_knock
 from accel_calib.calibrate.pose_planning import (
     missing_poses, poses_needed, rows_of, shape_words, unseen)
 from accel_calib.capture import rounding_left
-from accel_calib.capture.chunks import Extremes
+from accel_calib.capture.chunks import repeated_extremes
 from accel_calib.capture.trend import (
     _long_run as long_run, excess_of_means, lines_through, oscillation)
 from accel_calib.cli.commands import COMMANDS, HIDDEN as DEMO_CHOICES, parser
@@ -92,15 +92,19 @@ from accel_calib.report.sheet import sheet
 from accel_calib.report.stability import comparison_page, history_page
 from accel_calib.ros.run import own_domain
 from accel_calib.session import store as session_store, worker
-from accel_calib.session.commands import fit as fit_in_node
-from accel_calib.session.guidance import Guide, next_action, Plan, plan_for
+from accel_calib.session.commands import (
+    due as automatic_fits_due, fit as fit_in_node, poses_changed)
+from accel_calib.session.guidance import next_action
+from accel_calib.session.guide import Guide, Plan, plan_for
 from accel_calib.session.live_capture import LiveCapture, PoseBook, with_temperature
-from accel_calib.session.sensor import rest_after, Sensor, TemperatureHistory
+from accel_calib.session.sensor import rest_after, Sensor
 from accel_calib.session.settings import capture_settings, changed, default_of
 from accel_calib.session.state import figures
 from accel_calib.session.store import (
-    aside, Identity, Lock, MOST_STEPS, Store as SensorStore, store_of, writing_advice)
-from accel_calib.session.stream import StreamStatistics
+    aside, Identity, lock as lock_files, MOST_STEPS, Store as SensorStore, store_of,
+    writing_advice)
+from accel_calib.session.stream import StreamStatistics, TemperatureHistory
+from accel_calib.session.use import adopt as use_calibration
 from accel_calib.session.worker import Worker, WorkerProcess
 from accel_calib.stored import calibration_yaml, plain_yaml
 from accel_calib.stored.calibration_yaml import (

@@ -16,7 +16,7 @@ from pathlib import Path
 from accel_calib.errors import AccelCalibError
 from accel_calib.session import Mounting
 from accel_calib.stored import read_calibration
-from inside import main, spread_directions
+from inside import automatic_fits_due, main, spread_directions
 import pytest
 from shared import Readings, result, Stored
 from test_session import Driver
@@ -136,12 +136,12 @@ def test_an_automatic_fit_of_a_sensor_is_not_one_of_the_next(readings: Readings)
     turned = readings(spread_directions(12))
     driver.feed(turned)
     driver.session.set_settings(replace(driver.session.settings, auto_fit=True))
-    task, = driver.session.commands.due()
+    task, = automatic_fits_due(driver.session)
     driver.now += 3.0
     driver.feed(turned[:200], 'other')
     assert driver.done(task) == ''
     assert driver.session.sensor.calibration is None
-    assert not driver.session.commands.due()
+    assert not automatic_fits_due(driver.session)
 
 
 def test_correction_that_was_switched_off_stays_off_with_the_next_sensor(readings: Readings

@@ -12,7 +12,8 @@ from accel_calib.logs import read_recording
 from accel_calib.table import numbered, Recording
 from accel_calib.units import units_of
 from inside import (
-    excess_of_means, Extremes, lines_through, long_run, Model, oscillation, simulate_recording)
+    excess_of_means, lines_through, long_run, Model, oscillation, repeated_extremes,
+    simulate_recording)
 import numpy as np
 import pytest
 from scipy.signal import butter, lfilter
@@ -233,12 +234,13 @@ def test_a_knock_separates_dwells_whose_means_differ_by_more_than_the_noise(nois
 
 
 def test_samples_that_repeat_an_extreme_of_an_axis_are_counted_over_blocks():
-    extremes, starts = Extremes(), np.array([0, 4])
+    starts = np.array([0, 4])
     first = np.array([[1, 1, 0, 1, 1, 0, 0, 0], [-2, 0, -2, 0, -3, -3, -1, 0],
                       [5, 6, 6, 7, 7, 7, 0, 0.0]])
-    np.testing.assert_array_equal(extremes.repeated(first, starts), [[2, 2, 0], [4, 2, 3]])
+    found, highest = repeated_extremes(first, starts, np.full(6, -np.inf))
+    np.testing.assert_array_equal(found, [[2, 2, 0], [4, 2, 3]])
     later = np.array([[1, 0, 0, 1], [-3, 0, -3, -3], [8, 8, 0, 0.0]])
-    np.testing.assert_array_equal(extremes.repeated(later, starts[:1]), [[4, 4, 3]])
+    np.testing.assert_array_equal(repeated_extremes(later, starts[:1], highest)[0], [[4, 4, 3]])
 
 
 def shaken(seed, frequency, size=0.1, seconds=12.0, rate=100.0, noise=2e-3):
@@ -328,41 +330,32 @@ def test_a_dwell_that_is_not_still_according_to_later_ones_is_doubtful():
     assert start < 1.0
 
 
-def test_lines_through_series_of_unequal_length_are_those_of_least_squares():
-    rng, sizes = np.random.default_rng(4), np.array([12, 7])
-    series = [rng.normal(size=(3, size)) for size in sizes]
-    centred = np.zeros((3, 2, 12))
-    for k, values in enumerate(series):
-        centred[:, k, :sizes[k]] = values - values.mean(axis=1, keepdims=True)
-    line = lines_through(centred, sizes)
-    for k, values in enumerate(series):
-        time = np.arange(sizes[k])
-        fitted = np.polyfit(time, values.T, 1)
-        left = values.T - np.outer(time, fitted[0]) - fitted[1]
-        np.testing.assert_allclose(line.slope[:, k], fitted[0])
-        np.testing.assert_allclose(line.square[:, k], np.sum(left ** 2, axis=0))
-        np.testing.assert_allclose(line.time_square[k], np.sum((time - time.mean()) ** 2))
+def test_lines_through_series_are_those_of_least_squares():
+    values = np.random.default_rng(4).normal(size=(3, 12))
+    line = lines_through(values - values.mean(axis=1, keepdims=True))
+    time = np.arange(12)
+    fitted = np.polyfit(time, values.T, 1)
+    left = values.T - np.outer(time, fitted[0]) - fitted[1]
+    np.testing.assert_allclose(line.slope, fitted[0])
+    np.testing.assert_allclose(line.square, np.sum(left ** 2, axis=0))
+    np.testing.assert_allclose(line.neighbours, np.sum(left[1:] * left[:-1], axis=0))
+    np.testing.assert_allclose(line.time_square, np.sum((time - time.mean()) ** 2))
 
 
 def test_correlations_at_lags_of_half_a_series_and_more_are_not_used():
-    sizes = np.array([9])
-    known = np.array([[1.0, 0.5, 0.3, 0.2, 0.0, 0.0, 0.0, 0.0]])
-    beyond = known + 0.3 * (np.arange(8) >= 4)
-    shorter = known * [1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
-    np.testing.assert_array_equal(long_run(beyond, sizes), long_run(known, sizes))
-    assert long_run(known, sizes) > long_run(shorter, sizes)
+    known = np.array([1.0, 0.5, 0.3, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
+    beyond = known + 0.3 * (np.arange(9) >= 4)
+    assert long_run(beyond, 9) == long_run(known, 9)
+    assert long_run(known, 9) > long_run(known * (np.arange(9) < 2), 9)
 
 
 def test_the_excess_of_a_mean_is_1_for_fewer_than_four_cells_or_without_noise():
-    rng = np.random.default_rng(2)
-    sizes = np.array([40.0, 4.0, 3.0])
-    inside = np.arange(40) < sizes[:, np.newaxis]
-    series = np.cumsum(rng.normal(size=(3, 3, 40)), axis=2) * inside
-    centred = (series - series.sum(axis=2, keepdims=True) / sizes[:, np.newaxis]) * inside
-    found = excess_of_means(centred, sizes, np.ones((3, 3)))
+    series = np.cumsum(np.random.default_rng(2).normal(size=(3, 40)), axis=1)
+    found = [excess_of_means(part - part.mean(axis=1, keepdims=True), np.ones(3))
+             for part in (series, series[:, :4], series[:, :3])]
     assert found[0] > 3.0
     assert found[1] != found[2] == 1.0
-    np.testing.assert_array_equal(excess_of_means(centred, sizes, np.zeros((3, 3))), 1.0)
+    assert excess_of_means(series - series.mean(axis=1, keepdims=True), np.zeros(3)) == 1.0
 
 
 @pytest.mark.parametrize('periods', [2.0, 2.5, 3.0, 11.5])

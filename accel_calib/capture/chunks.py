@@ -85,19 +85,19 @@ class CaptureSettings:
     repeated: Repeated = 'keep'
 
     def __post_init__(self) -> None:
-        for name in ('still_window', 'min_dwell'):
-            self._check(name, 0.0 < getattr(self, name) < _LARGEST, f'0 to {_LARGEST:g} [s]')
-        self._check('max_dwell', self.max_dwell >= 2.0 * self.min_dwell,
-                    'at least twice min_dwell [s]')
-        self._check('min_pose_angle', 0.0 <= self.min_pose_angle <= math.pi, '0 to π [rad]')
-        self._check('repeated', self.repeated in REPEATED, f'one of {REPEATED}')
-        self._check('still_norm_tolerance', self.still_norm_tolerance > 0.0, 'positive [g]')
-        for name in ('still_std_max', 'still_gyro_max'):
-            self._check(name, 0.0 <= getattr(self, name) < _LARGEST, f'0 to {_LARGEST:g}')
-
-    def _check(self, name: str, good: bool, expected: str) -> None:
-        if not good:
-            raise ValueError(f'{name} is {getattr(self, name)!r}, expected {expected}')
+        most = f'0 to {_LARGEST:g}'
+        for name, good, expected in (
+                ('still_window', 0.0 < self.still_window < _LARGEST, f'{most} [s]'),
+                ('min_dwell', 0.0 < self.min_dwell < _LARGEST, f'{most} [s]'),
+                ('max_dwell', self.max_dwell >= 2.0 * self.min_dwell,
+                 'at least twice min_dwell [s]'),
+                ('min_pose_angle', 0.0 <= self.min_pose_angle <= math.pi, '0 to π [rad]'),
+                ('repeated', self.repeated in REPEATED, f'one of {REPEATED}'),
+                ('still_norm_tolerance', self.still_norm_tolerance > 0.0, 'positive [g]'),
+                ('still_std_max', 0.0 <= self.still_std_max < _LARGEST, most),
+                ('still_gyro_max', 0.0 <= self.still_gyro_max < _LARGEST, most)):
+            if not good:
+                raise ValueError(f'{name} is {getattr(self, name)!r}, expected {expected}')
 
 
 def settings_from(given: Mapping[str, Any], units: Units) -> CaptureSettings:
@@ -136,9 +136,10 @@ MOTION = 7
 CHUNKS_PER_WINDOW = 5
 
 
-def sums_type(columns: int) -> np.dtype[Any]:
-    """Return the type of the sums of a chunk, with this number of columns of context."""
-    return np.dtype([
+@cache
+def chunk_type(columns: int) -> np.dtype[Any]:
+    """Return the type of a chunk, with this number of columns of context."""
+    sums = np.dtype([
         ('count', float),                   # samples
         ('time', float),                    # of the stamps, relative to the epoch [s]
         ('first', float, 6),                # of reading and rate, relative to the origin
@@ -147,15 +148,18 @@ def sums_type(columns: int) -> np.dtype[Any]:
         ('repeats', float),                 # samples that repeat the one before in the chunk
         ('zeros', float),                   # samples that are zero on all axes
         ('context_count', float, (columns,)),  # samples that have the context
-        ('context_sum', float, (columns,))])
-
-
-@cache
-def window_type(sums: np.dtype[Any]) -> np.dtype[Any]:
-    """Return the type of the sums of a chunk with its window, from that of its sums alone."""
-    return np.dtype([*sums.descr,
-                     ('level', float, 6),  # variance of the window at each chunk
-                     ('windows', float)])  # number of windows in that sum
+        ('context_sum', float, (columns,)),
+        ('level', float, 6),                # variance of the window at each chunk; NaN: no rate
+        ('windows', float)])                # number of windows in that sum
+    return np.dtype([
+        ('sums', sums),
+        ('begin', float), ('end', float),   # first and last stamp [s]
+        ('step', float, 2),                 # smallest nonzero step of reading and rate, see Chunks
+        # The verdict of `rule` on the window that ends with the chunk:
+        ('limit', float, 6),                # largest level of a still window; infinite: no rate
+        ('still', bool),
+        ('missing', np.intp),               # place in `MISSING` of what stands for readings; 0
+        ('trending', np.intp)])             # chunks over which it has a slope or oscillates; 0
 
 
 def chained(*parts: Records) -> Records:
@@ -177,14 +181,20 @@ def summed(records: Records, size: int) -> Records:
 def sums_of(samples: Floats, starts: Indices, epoch: float, origin: Floats, kind: np.dtype[Any]
             ) -> Records:
     """
-    Return the (m,) records of a `sums_type` over the samples from each start to the next.
+    Return the (m,) chunks of a `chunk_type` with the samples from each start to the next.
 
     `samples` are (k, n): time and reading (k = 4), with rate (7), with the columns of the context
-    (more). `epoch` and `origin` (6,) are subtracted. Sums of a missing rate are NaN.
+    (more). `epoch` and `origin` (6,) are subtracted. Sums of a missing rate are NaN. What `rule`
+    adds is not known yet: no level, one window, and no limit.
 
     """
-    sums = np.zeros(len(starts), kind)
-    sums['first'] = sums['second'] = np.nan
+    found = np.zeros(len(starts), kind)
+    found['begin'] = samples[0, starts]
+    found['end'] = samples[0, np.append(starts[1:], samples.shape[1]) - 1]
+    found['step'] = found['limit'] = np.inf
+    sums = found['sums']
+    sums['first'] = sums['second'] = sums['level'] = np.nan
+    sums['windows'] = 1.0
     reading = samples[1:4]
     same = np.append(False, np.all(reading[:, 1:] == reading[:, :-1], axis=0))
     same[starts] = False
@@ -202,7 +212,7 @@ def sums_of(samples: Floats, starts: Indices, epoch: float, origin: Floats, kind
         known = np.isfinite(around)
         sums['context_count'] = np.add.reduceat(known.astype(float), starts, axis=1).T
         sums['context_sum'] = np.add.reduceat(np.where(known, around, 0.0), starts, axis=1).T
-    return sums
+    return found
 
 
 def smallest_steps(values: Floats, starts: Indices, least: float) -> Floats:
@@ -218,25 +228,24 @@ def smallest_steps(values: Floats, starts: Indices, least: float) -> Floats:
     return np.asarray(np.where(found < least, found, np.inf))
 
 
-class Extremes:
-    """The largest and the smallest reading of each axis so far."""
+def repeated_extremes(reading: Floats, starts: Indices, highest: Floats) -> tuple[Floats, Floats]:
+    """
+    Return the (m, 3) samples of each chunk that repeat the extreme of their axis so far.
 
-    def __init__(self) -> None:
-        self._highest = np.full(6, -np.inf)
+    `highest` (6,) are the largest readings before, and the smallest ones with the other sign.
+    Those after the chunks are returned, too.
 
-    def repeated(self, reading: Floats, starts: Indices) -> Floats:
-        """Return the (m, 3) samples of each chunk that repeat an extreme; update the extremes."""
-        found, sizes = np.zeros((len(starts), 3)), np.diff(starts, append=reading.shape[1])
-        extreme = np.concatenate([reading.max(axis=1), -reading.min(axis=1)])
-        # Most blocks reach no extreme; they need no more than the maximum and the minimum.
-        for k in np.flatnonzero(extreme >= self._highest):
-            values = reading[k] if k < 3 else -reading[k - 3]
-            highest = np.maximum.reduceat(values, starts)
-            so_far = np.maximum.accumulate(np.append(self._highest[k], highest))
-            equal = (values == np.repeat(so_far[1:], sizes)).astype(float)
-            found[:, k % 3] += np.add.reduceat(equal, starts) - (highest > so_far[:-1])
-        np.maximum(self._highest, extreme, out=self._highest)
-        return found
+    """
+    found, sizes = np.zeros((len(starts), 3)), np.diff(starts, append=reading.shape[1])
+    extreme = np.concatenate([reading.max(axis=1), -reading.min(axis=1)])
+    # Most blocks reach no extreme; they need no more than the maximum and the minimum.
+    for k in np.flatnonzero(extreme >= highest):
+        values = reading[k] if k < 3 else -reading[k - 3]
+        here = np.maximum.reduceat(values, starts)
+        so_far = np.maximum.accumulate(np.append(highest[k], here))
+        equal = (values == np.repeat(so_far[1:], sizes)).astype(float)
+        found[:, k % 3] += np.add.reduceat(equal, starts) - (here > so_far[:-1])
+    return found, np.maximum(highest, extreme)
 
 
 _LEARN = 16  # intervals from which the period is estimated
@@ -268,19 +277,15 @@ class Chunks:
     """
     m consecutive chunks of one segment.
 
-    `sums` (m,) are of a `sums_type`, with the time relative to `epoch`, the start of the segment,
-    and readings and rates relative to `origin` (6,), the first ones of the stream. `begin` and
-    `end` (m,) are the first and last stamp. `step` (2, m) is the smallest nonzero step between
-    successive readings, and rates; infinite if no step is smaller than before. `length` and
-    `period` are those of a chunk and of the samples; times are in s. `fresh` is whether these are
-    the first chunks of the segment.
+    `records` (m,) are of a `chunk_type`, with the time relative to `epoch`, the start of the
+    segment, and readings and rates relative to `origin` (6,), the first ones of the stream. Steps
+    are between successive readings, and rates; infinite if no step is smaller than before.
+    `length` and `period` are those of a chunk and of the samples; times are in s. `fresh` is
+    whether these are the first chunks of the segment.
 
     """
 
-    sums: Records
-    begin: Floats
-    end: Floats
-    step: Floats
+    records: Records
     epoch: float
     origin: Floats
     length: float
@@ -292,31 +297,27 @@ def together(found: Sequence[Chunks]) -> Iterator[Chunks]:
     """Yield the chunks with those of the same segment joined."""
     starts = [k for k, each in enumerate(found) if each.fresh or k == 0]
     for start, stop in pairwise([*starts, len(found)]):
-        parts = found[start:stop]
-        yield parts[0] if len(parts) == 1 else replace(
-            parts[0], sums=chained(*(each.sums for each in parts)),
-            begin=np.concatenate([each.begin for each in parts]),
-            end=np.concatenate([each.end for each in parts]),
-            step=np.concatenate([each.step for each in parts], axis=1))
+        yield replace(found[start],
+                      records=chained(*(each.records for each in found[start:stop])))
 
 
 class Chunker:
     """Convert samples in any blocks, with this number of columns of context, to chunks."""
 
     def __init__(self, settings: CaptureSettings, columns: int) -> None:
-        self._kind = sums_type(columns)
+        self._kind = chunk_type(columns)
         self._shortest = settings.still_window / CHUNKS_PER_WINDOW
         self._least = [np.inf, np.inf]
-        self._extremes = Extremes()
+        self._highest = np.full(6, -np.inf)
         self._origin: Floats = np.empty(0)
         self._length = self._epoch = self._latest = self._period = 0.0
         self._pending: Floats = np.empty(0)
         self.interruptions: deque[Interruption] = deque(maxlen=_INTERRUPTIONS_MAX)
         self.restart()
 
-    def feed(self, samples: Floats, last: bool) -> list[Chunks]:
+    def feed(self, samples: Floats, last: bool) -> Iterator[Chunks]:
         """
-        Return the chunks that samples complete: time [s], reading, rate and context as rows.
+        Yield the chunks that samples complete: time [s], reading, rate and context as rows.
 
         If they are the last ones, the period is estimated from few samples, too.
 
@@ -325,12 +326,11 @@ class Chunker:
         if not self._origin.size and pending.size:
             first = np.nan_to_num(pending[1:7, 0])
             self._origin = np.pad(first, (0, 6 - len(first)))
-        done: list[Chunks] = []
         while self._learned(pending[0], last):
             cut, in_order = self._first_break(pending[0])
             edges = self._edges(pending[0, :cut], in_order)
             if edges[-1]:
-                done.append(self._chunks(pending[:, :edges[-1]], edges[:-1]))
+                yield self._chunks(pending[:, :edges[-1]], edges[:-1])
                 self.fresh = False
             if cut == pending.shape[1]:
                 pending = pending[:, edges[-1]:]
@@ -341,7 +341,6 @@ class Chunker:
         if pending.shape[1] > _PENDING_MAX and self._period >= 0.0:
             self.interruptions.append(Interruption(self._latest, 'stopped', 0.0))
             self.restart()
-        return done
 
     def restart(self) -> None:
         """Start a new segment with the next sample."""
@@ -390,16 +389,15 @@ class Chunker:
         return np.append(0, edges)
 
     def _chunks(self, samples: Floats, starts: Indices) -> Chunks:
-        ends = np.append(starts[1:], samples.shape[1]) - 1
-        sums = sums_of(samples, starts, self._epoch, self._origin, self._kind)
-        sums['at_limit'] = self._extremes.repeated(samples[1:4], starts)
-        step = np.full((2, len(starts)), np.inf)
+        found = sums_of(samples, starts, self._epoch, self._origin, self._kind)
+        found['sums']['at_limit'], self._highest = repeated_extremes(
+            samples[1:4], starts, self._highest)
         for which, rows in enumerate((slice(1, 4), slice(4, 7))):
             if len(samples) >= rows.stop:
-                step[which] = smallest_steps(samples[rows], starts, self._least[which])
-                self._least[which] = min(self._least[which], float(step[which].min()))
-        return Chunks(sums, samples[0, starts], samples[0, ends], step, self._epoch, self._origin,
-                      self._length, self._period, self.fresh)
+                step = smallest_steps(samples[rows], starts, self._least[which])
+                self._least[which] = min(self._least[which], float(step.min()))
+                found['step'][:, which] = step
+        return Chunks(found, self._epoch, self._origin, self._length, self._period, self.fresh)
 
 
 def _joined(one: Floats, other: Floats) -> Floats:

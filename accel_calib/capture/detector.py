@@ -16,7 +16,7 @@ is moved outwards by this distance.
 """
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 import math
@@ -85,38 +85,30 @@ class StillDetector:
         """
         known = np.any(~np.isnan(samples), axis=0)
         rows = len(known) if known[MOTION:].any() else MOTION if known[4:MOTION].any() else 4
-        found = self._last(self.add([np.ascontiguousarray(samples[:, :rows].T)]))
+        found = self._ended(self._feed([np.ascontiguousarray(samples[:, :rows].T)], last=False))
         self._rule.least = self._rule.levels.least
         return found
-
-    def add(self, blocks: Iterable[Floats]) -> int:
-        """
-        Add samples as (k, n) arrays, and return how many dwells ended.
-
-        The rows are the columns of `push`, without those at the end that are not known.
-
-        """
-        return self._keep(self._feed(blocks, last=False))
 
     def add_recording(self, recording: Recording) -> None:
         """Add the samples of a recording; raise InputError if one is not finite."""
         for start in range(0, len(recording), _AT_ONCE):
             stop = min(start + _AT_ONCE, len(recording))
-            self.add(samples_of(recording, begin, min(begin + _BLOCK, stop), self._context)
-                     for begin in range(start, stop, _BLOCK))
+            self._keep(self._feed((
+                samples_of(recording, begin, min(begin + _BLOCK, stop), self._context)
+                for begin in range(start, stop, _BLOCK)), last=False))
 
     def close(self) -> list[Dwell]:
         """End the ongoing dwell, because the stream is interrupted; return it if it is still."""
-        count = self._keep(self._feed([np.empty((4, 0))], last=True) + self._leave())
+        found = [*self._feed([np.empty((4, 0))], last=True), *self._leave()]
         self._chunker.restart()
-        return self._last(count)
+        return self._ended(found)
 
     def current(self) -> Dwell | None:
         """Return the ongoing dwell so far, or None if it is too short or not still."""
         dwell = None if self._tracker is None else self._tracker.current()
         if dwell is None:
             return None
-        found, = self._beside(figures([dwell], known_units=self._rule.known), self._kept)
+        found, = self._beside(figures(dwell, known_units=self._rule.known), self._kept)
         return None if found.reason else found
 
     def dwells(self) -> list[Dwell]:
@@ -165,25 +157,24 @@ class StillDetector:
         """Return the most recent interruptions of the stamps, at most 10,000."""
         return tuple(self._chunker.interruptions)
 
-    def _feed(self, blocks: Iterable[Floats], last: bool) -> list[OngoingDwell]:
-        found: list[OngoingDwell] = []
+    def _feed(self, blocks: Iterable[Floats], last: bool) -> Iterator[OngoingDwell]:
+        """Yield the dwells that end with these samples."""
         whole = list[Chunks]()
         for block in blocks:
             whole += self._chunker.feed(block, last)
             self._measure(block[1:4])
         for chunks in together(whole):
             if chunks.fresh:
-                found += self._leave()
+                yield from self._leave()
             verdict = self._rule.feed(chunks)
             if self._tracker is None:
                 self._tracker = Tracker(self._settings, self._rule, chunks, self._number)
             self._miss(verdict, chunks.length)
-            found += self._tracker.feed(verdict)
+            yield from self._tracker.feed(verdict)
             self.still = bool(verdict['still'][-1])
             self._mean = chunks.origin
         if self._chunker.fresh:  # the stamps were interrupted: what is known of the rest is over
-            found += self._leave()
-        return found
+            yield from self._leave()
 
     def _measure(self, reading: Floats) -> None:
         """Note the ranges of (3, n) readings; zeros are missing samples."""
@@ -204,22 +195,22 @@ class StillDetector:
         self.still = False
         return found
 
-    def _keep(self, found: list[OngoingDwell]) -> int:
+    def _keep(self, ended: Iterable[OngoingDwell]) -> int:
         """Store the figures of these dwells, and return their number."""
+        found = list(ended)
         self.refused = tuple(Rest(each.begin, each.end, 'short') for each in found if each.short)
         if self._most is not None:  # only the account of a recording has the short ones
             found = [each for each in found if not each.short]
-        if found:
-            new = figures(found, known_units=self._rule.known)
-            every = chained(self._kept, new)
-            self._kept = every if self._most is None else every[-self._most:]
+        every = chained(self._kept, *(
+            figures(each, known_units=self._rule.known) for each in found))
+        self._kept = every if self._most is None else every[-self._most:]
         return len(found)
 
-    def _last(self, count: int) -> list[Dwell]:
-        """Return the last dwells that are still, tested together with earlier dwells."""
+    def _ended(self, found: Iterable[OngoingDwell]) -> list[Dwell]:
+        """Store these dwells; return those that are still, tested together with earlier ones."""
+        count = min(self._keep(found), len(self._kept))
         if not count:
             return []
-        count = min(count, len(self._kept))
         every = self._beside(self._kept[-count:], self._kept[:-count])
         self.refused += tuple(each.rest for each in every if each.reason)
         return [each for each in every if not each.reason]
@@ -341,8 +332,7 @@ def samples_of(recording: Recording, start: int, stop: int, context: Sequence[st
     for row, name in enumerate(context, start=MOTION):
         if name in recording:
             samples[row] = recording[name][which]
-    if not np.isfinite(samples[:4].sum()):
-        check_finite(samples[:4], recording.row[which])
+    check_finite(samples[:4], recording.row[which])
     return samples
 
 

@@ -44,7 +44,7 @@ dwell is rejected in three cases:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 import copy
 from dataclasses import dataclass, field
 import math
@@ -55,9 +55,10 @@ from numpy.typing import NDArray
 
 from .account import Rest
 from .chunks import (
-    CaptureSettings, chained, Chunks, CHUNKS_PER_WINDOW, Records, summed, sums_type, window_type)
-from .rule import DWELL_SLOPE_G, HORIZON, judged_type, RELATIVE, Rule, STRENGTH, WEAK_STRENGTH
-from .trend import excess_of_means, Line, lines_through, strength_of, Trend
+    CaptureSettings, chained, chunk_type, Chunks, CHUNKS_PER_WINDOW, Records, summed)
+from .rule import (
+    DWELL_SLOPE_G, HORIZON, RELATIVE, rounding_left, Rule, STRENGTH, SURE, TURN_G, WEAK_STRENGTH)
+from .trend import excess_of_means, lines_through, strength_of
 from ..table import Floats
 
 _FIGURES = [
@@ -65,10 +66,7 @@ _FIGURES = [
     ('average', float, 6),    # mean variance of the windows
     ('mean', float, 6),       # reading and rate
     ('std', float, 3),        # of the samples
-    ('slope', float, 3), ('square', float, 3), ('neighbours', float, 3),  # see `trend.Line`
-    ('time_square', float), ('cells', float),
-    ('white', float, 3),      # variance of a cell mean for independent samples
-    ('spacing', float),       # time between cells [s]
+    ('slope', float, 3), ('strength', float), ('error', float),  # see `trend.Trend`
     ('begin', float), ('end', float), ('time', float),  # first, last and mean stamp [s]
     ('samples', float),
     ('excess', float),        # variance of the mean over that of independent samples
@@ -78,7 +76,7 @@ _FIGURES = [
     ('at_limit', float, 3),   # share of samples that repeat the extreme of an axis so far
     ('orientation', np.intp),
     ('part_slope', float, 3), ('part_strength', float, 3)]  # first, middle and last half
-"""Means and variances in the unit of the readings, slopes per cell, `part_slope` per second."""
+"""Means and variances in the unit of the readings, slopes per second."""
 
 
 def figures_type(columns: int) -> np.dtype[Any]:
@@ -86,71 +84,46 @@ def figures_type(columns: int) -> np.dtype[Any]:
     return np.dtype([*_FIGURES, ('around', float, (columns,))])
 
 
-def figures(dwells: Sequence[OngoingDwell], *, known_units: bool) -> Records:
-    """Return one record of figures per dwell; with known units the mean is nearly vertical."""
-    total = chained(*(dwell.total() for dwell in dwells))
-    found = np.empty(len(dwells), figures_type(total['context_sum'].shape[1]))
-    count = total['count'][:, np.newaxis]
+def figures(dwell: OngoingDwell, *, known_units: bool) -> Records:
+    """Return the record of figures of a dwell; with known units its mean is nearly vertical."""
+    total = dwell.total()[0]
+    found = np.empty(1, figures_type(len(total['context_sum'])))
+    count = total['count']
     shift = total['first'] / count
     square = np.maximum(total['second'] - total['first'] * shift, 0.0)
-    variance = square[:, :3] / np.maximum(count - 1.0, 1.0)
-    level = total['level'] / np.maximum(total['windows'], 1.0)[:, np.newaxis]
-    found['mean'] = shift + [dwell.origin for dwell in dwells]
-    found['std'] = np.sqrt(variance)
-    _add_noise(found, dwells, variance.T, level[:, :3].T, known_units)
-    spread = np.sqrt((1.0 + np.maximum(found['excess'], 1.0)) / total['count'])
-    found['lowest'] = level * np.exp(-2.0 * spread)[:, np.newaxis]
-    found['average'] = level
+    variance = square[:3] / max(count - 1.0, 1.0)
+    level = total['level'] / max(total['windows'], 1.0)
+    mean = shift + dwell.origin
+    found['mean'], found['std'], found['average'] = mean, np.sqrt(variance), level
     for name in ('begin', 'end', 'orientation', 'beside_slope', 'short'):
-        found[name] = [getattr(dwell, name) for dwell in dwells]
-    found['time'] = [dwell.epoch for dwell in dwells] + total['time'] / total['count']
-    found['samples'] = total['count']
-    found['at_limit'] = total['at_limit'] / count
+        found[name] = getattr(dwell, name)
+    found['time'] = dwell.epoch + total['time'] / count
+    found['samples'], found['at_limit'] = count, total['at_limit'] / count
     known = total['context_count']
     found['around'] = np.where(known > 0.0, total['context_sum'], np.nan) / np.maximum(known, 1.0)
-    return found
 
-
-def _add_noise(found: Records, dwells: Sequence[OngoingDwell], variance: Floats, level: Floats,
-               known_units: bool) -> None:
-    """Set the figures that depend on the means of cells."""
-    sizes = np.array([len(dwell.cells) for dwell in dwells], dtype=float)
-    count = np.zeros((len(dwells), int(sizes.max())))
-    sums = np.zeros((3, *count.shape))
-    for k, dwell in enumerate(dwells):
-        count[k, :len(dwell.cells)] = dwell.cells['count']
-        sums[:, k, :len(dwell.cells)] = dwell.cells['first'][:, :3].T
-    per_cell = count.sum(axis=1) / sizes
-    means = sums / np.maximum(count, 1.0)
-    centred = (means - means.sum(axis=2, keepdims=True) / sizes[:, np.newaxis]) * (count > 0.0)
-    line = lines_through(centred, sizes)
-    spacing = np.array([dwell.size * dwell.length for dwell in dwells])
-    for name in ('slope', 'square', 'neighbours'):
-        found[name] = getattr(line, name).T
-    found['white'], found['spacing'] = (level / per_cell).T, spacing
-    found['time_square'], found['cells'] = line.time_square, sizes
-    _add_parts(found, centred, sizes, level / per_cell, spacing)
+    cells, spacing = dwell.cells, dwell.size * dwell.length
+    size, per_cell = len(cells), cells['count'].sum() / len(cells)
+    centred = cells['first'][:, :3].T / cells['count']
+    centred -= centred.sum(axis=1, keepdims=True) / size
+    white = level[:3] / per_cell
+    trend = strength_of(lines_through(centred), spacing, white)
+    found['slope'], found['strength'], found['error'] = trend.slope, trend.strength, trend.error
+    half = size // 2
+    parts = np.stack([centred[:, start:start + half]
+                      for start in (0, (size - half) // 2, size - half)], axis=1)
+    parts -= parts.sum(axis=2, keepdims=True) / half
+    trend = strength_of(lines_through(parts), spacing, white[:, np.newaxis])
+    found['part_slope'], found['part_strength'] = (
+        np.sqrt(np.sum(trend.slope ** 2, axis=0)), trend.strength)
     white = variance / per_cell
-    found['excess'] = found['along'] = excess_of_means(centred, sizes, white)
+    excess = along = excess_of_means(centred, white)
     if known_units:
-        mean = found['mean'][:, :3].T
-        up = mean / np.maximum(np.linalg.norm(mean, axis=0), 1e-300)
-        along = np.einsum('ak,akt->kt', up, centred)[np.newaxis]
-        found['along'] = excess_of_means(along, sizes, np.sum(up ** 2 * white, axis=0)[np.newaxis])
-
-
-def _add_parts(found: Records, centred: Floats, sizes: Floats, white: Floats, spacing: Floats
-               ) -> None:
-    """Set slopes and strengths of first, middle and last half, to detect a turn in a part."""
-    half = sizes // 2
-    inside = np.arange(int(half.max())) < half[:, np.newaxis]
-    for k, start in enumerate((0.0 * half, (sizes - half) // 2, sizes - half)):
-        index = start[:, np.newaxis] + np.arange(inside.shape[1])
-        part = np.take_along_axis(centred, index.astype(np.intp)[np.newaxis], axis=2) * inside
-        part -= inside * (part.sum(axis=2) / half)[:, :, np.newaxis]
-        trend = strength_of(lines_through(part, half), spacing, white)
-        found['part_slope'][:, k] = np.sqrt(np.sum(trend.slope ** 2, axis=0))
-        found['part_strength'][:, k] = trend.strength
+        up = mean[:3] / max(float(np.linalg.norm(mean[:3])), 1e-300)
+        along = excess_of_means((up @ centred)[np.newaxis], np.sum(up ** 2 * white, keepdims=True))
+    found['excess'], found['along'] = excess, along
+    found['lowest'] = level * math.exp(-2.0 * math.sqrt((1.0 + max(excess, 1.0)) / count))
+    return found
 
 
 DWELL_RATIO = 3.2
@@ -236,51 +209,57 @@ def judged(table: Records, rule: Rule, context: Sequence[str], first: int = 0) -
     All dwells of the table of `figures` are used. `context` names its columns of context.
 
     """
-    line = Line(table['slope'].T, table['square'].T, table['neighbours'].T, table['time_square'],
-                table['cells'])
-    slopes, means = strength_of(line, table['spacing'], table['white'].T), table['mean'][:, :3]
-    frozen = np.zeros(len(table), bool) if rule.repeats else np.all(
-        table['std'] <= RELATIVE * np.linalg.norm(means, axis=1)[:, np.newaxis], axis=1)
-    limit = rule.limit_of(rule.noise_of(table['mean'].T), DWELL_RATIO, DWELL_RATE_RATIO)
+    means, std, (step, rate_step) = table['mean'][:, :3], table['std'], rule.steps
+    tiny = RELATIVE * np.sqrt(np.sum(means.T**2, axis=0))
+    quiet, excess, reason = _reasons(table, rule, tiny)
     turned = np.ptp(means, axis=0) > _STUCK * np.max(np.abs(means))  # else an axis is stuck
-    usual = np.median(table['std'], axis=0)
-    step, rate_step = rule.steps
-    quieter = (table['std'] < _QUIETER * usual) & (usual > step)
-    ends = np.any((table['at_limit'] > _AT_LIMIT) & turned & quieter, axis=1)
-    reasons = {'short': table['short'], 'frozen': frozen,
-               'shaking': np.any(limit < table['lowest'].T, axis=0),
-               'slope': _sloping(table, slopes, rule)}
-    quiet = ~np.any(list(reasons.values()), axis=0)
-    across, along = (_excess(table[name], quiet) for name in ('excess', 'along'))
-    excess = np.minimum(across, along)
-    turning, sure = _by_gyro(table, quiet, rule)
-    reasons |= {'turning': turning, 'noisy': ~sure & ~rule.rests(slopes, across)}
-    good = ~np.any(list(reasons.values()), axis=0)
-    reasons['length'] = np.zeros(len(table), bool)
-    reasons['length'][good] = ~rule.reads_gravity(means[good])
+    usual = np.median(std, axis=0)
+    ends = np.any((table['at_limit'] > _AT_LIMIT) & turned
+                  & (std < _QUIETER * usual) & (usual > step), axis=1)
+    # The noise of samples and means with rounding; see `rule`.
     level = table['average'][quiet, :3].sum(axis=0) / (1.0 + quiet.sum())
-    std, count = _counts(table[first:], excess[first:], level, rule)
-    rate_std = np.maximum(np.sqrt(table['average'][first:, 3:]), rate_step / math.sqrt(12.0))
-    reason = np.select(list(reasons.values()), list(reasons), '')[first:].tolist()
-    return [_dwell(context, *each) for each in zip(
-        table[first:], std.T.copy(), count.tolist(), rate_std, reason, ends[first:].tolist(),
-        strict=True)]
+    left = step**2 * rounding_left(level / step**2) if step > 0.0 else np.zeros(3)
+    rounded = np.maximum(std.T, np.maximum(step / math.sqrt(12.0), tiny))
+    variance = (rounded**2 * excess / table['samples']
+                + np.maximum(left[:, np.newaxis], 1e-2 * tiny**2))
+    count = np.sum(rounded**2, axis=0) / np.sum(variance, axis=0)
+    rate_std = np.maximum(np.sqrt(table['average'][:, 3:]), rate_step / math.sqrt(12.0))
+    return [_dwell(context, *each) for each in zip(*(part[first:] for part in (
+        table, rounded.T.copy(), count, rate_std, reason, ends)), strict=True)]
+
+
+def _reasons(table: Records, rule: Rule, tiny: Floats
+             ) -> tuple[NDArray[np.bool_], Floats, NDArray[np.str_]]:
+    """
+    Return which dwells are quiet, the excess of their noise, and why they are no poses.
+
+    `tiny` is the standard deviation of each below which it repeats one reading.
+
+    """
+    mean, slope, scale = table['mean'].T, table['slope'].T, rule.scale
+    limit = rule.limit_of(rule.noise_of(mean), DWELL_RATIO, DWELL_RATE_RATIO)
+    sloping = rule.is_steep(slope, np.asarray(scale), table['average'].T[:3], DWELL_SLOPE_G)
+    sloping &= table['strength'] > np.where(table['beside_slope'], WEAK_STRENGTH, STRENGTH)
+    sloping |= (scale > 0.0) & np.any((table['part_slope'] > PART_SLOPE_G * scale)
+                                      & (table['part_strength'] > PART_STRENGTH), axis=1)
+    found = {'short': table['short'],
+             'frozen': np.all(tiny >= table['std'].T, axis=0) & (not rule.repeats),
+             'shaking': np.any(limit < table['lowest'].T, axis=0), 'slope': sloping}
+    quiet = ~np.any(list(found.values()), axis=0)
+    across, along = (_excess(table[name], quiet) for name in ('excess', 'along'))
+    found['turning'], sure = _by_gyro(table, quiet, rule)
+    turn = np.sqrt(np.sum(slope**2, axis=0)) + SURE * table['error'] * np.sqrt(across)
+    found['noisy'] = ~sure & ~((turn < TURN_G * scale) | (scale == 0.0))
+    good = ~np.any(list(found.values()), axis=0)
+    found['length'] = np.zeros(len(table), bool)
+    found['length'][good] = ~rule.reads_gravity(table['mean'][:, :3][good])
+    return quiet, np.minimum(across, along), np.select(list(found.values()), list(found), '')
 
 
 def _excess(own: Floats, quiet: NDArray[np.bool_]) -> Floats:
     """Return the excess of the noise of each mean, estimated from all dwells."""
     common = float(np.median(own[quiet])) if quiet.any() else 1.0
     return np.asarray(np.maximum(max(1.0, common), own / _OWN_EXCESS))
-
-
-def _sloping(table: Records, slopes: Trend, rule: Rule) -> NDArray[np.bool_]:
-    """Return which dwells have a slope."""
-    strength = np.where(table['beside_slope'], WEAK_STRENGTH, STRENGTH)
-    moved = rule.moved(slopes, np.asarray(rule.scale), table['average'].T[:3], strength,
-                       DWELL_SLOPE_G)
-    turned = np.any((table['part_slope'] > PART_SLOPE_G * rule.scale)
-                    & (table['part_strength'] > PART_STRENGTH), axis=1)
-    return np.asarray(moved | (turned & (rule.scale > 0.0)))
 
 
 def _by_gyro(table: Records, quiet: NDArray[np.bool_], rule: Rule
@@ -305,14 +284,6 @@ def _by_gyro(table: Records, quiet: NDArray[np.bool_], rule: Rule
     return known & (tilting > max(_GYRO_RATE, 2.0 * _SPREADS * spread)), sure
 
 
-def _counts(table: Records, excess: Floats, level: Floats, rule: Rule) -> tuple[Floats, Floats]:
-    """Return (3, k) standard deviations and (k,) independent samples, including rounding."""
-    resolution, left = rule.rounding(table['mean'].T[:3], level)
-    std = np.maximum(table['std'].T, resolution)
-    variance = std**2 * excess / table['samples'] + left
-    return std, np.asarray(np.sum(std**2, axis=0) / np.sum(variance, axis=0))
-
-
 def _dwell(context: Sequence[str], found: Any, std: Floats, count: float, rate_std: Floats,
            reason: str, at_limit: bool) -> Dwell:
     known: dict[str, float | Floats] = {
@@ -322,12 +293,11 @@ def _dwell(context: Sequence[str], found: Any, std: Floats, count: float, rate_s
     if np.isfinite(mean).all():
         known['rate'] = mean[3:]
     return Dwell(float(found['begin']), float(found['end']), float(found['time']), mean[:3], std,
-                 count, int(found['samples']), known, int(found['orientation']),
-                 rate_std=rate_std, reason=reason, at_limit=at_limit)
+                 float(count), int(found['samples']), known, int(found['orientation']),
+                 rate_std=rate_std, reason=str(reason), at_limit=bool(at_limit))
 
 
 CELLS = 256
-
 
 _AGREE_G = 2e-3
 """Largest change of the mean by a knock [g], in addition to the noise, at equal orientation."""
@@ -347,7 +317,7 @@ class OngoingDwell:
         self.epoch = chunks.epoch
         self.origin = chunks.origin
         self.length = chunks.length
-        self.cells = self._partial = np.empty(0, window_type(chunks.sums.dtype))
+        self.cells = self._partial = np.empty(0, chunks.records.dtype['sums'])
         self.size = 1
         self.begin = self.end = 0.0
         self.chunks = 0
@@ -355,7 +325,7 @@ class OngoingDwell:
         self.orientation = orientation
 
     def add(self, chunks: Records) -> None:
-        """Add consecutive chunks, of a `judged_type`."""
+        """Add consecutive chunks, of a `chunk_type`."""
         if not len(chunks):
             return
         self.begin = self.begin if self.chunks else float(chunks['begin'][0])
@@ -365,12 +335,10 @@ class OngoingDwell:
         while len(left):
             room = (2 * CELLS - len(self.cells)) * self.size - len(self._partial)
             sums, left = left[:room], left[room:]
-            if self.size > 1:
-                sums = chained(self._partial, sums)
-                whole = len(sums) // self.size * self.size
-                self._partial = sums[whole:]
-                sums = summed(sums[:whole], self.size) if whole else sums[:0]
-            self.cells = chained(self.cells, sums)
+            sums = chained(self._partial, sums)
+            whole = len(sums) // self.size * self.size
+            self._partial = sums[whole:]
+            self.cells = chained(self.cells, summed(sums[:whole], self.size))
             if len(self.cells) == 2 * CELLS:
                 self.cells = summed(self.cells, 2)
                 self.size *= 2
@@ -403,7 +371,7 @@ _LEAD = CHUNKS_PER_WINDOW - 2
 """Chunks before the first still window that belong to the dwell."""
 
 
-_NONE = np.empty(0, judged_type(sums_type(0)))
+_NONE = np.empty(0, chunk_type(0))
 """No chunks, of any type."""
 
 
@@ -424,13 +392,13 @@ class Tracker:
         self.number = number
 
     def feed(self, chunks: Records) -> list[OngoingDwell]:
-        """Return the dwells that end with these chunks, of a `judged_type`."""
+        """Return the dwells that end with these chunks, of a `chunk_type`."""
         self._waiting = chained(self._waiting, chunks)
-        return self._decide(last=False)
+        return list(self._decide(last=False))
 
     def close(self) -> list[OngoingDwell]:
         """End the ongoing dwell because no chunk follows, and return all dwells that end."""
-        return self._decide(last=True) + self._end()
+        return [*self._decide(last=True), *self._end()]
 
     def current(self) -> OngoingDwell | None:
         """Return the ongoing dwell as if it ended now, or None if it is too short."""
@@ -438,41 +406,39 @@ class Tracker:
             return None
         twin = copy.copy(self)
         twin._dwell = copy.copy(self._dwell)
-        twin._decide(last=True)
+        list(twin._decide(last=True))
         found = twin._finished()
         return None if found is None or found.short else found
 
-    def _decide(self, last: bool) -> list[OngoingDwell]:
+    def _decide(self, last: bool) -> Iterator[OngoingDwell]:
+        """Yield the dwells that end with the chunks whose verdict is final."""
         waiting = self._waiting
         verdict = _verdict(waiting, last)
-        done: list[OngoingDwell] = []
         edges = np.flatnonzero(np.diff(verdict)) + 1
         for start, stop in zip([0, *edges], [*edges, len(verdict)]):
             if stop > start:
                 part = waiting[start:stop]
-                done += self._extend(part) if verdict[start] else self._skip(part)
+                yield from self._extend(part) if verdict[start] else self._skip(part)
         self._waiting = waiting[len(verdict):]
-        return done
 
-    def _skip(self, chunks: Records) -> list[OngoingDwell]:
+    def _skip(self, chunks: Records) -> Iterator[OngoingDwell]:
         self._pause += len(chunks)
         self._lead = chained(self._lead, chunks[-_LEAD:])[-_LEAD:]
         self._held = _NONE
         sloping = bool((chunks['trending'] > 0).any())
         self._beside_slope |= sloping
-        done = self._end() if self._pause > KNOCK or sloping else []
+        if self._pause > KNOCK or sloping:
+            yield from self._end()
         self._beside_slope = sloping or (self._beside_slope and self._dwell is not None)
-        return done
 
-    def _extend(self, chunks: Records) -> list[OngoingDwell]:
-        done: list[OngoingDwell] = []
+    def _extend(self, chunks: Records) -> Iterator[OngoingDwell]:
         before = self._held
         if self._pause or self._dwell is None:
             before = self._lead.copy()  # without its windows, which are not still
             before['sums']['level'] = before['sums']['windows'] = 0.0
             if (self._dwell is None or not self._dwell.chunks or not self._dwell.continued_by(
                     chained(before, chunks[:1])['sums'], self._rule.scale)):
-                done = self._end()
+                yield from self._end()
                 self._dwell = OngoingDwell(self._chunks, self.number)
             self._pause = 0
         chunks = chained(before, chunks)
@@ -482,19 +448,19 @@ class Tracker:
         while self._longest and self._dwell.chunks + len(chunks) >= self._longest:
             room = self._longest - self._dwell.chunks
             self._dwell.add(chunks[:room])
-            done.append(self._dwell)
+            yield self._dwell
             self._dwell = OngoingDwell(self._chunks, self.number)
             chunks = chunks[room:]
         self._dwell.add(chunks)
-        return done
 
-    def _end(self) -> list[OngoingDwell]:
+    def _end(self) -> Iterator[OngoingDwell]:
         found = self._finished()
+        if found is not None:
+            yield found
         if self._dwell is not None:
             self.number += 1
         self._dwell = None
         self._held = _NONE
-        return [] if found is None else [found]
 
     def _finished(self) -> OngoingDwell | None:
         least = min(max(_LEAST_REST * self._shortest, CHUNKS_PER_WINDOW), self._shortest)

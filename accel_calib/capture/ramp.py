@@ -80,30 +80,32 @@ def cells_of(blocks: Iterable[Recording], units: Units) -> Poses:
 
     """
     _check_scale(units)
-    parts, sensor, autopilot = list[Floats](), '', None
-    start = 0.0
-    zero: Floats = np.zeros(3)
-    for block in blocks:
-        if not len(block):
-            continue
-        if not parts:
-            start, zero = float(block['time'][0]), units.to_g(block.reading[0])
-            sensor, autopilot = block.sensor, block.autopilot
+    parts, first = list[Floats](), None
+    for block in filter(len, blocks):
+        first = first or block
+        start, zero = first['time'][0], units.to_g(first.reading[0])
         check_finite(np.vstack([block['time'], block.reading.T]), block.row)
-        parts.append(_sums(block, units, start, zero))
-    if not parts:
+        time, reading = block['time'] - start, units.to_g(block.reading) - zero
+        warm = block['temperature'] if 'temperature' in block else np.full(len(time), np.nan)
+        known = np.isfinite(warm)
+        cell, place = np.unique(np.floor(time), return_inverse=True)
+        sums = (np.bincount(place, column) for column in (
+            np.ones(len(time)), known, time, np.where(known, warm, 0.0), *reading.T,
+            *(reading ** 2).T))
+        parts.append(np.array([cell, *sums]))
+    if first is None:
         raise InputError('the log has no samples, expected those of a still board',
                          'record the board while its temperature changes')
     cell, place = np.unique(np.concatenate([part[0] for part in parts]), return_inverse=True)
     n, n_warm, time, warm, *rest = (np.bincount(place, column, len(cell)) for column in
                                     np.concatenate([part[1:] for part in parts], axis=1))
-    first, second = np.array(rest[:3]).T, np.array(rest[3:]).T
-    mean = first / n[:, np.newaxis]
-    variance = (second - mean * first) / np.maximum(n - 1.0, 1.0)[:, np.newaxis]
+    total, square = np.array(rest[:3]).T, np.array(rest[3:]).T
+    mean = total / n[:, np.newaxis]
+    variance = (square - mean * total) / np.maximum(n - 1.0, 1.0)[:, np.newaxis]
     with np.errstate(invalid='ignore'):
         columns = {'time': time / n + start, 'temperature': warm / n_warm, 'count': n,
                    'reading': mean + zero, 'std': np.sqrt(np.maximum(variance, 0.0))}
-    return Poses(columns, numbered(columns), 'g', sensor, autopilot)
+    return Poses(columns, numbered(columns), 'g', first.sensor, first.autopilot)
 
 
 def rests_in_cells(poses: Poses, units: Units) -> Poses:
@@ -125,17 +127,6 @@ def _check_scale(units: Units) -> None:
         raise InputError('the readings are in native units, and a board in one orientation does '
                          'not show their scale; expected readings in m/s2 or g',
                          'convert the readings')
-
-
-def _sums(block: Recording, units: Units, start: float, zero: Floats) -> Floats:
-    """Return (11, m): the number of each cell, and the sums of its samples."""
-    reading, time = units.to_g(block.reading) - zero, block['time'] - start
-    warm = block['temperature'] if 'temperature' in block else np.full(len(time), np.nan)
-    known = np.isfinite(warm)
-    cell, place = np.unique(np.floor(time), return_inverse=True)
-    columns = (np.ones(len(time)), known, time, np.where(known, warm, 0.0), *reading.T,
-               *(reading ** 2).T)
-    return np.array([cell, *(np.bincount(place, column) for column in columns)])
 
 
 def _is_still(cells: Poses) -> NDArray[np.bool_]:

@@ -46,15 +46,13 @@ References
 
 from collections.abc import Mapping
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .chunks import CaptureSettings, chained, Chunks, CHUNKS_PER_WINDOW, Records, window_type
+from .chunks import CaptureSettings, chained, Chunks, CHUNKS_PER_WINDOW, Records
 from .levels import Known, Levels
-from .trend import (
-    Columns, columns_of, oscillation, sliding_max, sliding_sum, Stretch, stretch, Trend, windows)
+from .trend import Columns, columns_of, oscillation, sliding_max, sliding_sum, Stretch, stretch
 from ..table import Floats
 from ..units import Units
 
@@ -149,29 +147,6 @@ WHITE = 4.0
 """Largest excess of a stretch whose scatter is noise rather than a motion."""
 
 
-def judged_type(sums: np.dtype[Any]) -> np.dtype[Any]:
-    """Return the type of a chunk with the verdict on the window that ends with it."""
-    return np.dtype([
-        ('sums', window_type(sums)),  # the level of a missing rate is NaN
-        ('begin', float), ('end', float),
-        ('limit', float, 6),          # largest level of a still window; infinite without a rate
-        ('still', bool),              # the verdict
-        ('missing', np.intp),         # place in `MISSING` of what stands for readings; 0: none
-        ('trending', np.intp)])       # chunks over which the reading has a slope or oscillates; 0
-
-
-def judged_chunks(chunks: Chunks, level: Floats, limit: Floats) -> Records:
-    """Return chunks with the (3 or 6, m) level of their windows and its limit, not judged yet."""
-    found = np.empty(len(chunks.sums), judged_type(chunks.sums.dtype))
-    for name in chunks.sums.dtype.names or ():
-        found['sums'][name] = chunks.sums[name]
-    found['sums']['level'], found['sums']['windows'], found['limit'] = np.nan, 1.0, np.inf
-    found['sums']['level'][:, :len(level)] = level.T
-    found['limit'][:, :len(limit)] = limit.T
-    found['begin'], found['end'] = chunks.begin, chunks.end
-    return found
-
-
 class Rule:
     """
     The rule with its state: the last chunks, and noise and resolution so far.
@@ -222,20 +197,6 @@ class Rule:
         noise = at_least(self._floor[:axes, np.newaxis], self._step[:, np.newaxis], mean)
         return at_least_any(np.fmax(noise, self.least[:axes, np.newaxis]), np.asarray(self.scale))
 
-    def rounding(self, mean: Floats, level: Floats) -> tuple[Floats, Floats]:
-        """
-        Return the (n,) rounding std of a sample, and the (3, n) rounding variance of the means.
-
-        `mean` are the (3, n) mean readings of dwells, and `level` the (3,) mean variance of the
-        samples over many dwells. The std is always above 0.
-
-        """
-        step, _ = self.steps
-        tiny = RELATIVE * np.sqrt(np.sum(mean**2, axis=0))
-        resolution = np.maximum(step / math.sqrt(12.0), tiny)
-        left = step**2 * rounding_left(level / step**2) if step > 0.0 else np.zeros(3)
-        return resolution, np.maximum(left[:, np.newaxis], 1e-2 * tiny**2)
-
     def limit_of(self, noise: Floats, ratio: float = VARIANCE_RATIO,
                  rate_ratio: float = RATE_RATIO) -> Floats:
         """Return the (3 or 6, n) largest variances of a still window, for this noise."""
@@ -250,23 +211,22 @@ class Rule:
         return np.asarray(limit)
 
     def feed(self, chunks: Chunks) -> Records:
-        """Apply the rule to consecutive chunks, and return records of a `judged_type`."""
+        """Return consecutive chunks with the verdict on their windows."""
+        judged = chunks.records.copy()
+        own = judged['sums'].copy()
         if chunks.fresh:
-            kind = chunks.sums.dtype
-            self._before = np.full((HORIZON - 1) * (kind.itemsize // 8), np.nan).view(kind)
-        sums = chained(self._before, chunks.sums)
+            self._before = np.full((HORIZON - 1) * (own.itemsize // 8), np.nan).view(own.dtype)
+        sums = chained(self._before, own)
         self._before = sums[len(sums) - HORIZON + 1:].copy()
         if self._axes == 3 and np.isfinite(sums['first'][:, 3]).any():
             self._axes = 6
-        size, columns = len(chunks.sums), columns_of(sums, self._axes)
-        mean, level = windows(columns)
-        mean += chunks.origin[:self._axes, np.newaxis]
-        zero, equal = windows_without_readings(columns, mean[:3], level[:3])
-        mean, recent = mean[:, -size:], level[:, -size:]
-        seen = {length: stretch(columns, level, length, size, chunks.length)
-                for length in SLOPE_CHUNKS}
-        gaps = (zero, zero + equal, np.where(level[3:] == 0.0, 1.0, 0.0))
-        noise, varied = self._learn(seen[LONG], mean, chunks.step, *(
+        axes, size = self._axes, len(judged)
+        columns = columns_of(sums, axes, chunks.origin)
+        mean, recent = columns.mean[:, -size:], columns.level[:, -size:]
+        seen = {length: stretch(columns, length, size, chunks.length) for length in SLOPE_CHUNKS}
+        zero, equal = windows_without_readings(columns)
+        gaps = (zero, zero + equal, np.where(columns.level[3:] == 0.0, 1.0, 0.0))
+        noise, varied = self._learn(seen[LONG], mean, judged['step'].T, *(
             sliding_max(each, LONG - CHUNKS_PER_WINDOW + 1)[..., -size:] > 0.0 for each in gaps))
         missing = np.where(zero[-size:] > 0.0, 1, np.where((equal[-size:] > 0.0) & varied, 2, 0))
         quiet = np.all(QUIETER * recent[:3] < self._given.least[:3, np.newaxis], axis=0)
@@ -277,18 +237,19 @@ class Rule:
         scale = self._scales(
             mean, measured & np.all(recent <= self.limit_of(noise), axis=0), noise)
         limit = self.limit_of(at_least_any(noise, scale))
-        judged = judged_chunks(chunks, recent, limit)
-        judged['missing'] = missing
-        judged['trending'] = self._trending(seen, mean, limit, scale)
-        judged['still'] = (self._quiet(mean, recent, limit) & (judged['trending'] == 0)
-                           & measured)
+        judged['sums']['level'][:, :axes], judged['limit'][:, :axes] = recent.T, limit.T
+        judged['missing'], judged['trending'] = missing, self._trending(seen, mean, limit, scale)
+        still = measured & (judged['trending'] == 0) & np.all(recent[:3] <= limit[:3], axis=0)
+        still &= ~np.any(recent[3:] > limit[3:], axis=0)  # a rate can be NaN
+        if self._settings.still_gyro_max > 0.0:
+            still &= ~(np.sum(mean[3:]**2, axis=0) > self._settings.still_gyro_max**2)
+        judged['still'] = still
         return judged
 
-    def moved(self, found: Trend, scale: Floats, variance: Floats,
-              strength: float | Floats = STRENGTH, drift_g: float = SLOPE_G
-              ) -> NDArray[np.bool_]:
+    def is_steep(self, slope: Floats, scale: Floats, variance: Floats, drift_g: float = SLOPE_G
+                 ) -> NDArray[np.bool_]:
         """
-        Return whether a slope has this strength and is larger than a drift of `drift_g` [g/s].
+        Return whether (3, ...) slopes [per s] are larger than a drift of `drift_g` [g/s].
 
         `scale` (...) is the reading of 1 g, and `variance` (3, ...) that of the samples.
 
@@ -296,13 +257,7 @@ class Rule:
         drift = drift_g * scale
         if not self.known:
             drift = np.maximum(drift, SLOPE_NOISE * np.sqrt(variance.mean(axis=0)))
-        large = np.sum(found.slope**2, axis=0) > drift**2
-        return np.asarray(large & (found.strength > strength))
-
-    def rests(self, found: Trend, excess: Floats) -> NDArray[np.bool_]:
-        """Return whether dwells exclude a slow turn; see `TURN_G`."""
-        size = np.sqrt(np.sum(found.slope**2, axis=0)) + SURE * found.error * np.sqrt(excess)
-        return np.asarray((size < TURN_G * self.scale) | (self.scale == 0.0))
+        return np.asarray(np.sum(slope**2, axis=0) > drift**2)
 
     def reads_gravity(self, means: Floats) -> NDArray[np.bool_]:
         """
@@ -328,7 +283,8 @@ class Rule:
             one_g = np.maximum(scale, np.sqrt(np.sum(mean[:3]**2, axis=0)))
         for length, each in seen.items():
             calm = np.all(each.highest <= limit[:3], axis=0)
-            moved = self.moved(each.trend, scale, each.variance[:3])
+            moved = self.is_steep(each.trend.slope, scale, each.variance[:3])
+            moved &= each.trend.strength > STRENGTH
             suspect = each.scatter > np.maximum((OSCILLATION_G * one_g)**2, each.white)
             suspect &= calm & (self._settings.still_std_max == 0.0)
             index = np.flatnonzero(suspect)
@@ -336,14 +292,6 @@ class Rule:
             moved[index] |= share > OSCILLATION[length]
             trending[calm & moved] = length
         return trending
-
-    def _quiet(self, mean: Floats, level: Floats, limit: Floats) -> NDArray[np.bool_]:
-        quiet = np.all(level[:3] <= limit[:3], axis=0)
-        if len(level) > 3:
-            quiet &= ~np.any(level[3:] > limit[3:], axis=0)
-        if self._settings.still_gyro_max > 0.0 and len(mean) > 3:
-            quiet &= ~(np.sum(mean[3:]**2, axis=0) > self._settings.still_gyro_max**2)
-        return np.asarray(quiet)
 
     def _scales(self, mean: Floats, quiet: NDArray[np.bool_], noise: Floats) -> Floats:
         if self.known:
@@ -375,7 +323,8 @@ class Rule:
         floors = np.fmin.accumulate(floors, axis=2)
         deviation = np.sqrt(np.max(seen.variance[:3], axis=0))
         calm = (seen.trend.excess < WHITE) & ~zero
-        calm &= ~self.moved(seen.trend, np.asarray(self.scale), seen.variance[:3])
+        calm &= ~((seen.trend.strength > STRENGTH) & self.is_steep(
+            seen.trend.slope, np.asarray(self.scale), seen.variance[:3]))
         if self.known:
             calm &= deviation < STD_CAP_G * self._per_g
         varies = calm & ~repeated & (deviation > VARIED_STEPS * steps[0])
@@ -431,18 +380,12 @@ def _half_range(low: Floats, high: Floats, noise: Floats) -> Floats:
     return np.where(turned, half, 0.0)
 
 
-def windows_without_readings(sums: Columns, mean: Floats, level: Floats
-                             ) -> tuple[Floats, Floats]:
-    """
-    Return the (n,) windows that have samples of zeros, and those of one repeated reading, as 1.
-
-    `mean` and `level` are the (3, n) mean and variance of the windows.
-
-    """
+def windows_without_readings(sums: Columns) -> tuple[Floats, Floats]:
+    """Return the (n,) windows that have samples of zeros, and those of one reading, as 1."""
     zero = sliding_max(sums.zeros, CHUNKS_PER_WINDOW)
     constant = (sums.repeats == sums.count - 1.0).astype(float)
     equal = ((sliding_sum(constant, CHUNKS_PER_WINDOW) == CHUNKS_PER_WINDOW)
-             & np.all(level <= _tiny(mean), axis=0))
+             & np.all(sums.level[:3] <= _tiny(sums.mean[:3]), axis=0))
     return zero, equal.astype(float)
 
 

@@ -77,8 +77,8 @@ class Line(NamedTuple):
     slope: Floats
     square: Floats
     neighbours: Floats
-    time_square: float | Floats
-    length: int | Floats
+    time_square: float
+    length: int
 
 
 def sliding_sum(values: Floats, length: int) -> Floats:
@@ -116,7 +116,7 @@ def lines(values: Floats, length: int) -> Line:
     """Return the lines through all windows of this length, (axes, n - length + 1)."""
     if values.shape[-1] == length:
         centred = values - values.sum(axis=1, keepdims=True) / length
-        return lines_through(centred[:, np.newaxis], np.array([length]))
+        return lines_through(centred[:, np.newaxis])
     total, weighted = _folded(np.stack([values, np.zeros_like(values)]), length, _weighted)
     first, last = values[..., :1 - length], values[..., length - 1:]
     square = sliding_sum(values * values, length)
@@ -135,22 +135,15 @@ def lines(values: Floats, length: int) -> Line:
     return Line(slope, np.maximum(square, 0.0), product, time_square, length)
 
 
-def lines_through(centred: Floats, sizes: Floats) -> Line:
-    """
-    Return one line through each series.
-
-    `centred` are (axes, k, K) values minus their mean, and 0 after the end of a series; `sizes`
-    are the (k,) lengths of the series.
-
-    """
-    index = np.arange(centred.shape[2])
-    inside = index < sizes[:, np.newaxis]
-    time = (index - 0.5 * (sizes[:, np.newaxis] - 1.0)) * inside
-    time_square = np.einsum('kt,kt->k', time, time)
-    slope = np.einsum('akt,kt->ak', centred, time) / time_square
-    left = centred - slope[:, :, np.newaxis] * time
-    return Line(slope, np.einsum('akt,akt->ak', left, left),
-                np.einsum('akt,akt->ak', left[:, :, 1:], left[:, :, :-1]), time_square, sizes)
+def lines_through(centred: Floats) -> Line:
+    """Return the lines through whole series, (..., K) values minus the mean of each series."""
+    size = centred.shape[-1]
+    time = np.arange(size) - 0.5 * (size - 1)
+    time_square = np.sum(time**2)
+    slope = np.einsum('...t,t->...', centred, time) / time_square
+    left = centred - slope[..., np.newaxis] * time
+    return Line(slope, np.einsum('...t,...t->...', left, left),
+                np.einsum('...t,...t->...', left[..., 1:], left[..., :-1]), time_square, size)
 
 
 def oscillation(values: Floats, length: int, index: NDArray[np.intp]) -> Floats:
@@ -202,7 +195,7 @@ class Trend(NamedTuple):
     error: Floats
 
 
-def strength_of(line: Line, spacing: float | Floats, white: Floats) -> Trend:
+def strength_of(line: Line, spacing: float, white: Floats) -> Trend:
     """
     Return the slopes of (3, ...) lines through cells at this spacing [s].
 
@@ -215,7 +208,7 @@ def strength_of(line: Line, spacing: float | Floats, white: Floats) -> Trend:
     square = np.sum(line.square * weight, axis=0)
     neighbours = np.sum(line.neighbours * weight, axis=0)
     correlation = np.clip(neighbours / (square + _TINY) + 3.0 / size, 0.0, _CORRELATION_MAX)
-    power = np.maximum(square / (3.0 * np.maximum(size - 2, 1)), 1.0)
+    power = np.maximum(square / (3.0 * max(size - 2, 1)), 1.0)
     excess = power * (1.0 + correlation) / (1.0 - correlation)
     time_square = line.time_square * spacing**2
     strength = np.sum(slope * slope * weight, axis=0) * time_square / excess
@@ -223,36 +216,33 @@ def strength_of(line: Line, spacing: float | Floats, white: Floats) -> Trend:
     return Trend(slope, strength, excess, error)
 
 
-def excess_of_means(centred: Floats, sizes: Floats, white: Floats) -> Floats:
+def excess_of_means(centred: Floats, white: Floats) -> float:
     """
-    Return the (k,) excess of series: the variance of the mean over that of white noise.
+    Return the excess of a series: the variance of its mean over that of white noise.
 
-    `centred` (3, k, K) are means of cells minus their common mean, and 0 after the end of a
-    series. `sizes` (k,) are the lengths; the excess is 1 for fewer than 4 cells. `white` (3, k) is
-    the variance of a cell mean for independent samples; axes with 0 are ignored.
+    `centred` (axes, K) are means of cells minus their common mean; the excess is 1 for fewer than
+    4 cells. `white` (axes,) is the variance of a cell mean for independent samples; axes with 0
+    are ignored.
 
     """
-    axes = white > 0.0
-    scaled = centred / np.sqrt(np.where(axes, white, np.inf))[:, :, np.newaxis]
+    axes, size = white > 0.0, centred.shape[1]
+    if size < 4 or not axes.any():
+        return 1.0
+    scaled = centred[axes] / np.sqrt(white[axes])[:, np.newaxis]
     # The autocovariances are computed by a Fourier transform with zero padding.
-    length = centred.shape[2]
-    padded = 1 << (2 * length - 1).bit_length()
-    power = np.sum(np.abs(np.fft.rfft(scaled, padded, axis=2))**2, axis=0)
-    lags = np.arange(max(length // 2, 2))
-    terms = np.maximum(sizes[:, np.newaxis] - lags, 1.0) * np.maximum(
-        axes.sum(axis=0), 1)[:, np.newaxis]
-    found = _long_run(np.fft.irfft(power, padded, axis=1)[:, lags] / terms, sizes)
-    return np.where(axes.any(axis=0) & (sizes >= 4), found, 1.0)
+    padded = 1 << (2 * size - 1).bit_length()
+    power = np.sum(np.abs(np.fft.rfft(scaled, padded, axis=1))**2, axis=0)
+    terms = (size - np.arange(size)) * axes.sum()
+    return _long_run(np.fft.irfft(power, padded)[:size] / terms, size)
 
 
-def _long_run(covariance: Floats, sizes: Floats) -> Floats:
-    """Return the sum of (k, lags) autocovariances; see the module."""
-    pairs = covariance[:, 0:-1:2] + covariance[:, 1::2]
-    usable = np.arange(pairs.shape[1]) < (sizes // 2 // 2)[:, np.newaxis]
-    kept = np.logical_and.accumulate((pairs > 0.0) & usable, axis=1)
-    found = 2.0 * np.sum(np.where(kept, pairs, 0.0), axis=1) - covariance[:, 0]
-    lost = (4.0 * kept.sum(axis=1) - 1.0) / sizes
-    return np.asarray(np.maximum(found, 0.0) / np.maximum(1.0 - lost, 0.25))
+def _long_run(covariance: Floats, size: int) -> float:
+    """Return the sum of the autocovariances of a series at lags below its half; see the module."""
+    near = covariance[:size // 2]
+    pairs = near[0:-1:2] + near[1::2]
+    kept = pairs[np.logical_and.accumulate(pairs > 0.0)]
+    lost = (4.0 * len(kept) - 1.0) / size
+    return max(2.0 * float(kept.sum()) - float(near[0]), 0.0) / max(1.0 - lost, 0.25)
 
 
 _DIGITS = 1e-14
@@ -262,35 +252,38 @@ _DIGITS = 1e-14
 @dataclass(frozen=True)
 class Columns:
     """
-    Sums of n chunks as contiguous arrays, (axes, n) of reading and rate.
+    Sums of n chunks as contiguous arrays, and the windows that end with them.
 
-    `repeats` (n,) are the samples that repeat the one before; `zeros` is 1 for chunks with zeros.
+    `first` (axes, n) are those of reading and rate. `repeats` (n,) are the samples that repeat the
+    one before; `zeros` is 1 for chunks with zeros. `mean` and `level`, (axes, m), are the means
+    and variances of the m windows.
 
     """
 
     count: Floats
     first: Floats
-    second: Floats
     at_limit: Floats
     repeats: Floats
     zeros: Floats
+    mean: Floats
+    level: Floats
 
 
-def columns_of(sums: Records, axes: int) -> Columns:
-    """Return the sums of n chunks for the reading (3 axes), or reading and rate (6)."""
+def columns_of(sums: Records, axes: int, origin: Floats) -> Columns:
+    """
+    Return the sums of n chunks for the reading (3 axes), or reading and rate (6).
+
+    They are relative to the `origin` (6,), which is added to the means.
+
+    """
     first, second = (np.ascontiguousarray(sums[name].T[:axes]) for name in ('first', 'second'))
     count = sums['count'].copy()
-    return Columns(count, first, second, np.ascontiguousarray(sums['at_limit'].T),
-                   sums['repeats'].copy(), (sums['zeros'] > 0.0).astype(float))
-
-
-def windows(sums: Columns) -> tuple[Floats, Floats]:
-    """Return mean and variance of the windows that end with each chunk, (axes, n)."""
-    count = sliding_sum(sums.count, CHUNKS_PER_WINDOW)
-    first = sliding_sum(sums.first, CHUNKS_PER_WINDOW)
-    mean = first / count
-    power = sliding_sum(sums.second, CHUNKS_PER_WINDOW) - first * mean
-    return mean, np.maximum(power, 0.0) / (count - 1.0)
+    inside, total = (sliding_sum(each, CHUNKS_PER_WINDOW) for each in (count, first))
+    mean = total / inside
+    power = np.maximum(sliding_sum(second, CHUNKS_PER_WINDOW) - total * mean, 0.0)
+    return Columns(count, first, np.ascontiguousarray(sums['at_limit'].T), sums['repeats'].copy(),
+                   (sums['zeros'] > 0.0).astype(float), mean + origin[:axes, np.newaxis],
+                   power / (inside - 1.0))
 
 
 @dataclass(frozen=True)
@@ -320,12 +313,12 @@ class Stretch:
     white: Floats
 
 
-def stretch(sums: Columns, level: Floats, length: int, size: int, spacing: float) -> Stretch:
+def stretch(sums: Columns, length: int, size: int, spacing: float) -> Stretch:
     """Return the figures over `length` chunks that end at each of the last `size` chunks."""
     start = len(sums.count) - size - length + 1
     counts, first = sums.count[start:], sums.first[:, start:]
     inner = length - CHUNKS_PER_WINDOW + 1
-    level = level[:, level.shape[1] - size - inner + 1:]
+    level = sums.level[:, sums.level.shape[1] - size - inner + 1:]
     variance = sliding_sum(level, inner) / inner
     count = sliding_sum(counts, length)
     cells = first / counts

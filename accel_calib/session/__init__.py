@@ -4,10 +4,12 @@
 """
 The calibrator without ROS: it takes samples and commands, and returns answers and events.
 
-`session` is the entry point, and `commands` contains what the user can ask for. `sensor` is what
-belongs to one sensor: `live_capture` captures its poses, and `guidance` says which pose is next.
-`store` manages and locks files. `worker` runs the tasks and defines the events. `stream` describes
-the messages, `state` the state. `settings` defines the parameters.
+`session` is the entry point, and `core` the state that all other modules read. `commands` contains
+what the user can ask for, and `use` what follows when the calibration or the poses change.
+`sensor` is what belongs to one sensor: `live_capture` captures its poses, and `guide` chooses the
+next one. `stream` describes the messages, and `faults` what is wrong with them. `guidance` is the
+next step, and `state` what topics and pages show. `store` manages and locks files. `worker` runs
+the tasks and defines the events. `settings` defines the parameters. Imports point one way.
 
 """
 

@@ -15,32 +15,30 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-import math
-from typing import Any, cast, TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
-from .guidance import next_words, plan_for
+from .core import State
+from .faults import thermometer_words
+from .guidance import next_words
+from .guide import plan_for
 from .sensor import gyro_bias_of_rest, Sensor
 from .settings import CalibratorSettings
 from .store import writing_advice
-from .stream import thermometer_words
+from .use import adopt, rate, show_poses
 from .worker import Compute, Files, nothing, Parse, Part, Task
-from ..calibrate import (
-    angle_words, Calibration, fit_partial, level, mounting_only, outlook, set_heading)
+from ..calibrate import angle_words, Calibration, fit_partial, level, mounting_only, set_heading
 from ..capture import Dwell, poses_from
 from ..effects import Model
 from ..errors import AccelCalibError, InputError, RefusedFitError, StoredCalibrationError
-from ..findings import calibration_json, rate, rate_refinement, Rating, refinement_json
+from ..findings import rate_refinement, Rating
 from ..geometry import angle_of, spread_directions
 from ..pipeline import calibrated, is_partial, is_refined, Plan
 from ..refine import refine, Refinement, shown_name, times_typical, verdict_words
 from ..table import Poses
-from ..text import counted, listed, now, plain
+from ..text import counted, listed, now
 from ..units import MG, Units
-
-if TYPE_CHECKING:
-    from .session import Session
 
 _OLD = 0.5
 """Largest age of the last message for a capture [s]."""
@@ -64,22 +62,22 @@ class ChangedError(AccelCalibError):
     """The calibration changed during a fit or a refinement."""
 
 
+@dataclass(frozen=True)
 class Commands:
     """The commands of a session; those with `offers` only offer a new calibration."""
 
-    def __init__(self, session: Session, *, offers: bool = False) -> None:
-        self._session, self._offers = session, offers
-        self._refused, self._auto_fit_at = '', -math.inf
+    session: State
+    offers: bool = False
 
     # Poses
 
     def capture_pose(self) -> Task:
         """Capture the ongoing rest as a pose."""
-        session, sensor, dwell = self._session, self._session.sensor, _rest(self._session)
+        session, sensor, dwell = self.session, self.session.sensor, _rest(self.session)
         session.files.usable()
         sensor.live.capture(dwell)
         sensor.guide.is_new_rest(dwell.start)  # the answer is the line about this pose
-        session.poses_changed(ended=False)
+        poses_changed(session, ended=False)
         poses = sensor.live.book.poses()
         words = (f'{counted(len(poses), "pose")}: the sensor has been still for '
                  f'{dwell.end - dwell.start:.1f} s')
@@ -93,12 +91,12 @@ class Commands:
 
     def undo_pose(self) -> Task:
         """Remove the last pose."""
-        session = self._session
+        session = self.session
         if session.files.store is not None:
             session.files.usable()
         if not session.sensor.live.undo():
             raise InputError('there are no poses to remove', 'capture a pose first')
-        session.poses_changed(ended=False)
+        poses_changed(session, ended=False)
         count = len(session.sensor.live.book.poses())
         yield Files(nothing)  # until the poses are stored
         return f'the last pose is removed; remaining: {counted(count, "pose")}'
@@ -107,39 +105,11 @@ class Commands:
 
     def fit(self) -> Task:
         """Fit the poses; use and store the calibration, or only offer it."""
-        return (yield from self._use((yield from _fit(self._session))))
-
-    def due(self) -> list[Task]:
-        """Return an automatic fit if one is due."""
-        session, now = self._session, self._session.clock()
-        sensor, settings = session.sensor, session.settings
-        if (settings.auto_fit and sensor.auto_fit_waits
-                and now - self._auto_fit_at >= _AUTO_FIT_EVERY and session.files.locked
-                and len(sensor.live.book.poses()) >= settings.auto_fit_poses):
-            sensor.auto_fit_waits, self._auto_fit_at = False, now
-            return [self._auto_fit(sensor)]
-        return []
-
-    def _auto_fit(self, sensor: Sensor) -> Task:
-        """Fit the poses of a sensor; use the result if it differs by more than its uncertainty."""
-        if self._session.sensor is not sensor:
-            return ''
-        try:
-            fitted = yield from _fit(self._session)
-        except ChangedError:
-            sensor.auto_fit_waits = True
-            return ''
-        except RefusedFitError as error:
-            before, self._refused = self._refused, str(error)
-            if self._refused == before:
-                return ''
-            raise
-        self._refused = ''
-        return (yield from self._use(fitted)) if fitted.differs else ''
+        return (yield from self._use((yield from _fit(self.session))))
 
     def refine(self) -> Task:
         """Refine the calibration; use and store the refined calibration, or only offer it."""
-        session = self._session
+        session = self.session
         fitted = yield from _sound(session, 'refine', refined, session.units, session.name,
                                    session.sensor.present, thermometer_words(session),
                                    session.own)
@@ -151,7 +121,7 @@ class Commands:
 
     def set_level(self) -> Task:
         """Level the mounting from the ongoing rest; without a calibration, the mounting alone."""
-        session, rest = self._session, _rest(self._session)
+        session, rest = self.session, _rest(self.session)
         calibration = session.sensor.present
         if calibration is None:
             calibration = session.with_given(mounting_only(
@@ -161,7 +131,7 @@ class Commands:
 
     def set_heading(self) -> Task:
         """Set the heading of the mounting from the ongoing rest, with the nose down."""
-        session, calibration = self._session, self._session.sensor.present
+        session, calibration = self.session, self.session.sensor.present
         if calibration is None or not calibration.is_levelled:
             raise InputError('the mounting is not levelled', 'place the robot flat and call '
                              '~/set_level first, then tilt its nose down')
@@ -175,11 +145,17 @@ class Commands:
 
     def calibrate_at_rest(self) -> Task:
         """Take mounting, gyro bias and the offset along gravity from the ongoing level rest."""
-        session, rest = self._session, _rest(self._session)
+        session, rest = self.session, _rest(self.session)
         before = session.sensor.present
-        calibration = session.with_given(at_rest(rest, session.units, session.name, before))
-        words = (calibration.reason if before is None or is_partial(before)
-                 else 'offset and gain of the fit are kept')
+        if before is not None and not is_partial(before):
+            found, words = before, 'offset and gain of the fit are kept'
+        else:
+            found = fit_partial(poses_from([rest]), session.units, sensor=session.name, date=now())
+            rotation = np.eye(3) if before is None else before.rotation
+            found = replace(found, model=Model(found.model.values, rotation))
+            words = found.reason
+        calibration = session.with_given(replace(
+            found, gyro=gyro_bias_of_rest(rest) or found.gyro))
         if calibration.gyro is not None:
             bias = ', '.join(f'{np.degrees(part):+.3f}' for part in calibration.gyro.bias)
             words += f', gyro bias ({bias}) °/s'
@@ -187,7 +163,7 @@ class Commands:
 
     def _use_mounting(self, calibration: Calibration, words: str) -> Part[str]:
         """Use or offer a calibration with a new mounting; return the answer."""
-        sensor = self._session.sensor
+        sensor = self.session.sensor
         details = [change_words(sensor.present, calibration), *(
             each.words for each in calibration.noted if each.kind in ('flat_pose', 'heading'))]
         return (yield from self._use(Fitted(
@@ -195,32 +171,13 @@ class Commands:
             refinement=sensor.refinement)))
 
     def _use(self, fitted: Fitted) -> Part[str]:
-        """Store and use, or offer, a new calibration; log the details, and return the answer."""
-        session, calibration, words = self._session, fitted.calibration, fitted.words
-        store, mounting = session.files.usable(), session.mounting_words(calibration)
-        if self._offers or session.settings.confirm:
-            session.sensor.offer(calibration)
-            session.rate(fitted.refinement, fitted.rating)
-            session.log('info', '; '.join(filter(None, [*fitted.details, mounting])))
-            return (f'{words}; published on ~/preview only: call ~/save to use and store it, or '
-                    '~/undo to discard it')
-        try:
-            yield from _alone(session, Files(store.write, Parse(store.prepared, calibration)))
-        except OSError as error:
-            session.adopt(calibration, fitted.refinement, fitted.rating)
-            session.sensor.unsaved = True
-            raise InputError(f'the calibration is in use but could not be stored: {error}',
-                             f'{writing_advice(error)}, and call ~/save') from error
-        session.adopt(calibration, fitted.refinement, fitted.rating)
-        session.log('info', '; '.join(filter(None, [
-            *fitted.details, f'stored in {store.calibration}', mounting])))
-        return f'{words}{next_words(session)}'
+        return _use(self.session, fitted, offers=self.offers)
 
     # Files
 
     def save(self) -> Task:
         """Use the offered calibration if there is one; store calibration and poses."""
-        session, sensor, store = self._session, self._session.sensor, self._session.files.usable()
+        session, sensor, store = self.session, self.session.sensor, self.session.files.usable()
         calibration = sensor.present
         if calibration is None:
             raise InputError('there is no calibration', 'capture poses and call ~/fit first')
@@ -228,30 +185,30 @@ class Commands:
         yield Files(store.save_poses, sensor.live.book.poses())
         sensor.unsaved = False
         if sensor.offered is calibration:
-            session.adopt(calibration, sensor.refinement, sensor.rating)
+            adopt(session, calibration, sensor.refinement, sensor.rating)
         return f'stored in {store.calibration} and {store.poses}'
 
     def load(self) -> Task:
         """Read the stored calibration again; if it is refused, the calibration in use is kept."""
-        session, store = self._session, self._session.files.usable()
+        session, store = self.session, self.session.files.usable()
         calibration = yield from _alone(session, Parse(store.load_calibration))
         if calibration is None:
             raise StoredCalibrationError(f'{store.calibration} does not exist',
                                          'call ~/fit, or copy a calibration there')
-        session.adopt(calibration)
+        adopt(session, calibration)
         return f'read {store.calibration}'
 
     def undo(self) -> Task:
         """Discard the offered calibration, or return to the one before the last stored one."""
-        session = self._session
+        session = self.session
         if session.sensor.offered is not None:
             session.sensor.fitted_poses = 0
             session.sensor.offer(None)
-            session.rate(None)
+            rate(session, None)
             return 'the calibration on ~/preview is discarded; the one in use is unchanged'
         calibration = yield from _alone(session, Files(session.files.usable().step_back))
         before = session.sensor.calibration
-        session.adopt(calibration)
+        adopt(session, calibration)
         session.sensor.fitted_poses = 0
         if calibration is None:
             return 'there is no calibration any more, as before the first fit'
@@ -260,18 +217,18 @@ class Commands:
 
     def reset(self) -> Task:
         """Remove poses and calibration; the stored files are renamed."""
-        session, store = self._session, self._session.files.usable()
+        session, store = self.session, self.session.files.usable()
         kept = yield from _alone(session, Files(store.set_aside, Parse(store.is_good)))
         session.sensor.live.clear()
-        session.adopt(None)
+        adopt(session, None)
         session.sensor.fitted_poses = 0
-        session.poses_changed(ended=False)
+        poses_changed(session, ended=False)
         return 'poses and calibration are removed' + ''.join(
             f'; the stored file is kept as {path.name}' for path in kept)
 
     def enable(self, on: bool) -> str:
         """Switch the correction on or off."""
-        session = self._session
+        session = self.session
         session.enabled = on
         if not on:
             return 'the correction is off: raw messages are published unchanged'
@@ -284,13 +241,74 @@ class Commands:
 
 # ----------------------------------------------------------------------------- parts of commands
 
-def _fit(session: Session) -> Part[Fitted]:
+def poses_changed(session: State, *, ended: bool, new_rest: bool = False) -> None:
+    """Draw and store the poses, and fit if auto_fit is set; `ended`: a rest has ended."""
+    sensor = session.sensor
+    show_poses(session, store=session.files.locked, new_rest=new_rest)
+    if ended or len(sensor.live.book.poses()) > sensor.fitted_poses:
+        sensor.auto_fit_waits = True
+    session.events += due(session)
+
+
+def due(session: State) -> list[Task]:
+    """Return an automatic fit if one is due."""
+    sensor, settings = session.sensor, session.settings
+    if (settings.auto_fit and sensor.auto_fit_waits and session.files.locked
+            and len(sensor.live.book.poses()) >= settings.auto_fit_poses
+            and session.throttle.passes('auto_fit', _AUTO_FIT_EVERY)):
+        sensor.auto_fit_waits = False
+        return [_auto_fit(session, sensor)]
+    return []
+
+
+def _auto_fit(session: State, sensor: Sensor) -> Task:
+    """Fit the poses of a sensor; use the result if it differs by more than its uncertainty."""
+    if session.sensor is not sensor:
+        return ''
+    try:
+        fitted = yield from _fit(session)
+    except ChangedError:
+        sensor.auto_fit_waits = True
+        return ''
+    except RefusedFitError as error:
+        before, sensor.refusal = sensor.refusal, str(error)
+        if sensor.refusal == before:
+            return ''
+        raise
+    sensor.refusal = ''
+    return (yield from _use(session, fitted, offers=False)) if fitted.differs else ''
+
+
+def _use(session: State, fitted: Fitted, *, offers: bool) -> Part[str]:
+    """Store and use, or offer, a new calibration; log the details, and return the answer."""
+    calibration, words = fitted.calibration, fitted.words
+    store, mounting = session.files.usable(), session.mounting_words(calibration)
+    if offers or session.settings.confirm:
+        session.sensor.offer(calibration)
+        rate(session, fitted.refinement, fitted.rating)
+        session.log('info', '; '.join(filter(None, [*fitted.details, mounting])))
+        return (f'{words}; published on ~/preview only: call ~/save to use and store it, or '
+                '~/undo to discard it')
+    try:
+        yield from _alone(session, Files(store.write, Parse(store.prepared, calibration)))
+    except OSError as error:
+        adopt(session, calibration, fitted.refinement, fitted.rating)
+        session.sensor.unsaved = True
+        raise InputError(f'the calibration is in use but could not be stored: {error}',
+                         f'{writing_advice(error)}, and call ~/save') from error
+    adopt(session, calibration, fitted.refinement, fitted.rating)
+    session.log('info', '; '.join(filter(None, [
+        *fitted.details, f'stored in {store.calibration}', mounting])))
+    return f'{words}{next_words(session)}'
+
+
+def _fit(session: State) -> Part[Fitted]:
     """Return a fit to the poses; the values of a refined calibration are fitted anew."""
     return (yield from _sound(session, 'fit', fit, session.units, session.settings,
                               session.name, session.sensor.present))
 
 
-def _sound(session: Session, name: str, function: Callable[..., Fitted], *given: Any
+def _sound(session: State, name: str, function: Callable[..., Fitted], *given: Any
            ) -> Part[Fitted]:
     """Return what a function makes of the poses; fail if it is not fit for use, or outdated."""
     session.files.usable()
@@ -313,13 +331,13 @@ def _sound(session: Session, name: str, function: Callable[..., Fitted], *given:
         why, advice = found.refusal
         sensor.guide.refuse(count, advice)
         if found.refinement is not None:
-            session.rate(found.refinement)
+            rate(session, found.refinement)
         raise RefusedFitError(f'{found.words}; not used: {why}', advice)
     sensor.fitted_poses = count
     return found
 
 
-def _levelled(session: Session, calibration: Calibration, rest: Dwell) -> Calibration:
+def _levelled(session: State, calibration: Calibration, rest: Dwell) -> Calibration:
     """Return a calibration levelled by a rest; check it against the given mounting."""
     levelled = level(calibration, rest.mean, session.frame,
                      session.sensor.context_of(rest, calibration))
@@ -330,7 +348,7 @@ def _levelled(session: Session, calibration: Calibration, rest: Dwell) -> Calibr
     return levelled
 
 
-def _alone(session: Session, step: Parse) -> Part[Any]:
+def _alone(session: State, step: Parse) -> Part[Any]:
     """Use files; fail if another sensor replaces this one meanwhile."""
     sensor, name = session.sensor, session.name
     found = yield step
@@ -341,7 +359,7 @@ def _alone(session: Session, step: Parse) -> Part[Any]:
     return found
 
 
-def _rest(session: Session) -> Dwell:
+def _rest(session: State) -> Dwell:
     """Return the ongoing rest; InputError if there is none, or no recent message."""
     statistics, settings, live = session.statistics, session.settings, session.sensor.live
     if not statistics.messages:
@@ -447,33 +465,15 @@ def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None,
     details += [*calibration.warnings, *refinement.advice]
     if not refinement.refusal:
         details.append(change_words(before, calibration))
-    return Fitted(calibration, f'{rating.name}: {_verdict(refinement)}, {rating.figures}', details,
-                  rating, refinement, refusal=refinement.refusal or _refusal(rating))
-
-
-def _verdict(refinement: Refinement) -> str:
     names = [shown_name(step.name) + (f' (or {", ".join(step.likely_rivals)})' if step.rivals
                                       else '') for step in refinement.steps]
     found, verb = ' and '.join(names), 's' if len(names) == 1 else ''
-    return {'no_gap': 'no gap beyond the noise', 'explained': f'{found} explain{verb} the gap',
-            'described': f'{found} describe{verb} the gap',
-            'drifts': 'the offset drifts'}.get(
-        refinement.verdict, f'a gap remains beyond {found}' if names else 'a gap remains that no '
-        'effect explains')
-
-
-def at_rest(rest: Dwell, units: Units, sensor: str, before: Calibration | None) -> Calibration:
-    """
-    Return a calibration from one rest: the offset along gravity, and the bias of the gyro.
-
-    The offset and gain of a full fit before are kept.
-
-    """
-    if before is None or is_partial(before):
-        rotation = np.eye(3) if before is None else before.rotation
-        found = fit_partial(poses_from([rest]), units, sensor=sensor, date=now())
-        before = replace(found, model=Model(found.model.values, rotation))
-    return replace(before, gyro=gyro_bias_of_rest(rest) or before.gyro)
+    verdict = {'no_gap': 'no gap beyond the noise', 'explained': f'{found} explain{verb} the gap',
+               'described': f'{found} describe{verb} the gap', 'drifts': 'the offset drifts',
+               'unexplained': f'a gap remains beyond {found}' if names else
+               'a gap remains that no effect explains'}[refinement.verdict]
+    return Fitted(calibration, f'{rating.name}: {verdict}, {rating.figures}', details, rating,
+                  refinement, refusal=refinement.refusal or _refusal(rating))
 
 
 def change_words(before: Calibration | None, after: Calibration) -> str:
@@ -505,12 +505,3 @@ def _replaces(before: Calibration | None, after: Calibration) -> bool:
     change = up @ (gain - gain_before).T + offset - offset_before
     covariance = after.force_covariance(up * after.force_per_g) / after.force_per_g ** 2
     return bool(np.sum(change ** 2) > np.sum(np.trace(covariance, axis1=1, axis2=2)))
-
-
-def rated(calibration: Calibration, refinement: Refinement | None, rating: Rating | None,
-          model: str) -> tuple[Rating, dict[str, Any]]:
-    """Return the rating of a calibration, if it is not known, and its JSON as of commands."""
-    found = {} if refinement is None else refinement_json(refinement)
-    whole = {**calibration_json(calibration, outlook(calibration, model)), **found}
-    return (rate(calibration, refinement=refinement) if rating is None else rating,
-            cast('dict[str, Any]', plain(whole)))

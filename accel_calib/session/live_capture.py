@@ -16,10 +16,10 @@ pose is marked as doubtful, and the fit leaves it out if possible.
 
 """
 
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
-from operator import is_
+from operator import is_, is_not
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,10 +57,13 @@ class PoseBook:
         self.held: list[Dwell] = []
         self._made: tuple[list[Dwell], Poses] | None = None
 
+    @property
+    def _all(self) -> list[Dwell]:
+        return [*self._earlier, *self._dwells, *self.held]
+
     def poses(self) -> Poses:
         """Return the pose table."""
-        dwells = [*self._earlier, *self._dwells, *self.held]
-        made = self._made
+        dwells, made = self._all, self._made
         if made is None or len(made[0]) != len(dwells) or not all(map(is_, made[0], dwells)):
             # Merging compares all pairs; the diagnostics ask every second.
             made = self._made = dwells, poses_from(self._selected(dwells), self._settings)
@@ -77,13 +80,12 @@ class PoseBook:
 
     def lacking(self, column: str) -> tuple[int, int]:
         """Return how many dwells have no value in a column of the context, and how many have."""
-        known = [column in each.context for each in (*self._earlier, *self._dwells, *self.held)]
+        known = [column in each.context for each in self._all]
         return known.count(False), known.count(True)
 
     def add_stored(self, poses: Poses) -> None:
         """Insert stored poses before the others."""
-        stored = [_dwell_of(poses, k) for k in range(len(poses))]
-        self._earlier = [*stored, *self._earlier]
+        self._earlier[:0] = [_dwell_of(poses, k) for k in range(len(poses))]
 
     def holds(self, dwell: Dwell) -> bool:
         """Return whether this rest is a provisional pose."""
@@ -106,12 +108,8 @@ class PoseBook:
     def end(self, dwell: Dwell) -> None:
         """Add a rest that ended, in place of its provisional pose."""
         self.held = [each for each in self.held if not overlap(dwell, each)]
-        self._add(dwell)
-
-    def _add(self, dwell: Dwell) -> None:
-        if self._has(dwell):
-            return
-        self._dwells.append(dwell)
+        if not self._has(dwell):
+            self._dwells.append(dwell)
         if len(self._dwells) > _SEPARATE:
             self._earlier = self._selected([*self._earlier, self._dwells.pop(0)])
 
@@ -120,20 +118,13 @@ class PoseBook:
         over = [each for each in self.held if is_over(each)]
         self.held = [each for each in self.held if not is_over(each)]
         for dwell in over:
-            self._add(replace(dwell, doubtful=True))
+            self.end(replace(dwell, doubtful=True))
         return len(over)
 
-    def doubt(self, starts: Container[float]) -> int:
-        """Mark the dwells with these start times as doubtful; return the number of new marks."""
-        new = [dwell for dwell in self._dwells if dwell.start in starts and not dwell.doubtful]
-        self._dwells = [replace(dwell, doubtful=True) if dwell.start in starts else dwell
-                        for dwell in self._dwells]
-        return len(new)
-
-    def limit(self, ends: Mapping[float, bool]) -> None:
-        """Take over by start time whether dwells are at a limit: the later ones show it, too."""
-        self._dwells = [dwell if ends.get(dwell.start, dwell.at_limit) is dwell.at_limit else
-                        replace(dwell, at_limit=not dwell.at_limit) for dwell in self._dwells]
+    def mark(self, marked: Callable[[Dwell], Dwell]) -> int:
+        """Replace dwells by marked ones, or keep them; return the number of new ones."""
+        before, self._dwells = self._dwells, list(map(marked, self._dwells))
+        return sum(map(is_not, before, self._dwells))
 
     def undo(self) -> bool:
         """Remove the last pose; return whether there was one."""
@@ -161,17 +152,16 @@ def _bands(dwells: list[Dwell]) -> NDArray[np.int64]:
 def with_temperature(dwells: list[Dwell]) -> list[Dwell]:
     """Return dwells with missing temperatures set to that of the nearest one; tables need all."""
     known = [dwell for dwell in dwells if 'temperature' in dwell.context]
-
-    def completed(dwell: Dwell) -> Dwell:
-        if not known or 'temperature' in dwell.context:
-            return dwell
-        near = min(known, key=lambda other: abs(other.time - dwell.time))
-        if abs(near.time - dwell.time) > _SAME_TEMPERATURE:
-            return dwell
-        return replace(dwell, context={
-            **dwell.context, 'temperature': near.context['temperature']})
-
-    return [completed(dwell) for dwell in dwells]
+    found, times = [], np.array([dwell.time for dwell in known])
+    for dwell in dwells:
+        away = np.abs(times - dwell.time)
+        lacks = 'temperature' not in dwell.context
+        if lacks and np.min(away, initial=np.inf) <= _SAME_TEMPERATURE:
+            warm = known[int(np.argmin(away))].context['temperature']
+            found.append(replace(dwell, context={**dwell.context, 'temperature': warm}))
+        else:
+            found.append(dwell)
+    return found
 
 
 def overlap(one: Dwell | Rest, other: Dwell) -> bool:
@@ -259,8 +249,12 @@ class LiveCapture:
         `capture`: every rest becomes a pose.
 
         """
-        for piece in _pieces(samples):
-            change = self._after(self.detector.push(piece), float(piece[-1, 0]), capture)
+        times, pieces = samples[:, 0], [samples]
+        if not 0.0 <= times[-1] - times[0] < _PIECE:
+            pieces = np.split(samples, np.flatnonzero(np.diff(np.floor(times / _PIECE))) + 1)
+        for piece in pieces:
+            ended, time = self.detector.push(piece), float(piece[-1, 0])
+            change = self._end(ended, capture) if ended else self._look(time, capture)
             refused = tuple(filter(self.book.lacks, self.detector.refused))
             if change is not None or refused:
                 yield replace(change or Change(), refused=refused)
@@ -269,19 +263,6 @@ class LiveCapture:
         """End the ongoing rest, because the stream is interrupted; parameters as in `push`."""
         ended = self.detector.close()
         return [self._end(ended, capture)] if ended else []
-
-    def _after(self, ended: list[Dwell], time: float, capture: bool) -> Change | None:
-        """Return the changes by the samples up to this time."""
-        if ended:
-            return self._end(ended, capture)
-        still = self.detector.still
-        if still:
-            self._was_still = time
-        until = self._known_until if still else self._looked + _LOOK_EVERY
-        if self._looked <= time < until:
-            return None
-        self._looked, self._known_until = time, time + _LOOK_EVERY
-        return self._look(capture) if still else self._doubt_held(time)
 
     def poses(self, found: tuple[Finding, ...]) -> Poses:
         """
@@ -292,7 +273,8 @@ class LiveCapture:
         """
         check_measured(self.detector.lengths, self._units)
         judged = self.detector.judged()
-        self.book.limit({each.start: each.at_limit for each in judged})
+        ends = {each.start: each.at_limit for each in judged}  # the later ones show it, too
+        self.book.mark(lambda each: replace(each, at_limit=ends.get(each.start, each.at_limit)))
         rests = [*(each.rest for each in judged), *self.detector.missing]
         own = [each for each in rests if each.start >= self._begun]
         return replace(self.book.poses(), findings=(*found, *account_of(own, self._settings)))
@@ -318,7 +300,17 @@ class LiveCapture:
         self._declined, self._begun = self._rest, self._looked
         self.book.clear()
 
-    def _look(self, capture: bool) -> Change | None:
+    def _look(self, time: float, capture: bool) -> Change | None:
+        """Return the changes by the ongoing rest at this time, if it is due."""
+        still = self.detector.still
+        if still:
+            self._was_still = time
+        until = self._known_until if still else self._looked + _LOOK_EVERY
+        if self._looked <= time < until:
+            return None
+        self._looked, self._known_until = time, time + _LOOK_EVERY
+        if not still:
+            return self._doubt_held(time)
         dwell = self.detector.current()
         if dwell is None or _length(dwell) < _due(_length(self._rest, dwell)):
             return None
@@ -347,8 +339,9 @@ class LiveCapture:
         threshold = self.detector.threshold
         if threshold <= _NOISE_FELL * self._judged_at:
             self._judged_at = threshold
-            doubted += self.book.doubt(
-                {each.start for each in self.detector.judged() if each.reason})
+            moved = {each.start for each in self.detector.judged() if each.reason}
+            doubted += self.book.mark(lambda each: replace(each, doubtful=True) if (
+                each.start in moved and not each.doubtful) else each)
         return Change(last if latest else None, tuple(ended), bool(captured or doubted), doubted)
 
     def _doubt_held(self, time: float) -> Change | None:
@@ -361,13 +354,6 @@ class LiveCapture:
 
         count = self.book.doubt_held(is_over)
         return Change(poses=True, doubted=count) if count else None
-
-
-def _pieces(samples: Floats) -> list[Floats]:
-    times = samples[:, 0]
-    if 0.0 <= times[-1] - times[0] < _PIECE:
-        return [samples]
-    return np.split(samples, np.flatnonzero(np.diff(np.floor(times / _PIECE))) + 1)
 
 
 def _due(length: float) -> float:

@@ -13,35 +13,28 @@ final average replaces this first comparison. A robot can stand for weeks, so ea
 
 """
 
-from __future__ import annotations
-
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
-from itertools import islice
 import math
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
-from .guidance import Guide
+from .guide import Guide
 from .live_capture import LiveCapture, LONG_REST, overlap
 from .settings import CalibratorSettings, capture_settings, columns_of
-from .stream import StreamStatistics
-from ..calibrate import (
-    Calibration, GyroBias, on_topics, Outside, outside, SampleNoise, thermal_stream)
+from .stream import TemperatureHistory
+from ..calibrate import Calibration, GyroBias, on_topics, Outside, outside, SampleNoise
 from ..capture import Dwell
 from ..compare import compared, Drift, rest_errors
-from ..effects import Context, Model, ThermalStream
+from ..effects import Context
 from ..errors import InputError
+from ..findings import Rating
 from ..messages import output_scale
 from ..messages.one_reading import Known, OneReading, Triple
+from ..refine import Refinement
 from ..table import Floats
 from ..units import Units
-
-if TYPE_CHECKING:
-    from ..findings import Rating
-    from ..refine import Refinement
 
 _SHORT_REST = 30.0
 """Shortest remainder of a partly counted rest that counts [s]."""
@@ -77,6 +70,8 @@ class Sensor:
         Number of poses of the last fit; 0 if more poses are asked for.
     auto_fit_waits : bool
         Whether poses wait for an automatic fit.
+    refusal : str
+        Why the last automatic fit was refused; empty if it was not.
     owners : set of str
         Sensors that the stored files name.
     drift : Drift or None
@@ -95,13 +90,13 @@ class Sensor:
         self.refinement: Refinement | None = None
         self.changes = self.fitted_poses = 0
         self.auto_fit_waits = self.unsaved = False
+        self.refusal = ''
         self.owners: set[str] = set()
         self.drift: Drift | None = None
         self.rest: Dwell | None = None
         self._g, self._rotates, self._frame = settings.gravity, settings.rotate, settings.frame
         self._past: Drift | None = None
         self._counted: Dwell | None = None
-        self._stillness = math.nan, math.nan
         self._prepared: tuple[Calibration, OneReading] | None = None
         self._held: tuple[Dwell | None, Calibration | None, Floats | None] = None, None, None
 
@@ -109,14 +104,6 @@ class Sensor:
     def present(self) -> Calibration | None:
         """Return the calibration that a command starts from: the offered one, or that in use."""
         return self.offered or self.calibration
-
-    def stillness(self, statistics: StreamStatistics) -> float:
-        """Return the spread of the last samples relative to the largest of a still sensor."""
-        arrived, stillness = self._stillness
-        if arrived != statistics.arrived:  # the threshold takes longer than all the rest
-            stillness = statistics.spread / self.live.detector.threshold
-            self._stillness = statistics.arrived, stillness
-        return stillness
 
     def offer(self, calibration: Calibration | None) -> None:
         """Publish this calibration on ~/preview only; None: discard the offered one."""
@@ -128,7 +115,14 @@ class Sensor:
         """Use this calibration; the drift monitor restarts unless only the mounting differs."""
         self.offer(None)
         self.unsaved = False
-        if not _only_levelled(self.calibration, calibration):
+        before = self.calibration
+        only_levelled = (
+            before is not None and calibration is not None
+            and before.model.effects == calibration.model.effects
+            and np.array_equal(before.model.vector, calibration.model.vector)
+            and np.array_equal(before.covariance, calibration.covariance)
+            and not np.array_equal(before.model.rotation, calibration.model.rotation))
+        if not only_levelled:
             self._past = None if calibration is None else Drift(calibration)
             self._counted = self.rest
         self.calibration, self.drift = calibration, self._past
@@ -267,18 +261,6 @@ class Sensor:
         except InputError:
             return None  # a quantity is not known yet, or the reading is out of range
 
-    def rest_ago(self, stamp: float) -> float:
-        """Return the time since the last rest, by header stamps [s]; NaN: no rest yet."""
-        if self.rest is None:
-            return math.nan
-        return 0.0 if self.live.still else max(0.0, stamp - self.rest.end)
-
-    @property
-    def residual(self) -> float:
-        """Return |a| - 1 g at the last rest [g]; NaN if not known."""
-        gravity = self.gravity
-        return math.nan if gravity is None else float(np.linalg.norm(gravity)) / self._g - 1.0
-
 
 def gyro_bias_of_rest(rest: Dwell) -> GyroBias | None:
     """Return the bias of the gyro from one rest; None without a plausible angular rate."""
@@ -312,119 +294,8 @@ def _as_noisy_as(part: Dwell, rest: Dwell) -> Dwell:
     return replace(rest, std=part.std, count=part.count / part.samples * rest.samples)
 
 
-def _only_levelled(before: Calibration | None, after: Calibration | None) -> bool:
-    return (before is not None and after is not None
-            and before.model.effects == after.model.effects
-            and np.array_equal(before.model.vector, after.model.vector)
-            and np.array_equal(before.covariance, after.covariance)
-            and not np.array_equal(before.model.rotation, after.model.rotation))
-
-
 def title(calibration: Calibration) -> str:
     """Return a short description of a calibration."""
     return (f'model {calibration.name} of {calibration.date or "unknown date"}, '
             f'{calibration.quality.rms_after_mg:.3f} mg, '
             f'{"levelled" if calibration.is_levelled else "not levelled"}')
-
-
-_APART = 2.0
-"""Shortest time between two temperatures of the history [s]."""
-
-_POINTS = 3600
-"""Largest number of temperatures of the history: two hours, many times a common lag."""
-
-_RECENT = int(2.0 * LONG_REST / _APART)
-"""Number of recent points whose columns are kept; they cover the longest rest."""
-
-
-_Columns = deque[tuple[float, dict[str, float]]]
-"""Columns by time [s]."""
-
-_Followed = tuple[ThermalStream | None, _Columns]
-"""The stream of a model, None if it needs none, and its columns at the recent points."""
-
-
-class TemperatureHistory:
-    """
-    Temperatures of the last hours, and the columns that a model needs from them.
-
-    A calibration that changes while the node runs thus starts with the lag that the sensor has.
-
-    """
-
-    def __init__(self) -> None:
-        self._points: deque[tuple[float, float]] = deque(maxlen=_POINTS)
-        self._followed: dict[tuple[object, ...], _Followed] = {}
-
-    def forget(self) -> None:
-        """Compute no columns any more, except for the models that are asked for from now on."""
-        self._followed.clear()
-
-    def add(self, time: Floats, temperature: Floats) -> None:
-        """
-        Add samples; a temperature that is NaN is ignored.
-
-        The points do not depend on how the samples are divided into calls: of a recording that is
-        played fast, a call may have the samples of many seconds.
-
-        """
-        known = np.isfinite(time + temperature)
-        if not np.any(known):
-            return
-        time, temperature = time[known], temperature[known]
-        if self._points and time[-1] < self._points[-1][0]:  # the stream starts again
-            self._points.clear()
-            for _, columns in self._followed.values():
-                columns.clear()
-        back = np.flatnonzero(np.diff(time) < -_APART)
-        begin = int(back[-1]) + 1 if len(back) else 0
-        while begin < len(time):
-            due = self._points[-1][0] + _APART if self._points else -np.inf
-            later = np.flatnonzero(time[begin:] >= due)
-            end = begin + int(later[0]) + 1 if len(later) else len(time)
-            now = float(time[end - 1])
-            followed = [(stream, columns) for stream, columns in self._followed.values() if stream]
-            for stream, _ in followed:
-                stream.add_all(time[begin:end], temperature[begin:end])
-            if len(later):
-                self._points.append((now, float(temperature[end - 1])))
-                for stream, columns in followed:
-                    columns.append((now, stream.value))
-            begin = end
-
-    def columns_of(self, model: Model) -> Mapping[str, float]:
-        """Return the present columns of a model."""
-        stream, _ = self._follow(model)
-        return {} if stream is None else stream.value
-
-    def stream(self, model: Model) -> ThermalStream | None:
-        """Return the lag and rate for a model after this history; None if it needs none."""
-        return self._replayed(model)[0]
-
-    def during(self, model: Model, start: float, end: float) -> Context:
-        """Return the mean columns that a model needs between two times; empty if not known."""
-        _, columns = self._follow(model)
-        inside = [each for time, each in columns if start - _APART <= time <= end]
-        if not inside:
-            return {}
-        return {key: np.array([np.mean([each[key] for each in inside])]) for key in inside[0]}
-
-    def _follow(self, model: Model) -> _Followed:
-        """Return the stream and columns of a model, which are computed from now on."""
-        key = tuple(model.lags.items()), 'temperature_rate' in model.over
-        if key not in self._followed:
-            self._followed[key] = self._replayed(model)
-        return self._followed[key]
-
-    def _replayed(self, model: Model) -> _Followed:
-        """Return the stream of a model after this history, and the columns at its last points."""
-        stream, columns = thermal_stream(model), _Columns(maxlen=_RECENT)
-        if stream is None:
-            return None, columns
-        old = max(len(self._points) - _RECENT, 0)
-        if old:
-            stream.add_all(*np.array(list(islice(self._points, old))).T)
-        for time, temperature in islice(self._points, old, None):
-            stream.add(time, temperature)
-            columns.append((time, stream.value))
-        return stream, columns

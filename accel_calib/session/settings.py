@@ -15,6 +15,7 @@ Types are checked here and not by rclpy. rclpy refuses ``5`` for ``5.0`` and ``m
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, Field, field, fields, MISSING, replace
 import math
 from pathlib import Path
@@ -73,22 +74,6 @@ _ACCEPTED: dict[type, tuple[type, ...]] = {
     int: (int,), float: (int, float), str: (int, float, str)}
 
 
-def _converted(given: Field[Any], value: Any) -> Any:
-    """Return a value converted to the type of the default, or None if that is not possible."""
-    default = default_of(given)
-    kind = type(default)
-    if kind is list:
-        try:  # rclpy passes arrays and bytes
-            items = [type(default[0])(item) for item in value]
-        except (TypeError, ValueError):
-            return None
-        has_length = not isinstance(default[0], float) or len(items) == len(default)
-        return items if has_length else None
-    if kind is bool or isinstance(value, bool):
-        return value if type(value) is kind else None
-    return kind(value) if isinstance(value, _ACCEPTED[kind]) else None
-
-
 def expected(given: Field[Any]) -> str:
     """Return a text about the values that a parameter accepts."""
     if given.metadata['choices']:
@@ -105,13 +90,23 @@ def expected(given: Field[Any]) -> str:
 
 def checked(given: Field[Any], value: Any) -> Any:
     """Return a value converted to the type of a parameter; InputError if it is not accepted."""
-    converted, limits = _converted(given, value), given.metadata['limits']
-    choices = given.metadata['choices']
-    if (converted is None or (choices and converted not in choices)
-            or (limits is not None and not limits[0] <= converted <= limits[1])):
+    default, found = default_of(given), None
+    choices, limits = given.metadata['choices'], given.metadata['limits']
+    kind = type(default)
+    if kind is list:
+        with suppress(TypeError, ValueError):  # rclpy passes arrays and bytes
+            items = [type(default[0])(item) for item in value]
+            if not isinstance(default[0], float) or len(items) == len(default):
+                found = items
+    elif bool in (kind, type(value)):
+        found = value if type(value) is kind else None
+    elif isinstance(value, _ACCEPTED[kind]):
+        found = kind(value)
+    if (found is None or (choices and found not in choices)
+            or (limits is not None and not limits[0] <= found <= limits[1])):
         raise InputError(f'parameter {given.name} is {value!r}, expected {expected(given)}',
                          'correct the value')
-    return converted
+    return found
 
 
 def changed(settings: Settings, values: Mapping[str, Any]) -> Settings:

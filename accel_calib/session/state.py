@@ -15,16 +15,18 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, MISSING
 from enum import IntEnum
 import math
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
+from .core import State
+from .faults import missing_context, stream_faults, thermometer_words
 from .guidance import next_action
 from .sensor import title
 from .settings import context_topics
-from .stream import missing_context, SILENT, stream_faults, thermometer_words
+from .stream import SILENT
 from ..calibrate import USES_LIMIT
-from ..compare import Drift, status
+from ..compare import status
 from ..errors import InputError
 from ..finding import has
 from ..messages.one_reading import Triple
@@ -32,9 +34,6 @@ from ..pipeline import is_partial
 from ..table import column_of
 from ..text import counted
 from ..units import MG
-
-if TYPE_CHECKING:
-    from .session import Session
 
 
 def _figure(name: str, write: Callable[[Any], str], read: Callable[[str], Any],
@@ -138,35 +137,31 @@ Newest = tuple[tuple[float, ...], float, float]
 _NOT_KNOWN: Newest = (), math.nan, math.nan
 
 
-def progress(session: Session, reading: Triple | None = None) -> Progress:
+def progress(session: State, reading: Triple | None = None) -> Progress:
     """Return the progress; `reading` is the newest one, by default the last that was pushed."""
     sensor, statistics = session.sensor, session.statistics
     plan, silent = sensor.guide.plan, statistics.age > SILENT
     up, length, corrected = _NOT_KNOWN if silent else _newest(session, reading)
-    action = next_action(session)
+    action, rating = next_action(session), sensor.rating
+    # NaN if it is not known, or not the noise alone.
+    noisy = rating is not None and has(rating.findings, 'beyond_noise')
+    accuracy = math.nan if plan is None or noisy else plan.asked.error * plan.noise_g
     direction = None if plan is None or action.kind != 'poses' else plan.asked.direction
     return Progress(
         still=session.still and not silent,
-        stillness=math.nan if silent else sensor.stillness(statistics),
+        stillness=math.nan if silent else (
+            statistics.spread / sensor.live.detector.threshold),
         dwell=statistics.stamp - session.still_since if session.still else 0.0,
         min_dwell=session.settings.min_dwell, poses=sensor.guide.poses,
         total=0 if plan is None else plan.asked.total,
         coverage=0.0 if plan is None else plan.coverage,
-        accuracy=_accuracy(session), step=action.kind, advice=action.words,
+        accuracy=accuracy, step=action.kind, advice=action.words,
         command=action.command,
         direction=() if direction is None else tuple(direction.tolist()),
         up=up, length=length, corrected=corrected, temperature=session.around.temperature)
 
 
-def _accuracy(session: Session) -> float:
-    """Return the expected error of |a| [g]; NaN if it is not known, or not the noise alone."""
-    plan, rating = session.sensor.guide.plan, session.sensor.rating
-    if plan is None or (rating is not None and has(rating.findings, 'beyond_noise')):
-        return math.nan
-    return plan.asked.error * plan.noise_g
-
-
-def _newest(session: Session, reading: Triple | None) -> Newest:
+def _newest(session: State, reading: Triple | None) -> Newest:
     """Describe the newest reading; a native one has a direction only if its zero is known."""
     sensor, newest = session.sensor, session.statistics.newest
     if reading is None:
@@ -206,7 +201,7 @@ class Check:
     words: str
 
 
-def checks(session: Session) -> list[Check]:
+def checks(session: State) -> list[Check]:
     """Return the results of all checks, one for each concern."""
     faults = {**stream_faults(session), **missing_context(session)}
     drift, store, path = session.sensor.drift, session.files.store, session.files.path
@@ -221,32 +216,29 @@ def checks(session: Session) -> list[Check]:
               'restart the node with another calibration_file')]
 
 
-def worst(session: Session, found: Sequence[Check]) -> Check:
+def worst(session: State, found: Sequence[Check]) -> Check:
     """Return the most severe of the checks, or the state of the session if all are OK."""
     severest = max(found, key=lambda check: check.level)
     words = words_of_state(session) if severest.level == Level.OK else severest.words
     return Check('state', severest.level, words)
 
 
-def words_of_state(session: Session) -> str:
+def words_of_state(session: State) -> str:
     """Return whether messages are corrected, and why not."""
     calibration = session.sensor.calibration
-    if session.files.problem:
-        return 'another node uses the files, nothing is published'
-    if not session.enabled:
-        return 'correction switched off, raw messages are published'
-    if session.sensor.offered is not None:
-        return 'a new calibration waits for ~/save or ~/undo'
-    if calibration is not None:
-        return ('correcting, with a calibration of a part of the orientations'
-                if is_partial(calibration) else 'correcting')
-    if not session.statistics.messages:
-        return 'waiting for the first message'
-    return ('no calibration, raw messages are published' if session.settings.passthrough
-            else 'no calibration, nothing is published')
+    return next(words for holds, words in (
+        (session.files.problem, 'another node uses the files, nothing is published'),
+        (not session.enabled, 'correction switched off, raw messages are published'),
+        (session.sensor.offered is not None, 'a new calibration waits for ~/save or ~/undo'),
+        (calibration is not None and is_partial(calibration),
+         'correcting, with a calibration of a part of the orientations'),
+        (calibration is not None, 'correcting'),
+        (not session.statistics.messages, 'waiting for the first message'),
+        (session.settings.passthrough, 'no calibration, raw messages are published'),
+        (True, 'no calibration, nothing is published')) if holds)
 
 
-def _calibration(session: Session) -> Check:
+def _calibration(session: State) -> Check:
     sensor = session.sensor
     if session.problem:
         return Check('calibration', Level.ERROR, session.problem)
@@ -265,13 +257,14 @@ def _calibration(session: Session) -> Check:
     return Check('calibration', Level.OK, title(sensor.calibration))
 
 
-def _advice(session: Session) -> str:
+def _advice(session: State) -> str:
     return next_action(session).words or 'turn the sensor'
 
 
-def figures(session: Session) -> Iterator[tuple[str, str]]:
+def figures(session: State) -> Iterator[tuple[str, str]]:
     """Yield names and values for the diagnostics."""
-    sensor, counts = session.sensor, session.statistics
+    sensor, counts, warm = session.sensor, session.statistics, session.around.temperature
+    gravity, rest, drift, live = sensor.gravity, sensor.rest, sensor.drift, sensor.live
     yield 'state', words_of_state(session)
     yield 'sensor', session.name
     yield 'calibration', 'none' if sensor.calibration is None else title(sensor.calibration)
@@ -281,11 +274,21 @@ def figures(session: Session) -> Iterator[tuple[str, str]]:
     yield 'readings not finite', str(counts.dropped['not_finite'])
     yield 'messages of another sensor', str(counts.dropped['foreign'])
     yield 'corrected messages not plausible', str(counts.dropped['implausible'])
-    yield 'residual |a| - 1 g at last rest [mg]', _number(sensor.residual * MG)
-    yield from _drift_figures(sensor.drift)
-    yield 'since last rest [s]', _number(sensor.rest_ago(counts.stamp))
+    yield 'residual |a| - 1 g at last rest [mg]', _number(math.nan if gravity is None else (
+        float(np.linalg.norm(gravity)) / session.settings.gravity - 1.0) * MG)
+    if drift is not None:
+        yield 'drift since calibration [mg]', _number(drift.error * MG)
+        yield 'stated uncertainty at last rest [mg]', _number(drift.stated * MG)
+        yield 'rests since calibration', str(drift.count)
+        yield 'rests since it changed', str(drift.lasted)
+        if drift.change is not None:
+            yield 'changed by [mg]', _number(drift.change.error * MG)
+        if drift.temperatures:
+            low, high = drift.temperatures
+            yield 'temperature when calibrated [°C]', f'{low:.1f} to {high:.1f}'
+    yield 'since last rest [s]', _number(math.nan if rest is None else (
+        0.0 if live.still else max(0.0, counts.stamp - rest.end)))
     yield from _pose_figures(session)
-    warm = session.around.temperature
     yield 'temperature [°C]', (_number(warm) if math.isfinite(warm)
                                else f'not known: {thermometer_words(session)}')
     for column in context_topics(session.settings):
@@ -293,48 +296,28 @@ def figures(session: Session) -> Iterator[tuple[str, str]]:
         if column != 'temperature':
             yield f'{column} [{unit}]' if unit else column, _number(
                 session.around.values.get(column, math.nan))
-    yield 'still below [m/s² or native]', f'{sensor.live.detector.threshold:.4g}'
-    yield from _sensor_figures(session)
+    yield 'still below [m/s² or native]', f'{live.detector.threshold:.4g}'
+    yield 'mounting', session.mounting_words(sensor.calibration) or 'not known'
+    gyro, noise = sensor.gyro, sensor.noise
+    if gyro is not None:
+        yield 'gyro bias [rad/s]', _vector(gyro.at(warm))
+        yield 'gyro bias, standard deviation [rad/s]', _vector(gyro.sd)
+    if noise is not None:
+        yield 'noise of acceleration [m/s² or native]', _vector(noise.force)
+        yield 'noise of angular velocity [rad/s]', _vector(noise.rate)
 
 
-def _drift_figures(drift: Drift | None) -> Iterator[tuple[str, str]]:
-    if drift is None:
-        return
-    yield 'drift since calibration [mg]', _number(drift.error * MG)
-    yield 'stated uncertainty at last rest [mg]', _number(drift.stated * MG)
-    yield 'rests since calibration', str(drift.count)
-    yield 'rests since it changed', str(drift.lasted)
-    if drift.change is not None:
-        yield 'changed by [mg]', _number(drift.change.error * MG)
-    if drift.temperatures:
-        low, high = drift.temperatures
-        yield 'temperature when calibrated [°C]', f'{low:.1f} to {high:.1f}'
-
-
-def _pose_figures(session: Session) -> Iterator[tuple[str, str]]:
+def _pose_figures(session: State) -> Iterator[tuple[str, str]]:
     live = session.sensor.live
     poses, breaks = live.book.poses(), live.detector.interruptions
-    doubtful = int(np.sum(poses['doubtful'])) if 'doubtful' in poses else 0
     yield 'poses captured', str(len(poses))
-    yield 'poses doubtful', str(doubtful)
+    yield 'poses doubtful', str(int(np.sum(poses['doubtful'])) if 'doubtful' in poses else 0)
     yield 'next', _advice(session)
     yield 'interruptions of the clock', str(len(breaks))
     yield 'last interruption', (
         f'{breaks[-1].kind}, {breaks[-1].seconds:.2f} s' if breaks else 'none')
     yield 'zeros or frozen readings [s]', (
         f'{sum(each.end - each.start for each in live.detector.missing):.1f}')
-
-
-def _sensor_figures(session: Session) -> Iterator[tuple[str, str]]:
-    calibration, gyro, noise = (
-        session.sensor.calibration, session.sensor.gyro, session.sensor.noise)
-    yield 'mounting', session.mounting_words(calibration) or 'not known'
-    if gyro is not None:
-        yield 'gyro bias [rad/s]', _vector(gyro.at(session.around.temperature))
-        yield 'gyro bias, standard deviation [rad/s]', _vector(gyro.sd)
-    if noise is not None:
-        yield 'noise of acceleration [m/s² or native]', _vector(noise.force)
-        yield 'noise of angular velocity [rad/s]', _vector(noise.rate)
 
 
 def _vector(values: Iterable[float]) -> str:

@@ -15,7 +15,7 @@ It is held until it is released or the process ends.
 
 """
 
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 import errno
 import fcntl
@@ -311,11 +311,10 @@ def writing_advice(error: OSError) -> str:
     """Return what to do about a file that cannot be written."""
     if is_full(error):
         return FREE_SPACE
-    if error.errno in _OTHER_PLACE:
-        return 'restart the node with another calibration_file'
+    another = 'restart the node with another calibration_file'
     if error.errno == errno.EROFS:
         return 'mount the file system for writing, or restart the node with calibration_file'
-    return 'correct the permissions, or restart the node with another calibration_file'
+    return another if error.errno in _OTHER_PLACE else f'correct the permissions, or {another}'
 
 
 _TO_LOCK = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
@@ -326,41 +325,37 @@ class StoreInUseError(AccelCalibError):
     """Another node uses the files."""
 
 
-class Lock:
-    """A lock on the files of a store; StoreInUseError if another process has locked them."""
+def lock(store: Store) -> ExitStack:
+    """
+    Lock the files of a store until the result is closed.
 
-    def __init__(self, store: Store) -> None:
-        self._handle = -1
-        path = store.calibration.with_name(f'{store.calibration.stem}.lock')
+    StoreInUseError if another process has locked them.
+
+    """
+    path = store.calibration.with_name(f'{store.calibration.stem}.lock')
+    with ExitStack() as held:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._handle = os.open(path, _TO_LOCK, 0o644)
+            handle = os.open(path, _TO_LOCK, 0o644)
         except OSError:
-            return  # the folder cannot be written, so there is nothing to protect
-        if not stat.S_ISREG(os.fstat(self._handle).st_mode):
-            self.release()
-            return
+            return held  # the folder cannot be written, so there is nothing to protect
+        held.callback(os.close, handle)
+        if not stat.S_ISREG(os.fstat(handle).st_mode):
+            return held
         try:
-            fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            holder = os.read(self._handle, 32).decode(errors='replace').strip()
-            self.release()
+            holder = os.read(handle, 32).decode(errors='replace').strip()
             raise StoreInUseError(
                 f'{store.calibration} is used by the node with process id {holder or "unknown"}',
                 'stop that node, or restart this node with another calibration_file or sensor'
             ) from None
         except OSError:
-            self.release()  # this file system has no locks
-            return
+            return held  # this file system has no locks
         with suppress(OSError):  # without space on the disk, the lock does not name its holder
-            os.ftruncate(self._handle, 0)
-            os.pwrite(self._handle, f'{os.getpid()}\n'.encode(), 0)
-
-    def release(self) -> None:
-        """Release the lock."""
-        if self._handle >= 0:
-            os.close(self._handle)
-            self._handle = -1
+            os.ftruncate(handle, 0)
+            os.pwrite(handle, f'{os.getpid()}\n'.encode(), 0)
+        return held.pop_all()
 
 
 class SensorFiles:
@@ -368,7 +363,7 @@ class SensorFiles:
 
     def __init__(self, settings: CalibratorSettings, topic: str) -> None:
         self._settings, self._topic = settings, topic
-        self._lock: Lock | None = None
+        self._lock: ExitStack | None = None
         self.store: Store | None = None
         self.problem = ''
 
@@ -396,7 +391,7 @@ class SensorFiles:
         if self.store is None or self.locked:
             return None
         try:
-            self._lock, self.problem = Lock(self.store), ''
+            self._lock, self.problem = lock(self.store), ''
         except StoreInUseError as error:
             self.problem = str(error)
             return None
@@ -414,7 +409,7 @@ class SensorFiles:
     def release(self) -> None:
         """Unlock the files."""
         if self._lock is not None:
-            self._lock.release()
+            self._lock.close()
         self._lock = None
 
 

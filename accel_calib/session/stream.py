@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The messages of a session: statistics, faults, and log lines.
+The messages of a session: their statistics, and what is known beside them.
 
 Rates and ages use the arrival times by a steady clock, so that they are also right for a bag that
 is played at another speed. They cover the last `_SPAN` seconds.
@@ -13,21 +13,17 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
+from itertools import islice
 import math
-from typing import NamedTuple, TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
 
-from .settings import context_topics
-from ..calibrate import USES_LIMIT
-from ..effects import Model
-from ..errors import AccelCalibError
+from .live_capture import LONG_REST
+from ..calibrate import thermal_stream
+from ..effects import Context, Model, ThermalStream
 from ..table import Floats, is_quantity
-from ..text import counted
 from ..units import Units
-
-if TYPE_CHECKING:
-    from .session import Session
 
 _SPAN = 5.0
 """Time over which rate and faults are counted [s]."""
@@ -169,17 +165,16 @@ class StreamStatistics:
         messages, zero, repeated, backward = np.sum([each[4:] for each in self._batches], axis=0)
         if messages < _FEWEST:
             return ''
-        if zero > _FEW * messages:
-            return ('the stamps are zero, expected the time of each reading: set header.stamp in '
-                    'the driver')
-        if repeated > _FEW * messages:
-            return (f'the stamps are constant ({self.stamp:.3f} s), expected the time of each '
-                    'reading: set header.stamp in the driver')
-        if backward > 1:
-            return (f'the stamps are out of order in {backward} of the last {messages} '
-                    'messages, expected increasing stamps: check that only one driver publishes')
-        return ''
+        driver = 'expected the time of each reading: set header.stamp in the driver'
+        return next((f'the stamps are {words}' for holds, words in (
+            (zero > _FEW * messages, f'zero, {driver}'),
+            (repeated > _FEW * messages, f'constant ({self.stamp:.3f} s), {driver}'),
+            (backward > 1, f'out of order in {backward} of the last {messages} messages, expected '
+             'increasing stamps: check that only one driver publishes')) if holds), '')
 
+
+AGAIN = 10.0
+"""Shortest time between two equal log lines about single messages or a silent stream [s]."""
 
 HELD = 30.0
 """Time for which the last value of a quantity holds [s]."""
@@ -223,227 +218,104 @@ class Around:
         return self._clock() - self._came.get(column, self._begun) > limit
 
 
-def missing_context(session: Session) -> dict[str, str]:
-    """Return by column of the context why it is missing, and what follows."""
-    calibration = session.sensor.calibration
-    model = Model({}) if calibration is None else calibration.model
-    wanted = [*context_topics(session.settings), *(
-        key for key in model.needs if is_quantity(key) or key == 'supply_voltage')]
-    return {column: _missing_words(session, model, column) for column in dict.fromkeys(wanted)
-            if session.around.is_missing(column)}
+_APART = 2.0
+"""Shortest time between two temperatures of the history [s]."""
+
+_POINTS = 3600
+"""Largest number of temperatures of the history: two hours, many times a common lag."""
+
+_RECENT = int(2.0 * LONG_REST / _APART)
+"""Number of recent points whose columns are kept; they cover the longest rest."""
 
 
-def _missing_words(session: Session, model: Model, column: str) -> str:
-    why = session.missing.get(column) or (
-        'the samples do not have it' if session.publishers is None else
-        f"start the node with context:=['{column}:=TOPIC'], and its topic")
-    names = [name for name in model.effects if column in Model({name: model.values[name]}).needs]
-    if column in session.around.values:
-        follows = '; the last value holds'
-    elif names and is_quantity(column):
-        follows = f'; {" and ".join(names)} {"is" if len(names) == 1 else "are"} left out'
-    else:
-        follows = ''
-    return f'no {column} arrives: {why}{follows}'
+_Columns = deque[tuple[float, dict[str, float]]]
+"""Columns by time [s]."""
+
+_Followed = tuple[ThermalStream | None, _Columns]
+"""The stream of a model, None if it needs none, and its columns at the recent points."""
 
 
-def thermometer_words(session: Session) -> str:
-    """Return how the node would get a temperature; empty if it has one."""
-    if math.isfinite(session.around.temperature):
-        return ''
-    if 'temperature' in session.missing:
-        return session.missing['temperature']
-    topics = ' or '.join(session.thermometers)
-    return (f'restart the node with temperature:={topics}' if topics else
-            'publish the temperature of the sensor on the topic temperature')
+class TemperatureHistory:
+    """
+    Temperatures of the last hours, and the columns that a model needs from them.
 
+    A calibration that changes while the node runs thus starts with the lag that the sensor has.
 
-def slow_turn(session: Session) -> str:
-    """Return that the sensor turns slowly, and what to do; empty if it is still or shaken."""
-    statistics, live = session.statistics, session.sensor.live
-    if live.still or session.units.is_native or statistics.age > SILENT:
-        return ''
-    rate = statistics.turn_rate(live.detector.threshold, session.units.per_g)
-    return f'turning slowly, {rate:.1f} °/s: rest it on something' if rate else ''
+    """
 
+    def __init__(self) -> None:
+        self._points: deque[tuple[float, float]] = deque(maxlen=_POINTS)
+        self._followed: dict[tuple[object, ...], _Followed] = {}
 
-_DROPPED_SHOWN_FOR = 60.0
-"""Duration of the warning after a dropped message [s]."""
+    def forget(self) -> None:
+        """Compute no columns any more, except for the models that are asked for from now on."""
+        self._followed.clear()
 
-_DROPPED = {
-    'not_finite': ('message', 'with NaN, infinite or absurd readings: check the driver'),
-    'foreign': ('message', 'of another sensor: use a separate topic for each sensor'),
-    'implausible': ('corrected message', 'with implausible values: check the calibration')}
-"""Kinds of dropped messages: what was dropped, and what to do."""
+    def add(self, time: Floats, temperature: Floats) -> None:
+        """
+        Add samples; a temperature that is NaN is ignored.
 
-_LIKELY_G = (0.2, 5.0)
-"""Range of |a| [g]; outside of it the unit is probably wrong."""
+        The points do not depend on how the samples are divided into calls: of a recording that is
+        played fast, a call may have the samples of many seconds.
 
-_WITHOUT_GRAVITY_G = 0.07
-"""Mean |a| below which no unit makes the readings those of a sensor that measures gravity [g]."""
+        """
+        known = np.isfinite(time + temperature)
+        if not np.any(known):
+            return
+        time, temperature = time[known], temperature[known]
+        if self._points and time[-1] < self._points[-1][0]:  # the stream starts again
+            self._points.clear()
+            for _, columns in self._followed.values():
+                columns.clear()
+        back = np.flatnonzero(np.diff(time) < -_APART)
+        begin = int(back[-1]) + 1 if len(back) else 0
+        while begin < len(time):
+            due = self._points[-1][0] + _APART if self._points else -np.inf
+            later = np.flatnonzero(time[begin:] >= due)
+            end = begin + int(later[0]) + 1 if len(later) else len(time)
+            now = float(time[end - 1])
+            followed = [(stream, columns) for stream, columns in self._followed.values() if stream]
+            for stream, _ in followed:
+                stream.add_all(time[begin:end], temperature[begin:end])
+            if len(later):
+                self._points.append((now, float(temperature[end - 1])))
+                for stream, columns in followed:
+                    columns.append((now, stream.value))
+            begin = end
 
-_UNITS = (('g', 0.8, 1.2), ('m/s2', 8.0, 12.0))
-"""Units with the lowest and highest |reading| of a resting sensor in this unit."""
+    def columns_of(self, model: Model) -> Mapping[str, float]:
+        """Return the present columns of a model."""
+        stream, _ = self._follow(model)
+        return {} if stream is None else stream.value
 
+    def stream(self, model: Model) -> ThermalStream | None:
+        """Return the lag and rate for a model after this history; None if it needs none."""
+        return self._replayed(model)[0]
 
-def stream_faults(session: Session) -> dict[str, str]:
-    """Return by kind what is wrong with the messages, and what to do."""
-    statistics = session.statistics
-    faults = {
-        'publishers': _publishers(session), 'mismatches': '; '.join(session.mismatches),
-        'silence' if session.publishers else 'no_publisher': _silence(session),
-        'stamps': statistics.stamp_fault}
-    if statistics.dropped_ago < _DROPPED_SHOWN_FOR:
-        faults |= {kind: f'dropped {counted(statistics.dropped[kind], what)} {why}'
-                   for kind, (what, why) in _DROPPED.items() if statistics.dropped[kind]}
-    faults['unit'] = _wrong_unit(statistics, session.units)
-    return {kind: words for kind, words in faults.items() if words}
+    def during(self, model: Model, start: float, end: float) -> Context:
+        """Return the mean columns that a model needs between two times; empty if not known."""
+        _, columns = self._follow(model)
+        inside = [each for time, each in columns if start - _APART <= time <= end]
+        if not inside:
+            return {}
+        return {key: np.array([np.mean([each[key] for each in inside])]) for key in inside[0]}
 
+    def _follow(self, model: Model) -> _Followed:
+        """Return the stream and columns of a model, which are computed from now on."""
+        key = tuple(model.lags.items()), 'temperature_rate' in model.over
+        if key not in self._followed:
+            self._followed[key] = self._replayed(model)
+        return self._followed[key]
 
-def _publishers(session: Session) -> str:
-    names = session.publishers
-    if names is None or len(names) < 2:
-        return ''
-    count = 'two' if len(names) == 2 else str(len(names))
-    return (f'{count} publishers on the topic {session.topic}: {", ".join(names)}; expected one '
-            'sensor: stop the others, or give each sensor its own topic; a driver that was killed '
-            'disappears after about 20 s')
-
-
-def _silence(session: Session) -> str:
-    topic, publishers = session.topic, session.publishers
-    if session.mismatches or (
-            min(session.statistics.age, session.statistics.dropped_ago) <= SILENT):
-        return ''
-    if publishers is None:
-        return (f'{topic} sends no samples: check the board, its cable and its program; the poses '
-                'are kept')
-    if publishers:
-        return (f'no Imu messages on {topic}, although {publishers[0]} publishes there: check '
-                'the driver')
-    there = f', such as {" or ".join(session.imus)}' if session.imus else ''
-    return (f'no Imu messages on {topic}, and no publisher: start the driver, or remap '
-            f'imu/data_raw to its topic{there}')
-
-
-def _wrong_unit(statistics: StreamStatistics, units: Units) -> str:
-    length, size = statistics.length_g(units), statistics.length
-    if not (length < _LIKELY_G[0] or length > _LIKELY_G[1]):
-        return ''
-    if length < _WITHOUT_GRAVITY_G and not units.is_native:
-        return (f'|a| is {length:.3g} g, expected about 1 g at rest: this is linear acceleration, '
-                'gravity removed: let the driver publish what the accelerometer reads')
-    likely = next((name for name, low, high in _UNITS if low < size < high), 'native')
-    return (f'|a| is {length:.3g} g, expected about 1 g at rest: start the node with '
-            f'units:={likely}')
-
-
-AGAIN = 10.0
-"""Shortest time between two equal log lines about single messages or a silent stream [s]."""
-
-_FAULT_AGAIN = 60.0
-"""Shortest time between two equal log lines about another fault of the stream [s]."""
-
-
-class Reports:
-    """The log lines about the messages of a session, which is the only argument."""
-
-    def __init__(self, session: Session) -> None:
-        self._session = session
-        self._faults: tuple[object, ...] | None = None
-        self._faults_at = -math.inf
-        self._left: frozenset[str] = frozenset()
-        self._missing: frozenset[str] = frozenset()
-
-    def tick(self) -> None:
-        """Report what is wrong with the messages now; to be called about once per second."""
-        self._faults_of_stream()
-        self._limits()
-        session, turn = self._session, slow_turn(self._session)
-        if turn and session.settings.auto_capture:
-            session.log('info', f'no pose yet: {turn}', 'slow_turn', AGAIN)
-        if (session.thermometers and session.statistics.messages
-                and math.isnan(session.around.temperature)
-                and 'temperature' not in context_topics(session.settings)):
-            session.log('warning', f'no temperature arrives; {thermometer_words(session)}',
-                        'thermometers', 10.0 * _FAULT_AGAIN)
-        self._context()
-
-    def foreign(self, frame_id: str) -> None:
-        """Count a message of another sensor."""
-        self._session.statistics.drop('foreign')
-        self._session.log('error', f'an Imu message has frame_id {frame_id!r}, expected '
-                          f'{self._session.frame_id!r}; it is dropped: use a separate topic for '
-                          'each sensor', 'foreign', AGAIN)
-
-    def absurd(self, readings: Floats, largest: float) -> None:
-        """Count readings that are not of a sensor."""
-        reading = tuple(readings[0].tolist())
-        self._session.statistics.drop('not_finite', len(readings))
-        self._session.log('warning', f'an Imu message has the linear_acceleration {reading}, '
-                          f'expected three finite numbers up to {largest:.3g}; it is dropped: '
-                          'check the driver', 'absurd', AGAIN)
-
-    def unreadable(self, size: int) -> None:
-        """Count an unreadable message of this size [bytes]."""
-        self._session.statistics.drop('not_finite')
-        self._session.log('warning', f'an Imu message of {size} bytes cannot be read; it is '
-                          'dropped: check the driver', 'unreadable', AGAIN)
-
-    def uncorrected(self, error: AccelCalibError) -> None:
-        """Count a corrected message that is not published because of an error."""
-        self._session.statistics.drop('implausible')
-        self._session.log('error', f'messages are not corrected: {error}', 'uncorrected', AGAIN)
-
-    def jump(self, seconds: float, since: float) -> None:
-        """Log a jump of the stamps, unless no messages arrived for as long [s]."""
-        if abs(seconds - since) > SILENT:
-            where = 'back' if seconds < 0.0 else 'ahead'
-            self._session.log('warning', f'the stamps jumped {where} by {abs(seconds):.1f} s; the '
-                              'rest before it has ended, and the poses are kept: unless a '
-                              'recording is played, check the clock of the driver',
-                              f'jump {where}', _FAULT_AGAIN)
-
-    def _limits(self) -> None:
-        left = self._session.sensor.limits_left(self._session.context)
-        for key, each in left.items():
-            if key not in self._left:
-                self._session.log(
-                    'warning', f'{each.name} has left the range of the calibration, '
-                    f'{each.range_words(each.low, each.high)}: it is '
-                    f'{each.range_words(each.least, each.most)}, and {USES_LIMIT}',
-                    f'limits of {key}', _FAULT_AGAIN)
-        self._left = frozenset(left)
-
-    def _context(self) -> None:
-        """Log when a column of the context is missing or back, and that poses lack it."""
-        session, missing = self._session, missing_context(self._session)
-        for column, words in missing.items():
-            if column not in self._missing:
-                session.log('warning', words, f'missing {column}', _FAULT_AGAIN)
-        for column in sorted(self._missing - missing.keys()):
-            session.log('info', f'{column} arrives')
-        self._missing = frozenset(missing)
-        for column in context_topics(session.settings):
-            lack, have = session.sensor.live.book.lacking(column)
-            if lack and have:
-                session.log('warning', f'{lack} of {counted(lack + have, "pose")} have no '
-                            f'{column}, so that ~/refine cannot use it: call ~/reset, and take '
-                            'the poses again', f'poses without {column}', 10.0 * _FAULT_AGAIN)
-
-    def _faults_of_stream(self) -> None:
-        """Log a fault of the stream when it appears, and again while it lasts."""
-        session, statistics = self._session, self._session.statistics
-        faults = stream_faults(session)
-        limit = AGAIN if statistics.age > SILENT else _FAULT_AGAIN
-        again = session.clock() - self._faults_at >= limit
-        kinds = (frozenset(faults), session.mismatches)
-        if faults and (again or kinds != self._faults):
-            waiting, words = not statistics.messages and not session.mismatches, '; '.join(
-                faults.values())
-            session.log('info' if waiting else 'warning',
-                        f'waiting: {words}' if waiting else words)
-            self._faults, self._faults_at = kinds, session.clock()
-        elif not faults and self._faults is not None:
-            session.log('info', f'messages arrive as expected, {statistics.rate:.1f} Hz')
-            self._faults = None
+    def _replayed(self, model: Model) -> _Followed:
+        """Return the stream of a model after this history, and the columns at its last points."""
+        stream, columns = thermal_stream(model), _Columns(maxlen=_RECENT)
+        if stream is None:
+            return None, columns
+        old = max(len(self._points) - _RECENT, 0)
+        if old:
+            stream.add_all(*np.array(list(islice(self._points, old))).T)
+        for time, temperature in islice(self._points, old, None):
+            stream.add(time, temperature)
+            columns.append((time, stream.value))
+        return stream, columns

@@ -46,7 +46,7 @@ import sys
 from threading import Lock, Thread
 from time import monotonic
 from traceback import format_exc
-from typing import Any, BinaryIO, cast, Literal, TYPE_CHECKING, TypeVar
+from typing import Any, BinaryIO, cast, Literal, Protocol, TypeVar
 
 from .store import writing_advice
 from ..calibrate import NextPose
@@ -54,9 +54,6 @@ from ..effects import know_code, KNOWN_CODE
 from ..errors import AccelCalibError, InputError
 from ..one_thread import ONE_THREAD
 from ..table import Floats
-
-if TYPE_CHECKING:
-    from .session import Session
 
 Found = TypeVar('Found')
 
@@ -362,6 +359,16 @@ CallSoon = Callable[[Callable[[], None]], None]
 """Function that lets the thread of the session call a function, one after the other."""
 
 
+class Reporting(Protocol):
+    """What a worker needs of a session."""
+
+    events: deque[Event]
+
+    def log(self, severity: Severity, words: str) -> None: ...
+
+    def close(self) -> None: ...
+
+
 class Worker:
     """
     The threads for the tasks of a session.
@@ -373,7 +380,7 @@ class Worker:
 
     """
 
-    def __init__(self, session: Session, call_soon: CallSoon, show: Callable[[Any], object],
+    def __init__(self, session: Reporting, call_soon: CallSoon, show: Callable[[Any], object],
                  flush: Callable[[], object] = lambda: None) -> None:
         self._session, self._call_soon, self._show = session, call_soon, show
         self._flush = flush

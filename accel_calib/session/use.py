@@ -1,0 +1,170 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+The calibration in use and the poses of a session: what follows when they change.
+
+Ratings, plans and files take time, so they are tasks, which are added to the events.
+
+"""
+
+import json
+from typing import Any, cast
+
+import numpy as np
+
+from .core import State
+from .guidance import next_action
+from .guide import NOT_KNOWN, plan_for
+from .sensor import Sensor, title
+from .store import Store, tidied, unusable, writing_advice
+from .stream import AGAIN
+from .worker import Compute, Files, Mounting, nothing, Parse, Result, Severity, ShowPoses, Task
+from ..calibrate import Calibration, in_frame, mounting_figures, on_topics, outlook
+from ..findings import calibration_json, rate as rating_of, Rating, rating_json, refinement_json
+from ..refine import Refinement
+from ..table import Poses
+from ..text import counted, plain
+
+_SEVERITY: dict[str, Severity] = {'GOOD': 'info', 'USABLE': 'warning', 'BAD': 'error'}
+"""Severity of the log line about a finding, by its level."""
+
+
+def adopt(session: State, calibration: Calibration | None, refinement: Refinement | None = None,
+          rating: Rating | None = None) -> None:
+    """Correct with this calibration, and with the given mounting if there is one."""
+    session.problem = ''
+    if calibration is None:
+        session.sensor.adopt(None)
+        rate(session, None)
+        return
+    levelled = calibration.is_levelled
+    if levelled and calibration.frame != session.frame:
+        session.log('warning', f'the stored mounting is for the frame {calibration.frame}, but '
+                    f'frame is {session.settings.frame}: it is turned, and a measured heading is '
+                    'kept')
+        calibration = in_frame(calibration, session.frame)
+    stored, calibration = calibration, session.with_given(calibration)
+    if levelled and not np.allclose(stored.rotation[:, 2], calibration.rotation[:, 2]):
+        session.log('warning', 'the stored mounting differs from the given one by more than 10° '
+                    'of tilt: the given mounting is used; call ~/set_level with the robot level')
+    session.sensor.adopt(calibration)
+    rate(session, refinement, rating)
+    turned = calibration.is_levelled and session.settings.rotate
+    session.log('info', f'correcting with {title(calibration)}; messages are in the frame '
+                f'{session.settings.frame if turned else "of the sensor"}')
+    for finding in calibration.noted:
+        session.log(_SEVERITY[finding.level], finding.words)
+    show_mounting(session)
+
+
+def show_mounting(session: State) -> None:
+    """Show the mounting of the calibration in use, if it is levelled."""
+    calibration = session.sensor.calibration
+    if session.frame_id and calibration is not None and calibration.is_levelled:
+        levelled = on_topics(calibration, session.settings.frame)
+        session.events.append(Mounting(levelled.rotation, session.frame_id))
+
+
+def rate(session: State, refinement: Refinement | None, rating: Rating | None = None) -> None:
+    """Add a task that rates the present calibration, if need be, and reports it as JSON."""
+    sensor = session.sensor
+    sensor.refinement = refinement
+    if rating is not None or sensor.present is None:
+        sensor.rating = rating
+    if sensor.present is not None:
+        session.events.append(_report_rating(session, sensor, sensor.present, rating))
+
+
+def _report_rating(session: State, sensor: Sensor, calibration: Calibration,
+                   rating: Rating | None) -> Task:
+    """Rate a calibration, and report it, unless another one has replaced it."""
+    rating, found = yield Compute(rated, calibration, sensor.refinement, rating,
+                                  session.settings.model)
+    if sensor.present is not calibration:
+        return ''
+    sensor.rating = rating
+    action = next_action(session)
+    if action is not NOT_KNOWN:
+        found['in_use'] = sensor.offered is not calibration
+        if calibration.is_levelled:
+            found['mounting'] = mounting_figures(
+                calibration.rotation, session.frame_id or '', session.settings.base_frame)
+        command = action.command and f'~/{action.command}'
+        session.events.append(Result(json.dumps({
+            **found, **rating_json(rating, action.kind, action.words, command)})))
+    return ''
+
+
+def rated(calibration: Calibration, refinement: Refinement | None, rating: Rating | None,
+          model: str) -> tuple[Rating, dict[str, Any]]:
+    """Return the rating of a calibration, if it is not known, and its JSON as of commands."""
+    found = {} if refinement is None else refinement_json(refinement)
+    whole = {**calibration_json(calibration, outlook(calibration, model)), **found}
+    return (rating_of(calibration, refinement=refinement) if rating is None else rating,
+            cast('dict[str, Any]', plain(whole)))
+
+
+def show_poses(session: State, *, store: bool, new_rest: bool = False) -> None:
+    """Add a task that stores the poses, and draws them with the next pose."""
+    sensor = session.sensor
+    poses = sensor.live.book.poses()
+    added = sensor.guide.added(len(poses), session.statistics.stamp)
+    session.events.append(_draw_poses(
+        session, sensor, poses, added, new_rest, session.files.store if store else None))
+
+
+def _draw_poses(session: State, sensor: Sensor, poses: Poses, added: int, new_rest: bool,
+                store: Store | None) -> Task:
+    """Store and draw poses, this number more than before; return the line of a new rest."""
+    guide, given = sensor.guide, (poses, session.units, session.settings.model)
+    due = added != 0 or guide.plan is None
+    try:
+        yield Files(nothing) if store is None else Files(store.save_poses, poses)
+    except OSError as error:
+        session.log('error', f'the poses could not be stored: {error}; {writing_advice(error)}',
+                    'not_stored', AGAIN)
+    # Computed even where only an average has changed, so that the lines keep their order.
+    plan = yield Compute(plan_for, *given) if due and len(poses) else Compute(nothing)
+    if due and not len(poses):  # without the start of the worker process
+        plan = plan_for(*given)
+    if plan is not None and sensor is session.sensor:
+        guide.plan = plan
+        session.events.append(ShowPoses(plan.up, plan.asked, session.frame_id or ''))
+    if not new_rest or sensor is not session.sensor:
+        return ''
+    return guide.line(poses, session.units, next_action(session), added=added > 0)
+
+
+def load(session: State, store: Store, sensor: Sensor) -> Task:
+    """Read the files of a sensor, and use them unless another one has replaced it."""
+    calibration: Calibration | None = None
+    poses: Poses | None = None
+    problem = ''
+    notes: list[str] = yield Files(tidied, store)
+    try:
+        calibration = yield Parse(store.load_calibration)
+    except Exception as error:  # the node starts in any case
+        problem = yield Files(unusable, store.calibration, error)
+    if calibration is not None and calibration.stream not in ('', store.identity.topic):
+        notes.append(f'{store.calibration} was made for {calibration.stream}, but it is used '
+                     f'for {store.identity.topic}')
+    try:
+        poses = yield Files(store.load_poses)
+    except Exception as error:
+        notes.append((yield Files(unusable, store.poses, error, True)))
+    if session.sensor is not sensor:
+        return ''
+    sensor.owners = {each.sensor for each in (calibration, poses)
+                     if each is not None and each.sensor}
+    if poses is not None:
+        sensor.live.book.add_stored(poses)
+        session.log('info', f'read {counted(len(poses), "pose")} from the store')
+    if calibration is not None:
+        adopt(session, calibration)
+        sensor.fitted_poses = len(calibration.poses)
+    session.problem = problem
+    for line in filter(None, (problem, *notes)):
+        session.log('error', line)
+    show_poses(session, store=False)
+    return ''
