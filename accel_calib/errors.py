@@ -19,6 +19,7 @@ import tempfile
 import traceback
 
 from . import __version__
+from .text import one_line
 
 _LONGEST = 2000
 """Longest message [characters]."""
@@ -32,9 +33,8 @@ class AccelCalibError(Exception):
     def __init__(self, message: str, advice: str) -> None:
         if len(message) > _LONGEST:  # it quotes a name of a damaged file
             message = f'{message[:_LONGEST // 2]} … {message[-_LONGEST // 2:]}'
-        super().__init__(message, advice)
-        self.message = message
-        self.advice = advice
+        self.message, self.advice = one_line(message), one_line(advice)
+        super().__init__(self.message, self.advice)
 
     def __str__(self) -> str:
         return f'{self.message}; {self.advice}'

@@ -103,10 +103,10 @@ from accel_calib.session.store import (
 from accel_calib.session.stream import StreamStatistics
 from accel_calib.session.worker import Worker, WorkerProcess
 from accel_calib.stored import calibration_yaml, plain_yaml
-from accel_calib.stored.calibration_yaml import (
-    _values_in as values_in, calibration_bytes, calibration_from)
+from accel_calib.stored.calibration_yaml import calibration_bytes, calibration_from
 from accel_calib.stored.exports import (
-    CALIBRATION_ALONE, export, FORMATS as EXPORT_FORMATS, identifier, Options as ExportOptions)
+    CALIBRATION_ALONE, export, FORMATS as EXPORT_FORMATS, identifier, Options as ExportOptions,
+    read_noise)
 from accel_calib.stored.plain_yaml import MOST_BYTES, MOST_VALUES, read_plain
 from accel_calib.table import concatenated, Poses, Recording
 from accel_calib.units import Units
@@ -170,8 +170,7 @@ ROWS_OF_A_TEXT = text, 'ROWS'
 ROWS_OF_A_BAG = bag_samples, '_ROWS'
 BLOCK_OF_A_BAG = bag_samples, 'BLOCK'
 MOST_VALUES_READ = plain_yaml, 'MOST_VALUES'
-MOST_VALUES_WRITTEN = calibration_yaml, 'MOST_VALUES'
-MOST_BYTES_WRITTEN = calibration_yaml, 'MOST_BYTES'
+MOST_BYTES_READ = plain_yaml, 'MOST_BYTES'
 MOST_LETTERS_OF_LABELS = calibration_yaml, '_MOST_LETTERS'
 PATIENCE_OF_A_PORT = sources, '_PATIENCE_S'
 HEAD_OF_A_PORT = sources, '_HEAD_S'

@@ -34,7 +34,7 @@ from .sensors import is_damaged, merge_sensor, read_parquet, Store, UNREAD, writ
 from ..calibrate import Calibration, FleetPrior
 from ..disk import write_atomically
 from ..effects import know_code, KNOWN_CODE
-from ..errors import AccelCalibError, InputError, needing, system_error
+from ..errors import AccelCalibError, crash_words, InputError, needing, system_error
 from ..findings import Rating
 from ..logs import Progress
 from ..session import WorkerProcess
@@ -415,8 +415,8 @@ def calibrate_recording(found: Input, options: Options, store: Store, limit_s: f
     """
     Calibrate one recording, add the result to the store, and return what happened to it.
 
-    The row is returned, and not stored, if the recording cannot be read or takes longer than
-    `limit_s` [s]. OSError is raised if the result cannot be written.
+    The row is returned, and not stored, if the recording cannot be read, takes longer than
+    `limit_s` [s], or ends in any other error. OSError is raised if the result cannot be written.
 
     """
     begin = time.perf_counter()
@@ -427,16 +427,21 @@ def calibrate_recording(found: Input, options: Options, store: Store, limit_s: f
             if store.has(key):
                 return 'skipped'
             row, calibration = _apart.process.call_within(limit_s, row_of, found, path, options)
-    except (OSError, EOFError, AccelCalibError) as err:
+    except Exception as err:  # one recording must not stop the others
         return unread_row(found, options, _reason(err, found.path, limit_s))
     row |= {'key': key, 'content': content, 'seconds': time.perf_counter() - begin}
-    if calibration is not None:
-        name = f'calibrations/{as_folder(row["sensor"])}/{key}.yaml'
-        (store.folder / name).parent.mkdir(parents=True, exist_ok=True)
-        write_calibration(store.folder / name, calibration, keep_before=False)
-        row['calibration'] = name
-        row['warnings'] += _exported(calibration, store.folder / name, options.exports)
-    store.add(row)
+    try:
+        if calibration is not None:
+            name = f'calibrations/{as_folder(row["sensor"])}/{key}.yaml'
+            (store.folder / name).parent.mkdir(parents=True, exist_ok=True)
+            write_calibration(store.folder / name, calibration, keep_before=False)
+            row['calibration'] = name
+            row['warnings'] += _exported(calibration, store.folder / name, options.exports)
+        store.add(row)
+    except OSError:
+        raise
+    except Exception as err:
+        return unread_row(found, options, _reason(err, found.path, limit_s))
     return str(row['status'])
 
 
@@ -447,7 +452,9 @@ def _reason(error: Exception, name: str, limit_s: float) -> AccelCalibError:
                           'raise --time-limit, or leave it out')
     if isinstance(error, AccelCalibError):  # an address without its package, or a missing match
         return error
-    return system_error(error if isinstance(error, OSError) else OSError(str(error)))
+    if isinstance(error, OSError | EOFError):
+        return system_error(error if isinstance(error, OSError) else OSError(str(error)))
+    return InputError(crash_words(error), 'report it, with the recording')
 
 
 def _exported(calibration: Calibration, path: Path, formats: Sequence[str]) -> list[str]:

@@ -39,6 +39,7 @@ from aiohttp import web, WSCloseCode, WSMsgType
 
 from ..errors import InputError
 from ..session import COMMANDS as COMMANDS_OF_A_SESSION, ros_home
+from ..text import read_json
 
 if TYPE_CHECKING:
     from .server import PageServer
@@ -98,8 +99,8 @@ def request_of(text: str) -> Hello | Ask:
     wrong = InputError('the message is not understood, expected {"hello": {"token", "seen"}} or '
                        '{"ask": {"id", "command"}}', 'load the page again')
     try:
-        found = json.loads(text)
-    except (ValueError, RecursionError):
+        found = read_json(text)
+    except ValueError:
         raise wrong from None
     match found:
         case {'hello': {'token': str(token), 'seen': int(seen)}}:

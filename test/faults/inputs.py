@@ -8,6 +8,7 @@ import copy
 from dataclasses import dataclass
 import datetime
 from functools import cache
+import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
@@ -215,6 +216,63 @@ def _wild(rng: Rng) -> str:
     if kind == 2:
         return str(int(rng.integers(-10**6, 10**6)))
     return rng.bytes(int(rng.integers(1, 6))).decode('latin-1')
+
+
+EVIL = 'EVIL'
+"""What a line of hostile text begins with."""
+
+_HOSTILE = ('a', 'imu_link', 'ß', '\n', '\r\n', '\u2028', '\x85', '\x1b[31m', '\x00', '\ud800',
+            '*/', '/*', '??/', '\\', '"', '#', '\t1\t', '\u202e', '<script>', '{{ x }}', '%s',
+            900 * 'x')
+
+
+def hostile(rng: Rng) -> str:
+    """Return text that would end a comment, a line or a file, if it were written as it is."""
+    parts = [_one(rng, (*_HOSTILE, f'\n{EVIL} ')) for _ in range(int(rng.integers(1, 8)))]
+    return ''.join(parts)
+
+
+def hostile_value(rng: Rng) -> Any:
+    """Return a value for JSON: of any type, a number of any size, or with many levels."""
+    kind, value = rng.integers(4), _one(rng, (True, None, [], {}, 1e999, 1, 0.01, 200.0))
+    if kind == 0:
+        return hostile(rng)
+    if kind == 1:
+        return int(rng.integers(1, 10)) * 10 ** int(rng.integers(0, 400))
+    for _ in range(int(rng.integers(0, 50)) if kind == 2 else 0):
+        value = _one(rng, ([value], {hostile(rng): value}))
+    return value
+
+
+def hostile_table(rng: Rng) -> Files:
+    """Return a sound pose table with hostile comments, labels and names of columns."""
+    poses = ac.simulate({'offset': 0.02}, poses=12, seed=int(rng.integers(100)))
+    place = {'firmware': _one(rng, ('px4', 'ardupilot')), 'instance': 1,
+             'device_id': _one(rng, (7, 2**32, 10**400)), 'corrected': hostile(rng)}
+    sensor: Any = _one(rng, (hostile(rng), hostile(rng), 5000 * 'x', hostile_value(rng)))
+    if rng.random() < 0.3:
+        place[_one(rng, list(place))] = hostile_value(rng)
+    text = ''.join(f'# {name}: {json.dumps(value, ensure_ascii=bool(rng.integers(2)))}\n'
+                   for name, value in (('sensor', sensor), ('autopilot', place)))
+    if rng.random() < 0.1:
+        text = f'# sensor: {int(rng.integers(1, 10**6)) * "["}\n'
+    name = json.dumps(hostile(rng).replace('"', ''), ensure_ascii=False)
+    rows = [f'{x},{y},{z},"{hostile(rng) if k == 3 else k}",{k}' for k, (x, y, z) in
+            enumerate(poses.reading.tolist())]
+    text += '\n'.join((f'ax,ay,az,label,{name}', *rows, ''))
+    return Files('poses.csv', {'poses.csv': text.encode(errors='replace')})
+
+
+def hostile_noise(rng: Rng) -> Files:
+    """Return figures of the noise, some of which are no figures of a sensor."""
+    figures: dict[str, Any] = {
+        f'{sensor}_{figure}': 1e-3 for sensor in ('accelerometer', 'gyroscope')
+        for figure in ('noise_density', 'random_walk')}
+    figures |= {'update_rate': 200.0, 'accelerometer_random_walk_reason': hostile(rng)}
+    for _ in range(int(rng.integers(0, 3))):
+        figures[_one(rng, list(figures))] = hostile_value(rng)
+    text = int(rng.integers(1, 10**6)) * '[' if rng.random() < 0.1 else json.dumps(figures)
+    return Files('noise.json', {'noise.json': text.encode()})
 
 
 @cache
