@@ -35,7 +35,7 @@ from ..calibrate import Calibration, determines, directions_of, fit_poses
 from ..compare import NAMES, rotation_free
 from ..disk import check_regular
 from ..effects import KNOWN_CODE, MODELS
-from ..errors import AccelCalibError, crash_words, InputError, RefusedFitError
+from ..errors import AccelCalibError, InputError, known_error, RefusedFitError
 from ..findings import residual_figures
 from ..logs import LogOptions, SUFFIXES
 from ..pipeline import calibrated, Intake, Outcome, Plan, poses_of
@@ -390,10 +390,8 @@ def row_of(found: Input, path: Path, options: Options) -> tuple[Row, Calibration
             sensor=row['sensor'], refined=options.refined, also=options.own))
     except OSError:
         raise  # it may be possible to read it later
-    except AccelCalibError as err:
-        return row | _failed(err, str(path), found.path), None
-    except Exception as err:  # a defect of this program must not stop the other recordings
-        return row | _failed(InputError(crash_words(err), 'report it, with the recording')), None
+    except Exception as err:  # also a defect of this program must not stop the other recordings
+        return row | _failed(known_error(err), str(path), found.path), None
     calibration = replace(outcome.calibration, date=row['date'])
     stored = outcome.rating.name != 'BAD'
     return row | _figures(intake, outcome), calibration if stored else None
@@ -439,6 +437,9 @@ def _figures(intake: Intake, outcome: Outcome) -> Row:
     poses = calibration.used_poses
     warm = float(np.median(poses['temperature'])) if 'temperature' in poses else None
     deviation = np.sqrt(np.diag(calibration.covariance))
+    # Offset and gain at the middle of the context.
+    free = rotation_free(calibration, calibration.typical_context(1), calibration.units.per_g)
+    variance = np.einsum('tp,pq,tq->t', free.slope, calibration.covariance, free.slope)
     return {
         'status': 'ok', 'rating': outcome.rating.name, 'rating_reason': outcome.rating.reason,
         'model': calibration.name, 'effects': list(calibration.model.effects),
@@ -450,15 +451,9 @@ def _figures(intake: Intake, outcome: Outcome) -> Row:
         'parameters': [{'name': name, 'value': value, 'sd': sd} for name, value, sd in zip(
             calibration.parameters, calibration.model.vector.tolist(), deviation.tolist(),
             strict=True)],
-        **_linear(calibration), **_for_prior(intake, calibration)}
-
-
-def _linear(calibration: Calibration) -> Row:
-    """Return V and S with their standard deviations, at the middle of the context."""
-    free = rotation_free(calibration, calibration.typical_context(1), calibration.units.per_g)
-    variance = np.einsum('tp,pq,tq->t', free.slope, calibration.covariance, free.slope)
-    return {column: float(value) for k, name in enumerate(NAMES) for column, value in (
-        (name, free.values[k]), (f'{name}.sd', np.sqrt(max(variance[k], 0.0))))}
+        **{column: float(value) for k, name in enumerate(NAMES) for column, value in (
+            (name, free.values[k]), (f'{name}.sd', np.sqrt(max(variance[k], 0.0))))},
+        **_for_prior(intake, calibration)}
 
 
 def _for_prior(intake: Intake, found: Calibration) -> Row:

@@ -51,7 +51,7 @@ from ..calibrate import Calibration
 from ..compare import History, history_of, LEVEL, Parameter
 from ..disk import write_atomically
 from ..effects import LADDER
-from ..errors import AccelCalibError, crash_words, InputError
+from ..errors import InputError, known_error
 from ..stored import read_calibration
 from ..table import Floats
 
@@ -121,18 +121,21 @@ class Store:
         """
         Add the pending rows of a sensor, by the name of its folder, to its Parquet file.
 
-        If it raises OSError, the next `merge` completes it.
+        They replace rows of the same content. The rows are in order of date. If it raises OSError,
+        the next `merge` completes it.
 
         """
         folder = self.pending / name
         paths = sorted(folder.glob('*.json'), key=lambda path: path.stat().st_mtime)
         new = [_pending_row(path) for path in paths]
-        old = self.of_sensor(name)
-        rows, replaced = _merged(old, new)
+        old, newest = self.of_sensor(name), {row['content']: row for row in new}
         if new:
-            write_parquet(self.data(name), rows, schema())
-        for key in replaced:
-            self._mark(key).unlink(missing_ok=True)
+            kept = [row for row in old if row['content'] not in newest]
+            write_parquet(self.data(name), sorted((*kept, *newest.values()), key=lambda row: (
+                row['date'] or '', row['recording'])), schema())
+        for row in (*old, *new):
+            if newest.get(row['content'], row)['key'] != row['key']:
+                self._mark(row['key']).unlink(missing_ok=True)
         for row in new:
             mark = self._mark(row['key'])
             mark.parent.mkdir(parents=True, exist_ok=True)
@@ -255,17 +258,6 @@ def _digest(text: str) -> str:
     return blake2b(text.encode(), digest_size=8).hexdigest()
 
 
-def _merged(old: list[Row], new: list[Row]) -> tuple[list[Row], list[str]]:
-    """Return the rows in order of date, and the keys of old rows that new ones replace."""
-    newest = {row['content']: row for row in new}
-    kept = [row for row in old if row['content'] not in newest]
-    keys = {row['key'] for row in newest.values()}
-    replaced = [row['key'] for row in (*old, *new)
-                if row['content'] in newest and row['key'] not in keys]
-    return sorted((*kept, *newest.values()),
-                  key=lambda row: (row['date'] or '', row['recording'])), replaced
-
-
 # ----------------------------------------------------------------------------- over time
 
 _MOST_COMPARED = 100
@@ -345,10 +337,8 @@ def merge_sensor(name: str, store: Store) -> Row:
                                   for row in good], good)
     except OSError:
         raise
-    except AccelCalibError as err:  # such as calibrations in different units
-        return about | {'note': str(err)}
-    except Exception as err:  # a defect of this program must not stop the other sensors
-        return about | {'note': crash_words(err)}
+    except Exception as err:  # such as calibrations in different units
+        return about | {'note': str(known_error(err))}
 
 
 def _compared(calibrations: Sequence[Calibration], rows: Sequence[Row]) -> Row:

@@ -419,15 +419,16 @@ _MOST_SENSORS = 10**9
 
 
 def write_priors(path: Path, priors: Mapping[str, FleetPrior]) -> None:
-    """Write typical values as YAML; raise OSError if the file cannot be written."""
+    """Write typical values as YAML; OSError if that fails, InputError if the reader refuses it."""
     models = [{'model': fleet.model, 'sensors': fleet.sensors, 'names': list(_PRIOR_NAMES),
                'mean': fleet.prior.mean.tolist(),
                'sd': np.sqrt(np.diag(fleet.prior.covariance)).tolist(),
                'covariance': fleet.prior.covariance.tolist()} for fleet in priors.values()]
     content = {'format': _PRIORS, 'values_of': 'model 10 at |force| = 1 g', 'unit': 'g',
                'models': models}
-    write_atomically(path, lambda file: yaml.safe_dump(content, file, sort_keys=False,
-                                                       allow_unicode=True, width=99))
+    text: str = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=99)
+    _fleets_in(text.encode(), path)
+    write_atomically(path, lambda file: file.write(text))
 
 
 def read_prior(path: Path, model: str = '') -> FleetPrior:
@@ -449,21 +450,26 @@ def read_prior(path: Path, model: str = '') -> FleetPrior:
         If the file cannot be read.
 
     """
-    try:
-        content = read_plain(decoded(beginning_of(path)))
-        if content['format'] != _PRIORS:
-            raise InputError(f'{path} has format {shown(content["format"])}, expected {_PRIORS}',
-                             'update accel_calib, or make the file again')
-        found = [_fleet_of(each) for each in values_at(content, 'models', dict)]
-    except (KeyError, TypeError, ValueError, np.linalg.LinAlgError) as err:
-        raise InputError(f'{path} has no typical values of a fleet: {err}',
-                         'use fleet.yaml of accel-calib fleet') from err
+    found = _fleets_in(beginning_of(path), path)
     chosen = [each for each in found if each.model == model or (not model and len(found) == 1)]
     if not chosen:
         names = some(each.model or "''" for each in found) or 'no model'
         raise InputError(f'{path} has {names}, expected the model {model!r}',
                          'set --sensor-model to a model in the file')
     return chosen[0]
+
+
+def _fleets_in(data: bytes, path: Path) -> list[FleetPrior]:
+    """Return the typical values in the data of a file, of all models."""
+    try:
+        content = read_plain(decoded(data))
+        if content['format'] != _PRIORS:
+            raise InputError(f'{path} has format {shown(content["format"])}, expected {_PRIORS}',
+                             'update accel_calib, or make the file again')
+        return [_fleet_of(each) for each in values_at(content, 'models', dict)]
+    except (KeyError, TypeError, ValueError, np.linalg.LinAlgError) as err:
+        raise InputError(f'{path} has no typical values of a fleet: {err}',
+                         'use fleet.yaml of accel-calib fleet') from err
 
 
 def _fleet_of(content: Mapping[str, Any]) -> FleetPrior:

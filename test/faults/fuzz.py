@@ -20,8 +20,9 @@ Run many cases by hand: ``python test/faults/fuzz.py --count 100000 --seed 7 csv
 
 import argparse
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import replace
 import io
 import os
 from pathlib import Path
@@ -31,7 +32,6 @@ import signal
 import sys
 from tempfile import TemporaryDirectory, TemporaryFile
 import time
-from typing import Any
 import warnings
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -43,13 +43,14 @@ from accel_calib.logs import LogOptions, write_table  # noqa: E402
 from accel_calib.messages import correct_bag  # noqa: E402
 from accel_calib.stored import read_calibration, write_calibration  # noqa: E402
 from faults import inputs  # noqa: E402
-from faults.inputs import BAGS, EVIL, EXTREME, Files  # noqa: E402
+from faults.inputs import BAGS, EXTREME, Files, one  # noqa: E402
 from inside import (  # noqa: E402
-    Calibration, CALIBRATION_ALONE, export, format_calibration, main as command_line,
-    parse_calibration, poses_of, read_log, read_noise)
+    Calibration, CALIBRATION_ALONE, export, ExportOptions, format_calibration,
+    main as command_line, parse_calibration, poses_of, read_log, read_noise)
 import numpy as np  # noqa: E402
 import pandas  # noqa: E402
 from shared import known  # noqa: E402
+import yaml  # noqa: E402
 
 Rng = np.random.Generator
 Make = Callable[[Rng], Files]
@@ -173,27 +174,30 @@ def _fitted(path: Path, rng: Rng) -> object:
 
 def _told(path: Path, rng: Rng) -> object:
     """Fit the poses of a table with hostile text, store and export the calibration."""
-    stored = path.parents[1] / 'told.yaml'
-    write_calibration(stored, ac.fit(path))
-    found = read_calibration(stored)
-    if not all(map(str.isprintable, (found.sensor, *found.poses.columns.get('label', ())))):
-        raise NotAllowedError(f'{found.sensor!r} is not one line')
-    _check_lines(found, _one_of(rng, CALIBRATION_ALONE[:-2]), None)
+    fitted, stored = ac.fit(path), path.parents[1] / 'told.yaml'
+    write_calibration(stored, fitted)
+    found, place = read_calibration(stored), fitted.poses.autopilot
+    plain = replace(found, sensor='', poses=replace(
+        found.poses, autopilot=place and replace(place, corrected='')))
+    to = one(rng, CALIBRATION_ALONE[:-2])
+    if found.sensor != fitted.sensor or _lines_of(found, to) != _lines_of(plain, to):
+        raise NotAllowedError(f'{to} has lines of {found.sensor!r} or {place}')
     write_table(stored, found.poses)
     return _log(stored, rng)
 
 
+def _lines_of(calibration: Calibration, to: str) -> list[str]:
+    """Return the lines of an export that are no comments."""
+    text = str(export(calibration, to, options=ExportOptions(name='imu')).text_or_bytes)
+    return [line for line in text.split('\n') if not re.match(r'#? |# | \*|//|  "comment"', line)]
+
+
 def _noise(path: Path, rng: Rng) -> object:
     """Export figures of the noise."""
-    return _check_lines(known(), _one_of(rng, ('kalibr', 'vins', 'openvins')), read_noise(path))
-
-
-def _check_lines(calibration: Calibration, to: str, noise: Any) -> None:
-    """Export, and check that foreign text is in comments alone."""
-    text = export(calibration, to, noise).text_or_bytes
-    for line in str(text).splitlines():
-        if EVIL in line and not re.match(r'#| \*|//|  "comment"', line):
-            raise NotAllowedError(f'{to} has the line {line!r}')
+    found = yaml.safe_load(str(export(known(), 'vins', read_noise(path)).text_or_bytes))
+    if len(found) != 5 or not all(isinstance(each, float) for each in found.values()):
+        raise NotAllowedError(f'the file has {found}')
+    return found
 
 
 def _frame(path: Path, rng: Rng) -> object:
@@ -204,13 +208,9 @@ def _frame(path: Path, rng: Rng) -> object:
         raise InputError(str(err), '') from err
     if rng.random() < 0.3:
         frame.columns = rng.choice(list(frame.columns), len(frame.columns))
-    frame.attrs = {name: inputs.hostile_value(rng) for name in ('sensor', 'autopilot', 'units')
-                   if rng.random() < 0.3}
+    frame.attrs = {name: one(rng, (inputs.hostile(rng), *inputs.VALUES))
+                   for name in ('sensor', 'autopilot', 'units') if rng.random() < 0.3}
     return ac.fit(frame)
-
-
-def _one_of(rng: Rng, names: Sequence[str]) -> str:
-    return names[int(rng.integers(len(names)))]
 
 
 def _run(path: Path, rng: Rng) -> object:
@@ -265,8 +265,8 @@ KINDS: dict[str, tuple[Callable[[], Make], Read]] = {
     'messages': (inputs.random_messages, read_bag),
     'text': (lambda: inputs.hostile_table, _told),
     'noise': (lambda: inputs.hostile_noise, _noise),
-    'frame': (lambda: lambda rng: (inputs.random_table, inputs.hostile_table)[
-        int(rng.integers(2))](rng), _frame),
+    'frame': (lambda: lambda rng: one(rng, (inputs.random_table, inputs.hostile_table))(rng),
+              _frame),
     'command': (_of_all, _run)}
 """Maker and reader of each kind."""
 
