@@ -320,10 +320,10 @@ def test_of_too_many_viewers_those_without_the_token_give_way(bench: Bench) -> N
     assert all(owner.code is None for owner in owners[1:])
 
 
-def asked(bench: Bench, address: str = '') -> socket.socket:
-    """Ask for the stream as a viewer at an address does, without a hello."""
-    return bench.connected(request(bench, 'GET', '/stream', f'{UPGRADE}{VERSION}'
-                                   'Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n'), address)
+def asking(bench: Bench) -> str:
+    """Return the request of a viewer."""
+    return request(bench, 'GET', '/stream', f'{UPGRADE}{VERSION}'
+                   'Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n')
 
 
 @pytest.mark.parametrize('address', ['127.0.0.1', '127.0.0.2'])
@@ -334,7 +334,7 @@ def test_a_flood_of_visitors_that_leave_does_not_keep_the_owner_out(
     def flood() -> None:
         for _ in range(5000):
             with suppress(OSError):
-                held.append(asked(bench, address))
+                held.append(bench.connected(asking(bench), address))
             if over.is_set():
                 return
 
@@ -373,7 +373,7 @@ def test_a_stuck_viewer_is_closed_and_the_others_go_on(
         bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(*STUCK, 2.0)
     other = bench.viewer()
-    with asked(bench) as stuck:
+    with bench.connected(asking(bench)) as stuck:
         stuck.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         hello = b'{"hello": {"token": "", "seen": 0}}'
         stuck.sendall(bytes([0x81, 0x80 | len(hello), 0, 0, 0, 0]) + hello)  # masked with zeros
@@ -388,14 +388,9 @@ def test_a_stuck_viewer_is_closed_and_the_others_go_on(
 
 def test_a_viewer_without_hello_is_closed(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(*PATIENCE_FOR_A_HELLO, 0.3)
-    with asked(bench) as silent:
-        received = b''
-        while part := silent.recv(4096):
-            received += part
-            if b'no hello came' in received:
-                break
-        assert b'no hello came' in received
-        assert b'progress' not in received
+    received = bench.sent(asking(bench))
+    assert b'no hello came' in received
+    assert b'progress' not in received
 
 
 def test_a_port_in_use_is_an_error_in_one_line(shared: Bench, tmp_path: Path) -> None:

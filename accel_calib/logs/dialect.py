@@ -453,7 +453,8 @@ def _about(path: Path, comments: Sequence[str]) -> dict[str, Any]:
         if colon and name.strip() in ABOUT:
             try:
                 value = read_json(text)
-                about[name.strip()] = Autopilot(**value) if 'autopilot' in name else str(value)
+                about[name.strip()] = Autopilot(**value) if 'autopilot' in name else (
+                    '' if value is None else str(value))
             except (TypeError, ValueError):
                 continue  # an ordinary comment
     if about.get('units', '') not in ('', *UNIT_NAMES):
