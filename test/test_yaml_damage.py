@@ -181,7 +181,7 @@ DAMAGE = [
     ('tau: ', 'tuu: 1.0, tau: ', "the key 'tuu' of an effect is not known"),
     ('reading:\n', 'reading:\n  - [0.0, 0.0, x]\n', "reading has shape|reading contains 'x'"),
     ('offset: {', 'offset: {x: 1e200, ', 'stated twice'),
-    ('unit: g, x: ', 'unit: g, x: -1e31 #', r'x is .*, expected at most 1e\+30'),
+    ('y: -1.1102230246251565e-16', 'y: -1.1102230246251565e31', r'y is .*, expected at most 1e'),
     ('sensor: imu_link', f'sensor: {4097 * "x"}', 'sensor has 4097 characters, expected at most'),
     ('chi2_per_dof: ', 'chi2_per_dof: -', 'chi2_per_dof is -.*, expected 0 or more'),
     ('rejected: []', 'rejected: [1]', 'rejected contains 1, expected names'),
