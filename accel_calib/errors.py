@@ -17,8 +17,10 @@ import platform
 import sys
 import tempfile
 import traceback
+import warnings
 
 from . import __version__
+from .text import one_line
 
 _LONGEST = 2000
 """Longest message [characters]."""
@@ -32,9 +34,8 @@ class AccelCalibError(Exception):
     def __init__(self, message: str, advice: str) -> None:
         if len(message) > _LONGEST:  # it quotes a name of a damaged file
             message = f'{message[:_LONGEST // 2]} … {message[-_LONGEST // 2:]}'
-        super().__init__(message, advice)
-        self.message = message
-        self.advice = advice
+        self.message, self.advice = one_line(message), one_line(advice)
+        super().__init__(self.message, self.advice)
 
     def __str__(self) -> str:
         return f'{self.message}; {self.advice}'
@@ -99,6 +100,14 @@ def system_error(error: OSError) -> InputError:
                       'check the name and the permissions')
 
 
+def known_error(error: Exception) -> AccelCalibError:
+    """Return any error as one for users; of a defect of this program, the traceback is stored."""
+    if isinstance(error, AccelCalibError):
+        return error
+    return system_error(error) if isinstance(error, OSError) else InputError(
+        crash_words(error), 'report it, with the input')
+
+
 FREE_SPACE = 'free space on the disk'
 """Advice for a full disk."""
 
@@ -108,6 +117,13 @@ TAKE_ALL_SIDES = 'take poses with each side of the sensor up and down, and some 
 NEEDS_ROS = ("source /opt/ros/jazzy/setup.bash, or run pip install '.[ros]' in the folder of the "
              'sources')
 """Advice if ROS 2 is not installed."""
+
+
+def hide_warnings() -> None:
+    """Keep warnings of numpy, on which no user can act, from the terminal; also of children."""
+    if not sys.warnoptions:
+        warnings.simplefilter('ignore', RuntimeWarning)
+        os.environ['PYTHONWARNINGS'] = 'ignore::RuntimeWarning'
 
 
 def crash_words(error: BaseException) -> str:

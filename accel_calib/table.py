@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from .errors import InputError, needing
 from .finding import Finding
-from .text import counted, table
+from .text import counted, LONGEST_NAME, one_line, table
 from .units import Floats as Floats, STANDARD_GRAVITY, UnitName, Units
 
 ABOUT = ('units', 'sensor', 'autopilot')
@@ -31,6 +31,9 @@ ABOUT = ('units', 'sensor', 'autopilot')
 
 LARGEST = 1e30
 """Larger numbers are damage. The products of smaller ones do not overflow."""
+
+_NUMBERS = range(-2**31, 2**32)
+"""Numbers of an autopilot: those of 32 bits, with or without a sign."""
 
 
 @dataclass(frozen=True)
@@ -172,6 +175,8 @@ class Autopilot:
     corrected : str
         Why the readings are still those that old parameters correct; empty: they are raw.
 
+    ValueError is raised for other values, and InputError for a long text.
+
     """
 
     firmware: Firmware
@@ -183,8 +188,20 @@ class Autopilot:
     def __post_init__(self) -> None:
         numbers = (self.instance, self.device_id, self.thermal)
         if (self.firmware not in get_args(Firmware) or not isinstance(self.corrected, str)
-                or any(each is not None and type(each) is not int for each in numbers)):
-            raise ValueError(f'autopilot is {self}, expected px4 or ardupilot, and whole numbers')
+                or any(each is not None and (type(each) is not int or each not in _NUMBERS)
+                       for each in numbers)):
+            raise ValueError('the autopilot is not known, expected px4 or ardupilot, and whole '
+                             'numbers of 32 bits')
+        object.__setattr__(self, 'corrected', name_from(self.corrected, 'the text of autopilot'))
+
+
+def name_from(text: str, what: str) -> str:
+    """Return a name or a text from outside as one line; InputError if it is too long."""
+    name = one_line(text).strip()
+    if len(name) > LONGEST_NAME:
+        raise InputError(f'{what} has {len(name)} characters, expected at most {LONGEST_NAME}',
+                         'shorten it')
+    return name
 
 
 _Self = TypeVar('_Self', bound='Table')
@@ -213,6 +230,8 @@ class Table(Record):
     findings : tuple of Finding
         What was found in the samples and the rests that they come from.
 
+    InputError is raised if the name of the sensor is too long.
+
     """
 
     columns: Mapping[str, NDArray[Any]]
@@ -225,6 +244,7 @@ class Table(Record):
     def __post_init__(self) -> None:
         if 'reading' not in self.columns:
             raise ValueError('the table has no readings, expected the column reading')
+        object.__setattr__(self, 'sensor', name_from(self.sensor, 'the name of the sensor'))
         object.__setattr__(self, 'columns', {key: read_only(values)
                                              for key, values in self.columns.items()})
         for key, values in self.columns.items():

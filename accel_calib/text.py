@@ -1,12 +1,20 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Numbers, counts, dates, tables and results as text."""
+"""
+Numbers, counts, dates, tables and results as text; and text from outside.
+
+Text that others wrote can hold line ends, control characters and halves of pairs (surrogates),
+which no file in UTF-8 holds. `one_line` makes it one printable line, for names, comments, messages
+and what is read from YAML. `read_json` is the only reader of JSON from outside.
+
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime, timezone
 from html import escape
 from itertools import repeat
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -16,6 +24,15 @@ _ZERO = 1e-12
 
 _LONGEST_ITEM, _LONGEST_REASON = 100, 400
 """Characters that a message shows of one item of a list, and of the reason of a library."""
+
+_MOST_LEVELS = 32
+"""Largest number of levels of lists and objects in JSON: less than a function that recurses can
+take in any version of Python."""
+
+_TOO_DEEP = f'it has more than {_MOST_LEVELS} levels'
+
+LONGEST_NAME = 4096
+"""Longest name of a sensor, a topic or an effect [characters]; messages repeat names."""
 
 
 def short(value: float) -> str:
@@ -87,10 +104,31 @@ def some(items: Iterable[object], most: int = 12) -> str:
     return ', '.join(words[:most]) + more
 
 
+def one_line(text: str) -> str:
+    """Return text from outside as one printable line: a space replaces any other character."""
+    if text.isprintable():
+        return text
+    return ''.join(each if each.isprintable() else ' ' for each in text)
+
+
+def read_json(text: str) -> Any:
+    """Return the content of JSON from outside; ValueError if it is none, or has many levels."""
+    try:
+        found = json.loads(text)
+    except RecursionError as err:
+        raise ValueError(_TOO_DEEP) from err
+    level: list[Any] = [[found]]
+    for _ in range(_MOST_LEVELS + 1):
+        level = [each for part in level for each in (
+            part.values() if isinstance(part, dict) else part) if isinstance(each, dict | list)]
+        if not level:
+            return found
+    raise ValueError(_TOO_DEEP)
+
+
 def reason(error: BaseException) -> str:
     """Return why foreign code raises an error, in one printable line of limited length."""
-    text = str(error)[:_LONGEST_REASON]
-    said = ' '.join(''.join(each if each.isprintable() else ' ' for each in text).split())
+    said = ' '.join(one_line(str(error)[:_LONGEST_REASON]).split())
     return said if ' ' in said else f'{type(error).__name__} {said}'.strip()
 
 

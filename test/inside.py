@@ -107,10 +107,10 @@ from accel_calib.session.stream import StreamStatistics, TemperatureHistory
 from accel_calib.session.use import adopt as use_calibration
 from accel_calib.session.worker import Worker, WorkerProcess
 from accel_calib.stored import calibration_yaml, plain_yaml
-from accel_calib.stored.calibration_yaml import (
-    _values_in as values_in, calibration_bytes, calibration_from)
+from accel_calib.stored.calibration_yaml import calibration_bytes, calibration_from
 from accel_calib.stored.exports import (
-    CALIBRATION_ALONE, export, FORMATS as EXPORT_FORMATS, identifier, Options as ExportOptions)
+    CALIBRATION_ALONE, export, FORMATS as EXPORT_FORMATS, identifier, Options as ExportOptions,
+    read_noise)
 from accel_calib.stored.plain_yaml import MOST_BYTES, MOST_VALUES, read_plain
 from accel_calib.table import concatenated, Poses, Recording
 from accel_calib.units import Units
@@ -174,11 +174,11 @@ ROWS_OF_A_TEXT = text, 'ROWS'
 ROWS_OF_A_BAG = bag_samples, '_ROWS'
 BLOCK_OF_A_BAG = bag_samples, 'BLOCK'
 MOST_VALUES_READ = plain_yaml, 'MOST_VALUES'
-MOST_VALUES_WRITTEN = calibration_yaml, 'MOST_VALUES'
-MOST_BYTES_WRITTEN = calibration_yaml, 'MOST_BYTES'
+MOST_BYTES_READ = plain_yaml, 'MOST_BYTES'
 MOST_LETTERS_OF_LABELS = calibration_yaml, '_MOST_LETTERS'
 PATIENCE_OF_A_PORT = sources, '_PATIENCE_S'
 HEAD_OF_A_PORT = sources, '_HEAD_S'
+MOST_OF_A_HEAD = sources, '_HEAD_CHARACTERS'
 CLOCK_OF_A_SOURCE = sources, 'time'
 PATIENCE_OF_A_WORKER = worker, '_PATIENCE'
 LARGEST_SAMPLE = refine_base, 'MOST'

@@ -56,7 +56,6 @@ class TurnedSensor:
 
     name, findings = 'simulated', ()
     problem = str
-    findings = ()
 
     def __init__(self, speed: float = 20.0, sensor: str = 'imu_link') -> None:
         self.speed, self.sensor = speed, sensor

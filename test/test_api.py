@@ -231,10 +231,10 @@ def test_a_record_is_pickled_with_cached_values_while_another_thread_adds_one(po
             vars(record)['late'] = True
             return str, ('arm',)
 
-    record = replace(poses, sensor=Late())
+    record = replace(poses, findings=(Late(),))
     vars(record)['early'] = True
     again = pickle.loads(pickle.dumps(record))
-    assert again.sensor == 'arm'
+    assert again.findings == ('arm',)
     assert vars(record)['late']
     assert vars(again).keys() == {'early', *(each.name for each in fields(poses))}
 
@@ -250,6 +250,9 @@ def test_a_record_is_pickled_with_cached_values_while_another_thread_adds_one(po
     (lambda poses: ac.simulate({}, time=[0.0, 1.0]), r'time has shape \(2,\), expected 24 rows'),
     (lambda poses: ac.compare([ac.fit(poses)]), 'found 1 calibration, expected at least 2'),
     (lambda poses: ac.capture(ac.simulate({}, recording=True, poses=2), min_dwel=3), 'min_dwel'),
+    (lambda poses: ac.fit(poses).apply(poses.to_dataframe()), r'shape \(24, 7\), expected \(n, 3'),
+    (lambda poses: ac.fit(poses.to_dataframe().set_axis([*'xyzxyz', 'n'], axis=1)),
+     'the DataFrame has several columns x, y, z, expected one of each'),
 ])
 def test_bad_input_is_refused_in_one_line(call, message, poses):
     with pytest.raises(AccelCalibError, match=message) as refusal:

@@ -35,7 +35,8 @@ def normal(name: str) -> str:
 def pins(path: str) -> dict[str, str]:
     """Return the version by name of a file with exact versions."""
     lines = (ROOT / path).read_text(encoding='utf-8').splitlines()
-    found = [line.split('==') for line in lines if line and not line.startswith('#')]
+    found = [line.partition(' --hash=sha256:')[0].split('==') for line in lines
+             if line and not line.startswith('#')]
     return {normal(name): version for name, version in found}
 
 
@@ -85,6 +86,7 @@ def test_tested_versions_are_within_the_bounds(path: str, setup_py: dict[str, An
 
 
 def test_lock_file_has_every_requirement(setup_py: dict[str, Any]) -> None:
-    known = pins('requirements-dev.txt')
+    known, lock = pins('requirements-dev.txt'), ROOT / 'requirements-dev.txt'
+    assert len(re.findall(r'==\S+ --hash=sha256:[0-9a-f]{64}\n', lock.read_text())) == len(known)
     assert not {normal(each.name) for each in all_of(
         setup_py, *setup_py['extras_require'])} - {*known}

@@ -125,6 +125,7 @@ def made(tmp_path_factory):
     assert run('simulate', '-o', folder / 'poses.csv', '--poses', 14) == 0
     assert run('fit', folder / 'poses.csv', '-o', folder / 'cal.yaml') == 0
     (folder / 'notes.txt').write_text('my notes\n')
+    (folder / 'old.json').write_text('{}')
     (folder / 'out').mkdir()
     (folder / 'more').mkdir()
     (folder / 'more' / 'poses.csv').write_bytes((folder / 'poses.csv').read_bytes())
@@ -167,6 +168,9 @@ def contents(folder):
     ('fit', 'poses.csv', 'more/poses.csv', '-o', 'out'),
     ('fit', 'poses.csv', 'rec.csv', '-o', 'cal.yaml'),
     ('compare', 'cal.yaml', 'cal.yaml', '--json', 'cal.yaml'),
+    *((command, *read, '--json', 'old.json', '--force') for command, *read in (
+        ('fit', 'poses.csv', '--prior', 'old.json'), ('refine', 'poses.csv', '--also', 'old.json'),
+        ('fleet', 'rec.csv', '@old.json', '-o', 'out'))),
 ], ids=' '.join)
 def test_nothing_else_is_overwritten(arguments, here, capsys):
     before = contents(here)

@@ -74,8 +74,9 @@ def test_recordings_without_a_name_are_said_to_need_one(client: Any, tmp_path: P
     for k in range(3):
         write_poses(tmp_path / 'in' / f'board{k}.csv', OFFSET, seed=k, sensor='')
     summary = run(client, found_in(tmp_path / 'in'), QUICK, Store(tmp_path / 'out'))
-    (finding,) = [each for each in summary.rating.findings if each.kind == 'unnamed']
-    assert finding.text.startswith('3 recordings')
+    finding, (unknown,) = summary.rating.findings[0], summary.sensors
+    assert finding.text == '3 recordings do not state their sensor, and are not compared'
+    assert (unknown['calibrations'], unknown['drift'], unknown['changes']) == (0, None, [])
     assert '--sensor-from' in finding.advice
     assert '--sensor-from' in page_of(tmp_path / 'out')
     named = replace(QUICK, sensor_from=r'board\d')
@@ -322,7 +323,9 @@ def test_a_date_is_taken_from_the_path_if_there_are_no_stamps(
     assert date_of(Input(inside, inside), None, 5.0) == expected
 
 
-def test_lists_globs_and_folders_find_recordings(tmp_path: Path) -> None:
+def test_lists_globs_and_folders_find_recordings(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
     write_fleet(tmp_path, 2, 2)
     (tmp_path / 'list.txt').write_text('# mine\nrobot_0\nrobot_1/*-02-*.csv\n')
     (tmp_path / 'robot_0' / 'notes.md').write_text('no recording')
@@ -331,20 +334,16 @@ def test_lists_globs_and_folders_find_recordings(tmp_path: Path) -> None:
     assert [each.inside for each in found_in(tmp_path / 'robot_*')] == [
         'robot_0/2026-01-03.csv', 'robot_0/2026-02-03.csv',
         'robot_1/2026-01-03.csv', 'robot_1/2026-02-03.csv']
-    with pytest.raises(InputError, match='does not exist'):
-        found_in(tmp_path / 'robot_9')
-    with pytest.raises(InputError, match='holds no recording'):
-        found_in(tmp_path / 'nothing_*')
-
-
-@pytest.mark.parametrize(('content', 'words'), [
-    (b'@list.txt\n', '@list.txt does not exist'), (b'\xff.csv\n', '.csv does not exist')])
-def test_a_list_that_names_no_recordings_is_refused(
-        content: bytes, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path('list.txt').write_bytes(content)
-    with pytest.raises(InputError, match=words):
-        found_in('@list.txt')
+    (tmp_path / 'itself.txt').write_text('@itself.txt\n')
+    (tmp_path / 'latin.txt').write_bytes(b'\xff.csv\n')
+    for name, words in (('robot_9', 'robot_9 does not'), ('nothing_*', 'holds no recording'),
+                        ('@itself.txt', '@itself.txt does not'), ('@latin.txt', '.csv does not')):
+        with pytest.raises(InputError, match=words):
+            found_in(name)
+    whole = found_in(tmp_path)
+    for link, target in (('robot_0/up', tmp_path), ('a', 'robot_1'), ('a.csv', 'none.csv')):
+        (tmp_path / link).symlink_to(target)
+    assert found_in(tmp_path) == whole
 
 
 def test_an_address_of_the_web_may_have_a_query(tmp_path: Path) -> None:
@@ -385,7 +384,8 @@ def test_pandas_reads_the_results_as_the_page_says(client: Any, tmp_path: Path,
 
 
 def test_each_calibration_is_exported_as_asked(client: Any, tmp_path: Path) -> None:
-    write_poses(tmp_path / 'in' / 'a.csv')
+    path = write_poses(tmp_path / 'in' / 'a.csv')
+    path.write_text(path.read_text().replace('imu_link', r'a\ud800\n'))
     options = replace(QUICK, exports=('c', 'arduino', 'px4', 'betaflight'))
     run(client, found_in(tmp_path / 'in'), options, Store(tmp_path / 'out'))
     row, = rows_of(tmp_path / 'out')
@@ -397,6 +397,10 @@ def test_each_calibration_is_exported_as_asked(client: Any, tmp_path: Path) -> N
     assert stored.with_name(f'{stored.stem}_px4.params').read_bytes().decode() == (
         export(calibration, 'px4').text_or_bytes)
     assert any(line.startswith('betaflight: ') for line in row['warnings'])
+    assert row['sensor'] == 'a'
+    unexpected = run(client, found_in(tmp_path / 'in'), replace(QUICK, exports=('none',)),
+                     Store(tmp_path / 'other'))
+    assert (unexpected.counts, unexpected.rating.name) == ({'unread': 1}, 'BAD')
 
 
 def test_typical_values_that_no_longer_hold_are_removed(

@@ -3,6 +3,7 @@
 
 """The server of the live page with a real session, without ROS and without a browser."""
 
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, ExitStack, suppress
 from functools import partial
@@ -12,7 +13,7 @@ from pathlib import Path
 import re
 import signal
 import socket
-from threading import Event
+from threading import Event, Thread
 import time
 
 from accel_calib.errors import InputError
@@ -81,9 +82,9 @@ class Bench:
                     found += part
             return found
 
-    def connected(self, request: str | bytes = b'') -> socket.socket:
-        """Return a connection, after a request was sent."""
-        client = socket.create_connection(('127.0.0.1', self.port))
+    def connected(self, request: str | bytes = b'', address: str = '') -> socket.socket:
+        """Return a connection from an address, after a request was sent."""
+        client = socket.create_connection(('127.0.0.1', self.port), None, (address, 0))
         client.sendall(request.encode() if isinstance(request, str) else request)
         return client
 
@@ -319,19 +320,35 @@ def test_of_too_many_viewers_those_without_the_token_give_way(bench: Bench) -> N
     assert all(owner.code is None for owner in owners[1:])
 
 
-def stream(bench: Bench) -> socket.socket:
-    """Ask for the stream as a viewer does, without a hello."""
-    client = bench.connected(request(bench, 'GET', '/stream', f'{UPGRADE}{VERSION}'
-                                     'Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n'))
-    assert b'101' in client.recv(64)
-    return client
+def asking(bench: Bench) -> str:
+    """Return the request of a viewer."""
+    return request(bench, 'GET', '/stream', f'{UPGRADE}{VERSION}'
+                   'Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n')
 
 
-def test_connections_that_say_nothing_do_not_keep_anybody_out(bench: Bench) -> None:
-    with ExitStack() as silent:
-        for _ in range(40):
-            silent.enter_context(stream(bench))
-        assert bench.viewer().got[0]['may']
+@pytest.mark.parametrize('address', ['127.0.0.1', '127.0.0.2'])
+def test_a_flood_of_visitors_that_leave_does_not_keep_the_owner_out(
+        address: str, bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+    over, held = Event(), deque[socket.socket](maxlen=300)
+
+    def flood() -> None:
+        for _ in range(5000):
+            with suppress(OSError):
+                held.append(bench.connected(asking(bench), address))
+            if over.is_set():
+                return
+
+    visitors = Thread(target=flood)
+    visitors.start()
+    wait(lambda: len(held) == 300)
+    for _ in range(10):
+        owner = bench.viewer()
+        assert owner.got[0]['may']
+        owner.close()
+    over.set()
+    visitors.join()
+    assert any('ended a connection' in line.words for line in bench.logged)
+    assert not caplog.records
 
 
 def test_a_viewer_that_comes_back_gets_the_lines_it_missed(bench: Bench) -> None:
@@ -356,7 +373,7 @@ def test_a_stuck_viewer_is_closed_and_the_others_go_on(
         bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(*STUCK, 2.0)
     other = bench.viewer()
-    with stream(bench) as stuck:
+    with bench.connected(asking(bench)) as stuck:
         stuck.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         hello = b'{"hello": {"token": "", "seen": 0}}'
         stuck.sendall(bytes([0x81, 0x80 | len(hello), 0, 0, 0, 0]) + hello)  # masked with zeros
@@ -371,14 +388,9 @@ def test_a_stuck_viewer_is_closed_and_the_others_go_on(
 
 def test_a_viewer_without_hello_is_closed(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(*PATIENCE_FOR_A_HELLO, 0.3)
-    with stream(bench) as silent:
-        received = b''
-        while part := silent.recv(4096):
-            received += part
-            if b'no hello came' in received:
-                break
-        assert b'no hello came' in received
-        assert b'progress' not in received
+    received = bench.sent(asking(bench))
+    assert b'no hello came' in received
+    assert b'progress' not in received
 
 
 def test_a_port_in_use_is_an_error_in_one_line(shared: Bench, tmp_path: Path) -> None:

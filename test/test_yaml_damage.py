@@ -20,9 +20,8 @@ from accel_calib.units import units_of
 from faults.fuzz import LONGEST_LINE
 from faults.inputs import intact
 from inside import (
-    format_calibration, Model, MOST_BYTES, MOST_BYTES_WRITTEN, MOST_LETTERS_OF_LABELS, MOST_VALUES,
-    MOST_VALUES_READ, MOST_VALUES_WRITTEN, parse_calibration, read_plain, simulate_poses,
-    spread_directions, values_in)
+    format_calibration, Model, MOST_BYTES, MOST_BYTES_READ, MOST_LETTERS_OF_LABELS, MOST_VALUES,
+    MOST_VALUES_READ, parse_calibration, read_plain, simulate_poses, spread_directions)
 import numpy as np
 import pytest
 from shared import with_effects
@@ -59,7 +58,7 @@ BOMBS: dict[str, tuple[str, str]] = {
     'underscore': (f'{FIRST}x: 1_0.5\n', "the value is '1_0.5', expected a decimal number"),
     'huge': (f'{FIRST}version: 1{400 * "0"}\n', "its version is '1000"),
     'large': (f'{FIRST}version: {30 * "9"}\n', "the value is '9999"),
-    'escape': (f'{FIRST}version: "\\e[31m"\n', r"version is '\\x1b\[31m'"),
+    'escape': (f'{FIRST}version: "\\e[31m"\n', r"version is ' \[31m'"),
     'zero byte': (f'{FIRST}x: \0\n', 'control characters'),
 }
 
@@ -102,7 +101,7 @@ def test_the_size_of_a_file_is_bounded_before_it_is_parsed(
 
 def test_another_format_of_typical_values_is_refused_in_one_line(tmp_path: Path) -> None:
     (tmp_path / 'fleet.yaml').write_text('format: "a\\nb"\n')
-    with pytest.raises(InputError, match=r"has format 'a\\nb', expected 1"):
+    with pytest.raises(InputError, match=r"has format 'a b', expected 1"):
         read_prior(tmp_path / 'fleet.yaml')
 
 
@@ -118,19 +117,12 @@ def with_poses(count: int) -> Calibration:
 def test_what_is_written_is_within_the_limits_of_the_reader(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calibration = with_poses(2000)
+    monkeypatch.setattr(*MOST_VALUES_READ, MOST_VALUES // 40)
     text = format_calibration(calibration)
-    most = values_in(calibration)
-    monkeypatch.setattr(*MOST_VALUES_READ, most)
-    assert len(parse_calibration(text, 'x.yaml').poses) == 2000
-    monkeypatch.setattr(*MOST_VALUES_READ, most // 2)
-    with pytest.raises(DamagedCalibrationError, match='more than .* values'):
-        parse_calibration(text, 'x.yaml')
-    assert 40 * most < MOST_VALUES
-    for where, limit in ((MOST_VALUES_WRITTEN, most - 1),
-                         (MOST_BYTES_WRITTEN, len(text.encode()) - 1)):
+    for where, limit in ((MOST_VALUES_READ, 10_000), (MOST_BYTES_READ, len(text.encode()) - 1)):
         with monkeypatch.context() as lower:
             lower.setattr(*where, limit)
-            with pytest.raises(InputError, match='has 2000 poses, which is more than its file'):
+            with pytest.raises(InputError, match='2000 poses cannot be stored: .* more than'):
                 write_calibration(tmp_path / 'c.yaml', calibration)
     assert not (tmp_path / 'c.yaml').exists()
 
@@ -144,22 +136,6 @@ def test_one_long_label_cannot_take_the_memory_of_all(monkeypatch: pytest.Monkey
     monkeypatch.setattr(*MOST_LETTERS_OF_LABELS, 49 * len(labels))
     with pytest.raises(DamagedCalibrationError, match='label has 50 characters, expected 49'):
         parse_calibration(text, 'x.yaml')
-
-
-def test_a_long_name_and_a_value_far_beyond_all_sensors_are_refused() -> None:
-    content = yaml.safe_load(intact()[0])
-
-    def parsed() -> Calibration:
-        return parse_calibration(yaml.dump(content, sort_keys=False), 'x.yaml')
-
-    content['sensor'] = 4096 * 'x'
-    assert parsed().sensor == 4096 * 'x'
-    content['sensor'] += 'x'
-    with pytest.raises(DamagedCalibrationError, match='sensor has 4097 characters, expected at'):
-        parsed()
-    content['sensor'], content['effects']['offset']['x'] = '', -1e31
-    with pytest.raises(DamagedCalibrationError, match='x is .*, expected at most 1e.30'):
-        parsed()
 
 
 # Kinds of content
@@ -205,6 +181,9 @@ DAMAGE = [
     ('tau: ', 'tuu: 1.0, tau: ', "the key 'tuu' of an effect is not known"),
     ('reading:\n', 'reading:\n  - [0.0, 0.0, x]\n', "reading has shape|reading contains 'x'"),
     ('offset: {', 'offset: {x: 1e200, ', 'stated twice'),
+    ('y: -1.1102230246251565e-16', 'y: -1.1102230246251565e31', r'y is .*, expected at most 1e'),
+    ('sensor: imu_link', f'sensor: {4097 * "x"}', 'sensor has 4097 characters, expected at most'),
+    ('chi2_per_dof: ', 'chi2_per_dof: -', 'chi2_per_dof is -.*, expected 0 or more'),
     ('rejected: []', 'rejected: [1]', 'rejected contains 1, expected names'),
     ('  bias: [', '  bias: [1.0, 0.0, 0.0]\n  was: [', 'below 1 in magnitude'),
     ('  bias: [', '  bias: [.nan, 0.0, 0.0]\n  was: [', 'bias contains a number that is not'),
@@ -265,11 +244,13 @@ def test_numbers_without_a_point_in_an_edited_file_are_read() -> None:
 
 @pytest.mark.parametrize('value', [
     '1e5', '010', '0x10', '1:30', 'yes', '~', '', ' ', '2001-01-01', '=', '<<', '.nan', '1_0',
-    '#', 'a: b', '[', '\x1b[31m', '\u2028', 'ß', '😀', '*a', '&a', '!a', '1.0e+5', '-', 60 * '1'])
-def test_text_of_any_form_is_stored_as_it_is(value: str) -> None:
-    calibration = replace(parse_calibration(intact()[0], 'x.yaml'), sensor=value, reason=value)
+    '#', 'a: b', '[', 'ß', '😀', '*a', '&a', '!a', '1.0e+5', '-', 60 * '1', '\x1b[31m', '\u2028',
+    'a\ud800b', 'a\n# b: c', 4096 * 'x'])
+def test_text_of_any_form_is_stored_as_one_printable_line(value: str) -> None:
+    calibration = replace(parse_calibration(intact()[0], 'x.yaml'), sensor=value)
+    kept = ''.join(each if each.isprintable() else ' ' for each in value).strip()
     found = parse_calibration(format_calibration(calibration), 'x.yaml')
-    assert (found.sensor, found.reason) == (value, value)
+    assert found.sensor == found.poses.sensor == calibration.sensor == kept
     assert not has(found.noted, 'edited')
 
 

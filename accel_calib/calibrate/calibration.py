@@ -27,11 +27,11 @@ from .rest_noise import GyroBias, SampleNoise
 from ..effects import (
     acting_temperature, AXES, between_steps, Context, correct, effect_named, Model, ModelForm,
     MODELS, parameter_names, predict, rate_at, ThermalStream, variable_of, way_of, with_turns)
-from ..errors import InputError, StoredCalibrationError
+from ..errors import InputError, RefusedFitError, StoredCalibrationError
 from ..finding import Finding
 from ..geometry import over_axes
-from ..table import column_of, Floats, in_unit, Poses, Record, Table
-from ..text import counted, table, with_sd
+from ..table import column_of, Floats, in_unit, name_from, Poses, Record, Table
+from ..text import counted, one_line, table, with_sd
 from ..units import FrameName, METHODS, MG, UnitName, Units, units_of
 
 ORIENTED = '12'
@@ -85,6 +85,8 @@ class Quality:
     coverage : float
         Share of the sphere within 45° of a pose.
 
+    RefusedFitError is raised for a negative figure.
+
     """
 
     rms_before_mg: float
@@ -95,6 +97,11 @@ class Quality:
     noise_floor_mg: float | None
     chi2_per_dof: float | None
     coverage: float
+
+    def __post_init__(self) -> None:
+        for name, figure in vars(self).items():
+            if figure is not None and figure < 0.0:
+                raise RefusedFitError(f'{name} is {figure:.3g}, expected 0 or more', 'fit again')
 
 
 RejectedKind = Literal['implausible', 'doubtful', 'outlier', 'clipped']
@@ -172,6 +179,8 @@ class Calibration(Record):
     noise: SampleNoise | None = None
 
     def __post_init__(self) -> None:
+        for name in ('sensor', 'stream', 'date'):
+            object.__setattr__(self, name, name_from(getattr(self, name), name))
         if (self.poses.units, self.poses.sensor) != (self.units.name, self.sensor):
             object.__setattr__(self, 'poses', replace(
                 self.poses, units=self.units.name, sensor=self.sensor))
@@ -375,11 +384,16 @@ class Calibration(Record):
         Raises
         ------
         InputError
-            If context is missing, or the effects cannot be corrected.
+            If the readings have not three columns, context is missing, or the effects cannot be
+            corrected.
 
         """
-        given = np.asarray(readings, float)
-        rows = np.atleast_2d(given)
+        given = np.asarray(readings)
+        if given.shape[-1:] != (3,) or given.ndim > 2:
+            raise InputError(f'the readings have shape {given.shape}, expected (n, 3) or (3,)',
+                             'pass the columns of the acceleration alone, and the context by '
+                             'name, such as temperature=…')
+        rows = np.atleast_2d(given.astype(float))
         context = {key: np.broadcast_to(np.asarray(values, float),
                                         (len(rows), 3) if key == 'rate' else (len(rows),))
                    for key, values in known.items()}
@@ -485,6 +499,7 @@ def with_history(poses_g: Poses, model: Model) -> Poses:
 
 def check_sensor(calibration: Calibration, sensor: str) -> None:
     """Raise StoredCalibrationError if a calibration is of another sensor; '' matches any."""
+    sensor = one_line(sensor).strip()
     if calibration.sensor and sensor and calibration.sensor != sensor:
         raise StoredCalibrationError(f'the calibration belongs to sensor {calibration.sensor!r}, '
                                      f'but the readings come from {sensor!r}',

@@ -35,7 +35,7 @@ from ..calibrate import Calibration, FleetPrior
 from ..capture import CaptureSettings
 from ..disk import replaceable, STANDARD_OUTPUT, write_atomically
 from ..effects import know_file
-from ..errors import AccelCalibError, InputError, RefusedFitError, saying, system_error
+from ..errors import AccelCalibError, InputError, known_error, RefusedFitError, saying
 from ..logs import LogOptions, OpenLog
 from ..pipeline import Intake, options_for, poses_of
 from ..stored import calibration_from, OF_FILE, read_calibration, read_prior
@@ -48,7 +48,6 @@ if TYPE_CHECKING:
 FAILED = 1
 """Exit status for a result that is BAD, or if a check that was asked for fails."""
 
-_INPUTS = ('poses', 'recording', 'log', 'logs', 'calibration', 'calibrations', 'noise')
 _OUTPUTS = {'json': 'result', 'report': 'page', 'plan': 'table', 'figures': ''}
 """Kind of the file that each option writes, besides ``-o``."""
 
@@ -165,7 +164,7 @@ def _with_page(done: Done, page: Path, text_of: Callable[[], str], *, beside: bo
     except (InputError, OSError) as err:
         if not (beside or done.stored):
             raise
-        return replace(done, shown=[*done.shown, f'no page {page}: {_known(err)}'])
+        return replace(done, shown=[*done.shown, f'no page {page}: {known_error(err)}'])
     return replace(done, stored=[*done.stored, page])
 
 
@@ -212,12 +211,8 @@ def _attempt(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     return BAD_INPUT if refused else done.status, {**plain(done.result), **refused}
 
 
-def _known(error: AccelCalibError | OSError) -> AccelCalibError:
-    return system_error(error) if isinstance(error, OSError) else error
-
-
 def _of_error(error: AccelCalibError | OSError) -> dict[str, str]:
-    known = _known(error)
+    known = known_error(error)
     read_as = {'read_as': known.read_as} if known.read_as else {}
     return {'error': known.message, 'advice': known.advice, **read_as}
 
@@ -316,9 +311,10 @@ def _check_targets(args: argparse.Namespace, each: Sequence[argparse.Namespace])
     if piped and piped != ['--json'] and (len(each) > 1 or not COMMANDS[args.command].writes):
         raise InputError(f'{piped[0]} is -, expected a folder here',
                          'use a folder; results of several files do not fit into one')
-    read = [getattr(args, name, None) for name in _INPUTS]
+    read = [value for name, value in vars(args).items() if name not in ('output', *_OUTPUTS)]
     inputs = [path for value in read for path in (value if isinstance(value, list) else [value])
               if isinstance(path, Path)]
+    inputs += [Path(text.removeprefix('@')) for text in getattr(args, 'recordings', ())]
     seen: dict[Path, str] = {}
     for target in _targets(args, each):
         if not target.kind and not target.path.exists():

@@ -34,13 +34,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with _leaving():
         from .commands import parser
         from .options import BAD_INPUT, in_one_line
-        from ..errors import AccelCalibError, crash_words, system_error
+        from ..errors import AccelCalibError, crash_words, hide_warnings, system_error
         from ..one_thread import use_one_thread
 
         use_one_thread()
         _open_streams()
         if '_ARGCOMPLETE' in os.environ:
             _complete()
+        if arguments is None:
+            hide_warnings()
         given = sys.argv[1:] if arguments is None else list(arguments)
         at = given.index('--ros-args') if '--ros-args' in given else len(given)
         own = given[:at]

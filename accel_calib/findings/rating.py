@@ -444,6 +444,10 @@ def rate_fleet(counts: Mapping[str, int], sensors: int, changed: int, unnamed: i
     figures = (f'{counted(total, "recording")} of {counted(sensors, "sensor")}: '
                f'{", ".join(f"{count} {name}" for name, count in sorted(counts.items()))}')
     found = []
+    if unnamed > 1:
+        found.append(Finding(
+            'unnamed', f'{unnamed} recordings do not state their sensor, and are not compared',
+            'take the names of the sensors from the paths with --sensor-from REGEX', 'USABLE'))
     if usable < total:
         found.append(Finding(
             'not_calibrated', f'{total - usable} of {counted(total, "recording")} have no usable '
@@ -452,9 +456,5 @@ def rate_fleet(counts: Mapping[str, int], sensors: int, changed: int, unnamed: i
     if changed:
         found.append(Finding('changed', f'{counted(changed, "sensor")} changed',
                              'use the latest calibrations of these', 'USABLE', step='done'))
-    if unnamed > 1:
-        found.append(Finding(
-            'unnamed', f'{unnamed} recordings do not state their sensor, and count as one sensor',
-            'take the names of the sensors from the paths with --sensor-from REGEX', 'USABLE'))
     return rated(found, 'each recording has a usable calibration', figures,
                  NextStep('done', 'use the calibrations'))

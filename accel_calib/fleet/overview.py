@@ -158,14 +158,15 @@ def digest_of(name: str, store: Store) -> Digest:
 
 
 def digest(sensor: str, rows: Sequence[Row]) -> Digest:
-    """Return the digest of the rows of a sensor, in order of date."""
-    good = alike(rows)
+    """Return the digest of the rows of a sensor, in order of date; without a name, no values."""
+    named = rows if sensor != UNKNOWN else ()
+    good = alike(named)
     values, differences = _values_of(good) if good else (None, [])
     return Digest(
         sensor, model_of(rows), Counter(row['rating'] or row['status'] for row in rows),
         [row for row in rows if row['status'] != 'ok'][:MOST_ERRORS],
         sum(bool(row['calibration']) for row in rows) - len(good), values, differences,
-        typical_of(rows))
+        typical_of(named))
 
 
 def _values_of(rows: Sequence[Row]) -> tuple[Values, list[tuple[str, Floats]]]:

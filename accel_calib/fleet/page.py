@@ -89,7 +89,11 @@ def _body(store: Store, known: Overview, sensors: Sequence[Row],
                     f'{len(models)} models.' if len(models) > _MOST_MODELS else '', 'soft')
     yield _changes(differ)
     yield _over_time(store, sensors, differ, odd_names)
-    yield section('Recordings without a calibration', _errors(known))
+    rows = [(row['recording'], row['error'], row['advice']) for row in known.errors[:_MOST]]
+    count = sum(known.counts[status] for status in ('error', 'unread'))
+    yield section('Recordings without a calibration', scroll_table(
+        'Errors', ('recording', 'error', 'what to do'), rows, '', long=len(rows) > _LONG),
+        _not_shown(count - len(rows), 'recording'))
 
 
 def _of_model(model: str, known: OfModel, odd: Sequence[Odd], prefix: str,
@@ -193,14 +197,6 @@ def _over_time(store: Store, sensors: Sequence[Row], differ: Sequence[Row],
         'differs, or it is the newest one. Sensors that changed, odd sensors, and the newest '
         'recordings.'), _figures(drawings),
         _not_shown(len(by_name) - len(chosen), 'other sensor')) if drawings else ''
-
-
-def _errors(known: Overview) -> str:
-    """Return a table of the recordings without a calibration."""
-    rows = [(row['recording'], row['error'], row['advice']) for row in known.errors[:_MOST]]
-    count = sum(known.counts[status] for status in ('error', 'unread'))
-    return scroll_table('Errors', ('recording', 'error', 'what to do'), rows, '',
-                        long=len(rows) > _LONG) + _not_shown(count - len(rows), 'recording')
 
 
 def _not_shown(count: int, what: str) -> str:

@@ -13,6 +13,7 @@ recording are part of the row.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -34,11 +35,12 @@ from ..calibrate import Calibration, determines, directions_of, fit_poses
 from ..compare import NAMES, rotation_free
 from ..disk import check_regular
 from ..effects import KNOWN_CODE, MODELS
-from ..errors import AccelCalibError, crash_words, InputError, RefusedFitError
+from ..errors import AccelCalibError, InputError, known_error, RefusedFitError
 from ..findings import residual_figures
 from ..logs import LogOptions, SUFFIXES
 from ..pipeline import calibrated, Intake, Outcome, Plan, poses_of
 from ..table import Poses
+from ..text import one_line
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -92,7 +94,13 @@ def _stated(text: str) -> Iterator[str]:
 
 
 def _local(text: str) -> Iterator[Input]:
-    """Yield the recordings of a file, folder or glob of this machine, in order."""
+    """
+    Yield the recordings of a file, folder or glob of this machine, in order.
+
+    Links come last, and each file and folder is read once, whatever its names: a link to a folder
+    above would make many sensors of one.
+
+    """
     path = Path(os.path.abspath(text))
     if path.exists():
         root = path if path.is_dir() and not _is_bag_folder(path) else path.parent
@@ -105,24 +113,24 @@ def _local(text: str) -> Iterator[Input]:
     else:
         raise InputError(f'{text} does not exist, expected a recording, a folder, a glob or @LIST',
                          'correct the name')
-    for each in found:
-        yield from _at(each, root)
+    waiting, links, seen = deque(found), deque[Path](), set[tuple[int, int]]()
+    while waiting or links:
+        each = (waiting or links).popleft()
+        if not each.exists() or (place := (each.stat().st_dev, each.stat().st_ino)) in seen:
+            continue
+        seen.add(place)
+        if each.is_file() or _is_bag_folder(each):
+            yield Input(str(each), each.relative_to(root).as_posix())
+        elif each.is_dir():
+            inside = [part for part in sorted(each.iterdir()) if not part.name.startswith('.')
+                      and (part.is_dir() or part.suffix.lower() in SUFFIXES)]
+            links.extend(filter(Path.is_symlink, inside))
+            waiting.extendleft(part for part in reversed(inside) if not part.is_symlink())
 
 
 def _is_bag_folder(path: Path) -> bool:
     """Return whether a path is the folder of a rosbag2, which is one recording."""
     return (path / 'metadata.yaml').is_file()
-
-
-def _at(path: Path, root: Path) -> Iterator[Input]:
-    """Yield a recording, or those in a folder and its subfolders, in order."""
-    if path.is_file() or _is_bag_folder(path):
-        yield Input(str(path), path.relative_to(root).as_posix())
-    elif path.is_dir():
-        for each in sorted(path.iterdir()):
-            if not each.name.startswith('.') and (
-                    each.is_dir() or each.suffix.lower() in SUFFIXES):
-                yield from _at(each, root)
 
 
 def _addresses(text: str) -> Iterator[Input]:
@@ -214,7 +222,10 @@ def content_hash(path: Path) -> str:
 # ----------------------------------------------------------------------------- names and dates
 
 UNKNOWN = 'unknown'
-"""Sensor of a recording in the passed folder itself, whose file has no name of a sensor."""
+"""
+Sensor of a recording in the passed folder itself, whose file has no name of a sensor. It can be
+any sensor, so that such recordings are not compared.
+"""
 
 _LONGEST_FOLDER = 180
 
@@ -237,12 +248,12 @@ def sensor_of(found: Input, name: str, pattern: str = '') -> str:
 
     """
     if pattern:
-        return matched(pattern, found.path, '--sensor-from')
+        return one_line(matched(pattern, found.path, '--sensor-from')).strip()
     folders = [part for part in PurePosixPath(found.inside).parts[:-1]
                if not _DATE_FOLDER.fullmatch(part)]
     if name and name not in folders:
         folders.append(name)
-    return '/'.join(folders) or UNKNOWN
+    return one_line('/'.join(folders)).strip() or UNKNOWN
 
 
 def matched(pattern: str, text: str, option: str) -> str:
@@ -379,10 +390,8 @@ def row_of(found: Input, path: Path, options: Options) -> tuple[Row, Calibration
             sensor=row['sensor'], refined=options.refined, also=options.own))
     except OSError:
         raise  # it may be possible to read it later
-    except AccelCalibError as err:
-        return row | _failed(err, str(path), found.path), None
-    except Exception as err:  # a defect of this program must not stop the other recordings
-        return row | _failed(InputError(crash_words(err), 'report it, with the recording')), None
+    except Exception as err:  # also a defect of this program must not stop the other recordings
+        return row | _failed(known_error(err), str(path), found.path), None
     calibration = replace(outcome.calibration, date=row['date'])
     stored = outcome.rating.name != 'BAD'
     return row | _figures(intake, outcome), calibration if stored else None
@@ -428,6 +437,9 @@ def _figures(intake: Intake, outcome: Outcome) -> Row:
     poses = calibration.used_poses
     warm = float(np.median(poses['temperature'])) if 'temperature' in poses else None
     deviation = np.sqrt(np.diag(calibration.covariance))
+    # Offset and gain at the middle of the context.
+    free = rotation_free(calibration, calibration.typical_context(1), calibration.units.per_g)
+    variance = np.einsum('tp,pq,tq->t', free.slope, calibration.covariance, free.slope)
     return {
         'status': 'ok', 'rating': outcome.rating.name, 'rating_reason': outcome.rating.reason,
         'model': calibration.name, 'effects': list(calibration.model.effects),
@@ -439,15 +451,9 @@ def _figures(intake: Intake, outcome: Outcome) -> Row:
         'parameters': [{'name': name, 'value': value, 'sd': sd} for name, value, sd in zip(
             calibration.parameters, calibration.model.vector.tolist(), deviation.tolist(),
             strict=True)],
-        **_linear(calibration), **_for_prior(intake, calibration)}
-
-
-def _linear(calibration: Calibration) -> Row:
-    """Return V and S with their standard deviations, at the middle of the context."""
-    free = rotation_free(calibration, calibration.typical_context(1), calibration.units.per_g)
-    variance = np.einsum('tp,pq,tq->t', free.slope, calibration.covariance, free.slope)
-    return {column: float(value) for k, name in enumerate(NAMES) for column, value in (
-        (name, free.values[k]), (f'{name}.sd', np.sqrt(max(variance[k], 0.0))))}
+        **{column: float(value) for k, name in enumerate(NAMES) for column, value in (
+            (name, free.values[k]), (f'{name}.sd', np.sqrt(max(variance[k], 0.0))))},
+        **_for_prior(intake, calibration)}
 
 
 def _for_prior(intake: Intake, found: Calibration) -> Row:

@@ -34,7 +34,7 @@ from .sensors import is_damaged, merge_sensor, read_parquet, Store, UNREAD, writ
 from ..calibrate import Calibration, FleetPrior
 from ..disk import write_atomically
 from ..effects import know_code, KNOWN_CODE
-from ..errors import AccelCalibError, InputError, needing, system_error
+from ..errors import AccelCalibError, InputError, known_error, needing
 from ..findings import Rating
 from ..logs import Progress
 from ..session import WorkerProcess
@@ -227,6 +227,8 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
         If a result cannot be written.
 
     """
+    from distributed import KilledWorker
+
     with store.locked():
         files = list(store.files())
         damaged = tuple(str(store.set_aside(path)) for path, is_so in zip(
@@ -235,8 +237,12 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
         _merge(client, store)  # what an interrupted run left
         counts, unread = Counter[str](), list[Row]()
         for item, status in mapped(client, calibrate_recording, found, options, store, limit_s):
-            if isinstance(status, Exception):
-                status = _row_of_killed(item, options, status)
+            if isinstance(status, Exception):  # not of the recording, unless workers died
+                if not isinstance(status, KilledWorker):
+                    raise status
+                status = unread_row(item, options, InputError(
+                    'the workers that calibrated this recording died, expected them to finish',
+                    'give the workers more memory, and run again'))
             if not isinstance(status, str):
                 unread.append(status)
                 status = 'unread'
@@ -277,17 +283,6 @@ def _in_order(client: Client, function: Callable[..., _Result], items: Sequence[
         early[item] = result
         while due and due[0] in early:
             yield early.pop(due.popleft())
-
-
-def _row_of_killed(item: Input, options: Options, error: Exception) -> Row:
-    """Return the row of a recording that kills workers; raise an error that is not its own."""
-    from distributed import KilledWorker
-
-    if not isinstance(error, KilledWorker):
-        raise error
-    return unread_row(item, options, InputError(
-        'the workers that calibrated this recording died, expected them to finish',
-        'give the workers more memory, and run again'))
 
 
 def mapped(client: Client, function: Callable[..., Any], items: Iterable[_Item], *others: Any
@@ -425,8 +420,8 @@ def calibrate_recording(found: Input, options: Options, store: Store, limit_s: f
     """
     Calibrate one recording, add the result to the store, and return what happened to it.
 
-    The row is returned, and not stored, if the recording cannot be read or takes longer than
-    `limit_s` [s]. OSError is raised if the result cannot be written.
+    The row is returned, and not stored, if the recording cannot be read, takes longer than
+    `limit_s` [s], or ends in any other error. OSError is raised if the result cannot be written.
 
     """
     begin = time.perf_counter()
@@ -437,16 +432,21 @@ def calibrate_recording(found: Input, options: Options, store: Store, limit_s: f
             if store.has(key):
                 return 'skipped'
             row, calibration = _apart.process.call_within(limit_s, row_of, found, path, options)
-    except (OSError, EOFError, AccelCalibError) as err:
+    except Exception as err:  # one recording must not stop the others
         return unread_row(found, options, _reason(err, found.path, limit_s))
     row |= {'key': key, 'content': content, 'seconds': time.perf_counter() - begin}
-    if calibration is not None:
-        name = f'calibrations/{as_folder(row["sensor"])}/{key}.yaml'
-        (store.folder / name).parent.mkdir(parents=True, exist_ok=True)
-        write_calibration(store.folder / name, calibration, keep_before=False)
-        row['calibration'] = name
-        row['warnings'] += _exported(calibration, store.folder / name, options.exports)
-    store.add(row)
+    try:
+        if calibration is not None:
+            name = f'calibrations/{as_folder(row["sensor"])}/{key}.yaml'
+            (store.folder / name).parent.mkdir(parents=True, exist_ok=True)
+            write_calibration(store.folder / name, calibration, keep_before=False)
+            row['calibration'] = name
+            row['warnings'] += _exported(calibration, store.folder / name, options.exports)
+        store.add(row)
+    except OSError:
+        raise
+    except Exception as err:
+        return unread_row(found, options, _reason(err, found.path, limit_s))
     return str(row['status'])
 
 
@@ -455,9 +455,7 @@ def _reason(error: Exception, name: str, limit_s: float) -> AccelCalibError:
     if isinstance(error, TimeoutError):
         return InputError(f'{name} takes longer than {limit_s:g} s, expected less',
                           'raise --time-limit, or leave it out')
-    if isinstance(error, AccelCalibError):  # an address without its package, or a missing match
-        return error
-    return system_error(error if isinstance(error, OSError) else OSError(str(error)))
+    return known_error(OSError(str(error)) if isinstance(error, EOFError) else error)
 
 
 def _exported(calibration: Calibration, path: Path, formats: Sequence[str]) -> list[str]:

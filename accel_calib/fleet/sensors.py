@@ -46,12 +46,12 @@ from urllib.parse import unquote
 import numpy as np
 import scipy
 
-from .recording import as_folder, Row, schema
+from .recording import as_folder, Row, schema, UNKNOWN
 from ..calibrate import Calibration
 from ..compare import History, history_of, LEVEL, Parameter
 from ..disk import write_atomically
 from ..effects import LADDER
-from ..errors import AccelCalibError, InputError
+from ..errors import InputError, known_error
 from ..stored import read_calibration
 from ..table import Floats
 
@@ -98,10 +98,18 @@ class Store:
         return self._mark(key).exists()
 
     def add(self, row: Row) -> None:
-        """Write a row, to be merged into the data set; raise OSError if it fails."""
+        """
+        Write a row, to be merged into the data set; raise OSError if it fails.
+
+        ValueError is raised for a row that the data set cannot hold.
+
+        """
+        import pyarrow as pa
+
         folder = self.pending / as_folder(row['sensor'])
         folder.mkdir(parents=True, exist_ok=True)
         text = json.dumps(row)
+        pa.Table.from_pylist([json.loads(text)], schema())
         write_atomically(folder / f'{row["key"]}.json',
                          lambda file: file.write(f'{text}\n{_digest(text)}\n'))
 
@@ -113,18 +121,21 @@ class Store:
         """
         Add the pending rows of a sensor, by the name of its folder, to its Parquet file.
 
-        If it raises OSError, the next `merge` completes it.
+        They replace rows of the same content. The rows are in order of date. If it raises OSError,
+        the next `merge` completes it.
 
         """
         folder = self.pending / name
         paths = sorted(folder.glob('*.json'), key=lambda path: path.stat().st_mtime)
         new = [_pending_row(path) for path in paths]
-        old = self.of_sensor(name)
-        rows, replaced = _merged(old, new)
+        old, newest = self.of_sensor(name), {row['content']: row for row in new}
         if new:
-            write_parquet(self.data(name), rows, schema())
-        for key in replaced:
-            self._mark(key).unlink(missing_ok=True)
+            kept = [row for row in old if row['content'] not in newest]
+            write_parquet(self.data(name), sorted((*kept, *newest.values()), key=lambda row: (
+                row['date'] or '', row['recording'])), schema())
+        for row in (*old, *new):
+            if newest.get(row['content'], row)['key'] != row['key']:
+                self._mark(row['key']).unlink(missing_ok=True)
         for row in new:
             mark = self._mark(row['key'])
             mark.parent.mkdir(parents=True, exist_ok=True)
@@ -247,17 +258,6 @@ def _digest(text: str) -> str:
     return blake2b(text.encode(), digest_size=8).hexdigest()
 
 
-def _merged(old: list[Row], new: list[Row]) -> tuple[list[Row], list[str]]:
-    """Return the rows in order of date, and the keys of old rows that new ones replace."""
-    newest = {row['content']: row for row in new}
-    kept = [row for row in old if row['content'] not in newest]
-    keys = {row['key'] for row in newest.values()}
-    replaced = [row['key'] for row in (*old, *new)
-                if row['content'] in newest and row['key'] not in keys]
-    return sorted((*kept, *newest.values()),
-                  key=lambda row: (row['date'] or '', row['recording'])), replaced
-
-
 # ----------------------------------------------------------------------------- over time
 
 _MOST_COMPARED = 100
@@ -266,6 +266,9 @@ _MOST_COMPARED = 100
 _YEAR_S = 365.25 * 86400.0
 _FEWEST_STEPS = 3
 """Smallest number of steps that distinguish a drift from a change."""
+
+_SHORTEST_YEARS = 1.0 / 365.25
+"""Shortest time from the first to the last calibration that has a drift per year [year]."""
 
 
 def alike(rows: Iterable[Row]) -> list[Row]:
@@ -319,8 +322,9 @@ def merge_sensor(name: str, store: Store) -> Row:
     """
     store.merge(name)
     rows = store.of_sensor(name)
-    good = alike(rows)[-_MOST_COMPARED:]
-    about: Row = {**dict.fromkeys(sensors_schema().names), 'sensor': unquote(name),
+    sensor = unquote(name)
+    good = alike(rows)[-_MOST_COMPARED:] if sensor != UNKNOWN else []
+    about: Row = {**dict.fromkeys(sensors_schema().names), 'sensor': sensor,
                   'recordings': len(rows), 'calibrations': len(good),
                   'errors': sum(row['status'] != 'ok' for row in rows), 'changes': [],
                   'sensor_model': model_of(rows)}
@@ -331,8 +335,10 @@ def merge_sensor(name: str, store: Store) -> Row:
     try:
         return about | _compared([read_calibration(store.folder / row['calibration'])
                                   for row in good], good)
-    except AccelCalibError as err:  # such as calibrations in different units
-        return about | {'note': str(err)}
+    except OSError:
+        raise
+    except Exception as err:  # such as calibrations in different units
+        return about | {'note': str(known_error(err))}
 
 
 def _compared(calibrations: Sequence[Calibration], rows: Sequence[Row]) -> Row:
@@ -415,7 +421,7 @@ def years_of(history: History) -> Floats | None:
 
 def drift_of(history: History, changes: Mapping[int, bool | None] = {}) -> Row | None:
     """
-    Return the most significant drift of a value over the dates; None without enough dates.
+    Return the most significant drift of a value over the dates; None without enough of them.
 
     A line, with a step at each lasting change, is fitted with the stated standard deviations. If
     the values scatter more about it, the standard deviation of the slope is enlarged accordingly.
@@ -426,7 +432,7 @@ def drift_of(history: History, changes: Mapping[int, bool | None] = {}) -> Row |
 
     """
     years = years_of(history)
-    if years is None:
+    if years is None or np.ptp(years) < _SHORTEST_YEARS:
         return None
     kept = np.ones(len(years), bool)
     kept[[index for index, for_good in changes.items() if not for_good]] = False

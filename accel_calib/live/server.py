@@ -6,7 +6,9 @@ The server of the live page, on its own thread with its own event loop.
 
 **Who may.** Everybody who reaches the server can look. Commands and exports need the token in the
 fragment of the link, which browsers do not send. If there are too many viewers, one with the token
-takes the place of one without it, so that nobody can keep its owner out. Host and Origin are
+takes the place of one without it. If there are too many connections, one ends of the address that
+has most of them, and the oldest of those that have got least far; of the owner, only the last. So
+nobody can keep the owner out. Host and Origin are
 checked, so that a page of another site cannot use the server through the browser of a user. Files
 come from a fixed list.
 
@@ -30,8 +32,8 @@ from urllib.parse import urlsplit
 from aiohttp import web
 
 from .viewer import (
-    announce, Connection, LARGEST, Message, not_bound, reachable, secured, STUCK_S, TooManyError,
-    Viewer)
+    announce, Connection, LARGEST, Message, not_bound, OWNER, reachable, secured, STUCK_S,
+    TooManyError, Viewer)
 from .. import __version__
 from ..report import policy
 from ..session import Throttle
@@ -50,10 +52,11 @@ PAGE = Path(__file__).with_name('page') / 'index.html'
 """The page; what it loads is in the same folder."""
 
 _VIEWERS = 16
-"""Largest number of viewers, and of connections that have not said hello yet."""
+"""Largest number of viewers that have said hello."""
 
-_CONNECTIONS = 64
-"""Largest number of connections: of viewers, and of requests that arrive or are answered."""
+_CONNECTIONS = 128
+"""Largest number of connections: of viewers, and of requests that arrive or are answered. It is
+larger than the number that asyncio accepts at once (100), so that a request is read first."""
 
 _QUIET_S = 60.0
 """Shortest time between two log lines about the same misuse [s]."""
@@ -170,7 +173,6 @@ class PageServer:
         self._link_file: Path | None = None
         self.board = Board()
         self.viewers: list[Viewer] = []
-        self._new: list[Viewer] = []
         self._connections: list[Connection] = []
         self._reported, self._filter = Counter[str](), Throttle()
         self._files = {f'/page/{each.name}': each for each in PAGE.parent.iterdir()
@@ -249,8 +251,9 @@ class PageServer:
         self._look()
         await self._over.wait()
         listener.close()
-        for viewer in [*self.viewers, *self._new]:
-            viewer.abort()
+        for connection in list(self._connections):
+            if connection.stage > 1:
+                connection.abort()
         await http.shutdown(_ENDING_S)
 
     def _on_error(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
@@ -262,10 +265,12 @@ class PageServer:
             loop.default_exception_handler(context)
 
     def add(self, connection: Connection) -> None:
-        """Add a connection; at the limit, end the one of the lowest stage, the oldest of them."""
+        """Add a connection; at the limit, end another one."""
         if len(self._connections) >= _CONNECTIONS:
             self.report(f'ended a connection, because {_CONNECTIONS} were open')
-            ended = min(self._connections, key=lambda each: each.stage)
+            of = Counter(each.address for each in self._connections)
+            ended = max(self._connections, key=lambda each: (
+                each.stage < OWNER, of[each.address], -each.stage))
             self.remove(ended)
             ended.abort()
         self._connections.append(connection)
@@ -315,7 +320,11 @@ class PageServer:
     async def _file(self, request: web.BaseRequest, path: str) -> web.Response:
         """Return a file of the page, the calibration page, or an export."""
         if path == '/calibration.html':
-            return await self._page()
+            success, text = await self._asked(self._desk.page)
+            if not success:
+                return web.Response(status=404, text=f'{text}\n')
+            allowed = {'Content-Security-Policy': f"{policy()}; frame-ancestors 'self'"}
+            return web.Response(text=text, content_type='text/html', headers=allowed)
         if path.startswith('/export/') and path.removeprefix('/export/') in FORMATS:
             return await self._export(request, path.removeprefix('/export/'))
         file = self._files.get(path)
@@ -323,13 +332,6 @@ class PageServer:
             return web.Response(status=404, text='there is no such page; open /\n')
         return web.Response(body=file.read_bytes(), content_type=_KINDS[file.suffix],
                             charset='utf-8')
-
-    async def _page(self) -> web.Response:
-        success, text = await self._asked(self._desk.page)
-        if not success:
-            return web.Response(status=404, text=f'{text}\n')
-        allowed = {'Content-Security-Policy': f"{policy()}; frame-ancestors 'self'"}
-        return web.Response(text=text, content_type='text/html', headers=allowed)
 
     async def _export(self, request: web.BaseRequest, name: str) -> web.Response:
         kind, _, token = request.headers.get('Authorization', '').partition(' ')
@@ -369,24 +371,15 @@ class PageServer:
         await socket_.prepare(request)
         connection.stage = 2
         viewer = Viewer(self, socket_, connection)
-        if len(self._new) >= _VIEWERS:
-            self._close(self._new[0])
-        self._new.append(viewer)
         try:
             await viewer.run()
         finally:
             self._forget(viewer)
         return socket_
 
-    def _close(self, viewer: Viewer) -> None:
-        """Close a viewer in favour of another one."""
-        viewer.abort()
-        self._forget(viewer)
-
     def _forget(self, viewer: Viewer) -> None:
-        for each in (self._new, self.viewers):
-            if viewer in each:
-                each.remove(viewer)
+        if viewer in self.viewers:
+            self.viewers.remove(viewer)
 
     def admit(self, viewer: Viewer, token: str) -> None:
         """
@@ -402,8 +395,10 @@ class PageServer:
             if viewer.why or not guests:
                 raise TooManyError(f'{_VIEWERS} viewers are connected already', 'close one of '
                                    'them')
-            self._close(guests[0])
-        self._forget(viewer)
+            guests[0].connection.abort()
+            self._forget(guests[0])
+        if not viewer.why:
+            viewer.connection.stage = OWNER
         self.viewers.append(viewer)
 
     def ask(self, command: str, answer: Callable[[bool, str], object]) -> None:

@@ -31,7 +31,10 @@ _WAIT_S = 0.03
 _HEAD_S = 2.0
 """Time over which the first lines of a port are collected [s]."""
 
-_HEAD_LINES = 20
+_HEAD_LINES, _HEAD_CHARACTERS = 20, 1 << 18
+"""Fewest first lines, and number of characters after which no more are collected: each takes some
+150 bytes while the lines are recognised."""
+
 _PATIENCE_S = 10.0
 """Time without a line that is understood after which a port is refused [s]."""
 
@@ -223,6 +226,7 @@ def _understood(name: str, lines: Iterator[list[str]], options: LogOptions, baud
                 ) -> LineReader:
     """Return the reader of the lines, as soon as the first ones are understood."""
     head: list[str] = []
+    count = size = 0
     arrived: list[tuple[int, float]] = []
     begin = tried = time.monotonic()
     problem = InputError(f'{name} sends no lines, expected one line for each sample',
@@ -231,9 +235,10 @@ def _understood(name: str, lines: Iterator[list[str]], options: LogOptions, baud
         now = time.monotonic()
         if new and not head:
             begin = tried = now
-        head += new
         if new:
-            arrived.append((len(head), now))
+            head += new if size < _HEAD_CHARACTERS else []
+            count, size = count + len(new), size + sum(map(len, new))
+            arrived.append((count, now))
         if now - tried >= _HEAD_S and len(head) >= _HEAD_LINES and (
                 arrived[-1][1] - arrived[0][1] > _WAIT_S):
             tried = now

@@ -39,6 +39,7 @@ from aiohttp import web, WSCloseCode, WSMsgType
 
 from ..errors import InputError
 from ..session import COMMANDS as COMMANDS_OF_A_SESSION, ros_home
+from ..text import read_json
 
 if TYPE_CHECKING:
     from .server import PageServer
@@ -71,6 +72,9 @@ COMMANDS = (*COMMANDS_OF_A_SESSION, 'enable', 'disable')
 LARGEST = 4096
 """Largest message of a viewer [bytes]."""
 
+OWNER = 3
+"""Stage of a connection whose viewer has the token."""
+
 Answered = TypeVar('Answered', bound=web.StreamResponse)
 
 _BUFFER = 65536
@@ -98,8 +102,8 @@ def request_of(text: str) -> Hello | Ask:
     wrong = InputError('the message is not understood, expected {"hello": {"token", "seen"}} or '
                        '{"ask": {"id", "command"}}', 'load the page again')
     try:
-        found = json.loads(text)
-    except (ValueError, RecursionError):
+        found = read_json(text)
+    except ValueError:
         raise wrong from None
     match found:
         case {'hello': {'token': str(token), 'seen': int(seen)}}:
@@ -183,17 +187,24 @@ def secured(response: Answered) -> Answered:
 
 
 class Connection(web.RequestHandler):
-    """A connection; `stage` 0: its request has not arrived; 1: it is answered; 2: a viewer."""
+    """
+    A connection from an `address`.
+
+    `stage` 0: its request has not arrived; 1: it is answered; 2: a viewer; 3: the `OWNER`.
+
+    """
 
     def __init__(self, server: PageServer, http: web.Server) -> None:
         super().__init__(http, loop=asyncio.get_running_loop(),
                          access_log=None)  # type: ignore[arg-type]
-        self._owner, self.stage = server, 0
+        self._owner, self.stage, self.address = server, 0, ''
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Close the connection later, unless its request arrives."""
         super().connection_made(transport)
-        self._limit = asyncio.get_running_loop().call_later(_REQUEST_S, self._abort_if_silent)
+        self.address = str((transport.get_extra_info('peername') or [''])[0])
+        self._limit = asyncio.get_running_loop().call_later(
+            _REQUEST_S, lambda: self.stage or self.abort())
         self._owner.add(self)
 
     def connection_lost(self, exc: BaseException | None) -> None:
@@ -201,10 +212,6 @@ class Connection(web.RequestHandler):
         self._limit.cancel()
         self._owner.remove(self)
         super().connection_lost(exc)
-
-    def _abort_if_silent(self) -> None:
-        if not self.stage:
-            self.abort()
 
     def abort(self) -> None:
         """End the connection without waiting."""
@@ -215,10 +222,12 @@ class Connection(web.RequestHandler):
                      exc: BaseException | None = None, message: str | None = None
                      ) -> web.StreamResponse:
         """Return the answer to a request that is not HTTP, or to an unexpected error."""
-        if status != HTTPStatus.BAD_REQUEST:
+        has_left = isinstance(exc, ConnectionError)
+        if status != HTTPStatus.BAD_REQUEST and not has_left:
             return secured(super().handle_error(request, status, exc, message))
         self.stage = 1
-        self._owner.report('refused a request that is not HTTP')
+        self._owner.report('lost a visitor before its answer' if has_left else
+                           'refused a request that is not HTTP')
         return secured(web.Response(
             status=status, text='the request is not HTTP; open the link in a browser\n'))
 
@@ -231,14 +240,13 @@ class Viewer:
     """
     A viewer.
 
-    `why` it only looks is set when it is admitted, and empty if its commands are accepted. `abort`
-    ends the connection without waiting.
+    `why` it only looks is set when it is admitted, and empty if its commands are accepted.
 
     """
 
     def __init__(self, server: PageServer, websocket: web.WebSocketResponse,
                  connection: Connection) -> None:
-        self._server, self._socket, self.abort = server, websocket, connection.abort
+        self._server, self._socket, self.connection = server, websocket, connection
         self._sent: dict[str, Message] = {}
         self._answers: deque[Message] = deque()
         self._seen = 0
@@ -256,7 +264,7 @@ class Viewer:
     def abort_if_stuck(self, now: float) -> None:
         """End the connection if it has taken no data for too long; `now` is of the loop [s]."""
         if now - self._sending_since > STUCK_S:
-            self.abort()
+            self.connection.abort()
 
     async def run(self) -> None:
         """Serve the viewer until it ends."""
@@ -314,7 +322,7 @@ class Viewer:
                 await self._send_new()
                 await self._news.wait()
         except ConnectionError:
-            self.abort()
+            self.connection.abort()
 
     async def _send_new(self) -> None:
         """Send the log lines, the newest message of each kind, and then the answers."""

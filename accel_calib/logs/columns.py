@@ -24,6 +24,7 @@ from .names import (
     may_cause, Meaning, meaning, OURS, RATE, READING, recognise, unit_of, WHOLE_WORDS, WORDS)
 from ..errors import InputError
 from ..table import COLUMNS, Floats, quantity_key
+from ..text import one_line
 from ..units import STANDARD_GRAVITY, UnitName
 
 FRACTION = 'time_ns'
@@ -137,8 +138,8 @@ class Chosen:
         return np.column_stack([self.numbers(cells, name) for name in ours])
 
     def texts(self, cells: Cells, ours: str) -> list[str]:
-        """Return the texts of a column."""
-        return cells.texts[self.text.index(self.sources[ours].index)]
+        """Return the texts of a column, each one printable line."""
+        return [*map(one_line, cells.texts[self.text.index(self.sources[ours].index)])]
 
     def names(self, ours: Sequence[str]) -> list[str]:
         """Return the names of columns in the file."""

@@ -14,6 +14,7 @@ makes members of other files.
 from __future__ import annotations
 
 import bz2
+from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 import csv
@@ -35,6 +36,7 @@ import numpy as np
 from .child import LogFile
 from ..errors import InputError
 from ..table import ABOUT
+from ..text import some
 
 ROWS = 500
 """Number of rows that are read at once."""
@@ -133,7 +135,7 @@ def csv_of(rows: Iterator[Sequence[Any]]) -> Bytes:
     while block := list(islice(rows, ROWS)):
         text = io.StringIO()
         csv.writer(text, lineterminator='\n').writerows(block)
-        yield text.getvalue().encode()
+        yield text.getvalue().encode(errors='replace')  # half of a pair is no text in UTF-8
 
 
 # ------------------------------------------------------------------------------------ Excel
@@ -212,11 +214,14 @@ class Frame:
 
     @property
     def table(self) -> Member:
-        """Return the DataFrame as a table."""
+        """Return the DataFrame as a table; InputError if two columns have one name."""
+        if twice := [each for each, count in Counter(self.data.columns).items() if count > 1]:
+            raise InputError(f'{self} has several columns {some(twice)}, expected one of each',
+                             'remove or rename the others')
         columns = dict(self._columns())
         about = getattr(self.data, 'attrs', {})
-        head = ''.join(f'# {name}: {json.dumps(about[name])}\n' for name in ABOUT
-                       if about.get(name))
+        head = ''.join(f'# {name}: {json.dumps(about[name], default=str)}\n' for name in ABOUT
+                       if isinstance(about.get(name), str | Mapping) and about[name])
 
         def lines() -> Bytes:
             cells = [_plain(values) for values in columns.values()]

@@ -20,7 +20,6 @@ import csv
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from functools import lru_cache
-import json
 import math
 from pathlib import Path
 import re
@@ -31,7 +30,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..table import ABOUT, Autopilot, Floats
-from ..text import counted, some
+from ..text import counted, read_json, some
 from ..units import UNIT_NAMES
 
 DELIMITERS = (';', '\t', '|', ',', '')
@@ -453,8 +452,9 @@ def _about(path: Path, comments: Sequence[str]) -> dict[str, Any]:
         name, colon, text = line[1:].partition(':')
         if colon and name.strip() in ABOUT:
             try:
-                value = json.loads(text)
-                about[name.strip()] = Autopilot(**value) if 'autopilot' in name else str(value)
+                value = read_json(text)
+                about[name.strip()] = Autopilot(**value) if 'autopilot' in name else (
+                    '' if value is None else str(value))
             except (TypeError, ValueError):
                 continue  # an ordinary comment
     if about.get('units', '') not in ('', *UNIT_NAMES):

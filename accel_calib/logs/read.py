@@ -29,7 +29,7 @@ from .text import TextTable
 from ..disk import write_atomically
 from ..errors import InputError
 from ..table import check_values, column_of, COLUMNS, concatenated, Poses, Recording, Table
-from ..text import counted
+from ..text import counted, one_line
 
 _DIGITS = '.12g'
 
@@ -75,7 +75,7 @@ def write_blocks(path: Path, blocks: Iterable[Table]) -> int:
             if not keys:
                 keys = [key for key, column in COLUMNS.items() if key in block and not column.made]
                 keys += block.quantities
-                file.writelines(f'# {name}: {json.dumps(value, ensure_ascii=False)}\n'
+                file.writelines(f'# {name}: {one_line(json.dumps(value, ensure_ascii=False))}\n'
                                 for name, value in block.about.items())
                 writer.writerow([name for key in keys for name in column_of(key).names])
             parts = [_as_text(block[key]) for key in keys]

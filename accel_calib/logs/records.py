@@ -23,7 +23,6 @@ from contextlib import ExitStack
 from functools import partial
 import io
 from itertools import chain, islice
-import json
 from pathlib import Path
 import re
 from typing import Any
@@ -36,6 +35,7 @@ from .columns import is_log_header, LogOptions
 from .containers import Bytes, CELL_BYTES, csv_of, Member, ROWS
 from .dialect import shown
 from ..errors import InputError
+from ..text import read_json
 
 _MOST_BYTES, _LONGEST_LINE = 1 << 25, 1 << 20
 """Largest JSON file that is read as a whole [bytes], and longest line of a record [characters]."""
@@ -59,7 +59,7 @@ def json_document(path: Path, _: ExitStack) -> list[Member]:
         raise InputError(f'{path} has {size} bytes, expected a JSON file of at most {_MOST_BYTES}',
                          'store one record per line (JSON lines)')
     with path.open(encoding='utf-8-sig') as file:
-        return list(_in_json('', json.load(file), size))
+        return list(_in_json('', read_json(file.read()), size))
 
 
 def _in_json(name: str, held: Any, size: int) -> Iterator[Member]:
@@ -92,7 +92,7 @@ def _named(record: Record) -> tuple[str, Record]:
 
 def json_line(line: str) -> tuple[str, Record]:
     """Return the series of a line of JSON, and the record."""
-    return _named(json.loads(line))
+    return _named(read_json(line))
 
 
 def influx_line(line: str) -> tuple[str, Record]:

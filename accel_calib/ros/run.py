@@ -34,7 +34,7 @@ import sys
 from threading import Thread
 from typing import TYPE_CHECKING
 
-from ..errors import AccelCalibError, NEEDS_ROS
+from ..errors import AccelCalibError, hide_warnings, NEEDS_ROS
 from ..one_thread import use_one_thread
 
 if TYPE_CHECKING:
@@ -83,6 +83,8 @@ def run(node: str, args: Sequence[str] | None = None) -> int:
 
     """
     use_one_thread()
+    if args is None:
+        hide_warnings()
     came, written = os.pipe()
     os.set_blocking(written, False)
     signal.set_wakeup_fd(written, warn_on_full_buffer=False)

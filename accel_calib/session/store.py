@@ -38,6 +38,7 @@ from ..errors import (
 from ..logs import read_poses, write_table
 from ..stored import calibration_bytes, read_calibration
 from ..table import LARGEST, Poses
+from ..text import LONGEST_NAME, one_line
 from ..units import UnitName
 
 _UNSAFE = re.compile(r'[^A-Za-z0-9_-]+')
@@ -379,7 +380,8 @@ class SensorFiles:
 
     def take(self, sensor: str) -> Store | None:
         """Lock the files of a sensor and return the store; None if another node uses them."""
-        identity = Identity(sensor, self._topic, bool(self._settings.sensor))
+        identity = Identity(one_line(sensor).strip()[:LONGEST_NAME], self._topic,
+                            bool(self._settings.sensor))
         before, self.store = self.store, store_of(self._settings.calibration_file, identity,
                                                   self._settings.units)
         if before is None or before.calibration != self.store.calibration:

@@ -5,8 +5,9 @@
 Stored calibrations, and typical values of a fleet: readable, versioned YAML.
 
 The reader bounds size and nesting (`.plain_yaml`) and checks every value. The calibration then
-passes the same gate as a fit (`accel_calib.calibrate.gated`). The last line of a file is a
-checksum of the text before it; it reveals a file that was edited by hand.
+passes the same gate as a fit (`accel_calib.calibrate.gated`). The writer reads its own bytes, so
+that it stores nothing that the reader refuses. The last line of a file is a checksum of the text
+before it; it reveals a file that was edited by hand.
 
 """
 
@@ -21,13 +22,13 @@ from numpy.typing import NDArray
 import yaml
 
 from .plain_yaml import (
-    array_at, choice_at, decoded, MOST_BYTES, MOST_VALUES, name_at, number_at, read_plain, shown,
-    value_at, values_at)
+    array_at, beginning_of, choice_at, decoded, MOST_BYTES, number_at, read_plain, shown, value_at,
+    values_at)
 from .. import __version__
 from ..calibrate import (
     Calibration, FleetPrior, gated, GyroBias, in_g, LARGEST_OFFSET_G, mounting_figures, Quality,
     Rejected, RejectedKind, SampleNoise, STORED_METHODS, with_history)
-from ..disk import check_regular, FIRST_LINE, FORMAT, write_atomically
+from ..disk import FIRST_LINE, FORMAT, write_atomically
 from ..effects import (
     CHANGES, Effect, effect_named, factors_of, is_effect, Model, MODELS, parameter_names,
     PROCESSES)
@@ -37,9 +38,8 @@ from ..errors import (
 from ..estimate import Prior
 from ..finding import Finding, KINDS, LEVELS, without
 from ..geometry import rms
-from ..table import (
-    Autopilot, check_values, column_of, COLUMNS, Floats, is_quantity, LARGEST, Poses)
-from ..text import plain, some
+from ..table import Autopilot, check_values, COLUMNS, Floats, is_quantity, LARGEST, Poses
+from ..text import counted, LONGEST_NAME, plain, some
 from ..units import FRAMES, MODEL_NAMES, UNIT_NAMES, Units
 
 # The first is eight times as fast, but not in every build of PyYAML.
@@ -69,15 +69,9 @@ _SAME_OWN = 1e-6
 _CHECKSUM = '\nchecksum: sha256 '
 _NAMES = (*(name for name in MODEL_NAMES if name != 'auto'), 'ideal')
 
-_OTHERS = 10_000
-"""More values than a calibration has beside its poses."""
-
 _PER_G: Mapping[str, tuple[float, float]] = {
     'm/s2': (0.1, 100.0), 'g': (1.0, 1.0), 'native': (1.0 / LARGEST, LARGEST)}
 """Range of 1 g, by unit; for m/s² gravity on planets and moons."""
-
-_LONGEST_NAME = 4096
-"""Longest name of an effect, a sensor or a topic, which messages repeat."""
 
 _MOST_LETTERS = MOST_BYTES
 """Most characters of all labels, of which each takes as much memory as the longest one."""
@@ -96,27 +90,23 @@ def calibration_bytes(calibration: Calibration) -> bytes:
     RefusedFitError
         If the calibration is not plausible.
     InputError
-        If it has more poses than a file can hold.
+        If the reader refuses it, such as more poses than a file can hold.
 
     """
     text: str = yaml.dump(_content(gated(calibration)), Dumper=SafeDumper, sort_keys=False,
                           allow_unicode=True, width=99, default_flow_style=None).rstrip()
     data = f'{text}{_CHECKSUM}{_digest(text)}\n'.encode()
-    if len(data) > MOST_BYTES or _values_in(calibration) > MOST_VALUES:
-        raise InputError(f'the calibration has {len(calibration.poses)} poses, which is more than '
-                         'its file can hold', 'fit fewer poses')
+    try:
+        calibration_from(data, 'its file')
+    except DamagedCalibrationError as err:
+        raise InputError(f'the calibration of {counted(len(calibration.poses), "pose")} cannot be '
+                         f'stored: {err.message}', 'fit fewer poses, or shorten their texts'
+                         ) from err
     return data
 
 
 def _digest(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _values_in(calibration: Calibration) -> int:
-    """Return an upper limit of the number of values and keys in the file of a calibration."""
-    poses = calibration.poses
-    cells = sum(1 + len(column_of(key).names) for key in poses.columns)
-    return _OTHERS + (1 + cells) * len(poses) + 5 * len(calibration.rejected)
 
 
 def _content(calibration: Calibration) -> dict[str, Any]:
@@ -289,9 +279,8 @@ def _calibration(content: Mapping[str, Any]) -> Calibration:
     return Calibration(
         name=choice_at(content, 'model', _NAMES),
         method=choice_at(content, 'method', STORED_METHODS), model=model, units=units,
-        sensor=name_at(content, 'sensor', _LONGEST_NAME),
-        stream=name_at(content, 'stream', _LONGEST_NAME),
-        frame=choice_at(content, 'frame', FRAMES), date=name_at(content, 'date', _LONGEST_NAME),
+        sensor=value_at(content, 'sensor', str), stream=value_at(content, 'stream', str),
+        frame=choice_at(content, 'frame', FRAMES), date=value_at(content, 'date', str),
         covariance=array_at(content, 'covariance', (size, size), finite=False, most=LARGEST),
         quality=_quality(value_at(content, 'quality', dict)),
         poses=_poses(value_at(content, 'poses', dict), _optional(
@@ -320,7 +309,7 @@ def _units(stated: Mapping[str, Any]) -> Units:
 
 def _effects(stated: Mapping[str, Any]) -> dict[str, Floats]:
     for name in stated:
-        if (len(name) > _LONGEST_NAME or not is_effect(name) or name in CHANGES
+        if (len(name) > LONGEST_NAME or not is_effect(name) or name in CHANGES
                 or name in PROCESSES):
             raise ValueError(f'effect {shown(name)} is not in the catalogue')
     return {name: _values(effect_named(name), value_at(stated, name, dict)) for name in stated}
@@ -401,14 +390,7 @@ def read_calibration(path: Path) -> Calibration:
         If the file cannot be read.
 
     """
-    return calibration_from(_beginning_of(path), str(path))
-
-
-def _beginning_of(path: Path) -> bytes:
-    """Return the content of a regular file, with one byte too many if it is too large."""
-    check_regular(path)
-    with path.open('rb') as file:
-        return file.read(MOST_BYTES + 1)
+    return calibration_from(beginning_of(path), str(path))
 
 
 def write_calibration(path: Path, calibration: Calibration, *, keep_before: bool = True) -> None:
@@ -437,15 +419,16 @@ _MOST_SENSORS = 10**9
 
 
 def write_priors(path: Path, priors: Mapping[str, FleetPrior]) -> None:
-    """Write typical values as YAML; raise OSError if the file cannot be written."""
+    """Write typical values as YAML; OSError if that fails, InputError if the reader refuses it."""
     models = [{'model': fleet.model, 'sensors': fleet.sensors, 'names': list(_PRIOR_NAMES),
                'mean': fleet.prior.mean.tolist(),
                'sd': np.sqrt(np.diag(fleet.prior.covariance)).tolist(),
                'covariance': fleet.prior.covariance.tolist()} for fleet in priors.values()]
     content = {'format': _PRIORS, 'values_of': 'model 10 at |force| = 1 g', 'unit': 'g',
                'models': models}
-    write_atomically(path, lambda file: yaml.safe_dump(content, file, sort_keys=False,
-                                                       allow_unicode=True, width=99))
+    text: str = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=99)
+    _fleets_in(text.encode(), path)
+    write_atomically(path, lambda file: file.write(text))
 
 
 def read_prior(path: Path, model: str = '') -> FleetPrior:
@@ -467,21 +450,26 @@ def read_prior(path: Path, model: str = '') -> FleetPrior:
         If the file cannot be read.
 
     """
-    try:
-        content = read_plain(decoded(_beginning_of(path)))
-        if content['format'] != _PRIORS:
-            raise InputError(f'{path} has format {shown(content["format"])}, expected {_PRIORS}',
-                             'update accel_calib, or make the file again')
-        found = [_fleet_of(each) for each in values_at(content, 'models', dict)]
-    except (KeyError, TypeError, ValueError, np.linalg.LinAlgError) as err:
-        raise InputError(f'{path} has no typical values of a fleet: {err}',
-                         'use fleet.yaml of accel-calib fleet') from err
+    found = _fleets_in(beginning_of(path), path)
     chosen = [each for each in found if each.model == model or (not model and len(found) == 1)]
     if not chosen:
         names = some(each.model or "''" for each in found) or 'no model'
         raise InputError(f'{path} has {names}, expected the model {model!r}',
                          'set --sensor-model to a model in the file')
     return chosen[0]
+
+
+def _fleets_in(data: bytes, path: Path) -> list[FleetPrior]:
+    """Return the typical values in the data of a file, of all models."""
+    try:
+        content = read_plain(decoded(data))
+        if content['format'] != _PRIORS:
+            raise InputError(f'{path} has format {shown(content["format"])}, expected {_PRIORS}',
+                             'update accel_calib, or make the file again')
+        return [_fleet_of(each) for each in values_at(content, 'models', dict)]
+    except (KeyError, TypeError, ValueError, np.linalg.LinAlgError) as err:
+        raise InputError(f'{path} has no typical values of a fleet: {err}',
+                         'use fleet.yaml of accel-calib fleet') from err
 
 
 def _fleet_of(content: Mapping[str, Any]) -> FleetPrior:

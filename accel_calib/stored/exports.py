@@ -34,6 +34,7 @@ from .. import __version__
 from ..calibrate import Calibration
 from ..disk import write_atomically
 from ..errors import InputError
+from ..text import one_line
 from ..units import STANDARD_GRAVITY
 
 if TYPE_CHECKING:
@@ -278,7 +279,7 @@ def write_plan(path: Path, plan: PosePlan) -> None:
     columns = {**{key: (key, 1.0) for pose in plan.poses for key in pose.context}, **_CONTEXT}
 
     def write(file: TextIO) -> None:
-        file.writelines(f'# {line}\n' for line in plan.lines)
+        file.writelines(f'# {one_line(line)}\n' for line in plan.lines)
         writer = csv.writer(file, lineterminator='\n')
         writer.writerow(['pose', 'up_x', 'up_y', 'up_z', 'attitude',
                          *(name for name, _ in columns.values()), 'separates',

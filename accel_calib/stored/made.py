@@ -327,19 +327,18 @@ def unit_in_ascii(units: Units, native: str) -> str:
 def about(calibration: Calibration) -> list[str]:
     """Return lines about a calibration for a comment: sensor, unit, model, curves, quality."""
     quality, poses, units = calibration.quality, calibration.used_poses, calibration.units
-    lines = [f'sensor: {plain_text(calibration.sensor) or "not named"}',
-             f'date: {plain_text(calibration.date) or "not known"}',
+    lines = [f'sensor: {calibration.sensor or "not named"}',
+             f'date: {calibration.date or "not known"}',
              f'readings: {unit_in_ascii(units, "native (counts or volts)")}, '
              f'1 g = {units.per_g:.9g}',
-             f'model {plain_text(calibration.name)}: '
-             f'{plain_text(", ".join(calibration.model.effects)) or "no effects"}',
+             f'model {calibration.name}: {", ".join(calibration.model.effects) or "no effects"}',
              f'residual over {len(poses)} poses: before {quality.rms_before_mg:.3g} mg, after '
              f'{quality.rms_after_mg:.3g} mg',
              f'uncertainty of |force|: {uncertainty_g(calibration) * MG:.2g} mg (1 sd, largest '
              'over the sphere)']
     for name, values in calibration.model.values.items():
         formula = formula_of(name, values, calibration.deviations).replace('°C', 'degC')
-        lines += map(plain_text, wrap(f'formula of {formula}', _LARGEST_TEXT) if formula else ())
+        lines += [f'formula of {formula}'] if formula else []
     low, high = range_of(poses, 'temperature')
     if np.isfinite(low):
         lines.append(f'temperature of the poses: {low:.1f} to {high:.1f} degC')
@@ -359,7 +358,8 @@ def frame_words(calibration: Calibration) -> str:
 def rendered(name: str, chosen: Format, calibration: Calibration, made: Made) -> str:
     """Return the text of a file, from the template of this name."""
     of_reader = [f'source: {chosen.source}', f'equation: {chosen.equation}']
-    comment = [TITLE, *about(calibration), *(of_reader if chosen.source else ()), *made.comment]
+    lines = [TITLE, *about(calibration), *(of_reader if chosen.source else ()), *made.comment]
+    comment = [plain_text(part) for line in lines for part in wrap(line, _LARGEST_TEXT)]
     template = _environment().get_template(f'{name}.j2')
     return template.render({**plain(made.values), 'comment': comment})
 

@@ -10,18 +10,16 @@ the noise of one sample, which is the density times the square root of the rate.
 """
 
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import replace
-import json
 from pathlib import Path
 from typing import Any, TypeGuard
 
 from .affine import affine
 from .made import Made, plain_text
+from .plain_yaml import beginning_of, decoded, shown
 from ..calibrate import Calibration
-from ..disk import check_regular
 from ..errors import InputError
-from ..table import LARGEST
+from ..text import read_json
 from ..units import STANDARD_GRAVITY
 
 _NOISE = {'accelerometer_noise_density': 'm/s^2/sqrt(Hz)',
@@ -29,6 +27,9 @@ _NOISE = {'accelerometer_noise_density': 'm/s^2/sqrt(Hz)',
           'gyroscope_noise_density': 'rad/s/sqrt(Hz)',
           'gyroscope_random_walk': 'rad/s^2/sqrt(Hz)', 'update_rate': 'Hz'}
 """Figures of ``accel-calib noise --json``, and their units."""
+
+_LARGEST = 1e6
+"""Largest figure; noise and rate of any sensor are far below."""
 
 Noise = Mapping[str, Any]
 
@@ -88,18 +89,18 @@ def _noise_figures(noise: Noise | None, label: str) -> tuple[dict[str, float], t
             notes.append(f'{key} is not seen ({reason or "no reason is stated"}): its upper limit '
                          f'{value:.3g} is used')
         if not _is_positive(value):
-            found = f'has no {key}' if value is None else f'has {key} {value!r}'
+            found = f'has no {key}' if value is None else f'has {key} {shown(value)}'
             raise InputError(f'the file of the noise {found}{reason and ": "}{reason}, but '
-                             f'{label} needs a positive number', 'record a longer rest and run '
-                             'accel-calib noise again, or write the figure of the data sheet into '
-                             'the file')
+                             f'{label} needs a number above 0, up to {_LARGEST:g}',
+                             'record a longer rest and run accel-calib noise again, or write the '
+                             'figure of the data sheet into the file')
         figures[key] = value
     return figures, tuple(notes)
 
 
 def _is_positive(value: object) -> TypeGuard[float]:
     return (isinstance(value, int | float) and not isinstance(value, bool)
-            and 0.0 < value < LARGEST)
+            and 0.0 < value <= _LARGEST)
 
 
 def read_noise(path: Path) -> Noise:
@@ -109,16 +110,16 @@ def read_noise(path: Path) -> Noise:
     Raises
     ------
     InputError
-        If it is not a JSON object.
+        If it is not a JSON object, or is too large.
     OSError
         If the file cannot be read.
 
     """
-    check_regular(path)
-    content, fault = None, 'is not a JSON file'
-    with suppress(ValueError):
-        content = json.loads(path.read_text(encoding='utf-8'))
-        fault = 'contains no JSON object'
+    content, fault = None, 'contains no JSON object'
+    try:
+        content = read_json(decoded(beginning_of(path)))
+    except ValueError as err:
+        fault = f'is not a JSON file ({err})'
     if not isinstance(content, Mapping):
         raise InputError(f'{path} {fault}, expected the result of accel-calib noise --json',
                          'run accel-calib noise RECORDING --json noise.json')

@@ -10,6 +10,8 @@ the reading. (The loader of PyYAML makes a node of each value first: 100,000 pos
 take 210 MB with it, and 16 MB here.) Anchors, aliases, tags, keys that are not text, a key that is
 stated twice, dates, and numbers in other forms than the decimal one are refused.
 
+Text becomes one printable line.
+
 `value_at` and its siblings raise KeyError if a key is missing, and ValueError if its value is of
 another type.
 
@@ -17,6 +19,7 @@ another type.
 
 from collections.abc import Iterator, Mapping
 import math
+from pathlib import Path
 import re
 from typing import Any, TypeVar
 
@@ -24,7 +27,9 @@ import numpy as np
 import yaml
 from yaml.resolver import Resolver
 
+from ..disk import check_regular
 from ..table import Floats
+from ..text import one_line
 
 # The first is eight times as fast, but not in every build of PyYAML.
 SafeLoader: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
@@ -52,6 +57,13 @@ _WHOLE = re.compile(r'[-+]?(?:0|[1-9][0-9]*)')
 _NOT_FINITE = re.compile(r'[-+]?\.(?:nan|inf)', re.IGNORECASE)
 _EXPECTED: Mapping[type, str] = {dict: 'names with values', list: 'a list', str: 'text',
                                  int: 'a whole number'}
+
+
+def beginning_of(path: Path) -> bytes:
+    """Return the content of a regular file, with one byte too many if it is too large."""
+    check_regular(path)
+    with path.open('rb') as file:
+        return file.read(MOST_BYTES + 1)
 
 
 def decoded(data: bytes) -> str:
@@ -105,7 +117,7 @@ class _Reader:
         """Return the value that starts with an event below this number of levels."""
         self._check(event)
         if isinstance(event, yaml.ScalarEvent):
-            return self._scalar(event) if event.implicit[0] else event.value
+            return self._scalar(event) if event.implicit[0] else one_line(event.value)
         if depth == MOST_DEPTH:
             raise self._refusal(event, f'it has more than {MOST_DEPTH} levels')
         if isinstance(event, yaml.MappingStartEvent):
@@ -121,7 +133,7 @@ class _Reader:
             self._check(event)
             if not isinstance(event, yaml.ScalarEvent):
                 raise self._refusal(event, 'a key is a mapping or a list, expected a name')
-            key = str(event.value)
+            key = one_line(event.value)
             if key in content:
                 raise self._refusal(event, f'the key {shown(key)} is stated twice, expected once')
             self._keys.append(key)
@@ -146,7 +158,7 @@ class _Reader:
         """Return the value of unquoted text; refuse dates and numbers that are not decimal."""
         text = event.value
         if len(text) > _LONGEST_NUMBER:
-            return text
+            return one_line(text)
         tag: str = _RESOLVER.resolve(  # type: ignore[no-untyped-call]
             yaml.ScalarNode, text, (True, False))
         kind = tag.rpartition(':')[2]
@@ -161,7 +173,7 @@ class _Reader:
                                 'or text in quotes')
         if kind == 'bool':
             return SafeLoader.bool_values[text.lower()]
-        return None if kind == 'null' else text
+        return None if kind == 'null' else one_line(text)
 
     def _refusal(self, event: yaml.Event, words: str) -> ValueError:
         """Return the error for an event, with its key and line."""
@@ -186,14 +198,6 @@ def _checked(value: Any, where: str, kind: type[Kind]) -> Kind:
     if not isinstance(value, kind) or isinstance(value, bool):
         raise ValueError(f'{where} {shown(value)}, expected {_EXPECTED[kind]}')
     return value
-
-
-def name_at(content: Mapping[str, Any], key: str, most: int) -> str:
-    """Return the text under a key, of at most this number of characters."""
-    text = value_at(content, key, str)
-    if len(text) > most:
-        raise ValueError(f'{key} has {len(text)} characters, expected at most {most}')
-    return text
 
 
 def choice_at(content: Mapping[str, Any], key: str, choices: tuple[str, ...]) -> Any:

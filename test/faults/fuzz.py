@@ -6,11 +6,13 @@ Seeded damage to files of every kind that is read, and random files.
 
 Most cases change a sound file: bytes flipped, removed, repeated or inserted, numbers replaced by
 others, the file cut or joined with another one. Others are made at random: tables (``table``),
-calibrations with values of wrong types (``tree``), bags of damaged messages (``messages``). The
+calibrations with values of wrong types (``tree``), bags of damaged messages (``messages``), tables
+and figures of the noise with hostile text (``text``, ``noise``), and DataFrames (``frame``). The
 reader must end with a result or with an error of this package in one line, print nothing, and keep
-within a time limit. Bags are also corrected, and calibrations that are read are used. ``command``
-runs the command line on files of all kinds. It must end with exit status 0 or 1, or with 2 and one
-line.
+within a time limit. Bags are also corrected, and calibrations that are read are used. A
+calibration of a table with hostile text is stored, read and exported, and no line of that text
+leaves a comment. ``command`` runs the command line on files of all kinds. It must end with exit
+status 0 or 1, or with 2 and one line.
 
 Run many cases by hand: ``python test/faults/fuzz.py --count 100000 --seed 7 csv yaml``.
 
@@ -20,6 +22,7 @@ import argparse
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import replace
 import io
 import os
 from pathlib import Path
@@ -38,13 +41,16 @@ import accel_calib as ac  # noqa: E402
 from accel_calib.errors import AccelCalibError, InputError, StoredCalibrationError  # noqa: E402
 from accel_calib.logs import LogOptions, write_table  # noqa: E402
 from accel_calib.messages import correct_bag  # noqa: E402
-from accel_calib.stored import read_calibration  # noqa: E402
+from accel_calib.stored import read_calibration, write_calibration  # noqa: E402
 from faults import inputs  # noqa: E402
-from faults.inputs import BAGS, EXTREME, Files  # noqa: E402
+from faults.inputs import BAGS, EXTREME, Files, one  # noqa: E402
 from inside import (  # noqa: E402
-    format_calibration, main as command_line, parse_calibration, poses_of, read_log)
+    Calibration, CALIBRATION_ALONE, export, ExportOptions, format_calibration,
+    main as command_line, parse_calibration, poses_of, read_log, read_noise)
 import numpy as np  # noqa: E402
+import pandas  # noqa: E402
 from shared import known  # noqa: E402
+import yaml  # noqa: E402
 
 Rng = np.random.Generator
 Make = Callable[[Rng], Files]
@@ -166,6 +172,47 @@ def _fitted(path: Path, rng: Rng) -> object:
     return ac.fit(poses_of(path).poses)
 
 
+def _told(path: Path, rng: Rng) -> object:
+    """Fit the poses of a table with hostile text, store and export the calibration."""
+    fitted, stored = ac.fit(path), path.parents[1] / 'told.yaml'
+    write_calibration(stored, fitted)
+    found, place = read_calibration(stored), fitted.poses.autopilot
+    plain = replace(found, sensor='', poses=replace(
+        found.poses, autopilot=place and replace(place, corrected='')))
+    to = one(rng, CALIBRATION_ALONE[:-2])
+    if found.sensor != fitted.sensor or _lines_of(found, to) != _lines_of(plain, to):
+        raise NotAllowedError(f'{to} has lines of {found.sensor!r} or {place}')
+    write_table(stored, found.poses)
+    return _log(stored, rng)
+
+
+def _lines_of(calibration: Calibration, to: str) -> list[str]:
+    """Return the lines of an export that are no comments."""
+    text = str(export(calibration, to, options=ExportOptions(name='imu')).text_or_bytes)
+    return [line for line in text.split('\n') if not re.match(r'#? |# | \*|//|  "comment"', line)]
+
+
+def _noise(path: Path, rng: Rng) -> object:
+    """Export figures of the noise."""
+    found = yaml.safe_load(str(export(known(), 'vins', read_noise(path)).text_or_bytes))
+    if len(found) != 5 or not all(isinstance(each, float) for each in found.values()):
+        raise NotAllowedError(f'the file has {found}')
+    return found
+
+
+def _frame(path: Path, rng: Rng) -> object:
+    """Fit the poses of a DataFrame, at times with repeated names and hostile attributes."""
+    try:
+        frame = pandas.read_csv(path, comment='#', encoding_errors='replace', nrows=100)
+    except ValueError as err:  # as of an empty file, and not a finding
+        raise InputError(str(err), '') from err
+    if rng.random() < 0.3:
+        frame.columns = rng.choice(list(frame.columns), len(frame.columns))
+    frame.attrs = {name: one(rng, (inputs.hostile(rng), *inputs.VALUES))
+                   for name in ('sensor', 'autopilot', 'units') if rng.random() < 0.3}
+    return ac.fit(frame)
+
+
 def _run(path: Path, rng: Rng) -> object:
     """Run a random command on a file, and check how it ends."""
     table, calibration, out = (path.parents[1] / name for name in ('poses.csv', 'c.yaml', 'out'))
@@ -216,6 +263,10 @@ KINDS: dict[str, tuple[Callable[[], Make], Read]] = {
     'table': (lambda: inputs.random_table, _log),
     'tree': (inputs.random_trees, _used),
     'messages': (inputs.random_messages, read_bag),
+    'text': (lambda: inputs.hostile_table, _told),
+    'noise': (lambda: inputs.hostile_noise, _noise),
+    'frame': (lambda: lambda rng: one(rng, (inputs.random_table, inputs.hostile_table))(rng),
+              _frame),
     'command': (_of_all, _run)}
 """Maker and reader of each kind."""
 

@@ -8,6 +8,7 @@ import copy
 from dataclasses import dataclass
 import datetime
 from functools import cache
+import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
@@ -156,13 +157,13 @@ _COMMENTS = ('# units: g', '# units: m/s2', '# sensor: a', '#', '# units: [', '%
 
 def random_table(rng: Rng) -> Files:
     """Return a table of a random dialect, with random columns, and with some random cells."""
-    delimiter = _one(rng, (',', ',', ';', '\t', ' ', '|', ', '))
+    delimiter = one(rng, (',', ',', ';', '\t', ' ', '|', ', '))
     header = _header(rng)
-    rows = [_row(rng, header, k) for k in range(int(_one(rng, (0, 1, 3, 12, 24, 60))))]
-    wild = float(_one(rng, (0.0, 0.0, 0.003, 0.1)))
+    rows = [_row(rng, header, k) for k in range(int(one(rng, (0, 1, 3, 12, 24, 60))))]
+    wild = float(one(rng, (0.0, 0.0, 0.003, 0.1)))
     cells = [[_wild(rng) if rng.random() < wild else cell for cell in row] for row in rows]
     if rng.random() < 0.1 and cells:
-        _one(rng, cells).append('1')
+        one(rng, cells).append('1')
     if rng.random() < 0.9:
         cells.insert(0, list(header))
     if rng.random() < 0.15:
@@ -170,21 +171,21 @@ def random_table(rng: Rng) -> Files:
     if rng.random() < 0.15:
         cells = [[cell.replace('.', ',') for cell in row] for row in cells]
     lines = [delimiter.join(row) for row in cells]
-    for _ in range(int(_one(rng, (0, 0, 0, 1, 3)))):
+    for _ in range(int(one(rng, (0, 0, 0, 1, 3)))):
         lines.insert(int(rng.integers(len(lines) + 1)) if rng.random() < 0.3 else 0,
-                     _one(rng, _COMMENTS))
-    end = _one(rng, ('\n', '\n', '\r\n', '\r'))
+                     one(rng, _COMMENTS))
+    end = one(rng, ('\n', '\n', '\r\n', '\r'))
     text = end.join(lines) + (end if rng.random() < 0.8 else '')
-    data = text.encode(_one(rng, _CODES) if rng.random() < 0.2 else 'utf-8', errors='replace')
+    data = text.encode(one(rng, _CODES) if rng.random() < 0.2 else 'utf-8', errors='replace')
     return Files('table.csv', {'table.csv': data})
 
 
 def _header(rng: Rng) -> list[str]:
     """Return random names of columns, those of an accelerometer among them."""
-    header = list(_one(rng, _NAMES))
+    header = list(one(rng, _NAMES))
     if rng.random() < 0.6:
-        header.append(_one(rng, _TIMES))
-    header += [str(each) for each in rng.choice(_MORE, int(_one(rng, (0, 0, 1, 3, 8))))]
+        header.append(one(rng, _TIMES))
+    header += [str(each) for each in rng.choice(_MORE, int(one(rng, (0, 0, 1, 3, 8))))]
     if rng.random() < 0.5:
         rng.shuffle(header)
     return header
@@ -209,12 +210,56 @@ def _wild(rng: Rng) -> str:
     """Return the text of a random cell."""
     kind = rng.integers(4)
     if kind == 0:
-        return _one(rng, EXTREME).decode('latin-1')
+        return one(rng, EXTREME).decode('latin-1')
     if kind == 1:
         return f'{rng.normal() * 10.0 ** float(rng.integers(-320, 308)):.17g}'
     if kind == 2:
         return str(int(rng.integers(-10**6, 10**6)))
     return rng.bytes(int(rng.integers(1, 6))).decode('latin-1')
+
+
+_HOSTILE = ('a', 'ß', '\n', '\r\n1\t', '\u2028', '\x85', '\x1b[31m', '\x00', '\ud800', '*/', '/*',
+            '??/', '\\', '"', '#', '\u202e', '<script>', '{{ x }}', '%s', '\n1: ', 900 * 'x')
+
+
+def hostile(rng: Rng) -> str:
+    """Return text that would end a comment, a line or a file, if it were written as it is."""
+    return ''.join(one(rng, _HOSTILE) for _ in range(int(rng.integers(1, 8))))
+
+
+def hostile_json(rng: Rng, content: Any) -> str:
+    """Return JSON in which values are hostile, or which has many levels."""
+    if rng.random() < 0.1:
+        return '[' * int(rng.integers(1, 10**6))
+    if isinstance(content, dict):
+        for key in content:
+            if rng.random() < 0.1:
+                content[key] = one(rng, (*VALUES, hostile(rng), 10 ** int(rng.integers(400))))
+    return json.dumps(content, default=str, ensure_ascii=bool(rng.integers(2)))
+
+
+def hostile_table(rng: Rng) -> Files:
+    """Return a sound pose table with hostile comments, labels and names of columns."""
+    place = {'firmware': one(rng, ('px4', 'ardupilot')), 'instance': 1, 'corrected': hostile(rng),
+             'device_id': one(rng, (7, 2**32, 10**400))}
+    sensor = hostile_json(rng, one(rng, (hostile(rng), hostile(rng), 5000 * 'x')))
+    name = json.dumps(hostile(rng).replace('"', ''), ensure_ascii=False)
+    poses = ac.simulate({'offset': 0.02}, poses=12, seed=1).reading.tolist()
+    rows = [f'{x},{y},{z},"{hostile(rng) if k == 3 else k}",{k}'
+            for k, (x, y, z) in enumerate(poses)]
+    text = '\n'.join((f'# sensor: {sensor}', f'# autopilot: {hostile_json(rng, place)}',
+                      f'ax,ay,az,label,{name}', *rows, ''))
+    return Files('poses.csv', {'poses.csv': text.encode(errors='replace')})
+
+
+def hostile_noise(rng: Rng) -> Files:
+    """Return figures of the noise, some of which are no figures of a sensor."""
+    figures = {f'{sensor}_{figure}': 1e-3 for sensor in ('accelerometer', 'gyroscope')
+               for figure in ('noise_density', 'random_walk')}
+    text = hostile_json(rng, {
+        **figures, 'update_rate': 200.0, 'gyroscope_random_walk_axes_upper': [1e-3],
+        'gyroscope_random_walk_reason': hostile(rng)})
+    return Files('noise.json', {'noise.json': text.encode(errors='replace')})
 
 
 @cache
@@ -228,7 +273,7 @@ def random_trees() -> Callable[[Rng], Files]:
     contents = [yaml.safe_load(each) for each in sorted(intact(), key=len)[:-1]]
 
     def make(rng: Rng) -> Files:
-        content = copy.deepcopy(_one(rng, contents))
+        content = copy.deepcopy(one(rng, contents))
         for _ in range(int(rng.integers(1, 4))):
             _change(rng, content)
         text = yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
@@ -244,10 +289,10 @@ class _Dumper(yaml.CSafeDumper):
 
 def _change(rng: Rng, content: Any) -> None:
     """Replace, remove, repeat or rename a random value of nested lists and mappings."""
-    node, key = content, _one(rng, list(content))
+    node, key = content, one(rng, list(content))
     while isinstance(node[key], (dict, list)) and node[key] and rng.random() < 0.75:
         node = node[key]
-        key = _one(rng, list(node) if isinstance(node, dict) else range(len(node)))
+        key = one(rng, list(node) if isinstance(node, dict) else range(len(node)))
     kind, value = rng.integers(5), node[key]
     if kind == 0:
         del node[key]
@@ -256,9 +301,9 @@ def _change(rng: Rng, content: Any) -> None:
     elif kind == 2 and isinstance(value, list):
         value.extend(copy.deepcopy(value[:int(rng.integers(1, 4))]))
     elif kind == 3 and isinstance(node, dict):
-        node[str(_one(rng, list(content)))] = node.pop(key)
+        node[str(one(rng, list(content)))] = node.pop(key)
     else:
-        node[key] = copy.deepcopy(_one(rng, VALUES))
+        node[key] = copy.deepcopy(one(rng, VALUES))
 
 
 def random_messages() -> Callable[[Rng], Files]:
@@ -274,7 +319,7 @@ def random_messages() -> Callable[[Rng], Files]:
             if rng.random() < 0.2:
                 stamp = int(rng.integers(1 << 63))
             content[k] = (topic, stamp, _changed(rng, bytearray(data)))
-        topics = [(_one(rng, words) if rng.random() < 0.05 else name, kind)
+        topics = [(one(rng, words) if rng.random() < 0.05 else name, kind)
                   for name, kind in bags.TOPICS]
         with TemporaryDirectory() as name:
             path = bags.McapFile(topics).write(Path(name) / 'bag.mcap', content)
@@ -287,7 +332,7 @@ def _changed(rng: Rng, data: bytearray) -> bytes:
     kind, at = rng.integers(4), int(rng.integers(len(data) + 1))
     if kind == 0:
         at = max(at - at % 8 - 4, 0)
-        number = _one(rng, (np.nan, np.inf, 1e300, -1e-300, 0.0, float(rng.normal())))
+        number = one(rng, (np.nan, np.inf, 1e300, -1e-300, 0.0, float(rng.normal())))
         data[at:at + 8] = np.float64(number).tobytes()
     elif kind == 1:
         data[at:at + 1] = rng.bytes(1)
@@ -298,6 +343,6 @@ def _changed(rng: Rng, data: bytearray) -> bytes:
     return bytes(data)
 
 
-def _one(rng: Rng, values: Sequence[T]) -> T:
+def one(rng: Rng, values: Sequence[T]) -> T:
     """Return one of some values."""
     return values[int(rng.integers(len(values)))]
