@@ -12,7 +12,7 @@ all with the code. The package need not be installed.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
@@ -111,9 +111,12 @@ def formats() -> Iterator[str]:
     yield f'| refused with what converts it | {refused} | |'
 
 
-TABLES = {'columns': columns, 'effects': effects, 'exports': exports,
-          'findings': partial(kinds, KINDS), 'formats': formats, 'names': names, 'rating': rating,
-          'steps': partial(kinds, STEPS)}
+Tables = Mapping[str, Callable[[], Iterator[str]]]
+
+TABLES: Tables = {
+    'columns': columns, 'effects': effects, 'exports': exports,
+    'findings': partial(kinds, KINDS), 'formats': formats, 'names': names, 'rating': rating,
+    'steps': partial(kinds, STEPS)}
 REFERENCE = 'api.md'
 PARAMETERS = HERE.parent / 'config' / 'calibrator.yaml'
 COMMENT = '    # '
@@ -133,9 +136,9 @@ def parameters() -> Iterator[str]:
         yield f'    {each.name}: {str(value).lower() if isinstance(value, bool) else repr(value)}'
 
 
-def with_tables(text: str) -> str:
-    """Return the text of a page with its tables made from the code."""
-    for name, table in TABLES.items():
+def with_tables(text: str, made: Tables = TABLES) -> str:
+    """Return the text of a page with its tables, by default those of the code."""
+    for name, table in made.items():
         rows = '\n'.join(table()).replace('\\', r'\\')
         text = re.sub(rf'(<!-- {name} -->\n).*?(<!-- end -->)', rf'\1\n{rows}\n\n\2', text,
                       flags=re.DOTALL)
