@@ -204,7 +204,7 @@ class Connection(web.RequestHandler):
         super().connection_made(transport)
         self.address = str((transport.get_extra_info('peername') or [''])[0])
         self._limit = asyncio.get_running_loop().call_later(
-            _REQUEST_S, lambda: self.stage or self.abort())
+            _REQUEST_S, lambda: None if self.stage else self.abort())
         self._owner.add(self)
 
     def connection_lost(self, exc: BaseException | None) -> None:
