@@ -162,6 +162,8 @@ class Autopilot:
     """
     The accelerometer of an autopilot that readings come from.
 
+    ValueError is raised for other values, and InputError for a long text.
+
     Parameters
     ----------
     firmware : {'px4', 'ardupilot'}
@@ -174,8 +176,6 @@ class Autopilot:
         Number in the names of its thermal calibration; None if the vehicle has none in use.
     corrected : str
         Why the readings are still those that old parameters correct; empty: they are raw.
-
-    ValueError is raised for other values, and InputError for a long text.
 
     """
 
@@ -229,8 +229,6 @@ class Table(Record):
         Its place in an autopilot, for readings of a flight log.
     findings : tuple of Finding
         What was found in the samples and the rests that they come from.
-
-    InputError is raised if the name of the sensor is too long.
 
     """
 

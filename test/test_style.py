@@ -15,7 +15,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / 'accel_calib'
 
 LAYERS = (
-    'errors one_thread text units < disk finding < table < geometry < effects < logs '
+    'one_thread text units < errors < disk finding < table < geometry < effects < logs '
     '< capture estimate < calibrate < refine < compare noise < findings < stored < pipeline '
     '< messages < report < api session < fleet live < ros < cli')
 """Parts of the package, lowest first. Each part imports only from lower parts and itself."""

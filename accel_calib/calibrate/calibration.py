@@ -68,6 +68,8 @@ class Quality:
     """
     Residuals and other figures of a calibration, over the poses it was fitted to.
 
+    RefusedFitError is raised for a negative figure.
+
     Parameters
     ----------
     rms_before_mg, rms_after_mg : float
@@ -84,8 +86,6 @@ class Quality:
         known or there are no degrees of freedom.
     coverage : float
         Share of the sphere within 45° of a pose.
-
-    RefusedFitError is raised for a negative figure.
 
     """
 
@@ -384,8 +384,7 @@ class Calibration(Record):
         Raises
         ------
         InputError
-            If the readings have not three columns, context is missing, or the effects cannot be
-            corrected.
+            If there are not three columns, context is missing, or the effects cannot be corrected.
 
         """
         given = np.asarray(readings)
