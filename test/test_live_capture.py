@@ -46,13 +46,6 @@ def dwell(time: float, direction: Any, count: float = 50.0) -> Dwell:
                  np.full(3, 0.01), count, 50, {}, round(time))
 
 
-def test_a_mark_of_a_pose_outlives_a_restart() -> None:
-    marked = replace(dwell(0.0, [0, 0, 1]), at_limit=True, doubtful=True)
-    book = PoseBook(CaptureSettings(), MPS2)
-    book.add_stored(poses_from([dwell(5.0, [0, 1, 0]), marked]))
-    assert book.poses()['at_limit'].tolist() == book.poses()['doubtful'].tolist() == [0.0, 1.0]
-
-
 @pytest.mark.parametrize('seed', range(3))
 def test_the_first_poses_at_a_limit_are_marked_as_in_a_recording(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -166,11 +159,13 @@ def test_poses_of_a_robot_that_parks_for_years_need_bounded_memory() -> None:
 
 
 def test_stored_poses_are_added_as_they_were() -> None:
-    poses = book_of((10.0 * k, up) for k, up in enumerate(spread_directions(8))).poses()
-    again = book_of([])
+    book = book_of((10.0 * k, up) for k, up in enumerate(spread_directions(8)))
+    book.end(replace(dwell(-5.0, [0, 0, 1]), at_limit=True, doubtful=True))
+    poses, again = book.poses(), book_of([])
     again.add_stored(poses)
     for key in poses.columns:
         np.testing.assert_allclose(again.poses()[key], poses[key], err_msg=key)
+    assert again.poses()['at_limit'].sum() == again.poses()['doubtful'].sum() == 1.0
 
 
 def test_change_is_reported_during_the_third_rest_and_survives_a_new_level(stored: Stored) -> None:
@@ -277,9 +272,6 @@ def test_poses_of_a_noisier_time_are_marked_and_kept() -> None:
     assert len(poses) == 24
     assert doubted == np.sum(poses['doubtful']) == 12
     assert np.all(poses['doubtful'][:12] == 1.0)
-    again = LiveCapture(CaptureSettings(), MPS2)
-    again.book.add_stored(poses)
-    np.testing.assert_array_equal(again.book.poses()['doubtful'], poses['doubtful'])
     calibration = fit_poses(poses, MPS2, model='10')
     assert [each.row for each in calibration.rejected] == list(range(1, 13))
     assert list(calibration.used_poses.row) == list(range(13, 25))

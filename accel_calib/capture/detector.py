@@ -59,17 +59,16 @@ class StillDetector:
 
     def __init__(self, settings: CaptureSettings, units: Units, keep: int | None = 1000,
                  context: Sequence[str] = CONTEXT, known: Known = Known()) -> None:
-        self._settings, self._context = settings, context
+        self._context = context
         self._chunker = Chunker(settings, len(context))
         self._rule = Rule(settings, units, known)
-        self._tracker: Tracker | None = None
+        self._tracker = Tracker(settings, self._rule)
         self._most = keep
         self._kept = np.empty(0, figures_type(len(context)))
         self.still = False
         self._least, self._largest = np.full(4, np.inf), np.full(4, -np.inf)  # x, y, z, |reading|²
         self.refused: tuple[Rest, ...] = ()
         self._mean = np.full(6, np.nan)
-        self._number = 0
         self._missing: deque[Rest] = deque(maxlen=_MISSING_MAX)
 
     def push(self, samples: Floats) -> list[Dwell]:
@@ -105,7 +104,7 @@ class StillDetector:
 
     def current(self) -> Dwell | None:
         """Return the ongoing dwell so far, or None if it is too short or not still."""
-        dwell = None if self._tracker is None else self._tracker.current()
+        dwell = self._tracker.current()
         if dwell is None:
             return None
         found, = self._beside(figures(dwell, known_units=self._rule.known), self._kept)
@@ -166,9 +165,8 @@ class StillDetector:
         for chunks in together(whole):
             if chunks.fresh:
                 yield from self._leave()
+                self._tracker.start(chunks)
             verdict = self._rule.feed(chunks)
-            if self._tracker is None:
-                self._tracker = Tracker(self._settings, self._rule, chunks, self._number)
             self._miss(verdict, chunks.length)
             yield from self._tracker.feed(verdict)
             self.still = bool(verdict['still'][-1])
@@ -187,13 +185,8 @@ class StillDetector:
             self._largest = np.maximum(self._largest, np.append(reading.max(axis=1), square.max()))
 
     def _leave(self) -> list[OngoingDwell]:
-        if self._tracker is None:
-            return []
-        found = self._tracker.close()
-        self._number = self._tracker.number
-        self._tracker = None
         self.still = False
-        return found
+        return self._tracker.close()
 
     def _keep(self, ended: Iterable[OngoingDwell]) -> int:
         """Store the figures of these dwells, and return their number."""

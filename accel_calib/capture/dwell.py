@@ -376,20 +376,24 @@ _NONE = np.empty(0, chunk_type(0))
 
 
 class Tracker:
-    """Join still chunks to dwells, in one segment."""
+    """Join still chunks to dwells, one segment after the other."""
 
-    def __init__(self, settings: CaptureSettings, rule: Rule, chunks: Chunks, number: int) -> None:
-        self._rule = rule
-        self._chunks = chunks
-        shortest = max(settings.min_dwell, _SAMPLES * chunks.period)
-        self._shortest = math.ceil(shortest / chunks.length - 1e-9)
-        longest = settings.max_dwell / chunks.length
-        self._longest = max(int(longest), self._shortest) if math.isfinite(longest) else 0
-        self._waiting = self._lead = self._held = _NONE
+    def __init__(self, settings: CaptureSettings, rule: Rule) -> None:
+        self._settings, self._rule = settings, rule
+        self._chunks: Chunks
+        self._shortest = self._longest = self._number = 0
+        self._waiting = _NONE
         self._dwell: OngoingDwell | None = None
-        self._pause = 0
-        self._beside_slope = False
-        self.number = number
+
+    def start(self, chunks: Chunks) -> None:
+        """Start the segment of these chunks; the one before is closed."""
+        self._chunks = chunks
+        self._waiting = self._lead = self._held = _NONE
+        self._pause, self._beside_slope = 0, False
+        shortest = max(self._settings.min_dwell, _SAMPLES * chunks.period)
+        self._shortest = math.ceil(shortest / chunks.length - 1e-9)
+        longest = self._settings.max_dwell / chunks.length
+        self._longest = max(int(longest), self._shortest) if math.isfinite(longest) else 0
 
     def feed(self, chunks: Records) -> list[OngoingDwell]:
         """Return the dwells that end with these chunks, of a `chunk_type`."""
@@ -439,7 +443,7 @@ class Tracker:
             if (self._dwell is None or not self._dwell.chunks or not self._dwell.continued_by(
                     chained(before, chunks[:1])['sums'], self._rule.scale)):
                 yield from self._end()
-                self._dwell = OngoingDwell(self._chunks, self.number)
+                self._dwell = OngoingDwell(self._chunks, self._number)
             self._pause = 0
         chunks = chained(before, chunks)
         self._lead = _NONE
@@ -449,7 +453,7 @@ class Tracker:
             room = self._longest - self._dwell.chunks
             self._dwell.add(chunks[:room])
             yield self._dwell
-            self._dwell = OngoingDwell(self._chunks, self.number)
+            self._dwell = OngoingDwell(self._chunks, self._number)
             chunks = chunks[room:]
         self._dwell.add(chunks)
 
@@ -458,7 +462,7 @@ class Tracker:
         if found is not None:
             yield found
         if self._dwell is not None:
-            self.number += 1
+            self._number += 1
         self._dwell = None
         self._held = _NONE
 

@@ -44,6 +44,8 @@ class State:
         What was found in the samples before they come here.
     enabled : bool
         Whether messages are corrected.
+    stillness : float
+        Spread of the last samples, relative to the largest of a still sensor.
     given : (3, 3) array or None
         Mounting ΔR that is known from elsewhere.
     publishers : tuple of str or None
@@ -91,6 +93,7 @@ class State:
         self.imus: tuple[str, ...] = ()
         self.thermometers: tuple[str, ...] = ()
         self.enabled, self.still, self.still_since = True, False, math.nan
+        self.stillness = math.nan
         self.computing, self.ended = 0, False
         self.own = own_effects(settings)
         self.given: Floats | None = (

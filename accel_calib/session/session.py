@@ -154,6 +154,7 @@ class Session(State):
             live = self.sensor.live
             before = live.detector.interruptions[-1:]
             self._change(live.push(samples, self.settings.auto_capture))
+            self.stillness = self.statistics.spread / live.detector.threshold
             last = live.detector.interruptions[-1:]
             if last != before and abs(last[0].seconds - since) > SILENT:
                 where = 'back' if last[0].seconds < 0.0 else 'ahead'

@@ -149,8 +149,7 @@ def progress(session: State, reading: Triple | None = None) -> Progress:
     direction = None if plan is None or action.kind != 'poses' else plan.asked.direction
     return Progress(
         still=session.still and not silent,
-        stillness=math.nan if silent else (
-            statistics.spread / sensor.live.detector.threshold),
+        stillness=math.nan if silent else session.stillness,
         dwell=statistics.stamp - session.still_since if session.still else 0.0,
         min_dwell=session.settings.min_dwell, poses=sensor.guide.poses,
         total=0 if plan is None else plan.asked.total,

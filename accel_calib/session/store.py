@@ -219,7 +219,17 @@ class Store:
         step, StoredCalibrationError if the earlier calibration cannot be used.
 
         """
-        step = self._last_step()
+        now = b''
+        if _exists(self.calibration):
+            check_regular(self.calibration)
+            now = self.calibration.read_bytes()
+        # The last step that differs from the file; equal ones come from failed writes.
+        for step in map(self._step, reversed(self.steps())):
+            if step.read_bytes() != now:
+                break
+            step.unlink()
+        else:
+            raise InputError('there is no earlier calibration', 'nothing can be undone')
         try:
             before = self.read(step) if step.stat().st_size else None
         except DamagedCalibrationError as error:
@@ -234,18 +244,6 @@ class Store:
         self.calibration.unlink(missing_ok=True)
         step.unlink()
         return None
-
-    def _last_step(self) -> Path:
-        """Return the last step that differs from the file; equal ones come from failed writes."""
-        now = b''
-        if _exists(self.calibration):
-            check_regular(self.calibration)
-            now = self.calibration.read_bytes()
-        for step in map(self._step, reversed(self.steps())):
-            if step.read_bytes() != now:
-                return step
-            step.unlink()
-        raise InputError('there is no earlier calibration', 'nothing can be undone')
 
     def save_poses(self, poses: Poses) -> None:
         """Write the poses, or remove the file if there are none."""
