@@ -213,8 +213,10 @@ class Frame:
     @property
     def table(self) -> Member:
         """Return the DataFrame as a table."""
-        columns = dict(self._columns())
-        about = getattr(self.data, 'attrs', {})
+        columns = {str(name): self.data[name] for name in self.data.columns}
+        index, about = getattr(self.data, 'index', None), getattr(self.data, 'attrs', {})
+        if index is not None and (index.name is not None or index.dtype.kind in 'fMm'):
+            columns = {str(index.name or 'time'): index, **columns}
         head = ''.join(f'# {name}: {json.dumps(about[name])}\n' for name in ABOUT
                        if about.get(name))
 
@@ -224,12 +226,6 @@ class Frame:
             yield from csv_of(chain([list(columns)], zip(*cells, strict=True)))
 
         return Member('', len(columns) * len(self.data) * CELL_BYTES, lines)
-
-    def _columns(self) -> Iterator[tuple[str, Any]]:
-        index = getattr(self.data, 'index', None)
-        if index is not None and (index.name is not None or index.dtype.kind in 'fMm'):
-            yield str(index.name or 'time'), index
-        yield from ((str(name), self.data[name]) for name in self.data.columns)
 
 
 def _plain(values: Any) -> list[Any]:

@@ -66,7 +66,7 @@ _PX4_ADVICE = ('read sensor_accel, which CAL_ACC does not correct (add 4 or 64 t
                'to log it at 10 Hz)')
 _RELATIVE = 'accelerometer_timestamp_relative'
 _RAW, _FILTERED = 'sensor_accel', 'vehicle_acceleration'
-_MORE = {'sensor_combined': (_RELATIVE,), 'vehicle_imu': tuple(PX4_SPANS)}
+_MORE = {'sensor_combined': (_RELATIVE,), 'vehicle_imu': tuple(PX4_SPANS.values())}
 _NEEDED = {name: {*chain(*fields.values()), *_MORE.get(name, ())}
            for name, fields in PX4_FIELDS.items()}
 _ALSO = ('sensor_gyro', 'sensor_selection')
@@ -164,7 +164,7 @@ def _px4_samples(message: Message) -> tuple[dict[str, Floats], list[str]]:
     if _RELATIVE in fields:
         relative = fields[_RELATIVE].astype(float)
         time, valid = time + relative * MICRO, relative != _INVALID
-    for name, key in PX4_SPANS.items():
+    for key, name in PX4_SPANS.items():
         if name in fields:
             seconds = fields[name] * MICRO
             valid &= seconds > 0.0
