@@ -54,9 +54,13 @@ def text_of(rows: list[list[str]], header: str = '', delimiter: str = ',') -> st
     return '\n'.join([header, *lines] if header else lines) + '\n'
 
 
-def write(folder: Path, text: str | bytes, name: str = 'log.csv') -> Path:
+def write(folder: Path, content: Any, name: str = 'log.csv') -> Path:
+    """Write text, bytes, or what a function of the path writes."""
     path = folder / name
-    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    if callable(content):
+        content(path)
+    else:
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
     return path
 
 
