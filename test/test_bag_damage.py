@@ -3,6 +3,7 @@
 
 """Every damaged bag ends in one clear line or in a result, and leaves nothing half-written."""
 
+from collections.abc import Callable
 from pathlib import Path
 import shutil
 import sqlite3
@@ -79,28 +80,26 @@ def test_a_damaged_journal_ends_in_one_line_or_in_a_result(suffix: str, tmp_path
         check(path)
 
 
-def test_a_folder_without_metadata_is_read(tmp_path: Path) -> None:
-    path = MAKES['mcap folder'](tmp_path)
-    (path / 'metadata.yaml').unlink()
-    assert read(path) == (COUNT, (f'{path} has no metadata.yaml, as after a recorder was killed; '
-                                  'bag.mcap is read without it',))
-
-
-def test_a_file_that_the_metadata_do_not_list_is_noted(tmp_path: Path) -> None:
-    path = MAKES['mcap folder'](tmp_path)
-    shutil.copy(path / 'bag.mcap', path / 'later.mcap')
-    count, notes = read(path)
-    assert count == COUNT
-    assert 'does not list file later.mcap' in notes[0]
-
-
-def test_damaged_metadata_print_nothing(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
-    path = MAKES['mcap folder'](tmp_path)
-    metadata = path / 'metadata.yaml'
-    text = metadata.read_text()
+def anchors(path: Path) -> None:
+    """Give several values of the metadata one anchor, of which YAML warns."""
+    text = (path / 'metadata.yaml').read_text()
     assert text.count('message_count: ') > 1
-    metadata.write_text(text.replace('message_count: ', 'message_count: &a '))
-    assert read(path)[0] == COUNT
+    (path / 'metadata.yaml').write_text(text.replace('message_count: ', 'message_count: &a '))
+
+
+@pytest.mark.parametrize(('spoil', 'note'), [
+    (lambda path: (path / 'metadata.yaml').unlink(), 'has no metadata.yaml, as after a recorder '
+     'was killed; bag.mcap is read without it'),
+    (lambda path: shutil.copy(path / 'bag.mcap', path / 'later.mcap'),
+     'does not list file later.mcap'), (anchors, '')], ids=['missing', 'incomplete', 'damaged'])
+def test_a_folder_is_read_whatever_its_metadata(
+        spoil: Callable[[Path], object], note: str, tmp_path: Path,
+        recwarn: pytest.WarningsRecorder) -> None:
+    path = MAKES['mcap folder'](tmp_path)
+    spoil(path)
+    count, notes = read(path)
+    assert (count, len(notes)) == (COUNT, bool(note))
+    assert note in ''.join(notes)
     assert not [str(each.message) for each in recwarn]
 
 

@@ -29,6 +29,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from rosbags.typesys import get_typestore, Stores
 import scipy.io
 import shared
+from test_logs import write
 
 pytestmark = pytest.mark.usefixtures('in_time')
 
@@ -99,10 +100,7 @@ def database(*statements: str) -> Callable[[Path], Path]:
 
 
 def file(name: str, save: Callable[[Path], object]) -> Callable[[Path], Path]:
-    def write(folder: Path) -> Path:
-        save(folder / name)
-        return folder / name
-    return write
+    return lambda folder: write(folder, save, name)
 
 
 def archive(path: Path) -> None:

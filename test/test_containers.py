@@ -18,7 +18,7 @@ import numpy as np
 import openpyxl
 import pytest
 import scipy.io
-from test_logs import check, rows_of, samples, text_of
+from test_logs import check, rows_of, samples, text_of, write
 
 PHYPHOX = '"Time (s)","Acceleration x (m/s^2)","Acceleration y (m/s^2)","Acceleration z (m/s^2)"'
 LINEAR = PHYPHOX.replace('Acceleration', 'Linear Acceleration')
@@ -52,9 +52,7 @@ def tables_of(makers: str) -> tuple[dict[str, str], np.ndarray]:
 
 
 def raw(folder: Path, content: tuple[str, bytes]) -> Path:
-    path = folder / content[0]
-    path.write_bytes(content[1])
-    return path
+    return write(folder, content[1], content[0])
 
 
 def zipped(folder: Path, tables: Tables, name: str = 'log.zip',

@@ -23,7 +23,7 @@ from inside import read_log
 import numpy as np
 import pytest
 import shared
-from test_logs import check, rows_of, samples, text_of
+from test_logs import check, rows_of, samples, text_of, write
 
 h5py = pytest.importorskip('h5py')
 pa = pytest.importorskip('pyarrow')
@@ -115,15 +115,6 @@ READ: list[tuple[str, Any, Any]] = [
      b'Az\n' + lines('{t},{:.0f},{:.0f},{:.0f}\n', COUNTS), LogOptions(units='native'))]
 
 
-def written(folder: Path, name: str, content: Any) -> Path:
-    path = folder / name
-    if isinstance(content, bytes):
-        path.write_bytes(content)
-    else:
-        content(path)
-    return path
-
-
 FRAME = b'\x55\x51' + bytes(8) + b'\x03' + b'\x55\x52' + bytes(8) + b'\x04'
 SHIMMER = bytearray(256)
 SHIMMER[30:37] = b'\0\x03\0\0\0\x02\0'
@@ -153,7 +144,7 @@ REFUSED: list[tuple[str, Any, str]] = [
 @pytest.mark.parametrize(('name', 'content', 'words'), REFUSED, ids=[name for name, *_ in REFUSED])
 def test_what_is_not_read_is_refused_with_what_converts_it_and_little_memory(
         name: str, content: Any, words: str, tmp_path: Path) -> None:
-    path = written(tmp_path, name, content)
+    path = write(tmp_path, content, name)
     with shared.little_memory(), pytest.raises(InputError, match=words) as found:
         read_log(path)
     assert str(path) in found.value.message
@@ -175,7 +166,7 @@ def test_every_format_is_tested_and_fleet_finds_what_is_read(tmp_path: Path) -> 
 @pytest.mark.parametrize(('name', 'module'), [('log.h5', 'h5py'), ('log.feather', 'pyarrow')])
 def test_a_missing_library_is_named(name: str, module: str, tmp_path: Path,
                                     monkeypatch: pytest.MonkeyPatch) -> None:
-    path = written(tmp_path, name, next(content for each, content, _ in READ if each == name))
+    path = write(tmp_path, next(content for each, content, _ in READ if each == name), name)
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(InputError, match=f'needs it .*pip install {module}'):
         read_log(path)
@@ -184,13 +175,13 @@ def test_a_missing_library_is_named(name: str, module: str, tmp_path: Path,
 def test_the_series_of_a_file_are_tables_and_the_one_that_is_read_is_noted(tmp_path: Path) -> None:
     gyro = [influx(t, [0.0, 0.0, 0.0], 'imu,sensor=b').replace('a', 'g') for t, _ in ROWS]
     text = ''.join(influx(t, row) + other for (t, row), other in zip(ROWS, gyro, strict=True))
-    log = read_log(written(tmp_path, 'log.txt', text.encode()))
+    log = read_log(write(tmp_path, text, 'log.txt'))
     check(log, READING)
     assert log.read_as.startswith('imu,sensor=a, ')
     assert log.notes == ('imu,sensor=a is read of 2 tables: no other one has an accelerometer',)
     both = [{'sensor': name, 't': t, 'a': row} for t, row in ROWS for name in ('left', 'right')]
     with pytest.raises(InputError, match='2 tables of accelerometers, left, right, expected one'):
-        read_log(written(tmp_path, 'log.json', json.dumps(both).encode()))
+        read_log(write(tmp_path, json.dumps(both), 'log.json'))
 
 
 @pytest.mark.parametrize(('name', 'poses'), [('arrays.npz', 14), ('gcdc_x16.csv', 14)])
@@ -204,7 +195,7 @@ def test_logs_of_others_become_poses(name: str, poses: int, tmp_path: Path,
 @pytest.mark.parametrize(('name', 'content', 'options'), READ, ids=[name for name, *_ in READ])
 def test_a_log_is_read_as_it_was_written(name: str, content: Any, options: LogOptions | None,
                                          tmp_path: Path) -> None:
-    log = read_log(written(tmp_path, name, content), options or LogOptions())
+    log = read_log(write(tmp_path, content, name), options or LogOptions())
     native = options is not None and options.units == 'native'
     np.testing.assert_allclose(log.table.reading, COUNTS if native else READING, rtol=1e-6)
     check(log, time=TIME, within_s=1e-6)

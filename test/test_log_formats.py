@@ -17,6 +17,7 @@ from inside import format_named, read_dataflash, read_log, read_ulg
 import numpy as np
 import pytest
 from shared import LOGS
+from test_logs import write
 
 WITHIN_SD = 5.0
 
@@ -31,12 +32,6 @@ def ardupilot(name: str | Path, **given: str) -> Any:
     """Read a sample of ArduPilot, or another path."""
     pytest.importorskip('pymavlink')
     return read_dataflash(LOGS / 'ardupilot' / name, **given)
-
-
-def in_file(folder: Path, data: bytes) -> Path:
-    path = folder / 'log'
-    path.write_bytes(data)
-    return path
 
 
 def check(recording: Recording, units: Any, name: str) -> Calibration:
@@ -100,7 +95,7 @@ def test_the_csv_of_an_older_ardupilot_log_has_no_number_of_the_sensor(tmp_path:
     lines = (LOGS / 'ardupilot/two_imus.csv').read_text(encoding='utf-8').splitlines()
     rows = [line.split(',') for line in lines]
     kept = [','.join(row[:2] + row[3:]) for row in rows if row[2] in ('I', '0')]
-    log = read_log(in_file(tmp_path, '\n'.join([*kept, '']).encode()))
+    log = read_log(write(tmp_path, '\n'.join([*kept, '']).encode()))
     assert isinstance(log.table, Recording)
     check(log.table, log.units, 'ardupilot/two_imus.csv')
 
@@ -150,23 +145,23 @@ def test_vehicle_imu_is_divided_by_its_interval_and_not_read_without_it(tmp_path
     fields = make.imu_fields(make.recording(1), 1)  # of another version of PX4
     del fields['delta_velocity_dt']
     with pytest.raises(InputError, match='none of the messages'):
-        px4(in_file(tmp_path, make.ulog_bytes([('vehicle_imu', 0, fields)])))
+        px4(write(tmp_path, make.ulog_bytes([('vehicle_imu', 0, fields)])))
 
 
 def test_samples_that_px4_marks_as_invalid_are_left_out_and_counted(tmp_path: Path) -> None:
     fields = make.combined_fields(make.recording(1))
     kind, relative = fields['accelerometer_timestamp_relative']
     fields['accelerometer_timestamp_relative'] = (kind, [0x7fffffff] * 3 + list(relative[3:]))
-    log = px4(in_file(tmp_path, make.ulog_bytes([('sensor_combined', 0, fields)])))
+    log = px4(write(tmp_path, make.ulog_bytes([('sensor_combined', 0, fields)])))
     assert len(log.recording['time']) == len(relative) - 3
     assert '3 rows of' in log.notes[0]
 
 
 def test_flight_logs_that_are_cut_off_are_read_up_to_there(tmp_path: Path) -> None:
     data = (LOGS / 'px4/thermal.ulg').read_bytes()[:40_001]
-    assert 300 < len(px4(in_file(tmp_path, data)).recording['time']) < 600
+    assert 300 < len(px4(write(tmp_path, data)).recording['time']) < 600
     data = (LOGS / 'ardupilot/two_imus.bin').read_bytes()[:50_003]
-    log = ardupilot(in_file(tmp_path, data))
+    log = ardupilot(write(tmp_path, data))
     assert 400 < len(log.recording['time']) < 600
     assert any('1 message cut' in note for note in log.notes)
 
@@ -210,7 +205,7 @@ def test_the_text_log_has_the_numbers_of_the_binary_log() -> None:
 def test_garbage_within_an_ardupilot_log_is_passed_over_and_noted(tmp_path: Path) -> None:
     whole = (LOGS / 'ardupilot/raw_acc.bin').read_bytes()
     start = whole.index(b'\xa3\x95\x65', 20_000)
-    path = in_file(tmp_path, whole[:start] + b'\x00\x17\xff' * 9 + whole[start:])
+    path = write(tmp_path, whole[:start] + b'\x00\x17\xff' * 9 + whole[start:])
     log = ardupilot(path)
     assert ' left out' in ' '.join(log.notes)
     np.testing.assert_array_equal(log.recording.reading[:, 2],
@@ -218,14 +213,14 @@ def test_garbage_within_an_ardupilot_log_is_passed_over_and_noted(tmp_path: Path
 
 
 def test_the_messages_of_older_ardupilot_logs_are_read(tmp_path: Path) -> None:
-    path = in_file(tmp_path, b'FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns\n'
-                   b'FMT, 131, 43, IMU, Iffffff, TimeMS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ\n'
-                   b'FMT, 135, 43, IMU2, Iffffff, TimeMS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ\n'
-                   b'IMU, 1000, 0.1, 0.2, 0.3, 1.0, 2.0, -9.8\n'
-                   b'IMU2, 1000, 0.1, 0.2, 0.3, 1.5, 2.5, -9.5\n'
-                   b'IMU, 1020, 0.1, 0.2, 0.3, 1.1, 2.1, -9.9\n'
-                   b'IMU2, 1020, 0.1, 0.2, 0.3, 1.6, 2.6, -9.6\n'
-                   b'IMU, 1040, 0.1\n')
+    path = write(tmp_path, b'FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns\n'
+                 b'FMT, 131, 43, IMU, Iffffff, TimeMS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ\n'
+                 b'FMT, 135, 43, IMU2, Iffffff, TimeMS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ\n'
+                 b'IMU, 1000, 0.1, 0.2, 0.3, 1.0, 2.0, -9.8\n'
+                 b'IMU2, 1000, 0.1, 0.2, 0.3, 1.5, 2.5, -9.5\n'
+                 b'IMU, 1020, 0.1, 0.2, 0.3, 1.1, 2.1, -9.9\n'
+                 b'IMU2, 1020, 0.1, 0.2, 0.3, 1.6, 2.6, -9.6\n'
+                 b'IMU, 1040, 0.1\n')
     log = read_dataflash(path)
     np.testing.assert_allclose(log.recording['time'], [1.0, 1.02])
     np.testing.assert_allclose(log.recording.reading[:, 2], [-9.8, -9.9])
@@ -237,7 +232,7 @@ def test_the_messages_of_older_ardupilot_logs_are_read(tmp_path: Path) -> None:
 def test_the_calibration_that_an_ardupilot_log_holds_already_is_named(tmp_path: Path) -> None:
     rows = [*make.dataflash_forms(), ('PARM', (1, 'INS_ACCOFFS_X', 0.25, 0.0)),
             *make.imu_rows(make.recording(1), 0)]
-    log = ardupilot(in_file(tmp_path, make.dataflash_bytes(rows)))
+    log = ardupilot(write(tmp_path, make.dataflash_bytes(rows)))
     assert any('INS_ACCOFFS_X 0.25' in note for note in log.notes)
 
 
@@ -248,8 +243,7 @@ def test_the_calibration_that_an_ardupilot_log_holds_already_is_named(tmp_path: 
                                   b'\xa3\x95\x80' + b'\xff' * 400))])
 def test_what_is_no_flight_log_is_refused_in_one_line(suffix: str, content: bytes, tmp_path: Path
                                                       ) -> None:
-    path = tmp_path / f'log{suffix}'
-    path.write_bytes(content)
+    path = write(tmp_path, content, f'log{suffix}')
     with pytest.raises(InputError, match=re.escape(str(path))) as caught:
         read_log(path)
     assert '\n' not in str(caught.value)

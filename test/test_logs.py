@@ -54,9 +54,13 @@ def text_of(rows: list[list[str]], header: str = '', delimiter: str = ',') -> st
     return '\n'.join([header, *lines] if header else lines) + '\n'
 
 
-def write(folder: Path, text: str | bytes, name: str = 'log.csv') -> Path:
+def write(folder: Path, content: Any, name: str = 'log.csv') -> Path:
+    """Write text, bytes, or what a function of the path writes."""
     path = folder / name
-    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    if callable(content):
+        content(path)
+    else:
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
     return path
 
 
@@ -273,11 +277,13 @@ def test_columns_are_given_by_name_or_number(reads: Reads) -> None:
     columns = made['reading'][:, ::-1], made['time'] * 1e6
     with pytest.raises(InputError, match='expected three of an accelerometer'):
         reads(header, *columns)
-    given = {'ax': 'third', 'ay': '2', 'az': 'First', 'time': 'fourth_us'}
+    given = {'ax': 'third', 'ay': '2', 'az': 'First', 'time': 'fourth_us', 'label': 'second'}
     log = reads(header, *columns, digits='.12g', columns=given)
     check(log, made['reading'], made['time'])
+    assert log.table['label'][9] == format(made['reading'][9, 1], '.12g')
     for wrong, message in (({'ax': 'fifth'}, "no column 'fifth'"), ({'ax': '9'}, "column '9'"),
-                           ({'bx': '1'}, "names 'bx'"), ({'ax': '1'}, 'expected ax, ay and az')):
+                           ({'bx': '1'}, "names 'bx'"), ({'ax': '1'}, 'expected ax, ay and az'),
+                           ({'az': ''}, 'names az, expected ax, ay and az')):
         with pytest.raises(InputError, match=message):
             reads(header, *columns, columns=wrong)
 

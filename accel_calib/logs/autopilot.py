@@ -153,16 +153,15 @@ class Parameters:
     def __bool__(self) -> bool:
         return bool(self._stated)
 
-    def spans(self) -> Iterator[tuple[float, Values]]:
-        """Yield from when on which values hold; the first value of each holds from the start."""
-        values: dict[str, float] = {}
-        for _, name, value in self._stated:
-            values.setdefault(name, value)
-        yield -np.inf, dict(values)
+    def spans(self) -> Iterator[tuple[float, float, Values]]:
+        """Yield from when to when which values hold; the first of each holds from the start."""
+        values = {name: value for _, name, value in reversed(self._stated)}
+        start = -np.inf
         for time, name, value in self._stated:
             if values[name] != value and not _AT_BOOT.match(name):
-                values[name] = value
-                yield time, dict(values)
+                yield start, time, dict(values)
+                values[name], start = value, time
+        yield start, np.inf, values
 
     def lookup(self, values: Values, name: str, usual: float) -> float:
         """Return a value, or the usual one; others than the usual one are named in a note."""
@@ -200,12 +199,9 @@ def _is_number(value: float | str | bytes) -> bool:
 def raw_columns(columns: Mapping[str, Floats], parameters: Parameters, correction: Correction
                 ) -> dict[str, Floats]:
     """Return columns with the readings of the sensor in its own axes; rates are only turned."""
-    if not parameters:
-        raise UnknownCorrectionError('its parameters are not in the log')
     time, found = columns['time'], {key: values.copy() for key, values in columns.items()}
     temperature = found.get('temperature', np.zeros(len(time)))
-    spans = list(parameters.spans())
-    for (start, values), (stop, _) in zip(spans, [*spans[1:], (np.inf, {})]):
+    for start, stop, values in parameters.spans():
         which = (time >= start) & (time < stop)
         if not np.any(which):
             continue
@@ -215,13 +211,15 @@ def raw_columns(columns: Mapping[str, Floats], parameters: Parameters, correctio
         found['reading'][which] = old.raw(found['reading'][which], temperature[which])
         if 'rate' in found:
             found['rate'][which] = found['rate'][which] @ old.rotation
+    if not parameters:
+        raise UnknownCorrectionError('its parameters are not in the log')
     return found
 
 
 def px4_slot(parameters: Parameters, device: int, name: str = 'CAL_ACC') -> int | None:
     """Return n of CAL_ACCn or TC_An of a device; None if PX4 has none of it in use."""
-    return next((slot for _, values in parameters.spans() for slot in _slots(values, device, name)
-                 if device), None)
+    return next((slot for _, _, values in parameters.spans()
+                 for slot in _slots(values, device, name) if device), None)
 
 
 def _slots(values: Values, device: int, name: str) -> list[int]:
@@ -229,66 +227,56 @@ def _slots(values: Values, device: int, name: str) -> list[int]:
     return [slot for slot in _SLOTS if used and values.get(f'{name}{slot}_ID') == device]
 
 
-def px4_correction(parameters: Parameters, device: int, release: tuple[int, int] | None
-                   ) -> Correction:
+def px4_correction(parameters: Parameters, device: int, release: tuple[int, int] | None,
+                   values: Values) -> ByAxis:
     """Return the correction of PX4 for the accelerometer with this id, of a known release."""
     if not device:
         raise UnknownCorrectionError('the log does not state the device id of the accelerometer')
     slot = px4_slot(parameters, device)
-
-    def correction(values: Values) -> ByAxis:
-        start = 'uncalibrated ' if slot is None else f'CAL_ACC{slot}_'
-        offset = parameters.three(values, f'{start}{{}}OFF', 0.0)
-        scale = _scale(parameters.three(values, f'{start}{{}}SCALE', 1.0))
-        number = parameters.lookup(values, f'{start}ROT', -1.0)
-        if number < 0.0:  # internal: it follows the board
-            number = parameters.lookup(values, 'SENS_BOARD_ROT', 0.0)
-        if number >= _FIRST_OTHER and release is not None and release < _BEFORE_MAVLINK:
-            raise UnknownCorrectionError(f'PX4 {release[0]}.{release[1]} numbers rotation '
-                                         f'{number:.0f} in another way')
-        level = parameters.three(values, 'SENS_BOARD_{}_OFF', 0.0)
-        rotation = _rotation(level) @ _numbered('SENS_BOARD_ROT', number, _ROTATIONS)
-        slots = _slots(values, device, _THERMAL)
-        start = f'{_THERMAL}{slots[0]}_' if slots else 'uncalibrated '
-        constant, *thermal = (np.array([parameters.lookup(values, f'{start}X{order}_{axis}', 0.0)
-                                        for axis in range(3)]) for order in range(DEGREE + 1))
-        limits = values.get(f'{start}TMIN', 0.0), values.get(f'{start}TMAX', 100.0)
-        return ByAxis(offset + constant, scale, np.array(thermal),
-                      values.get(f'{start}TREF', 25.0), limits, rotation)
-
-    return correction
+    start = 'uncalibrated ' if slot is None else f'CAL_ACC{slot}_'
+    offset = parameters.three(values, f'{start}{{}}OFF', 0.0)
+    scale = _scale(parameters.three(values, f'{start}{{}}SCALE', 1.0))
+    number = parameters.lookup(values, f'{start}ROT', -1.0)
+    if number < 0.0:  # internal: it follows the board
+        number = parameters.lookup(values, 'SENS_BOARD_ROT', 0.0)
+    if number >= _FIRST_OTHER and release is not None and release < _BEFORE_MAVLINK:
+        raise UnknownCorrectionError(f'PX4 {release[0]}.{release[1]} numbers rotation '
+                                     f'{number:.0f} in another way')
+    level = parameters.three(values, 'SENS_BOARD_{}_OFF', 0.0)
+    rotation = _rotation(level) @ _numbered('SENS_BOARD_ROT', number, _ROTATIONS)
+    slots = _slots(values, device, _THERMAL)
+    start = f'{_THERMAL}{slots[0]}_' if slots else 'uncalibrated '
+    constant, *thermal = (np.array([parameters.lookup(values, f'{start}X{order}_{axis}', 0.0)
+                                    for axis in range(3)]) for order in range(DEGREE + 1))
+    limits = values.get(f'{start}TMIN', 0.0), values.get(f'{start}TMAX', 100.0)
+    return ByAxis(offset + constant, scale, np.array(thermal), values.get(f'{start}TREF', 25.0),
+                  limits, rotation)
 
 
-def ardupilot_correction(parameters: Parameters, instance: int) -> Correction:
+def ardupilot_correction(parameters: Parameters, instance: int, values: Values) -> ByAxis:
     """Return the correction of ArduPilot for an accelerometer, numbered from 1."""
     if instance not in _ARDUPILOT_INSTANCES:
         raise UnknownCorrectionError(f'parameters of accelerometer {instance} are not read')
-    start = f'INS_ACC{"" if instance == 1 else instance}'
-    thermal_start = f'INS_TCAL{instance}_'
-
-    def correction(values: Values) -> ByAxis:
-        offset = parameters.three(values, f'{start}OFFS_{{}}', 0.0)
-        scale = _scale(parameters.three(values, f'{start}SCAL_{{}}', 1.0))
-        thermal, limits = np.zeros((DEGREE, 3)), (0.0, 0.0)
-        if values.get(f'{thermal_start}ENABLE') == 1:
-            thermal = np.array([parameters.three(values, f'{thermal_start}ACC{order}_{{}}', 0.0)
-                                for order in range(1, DEGREE + 1)]) / PER_MILLION
-            limits = (values.get(f'{thermal_start}TMIN', 0.0),
-                      values.get(f'{thermal_start}TMAX', 70.0))
-        number = parameters.lookup(values, 'AHRS_ORIENTATION', 0.0)
-        names = _CUSTOM.get(int(number), ())
-        lacking = [name for name in names if name not in values]
-        if lacking:
-            raise UnknownCorrectionError(
-                f'AHRS_ORIENTATION is {number:.0f}, and the log lacks {lacking[0]}')
-        rotation = (_rotation([parameters.lookup(values, name, 0.0) for name in names]) if names
-                    else _numbered('AHRS_ORIENTATION', number, _OF_ARDUPILOT))
-        found = ByAxis(offset, scale, thermal, ARDUPILOT_REFERENCE, limits, rotation)
-        # The firmware adds the polynomial at CALTEMP, so that it is zero there.
-        at_offset = values.get(f'INS_ACC{instance}_CALTEMP', -300.0)
-        return replace(found, offset=offset - found.moved(at_offset))
-
-    return correction
+    start, thermal_start = f'INS_ACC{"" if instance == 1 else instance}', f'INS_TCAL{instance}_'
+    offset = parameters.three(values, f'{start}OFFS_{{}}', 0.0)
+    scale = _scale(parameters.three(values, f'{start}SCAL_{{}}', 1.0))
+    thermal, limits = np.zeros((DEGREE, 3)), (0.0, 0.0)
+    if values.get(f'{thermal_start}ENABLE') == 1:
+        thermal = np.array([parameters.three(values, f'{thermal_start}ACC{order}_{{}}', 0.0)
+                            for order in range(1, DEGREE + 1)]) / PER_MILLION
+        limits = values.get(f'{thermal_start}TMIN', 0.0), values.get(f'{thermal_start}TMAX', 70.0)
+    number = parameters.lookup(values, 'AHRS_ORIENTATION', 0.0)
+    names = _CUSTOM.get(int(number), ())
+    lacking = [name for name in names if name not in values]
+    if lacking:
+        raise UnknownCorrectionError(
+            f'AHRS_ORIENTATION is {number:.0f}, and the log lacks {lacking[0]}')
+    rotation = (_rotation([parameters.lookup(values, name, 0.0) for name in names]) if names
+                else _numbered('AHRS_ORIENTATION', number, _OF_ARDUPILOT))
+    found = ByAxis(offset, scale, thermal, ARDUPILOT_REFERENCE, limits, rotation)
+    # The firmware adds the polynomial at CALTEMP, so that it is zero there.
+    at_offset = values.get(f'INS_ACC{instance}_CALTEMP', -300.0)
+    return replace(found, offset=offset - found.moved(at_offset))
 
 
 def _numbered(name: str, number: float, known: Mapping[int, Sequence[float]]) -> Floats:
@@ -355,10 +343,10 @@ class AsSensed:
 
 
 def as_sensed(columns: Mapping[str, Floats], parameters: Parameters, autopilot: Autopilot,
-              correction: Callable[[], Correction], advice: str) -> AsSensed:
+              correction: Correction, advice: str) -> AsSensed:
     """Return columns without the correction, or as they are with a note why that is not known."""
     try:
-        raw = raw_columns(columns, parameters, correction())
+        raw = raw_columns(columns, parameters, correction)
     except UnknownCorrectionError as err:
         return AsSensed(columns, replace(autopilot, corrected=str(err)), notes=(
             f'readings are left as the vehicle corrected them ({err}), so do not load an export '
@@ -370,18 +358,11 @@ def as_sensed(columns: Mapping[str, Floats], parameters: Parameters, autopilot: 
 
 @dataclass(frozen=True)
 class Choice:
-    """
-    The message to read, and all messages of the log that matter.
-
-    `preferred` are the names of those with accelerations, the best first; `name` is that of the
-    sensor, if the user states one.
-
-    """
+    """The message to read, the name of its sensor, and notes on the messages that are not."""
 
     message: Message
-    found: Sequence[Message]
-    preferred: Sequence[str]
-    name: str
+    sensor: str
+    notes: Sequence[str]
 
     def log(self, kind: str, found: AsSensed, temperature: str, notes: Iterable[str]
             ) -> FlightLog:
@@ -392,26 +373,9 @@ class Choice:
         read_as = f'{kind}, {chosen} at {chosen.rate_hz:.4g} Hz, m/s2, {axes}'
         if 'temperature' in found.columns:
             read_as += f', {temperature}'
-        recording = Recording(found.columns, numbered(found.columns), 'm/s2',
-                              self.name or str(chosen), found.autopilot)
-        return FlightLog(recording, read_as, (*notes, *self._others(), *found.notes))
-
-    def _others(self) -> list[str]:
-        """Return notes on the other sensors of the same message, and on other messages."""
-        chosen, notes = self.message, []
-        usable = [each for each in self.found if len(each.time)]
-        rest = [each for each in usable
-                if each.name == chosen.name and each.instance != chosen.instance]
-        other = [each for each in usable if each.name in {*self.preferred} - {chosen.name}]
-        if rest:
-            notes.append(f'{chosen} is read; other sensors: {some(rest)} '
-                         f'(--sensor {rest[0].instance})')
-        if other:
-            names = ', '.join(dict.fromkeys(
-                f'{each.name} ({each.rate_hz:.3g} Hz)' for each in other
-                if each.instance == other[0].instance))
-            notes.append(f'not used: {names} (--topic {other[0].name})')
-        return notes
+        recording = Recording(found.columns, numbered(found.columns), 'm/s2', self.sensor,
+                              found.autopilot)
+        return FlightLog(recording, read_as, (*notes, *self.notes, *found.notes))
 
     def rates(self, time: Floats, sources: Iterable[Message], names: Sequence[str]
               ) -> dict[str, Floats]:
@@ -448,7 +412,16 @@ def choose(found: Sequence[Message], preferred: Sequence[str], topic: str, senso
     order = sorted(wanted, key=lambda message: (preferred.index(message.name), message.instance))
     dense = [message for message in order if message.rate_hz >= DENSE_HZ]
     best = dense[0] if dense else max(order, key=lambda message: message.rate_hz)
-    return Choice(best, found, preferred, '' if chooses else sensor)
+    notes = []
+    rest = [each for each in usable if each.name == best.name and each.instance != best.instance]
+    if rest:
+        notes.append(f'{best} is read; other sensors: {some(rest)} (--sensor {rest[0].instance})')
+    other = [each for each in usable if each.name != best.name]
+    if other:
+        names = ', '.join(dict.fromkeys(f'{each.name} ({each.rate_hz:.3g} Hz)' for each in other
+                                        if each.instance == other[0].instance))
+        notes.append(f'not used: {names} (--topic {other[0].name})')
+    return Choice(best, str(best) if chooses or not sensor else sensor, notes)
 
 
 def vectors(fields: Mapping[str, NDArray[Any]], names: Sequence[str]) -> Floats:

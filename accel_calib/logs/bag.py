@@ -18,6 +18,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, ExitStack
 from dataclasses import dataclass
 from functools import cache
+from operator import attrgetter
 from pathlib import Path
 import shutil
 import sqlite3
@@ -27,7 +28,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from .serialized import frame_ids, IMU_DOUBLES, joined, Messages, samples_of
+from .serialized import frame_ids, IMU_DOUBLES, joined, Messages, NANO, samples_of
 from ..disk import check_regular
 from ..errors import InputError
 from ..table import Floats
@@ -39,7 +40,10 @@ if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader as Reader2
     from rosbags.typesys.store import Typestore
 
-IMU = 'sensor_msgs/msg/Imu'
+IMU, TEMPERATURE = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/Temperature'
+_DOUBLES = {IMU: IMU_DOUBLES, TEMPERATURE: 2}
+"""Number of doubles of a message; those of a Temperature are temperature and variance."""
+
 BLOCK = 4096
 """Number of messages per block; a block fits in the cache of the processor."""
 
@@ -113,23 +117,26 @@ class Bag:
     def first(self, topic: str, msgtype: str = IMU, size: int = 1) -> list[Received]:
         return next(self.blocks(self.connections(topic, msgtype), size), [])
 
-    def joined(self, raws: Sequence[bytes], topic: str, before: int, doubles: int = IMU_DOUBLES
+    def joined(self, block: Sequence[Received], topic: str, msgtype: str = IMU, before: int = 0
                ) -> Messages:
         """Return messages of a topic as arrays; `before` is the number of earlier messages."""
-        return joined(raws, doubles, f'{self.path}, {topic}', ros2=self.ros2, before=before)
+        return joined([raw for _, _, raw in block], _DOUBLES[msgtype], f'{self.path}, {topic}',
+                      ros2=self.ros2, before=before)
 
-    def fields(self, msgtype: str, field: str, block: Sequence[Received]) -> list[tuple[Any, Any]]:
-        """Return stamp of the header (or None) and value of a field such as ``status.voltage``."""
+    def frame_id(self, topic: str, msgtype: str = IMU) -> str:
+        """Return the frame_id of the first message of a topic; empty if there is none."""
+        block = self.first(topic, msgtype)
+        return frame_ids(self.joined(block, topic, msgtype))[0] if block else ''
+
+    def fields(self, msgtype: str, field: str, block: Sequence[Received]) -> tuple[Floats, Floats]:
+        """Return stamps [s], NaN without header, and values of a field: ``status.voltage``."""
         store = _types(block[0][0], ros2=self.ros2)
         read = store.deserialize_cdr if self.ros2 else store.deserialize_ros1
-        rows = []
-        for _, _, raw in block:
-            value: Any = read(raw, msgtype)
-            stamp = getattr(getattr(value, 'header', None), 'stamp', None)
-            for name in field.split('.'):
-                value = getattr(value, name)
-            rows.append((stamp, value))
-        return rows
+        messages = [read(raw, msgtype) for _, _, raw in block]
+        stamps = [getattr(getattr(each, 'header', None), 'stamp', None) for each in messages]
+        return (np.array([np.nan if each is None else each.sec + each.nanosec * NANO
+                          for each in stamps]),
+                np.array([*map(attrgetter(field), messages)], float))
 
     def numbers(self, connection: Connection) -> tuple[str, ...]:
         """Return the paths of the single numbers of a message, without headers and times."""
@@ -164,11 +171,10 @@ class Bag:
 
     def first_frame_id(self, topic: str) -> str:
         """Return the frame_id of the first message of an Imu topic; there must be one."""
-        block = self.first(topic)
-        if not block:
+        if not self.first(topic):
             raise InputError(f'{self.path} has no message on {topic}, expected Imu messages',
                              'record while the sensor publishes')
-        return frame_ids(self.joined([block[0][2]], topic, 0))[0]
+        return self.frame_id(topic)
 
     def lost(self, topic: str, found: int) -> list[str]:
         """Return a note if fewer messages of a topic were found than the bag states."""

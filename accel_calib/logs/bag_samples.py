@@ -26,8 +26,8 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from .bag import Bag, BLOCK, imus_of, NUMBERS, open_bag, Received
-from .serialized import doubles_at, frame_ids, stamps_of
+from .bag import Bag, BLOCK, imus_of, NUMBERS, open_bag, Received, TEMPERATURE
+from .serialized import doubles_at, NANO, stamps_of
 from ..errors import InputError
 from ..table import concatenated, Floats, Recording
 from ..text import counted, listed, some
@@ -36,10 +36,6 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
     from .columns import LogOptions
-
-TEMPERATURE = 'sensor_msgs/msg/Temperature'
-_TEMPERATURE_DOUBLES = 2
-"""Number of doubles of a Temperature: temperature and variance."""
 
 _PRESSURE = 'sensor_msgs/msg/FluidPressure'
 _OF_TYPE = {TEMPERATURE: 'temperature', 'sensor_msgs/msg/BatteryState': 'supply_voltage'}
@@ -53,8 +49,6 @@ _PEEKED = 100
 
 _SAME_CLOCK_S = 60.0
 """Largest difference of a stamp from the time of receipt; a larger one is another clock."""
-
-_NANO = 1e-9
 
 
 @dataclass(frozen=True)
@@ -126,14 +120,10 @@ class ContextTopic:
     def values(self, block: Sequence[Received]) -> tuple[Floats, Floats]:
         """Return the times [s] and values of messages; a damaged message is an InputError."""
         if self.msgtype == TEMPERATURE:
-            messages = self.bag.joined([raw for _, _, raw in block], self.topic, 0,
-                                       _TEMPERATURE_DOUBLES)
+            messages = self.bag.joined(block, self.topic, TEMPERATURE)
             stamps, values = stamps_of(messages), doubles_at(messages, slice(0, 1))[:, 0]
         else:
-            fields = self.bag.fields(self.msgtype, self.field, block)
-            stamps = np.array([np.nan if stamp is None else stamp.sec + stamp.nanosec * _NANO
-                               for stamp, _ in fields])
-            values = np.array([value for _, value in fields], float)
+            stamps, values = self.bag.fields(self.msgtype, self.field, block)
         time = stamps if self.late is None else _received(block) + self.late
         return time, values * self.factor + self.summand
 
@@ -148,45 +138,13 @@ class ContextTopic:
 
 
 def _received(block: Sequence[Received]) -> Floats:
-    return np.array([stamp for _, stamp, _ in block]) * _NANO
+    return np.array([stamp for _, stamp, _ in block]) * NANO
 
 
-@dataclass(frozen=True)
-class ContextTopics:
-    """The topics that are used beside those of the Imu, and notes about them and about others."""
-
-    used: tuple[ContextTopic, ...]
-    notes: tuple[str, ...]
-
-    def needed(self, bag: Bag, needs: Collection[str]) -> ContextTopics:
-        """Return the topics that a calibration needs, without notes if it needs none."""
-        used = {source.quantity.key: source for source in self.used}
-        needed = [quantity for quantity in QUANTITIES if quantity.key in needs]
-        for quantity in needed:
-            if quantity.key not in used:
-                notes = ''.join(f'; {line}' for line in self.notes)
-                raise InputError(f'{bag.path} has no {quantity.words} in a topic that is used'
-                                 f'{notes}, but the calibration depends on the {quantity.words}',
-                                 f'name the topic with {quantity.option}, or use a calibration '
-                                 'without it')
-        return ContextTopics(tuple(source for source in self.used if source.quantity in needed),
-                             self.notes if needed else ())
-
-    def tracks(self) -> dict[str, Track]:
-        """Return all values of the bag by column; raise InputError if there are none."""
-        tracks = {}
-        for topic in self.used:
-            track = topic.track()
-            if not len(track.time):
-                raise InputError(f'{topic.bag.path}: {topic.topic} has no finite number, expected '
-                                 f'the {topic.quantity.words}', 'name another topic')
-            tracks[topic.quantity.key] = track
-        return tracks
-
-
-def context_of(bag: Bag, imu: str, sensor: str, options: LogOptions) -> ContextTopics:
+def context_of(bag: Bag, imu: str, sensor: str, options: LogOptions
+               ) -> tuple[list[ContextTopic], list[str]]:
     """
-    Return the topics with temperature and supply voltage.
+    Return the topics with temperature and supply voltage, and notes about them and about others.
 
     Parameters
     ----------
@@ -203,7 +161,8 @@ def context_of(bag: Bag, imu: str, sensor: str, options: LogOptions) -> ContextT
         If a topic is missing, has no messages, or does not contain the quantity.
 
     """
-    used, notes = [], []
+    used: list[ContextTopic] = []
+    notes: list[str] = []
     topics = options.temperature_topic, options.supply_topic
     for quantity, asked in zip(QUANTITIES, topics, strict=True):
         found = (_asked(bag, quantity, asked) if asked else
@@ -213,7 +172,7 @@ def context_of(bag: Bag, imu: str, sensor: str, options: LogOptions) -> ContextT
             used += [found] if found is not None else []
             notes += about
         notes += _not_used(bag, quantity, found)
-    return ContextTopics(tuple(used), tuple(notes))
+    return used, notes
 
 
 def _asked(bag: Bag, quantity: Quantity, asked: str) -> ContextTopic:
@@ -250,17 +209,12 @@ def _own(bag: Bag, imu: str, sensor: str) -> ContextTopic | None:
              if any(connection.msgcount for connection in bag.connections(topic, TEMPERATURE))]
     space = imu.rpartition('/')[0]
     for wanted in (lambda topic: True,
-                   lambda topic: sensor and _frame_id(bag, topic) == sensor,
+                   lambda topic: sensor and bag.frame_id(topic, TEMPERATURE) == sensor,
                    lambda topic: space and topic.rpartition('/')[0] == space):
         of_imu = [topic for topic in known if wanted(topic)]
         if len(of_imu) == 1:
             return ContextTopic(bag, QUANTITIES[0], of_imu[0], TEMPERATURE, 'temperature')
     return None
-
-
-def _frame_id(bag: Bag, topic: str) -> str:
-    raws = [raw for _, _, raw in bag.first(topic, TEMPERATURE)]
-    return frame_ids(bag.joined(raws, topic, 0, _TEMPERATURE_DOUBLES))[0] if raws else ''
 
 
 def _with_clock_and_unit(topic: ContextTopic, imu: str, *, named: bool
@@ -278,7 +232,7 @@ def _with_clock_and_unit(topic: ContextTopic, imu: str, *, named: bool
     notes = []
     late = 0.0  # the stamps of the first messages of the Imu after their receipt [s]
     if of_imu := topic.bag.first(imu, size=_PEEKED):
-        stamps = stamps_of(topic.bag.joined([raw for _, _, raw in of_imu], imu, 0))
+        stamps = stamps_of(topic.bag.joined(of_imu, imu))
         late = float(np.median(stamps - _received(of_imu)))
     if not np.median(np.abs(time - _received(block) - late)) <= _SAME_CLOCK_S:
         topic = replace(topic, late=late)
@@ -336,8 +290,8 @@ def _looks_like(connection: Connection, quantity: Quantity) -> bool:
 
 # ----------------------------------------------------------------------------------- samples
 
-def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool, context: ContextTopics,
-                notes: list[str]) -> Iterator[Recording]:
+def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool,
+                context: Sequence[ContextTopic], notes: list[str]) -> Iterator[Recording]:
     """
     Yield the samples of an Imu topic in blocks; `sensor` and `chosen` are as in `imus_of`.
 
@@ -345,11 +299,11 @@ def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool, context: Con
     NaN, or is from another sensor is an InputError.
 
     """
-    tracks = {source.quantity.key: source.track() for source in context.used}
+    tracks = {source.quantity.key: source.track() for source in context}
     parts: list[Recording] = []
     before = 0
     for block in bag.blocks(bag.connections(topic), BLOCK):
-        messages = bag.joined([raw for _, _, raw in block], topic, before)
+        messages = bag.joined(block, topic, before=before)
         columns, which = imus_of(messages, f'{bag.path}, {topic}', before, sensor, chosen=chosen)
         columns |= {key: track.at(columns['time']) for key, track in tracks.items()}
         samples = Recording(columns, before + np.arange(len(block)) + 1, 'm/s2', sensor)
@@ -365,6 +319,25 @@ def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool, context: Con
 
 # ---------------------------------------------------------------------------------- messages
 
+def _needed(bag: Bag, needs: Collection[str], used: Sequence[ContextTopic], notes: Sequence[str]
+            ) -> dict[str, Track]:
+    """Return all values of the quantities that a calibration needs; InputError without one."""
+    topics, tracks = {source.quantity: source for source in used}, {}
+    for quantity in QUANTITIES:
+        if quantity.key not in needs:
+            continue
+        if quantity not in topics:
+            raise InputError(f'{bag.path} has no {quantity.words} in a topic that is used'
+                             f'{"".join(f"; {line}" for line in notes)}, but the calibration '
+                             f'depends on the {quantity.words}', 'name the topic with '
+                             f'{quantity.option}, or use a calibration without it')
+        track = tracks[quantity.key] = topics[quantity].track()
+        if not len(track.time):
+            raise InputError(f'{bag.path}: {topics[quantity].topic} has no finite number, '
+                             f'expected the {quantity.words}', 'name another topic')
+    return tracks
+
+
 def messages_of(path: Path, options: LogOptions, needs: Collection[str]) -> Generator[Any]:
     """
     Yield what a corrected copy of a bag needs: what is known first, the messages, the notes.
@@ -379,12 +352,13 @@ def messages_of(path: Path, options: LogOptions, needs: Collection[str]) -> Gene
     with open_bag(path) as bag:
         topic = bag.imu_topic(options.topic)
         sensor = bag.first_frame_id(topic)
-        context = context_of(bag, topic, sensor, options).needed(bag, needs)
+        used, notes = context_of(bag, topic, sensor, options)
+        tracks = _needed(bag, needs, used, notes)
         connections = bag.reader.connections
         number = {id(each): k for k, each in enumerate(connections)}
         imu = [number[id(each)] for each in bag.connections(topic)]
         yield {'topic': topic, 'sensor': sensor, 'count': bag.count(topic), 'imu': imu,
-               'tracks': {key: vars(track) for key, track in context.tracks().items()},
+               'tracks': {key: vars(track) for key, track in tracks.items()},
                'compression': getattr(bag.reader, 'compression_mode', None),
                'connections': [{
                    'topic': each.topic, 'msgtype': each.msgtype, 'msgdef': each.msgdef.data,
@@ -398,4 +372,4 @@ def messages_of(path: Path, options: LogOptions, needs: Collection[str]) -> Gene
             yield {'connection': which, 'stamp': np.array([stamp for _, stamp, _ in block]),
                    'size': np.array([len(raw) for _, _, raw in block]),
                    'data': np.frombuffer(b''.join(raw for _, _, raw in block), np.uint8)}
-        yield [*bag.notes, *context.notes, *bag.lost(topic, found)]
+        yield [*bag.notes, *(notes if tracks else ()), *bag.lost(topic, found)]

@@ -23,8 +23,6 @@ every installation has it. What this process sends to the child is trusted, and 
 
 """
 
-from __future__ import annotations
-
 import atexit
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, contextmanager, ExitStack, suppress
@@ -45,7 +43,7 @@ import sys
 import tempfile
 from threading import Lock
 import time
-from typing import Any, BinaryIO, NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -173,7 +171,7 @@ def parts_of(file: LogFile, function: Callable[..., Generator[Any]], *given: Any
         stack.callback(ended)
         with suppress(ConnectionError):  # its end is found when the first part is read
             ours.sendall(pickle.dumps((file, function, given, task)))
-        yield _guarded(file, _received(file, _Inbox(file, stream), ended))
+        yield _guarded(file, _received(file, stream, ended))
 
 
 def _guarded(file: LogFile, parts: Iterator[Any]) -> Iterator[Any]:
@@ -206,46 +204,39 @@ def _send(stream: Any, kind: str, content: Any) -> None:
     stream.flush()
 
 
-class _Inbox:
-    """The parts that a child sends, which may have this size together."""
+def _made(taken: Callable[[int], bytearray], value: dict[str, Any]) -> Any:
+    """Return an array or a record of an object in JSON; a function takes bytes from the stream."""
+    key = next(iter(value)) if len(value) == 1 else ''
+    if key == _ARRAY:
+        kind, shape = np.dtype(value[key][0]), value[key][1]
+        if kind.kind not in _KINDS:
+            raise ValueError(f'its reader sends an array of {kind}')
+        return np.ndarray(shape, kind, taken(kind.itemsize * math.prod(shape)))
+    if key in _RECORDS:
+        return _RECORDS[key](**{name: tuple(each) if isinstance(each, list) else each
+                                for name, each in value[key].items()})
+    return value
 
-    def __init__(self, file: LogFile, stream: BinaryIO) -> None:
-        self._file, self._stream = file, stream
-        self._most = self._left = file.limits()[1]
 
-    def value(self) -> Any:
-        """Return the next value; EOFError if the child has ended."""
-        return json.loads(self._taken(int.from_bytes(self._taken(_LENGTH_BYTES), 'little')),
-                          object_hook=self._made)
+def _received(file: LogFile, stream: Any, ended: Callable[[], int]) -> Iterator[Any]:
+    """Yield the parts that a child sends; `ended` ends it, and returns its exit status."""
+    most = left = file.limits()[1]
 
-    def _taken(self, size: int) -> bytearray:
-        self._left -= size
-        if self._left < 0:
-            raise InputError(f'{self._file.path} holds more than {self._most} bytes of samples, '
-                             'expected at most as many for its size', 'use another file')
+    def taken(size: int) -> bytearray:
+        nonlocal left
+        left -= size
+        if left < 0:
+            raise InputError(f'{file.path} holds more than {most} bytes of samples, expected at '
+                             'most as many for its size', 'use another file')
         data = bytearray(size)
-        if self._stream.readinto(data) < size:  # type: ignore[attr-defined]
+        if stream.readinto(data) < size:
             raise EOFError
         return data
 
-    def _made(self, value: dict[str, Any]) -> Any:
-        key = next(iter(value)) if len(value) == 1 else ''
-        if key == _ARRAY:
-            kind, shape = np.dtype(value[key][0]), value[key][1]
-            if kind.kind not in _KINDS:
-                raise ValueError(f'its reader sends an array of {kind}')
-            return np.ndarray(shape, kind, self._taken(kind.itemsize * math.prod(shape)))
-        if key in _RECORDS:
-            return _RECORDS[key](**{name: tuple(each) if isinstance(each, list) else each
-                                    for name, each in value[key].items()})
-        return value
-
-
-def _received(file: LogFile, inbox: _Inbox, ended: Callable[[], int]) -> Iterator[Any]:
-    """Yield the parts that a child sends; `ended` ends it, and returns its exit status."""
     while True:
         try:
-            kind, content = inbox.value()
+            size = int.from_bytes(taken(_LENGTH_BYTES), 'little')
+            kind, content = json.loads(taken(size), object_hook=partial(_made, taken))
         except (EOFError, ConnectionError):
             status = ended()
             raise file.damaged(

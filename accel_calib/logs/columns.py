@@ -20,11 +20,10 @@ import numpy as np
 
 from .dialect import Cells, is_clock, is_number, Layout, shown
 from .names import (
-    BARE, bare_name, check_sensor, COUNTERS, format_named, is_unit, LINEAR_WORDS, LogFormat,
-    may_cause, Meaning, meaning, OURS, RATE, READING, recognise, unit_of, WHOLE_WORDS, WORDS)
+    BARE, bare_name, check_sensor, COUNTERS, format_named, FREE_WORDS, is_unit, LINEAR_WORDS,
+    LogFormat, may_cause, meaning, OURS, RATE, READING, recognise, unit_of, WHOLE_WORDS, WORDS)
 from ..errors import InputError
 from ..table import COLUMNS, Floats, quantity_key
-from ..text import one_line
 from ..units import STANDARD_GRAVITY, UnitName
 
 FRACTION = 'time_ns'
@@ -104,49 +103,42 @@ class Source:
 @dataclass(frozen=True)
 class Chosen:
     """
-    The columns of a text log that are used, under our names, and the maker's layout, if any.
+    The columns of a text log that are used, and the maker's layout, if any.
 
-    `numeric` and `text` are the indices of columns of numbers and of text, as read. The
-    `quantities` are further columns of numbers, the last ones of `numeric`.
+    `sources` are the columns by key of `COLUMNS`; those of ``KEY/`` divide the ones of a key, and
+    ``instance`` is the number of the sensor. The others are indices: of the columns of numbers
+    that each row needs, of `labels`, of `dates` (times as text), and of further columns of
+    numbers, the `quantities`.
 
     """
 
     layout: Layout
-    sources: Mapping[str, Source]
+    sources: Mapping[str, tuple[Source, ...]]
     maker: LogFormat | None
-    numeric: tuple[int, ...]
-    text: tuple[int, ...]
+    needed: tuple[int, ...]
+    labels: tuple[int, ...]
+    dates: tuple[int, ...]
     quantities: Mapping[str, int]
 
     @property
-    def dates(self) -> tuple[int, ...]:
-        """Columns of text that are dates, or times of the day: that of the times, or none."""
-        which = [self.sources['time'].index] if 'time' in self.sources else []
-        return tuple(set(which) & set(self.text))
+    def numeric(self) -> tuple[int, ...]:
+        """Return the indices of all columns of numbers."""
+        return (*self.needed, *self.quantities.values())
 
-    def numbers(self, cells: Cells, ours: str) -> Floats:
-        """Return the numbers of a column as in the file; divided, if its maker says so."""
-        values = cells.numbers[:, self.numeric.index(self.sources[ours].index)]
-        divisor = self.sources.get(f'{ours}/')
-        if divisor is None:
-            return values
-        with np.errstate(all='ignore'):  # a row divided by 0 is refused later, with its number
-            return values / cells.numbers[:, self.numeric.index(divisor.index)]
+    def numbers(self, cells: Cells, key: str) -> Floats:
+        """Return the (n, k) numbers of a key as in the file; divided, if its maker says so."""
+        values = np.column_stack([cells.numbers[source.index] for source in self.sources[key]])
+        for divisor in self.sources.get(f'{key}/', ()):
+            with np.errstate(all='ignore'):  # a row divided by 0 is refused later, with its number
+                values /= cells.numbers[divisor.index][:, np.newaxis]
+        return values
 
-    def three(self, cells: Cells, ours: Sequence[str]) -> Floats:
-        """Return the numbers of three columns, (n, 3)."""
-        return np.column_stack([self.numbers(cells, name) for name in ours])
-
-    def texts(self, cells: Cells, ours: str) -> list[str]:
-        """Return the texts of a column, each one printable line."""
-        return [*map(one_line, cells.texts[self.text.index(self.sources[ours].index)])]
-
-    def names(self, ours: Sequence[str]) -> list[str]:
-        """Return the names of columns in the file."""
-        return [self.sources[name].name for name in ours]
+    def names(self, key: str) -> list[str]:
+        """Return the names of the columns of a key in the file."""
+        return [source.name for source in self.sources[key]]
 
 
-def is_log_header(cells: Sequence[str], options: LogOptions) -> bool:
+def is_log_header(options: LogOptions, cells: Sequence[str]) -> bool:
     """Return whether cells are the names of the columns of a log."""
     theirs = [name.casefold() for name in options.columns.values()
               if name and not name.isdecimal()]
@@ -171,49 +163,46 @@ def chosen(layout: Layout, options: LogOptions) -> Chosen:
         # Our own names go first, unless the maker's layout says that they are other columns.
         if maker is not None and set(READING) <= {*header} and not {*READING} <= {*maker.marks}:
             maker = None
-    given = dict(options.columns)
+    given = options.columns
     if maker is None or set(READING) & given.keys():
-        found = sources(layout, given)
-        counted = counter(layout) if options.rate or layout.rate_hz else None
+        maker, found = None, _sources(layout, given)
+        counted = _counter(layout) if options.rate or layout.rate_hz else None
         if counted and 'time' not in found and 'time' not in given:
             found['time'] = counted
-        return with_indices(layout, found)
-    check_sensor(header[:MOST], layout.path)
-    found = sources(layout, {**maker.present(header), **given})
-    for ours, theirs in maker.divisors.items():
-        found[f'{ours}/'] = column(layout, theirs)
-    if maker.instance:
-        found['instance'] = column(layout, maker.instance)
-    return with_indices(layout, found, maker)
+    else:
+        check_sensor(header[:MOST], layout.path)
+        found = _sources(layout, {**maker.present(header), **given})
+        found |= {f'{key}/': column(layout, name) for key, name in maker.divisors.items()}
+        if maker.instance:
+            found['instance'] = column(layout, maker.instance)
+    sources = {key: tuple(found[name] for name in own.names) for key, own in COLUMNS.items()
+               if found.keys() >= {*own.names}}
+    sources |= {key: (source,) for key, source in found.items() if key not in OURS}
+    return _with_indices(layout, sources, maker)
 
 
-def with_indices(layout: Layout, sources: Mapping[str, Source],
-                 maker: LogFormat | None = None) -> Chosen:
-    """Return the columns with the indices of those of numbers and of text."""
-    text = [sources['label'].index] if 'label' in sources else []
-    if 'time' in sources:
-        cells = _sample(layout, sources['time'].index)[:_FIRST_ROWS]
-        if cells and all(map(is_clock, cells)):
-            text.append(sources['time'].index)
-    used = {source.index for source in sources.values()}
+def _with_indices(layout: Layout, sources: Mapping[str, tuple[Source, ...]],
+                  maker: LogFormat | None) -> Chosen:
+    index = {key: tuple(source.index for source in own) for key, own in sources.items()}
+    clocks = layout.first(index['time'][0])[:_FIRST_ROWS] if 'time' in index else []
+    dates = index['time'] if clocks and all(map(is_clock, clocks)) else ()
+    texts = {'label', 'time'} if dates else {'label'}
+    needed = {k for key, which in index.items() if key not in texts for k in which}
+    used = {k for which in index.values() for k in which}
     quantities: dict[str, int] = {}  # the other columns of numbers that can be a cause
     for k, name in enumerate(() if maker else layout.header[:MOST]):
         free = k not in used and meaning(name).quantity in ('', *sources) and may_cause(name)
-        if free and quantity_key(name) and _are_numbers(_sample(layout, k)):
+        if free and quantity_key(name) and _are_numbers(layout.first(k)):
             quantities.setdefault(quantity_key(name), k)
-    numeric = (*sorted(used - set(text)), *quantities.values())
-    return Chosen(layout, sources, maker, numeric, tuple(text), quantities)
+    return Chosen(layout, sources, maker, tuple(sorted(needed)), index.get('label', ()), dates,
+                  quantities)
 
 
 def _are_numbers(cells: Sequence[str]) -> bool:
     return all(is_number(cell.replace(',', '.')) for cell in cells)
 
 
-def _sample(layout: Layout, index: int) -> list[str]:
-    return [row[index] for row in layout.sample if index < len(row)]
-
-
-def sources(layout: Layout, given: Mapping[str, str]) -> dict[str, Source]:
+def _sources(layout: Layout, given: Mapping[str, str]) -> dict[str, Source]:
     """Return columns under our names; `given` are those that the user or a maker names."""
     header = layout.header
     found = _given(layout, given)
@@ -226,7 +215,7 @@ def sources(layout: Layout, given: Mapping[str, str]) -> dict[str, Source]:
     # What is not asked for, and holds other text than numbers, does not stand in the way.
     plain = {ours: source for ours, source in found.items()
              if ours not in CONTEXT or ours in given or source.name == ours
-             or _are_numbers(_sample(layout, source.index)[:_FIRST_ROWS])}
+             or _are_numbers(layout.first(source.index)[:_FIRST_ROWS])}
     return {ours: source for ours, source in plain.items() if given.get(ours, ours)}
 
 
@@ -236,8 +225,8 @@ def _given(layout: Layout, given: Mapping[str, str]) -> dict[str, Source]:
             raise InputError(f'--columns names {ours!r}, expected one of {", ".join(OURS)}',
                              'correct the name before the =')
     found = {ours: column(layout, theirs) for ours, theirs in given.items() if theirs}
-    partly = set(READING) & set(found)
-    if partly and partly != set(READING):
+    partly = set(READING) & set(given)
+    if partly and not set(READING) <= set(found):
         raise InputError(f'--columns names {", ".join(sorted(partly))}, expected ax, ay and az',
                          'name all three')
     return found
@@ -294,7 +283,7 @@ def _readings(layout: Layout) -> dict[str, Source]:
     header = layout.header
     groups = list(_triples('reading', header).values())
     words = {triple[0]: set(meaning(header[triple[0]]).group) for triple in groups}
-    with_gravity = [triple for triple in groups if not meaning(header[triple[0]]).free]
+    with_gravity = [triple for triple in groups if not FREE_WORDS & words[triple[0]]]
     plain = [triple for triple in with_gravity if not LINEAR_WORDS & words[triple[0]]]
     whole = [triple for triple in plain if WHOLE_WORDS & words[triple[0]]]
     if groups and not with_gravity:
@@ -323,16 +312,17 @@ def _listed(layout: Layout, triple: Sequence[int]) -> str:
     return ', '.join(map(layout.name, triple))
 
 
-def _meanings(header: Sequence[str]) -> list[tuple[int, Meaning]]:
-    """Return the indices of columns with what their names mean."""
-    return [(k, meaning(name)) for k, name in enumerate(header[:MOST])]
+def _named(quantity: str, header: Sequence[str]) -> list[int]:
+    """Return the indices of the columns whose names mean a quantity."""
+    return [k for k, name in enumerate(header[:MOST]) if meaning(name).quantity == quantity]
 
 
 def _triples(quantity: str, header: Sequence[str]) -> dict[tuple[str, ...], list[int]]:
     """Return the columns of the three axes of each sensor of a quantity."""
     axes: dict[tuple[str, ...], dict[int, list[int]]] = {}
-    for k, known in _meanings(header):
-        if known.quantity == quantity and known.axis is not None:
+    for k in _named(quantity, header):
+        known = meaning(header[k])
+        if known.axis is not None:
             axes.setdefault(known.group, {}).setdefault(known.axis, []).append(k)
     found: dict[tuple[str, ...], list[int]] = {}
     for group, by_axis in axes.items():
@@ -350,9 +340,9 @@ def _bare(header: Sequence[str]) -> list[list[int]]:
     if 'w' in map(str.casefold, header):
         return []
     axes: dict[int, list[int]] = {}
-    for k, known in _meanings(header):
-        if not (known.quantity or known.unit or known.axis is None
-                ) and BARE.issuperset(known.group):
+    for k in _named('', header):
+        known = meaning(header[k])
+        if not known.unit and known.axis is not None and BARE.issuperset(known.group):
             axes.setdefault(known.axis, []).append(k)
     count = min(len(axes.get(axis, ())) for axis in range(3))
     return [[axes[axis][k] for axis in range(3)] for k in range(count)]
@@ -361,34 +351,30 @@ def _bare(header: Sequence[str]) -> list[list[int]]:
 def _contexts(layout: Layout, found: Mapping[str, Source]) -> dict[str, Source]:
     more: dict[str, Source] = {}
     header = layout.header
-    by_quantity: dict[str, list[int]] = {}
-    for k, known in _meanings(header):
-        by_quantity.setdefault(known.quantity, []).append(k)
-    if 'time' not in found:
-        clocks = _clocks(layout, by_quantity.get('time', ()))
-        if clocks:
-            # The name that is most plainly that of the time of a sample.
-            best = max(clocks, key=lambda k: (
-                clocks[k], header[k].casefold() == 'time', {*WORDS['time']}.issuperset(
-                    meaning(header[k]).group), bool(meaning(header[k]).unit), -k))
-            more |= {'time': _source(layout, best), **_fraction(layout, best)}
+    clocks = {} if 'time' in found else _clocks(layout)
+    if clocks:
+        # The name that is most plainly that of the time of a sample.
+        best = max(clocks, key=lambda k: (
+            clocks[k], header[k].casefold() == 'time', {*WORDS['time']}.issuperset(
+                meaning(header[k]).group), bool(meaning(header[k]).unit), -k))
+        more |= {'time': _source(layout, best), **_fraction(layout, best)}
     if RATE[0] not in found:
         more |= {name: _source(layout, k) for name, k in zip(RATE, _rates(header, found))}
     for key in ('temperature', 'supply_voltage'):
-        which = by_quantity.get(key, [])
+        which = _named(key, header)
         if key not in found and len(which) == 1:
             more[key] = _source(layout, which[0])
     return more
 
 
-def _clocks(layout: Layout, which: Sequence[int]) -> dict[int, bool]:
+def _clocks(layout: Layout) -> dict[int, bool]:
     """
     Return the columns of times that run, and whether they run as finely as the finest one.
 
     A date that stays the same, or a time of the day in whole seconds, is no clock of the samples.
 
     """
-    cells = {k: _sample(layout, k) for k in which}
+    cells = {k: layout.first(k) for k in _named('time', layout.header)}
     different = {k: len(set(texts)) for k, texts in cells.items()
                  if all(is_number(text.replace(',', '.')) or is_clock(text)
                         for text in texts[:_FIRST_ROWS])}
@@ -398,18 +384,16 @@ def _clocks(layout: Layout, which: Sequence[int]) -> dict[int, bool]:
             if count > 1 or len(cells[k]) < _FIRST_ROWS}
 
 
-def counter(layout: Layout) -> Source | None:
+def _counter(layout: Layout) -> Source | None:
     """Return the column that counts the samples, or None."""
-    for k, name in enumerate(layout.header[:MOST]):
-        if (bare_name(name) in COUNTERS and len(_sample(layout, k)) >= _FIRST_ROWS
-                and _step_of(layout, k) > 0.0):
-            return _source(layout, k)
-    return None
+    return next((_source(layout, k) for k, name in enumerate(layout.header[:MOST])
+                 if bare_name(name) in COUNTERS and len(layout.first(k)) >= _FIRST_ROWS
+                 and _step_of(layout, k) > 0.0), None)
 
 
 def _step_of(layout: Layout, index: int) -> float:
     """Return the median step between the first numbers of a column; 0 if they are no numbers."""
-    cells = _sample(layout, index)
+    cells = layout.first(index)
     if len(cells) < 2 or not all(map(is_number, cells)):
         return 0.0
     return float(np.median(np.diff([float(cell) for cell in cells])))
@@ -418,15 +402,13 @@ def _step_of(layout: Layout, index: int) -> float:
 def rates_beside(layout: Layout, time: Source) -> list[float]:
     """Return the rates of the rows that the file states [Hz]: in words, or by another clock."""
     rates = []
-    counted = counter(layout)
+    counted = _counter(layout)
     if layout.rate_hz is not None:
         rates.append(layout.rate_hz / (_step_of(layout, counted.index) if counted else 1.0))
-    for k, known in _meanings(layout.header):
-        unit = unit_of('time', known.unit)
-        if known.quantity == 'time' and unit is not None and k != time.index:
-            step = _step_of(layout, k)
-            if step > 0.0:
-                rates.append(1.0 / (unit[1] * step))
+    for k in _named('time', layout.header):
+        unit, step = unit_of('time', meaning(layout.header[k]).unit), _step_of(layout, k)
+        if unit is not None and k != time.index and step > 0.0:
+            rates.append(1.0 / (unit[1] * step))
     return rates
 
 
@@ -434,9 +416,9 @@ def _fraction(layout: Layout, best: int) -> dict[str, Source]:
     """Return the column of the nanoseconds beside whole seconds, as ROS stamps have it."""
     known = meaning(layout.header[best])
     if unit_of('time', known.unit) == ('s', 1.0):
-        for k, other in _meanings(layout.header):
-            if (other.quantity, other.group) == ('time', known.group) and (
-                    unit_of('time', other.unit) == ('ns', 1e-9)):
+        for k in _named('time', layout.header):
+            other = meaning(layout.header[k])
+            if other.group == known.group and unit_of('time', other.unit) == ('ns', 1e-9):
                 return {FRACTION: _source(layout, k)}
     return {}
 
@@ -452,10 +434,11 @@ def _rates(header: Sequence[str], found: Mapping[str, Source]) -> list[int]:
     return groups[0][1] if groups else []
 
 
-def unused(layout: Layout, found: Mapping[str, Source]) -> list[str]:
+def unused(columns: Chosen) -> list[str]:
     """Return notes about columns that look like a temperature and are not used."""
-    names = [name for name in layout.header[:MOST] if meaning(name).quantity == 'temperature']
-    if 'temperature' in found or not names:
+    header = columns.layout.header
+    names = [header[k] for k in _named('temperature', header)]
+    if 'temperature' in columns.sources or not names:
         return []
     return [f'not used, though the names look like temperatures: {shown(names)}; choose one with '
             f'--columns temperature={names[0]}']

@@ -218,8 +218,10 @@ class Frame:
         if twice := [each for each, count in Counter(self.data.columns).items() if count > 1]:
             raise InputError(f'{self} has several columns {some(twice)}, expected one of each',
                              'remove or rename the others')
-        columns = dict(self._columns())
-        about = getattr(self.data, 'attrs', {})
+        columns = {str(name): self.data[name] for name in self.data.columns}
+        index, about = getattr(self.data, 'index', None), getattr(self.data, 'attrs', {})
+        if index is not None and (index.name is not None or index.dtype.kind in 'fMm'):
+            columns = {str(index.name or 'time'): index, **columns}
         head = ''.join(f'# {name}: {json.dumps(about[name], default=str)}\n' for name in ABOUT
                        if isinstance(about.get(name), str | Mapping) and about[name])
 
@@ -229,12 +231,6 @@ class Frame:
             yield from csv_of(chain([list(columns)], zip(*cells, strict=True)))
 
         return Member('', len(columns) * len(self.data) * CELL_BYTES, lines)
-
-    def _columns(self) -> Iterator[tuple[str, Any]]:
-        index = getattr(self.data, 'index', None)
-        if index is not None and (index.name is not None or index.dtype.kind in 'fMm'):
-            yield str(index.name or 'time'), index
-        yield from ((str(name), self.data[name]) for name in self.data.columns)
 
 
 def _plain(values: Any) -> list[Any]:

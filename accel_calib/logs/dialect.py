@@ -20,6 +20,7 @@ import csv
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from functools import lru_cache
+from itertools import product
 import math
 from pathlib import Path
 import re
@@ -158,6 +159,10 @@ class Layout:
                  '' if self.header else 'no header')
         return list(filter(None, words))
 
+    def first(self, column: int) -> list[str]:
+        """Return the first cells of a column."""
+        return [row[column] for row in self.sample if column < len(row)]
+
     def name(self, column: int) -> str:
         """Return the name of a column, or its number from 1."""
         has_name = column < len(self.header) and self.header[column]
@@ -166,11 +171,17 @@ class Layout:
 
 @dataclass(frozen=True)
 class Cells:
-    """A block of rows: (n, k) numbers, k texts of n cells, and n row numbers from 1."""
+    """A block of rows: numbers and texts by the index of the column, and row numbers from 1."""
 
-    numbers: Floats
-    texts: list[list[str]]
+    numbers: Mapping[int, Floats]
+    texts: Mapping[int, NDArray[np.object_]]
     row: NDArray[np.int64]
+
+    def take(self, which: NDArray[np.bool_] | slice) -> 'Cells':
+        """Return the rows at these indices, or where this mask is true."""
+        numbers = {k: values[which] for k, values in self.numbers.items()}
+        texts = {k: values[which] for k, values in self.texts.items()}
+        return Cells(numbers, texts, self.row[which])
 
 
 def split(line: str, delimiter: str) -> list[str]:
@@ -200,7 +211,7 @@ def has_date(text: str) -> bool:
     return match is not None and match[1] is not None
 
 
-def seconds_of(texts: Sequence[str], path: Path, rows: Sequence[int]) -> Floats:
+def seconds_of(texts: NDArray[np.object_], path: Path, rows: NDArray[np.int64]) -> Floats:
     """Return the seconds of dates since 1970, or of times since midnight; else InputError."""
     seconds = [_seconds(text) for text in texts]
     if None in seconds:
@@ -272,33 +283,42 @@ def layout_of(path: Path, head: Sequence[str], is_header: IsHeader, encoding: st
     log.
 
     """
-    _check_text(path, head)
+    bad = sum(len(_UNREADABLE.findall(line)) for line in head)
+    if bad > _UNREADABLE_SHARE * sum(map(len, head)):
+        raise InputError(f'{path} is not a text file, expected a CSV table',
+                         'use a CSV table or a bag')
+    if all(line.isspace() or line[0] == '#' for line in head):
+        raise InputError(f'{path} is empty, expected a header line {_EXAMPLE}',
+                         'check that this is the intended file')
     finder = _Finder(head, is_header)
     found = finder.named() or finder.unnamed() or finder.narrow()
     if found is None:
         raise InputError(f'{path} has no table of numbers in its first '
                          f'{counted(len(head), "line")}, expected a header line {_EXAMPLE}',
                          'check that this is the intended file')
-    start = finder.data_from(found)
-    numbers = [k for k in finder.plain if k >= start]
-    rate_hz = None if found.header else _rate_below_start(
-        [found.dialect.cells(head[k]) for k in numbers[:2]])
-    if rate_hz is not None and len(numbers) > 2:
-        start = numbers[2]
+    cells = {k: found.dialect.cells(head[k]) for k in finder.plain if k > found.at}
+    below = [k for k in cells if k >= found.line]
+    start = next((k for k in below if any(map(_LIKE_NUMBER.fullmatch, cells[k]))),
+                 below[0] if below else len(head))
+    rate_hz = None if found.header else _rate_below_start([cells[k] for k in below
+                                                           if k >= start][:2])
+    if rate_hz is not None and len(below) > 2:
+        start = below[2]
     passed = [short(head[k]) for k in finder.plain if k < start and k != found.at]
     skipped = f'skipped {counted(len(passed), "line")} before the table'
     notes = [f'{skipped}{":" if len(passed) == 1 else ", the first is"} {each!r}'
              for each in passed[:1]]
-    rows = [found.dialect.cells(head[k]) for k in finder.plain if k >= start]
+    between = [tuple(cells[k]) for k in cells if k < start and found.at >= 0]
+    units_row = next((each for each in between if len(each) == len(found.header)), ())
+    rows = [cells[k] for k in cells if k >= start]
     stated = {float(before or after) * (1000.0 if any(kilo) else 1.0) for line in head[:start]
               for before, *kilo, after in _RATE.findall(line[:1000])}
     if rate_hz is None and len(stated) == 1 and min(stated) > 0.0:
         rate_hz = stated.pop()
     decimal = {match[1] for row in rows[:_TRIED_LINES] for match in map(_DECIMAL.fullmatch, row)
                if match}
-    return Layout(path, found.dialect, min(decimal, default=''), found.header,
-                  finder.units_row(found, start), _width(found.header, rows), start, encoding,
-                  _about(path, [line for line in head if line[0] == '#']), tuple(notes),
+    return Layout(path, found.dialect, min(decimal, default=''), found.header, units_row,
+                  _width(found.header, rows), start, encoding, _about(path, head), tuple(notes),
                   tuple(map(tuple, rows[:_SAMPLE_ROWS])), rate_hz)
 
 
@@ -310,16 +330,6 @@ def _rate_below_start(rows: Sequence[Sequence[str]]) -> float | None:
         return None
     (begun,), (rate_hz,) = values
     return rate_hz if begun > EPOCH_S[0] and RATES_HZ[0] <= rate_hz <= RATES_HZ[1] else None
-
-
-def _check_text(path: Path, head: Sequence[str]) -> None:
-    bad = sum(len(_UNREADABLE.findall(line)) for line in head)
-    if bad > _UNREADABLE_SHARE * sum(map(len, head)):
-        raise InputError(f'{path} is not a text file, expected a CSV table',
-                         'use a CSV table or a bag')
-    if all(line.isspace() or line[0] == '#' for line in head):
-        raise InputError(f'{path} is empty, expected a header line {_EXAMPLE}',
-                         'check that this is the intended file')
 
 
 @dataclass(frozen=True)
@@ -347,17 +357,14 @@ class _Finder:
 
     def named(self) -> _Found | None:
         """Return the names in the first line with known names."""
-        for k in self.filled:
-            if not any(map(str.isalpha, self.head[k][:1000])):
-                continue
-            for delimiter in DELIMITERS:
-                dialect = replace(self.dialect, delimiter=delimiter)
-                cells = self._names(k, dialect)
-                if _are_names(cells) and self.is_header(cells):
-                    following = [dialect.cells(self.head[j]) for j in self.plain if j > k][:1]
-                    fits = any(len(row) == len(cells) for row in following)
-                    if fits or (delimiter and not is_comment(self.head[k])):
-                        return _Found(dialect, tuple(cells), k + 1, k)
+        lettered = (k for k in self.filled if any(map(str.isalpha, self.head[k][:1000])))
+        for k, delimiter in ((k, each) for k in lettered for each in DELIMITERS):
+            dialect = replace(self.dialect, delimiter=delimiter)
+            cells = self._names(k, dialect)
+            if _are_names(cells) and self.is_header(cells):
+                row = next((dialect.cells(self.head[j]) for j in self.plain if j > k), [])
+                if len(row) == len(cells) or (delimiter and not is_comment(self.head[k])):
+                    return _Found(dialect, tuple(cells), k + 1, k)
         return None
 
     def _names(self, k: int, dialect: Dialect) -> list[str]:
@@ -371,34 +378,25 @@ class _Finder:
         step = max(1, len(self.plain) // _TRIED_LINES)
         lines = [self.head[k] for k in self.plain[::-step]]
         tried = []
-        for labelled in (False, True):
-            for delimiter in DELIMITERS:
-                dialect = replace(self.dialect, delimiter=delimiter, labelled=labelled)
-                widths = Counter(filter(any, (_row_width(dialect.cells(line)) for line in lines)))
-                (width, others), count = max(widths.items(), key=lambda item: item[1],
-                                             default=((0, 0), 0))
+        for labelled, delimiter in product((False, True), DELIMITERS):
+            dialect = replace(self.dialect, delimiter=delimiter, labelled=labelled)
+            widths = Counter(filter(any, (_row_width(dialect.cells(line)) for line in lines)))
+            for (width, others), count in widths.most_common(1):
                 tried.append((count, -others, width, dialect))
-        count, _, width, dialect = max(tried, key=lambda each: each[:2])
-        if not count:
+        if not tried:
             return None
+        _, _, width, dialect = max(tried, key=lambda each: each[:2])
         first = next((k for k in self.plain
-                      if _row_width(dialect.cells(self.head[k]))[0] == width),
-                     self.plain[-1])
-        return self._with_names(dialect, first, width)
-
-    def _with_names(self, dialect: Dialect, first: int, width: int) -> _Found:
-        """Return the dialect with the names in the last line before the numbers, if any."""
+                      if _row_width(dialect.cells(self.head[k]))[0] == width), self.plain[-1])
         if dialect.prefix:
             return _Found(dialect, _MOTIONCAL_NAMES, first)
         if dialect.labelled:
             line = _LABELLED_UNIT.sub('', _MONITOR.sub('', self.head[first]))
             names = tuple(name.strip(' :=\t') for name in _LABEL.findall(line))
             return _Found(dialect, (*('time',) * dialect.monitor, *names), first)
-        for k in reversed([k for k in self.filled if k < first]):
-            cells = self._names(k, dialect)
-            if len(cells) == width and _are_names(cells):
-                return _Found(dialect, tuple(cells), first, k)
-        return _Found(dialect, (), first)
+        before = ((k, self._names(k, dialect)) for k in reversed(self.filled) if k < first)
+        return next((_Found(dialect, tuple(cells), first, k) for k, cells in before
+                     if len(cells) == width and _are_names(cells)), _Found(dialect, (), first))
 
     def narrow(self) -> _Found | None:
         """Return the first line as the names of a table with too few columns, or None."""
@@ -407,21 +405,9 @@ class _Finder:
         if not numbers:
             return None
         first = self.plain[0]
-        names = () if numbers[0] == first else tuple(split(self.head[first], ','))
-        return _Found(Dialect(','), names, first + bool(names), first if names else -1)
-
-    def data_from(self, found: _Found) -> int:
-        """Return the index of the first row; a line without numbers is none."""
-        rows = [k for k in self.plain if k >= found.line]
-        return next((k for k in rows if any(map(_LIKE_NUMBER.fullmatch,
-                                                found.dialect.cells(self.head[k])))),
-                    rows[0] if rows else len(self.head))
-
-    def units_row(self, found: _Found, start: int) -> tuple[str, ...]:
-        """Return the cells of a line between header and rows that can hold units."""
-        between = (found.dialect.cells(self.head[k]) for k in self.plain
-                   if -1 < found.at < k < start)
-        return next((tuple(cells) for cells in between if len(cells) == len(found.header)), ())
+        if numbers[0] == first:
+            return _Found(Dialect(','), (), first)
+        return _Found(Dialect(','), tuple(split(self.head[first], ',')), first + 1, first)
 
 
 def _are_names(cells: Sequence[str]) -> bool:
@@ -446,11 +432,11 @@ def _width(header: Sequence[str], rows: Sequence[Sequence[str]]) -> int:
     return len(header)
 
 
-def _about(path: Path, comments: Sequence[str]) -> dict[str, Any]:
+def _about(path: Path, head: Sequence[str]) -> dict[str, Any]:
     about = {}
-    for line in comments:
+    for line in head:
         name, colon, text = line[1:].partition(':')
-        if colon and name.strip() in ABOUT:
+        if line[0] == '#' and colon and name.strip() in ABOUT:
             try:
                 value = read_json(text)
                 about[name.strip()] = Autopilot(**value) if 'autopilot' in name else (

@@ -35,6 +35,7 @@ text form (``.log``) has the same messages, one per line.
 """
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 import io
 from itertools import chain
 from pathlib import Path
@@ -45,8 +46,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .autopilot import (
-    ardupilot_correction, as_sensed, AsSensed, at, choose, Correction, FlightLog, Message,
-    Parameters, px4_correction, px4_slot, sound, UnknownCorrectionError, vectors)
+    ardupilot_correction, as_sensed, AsSensed, at, ByAxis, choose, FlightLog, Message, Parameters,
+    px4_correction, px4_slot, sound, UnknownCorrectionError, Values, vectors)
 from .names import MICRO, PX4_FIELDS, PX4_SPANS
 from ..errors import InputError
 from ..table import Autopilot, Floats
@@ -65,7 +66,7 @@ _PX4_ADVICE = ('read sensor_accel, which CAL_ACC does not correct (add 4 or 64 t
                'to log it at 10 Hz)')
 _RELATIVE = 'accelerometer_timestamp_relative'
 _RAW, _FILTERED = 'sensor_accel', 'vehicle_acceleration'
-_MORE = {'sensor_combined': (_RELATIVE,), 'vehicle_imu': tuple(PX4_SPANS)}
+_MORE = {'sensor_combined': (_RELATIVE,), 'vehicle_imu': tuple(PX4_SPANS.values())}
 _NEEDED = {name: {*chain(*fields.values()), *_MORE.get(name, ())}
            for name, fields in PX4_FIELDS.items()}
 _ALSO = ('sensor_gyro', 'sensor_selection')
@@ -116,10 +117,10 @@ def read_ulg(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
     autopilot = Autopilot('px4', px4_slot(parameters, device), device or None,
                           px4_slot(parameters, device, 'TC_A'))
 
-    def correction() -> Correction:
+    def correction(values: Values) -> ByAxis:
         if chosen.name == _FILTERED:
             raise UnknownCorrectionError(f'{chosen.name} lacks the bias that PX4 estimates')
-        return px4_correction(parameters, device, release)
+        return px4_correction(parameters, device, release, values)
 
     sensed = (AsSensed(columns, autopilot) if chosen.name == _RAW else
               as_sensed(columns, parameters, autopilot, correction, _PX4_ADVICE))
@@ -163,7 +164,7 @@ def _px4_samples(message: Message) -> tuple[dict[str, Floats], list[str]]:
     if _RELATIVE in fields:
         relative = fields[_RELATIVE].astype(float)
         time, valid = time + relative * MICRO, relative != _INVALID
-    for name, key in PX4_SPANS.items():
+    for key, name in PX4_SPANS.items():
         if name in fields:
             seconds = fields[name] * MICRO
             valid &= seconds > 0.0
@@ -235,12 +236,12 @@ def read_dataflash(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
         if (message.name, message.instance) == ('IMU', chosen.instance)
         and np.any(message.fields.get(name, 0.0))))
     parameters, number = _parameters(tables.get('PARM', {})), chosen.instance + 1
-    *_, (_, values) = parameters.spans()
+    *_, (_, _, values) = parameters.spans()
     device = values.get(f'INS_ACC{"" if number == 1 else number}_ID', 0.0)
     warm = values.get(f'INS_TCAL{number}_ENABLE', 0.0) != 0.0
     autopilot = Autopilot('ardupilot', number, int(device) or None, number if warm else None)
     sensed = as_sensed(columns, parameters, autopilot,
-                       lambda: ardupilot_correction(parameters, number), _ARDUPILOT_ADVICE)
+                       partial(ardupilot_correction, parameters, number), _ARDUPILOT_ADVICE)
     return choice.log('ArduPilot log', sensed, 'temperature T', (*notes, *dropped))
 
 
@@ -314,6 +315,7 @@ def _text(path: Path) -> tuple[dict[str, _Table], list[str]]:
     names: dict[str, list[str]] = {}
     lines: dict[str, list[str]] = {}
     notes: list[str] = []
+    bad = 0
     with path.open(encoding='latin-1') as file:
         for line in file:
             if not line.endswith('\n'):
@@ -323,23 +325,21 @@ def _text(path: Path) -> tuple[dict[str, _Table], list[str]]:
             if kind == 'FMT':
                 cells = [cell.strip() for cell in rest.split(',')]
                 if len(cells) > 4 and _NAME.fullmatch(cells[2]):
-                    names[cells[2]] = cells[4:]
-            elif kind in names:
+                    names.setdefault(cells[2], cells[4:])
+            elif kind in names and rest.count(',') == len(names[kind]) - 1:
                 lines.setdefault(kind, []).append(rest)
+            else:
+                bad += kind in names
     tables: dict[str, _Table] = {}
-    bad = 0
     for kind, rows in lines.items():
-        sound = [row for row in rows if row.count(',') == len(names[kind]) - 1]
-        bad += len(rows) - len(sound)
         try:  # only the fields of PARM are not all numbers
-            table = (np.array([list(map(str.strip, row.split(','))) for row in sound], str)
-                     if kind == 'PARM' or not sound else
-                     np.loadtxt(sound, delimiter=',', ndmin=2, comments=None))
+            table = (np.array([list(map(str.strip, row.split(','))) for row in rows])
+                     if kind == 'PARM' else
+                     np.loadtxt(rows, delimiter=',', ndmin=2, comments=None))
         except ValueError as err:
             raise InputError(f'{path}: message {kind}: {err}, expected numbers',
                              'correct the line or remove it') from err
-        if sound:
-            tables[kind] = dict(zip(names[kind], table.reshape(-1, len(names[kind])).T))
+        tables[kind] = dict(zip(names[kind], table.T))
     if bad:
         notes.append(f'{counted(bad, "line")} of another length left out')
     return tables, notes

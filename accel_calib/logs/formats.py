@@ -30,11 +30,11 @@ from .autopilot import FlightLog
 from .bag import open_bag
 from .bag_samples import context_of, imu_samples, rate_words
 from .child import LogFile, parts_of
-from .columns import Chosen, chosen, is_log_header, LogOptions
+from .columns import Chosen, LogOptions
 from .containers import Frame, Member, Piped, Stream
-from .dialect import Cells, shown
+from .dialect import shown
 from .flight import DATAFLASH, read_dataflash, read_ulg
-from .names import meaning, READING, record_instead
+from .names import meaning, record_instead
 from .quantities import are_samples, are_untimed_samples, decided, Quantities
 from .text import open_text, PEEKED, TextTable
 from ..disk import check_regular, FIRST_LINE
@@ -97,8 +97,8 @@ def _bag(_: 'Format', path: Path, options: LogOptions) -> Iterator[OpenLog]:
     with open_bag(path) as bag:
         topic = bag.imu_topic(options.topic)
         sensor = options.sensor or bag.first_frame_id(topic)
-        context = context_of(bag, topic, sensor, options)
-        notes = [*bag.notes, *context.notes]
+        context, notes = context_of(bag, topic, sensor, options)
+        notes = [*bag.notes, *notes]
         blocks = imu_samples(bag, topic, sensor, chosen=bool(options.sensor), context=context,
                              notes=notes)
         # Drivers exist that publish g, although Imu messages are in m/s².
@@ -162,22 +162,16 @@ def _parts(path: Path, options: LogOptions) -> Generator[Any]:
 # ------------------------------------------------------------------------------------- tables
 
 @contextmanager
-def _tables(known: 'Format', path: Path, options: LogOptions) -> Iterator[OpenLog]:
-    with ExitStack() as stack:
-        with known.file(path).refused():
-            members = known.read(path, stack)
-        with open_members(path, members, options, known) as log:
-            yield log
-
-
-@contextmanager
-def open_members(path: Path, members: Sequence[Member], options: LogOptions,
-                 known: 'Format | None' = None) -> Iterator[OpenLog]:
+def _tables(known: 'Format', path: Path, options: LogOptions, members: Sequence[Member] = ()
+            ) -> Iterator[OpenLog]:
     """Open the one of the tables of a file that has the accelerometer, and note why it is."""
-    file = (known or TEXT).file(path)
-    member, why = _member_of(file, members, options)
-    with _opened(file, member, options) as text:
-        log = _text(path / member.name, text, options)
+    file = known.file(path)
+    with ExitStack() as stack:
+        with file.refused():
+            members = members or known.read(path, stack)
+        member, why = _member_of(file, members, options)
+        log = _text(path / member.name, stack.enter_context(_opened(file, member, options)),
+                    options)
         yield replace(log, read_as=', '.join(filter(None, (member.name, log.read_as))),
                       noted=lambda: (*why, *log.noted()))
 
@@ -192,8 +186,7 @@ def _opened(file: LogFile, member: Member, options: LogOptions) -> Iterator[Text
         if inside is not TEXT:
             raise InputError(f'{path} holds {name}, {inside.name}, expected a table of text',
                              containers.UNPACK)
-        with open_text(path / member.name, lambda cells: is_log_header(cells, options), raw,
-                       member.size) as text:
+        with open_text(path / member.name, options, raw, member.size) as text:
             yield text
 
 
@@ -221,7 +214,7 @@ def _member_of(file: LogFile, members: Sequence[Member], options: LogOptions
     for member in wanted:
         try:
             with _opened(file, member, options) as text:
-                tables[member] = chosen(text.layout, options)
+                tables[member] = text.columns
         except InputError as err:
             refused.append(err)
     if not tables:
@@ -233,7 +226,7 @@ def _member_of(file: LogFile, members: Sequence[Member], options: LogOptions
                          f'--topic "{names[0]}" to see why it is not read')
     ranks = {member: (not record_instead(columns.layout.header, columns.layout.path), any(
         meaning(name).quantity == 'reading' or 'accel' in name.casefold()
-        for name in (Path(member.name).stem, *columns.names(READING[:1]))))
+        for name in (Path(member.name).stem, *columns.names('reading')[:1])))
         for member, columns in tables.items()}
     left = [member for member in tables if ranks[member] == max(ranks.values())]
     if len(left) > 1:
@@ -246,14 +239,11 @@ def _member_of(file: LogFile, members: Sequence[Member], options: LogOptions
 
 
 def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
-    columns = chosen(text.layout, options)
-    text.choose(columns, skip_bad=options.skip_bad)
     cells = text.blocks()
     first = next(cells)
-    quantities = decided(columns, first, options)
+    quantities = decided(text.columns, first, options)
     if quantities.clock.newest_first:
-        first, *rest = (Cells(each.numbers[::-1], [part[::-1] for part in each.texts],
-                              each.row[::-1]) for each in [first, *cells][::-1])
+        first, *rest = (each.take(slice(None, None, -1)) for each in [first, *cells][::-1])
         cells = iter(rest)
 
     def converted() -> Iterator[Poses]:
@@ -479,6 +469,6 @@ def open_log(path: Path | Piped | Frame, options: LogOptions = LogOptions()) -> 
         known = _format_of(path)
         opened = (known.opened if known.plain else _binary)(known, path, options)
     else:
-        opened = open_members(Path(str(path)), [path.table], options)
+        opened = _tables(TEXT, Path(str(path)), options, [path.table])
     with opened as log, saying(log.read_as):
         yield log

@@ -126,6 +126,7 @@ ZEROS = {'°F': -160.0 / 9.0, 'K': -273.15}
 _WORD = re.compile(r'[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+')
 _BRACKET = re.compile(r'[(\[{<]([^()\[\]{}<>]*)[)\]}>]')
 _AXES = {'x': 0, 'y': 1, 'z': 2}
+_NUMBERED = {**_AXES, '0': 0, '1': 1, '2': 2, '3': 3}
 _FUSED = {f'{word}{axis}': (word, axis) for key in ('reading', 'rate')
           for word in WORDS[key] if len(word) > 1 for axis in _AXES}
 _FUSED |= {f'{axis}{word}': (word, axis) for word, axis in _FUSED.values()}
@@ -149,8 +150,8 @@ class Meaning:
     What a name means.
 
     `quantity` is a key of `WORDS`, and `unit` the text of the unit; both are empty if the name
-    does not state them. `axis` is 0 to 2 (or 1 to 3 where a log counts so), `group` are the other
-    words, and `free` is whether the name says that gravity is not in the values.
+    does not state them. `axis` is 0 to 2 (or 1 to 3 where a log counts so), and `group` are the
+    other words.
 
     """
 
@@ -158,27 +159,21 @@ class Meaning:
     axis: int | None
     unit: str
     group: tuple[str, ...]
-    free: bool = False
-
-
-def unit_text(text: str) -> str:
-    """Return the text of a unit in the spelling of `UNITS`."""
-    text = unicodedata.normalize('NFKD', text.replace('°', 'deg').replace('º', 'deg')).casefold()
-    text = text.replace('μ', 'u').replace('−', '-').replace('⁻', '-').replace('per', '/')
-    return re.sub(r'[\s^*·.⋅_()\ufffd]', '', text)
 
 
 def unit_of(quantity: str, text: str) -> tuple[str, float] | None:
-    """Return a unit of a quantity and the factor to it, or None."""
-    return UNITS.get(quantity, {}).get(unit_text(text))
+    """Return a unit of a quantity and the factor to it, in any spelling of `UNITS`, or None."""
+    text = unicodedata.normalize('NFKD', text.replace('°', 'deg').replace('º', 'deg')).casefold()
+    text = text.replace('μ', 'u').replace('−', '-').replace('⁻', '-').replace('per', '/')
+    return UNITS.get(quantity, {}).get(re.sub(r'[\s^*·.⋅_()\ufffd]', '', text))
 
 
 def may_cause(name: str) -> bool:
     """Return whether a column can be a cause, other than what is computed from the readings."""
     known = meaning(name)
-    return (known.quantity not in ('reading', 'rate', 'time') and not known.free
-            and bare_name(name) not in COUNTERS
-            and not (OTHER_WORDS - CAUSES).intersection(known.group))
+    computed = OTHER_WORDS - CAUSES | FREE_WORDS
+    return (known.quantity not in ('reading', 'rate', 'time')
+            and bare_name(name) not in COUNTERS and computed.isdisjoint(known.group))
 
 
 @lru_cache(maxsize=4096)
@@ -197,7 +192,7 @@ def meaning(name: str) -> Meaning:
         quantity = quantity or ('time' if unit else '')
     if not quantity and not unit:
         words += [each for each in brackets if each and not each.isdecimal()]
-    return Meaning(quantity, axis, unit, tuple(words), bool(FREE_WORDS.intersection(words)))
+    return Meaning(quantity, axis, unit, tuple(words))
 
 
 def bare_name(name: str) -> str:
@@ -231,13 +226,11 @@ def _axis(words: list[str], brackets: Sequence[str]) -> tuple[int | None, list[s
     if named:
         k = named[-1]
         return _AXES[words[k]], words[:k] + words[k + 1:]
-    for inner in brackets:
-        if inner.casefold() in _AXES:
-            return _AXES[inner.casefold()], words
-        if inner in ('0', '1', '2', '3'):
-            return int(inner), words
-    if len(words) > 1 and words[-1] in ('0', '1', '2', '3'):
-        return int(words[-1]), words[:-1]
+    for inner in map(str.casefold, brackets):
+        if inner in _NUMBERED:
+            return _NUMBERED[inner], words
+    if len(words) > 1 and words[-1] in _NUMBERED:
+        return _NUMBERED[words[-1]], words[:-1]
     return None, words
 
 
@@ -279,11 +272,11 @@ class LogFormat:
     """
     One layout of a text log, named as ``--format`` has it.
 
-    `columns` and `divisors` are names in the file: of our columns, and of the columns by which
-    ours are divided. `scales` are factors from the unit of the file to ours; a time without one is
-    in a unit that the reader recognises. `units` is the unit of the reading, empty if the file
-    does not determine it. `instance` is the column with the number of the sensor, if rows of
-    several alternate.
+    `columns` are the names in the file of our columns. By key of `COLUMNS`, `divisors` are the
+    names of columns by which ours are divided, and `scales` factors from the unit of the file to
+    ours; a time without one is in a unit that the reader recognises. `units` is the unit of the
+    reading, empty if the file does not determine it. `instance` is the column with the number of
+    the sensor, if rows of several alternate.
 
     The names of time, readings, `divisors` and `marks` together determine the layout if it is
     `plain`; otherwise it is used only where the user names it. `without_gravity` are the maker's
@@ -356,7 +349,7 @@ _PHYPHOX_FORMATS = tuple(
 # The g-force meter has gravity; ax, ay, az beside it are the linear acceleration.
 
 _TOOLBOX = LogFormat('physics-toolbox', {'time': 'time', **_axes('gF{}'), **dict(zip(
-    RATE, ('wx', 'wy', 'wz')))}, {'gx': 1.0}, 'g', READING)
+    RATE, ('wx', 'wy', 'wz')))}, {'rate': 1.0}, 'g', READING)
 
 # ---------------------------------------------------------------------- Sensor Logger
 # https://github.com/tszheichoi/awesome-sensor-logger/blob/main/UNITS.md
@@ -400,15 +393,14 @@ PX4_FIELDS: dict[str, dict[str, tuple[str, ...]]] = {
     'vehicle_acceleration': {'reading': _numbered('xyz')}}
 """Fields of the messages with accelerations, in order of preference, by key of `COLUMNS`."""
 
-PX4_SPANS = {'delta_velocity_dt': 'reading', 'delta_angle_dt': 'rate'}
+PX4_SPANS = {'reading': 'delta_velocity_dt', 'rate': 'delta_angle_dt'}
 """Interval [µs] in which a change of velocity or angle was measured."""
 
 
 def _px4(message: str, marks: tuple[str, ...] = (), note: str = _FRD, *, changes: bool = False,
          **others: str) -> LogFormat:
     """Return the layout of a message; `changes` are divided by their intervals."""
-    divisors = {axis: name for name, key in PX4_SPANS.items() for axis in COLUMNS[key].names
-                if changes}
+    divisors = PX4_SPANS if changes else {}
     return LogFormat(
         'px4', {'time': 'timestamp', **others, **{
             axis: name for key, names in PX4_FIELDS[message].items()
@@ -455,7 +447,7 @@ def _betaflight(time: str, unit: str, rate: str) -> LogFormat:
     """Return the layout with these units in the names of its columns."""
     columns = {'time': time, **_axes('accSmooth[{}]' + unit, names=_BY_NUMBER)}
     turns = _axes('gyroADC[{}]' + rate, RATE, _BY_NUMBER) if rate else {}
-    scales = {'time': _BLACKBOX_TIMES[time], **dict.fromkeys(turns, _BLACKBOX_RATES[rate])}
+    scales = {'time': _BLACKBOX_TIMES[time], 'rate': _BLACKBOX_RATES[rate]}
     note = '' if unit else 'Readings are counts, acc_1G of the header of the log to the g.'
     return LogFormat('betaflight', columns | turns, scales, _BLACKBOX_UNITS[unit],
                      tuple(turns.values()) or ('loopIteration',), note=note)

@@ -27,11 +27,12 @@ from numpy.typing import NDArray
 
 from .columns import Chosen, LogOptions, unused
 from .dialect import Cells
-from .names import DEGREE, meaning, RATE, READING, record_instead, unit_of, ZEROS
+from .names import DEGREE, meaning, READING, record_instead, unit_of, ZEROS
 from .times import Clock, clock_of
 from ..errors import InputError, saying
 from ..finding import Finding
 from ..table import COLUMNS, Floats
+from ..text import one_line
 from ..units import STANDARD_GRAVITY, UnitName, Units, units_of
 
 _WINDOWS = 400
@@ -115,11 +116,11 @@ class Quantities:
     """
     The conversion of the columns of a log; `decided` makes it.
 
-    `clock` converts the times; `rate_hz` is the rate of samples without times. `scales` are the
-    factor to our unit and our value at 0, by column. `instance` is the number of the sensor whose
-    rows are read, where rows of several alternate. `modulus` is 2ⁿ for columns whose numbers of n
-    bits lost their sign. `said` is what is assumed, `notes` what is not used, and `findings` what
-    the values contradict, and what is done about the times.
+    `clock` converts the times; `rate_hz` is the rate of samples without times. By key of
+    `COLUMNS`, `scales` are the factor to our unit and our value at 0, and `modulus` is 2ⁿ where
+    numbers of n bits lost their sign. `instance` is the number of the sensor whose rows are read,
+    where rows of several alternate. `said` is what is assumed, `notes` what is not used, and
+    `findings` what the values contradict, and what is done about the times.
 
     """
 
@@ -144,54 +145,39 @@ class Quantities:
         """Return what is not used, and whether the counter of the clock started again."""
         starts = self.clock.starts
         times = 'once' if starts == 1 else f'{starts} times'
-        again = (f'the clock starts again {times} at the end of its range; its times are '
-                 'continued',)
-        return (*self.notes, *(again if starts else ()))
+        again = f'the clock starts again {times} at the end of its range; its times are continued'
+        return (*self.notes, again) if starts else tuple(self.notes)
 
     def columns(self, cells: Cells) -> tuple[dict[str, NDArray[Any]], NDArray[np.int64]]:
         """Return the columns of a block in our units, and its row numbers."""
-        if self.instance is not None:
-            cells = _of_instance(self.chosen, cells, self.instance)
+        cells = self.of_sensor(cells)
         columns: dict[str, NDArray[Any]] = {}
-        sources = self.chosen.sources
-        for key, column in COLUMNS.items():
-            if column.made or not sources.keys() >= set(column.names):
-                continue
+        for key, own in self.chosen.sources.items():
             if key == 'label':
-                columns[key] = np.array(self.chosen.texts(cells, 'label'), dtype=str)
+                columns[key] = np.array([*map(one_line, cells.texts[own[0].index])], str)
             elif key == 'time':
                 columns[key] = self.clock.continued(cells)
-            else:
-                parts = [self._scaled(cells, name) for name in column.names]
-                columns[key] = np.column_stack(parts) if len(parts) > 1 else parts[0]
-        columns |= {key: cells.numbers[:, self.chosen.numeric.index(k)]
-                    for key, k in self.chosen.quantities.items()}
+            elif key in COLUMNS:
+                values = self.numbers(cells, key)
+                factor, zero = self.scales.get(key, (1.0, 0.0))
+                if (factor, zero) != (1.0, 0.0):
+                    values = values * factor + zero
+                columns[key] = values if len(own) > 1 else values[:, 0]
+        columns |= {key: cells.numbers[k] for key, k in self.chosen.quantities.items()}
         if self.rate_hz is not None:
             columns['time'] = (cells.row - 1) / self.rate_hz
         return columns, cells.row
 
-    def scale(self, keys: Sequence[str], factor: float, zero: float = 0.0) -> None:
-        """Set the factor of columns to our unit, and our value at 0."""
-        self.scales.update(dict.fromkeys(keys, (factor, zero)))
+    def of_sensor(self, cells: Cells) -> Cells:
+        """Return the rows of the sensor that is read."""
+        if self.instance is None:
+            return cells
+        return cells.take(self.chosen.numbers(cells, 'instance')[:, 0] == self.instance)
 
-    def three(self, cells: Cells, ours: Sequence[str]) -> Floats:
-        """Return the numbers of three columns with their sign, (n, 3), in the unit of the file."""
-        return np.column_stack([self._signed(cells, name) for name in ours])
-
-    def _signed(self, cells: Cells, ours: str) -> Floats:
-        values, modulus = self.chosen.numbers(cells, ours), self.modulus.get(ours)
-        return with_sign(values, modulus) if modulus else values
-
-    def _scaled(self, cells: Cells, ours: str) -> Floats:
-        values = self._signed(cells, ours)
-        factor, zero = self.scales.get(ours, (1.0, 0.0))
-        return values if (factor, zero) == (1.0, 0.0) else values * factor + zero
-
-
-def _of_instance(columns: Chosen, cells: Cells, instance: float) -> Cells:
-    which = columns.numbers(cells, 'instance') == instance
-    texts = [[text for text, own in zip(part, which) if own] for part in cells.texts]
-    return Cells(cells.numbers[which], texts, cells.row[which])
+    def numbers(self, cells: Cells, key: str) -> Floats:
+        """Return the numbers of a key, (n, k), with their sign, in the unit of the file."""
+        values = self.chosen.numbers(cells, key)
+        return with_sign(values, self.modulus[key]) if key in self.modulus else values
 
 
 def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
@@ -203,21 +189,20 @@ def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
     made.said += columns.layout.words
     if 'instance' in columns.sources:
         made.instance = _instance(columns, first, options, made.notes)
-        first = _of_instance(columns, first, made.instance)
-    for keys in (READING, RATE):
-        if columns.sources.keys() >= set(keys) and (modulus := modulus_of(
-                columns.three(first, keys))):
-            made.modulus |= dict.fromkeys(keys, modulus)
+        first = made.of_sensor(first)
+    for key in ('reading', 'rate'):
+        if key in columns.sources and (modulus := modulus_of(columns.numbers(first, key))):
+            made.modulus[key] = modulus
             made.findings.append(Finding(
-                'signs', f'{compact(columns.names(keys))} are numbers of '
+                'signs', f'{compact(columns.names(key))} are numbers of '
                 f'{round(math.log2(modulus))} bits that lost their sign: they are read with it',
                 'print them as signed numbers'))
     if not (columns.layout.header or options.columns) and _are_exchanged(made, first):
-        swapped = dict(zip((*READING, *RATE), (*RATE, *READING), strict=True))
+        swapped = {'reading': 'rate', 'rate': 'reading'}
         columns = made.chosen = replace(columns, sources={
             key: columns.sources[swapped.get(key, key)] for key in columns.sources})
         made.modulus = {swapped[key]: each for key, each in made.modulus.items()}
-        words = f'{compact(columns.names(RATE))} are a gyro by their values'
+        words = f'{compact(columns.names("rate"))} are a gyro by their values'
         made.said.append(words)
         made.findings.append(Finding('columns', words, 'name the columns in the first line'))
     if 'time' in columns.sources:
@@ -225,24 +210,24 @@ def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
         made.notes += made.clock.doubts
     samples = _decide_samples(made, first, options)
     made.clock.newest_first &= samples  # rows of poses keep their numbers
-    if 'time' in columns.sources and (samples or columns.sources['time'].name != 'time'):
-        made.said.append(made.clock.said)
+    if 'time' in columns.sources and (samples or columns.names('time') != ['time']):
+        made.said += [made.clock.words, *(each.text for each in made.clock.findings)]
     _decide_reading(made, first, options, samples=samples)
     _decide_rate(made, first)
     _decide_temperature(made, first)
     if 'supply_voltage' in columns.sources:
         _convert_if_stated(made, 'supply_voltage', 'V')
-    made.notes += unused(columns.layout, columns.sources)
+    made.notes += unused(columns)
     made.findings += made.clock.findings
     return made
 
 
 def _are_exchanged(made: Quantities, first: Cells) -> bool:
     """Return whether the rates of columns without names have a steady length, as gravity has."""
-    if (not made.chosen.sources.keys() >= {*READING, *RATE}
-            or rests_of(made.three(first, READING), samples=True).unit is not None):
+    if ('rate' not in made.chosen.sources
+            or rests_of(made.numbers(first, 'reading'), samples=True).unit is not None):
         return False
-    reading, rate = (_steadiness(made.three(first, keys)) for keys in (READING, RATE))
+    reading, rate = (_steadiness(made.numbers(first, key)) for key in ('reading', 'rate'))
     return rate > _STEADY and rate > _STEADIER * reading
 
 
@@ -307,18 +292,18 @@ def _decide_reading(made: Quantities, first: Cells, options: LogOptions, *, samp
     stated = options.units or of_file or (not named and options.default_units) or ''
     if stated and stated != named:
         factor = 1.0
-    rests = rests_of(made.three(first, READING) * factor, samples=samples)
-    name, words = stated or named, compact(columns.names(READING))
+    rests = rests_of(made.numbers(first, 'reading') * factor, samples=samples)
+    name, words = stated or named, compact(columns.names('reading'))
     with saying(', '.join([*made.said, f'{words} in {name}' if name else words])):
         _check_rests(columns, rests, units_of(name, options.gravity) if name else None,
                      stated=bool(stated))
-    own = columns.sources['ax'].name
+    own = columns.names('reading')[0]
     if not name:
         is_si = own == 'ax' and not rests.unit and rests.near(STANDARD_GRAVITY, _STATED_FACTOR)
         name, factor = ('m/s2', 1.0) if is_si else rests.unit or ('native', 1.0)
     made.units = units_of(name, options.gravity)
-    made.scale(READING, factor)
-    is_ours = columns.names(READING) == list(READING) and (stated or made.units.is_si)
+    made.scales['reading'] = factor, 0.0
+    is_ours = columns.names('reading') == [*READING] and (stated or made.units.is_si)
     if made.said or not is_ours:
         made.said.append(_words(columns, rests, made.units, factor, stated=bool(stated)))
     are_accelerations = (options.units or columns.maker or meaning(own).quantity
@@ -331,11 +316,10 @@ def _decide_reading(made: Quantities, first: Cells, options: LogOptions, *, samp
 
 def _decide_samples(made: Quantities, first: Cells, options: LogOptions) -> bool:
     """Return whether rows are samples, rather than poses; set their rate if they lack times."""
-    raw = made.three(first, READING)
-    there = {key: raw for key, column in COLUMNS.items() if column.names[0] in made.chosen.sources}
-    if 'time' in made.chosen.sources:
+    there = dict.fromkeys(made.chosen.sources, made.numbers(first, 'reading'))
+    if 'time' in there:
         return are_samples({**there, 'time': made.clock.seconds(first)})
-    samples = are_untimed_samples({**there, 'reading': raw})
+    samples = are_untimed_samples(there)
     made.rate_hz = options.rate or (made.chosen.layout.rate_hz if samples else None)
     return samples or made.rate_hz is not None
 
@@ -343,11 +327,11 @@ def _decide_samples(made: Quantities, first: Cells, options: LogOptions) -> bool
 def _named(columns: Chosen) -> tuple[UnitName | Literal[''], float]:
     """Return the unit that the maker or the names state, and the factor to it."""
     if columns.maker is not None and columns.maker.units:
-        return columns.maker.units, columns.maker.scales.get('ax', 1.0)
-    found = {unit_of('reading', columns.sources[name].unit) for name in READING}
+        return columns.maker.units, columns.maker.scales.get('reading', 1.0)
+    found = {unit_of('reading', source.unit) for source in columns.sources['reading']}
     if len(found) > 1:
         raise InputError(f'{columns.layout.path} has the columns '
-                         f'{", ".join(columns.names(READING))} in several units, expected one '
+                         f'{", ".join(columns.names("reading"))} in several units, expected one '
                          'unit', 'correct the names, or convert the columns')
     name, factor = found.pop() or ('', 1.0)
     return cast(UnitName, name), factor
@@ -372,14 +356,14 @@ def _check_rests(columns: Chosen, rests: Rests, units: Units | None, *, stated: 
         advice = (f'add --units {likely[0]}' if likely and likely[1] == 1.0 else
                   'correct the name, or add --units native')
         what = (f'the format {maker.name}' if maker is not None and maker.units else
-                f'the name {columns.sources["ax"].name!r}')
+                f'the name {columns.names("reading")[0]!r}')
         raise InputError(f'{layout.path}: {what} states readings in {units.name}, but at rest '
                          f'they have a length of {rests.length:.4g} {units.name}, expected about '
                          f'{per_g:.4g}', advice)
 
 
 def _words(columns: Chosen, rests: Rests, units: Units, factor: float, *, stated: bool) -> str:
-    words, name = compact(columns.names(READING)), units.name
+    words, name = compact(columns.names('reading')), units.name
     if units.is_native and not stated:
         size = rests.per_g
         value = f'{size:,.0f}'.replace(',', ' ') if size >= 1000.0 else f'{size:.3g}'
@@ -388,7 +372,7 @@ def _words(columns: Chosen, rests: Rests, units: Units, factor: float, *, stated
         return f'{words}, {value}{counts} {about} (native)'
     if factor == 1.0:
         return f'{words} in {name}'
-    unit = columns.sources['ax'].unit or {1e-3: 'mg'}.get(factor, f'{factor:g} {name}')
+    unit = columns.sources['reading'][0].unit or {1e-3: 'mg'}.get(factor, f'{factor:g} {name}')
     return f'{words} in {unit} -> {name}' if columns.maker is None else f'{words} -> {name}'
 
 
@@ -518,35 +502,34 @@ def are_untimed_samples(columns: Mapping[str, NDArray[Any]]) -> bool:
 
 # ---------------------------------------------------------------------------------- context
 
-def _leave_out(made: Quantities, keys: Sequence[str], why: str, advice: str) -> None:
-    sources = {key: value for key, value in made.chosen.sources.items() if key not in keys}
-    made.chosen = replace(made.chosen, sources=sources)
-    made.findings.append(Finding('columns', f'{why}, and {"is" if len(keys) == 1 else "are"} not '
-                                 'used', advice))
+def _leave_out(made: Quantities, key: str, why: str, advice: str) -> None:
+    made.chosen = replace(made.chosen, sources={
+        name: own for name, own in made.chosen.sources.items() if name != key})
+    made.findings.append(Finding('columns', f'{why} not used', advice))
 
 
 def _decide_rate(made: Quantities, first: Cells) -> None:
     columns = made.chosen
-    if not columns.sources.keys() >= set(RATE):
+    if 'rate' not in columns.sources:
         return
-    words = compact(columns.names(RATE))
+    words = compact(columns.names('rate'))
     if columns.maker is not None and 'gx' in columns.maker.columns:
-        made.scale(RATE, columns.maker.scales.get('gx', 1.0))
+        made.scales['rate'] = columns.maker.scales.get('rate', 1.0), 0.0
         return
-    stated = unit_of('rate', columns.sources['gx'].unit)
+    stated = unit_of('rate', columns.sources['rate'][0].unit)
     rests = None if stated else _units_at_rest(made, first)
-    largest = float(np.quantile(np.abs(made.three(first, RATE)), 0.999))
-    own = columns.sources['gx'].name == 'gx' and largest < _LARGEST_RATE
+    largest = float(np.quantile(np.abs(made.numbers(first, 'rate')), 0.999))
+    own = columns.names('rate')[0] == 'gx' and largest < _LARGEST_RATE
     if stated is None and own and columns.layout.header and (not rests or 'rad/s' in rests):
         return
     if stated is None and (largest >= _LIKELY_RATE_DEG or rests == {}):
-        _leave_out(made, RATE, f'the angular rates {words} at rest are those of no gyro in rad/s '
-                   'or °/s', 'state their unit in the names, such as gyroX_dps')
+        _leave_out(made, 'rate', f'the angular rates {words} at rest are those of no gyro in '
+                   'rad/s or °/s, and are', 'state their unit in the names, such as gyroX_dps')
         return
     seen = next(iter(rests.items())) if rests and len(rests) == 1 else None
     unit, factor = stated or seen or (
         ('rad/s', 1.0) if largest < _LIKELY_RATE else ('°/s', DEGREE))
-    made.scale(RATE, factor)
+    made.scales['rate'] = factor, 0.0
     read_as = f'{words} in {unit}{"" if unit == "rad/s" else " -> rad/s"}'
     made.said.append(read_as if stated else f'{read_as} (assumed)')
     if not stated:
@@ -562,7 +545,7 @@ def _units_at_rest(made: Quantities, first: Cells) -> dict[str, float] | None:
     the bias and the noise of the gyro. Rates without noise are computed, and show no unit.
 
     """
-    windows, rates = (_windows(made.three(first, keys)) for keys in (READING, RATE))
+    windows, rates = (_windows(made.numbers(first, key)) for key in ('reading', 'rate'))
     if len(windows) < 2:
         return None
     quiet = _quietest(windows)
@@ -583,23 +566,23 @@ def _decide_temperature(made: Quantities, first: Cells) -> None:
     if ('temperature' not in columns.sources
             or _convert_if_stated(made, 'temperature', '°C')):
         return
-    source = columns.sources['temperature']
+    source, = columns.sources['temperature']
     if columns.maker is not None or (source.name == 'temperature' and columns.layout.header):
         return
     middle = float(np.median(columns.numbers(first, 'temperature')))
     if _LIKELY_TEMPERATURE_C[0] <= middle <= _LIKELY_TEMPERATURE_C[1]:
         made.said.append(f'{source.name} in °C (assumed)')
     else:
-        _leave_out(made, ['temperature'], f'the temperature {source.name} has values of about '
-                   f'{middle:.4g} in a unit that is not known',
+        _leave_out(made, 'temperature', f'the temperature {source.name} has values of about '
+                   f'{middle:.4g} in a unit that is not known, and is',
                    'state its unit in the name, such as temperature_K')
 
 
 def _convert_if_stated(made: Quantities, key: str, ours: str) -> bool:
     """Convert a column whose name states another unit; return whether it states one."""
-    source = made.chosen.sources[key]
+    source, = made.chosen.sources[key]
     unit, factor = unit_of(key, source.unit) or ('', 1.0)
     if unit not in ('', ours):
-        made.scale([key], factor, ZEROS.get(unit, 0.0))
+        made.scales[key] = factor, ZEROS.get(unit, 0.0)
         made.said.append(f'{source.name} in {unit} -> {ours}')
     return bool(unit)

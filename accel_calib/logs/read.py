@@ -21,8 +21,8 @@ from typing import Any, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from .columns import chosen, is_log_header, LogOptions
-from .dialect import Cells, layout_of
+from .columns import LogOptions
+from .dialect import Cells
 from .formats import open_log
 from .quantities import decided
 from .text import TextTable
@@ -112,18 +112,16 @@ class LineReader:
     def __init__(self, name: str, head: Sequence[str], interval: float, options: LogOptions
                  ) -> None:
         lines = [f'{line}\n' for line in head]
-        layout = layout_of(Path(name), lines, lambda cells: is_log_header(cells, options), 'utf-8')
         self._name = name
-        columns = chosen(layout, options)
-        self._table = TextTable(layout, iter(()))
-        self._table.choose(columns, skip_bad=True)
-        first = self._table.read(lines[layout.start:])
+        self._table = TextTable(Path(name), lines, iter(()), replace(options, skip_bad=True))
+        rows = lines[self._table.layout.start:]
+        first = self._table.read(rows)
         if not len(first.row):
             raise InputError(f'{name} sends no row of numbers, expected one line for each sample',
                              'check the format of the lines')
-        timed = 'time' in columns.sources
-        rate_hz = options.rate or len(first.row) / (len(lines) - layout.start) / interval
-        self._quantities = decided(columns, first, options if timed else
+        timed = 'time' in self._table.columns.sources
+        rate_hz = options.rate or len(first.row) / len(rows) / interval
+        self._quantities = decided(self._table.columns, first, options if timed else
                                    replace(options, rate=rate_hz))
         self.units = self._quantities.units
         rate = f'no times, {rate_hz:.4g} Hz ({"stated" if options.rate else "measured"})'

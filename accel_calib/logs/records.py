@@ -16,8 +16,6 @@ MATLAB are refused: only MATLAB can convert all of them. No pickled object is re
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
@@ -267,7 +265,7 @@ def _groups(arrays: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     for group in by_length.values():
         header = [cell for name, values in group.items() for cell in _names(name, values)]
         alone = len(group) == 1 and len(header) in _BY_ORDER
-        if is_log_header(header, LogOptions()) and not alone:
+        if is_log_header(LogOptions(), header) and not alone:
             groups[', '.join(group)] = group
         else:
             groups |= {name: {'': values} for name, values in group.items()

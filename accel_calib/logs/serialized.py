@@ -104,7 +104,7 @@ Bytes = NDArray[np.uint8]
 Indices = NDArray[np.int64]
 
 _TRAILING = 3  # bytes of padding that a CDR message may end with
-_NANO = 1e-9
+NANO = 1e-9
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ def stamps_of(messages: Messages) -> Floats:
     """Return the header stamps [s]."""
     seconds = messages.head[:, 1]
     signed = seconds.view(np.int32) if messages.ros2 else seconds
-    return signed + messages.head[:, 2] * _NANO
+    return signed + messages.head[:, 2] * NANO
 
 
 def frame_ids(messages: Messages) -> list[str]:

@@ -23,9 +23,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .columns import Chosen
-from .dialect import (
-    Cells, first_label, is_clock, is_comment, is_number, IsHeader, Layout, layout_of, short, split)
+from .columns import chosen, is_log_header, LogOptions
+from .dialect import Cells, first_label, is_clock, is_comment, is_number, layout_of, short, split
 from ..errors import InputError
 from ..table import Floats
 from ..text import counted
@@ -49,7 +48,7 @@ _QUOTED_LINES = 20
 
 
 @contextmanager
-def open_text(path: Path, is_header: IsHeader, raw: io.BufferedReader[Any], size: int
+def open_text(path: Path, options: LogOptions, raw: io.BufferedReader[Any], size: int
               ) -> Iterator[TextTable]:
     """Open the text table of a file of this size [bytes]; see `layout_of`."""
     encoding = _encoding(raw.peek())
@@ -59,8 +58,7 @@ def open_text(path: Path, is_header: IsHeader, raw: io.BufferedReader[Any], size
         if label := first_label(head):
             rows = _readings(chain(head, text), label)
             head = list(islice(rows, _HEAD_LINES))
-        layout = layout_of(path, head, is_header, encoding)
-        yield TextTable(layout, chain(head[layout.start:], rows), size)
+        yield TextTable(path, head, rows, options, encoding, size)
 
 
 def _readings(lines: Iterable[str], label: str) -> Iterator[str]:
@@ -111,28 +109,23 @@ def _head(path: Path, file: io.TextIOWrapper) -> list[str]:
 
 class TextTable:
     """
-    An open text table, read once, block by block; `open_text` makes it.
+    A text table, read once, block by block; its columns are those that the options name.
 
-    `lines` are those from the first row on. `size` is the number of bytes.
+    `head` are the first lines, from which `layout` and `columns` are found, `rest` the others, and
+    `size` is the number of bytes. Bad rows raise unless the options skip them; bad quantities are
+    NaN.
 
     """
 
-    def __init__(self, layout: Layout, lines: Iterator[str], size: int = 0) -> None:
-        self.layout, self.size = layout, size
-        self._lines = lines
-        self._line, self._row = layout.start, 0
-        self._bad = ''
-        self._bad_count = 0
-        self._cut = ''
-        self.characters = 0
+    def __init__(self, path: Path, head: Sequence[str], rest: Iterator[str], options: LogOptions,
+                 encoding: str = 'utf-8', size: int = 0) -> None:
+        self.layout = layout_of(path, head, partial(is_log_header, options), encoding)
+        self.columns, self.size = chosen(self.layout, options), size
+        self._lines, self._skip_bad = chain(head[self.layout.start:], rest), options.skip_bad
+        self._line, self._row = self.layout.start, 0
+        self._bad = self._cut = ''
+        self._bad_count = self.characters = 0
         self.more = False
-
-    def choose(self, columns: Chosen, *, skip_bad: bool = False) -> None:
-        """Set the columns to read. Bad rows raise unless `skip_bad`; bad quantities are NaN."""
-        self._numeric, self._text, self._dates = columns.numeric, columns.text, columns.dates
-        self._needed = self._numeric[:len(self._numeric) - len(columns.quantities)]
-        self._spare = self._numeric[len(self._needed):]
-        self._skip_bad = skip_bad
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -160,61 +153,52 @@ class TextTable:
 
     def read(self, lines: Sequence[str], *, last: bool = False) -> Cells:
         """Return the rows of the next lines; a row that is cut at the last line is left out."""
-        dialect = self.layout.dialect
+        dialect, numeric = self.layout.dialect, self.columns.numeric
         kept = list(filter(dialect.is_row, lines))
-        rows_of = _joined_quotes(kept) if '"' in ''.join(kept) else kept
-        is_joined = len(rows_of) < len(kept)
-        number = np.arange(self._row + 1, self._row + len(rows_of) + 1)
-        self._row += len(rows_of)
-        if last and rows_of and self._row > 1:
-            line = rows_of[-1]
+        rows = _joined_quotes(kept) if '"' in ''.join(kept) else kept
+        is_joined = len(rows) < len(kept)
+        number = np.arange(self._row + 1, self._row + len(rows) + 1)
+        self._row += len(rows)
+        if last and rows and self._row > 1:
+            line = rows[-1]
             is_whole = line.endswith('\n') and len(dialect.cells(line)) >= self.layout.width
             if self._fault(line) is not None and not is_whole:
                 words = f'is cut: {short(line)!r}' if short(line) else 'holds no text'
                 self._cut = f'left out the last line, which {words}'
-                rows_of, number = rows_of[:-1], number[:-1]
-        values = self._parsed(rows_of)
+                rows, number = rows[:-1], number[:-1]
+        values = self._parsed(rows)
         if values is None:
             place = [k for k, line in enumerate(lines, self._line + 1) if dialect.is_row(line)]
-            good = self._good(rows_of, number, [] if is_joined else place)
-            rows_of, number = [rows_of[k] for k in good], number[good]
-            values = self._parsed(rows_of)
-        if values is None and self._spare:
-            self._numeric = self._needed
-            values = self._parsed(rows_of)
-        if values is not None and values.shape[1] < len(self._needed + self._spare):
-            rows = (dialect.cells(line) for line in rows_of)
-            spare = [[row[k].replace(',', '.') for k in self._spare] for row in rows]
-            values = np.hstack([values, [[float(text) if is_number(text) else np.nan
-                                          for text in texts] for texts in spare]])
-        if values is None:
-            raise InputError(f'{self.layout.path} cannot be read, expected a CSV table',
-                             'check it for stray characters')
+            good = self._good(rows, number, [] if is_joined else place)
+            rows, number = [rows[k] for k in good], number[good]
+            texts_of = ([cells[k].replace(',', '.') for k in numeric]
+                        for cells in map(dialect.cells, rows))
+            values = np.array([[float(text) if is_number(text) else np.nan for text in texts]
+                               for texts in texts_of])
         self._line += len(lines)
-        texts = [[dialect.cells(line)[k] for line in rows_of] for k in self._text]
-        return Cells(values, texts, number)
+        numbers = dict(zip(numeric, values.reshape(-1, len(numeric)).T, strict=True))
+        texts = {k: np.array([dialect.cells(line)[k] for line in rows], object)
+                 for k in (*self.columns.labels, *self.columns.dates)}
+        return Cells(numbers, texts, number)
 
     def _parsed(self, lines: list[str]) -> Floats | None:
-        """Return the numbers of rows, or None if a row has a fault."""
-        layout, columns = self.layout, self._numeric
+        """Return the numbers of rows, or None if one may have a fault."""
+        layout, columns = self.layout, self.columns.numeric
         dialect, delimiter = layout.dialect, layout.dialect.delimiter
-        if not lines or not columns:
-            sound = all(self._fault(line) is None for line in lines)
-            return np.zeros((len(lines), len(columns))) if sound else None
-        texts = lines
+        texts, breaks = lines, layout.width - 1
         if dialect.monitor or dialect.labelled or dialect.prefix:
             texts = list(map(dialect.plain, lines))
         if '"' in ''.join(texts):  # lines without quotes, parted by tabs
             rows = [split(line, delimiter) for line in texts]
-            cells = [[row[k] for k in columns] for row in rows if len(row) == layout.width]
-            texts = ['\t'.join(row) for row in cells]
+            if any(len(row) != layout.width for row in rows):
+                return None
+            texts = ['\t'.join([row[k] for k in columns]) for row in rows]
             delimiter, columns, breaks = '\t', tuple(range(len(columns))), len(columns) - 1
-        else:
-            breaks = layout.width - 1
-        if len(texts) < len(lines) or {line.count(delimiter) if delimiter else
-                                       len(line.split()) - 1 for line in texts} != {breaks}:
+        if {line.count(delimiter) if delimiter else len(line.split()) - 1
+                for line in texts} != {breaks}:
             return None
-        if any(not is_clock(dialect.cells(line)[k]) for k in self._dates for line in lines):
+        if any(not is_clock(dialect.cells(line)[k])
+               for k in self.columns.dates for line in lines):
             return None
         if delimiter != ',' and layout.decimal != '.':
             texts = [line.replace(',', '.') for line in texts]
@@ -249,11 +233,11 @@ class TextTable:
         if len(cells) != layout.width:
             return f' has {counted(len(cells), "value")}, expected {layout.width}'
         comma = layout.decimal != '.' and (layout.dialect.delimiter != ',' or '"' in line)
-        for k in self._needed:
+        for k in self.columns.needed:
             if not is_number(cells[k].replace(',', '.') if comma else cells[k]):
                 return (f', column {layout.name(k)} is {short(cells[k])!r}, expected a finite '
                         'number')
-        for k in self._dates:
+        for k in self.columns.dates:
             if not is_clock(cells[k]):
                 return (f', column {layout.name(k)} is {short(cells[k])!r}, expected a time such '
                         'as 2026-01-31T12:00:00.250')

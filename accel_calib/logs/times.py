@@ -95,11 +95,6 @@ class Clock:
     since: int = -1
 
     @property
-    def said(self) -> str:
-        """Return what is assumed, and what is done about the order and the steps of the stamps."""
-        return ', '.join([self.words, *(each.text for each in self.findings)])
-
-    @property
     def findings(self) -> tuple[Finding, ...]:
         """Return what is done about the order and the steps of the stamps."""
         order = Finding('clock', 'rows turned round (the newest was the first)')
@@ -111,11 +106,10 @@ class Clock:
         """Return the times of a block as they are stated [s]."""
         columns = self.columns
         if columns.dates:
-            return seconds_of(columns.texts(cells, 'time'), columns.layout.path,
-                              cells.row.tolist())
-        seconds = columns.numbers(cells, 'time') * self.scale
+            return seconds_of(cells.texts[columns.dates[0]], columns.layout.path, cells.row)
+        seconds = columns.numbers(cells, 'time')[:, 0] * self.scale
         if FRACTION in columns.sources:
-            return seconds + 1e-9 * columns.numbers(cells, FRACTION)
+            return seconds + 1e-9 * columns.numbers(cells, FRACTION)[:, 0]
         return seconds
 
     def continued(self, cells: Cells) -> Floats:
@@ -164,7 +158,7 @@ def clock_of(columns: Chosen, first: Cells, options: LogOptions) -> Clock:
 
 def _stated_clock(columns: Chosen, first: Cells, options: LogOptions) -> Clock:
     """Return the clock with the unit that is stated, or found from the rate."""
-    source, layout = columns.sources['time'], columns.layout
+    (source,), layout = columns.sources['time'], columns.layout
     rate_hz = options.rate or layout.rate_hz
     if rate_hz is not None and bare_name(source.name) in COUNTERS:
         return Clock(columns, 1.0 / rate_hz, tuple(2.0**bits / rate_hz for bits in (8, 16, 32)),
@@ -173,11 +167,11 @@ def _stated_clock(columns: Chosen, first: Cells, options: LogOptions) -> Clock:
         raise InputError(f'{layout.path} has times, but --rate is {options.rate:g}',
                          'remove --rate, or leave the times out with --columns time=')
     if columns.dates:
-        dated = has_date(columns.texts(first, 'time')[0])
+        dated = has_date(first.texts[source.index][0])
         rate = _rate_words(_step_of(Clock(columns).seconds(first)))
         return Clock(columns, periods=() if dated else (_DAY_S,), words=(
             f'{source.name}: {"dates" if dated else "times of the day"}{rate} -> s'))
-    stamps = columns.numbers(first, 'time')
+    stamps = columns.numbers(first, 'time')[:, 0]
     back = np.count_nonzero(np.diff(stamps) < 0.0)
     forth = np.count_nonzero(np.diff(stamps) > 0.0)
     if not layout.header and back > _MOST_BACK * (len(stamps) - 1) and forth > (
@@ -202,7 +196,7 @@ def _rate_words(step: float) -> str:
 
 
 def _unit_of_time(columns: Chosen, first: Cells, stamps: Floats) -> str:
-    source, layout = columns.sources['time'], columns.layout
+    (source,), layout = columns.sources['time'], columns.layout
     of_maker = columns.maker and columns.maker.scales.get('time')
     if of_maker:
         return next(name for name, factor in _UNITS.items() if factor == of_maker)
@@ -213,8 +207,8 @@ def _unit_of_time(columns: Chosen, first: Cells, stamps: Floats) -> str:
     if layout.header and source.name == 'time' and step < (
             _POSES_FAR_S if of_poses else _FAR_S) and (
             layout.about or of_poses or (
-                columns.names(READING) == list(READING)
-                and not _is_dense(stamps, columns.three(first, READING)))):
+                columns.names('reading') == [*READING]
+                and not _is_dense(stamps, columns.numbers(first, 'reading')))):
         return 's'
     # A unit with a plausible rate, best one that the file states; else s.
     units = TICKS.get(bare_name(source.name), _UNITS)
@@ -233,7 +227,7 @@ def _unit_of_time(columns: Chosen, first: Cells, stamps: Floats) -> str:
     if of_poses:
         plausible, usual = [*rates], _POSES_HZ
     elif 'temperature' in columns.sources:
-        warm = columns.numbers(first, 'temperature')
+        warm = columns.numbers(first, 'temperature')[:, 0]
         ends = np.array_split(warm[np.isfinite(warm)], _ENDS)
         change = abs(float(np.median(ends[-1]) - np.median(ends[0]))) if len(ends[-1]) else 0.0
         plausible = [name for name in plausible
