@@ -203,8 +203,7 @@ class Connection(web.RequestHandler):
         """Close the connection later, unless its request arrives."""
         super().connection_made(transport)
         self.address = str((transport.get_extra_info('peername') or [''])[0])
-        self._limit = asyncio.get_running_loop().call_later(
-            _REQUEST_S, lambda: None if self.stage else self.abort())
+        self._limit = asyncio.get_running_loop().call_later(_REQUEST_S, self.abort, 0)
         self._owner.add(self)
 
     def connection_lost(self, exc: BaseException | None) -> None:
@@ -213,9 +212,9 @@ class Connection(web.RequestHandler):
         self._owner.remove(self)
         super().connection_lost(exc)
 
-    def abort(self) -> None:
-        """End the connection without waiting."""
-        if self.transport is not None:
+    def abort(self, most: int = OWNER) -> None:
+        """End the connection without waiting, unless its stage is above `most`."""
+        if self.transport is not None and self.stage <= most:
             self.transport.abort()
 
     def handle_error(self, request: web.BaseRequest, status: int = 500,
