@@ -9,7 +9,8 @@ The search for missing effects.
 2. A beam search (`.beam`) finds the set of effects, outliers and a random walk of the offset with
    the best score, in the equations near the model.
 3. All values are fitted again, without the outliers, and the equations are set up near the new
-   model. Steps 2 and 3 are repeated until the set remains the same.
+   model. Steps 2 and 3 are repeated until the set remains the same, and again with products of two
+   columns if a gap or a walk remains.
 4. If the named effects explain only a small part of the residual above the noise, they are
    removed: the residual then has a cause outside of the catalogue. Beside a gap or a walk, an
    effect is also removed if its quantity explains more when it is shifted in time.
