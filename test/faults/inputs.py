@@ -94,7 +94,7 @@ def _bag(make: str, folder: Path) -> Files:
 def _containers(folder: Path) -> list[Files]:
     """Return packed text, arrays, archives and sheets."""
     of_text = ('.json', '.jsonl', '.log', '.lp', '.txt', '.csv')
-    paths = [formats.written(folder, name, content) for name, content, _ in formats.READ
+    paths = [formats.write(folder, content, name) for name, content, _ in formats.READ
              if not name.endswith(of_text)]
     tables, reading = containers.tables_of('phyphox')
     few = {name: '\n'.join(text.splitlines()[:300]) for name, text in tables.items()}
