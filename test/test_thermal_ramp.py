@@ -194,7 +194,8 @@ def test_a_table_of_rests_is_a_ramp(tmp_path, capsys):
 
 
 def test_rests_with_times_in_another_unit_are_read_right_or_refused_with_the_unit(
-        tmp_path, capsys):
+        tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     rests = stretches(ramp(3, BENT, minutes=80.0, cool=True)).stretches
     rests, path = rests.without_columns('temperature_rate'), tmp_path / 'rests.csv'
     for unit in (1e-9, 1e-6):
