@@ -175,7 +175,9 @@ def test_a_product_of_two_columns_is_named_and_stored(other, tmp_path):
 def test_a_temperature_in_steps_is_estimated_within_half_a_step(step):
     rng = np.random.default_rng(5)
     time = np.sort(rng.uniform(0.0, 3600.0, 60))
-    for true, left in ((20.0 + time / 500.0, 0.5), (rng.uniform(20.0, 40.0, 60), 1.1)):
+    jumps, twice, later = rng.uniform(20.0, 40.0, 60), [10, 30, 30], [11, 31, 32]
+    time[later], jumps[later] = time[twice] + [1e-9, 0.0, 1e-7], jumps[twice]  # at almost one time
+    for true, left in ((20.0 + time / 500.0, 0.5), (jumps, 1.1)):
         stated = np.round(true / step) * step if step else true
         found = between_steps(time, stated)
         assert np.max(np.abs(found - stated)) <= step / 2.0

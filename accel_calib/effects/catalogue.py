@@ -291,8 +291,9 @@ VARIABLES: dict[str, str] = {
 
 
 def variable_words(variable: str) -> str:
-    """Return the words of the variable of a curve: of `VARIABLES`, or the name of a quantity."""
-    return VARIABLES.get(variable) or column_of(variable).meaning.replace('*', ' times ')
+    """Return the words of a variable: of `VARIABLES`, a quantity, or a product of two columns."""
+    return ' times '.join(VARIABLES.get(column) or column_of(column).meaning
+                          for column in variable.split(_TIMES))
 
 
 _CARRIED = {'offset': by_axis(ONE), 'gain': by_axis(FORCE), 'cross_axis': CROSS, 'force': ALL_AXES}
@@ -398,7 +399,7 @@ COVARIATES = {'offset_covariate': ('offset', ONE, 'g/unit'),
 """What a covariate changes in proportion to a quantity: words, monomial, unit of its values."""
 
 _CURVED, _TIMES = '2', '*'
-_WITH_OTHERS = ('temperature', 'supply_voltage')
+IN_PRODUCTS = ('temperature', 'supply_voltage')
 """Columns with effects of their own, whose products with others are covariates."""
 
 
@@ -443,9 +444,10 @@ def _covariate(name: str) -> Effect:
     kind, _, rest = name.partition('-')
     variable, *curved = rest.split('-')
     columns = tuple(variable.split(_TIMES))
-    known = [is_quantity(column) or column in _WITH_OTHERS for column in columns]
-    if not (len(columns) == 2 and all(known) and columns[0] < columns[1] and not curved) and not (
-            is_quantity(variable) and curved in ([], [_CURVED])):
+    is_product = len(columns) == 2 and columns[0] < columns[1] and all(
+        is_quantity(column) or column in IN_PRODUCTS for column in columns)
+    if not (is_quantity(variable) and curved in ([], [_CURVED])) and not (
+            is_product and not curved):
         raise KeyError(name)
     what, monomial, unit = COVARIATES[kind]
     terms = by_axis(monomial)
@@ -456,7 +458,7 @@ def _covariate(name: str) -> Effect:
     return Effect(
         f'{what} that changes with {variable_words(variable)}', f'coefficient of {variable}',
         names, unit, np.inf, 0.5, terms, partial(_departure, columns, bool(curved)), columns,
-        ('zero',) if not columns[1:] else tuple(f'zero_{column}' for column in columns),
+        tuple(f'zero_{column}' for column in columns) if is_product else ('zero',),
         partial(_means, columns, 3 if curved else 2), (0.0,) * len(columns),
         includes=(f'{kind}-{variable}',) if curved else ())
 

@@ -15,6 +15,18 @@ spline, Wahba 1978) estimates the rate at the poses; a Kalman filter with the sa
 it from the past samples of a stream. The noise is chosen for periods of 400 s and more: the filter
 follows them, and it averages the steps of the temperature sensor.
 
+**Steps.** A thermometer of step q states a temperature that is wrong by up to q / 2. In a slow
+change these errors are not random: what is computed from time fits better than the true cause. The
+temperatures at the poses are therefore estimated. The temperature is a process whose second
+derivative is white noise, recorded with errors of the variance q² / 12. Its posterior mean is a
+cubic smoothing spline. With Q the second divided differences, and τ² R the covariance of the
+process in them (Green and Silverman 1994, equations 2.1 and 2.2), the mean for the readings y is
+
+    y - q² / 12 Q C⁻¹ Qᵀ y        C = q² / 12 QᵀQ + τ² R
+
+τ is that with the largest restricted likelihood. A temperature that jumps from pose to pose thus
+remains as it is. The step is measured: readings that occur more than once are multiples of it.
+
 **Low pass.** The solution of the first equation is exact for the interpolated temperature: between
 poses a cubic with the temperatures and the rates at its ends, between samples a straight line.
 Times need not be sorted. A row without time or temperature is NaN, and the other rows ignore it.
@@ -26,6 +38,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 import scipy
 
 from ..table import Floats
@@ -47,7 +60,25 @@ _RESTART = 1.0
 """If the time of a stream jumps back by more than this, the stream starts again [s]."""
 
 _SHORTEST = 0.1
-"""Shortest interval for the smoother [s]; earlier rows count as simultaneous."""
+"""Shortest interval for the smoothers [s]; earlier rows count as simultaneous."""
+
+_LEAST_MOMENTS = 5
+"""Smallest number of moments at which temperatures in steps are estimated."""
+
+_LEAST_LEVELS = 4
+"""Smallest number of temperatures that occur more than once, by which steps are known."""
+
+_COARSEST = 0.51
+"""Largest step of a thermometer [°C]: larger ones may be exact temperatures that were set."""
+
+_REPEATED = 0.5
+"""Smallest part of temperatures in steps that occur more than once."""
+
+_ON_STEP = 0.02
+"""Largest distance of a temperature from a multiple of the step, in steps."""
+
+_CHANGES = 10.0 ** np.arange(-10.0, 9.0, 0.5)
+"""Values of τ² that are tried, for a median interval and relative to q² / 12."""
 
 
 class Lag(NamedTuple):
@@ -85,15 +116,61 @@ def acting_temperature(context: Mapping[str, Any], key: str, lag: float, of_sens
 def rate_of(time: Floats, temperature: Floats) -> Floats:
     """Return the (n,) rate of the temperature at poses [°C/s]; NaN where an input is NaN."""
     known = np.isfinite(time) & np.isfinite(temperature)
-    rate = np.full(len(time), np.nan)
-    merged = np.round(time[known] / _SHORTEST) * _SHORTEST  # almost equal times become equal
-    moments, place = np.unique(merged, return_inverse=True)
-    if len(moments) < 2:
-        rate[known] = 0.0
-        return rate
-    mean = np.bincount(place, temperature[known]) / np.bincount(place)
-    rate[known] = _smoothed_rate(moments, mean)[place]
+    rate, (moments, place, mean) = np.full(len(time), np.nan), _at_moments(
+        time[known], temperature[known])
+    rate[known] = _smoothed_rate(moments, mean)[place] if len(moments) > 1 else 0.0
     return rate
+
+
+def _at_moments(time: Floats, temperature: Floats) -> tuple[Floats, NDArray[np.intp], Floats]:
+    """Return m increasing times, the place of each row among them, and the mean at each."""
+    merged = np.round(time / _SHORTEST) * _SHORTEST  # almost equal times become equal
+    moments, place = np.unique(merged, return_inverse=True)
+    return moments, place, np.bincount(place, temperature) / np.bincount(place)
+
+
+def between_steps(time: Floats, temperature: Floats) -> Floats:
+    """Return (n,) temperatures at poses [°C]; those in steps are estimated within half a step."""
+    known = np.isfinite(time) & np.isfinite(temperature)
+    values, estimated = temperature[known], temperature.copy()
+    different, count = np.unique(values, return_counts=True)
+    repeated = different[count > 1]
+    if len(repeated) < _LEAST_LEVELS or np.sum(count[count > 1]) < _REPEATED * len(values):
+        return temperature
+    step = float(np.min(np.diff(repeated)))
+    steps = (repeated - repeated[0]) / step
+    moments, place, mean = _at_moments(time[known], values)
+    if (step > _COARSEST or np.max(np.abs(steps - np.round(steps))) > _ON_STEP
+            or len(moments) < _LEAST_MOMENTS):
+        return temperature
+    spline = _spline(moments, mean, step ** 2 / 12.0 / np.bincount(place))
+    estimated[known] = np.clip(spline[place], values - step / 2.0, values + step / 2.0)
+    return estimated
+
+
+def _spline(time: Floats, mean: Floats, variance: Floats) -> Floats:
+    """Return the posterior means at n increasing times, of readings with (n,) variances."""
+    apart, best = np.diff(time) / np.median(np.diff(time)), (-np.inf, mean)
+    size, first, last = len(mean) - 2, 1.0 / apart[:-1], 1.0 / apart[1:]
+    middle = -first - last
+    of_error, of_process = np.zeros((2, 3, size))  # diagonals of the lower triangle
+    of_error[0] = first ** 2 * variance[:-2] + middle ** 2 * variance[1:-1] + (
+        last ** 2 * variance[2:])
+    of_error[1, :-1] = (middle[:-1] * first[1:] * variance[1:-2]
+                        + last[:-1] * middle[1:] * variance[2:-1])
+    of_error[2, :-2] = last[:-2] * first[2:] * variance[2:-2]
+    of_process[0], of_process[1, :-1] = (apart[:-1] + apart[1:]) / 3.0, apart[1:-1] / 6.0
+    across = first * mean[:-2] + middle * mean[1:-1] + last * mean[2:]
+    for change in _CHANGES * np.max(variance):
+        root = scipy.linalg.cholesky_banded(of_error + change * of_process, lower=True)
+        solved = scipy.linalg.cho_solve_banded((root, True), across)
+        likelihood = -float(np.sum(np.log(root[0])) + across @ solved / 2.0)
+        if likelihood > best[0]:
+            moved = np.zeros(len(mean))
+            for row, part in enumerate((first, middle, last)):
+                moved[row:size + row] += part * solved
+            best = likelihood, mean - variance * moved
+    return best[1]
 
 
 def _smoothed_rate(time: Floats, temperature: Floats) -> Floats:

@@ -42,8 +42,8 @@ from .linear import LEVEL, Set
 from .settle import fit_without, make_sound, settle
 from .state import beginning, Candidate, fitted_state, linearised, State, without
 from ..effects import (
-    CHANGES, covariate_names, effect_named, EFFECTS, empirical_parts, factors_of, included, LADDER,
-    linear_values, Model, parameter_names, product_names, WANDER)
+    CHANGES, covariate_names, effect_named, EFFECTS, empirical_parts, factors_of, IN_PRODUCTS,
+    included, LADDER, linear_values, Model, parameter_names, product_names, WANDER)
 from ..estimate import beside_scatter, kinds, scatter_of, stated
 from ..table import Floats, Poses
 
@@ -209,10 +209,12 @@ def _search(poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
     names = (*_visible(begun, LADDER), *(name for name in EFFECTS if name not in LADDER),
              *also, *covariate_names(causes(poses_g)), *_visible(begun, CHANGES))
     state, near, trial = settle(begun, poses_g, fixed, names)
-    products = tuple(product_names(varied := {*causes(poses_g), *filter(
-        poses_g.__contains__, ('temperature', 'supply_voltage'))}))
-    if products and len(varied) <= _MOST_VARIED and (near.walk is not None or not state.is_noise):
-        state, near, trial = settle(begun, poses_g, fixed, (*names, *products))
+    varied = {*causes(poses_g), *(column for column in IN_PRODUCTS if column in poses_g)}
+    if len(varied) <= _MOST_VARIED and (near.walk is not None or not state.is_noise):
+        products = tuple(product_names(varied))
+        beside = settle(begun, poses_g, fixed, (*names, *products))
+        if not {*products}.isdisjoint(beside[1].names):
+            state, near, trial = beside
     begun = fit_without(begun, poses_g, near.chosen.out)
     taken_back: tuple[str, ...] = ()
     share = 1.0 - (state.rss - state.dof) / max(begun.rss - begun.dof, 1e-300)

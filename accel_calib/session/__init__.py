@@ -6,10 +6,10 @@ The calibrator without ROS: it takes samples and commands, and returns answers a
 
 `session` is the entry point, and `core` the state that all other modules read. `commands` contains
 what the user can ask for, and `use` what follows when the calibration or the poses change.
-`sensor` is what belongs to one sensor: `live_capture` captures its poses, and `guide` chooses the
-next one. `stream` describes the messages, and `faults` what is wrong with them. `guidance` is the
-next step, and `state` what topics and pages show. `store` manages and locks files. `worker` runs
-the tasks and defines the events. `settings` defines the parameters. Imports point one way.
+`sensor` is what belongs to one sensor: `live_capture` captures its poses, and `pose_guide` chooses
+the next one. `stream` describes the messages, and `faults` what is wrong with them. `guidance` is
+the next step, and `state` what topics and pages show. `store` manages and locks files. `worker`
+runs the tasks and defines the events. `settings` defines the parameters. Imports point one way.
 
 """
 

@@ -22,7 +22,7 @@ import numpy as np
 from .core import State
 from .faults import thermometer_words
 from .guidance import next_words
-from .guide import plan_for
+from .pose_guide import plan_for
 from .sensor import gyro_bias_of_rest, Sensor
 from .settings import CalibratorSettings
 from .store import writing_advice

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 from .core import State
 from .faults import slow_turn, stream_faults
-from .guide import Action, calling, NOT_KNOWN
+from .pose_guide import Action, calling, NOT_KNOWN
 from .sensor import Sensor
 from ..compare import status
 from ..pipeline import FEWEST_IN_CONE, is_partial

@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from .guide import Guide
 from .live_capture import LiveCapture, LONG_REST, overlap
+from .pose_guide import Guide
 from .settings import CalibratorSettings, capture_settings, columns_of
 from .stream import TemperatureHistory
 from ..calibrate import Calibration, GyroBias, on_topics, Outside, outside, SampleNoise

@@ -15,7 +15,7 @@ import numpy as np
 
 from .core import State
 from .guidance import next_action
-from .guide import NOT_KNOWN, plan_for
+from .pose_guide import NOT_KNOWN, plan_for
 from .sensor import Sensor, title
 from .store import Store, tidied, unusable, writing_advice
 from .stream import AGAIN
