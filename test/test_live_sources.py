@@ -149,11 +149,11 @@ def test_a_rate_is_measured_also_if_lines_are_late_or_follow_a_boot(
         return ('rst:0x1, boot\r\n' * boots if k == 0 else '') + f'{numbers(k)}\n'
 
     monkeypatch.setattr(*HEAD_OF_A_PORT, 2.0)
-    monkeypatch.setattr(*MOST_OF_A_HEAD, 4000)  # fewer lines than arrive in this time
+    monkeypatch.setattr(*MOST_OF_A_HEAD, 2000)  # fewer lines than the 400 of this time
     with (board(paced(line, late)) as port, open_source(port, LogOptions()) as source):
         first = next(source.blocks)
         found = np.concatenate([first, samples(source.blocks, 450 - len(first))])
-    assert 20 < len(first) < 200
+    assert 20 < len(first) < 400
     assert '(measured)' in source.read_as
     assert np.mean(np.diff(found[:, 0])) == pytest.approx(1.0 / RATE_HZ, rel=0.1)
 
