@@ -87,6 +87,8 @@ STEPS: Mapping[str, str] = MappingProxyType({
     'level': 'level the mounting by a pose with the robot level',
     'accept': 'use the offered calibration, or discard it',
     'save': 'store the calibration',
+    'restart': 'start the node in another way, as the words say',
+    'enable': 'switch the correction on',
     'verify': 'check the calibration with new poses',
     'record': 'record again, as the words say',
     'done': 'nothing more needs to be done'})

@@ -386,9 +386,17 @@ def numbered(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.int64]:
     return np.arange(1, len(columns['reading']) + 1)
 
 
-def check_values(columns: Mapping[str, NDArray[Any]], source: str) -> None:
-    """Check values; InputError if not finite or beyond any sensor, a count <= 0 or an sd < 0."""
+def check_values(columns: Mapping[str, NDArray[Any]], source: str, *, partial: bool = False
+                 ) -> None:
+    """
+    Check values; InputError if not finite or beyond any sensor, a count <= 0 or an sd < 0.
+
+    `partial`: single numbers beside the readings can be NaN.
+
+    """
     for key, values in columns.items():
+        if partial and key in ('temperature', 'supply_voltage'):
+            values = np.nan_to_num(values, nan=0.0, posinf=np.inf, neginf=-np.inf)
         if key in COLUMNS and key != 'label' and not np.all(np.abs(values) < LARGEST):
             raise _beyond(key, values.reshape(len(values), -1), source)
     if 'count' in columns and not np.all(columns['count'] > 0):

@@ -52,6 +52,8 @@ EKF = {
 
 
 def generate_launch_description() -> LaunchDescription:
+    for package in ('imu_filter_madgwick', 'robot_localization'):
+        get_package_share_path(package)  # before a node starts; the error names the package
     calibrator = get_package_share_path('accel_calib') / 'launch' / 'calibrator.launch.py'
     arguments = {
         'namespace': ('', 'Namespace of the three nodes.'),

@@ -4,6 +4,8 @@
 """A session without threads, and a person who does what it says."""
 
 from collections.abc import Generator
+from contextlib import suppress
+import math
 from typing import Any
 
 from accel_calib.errors import AccelCalibError
@@ -23,6 +25,7 @@ class Driver:
     def __init__(self, topic: str = '/imu/data_raw', **parameters: Any) -> None:
         self.now = 0.0
         self.stamp = 1000.0
+        self.pace = 1.0  # of the stamps
         self.log: list[Log] = []
         self.results: list[str] = []
         self.shown: ShowPoses | None = None
@@ -53,7 +56,7 @@ class Driver:
 
     def ask(self, name: str, **options: bool) -> str:
         """Return the answer of a command."""
-        return self.done(getattr(self.session.commands, name)(**options))
+        return self.done(self.session.commands.run(name, **options))
 
     def refuses(self, words: str, *names: str) -> None:
         """Check that commands are refused with these words, a regular expression."""
@@ -88,12 +91,12 @@ class Driver:
             self.now += len(block) / RATE
             if self.session.accepts(frame_id):
                 rows = np.full((len(block), 7 + len(columns)), np.nan)
-                rows[:, 0] = self.stamp + np.arange(len(block)) / RATE
+                rows[:, 0] = self.stamp + self.pace * np.arange(len(block)) / RATE
                 rows[:, 1:4] = block
                 rows[:, 7:] = [context.get(column, np.nan) for column in columns]
                 self.session.push(rows, self.now)
                 accepted += len(block)
-            self.stamp += len(block) / RATE
+            self.stamp += self.pace * len(block) / RATE
             self.handle()
         return accepted
 
@@ -110,14 +113,16 @@ class Person:
 
     `sensor` returns the reading [g] of a direction of up at a temperature, and `warming` is the
     rise of the temperature by rest [°C]. `flat` is the direction of up with the robot level, and
-    `can_reach` whether the robot can be turned so that a direction points up.
+    `can_reach` whether the robot can be turned so that a direction points up. `shaken` is the
+    vibration after the first rest [g].
 
     """
 
     def __init__(self, driver: Driver, sensor: Any, *, warming: float = 0.0,
-                 flat: Any = (0.0, 0.0, 1.0), can_reach: Any = lambda up: True) -> None:
+                 flat: Any = (0.0, 0.0, 1.0), can_reach: Any = lambda up: True,
+                 shaken: float = 0.0) -> None:
         self.driver, self.sensor, self.warming, self.flat = driver, sensor, warming, flat
-        self.can_reach = can_reach
+        self.can_reach, self.shaken = can_reach, shaken
         self.temperature, self.steps, self.called = 25.0, [], []
         self._up, self._rng = np.array(flat, float), np.random.default_rng(5)
 
@@ -130,21 +135,26 @@ class Person:
         held = np.repeat([np.asarray(up, float)], count, axis=0)
         reading = np.array([self.sensor(each, self.temperature)
                             for each in np.concatenate([turning, held])])
-        reading += 0.0005 * self._rng.normal(size=reading.shape)
+        shaken = self.shaken if self.steps else 0.0
+        reading += max(shaken, 0.0005) * self._rng.normal(size=reading.shape)
         self.driver.feed(reading * GRAVITY, temperature=self.temperature)
         self._up = np.asarray(up, float)
         self.temperature += self.warming
 
     def nearest(self, up: Any) -> Any:
         """Return the direction on the way to another one that the robot can reach."""
-        way = (self.flat + share * (np.array(up) - self.flat) for share in (0.3, 0.1))
-        return next((each / np.linalg.norm(each) for each in way
-                     if self.can_reach(each / np.linalg.norm(each))), np.array(self.flat))
+        up = np.array(up) + 1e-3  # no way leads through zero
+        way = (self.flat + share * (up - self.flat) for share in np.linspace(1.0, 0.0, 41))
+        return next(each / np.linalg.norm(each) for each in way
+                    if self.can_reach(each / np.linalg.norm(each)))
 
-    def follow(self, most: int = 80) -> str:
-        """Do one step after the other; return the kind of the last one."""
+    def follow(self, most: int = 80, seconds: float = math.inf) -> str:
+        """Do one step after the other; return the kind of the last one, at most so many later."""
         self.rest(self.flat)
+        end = self.driver.now + seconds
         for _ in range(most):
+            if self.driver.now > end:
+                break
             now, action = state.progress(self.driver.session), next_action(self.driver.session)
             assert (now.step, now.advice, now.command) == (
                 action.kind, action.words, action.command)
@@ -153,13 +163,14 @@ class Person:
                 break
             if now.direction and self.can_reach(np.array(now.direction)):
                 self.rest(now.direction)
-            elif now.direction and not action.command:  # what it can do: stay, or tilt a little
-                self.rest(self.nearest(now.direction), 20.0)
+            elif now.direction and not action.command:  # what it can do
+                self.rest(self.nearest(now.direction), 3.0)
             elif action.command:
                 if action.kind == 'level':
                     self.rest(self.flat, 4.0)
                 self.called.append(action.command)
-                self.driver.ask(action.command)
+                with suppress(AccelCalibError):
+                    self.driver.ask(action.command)
             else:
-                break
+                self.rest(self._up)
         return self.steps[-1]

@@ -302,12 +302,16 @@ def test_context_outside_of_the_ranges_is_limited_with_a_warning(
 # Guidance
 
 
-def test_advice_changes_only_with_the_number_of_poses(readings: Readings) -> None:
+def test_advice_changes_with_the_poses_and_with_a_request_that_is_not_followed(
+        readings: Readings) -> None:
     driver = Driver()
     driver.feed(readings(spread_directions(5)))
-    before = next_action(driver.session)
-    driver.feed(readings([spread_directions(5)[0]], dwell=20.0))
-    assert next_action(driver.session) == before
+    before, rest = next_action(driver.session), readings([spread_directions(5)[0]], dwell=20.0)
+    driver.feed(rest[:300])
+    after = next_action(driver.session)
+    assert after.direction != before.direction
+    driver.feed(rest[300:])
+    assert next_action(driver.session) == after
     assert driver.logged('info').count('repeats') == 1
     driver.feed(readings(spread_directions(30)))
     lines = len(driver.log)
@@ -546,7 +550,7 @@ PER_AMPERE = np.array([2e-3, -1.5e-3, 1e-3])
 """Offset per ampere of the motor [g]."""
 
 
-def test_a_quantity_is_a_column_of_poses_is_corrected_live_and_left_out_when_it_stops(
+def test_a_quantity_is_a_column_of_poses_and_its_last_value_holds_when_it_stops(
         readings: Readings) -> None:
     driver = Driver(sensor='arm', context=[MOTOR])
     for k, direction in enumerate(spread_directions(26)):
@@ -566,17 +570,14 @@ def test_a_quantity_is_a_column_of_poses_is_corrected_live_and_left_out_when_it_
     np.testing.assert_allclose(force(2.0), force(10.0), atol=1e-3)
     driver.session.missing['motor_current'] = 'nothing comes on /motor/current'
     around.take('motor_current', 10.0)
-    for seconds, known in ((29.0, True), (2.0, False), (100.0, False)):
-        driver.now += seconds
-        driver.tick()
-        assert ('motor_current' in around.values) is known
-    line = ('no motor_current arrives: nothing comes on /motor/current; '
-            'offset_covariate-motor_current is left out')
-    assert driver.logged('warning').count(line) == 1
+    line = 'no motor_current arrives: nothing comes on /motor/current; the last value holds'
+    for seconds, count in ((29.0, 0), (2.0, 1), (20.0, 1)):
+        driver.tick(seconds)
+        assert driver.logged('warning').count(line) == count
     assert line in driver.finding('stream').words
-    neutral, reading = driver.calibration.model.neutral['motor_current'], (0.0, 0.0, GRAVITY)
+    reading = (0.0, 0.0, GRAVITY)
     assert driver.sensor.force_of(reading, driver.session.context) == pytest.approx(
-        driver.sensor.force_of(reading, {'motor_current': neutral}))
+        driver.sensor.force_of(reading, {'motor_current': 10.0}))
     around.take('motor_current', 3.0)
     driver.tick()
     assert 'motor_current arrives' in driver.logged('info')
@@ -595,15 +596,21 @@ def test_poses_in_one_direction_are_not_merged_over_a_quantity(readings: Reading
     assert np.sort(driver.poses['motor_current'] > 5.0).tolist() == [False, False, True, True]
 
 
-def test_poses_that_lack_a_quantity_are_said(readings: Readings) -> None:
-    first = Driver(sensor='arm')
-    first.feed(readings([UP, LEFT, FORWARD]))
-    first.session.close()
-    driver = Driver(sensor='arm', context=[MOTOR])
-    driver.feed(readings([[0, 0, -1], [0, -1, 0]]), motor_current=1.0)
-    driver.tick()
-    assert 'motor_current' not in driver.poses
-    assert re.search(r'\d of \d.*motor_current.*~/reset', driver.logged('warning'))
+@pytest.mark.parametrize('column', ['motor_current', 'temperature'])
+def test_a_start_without_a_column_leaves_it_in_the_stored_poses(
+        readings: Readings, column: str) -> None:
+    known = {'context': [MOTOR]} if column != 'temperature' else {}
+    for k, (way, given, lack) in enumerate((
+            ([UP, LEFT, FORWARD], known, 0), ([[0, 0, -1]], {}, 1), ([[0, -1, 0]], known, 1))):
+        driver = Driver(sensor='arm', **given)
+        driver.stamp += 500.0 * k
+        driver.feed(readings(way), **({} if k == 1 else {column: 25.0 + k}))
+        driver.feed(readings([way[-1]])[:15], **({} if k == 1 else {column: 25.0 + k}))
+        driver.tick()
+        assert np.sum(np.isnan(driver.poses[column])) == lack
+        assert ('1 of 5 poses' in driver.logged('info')) is (k == 2 and bool(known))
+        assert column not in driver.sensor.live.poses(()) or not lack
+        driver.session.close()
 
 
 def test_a_rest_that_is_no_pose_is_said_with_its_reason(readings: Readings) -> None:

@@ -24,7 +24,7 @@ from .partial import fit_partial, fit_with_fleet, FleetPrior, mounting_only, pos
 from .pose_planning import (
     determines, dilution, directions_in, error_left_in, free_parameters, identifiability,
     LARGEST_DILUTION, lies_in_cone, next_pose, NextPose, NORM_MODELS, Outlook, outlook,
-    refuse_if_unfit, stated_uncertainty)
+    refuse_if_unfit, request_for, stated_uncertainty)
 from .quality import (
     deviations_g, errors_after, errors_before, fit_findings, gated, has_usual_gains, in_g,
     LARGEST_OFFSET_G, OF_A_FIT, quality_of, record_of, uncertainty_g, Verification, verify)
@@ -43,5 +43,6 @@ __all__ = ['CLIPPED', 'FLEET', 'LARGEST_DILUTION', 'LARGEST_OFFSET_G', 'NORM_MOD
            'mounting_only', 'mounting_words', 'next_pose', 'of_samples', 'on_topics', 'only_norm',
            'outlook', 'outside', 'posterior', 'quality_of', 'record_of', 'refuse_if_unfit',
            'rejected_by', 'sample_noise_of', 'set_heading', 'sound_rows', 'stated_uncertainty',
-           'sure_rows', 'thermal_alone', 'thermal_stream', 'uncertainty_g', 'verify', 'with_curve',
+           'sure_rows', 'thermal_alone', 'thermal_stream', 'request_for',
+           'uncertainty_g', 'verify', 'with_curve',
            'with_given_mounting', 'with_history', 'with_rest_noise', 'without_curve']

@@ -327,12 +327,16 @@ class Calibration(Record):
                 for key in (*_HELD, *self.poses.quantities)
                 if key in wanted and key in known and np.any(used)}
 
+    @cached_property
+    def typical(self) -> Mapping[str, float]:
+        """Middle of `ranges` of each column, or its value of no change."""
+        return {**self.model.neutral,
+                **{key: sum(limits) / 2.0 for key, limits in self.ranges.items()}}
+
     def typical_context(self, count: int) -> Context:
         """Return the middle of `ranges` for `count` samples, without motion and vibration."""
         none = np.zeros((count, 3))
-        typical = {**self.model.neutral, **{key: sum(limits) / 2.0
-                                            for key, limits in self.ranges.items()}}
-        middle = {key: np.full(count, value) for key, value in typical.items()}
+        middle = {key: np.full(count, value) for key, value in self.typical.items()}
         return {'std': none, 'previous': none, 'rate': none, 'time': np.zeros(count), **middle}
 
     def held(self, known: _Known) -> _Known:

@@ -362,8 +362,12 @@ def next_pose(directions: Floats, name: str = '10', noise: Floats | None = None,
         words = f'more poses no longer help: {count} poses determine |a| to within {certain}'
         return NextPose(None, words, error, count, fits)
     total = count + len(list(_planned(name, directions, information, _SPARE)))
-    words = f'turn the sensor so that {words_of(up)} points up ({axes_of_signs(up)})'
-    return NextPose(up, words, error, total, fits)
+    return NextPose(up, request_for(up), error, total, fits)
+
+
+def request_for(up: Floats) -> str:
+    """Return the request to let a side, an edge or a corner point up."""
+    return f'turn the sensor so that {words_of(up)} points up ({axes_of_signs(up)})'
 
 
 def _planned(name: str, directions: Floats, information: Floats, spare: int) -> Iterator[Floats]:

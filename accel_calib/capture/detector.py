@@ -337,12 +337,14 @@ def check_finite(given: Floats, row: NDArray[np.int64]) -> None:
                          'finite numbers', 'remove that row, or repair the recording')
 
 
-def poses_from(dwells: Sequence[Dwell], settings: CaptureSettings = CaptureSettings()) -> Poses:
+def poses_from(dwells: Sequence[Dwell], settings: CaptureSettings = CaptureSettings(), *,
+               partial: bool = False) -> Poses:
     """
     Return the pose table of these dwells.
 
     It has the columns that all dwells have, ``orientation`` if ``max_dwell`` is finite, and
-    ``doubtful`` and ``at_limit`` if a dwell is.
+    ``doubtful`` and ``at_limit`` if a dwell is. `partial`: it also has the numbers beside them
+    that some dwells have, with NaN for the others.
 
     """
     def of(name: str) -> Floats:
@@ -351,9 +353,9 @@ def poses_from(dwells: Sequence[Dwell], settings: CaptureSettings = CaptureSetti
     columns: dict[str, NDArray[Any]] = {
         'time': of('time'), 'reading': of('mean').reshape(-1, 3), 'std': of('std').reshape(-1, 3),
         'count': of('count')}
-    for name in dwells[0].context if dwells else ():
-        if all(name in each.context for each in dwells):
-            columns[name] = np.array([each.context[name] for each in dwells])
+    for name in dict.fromkeys(name for each in dwells for name in each.context):
+        if all(name in each.context for each in dwells) or (partial and name != 'rate'):
+            columns[name] = np.array([each.context.get(name, np.nan) for each in dwells])
     if 'rate' in columns and np.isfinite(of('rate_std')).all():
         columns['rate_std'] = of('rate_std')
     if np.isfinite(settings.max_dwell):

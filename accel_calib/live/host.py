@@ -30,13 +30,13 @@ import numpy as np
 
 from .server import PAGE, PageServer, PERIOD
 from .viewer import Message
-from ..calibrate import Calibration
+from ..calibrate import angle_words, Calibration
 from ..errors import AccelCalibError, InputError, system_error
 from ..findings import rate, residual_figures
 from ..messages.one_reading import Triple
 from ..report import calibration_page, STORED
 from ..session import (
-    Answer, BATCH, CalibratorSettings, CallSoon, checks, Commands, Compute, Event, Level, Log,
+    Answer, BATCH, CalibratorSettings, CallSoon, Commands, Compute, conditions, Event, Level, Log,
     Result, Session, Severity, ShowPoses, state, Task, Throttle, title, words_of_state, Worker)
 from ..stored.exports import export, Exported
 from ..table import Floats
@@ -136,7 +136,7 @@ class Exchange:
     def _command(self, name: str) -> Task:
         if name in ('enable', 'disable'):
             return self._commands.enable(name == 'enable')
-        return (yield from getattr(self._commands, name)())
+        return (yield from self._commands.run(name))
 
     def _draw(self, answer: Answer) -> None:
         """Draw the calibration page, unless it is drawn already, or being drawn."""
@@ -192,6 +192,8 @@ def _state(session: Session, problem: str, *, busy: str, page: int) -> Message:
         'calibration': '' if in_use is None else title(in_use),
         'preview': sensor.offered is not None,
         'levelled': shown is not None and shown.is_levelled,
+        'mounting': '' if shown is None or not shown.is_levelled else (
+            f'the sensor is mounted with {angle_words(shown.rotation)}'),
         'file': session.files.path, 'busy': busy,
         'counts_per_g': None if shown is None or not shown.units.is_native else np.mean(
             np.linalg.norm(shown.gain, axis=0)),
@@ -203,8 +205,8 @@ def _state(session: Session, problem: str, *, busy: str, page: int) -> Message:
 
 def _problem(session: Session) -> str:
     """Return the most severe finding, other than that there is no calibration yet."""
-    found = [each for each in checks(session) if each.level > Level.OK and (
-        each.name != 'calibration' or session.sensor.calibration or session.problem)]
+    found = [each for each in conditions(session) if each.level and (
+        each.name or each.level == Level.ERROR)]
     return max(found, key=lambda each: each.level).words if found else ''
 
 

@@ -29,6 +29,9 @@ from ..units import STANDARD_GRAVITY, UnitName
 FRACTION = 'time_ns'
 """Key of a column with the nanoseconds of a time in whole seconds."""
 
+_MAY_LACK = ('temperature', 'supply_voltage')
+"""Columns that rows of a partial table may lack."""
+
 CONTEXT = (*RATE, 'temperature', 'supply_voltage')
 """Columns that are used only where they are plain."""
 
@@ -69,6 +72,8 @@ class LogOptions:
         Topics of temperature and supply voltage of a bag, ``TOPIC`` or ``TOPIC:FIELD``.
     in_child : bool
         Whether a binary file is read in a child process with limits, rather than in this one.
+    partial : bool
+        Whether columns of the context may have empty cells, which are NaN.
 
     """
 
@@ -84,6 +89,7 @@ class LogOptions:
     temperature_topic: str = ''
     supply_topic: str = ''
     in_child: bool = True
+    partial: bool = False
 
     @property
     def instance(self) -> str:
@@ -107,8 +113,8 @@ class Chosen:
 
     `sources` are the columns by key of `COLUMNS`; those of ``KEY/`` divide the ones of a key, and
     ``instance`` is the number of the sensor. The others are indices: of the columns of numbers
-    that each row needs, of `labels`, of `dates` (times as text), and of further columns of
-    numbers, the `quantities`.
+    that each row needs, of those of the `context` that rows may lack, of `labels`, of `dates`
+    (times as text), and of further columns of numbers, the `quantities`.
 
     """
 
@@ -116,6 +122,7 @@ class Chosen:
     sources: Mapping[str, tuple[Source, ...]]
     maker: LogFormat | None
     needed: tuple[int, ...]
+    context: tuple[int, ...]
     labels: tuple[int, ...]
     dates: tuple[int, ...]
     quantities: Mapping[str, int]
@@ -123,7 +130,7 @@ class Chosen:
     @property
     def numeric(self) -> tuple[int, ...]:
         """Return the indices of all columns of numbers."""
-        return (*self.needed, *self.quantities.values())
+        return (*self.needed, *self.context, *self.quantities.values())
 
     def numbers(self, cells: Cells, key: str) -> Floats:
         """Return the (n, k) numbers of a key as in the file; divided, if its maker says so."""
@@ -178,24 +185,27 @@ def chosen(layout: Layout, options: LogOptions) -> Chosen:
     sources = {key: tuple(found[name] for name in own.names) for key, own in COLUMNS.items()
                if found.keys() >= {*own.names}}
     sources |= {key: (source,) for key, source in found.items() if key not in OURS}
-    return _with_indices(layout, sources, maker)
+    return _with_indices(layout, sources, maker, options.partial)
 
 
 def _with_indices(layout: Layout, sources: Mapping[str, tuple[Source, ...]],
-                  maker: LogFormat | None) -> Chosen:
+                  maker: LogFormat | None, partial: bool) -> Chosen:
     index = {key: tuple(source.index for source in own) for key, own in sources.items()}
     clocks = layout.first(index['time'][0])[:_FIRST_ROWS] if 'time' in index else []
     dates = index['time'] if clocks and all(map(is_clock, clocks)) else ()
     texts = {'label', 'time'} if dates else {'label'}
     needed = {k for key, which in index.items() if key not in texts for k in which}
+    context = {k for key in _MAY_LACK for k in index.get(key, ())} if partial else set[int]()
     used = {k for which in index.values() for k in which}
     quantities: dict[str, int] = {}  # the other columns of numbers that can be a cause
     for k, name in enumerate(() if maker else layout.header[:MOST]):
         free = k not in used and meaning(name).quantity in ('', *sources) and may_cause(name)
-        if free and quantity_key(name) and _are_numbers(layout.first(k)):
+        cells = layout.first(k)
+        cells = list(filter(None, cells)) or cells if partial else cells
+        if free and quantity_key(name) and _are_numbers(cells):
             quantities.setdefault(quantity_key(name), k)
-    return Chosen(layout, sources, maker, tuple(sorted(needed)), index.get('label', ()), dates,
-                  quantities)
+    return Chosen(layout, sources, maker, tuple(sorted(needed - context)),
+                  tuple(sorted(context)), index.get('label', ()), dates, quantities)
 
 
 def _are_numbers(cells: Sequence[str]) -> bool:

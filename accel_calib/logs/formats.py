@@ -249,7 +249,7 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
     def converted() -> Iterator[Poses]:
         for block in chain((first,), cells):
             columns, row = quantities.columns(block)
-            check_values(columns, str(path))
+            check_values(columns, str(path), partial=options.partial)
             yield Poses(columns, row, **{**text.layout.about, 'units': quantities.units.name})
 
     blocks, poses = converted(), None
@@ -264,7 +264,8 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
                 width = 2 if text.layout.encoding.startswith('utf-16') else 1
                 count = max(count, int(text.size / width / max(text.characters, 1) * count))
         else:
-            poses = _pose_table(path, concatenated([head, *blocks]), quantities)
+            poses = _pose_table(path, concatenated([head, *blocks]), quantities,
+                                partial=options.partial)
             samples, count = _as_samples(path, poses), len(poses)
     rate = '' if quantities.rate_hz is None else f'{quantities.rate_hz:g} Hz (stated)'
     return OpenLog(samples, count, quantities.units, head.sensor,
@@ -273,9 +274,10 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
                    findings=tuple(quantities.findings))
 
 
-def _pose_table(path: Path, poses: Poses, quantities: Quantities) -> Poses:
+def _pose_table(path: Path, poses: Poses, quantities: Quantities, *, partial: bool) -> Poses:
     """Return rows as poses, without quantities that are not numbers; refuse samples."""
-    lacking = [key for key in poses.quantities if not np.isfinite(poses[key]).all()]
+    lacking = [] if partial else [
+        key for key in poses.quantities if not np.isfinite(poses[key]).all()]
     if lacking:
         quantities.notes.append(f'not used, because cells are not numbers: {some(lacking)}')
     if are_untimed_samples(poses.columns):

@@ -34,9 +34,14 @@ from ..text import counted, one_line
 _DIGITS = '.12g'
 
 
-def read_poses(path: Path) -> Poses:
-    """Return the poses of a pose table; a recording is an InputError, as others in `open_log`."""
-    with open_log(path) as log:
+def read_poses(path: Path, *, partial: bool = False) -> Poses:
+    """
+    Return the poses of a pose table; a recording is an InputError, as others in `open_log`.
+
+    `partial`: columns of the context with empty cells, which are NaN, are kept.
+
+    """
+    with open_log(path, LogOptions(partial=partial)) as log:
         if log.poses is not None:
             return log.poses
         raise InputError(f'{path} is a recording of {counted(sum(map(len, log.blocks)), "sample")}'
@@ -91,7 +96,7 @@ def _as_text(values: NDArray[Any]) -> list[list[str]]:
     if values.dtype.kind in 'US':
         return [values.tolist()]
     digits = '.16g' if values.ndim == 1 else _DIGITS  # stamps need all digits
-    return [[format(value, digits) for value in column.tolist()]
+    return [['' if value != value else format(value, digits) for value in column.tolist()]
             for column in np.atleast_2d(values.T)]
 
 

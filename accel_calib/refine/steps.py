@@ -376,7 +376,8 @@ def _directions(force: Floats, share_mg: Floats) -> str:
     counts = np.sum(near, axis=1)
     means = np.where(counts > 0, near @ share_mg / np.maximum(counts, 1), 0.0)
     sizes = np.round(np.abs(means) / max(float(np.max(np.abs(means))), 1e-300), 6)
-    largest = [k for k in np.argsort(-sizes, kind='stable')[:3] if counts[k]]  # the first of equals
+    # The first of equals, which a sum in another order does not change.
+    largest = [k for k in np.argsort(-sizes, kind='stable')[:3] if counts[k]]
     return 'with ' + ', '.join(
         f'{axes_of_signs(signs[k])} up ({means[k]:+.2g} mg over {counts[k]} of {len(share_mg)} '
         'poses)' for k in largest)

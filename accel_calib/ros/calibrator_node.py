@@ -18,6 +18,7 @@ EventsExecutor.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import partial
 from queue import SimpleQueue
 from time import monotonic
 from traceback import format_exc
@@ -46,7 +47,7 @@ from ..live import check_installed
 from ..messages.correction import output_frame
 from ..session import (
     CalibratorSettings, CallSoon, Check, checks, COMMANDS, context_topics, Event, figures, Level,
-    Log, Mounting, Result, Session, ShowPoses, state, Still, Task, Worker, worst)
+    Log, Mounting, next_action, Result, Session, ShowPoses, state, Still, Task, Worker, worst)
 from ..table import Floats
 
 if TYPE_CHECKING:
@@ -157,8 +158,7 @@ class Calibrator:
 
     def _serve(self) -> None:
         for name in COMMANDS:
-            command = getattr(self.session.commands, name)
-            serve(self._node, name, command, self._worker)
+            serve(self._node, name, partial(self.session.commands.run, name), self._worker)
         self._node.create_service(SetBool, '~/enable', self._on_enable, qos_profile=CALLS)
         self._node.create_service(SelfTest, '~/self_test', self._on_self_test, qos_profile=CALLS)
 
@@ -221,7 +221,7 @@ class Calibrator:
     def _show_diagnostics(self) -> None:
         found = checks(self.session)
         array = DiagnosticArray(status=[
-            self._status(worst(self.session, found), figures(self.session)),
+            self._status(worst(self.session), figures(self.session)),
             *map(self._status, found)])
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._diagnostics.publish(array)
@@ -253,8 +253,8 @@ class Calibrator:
     def _show_progress(self) -> None:
         self._progress_at = monotonic()
         now = state.progress(self.session)
-        self._progress.publish(self._status(Check('progress', Level.OK, now.advice),
-                                            now.figures()))
+        level = next_action(self.session).level
+        self._progress.publish(self._status(Check('progress', level, now.advice), now.figures()))
 
     def _show(self, event: Event) -> None:
         if self._page is not None:

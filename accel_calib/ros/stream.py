@@ -253,7 +253,7 @@ class Stream:
         if rewriter is None:
             return
         try:
-            corrected = rewriter(data, self._session.around.values)
+            corrected = rewriter(data, self._session.around.filled)
         except AccelCalibError as error:
             self._session.reports.uncorrected(error)
             return

@@ -7,20 +7,23 @@ The calibrator without ROS: it takes samples and commands, and returns answers a
 `session` is the entry point, and `core` the state that all other modules read. `commands` contains
 what the user can ask for, and `use` what follows when the calibration or the poses change.
 `sensor` is what belongs to one sensor: `live_capture` captures its poses, and `pose_guide` chooses
-the next one. `stream` describes the messages, and `faults` what is wrong with them. `guidance` is
-the next step, and `state` what topics and pages show. `store` manages and locks files. `worker`
-runs the tasks and defines the events. `settings` defines the parameters. Imports point one way.
+the next one. `stream` describes the messages. `conditions` is what is the case, and the next step;
+`reports` logs it, and `state` is what topics and pages show. `store` manages and locks files.
+`worker` runs the tasks and defines the events. `settings` defines the parameters. Imports point
+one way.
 
 """
 
 from . import state
 from .commands import COMMANDS, Commands
+from .conditions import conditions, next_action
+from .pose_guide import Level
 from .sensor import title
 from .session import BATCH, Session
 from .settings import (
     CalibratorSettings, changed, columns_of, context_topics, default_of, expected, parameter,
     Settings, WEB_PORT)
-from .state import Check, checks, figures, Level, Progress, words_of_state, worst
+from .state import Check, checks, figures, Progress, words_of_state, worst
 from .store import ros_home
 from .worker import (
     Answer, answered, CallSoon, Compute, Event, Files, Log, Mounting, nothing, Result, Severity,
@@ -30,5 +33,5 @@ __all__ = ['BATCH', 'COMMANDS', 'WEB_PORT', 'Answer', 'CalibratorSettings', 'Cal
            'Commands', 'Compute', 'Event', 'Files', 'Level', 'Log', 'Throttle', 'Mounting',
            'Progress', 'Result', 'Session', 'Settings', 'Severity', 'ShowPoses', 'Step', 'Still',
            'Task', 'Worker', 'WorkerProcess', 'answered', 'changed', 'checks', 'columns_of',
-           'context_topics', 'default_of', 'expected', 'figures', 'nothing', 'parameter',
-           'ros_home', 'state', 'title', 'words_of_state', 'worst']
+           'conditions', 'context_topics', 'default_of', 'expected', 'figures', 'next_action',
+           'nothing', 'parameter', 'ros_home', 'state', 'title', 'words_of_state', 'worst']

@@ -15,13 +15,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+import math
 from typing import Any
 
 import numpy as np
 
+from .conditions import next_words, thermometer_words
 from .core import State
-from .faults import thermometer_words
-from .guidance import next_words
 from .pose_guide import plan_for
 from .sensor import gyro_bias_of_rest, Sensor
 from .settings import CalibratorSettings
@@ -69,6 +69,14 @@ class Commands:
     session: State
     offers: bool = False
 
+    def run(self, name: str, **options: bool) -> Task:
+        """Run one of `COMMANDS`, and note why it is refused."""
+        try:
+            return (yield from getattr(self, name)(**options))
+        except AccelCalibError as error:
+            self.session.refuse(name, str(error))
+            raise
+
     # Poses
 
     def capture_pose(self) -> Task:
@@ -111,8 +119,7 @@ class Commands:
         """Refine the calibration; use and store the refined calibration, or only offer it."""
         session = self.session
         fitted = yield from _sound(session, 'refine', refined, session.units, session.name,
-                                   session.sensor.present, thermometer_words(session),
-                                   session.own)
+                                   session.sensor.present, _hint(session), session.own)
         if fitted.refinement is not None:
             session.sensor.guide.follow(fitted.refinement.plan.poses)
         return (yield from self._use(fitted))
@@ -241,7 +248,7 @@ class Commands:
 
 # ----------------------------------------------------------------------------- parts of commands
 
-def poses_changed(session: State, *, ended: bool, new_rest: bool = False) -> None:
+def poses_changed(session: State, *, ended: bool, new_rest: Dwell | None = None) -> None:
     """Draw and store the poses, and fit if auto_fit is set; `ended`: a rest has ended."""
     sensor = session.sensor
     show_poses(session, store=session.files.locked, new_rest=new_rest)
@@ -320,7 +327,7 @@ def _sound(session: State, name: str, function: Callable[..., Fitted], *given: A
         poses = sensor.live.poses(session.found)
         found: Fitted = yield Compute(function, poses, *given)
     except RefusedFitError as error:
-        sensor.guide.refuse(count, error.advice)
+        session.refuse('poses', error.advice)
         raise
     finally:
         session.computing -= 1
@@ -329,12 +336,17 @@ def _sound(session: State, name: str, function: Callable[..., Fitted], *given: A
                            'the result is discarded', f'call ~/{name} again')
     if found.refusal:
         why, advice = found.refusal
-        sensor.guide.refuse(count, advice)
+        session.refuse('poses', advice)
         if found.refinement is not None:
             rate(session, found.refinement)
         raise RefusedFitError(f'{found.words}; not used: {why}', advice)
     sensor.fitted_poses = count
     return found
+
+
+def _hint(session: State) -> str:
+    """Return how the node would get a temperature; empty if it has one."""
+    return '' if math.isfinite(session.around.temperature) else thermometer_words(session)
 
 
 def _levelled(session: State, calibration: Calibration, rest: Dwell) -> Calibration:

@@ -40,6 +40,8 @@ class State:
         That of the messages; None before the first one.
     problem : str
         Why the stored calibration, or the files, cannot be used.
+    is_refused : bool
+        Whether the stored calibration is sound, but not for this node as it was started.
     found : tuple of Finding
         What was found in the samples before they come here.
     enabled : bool
@@ -85,7 +87,8 @@ class State:
         # Messages in ned are those of ros, turned.
         self.frame: FrameName = 'ros' if settings.frame == 'ned' else settings.frame
         self.frame_id: str | None = None
-        self.problem = ''
+        self.problem, self.is_refused = '', False
+        self._refusals: dict[str, tuple[str, tuple[object, ...]]] = {}
         self.found: tuple[Finding, ...] = ()
         self.missing: dict[str, str] = {}
         self.publishers: tuple[str, ...] | None = ()
@@ -107,9 +110,24 @@ class State:
 
     @property
     def context(self) -> dict[str, float]:
-        """Present time [s], if known, and last values of the context."""
+        """Present time [s], if known, and the context as a calibration uses it."""
         stamp = self.statistics.stamp
-        return {**self.around.values, **({} if math.isnan(stamp) else {'time': stamp})}
+        return {**self.around.filled, **({} if math.isnan(stamp) else {'time': stamp})}
+
+    def refuse(self, command: str, words: str) -> None:
+        """Note that a command is refused, or ``poses`` for a fit, and what to do."""
+        self._refusals[command] = words, self._situation(command)
+
+    def refusal_of(self, command: str) -> str:
+        """Return what to do about a command that would be refused again; empty if it may work."""
+        words, situation = self._refusals.get(command, ('', None))
+        return words if situation and situation == self._situation(command) else ''
+
+    def _situation(self, command: str) -> tuple[object, ...]:
+        """Return what a refusal of a command depends on."""
+        sensor, rests = self.sensor, command in ('set_level', 'calibrate_at_rest')
+        return (id(sensor), len(sensor.live.book.poses()), sensor.changes,
+                rests and sensor.live.detector.current() is None)
 
     def log(self, severity: Severity, words: str, kind: str = '', once_in: float = 0.0) -> None:
         """Add a log line to the events; of a kind, if it has one, at most one in `once_in` [s]."""

@@ -62,11 +62,12 @@ class PoseBook:
         return [*self._earlier, *self._dwells, *self.held]
 
     def poses(self) -> Poses:
-        """Return the pose table."""
+        """Return the pose table, with NaN where a pose lacks a column of the context."""
         dwells, made = self._all, self._made
         if made is None or len(made[0]) != len(dwells) or not all(map(is_, made[0], dwells)):
             # Merging compares all pairs; the diagnostics ask every second.
-            made = self._made = dwells, poses_from(self._selected(dwells), self._settings)
+            made = self._made = dwells, poses_from(
+                self._selected(dwells), self._settings, partial=True)
         return made[1]
 
     def _selected(self, dwells: list[Dwell]) -> list[Dwell]:
@@ -181,7 +182,8 @@ def _dwell_of(poses: Poses, k: int) -> Dwell:
     time = float(poses['time'][k]) if 'time' in poses else 0.0
     count = float(poses['count'][k]) if 'count' in poses else 1.0
     std = poses['std'][k] if 'std' in poses else poses.reading[k] * 0.0
-    context = {key: poses[key][k] for key in (*CONTEXT, 'rate', *poses.quantities) if key in poses}
+    context = {key: poses[key][k] for key in (*CONTEXT, 'rate', *poses.quantities)
+               if key in poses and np.all(np.isfinite(poses[key][k]))}
     doubtful, at_limit = (name in poses and bool(poses[name][k])
                           for name in ('doubtful', 'at_limit'))
     rate_std = poses['rate_std'][k] if 'rate_std' in poses else np.full(3, np.nan)
@@ -277,7 +279,11 @@ class LiveCapture:
         self.book.mark(lambda each: replace(each, at_limit=ends.get(each.start, each.at_limit)))
         rests = [*(each.rest for each in judged), *self.detector.missing]
         own = [each for each in rests if each.start >= self._begun]
-        return replace(self.book.poses(), findings=(*found, *account_of(own, self._settings)))
+        poses = self.book.poses()
+        partial = [key for key in (*CONTEXT, *poses.quantities)
+                   if key in poses and np.isnan(poses[key]).any()]
+        return replace(poses.without_columns(*partial),
+                       findings=(*found, *account_of(own, self._settings)))
 
     def capture(self, rest: Dwell) -> None:
         """Capture the ongoing rest as a pose."""

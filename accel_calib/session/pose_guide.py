@@ -4,24 +4,32 @@
 """
 The next pose for the person who turns the sensor, and one line per pose.
 
-The next pose is chosen again only when a pose is added or removed. While a rest lasts, the advice
-therefore stays the same, although the average of its pose still changes.
+The next pose is chosen again only when a pose is added or removed, or a request was not followed.
+While a rest lasts, the advice therefore stays the same, although the average of its pose still
+changes.
+
+A rest answers the request before it. An answer in another direction is noted. If the answers agree
+with swapped or inverted axes, poses are asked for in the axes that the sensor reads. Otherwise the
+request is not repeated.
 
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from enum import IntEnum
+from itertools import permutations, product
 import math
 
 import numpy as np
 
-from ..calibrate import directions_of, next_pose, NextPose
+from ..calibrate import directions_of, lies_in_cone, next_pose, NextPose, request_for
 from ..errors import RefusedFitError
 from ..estimate import fit_sphere, pose_noise
-from ..geometry import coverage
+from ..geometry import attitude_words, ATTITUDES, axes_of_signs, coverage, unit
 from ..refine import PlannedPose
 from ..table import Floats, Poses
 from ..units import MG, Units
@@ -29,11 +37,76 @@ from ..units import MG, Units
 _TAKEN = math.cos(math.radians(17.0))
 """A pose within 17° of a planned one counts as taken, as for the next pose of a fit."""
 
+_FOLLOWED = math.cos(math.radians(30.0))
+"""A rest within 30° of what was asked for has followed; the next orientations are 35° away."""
+
+_APART = math.cos(math.radians(50.0))
+"""Requests 50° to 130° apart show two axes."""
+
 _FEWEST_NATIVE = 4
 """Smallest number of poses to estimate the centre of native readings."""
 
-_WITHOUT_NEW = 60.0
+_WITHOUT_NEW = 30.0
 """Time without a new pose after which the robot probably cannot be turned further [s]."""
+
+NOT_FOLLOWED = 3
+"""Number of requests in a row that are not followed, with the same meaning."""
+
+_FEWEST_WRONG = 2
+"""Smallest number of wrong answers that show swapped or inverted axes."""
+
+
+class Level(IntEnum):
+    """Severity, as in diagnostic_msgs/DiagnosticStatus."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+
+
+@dataclass(frozen=True)
+class Condition:
+    """
+    What is the case, and what to do about it.
+
+    Parameters
+    ----------
+    kind : str
+        Kind of the step, one of `accel_calib.finding.STEPS`; empty: not known yet.
+    words : str
+        What is the case and what to do.
+    command : str
+        Name of the service for it; may be empty.
+    direction : tuple of float
+        Direction to point up, a unit vector in the sensor axes; empty: none.
+    level : Level
+        Severity.
+    concern : str
+        The check of the diagnostics that it belongs to.
+    name : str
+        Name among all that can be wrong, for the log; empty: an ordinary step.
+
+    """
+
+    kind: str
+    words: str
+    command: str = ''
+    direction: tuple[float, ...] = ()
+    level: Level = Level.OK
+    concern: str = 'calibration'
+    name: str = ''
+
+
+NOT_KNOWN = Condition('', '')
+
+_SERVICES = {'fit': 'fit', 'refine': 'refine', 'level': 'set_level', 'save': 'save'}
+"""Service for each kind of step that has one."""
+
+
+def calling(kind: str, text: str) -> Condition:
+    """Return a step with the call of its service."""
+    command = _SERVICES.get(kind, '')
+    return Condition(kind, f'{text}; call ~/{command}' if command else text, command)
 
 
 @dataclass(frozen=True)
@@ -56,12 +129,13 @@ class Plan:
     zero: tuple[float, ...] = ()
 
 
-def plan_for(poses: Poses, units: Units, model: str) -> Plan:
+def plan_for(poses: Poses, units: Units, model: str, skipped: Sequence[Floats] = ()) -> Plan:
     """
     Return the next pose for a fit of this model, or that more poses no longer help.
 
     As long as the directions of native readings are not known, the poses are taken for those that
-    were asked for. Otherwise the same pose would be asked for again.
+    were asked for. Otherwise the same pose would be asked for again. The directions `skipped` are
+    not asked for, unless no others are left.
 
     """
     up: Floats = np.zeros((0, 3))
@@ -77,31 +151,20 @@ def plan_for(poses: Poses, units: Units, model: str) -> Plan:
     while len(supposed) < len(poses) and asked.direction is not None:
         supposed = np.vstack([supposed, asked.direction])
         asked = next_pose(supposed, fitted_model)
+    if asked.direction is not None and len(skipped):
+        other = next_pose(np.vstack([supposed, *skipped]), fitted_model)
+        if other.direction is not None:
+            asked = replace(asked, direction=other.direction, words=other.words)
     # The zero of readings in other units than native ones is known.
     zero = fit_sphere(poses.reading)[1].tolist() if units.is_native and len(up) else ()
     return Plan(asked, len(poses), up, math.nan if noise_g is None else noise_g,
                 coverage(up) if len(up) else 0.0, tuple(zero))
 
 
-@dataclass(frozen=True)
-class Action:
-    """The next step: one of `accel_calib.finding.STEPS`, its words, and its service or ''."""
-
-    kind: str
-    words: str
-    command: str = ''
-
-
-NOT_KNOWN = Action('', '')
-
-_SERVICES = {'fit': 'fit', 'refine': 'refine', 'level': 'set_level', 'save': 'save'}
-"""Service for each kind of step that has one."""
-
-
-def calling(kind: str, text: str) -> Action:
-    """Return a step with the call of its service."""
-    command = _SERVICES.get(kind, '')
-    return Action(kind, f'{text}; call ~/{command}' if command else text, command)
+_AXES = sorted((np.eye(3)[list(order)] * signs for order in permutations(range(3))
+                for signs in product((1.0, -1.0), repeat=3)),
+               key=lambda axes: np.sum(np.diag(axes) != 1.0) + 0.1 * np.sum(axes < 0.0))
+"""The 48 ways in which axes can be swapped and inverted, the most likely first: reading = A up."""
 
 
 class Guide:
@@ -109,33 +172,48 @@ class Guide:
     The next pose, and the lines about captured poses.
 
     `planned` are the poses of a refinement that are still asked for, () once all are taken; None:
-    the poses are for a fit.
+    the poses are for a fit. `axes` are the axes of the readings in those of the sensor, one of the
+    48 with right angles. `missed` counts the last requests in a row that were not followed, and
+    `skipped` are directions that are not asked for. `is_stale`: because of the last rest, another
+    pose is to be asked for.
 
     """
 
     def __init__(self) -> None:
         self._plan: Plan | None = None
         self.planned: tuple[PlannedPose, ...] | None = None
+        self.axes: Floats = _AXES[0]
+        self.skipped: list[Floats] = []
+        self.is_stale = False
+        self._answers = deque[tuple[Floats, Floats]](maxlen=4)
+        self.missed = 0
         self._begun = 0
         self._count = 0
         self._new_at = math.inf
-        self._refused = 0, ''
         self._rest = -math.inf
 
     @property
     def plan(self) -> Plan | None:
         """Return the next pose, or that of a followed refinement; None before the first choice."""
-        if self._plan is None or not self.planned:
-            return self._plan
-        first, plan = self.planned[0], self._plan
-        where = f' {first.conditions}' if first.conditions else ''
-        return replace(plan, asked=NextPose(
-            np.array(first.up), f'hold {first.words}{where}, {first.purpose}', plan.asked.error,
-            plan.poses + len(self.planned), fits=False))
+        plan = self._plan
+        if plan is None:
+            return None
+        asked = plan.asked
+        if self.planned:
+            first = self.planned[0]
+            up = self.axes.T @ first.up
+            words = first.words if self._is_usual else attitude_words(up)
+            where = f' {first.conditions}' if first.conditions else ''
+            asked = NextPose(up, f'hold {words}{where}, {first.purpose}', asked.error,
+                             plan.poses + len(self.planned), fits=False)
+        elif asked.direction is not None and not self._is_usual:
+            up = self.axes.T @ asked.direction
+            asked = replace(asked, direction=up, words=request_for(up))
+        return replace(plan, asked=asked)
 
     @plan.setter
     def plan(self, plan: Plan | None) -> None:
-        self._plan = plan
+        self._plan, self.is_stale = plan, False
         if plan is None or plan.poses < self._begun:
             self.planned = None
         elif self.planned:
@@ -143,12 +221,16 @@ class Guide:
             self.planned = tuple(
                 each for each in self.planned if not np.any(new @ each.up >= _TAKEN))
 
+    @property
+    def _is_usual(self) -> bool:
+        return np.array_equal(self.axes, _AXES[0])
+
     def follow(self, planned: Sequence[PlannedPose]) -> None:
         """Ask for these poses of a refinement next; for none, ask for poses for a fit."""
         self.planned, self._begun = tuple(planned) or None, self.poses
 
     @property
-    def action(self) -> Action:
+    def action(self) -> Condition:
         """Return what to do next with the poses; `NOT_KNOWN` before the first choice."""
         if self.planned == ():
             return calling('refine', 'all poses of the plan are taken')
@@ -158,8 +240,9 @@ class Guide:
         asked = plan.asked
         if asked.direction is None:
             return calling('fit', asked.words)
-        return (Action('poses', f'{asked.words}, or call ~/fit', 'fit') if asked.fits
-                else Action('poses', asked.words))
+        words, command = (f'{asked.words}, or call ~/fit', 'fit') if asked.fits else (
+            asked.words, '')
+        return Condition('poses', words, command, tuple(asked.direction.tolist()))
 
     @property
     def poses(self) -> int:
@@ -173,19 +256,9 @@ class Guide:
             self._new_at = stamp
         return change
 
-    def refuse(self, poses: int, advice: str) -> None:
-        """Note that a fit to this number of poses is refused, and what to do."""
-        self._refused = poses, advice
-
-    @property
-    def refused_advice(self) -> str:
-        """Return what to do after a refused fit to the present poses; empty otherwise."""
-        poses, advice = self._refused
-        return advice if poses == self.poses else ''
-
     def is_stuck(self, stamp: float) -> bool:
-        """Return whether a fit is refused, or no pose has been new for a minute."""
-        return bool(self.refused_advice) or stamp - self._new_at >= _WITHOUT_NEW
+        """Return whether several requests were not followed, or no pose is new for a time."""
+        return self.missed >= NOT_FOLLOWED or stamp - self._new_at >= _WITHOUT_NEW
 
     def is_new_rest(self, start: float) -> bool:
         """Return whether a captured rest with this start has no line yet, and note it."""
@@ -193,17 +266,71 @@ class Guide:
         self._rest = max(start, self._rest)
         return new
 
-    def line(self, poses: Poses, units: Units, action: Action, *, added: bool) -> str:
+    def rested(self, mean: Floats, units: Units) -> str:
+        """Note the mean reading of a new rest; return how it is not what was asked for, or ''."""
+        plan = self.plan
+        if plan is None or not plan.poses or plan.asked.direction is None or (
+                units.is_native and not plan.zero):
+            return ''
+        asked, read = plan.asked.direction, unit(mean - np.array(plan.zero or (0.0, 0.0, 0.0)))
+        self._answers.append((asked, read))
+        if read @ self.axes @ asked >= _FOLLOWED:
+            self.missed = 0
+            return ''
+        words = f'asked for {_signs(asked)}, the sensor reads {_signs(read)}'
+        self.skipped.append(self.axes @ asked)
+        self.missed, self.is_stale = self.missed + 1, True
+        axes = self._likely_axes(plan.up)
+        if not np.array_equal(axes, self.axes):
+            self.axes, self.skipped, self.missed = axes, [], 0
+        return words
+
+    def _likely_axes(self, up: Floats) -> Floats:
+        """Return the axes in which the last answers follow; `up` are the poses, (n, 3)."""
+        asked, read = map(np.array, zip(*self._answers, strict=True))
+        # Opposite requests show one axis alone, and a robot that tilts reads the same without end.
+        telling = np.min(np.abs(asked @ asked.T)) < _APART and not lies_in_cone(
+            np.vstack([up, read]))
+        if telling and np.sum(np.sum(read * asked, axis=1) < _FOLLOWED) >= _FEWEST_WRONG:
+            for axes in _AXES:
+                if np.all(np.sum(read * (asked @ axes.T), axis=1) >= _FOLLOWED):
+                    return axes
+        return _AXES[0]
+
+    @property
+    def axes_words(self) -> str:
+        """Return how the axes are probably swapped or inverted; empty if they are not."""
+        if self._is_usual:
+            return ''
+        inverted = [f'{name} axis' for name, sign in zip('xyz', np.diag(self.axes), strict=True)
+                    if sign < 0.0]
+        if np.count_nonzero(np.diag(self.axes)) == 3:
+            what = (f'the {" and the ".join(inverted)} of the readings '
+                    f'{"is" if len(inverted) == 1 else "are"} probably inverted')
+        else:
+            reads = {f'+{name}': _signs(read) for name, read in zip('xyz', self.axes.T)}
+            what = 'the axes of the readings are probably swapped: ' + ', '.join(
+                f'{name} reads {read}' for name, read in reads.items() if name != read)
+        return (f'{what}; a calibration does not mind, but the mounting does: correct the driver, '
+                'and take the poses again')
+
+    def line(self, poses: Poses, units: Units, action: Condition, *, added: bool) -> str:
         """Return the line about a rest that `added` a pose or repeats one; empty if no news."""
         if self.plan is None or action is NOT_KNOWN:
             return ''
         more, total = action.kind == 'poses', self.plan.asked.total
         if not added:
             return f'this rest repeats an earlier pose; next: {action.words}' if more else ''
-        count = f'{len(poses)} of about {total}' if more else f'{len(poses)}'
+        count = f'{len(poses)} of about {total}' if more and len(poses) < total else (
+            f'{len(poses)}')
         noise = ''
         if poses.noise is not None and not units.is_native:
             latest = poses.noise[int(np.argmax(poses['time']))]
             noise = f', {float(np.mean(units.to_g(latest))) * MG:.2f} mg'
         then = '' if action.kind == 'done' else f', next: {action.words}'
         return f'pose {count}{noise}{then}'
+
+
+def _signs(up: Floats) -> str:
+    """Return the axes of the side, edge or corner nearest to a direction."""
+    return axes_of_signs(ATTITUDES[int(np.argmax(ATTITUDES @ up))])

@@ -17,10 +17,10 @@ from time import monotonic
 import numpy as np
 
 from .commands import Commands, due, poses_changed
+from .conditions import next_action
 from .core import State
-from .faults import FAULT_AGAIN, Reports
-from .guidance import next_action
 from .live_capture import Change
+from .reports import FAULT_AGAIN, Reports
 from .sensor import Sensor
 from .settings import CalibratorSettings
 from .stream import AGAIN, SILENT
@@ -82,7 +82,6 @@ class Session(State):
         if store is not None:
             self.events.append(load(self, store, self.sensor))
         self._report_still()
-        self.around.expire()
         self.reports.tick()
         self.events += due(self)
 
@@ -184,7 +183,8 @@ class Session(State):
                     self.log('info', f'this rest gave no pose: {rest.words}', rest.reason, AGAIN)
             if change.poses:
                 new = change.rest is not None and sensor.guide.is_new_rest(change.rest.start)
-                poses_changed(self, ended=bool(change.ended), new_rest=new)
+                poses_changed(self, ended=bool(change.ended),
+                              new_rest=change.rest if new else None)
         self._report_still()
 
     def _report_still(self) -> None:

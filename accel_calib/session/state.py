@@ -13,19 +13,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, MISSING
-from enum import IntEnum
 import math
 from typing import Any
 
 import numpy as np
 
+from .conditions import conditions, next_action, thermometer_words
 from .core import State
-from .faults import missing_context, stream_faults, thermometer_words
-from .guidance import next_action
+from .pose_guide import Condition, Level
 from .sensor import title
 from .settings import context_topics
 from .stream import SILENT
-from ..calibrate import USES_LIMIT
 from ..compare import status
 from ..errors import InputError
 from ..finding import has
@@ -146,7 +144,6 @@ def progress(session: State, reading: Triple | None = None) -> Progress:
     # NaN if it is not known, or not the noise alone.
     noisy = rating is not None and has(rating.findings, 'beyond_noise')
     accuracy = math.nan if plan is None or noisy else plan.asked.error * plan.noise_g
-    direction = None if plan is None or action.kind != 'poses' else plan.asked.direction
     return Progress(
         still=session.still and not silent,
         stillness=math.nan if silent else session.stillness,
@@ -156,7 +153,7 @@ def progress(session: State, reading: Triple | None = None) -> Progress:
         coverage=0.0 if plan is None else plan.coverage,
         accuracy=accuracy, step=action.kind, advice=action.words,
         command=action.command,
-        direction=() if direction is None else tuple(direction.tolist()),
+        direction=action.direction,
         up=up, length=length, corrected=corrected, temperature=session.around.temperature)
 
 
@@ -183,14 +180,6 @@ def _unit(vector: Sequence[float], length: float) -> tuple[float, ...]:
     return tuple(part / length for part in vector) if 0.0 < length < math.inf else ()
 
 
-class Level(IntEnum):
-    """Severity, as in diagnostic_msgs/DiagnosticStatus."""
-
-    OK = 0
-    WARN = 1
-    ERROR = 2
-
-
 @dataclass(frozen=True)
 class Check:
     """The result of one check: name, severity and text."""
@@ -202,24 +191,34 @@ class Check:
 
 def checks(session: State) -> list[Check]:
     """Return the results of all checks, one for each concern."""
-    faults = {**stream_faults(session), **missing_context(session)}
-    drift, store, path = session.sensor.drift, session.files.store, session.files.path
-    return [
-        Check('stream', Level.WARN, '; '.join(faults.values())) if faults else
-        Check('stream', Level.OK, f'{session.statistics.rate:.1f} Hz on {session.topic}'),
-        _calibration(session),
-        Check('drift', Level.OK, 'no calibration yet') if drift is None else
-        Check('drift', Level.OK if drift.change is None else Level.WARN, status(drift)),
-        Check('storage', Level.OK, path) if store is None or store.is_writable() else
-        Check('storage', Level.ERROR, f'{path} cannot be written: correct the permissions, or '
-              'restart the node with another calibration_file')]
+    sensor, found = session.sensor, conditions(session)
+    drift = sensor.drift
+    fine = {'stream': f'{session.statistics.rate:.1f} Hz on {session.topic}',
+            'calibration': '' if sensor.calibration is None else title(sensor.calibration),
+            'drift': 'no calibration yet' if drift is None else status(drift),
+            'storage': session.files.path}
+    if sensor.calibration is None and sensor.offered is None:
+        count = counted(len(sensor.live.book.poses()), 'pose')
+        fine['calibration'] = f'no calibration yet, captured {count}'
+    return [_check(concern, [each for each in found if each.concern == concern and each.level],
+                   words) for concern, words in fine.items()]
 
 
-def worst(session: State, found: Sequence[Check]) -> Check:
-    """Return the most severe of the checks, or the state of the session if all are OK."""
-    severest = max(found, key=lambda check: check.level)
-    words = words_of_state(session) if severest.level == Level.OK else severest.words
-    return Check('state', severest.level, words)
+def _check(concern: str, wrong: Sequence[Condition], fine: str) -> Check:
+    said = list(dict.fromkeys(each.words for each in wrong))
+    if wrong and not any(each.name or each.level == Level.ERROR for each in wrong):
+        said = [': '.join(filter(None, [fine, *said[:1]])), *said[1:]]
+    return Check(concern, max([Level.OK, *(each.level for each in wrong)]),
+                 '; '.join(said) or fine)
+
+
+def worst(session: State) -> Check:
+    """Return the check of the first of the most severe conditions, or the state if all is OK."""
+    first = max(conditions(session), key=lambda each: each.level)
+    if not first.level:
+        return Check('state', first.level, words_of_state(session))
+    words = next(each.words for each in checks(session) if each.name == first.concern)
+    return Check('state', first.level, words)
 
 
 def words_of_state(session: State) -> str:
@@ -235,29 +234,6 @@ def words_of_state(session: State) -> str:
         (not session.statistics.messages, 'waiting for the first message'),
         (session.settings.passthrough, 'no calibration, raw messages are published'),
         (True, 'no calibration, nothing is published')) if holds)
-
-
-def _calibration(session: State) -> Check:
-    sensor = session.sensor
-    if session.problem:
-        return Check('calibration', Level.ERROR, session.problem)
-    if not session.enabled:
-        return Check('calibration', Level.WARN, f'{words_of_state(session)}: call ~/enable with '
-                     'true to correct them')
-    if sensor.calibration is None:
-        count = counted(len(sensor.live.book.poses()), 'pose')
-        state = '' if sensor.offered else f'no calibration yet, captured {count}: '
-        return Check('calibration', Level.WARN, f'{state}{_advice(session)}')
-    left = sensor.limits_left(session.context)
-    words = [each.words for key, each in left.items() if key != 'std']
-    if words:
-        return Check('calibration', Level.WARN, f'{"; ".join(words)}: {USES_LIMIT}; '
-                     'capture poses there and call ~/refine')
-    return Check('calibration', Level.OK, title(sensor.calibration))
-
-
-def _advice(session: State) -> str:
-    return next_action(session).words or 'turn the sensor'
 
 
 def figures(session: State) -> Iterator[tuple[str, str]]:
@@ -311,7 +287,7 @@ def _pose_figures(session: State) -> Iterator[tuple[str, str]]:
     poses, breaks = live.book.poses(), live.detector.interruptions
     yield 'poses captured', str(len(poses))
     yield 'poses doubtful', str(int(np.sum(poses['doubtful'])) if 'doubtful' in poses else 0)
-    yield 'next', _advice(session)
+    yield 'next', next_action(session).words or 'turn the sensor'
     yield 'interruptions of the clock', str(len(breaks))
     yield 'last interruption', (
         f'{breaks[-1].kind}, {breaks[-1].seconds:.2f} s' if breaks else 'none')

@@ -146,7 +146,7 @@ class Store:
         if size > _LARGEST_TABLE:
             raise InputError(f'{self.poses} has {size} bytes, expected at most {_LARGEST_TABLE}',
                              'new poses start a new table')
-        poses = read_poses(self.poses)
+        poses = read_poses(self.poses, partial=True)
         if 'count' in poses and np.any(poses['count'] < 1.0 / LARGEST):
             row = int(np.argmin(poses['count'])) + 1
             raise InputError(f'{self.poses}: row {row} has an impossible count, expected at least '
@@ -180,7 +180,11 @@ class Store:
         data, is_good = prepared
         self.calibration.parent.mkdir(parents=True, exist_ok=True)
         step = self._keep_step(is_good)
-        write_atomically(self.calibration, lambda file: file.buffer.write(data))
+        try:
+            write_atomically(self.calibration, lambda file: file.buffer.write(data))
+        except OSError:
+            step.unlink(missing_ok=True)
+            raise
         if step.read_bytes() == data:
             step.unlink()
 

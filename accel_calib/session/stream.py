@@ -22,7 +22,7 @@ import numpy as np
 from .live_capture import LONG_REST
 from ..calibrate import thermal_stream
 from ..effects import Context, Model, ThermalStream
-from ..table import Floats, is_quantity
+from ..table import Floats
 from ..units import Units
 
 _SPAN = 5.0
@@ -42,6 +42,12 @@ _FEWEST = 5
 
 _FEW = 0.5
 """Share of repeated stamps above which the stamps count as constant."""
+
+_OTHER_UNIT = 50.0
+"""Ratio of stamps to arrivals that no bag is played with."""
+
+_ONE_WAY_G = 0.15
+"""Largest change of the mean readings of a sensor that stays in one direction [g]."""
 
 
 class _Batch(NamedTuple):
@@ -72,7 +78,7 @@ class StreamStatistics:
     messages : int
         Number of messages.
     dropped : Counter of str
-        Number of dropped ones, by the kinds of `_DROPPED`.
+        Number of dropped ones by kind.
     stamp, arrived : float
         Stamp of the last message, and its arrival by the steady clock [s].
     newest : (3,) array or None
@@ -117,8 +123,16 @@ class StreamStatistics:
         rate = math.degrees(way) / seconds if seconds > 0.8 * _HELD else 0.0
         return rate if rate > _TURNS else 0.0
 
+    def shaken(self, per_g: float) -> float:
+        """Return the smallest spread of the last batches in one direction; 0 if it has turned."""
+        means = np.array([each.mean for each in self._batches]).reshape(-1, 3)
+        seconds = self.arrived - self._batches[0].arrived if self._batches else 0.0
+        if seconds < 0.8 * _SPAN or np.max(np.ptp(means, axis=0)) > _ONE_WAY_G * per_g:
+            return 0.0
+        return min(each.spread for each in self._batches)
+
     def drop(self, kind: str, count: int = 1) -> None:
-        """Count dropped messages of one of the kinds of `_DROPPED`."""
+        """Count dropped messages of a kind."""
         self.dropped[kind] += count
         if kind != 'implausible':  # its raw message is already counted
             self.messages += count
@@ -166,26 +180,43 @@ class StreamStatistics:
         if messages < _FEWEST:
             return ''
         driver = 'expected the time of each reading: set header.stamp in the driver'
-        return next((f'the stamps are {words}' for holds, words in (
-            (zero > _FEW * messages, f'zero, {driver}'),
-            (repeated > _FEW * messages, f'constant ({self.stamp:.3f} s), {driver}'),
-            (backward > 1, f'out of order in {backward} of the last {messages} messages, expected '
-             'increasing stamps: check that only one driver publishes')) if holds), '')
+        first, last = self._batches[0], self._batches[-1]
+        stamped, arrived = last.stamp - first.stamp, last.arrived - first.arrived
+        factor = abs(stamped) / arrived if arrived > 0.5 * _SPAN else 1.0
+        return next((f'the stamps {words}' for holds, words in (
+            (zero > _FEW * messages, f'are zero, {driver}'),
+            (repeated > _FEW * messages, f'are constant ({self.stamp:.3f} s), {driver}'),
+            (backward > 1, f'are out of order in {backward} of the last {messages} messages, '
+             'expected increasing stamps: check that only one driver publishes'),
+            (not 1.0 / _OTHER_UNIT < factor < _OTHER_UNIT,
+             f'advance by {stamped:.3g} s in {arrived:.1f} s of messages, about '
+             f'{_power_of_ten(factor)} times as much, expected seconds: the driver states them in '
+             'another unit: correct header.stamp')) if holds), '')
+
+
+def _power_of_ten(factor: float) -> str:
+    return f'1e{round(math.log10(factor))}' if factor > 0.0 else '0'
 
 
 AGAIN = 10.0
 """Shortest time between two equal log lines about single messages or a silent stream [s]."""
 
 HELD = 30.0
-"""Time for which the last value of a quantity holds [s]."""
+"""Time after which a column of which values have arrived counts as missing [s]."""
 
 
 class Around:
     """
-    The last value of each column of the context; `values` is another mapping after each change.
+    The last value of each column of the context, which holds until the next one.
 
-    A quantity holds for `HELD`: after that, its effect is left out. Temperature and supply voltage
-    hold until the next value, because their effects cannot be left out without a jump.
+    Attributes
+    ----------
+    values : mapping of str to float
+        What has arrived; another mapping after each change.
+    assumed : mapping of str to float
+        What a calibration uses for a column of which nothing has arrived.
+    filled : mapping of str to float
+        The values, and what is assumed for the others.
 
     """
 
@@ -193,6 +224,12 @@ class Around:
         self._clock, self._begun = clock, clock()
         self._came: dict[str, float] = {}
         self.values: Mapping[str, float] = {}
+        self.assumed: Mapping[str, float] = {}
+        self.filled: Mapping[str, float] = {}
+
+    def assume(self, assumed: Mapping[str, float]) -> None:
+        """Let a calibration use these values for columns of which nothing has arrived."""
+        self.assumed, self.filled = assumed, {**assumed, **self.values}
 
     @property
     def temperature(self) -> float:
@@ -204,13 +241,7 @@ class Around:
         if math.isfinite(value):
             self._came[column] = self._clock()
             self.values = {**self.values, column: value}
-
-    def expire(self) -> None:
-        """Remove the quantities that hold no longer."""
-        old = [column for column in self.values if is_quantity(column) and self.is_missing(column)]
-        if old:
-            self.values = {column: value for column, value in self.values.items()
-                           if column not in old}
+            self.filled = {**self.assumed, **self.values}
 
     def is_missing(self, column: str) -> bool:
         """Return whether nothing has arrived for too long."""

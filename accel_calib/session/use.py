@@ -9,21 +9,24 @@ Ratings, plans and files take time, so they are tasks, which are added to the ev
 """
 
 import json
+import math
 from typing import Any, cast
 
 import numpy as np
 
+from .conditions import next_action
 from .core import State
-from .guidance import next_action
 from .pose_guide import NOT_KNOWN, plan_for
 from .sensor import Sensor, title
 from .store import Store, tidied, unusable, writing_advice
 from .stream import AGAIN
 from .worker import Compute, Files, Mounting, nothing, Parse, Result, Severity, ShowPoses, Task
 from ..calibrate import Calibration, in_frame, mounting_figures, on_topics, outlook
+from ..capture import CONTEXT, Dwell
+from ..errors import DamagedCalibrationError, StoredCalibrationError
 from ..findings import calibration_json, rate as rating_of, Rating, rating_json, refinement_json
 from ..refine import Refinement
-from ..table import Poses
+from ..table import is_quantity, Poses
 from ..text import counted, plain
 
 _SEVERITY: dict[str, Severity] = {'GOOD': 'info', 'USABLE': 'warning', 'BAD': 'error'}
@@ -33,9 +36,10 @@ _SEVERITY: dict[str, Severity] = {'GOOD': 'info', 'USABLE': 'warning', 'BAD': 'e
 def adopt(session: State, calibration: Calibration | None, refinement: Refinement | None = None,
           rating: Rating | None = None) -> None:
     """Correct with this calibration, and with the given mounting if there is one."""
-    session.problem = ''
+    session.problem, session.is_refused = '', False
     if calibration is None:
         session.sensor.adopt(None)
+        session.around.assume({})
         rate(session, None)
         return
     levelled = calibration.is_levelled
@@ -49,6 +53,8 @@ def adopt(session: State, calibration: Calibration | None, refinement: Refinemen
         session.log('warning', 'the stored mounting differs from the given one by more than 10° '
                     'of tilt: the given mounting is used; call ~/set_level with the robot level')
     session.sensor.adopt(calibration)
+    session.around.assume({key: value for key, value in calibration.typical.items()
+                           if key in CONTEXT or is_quantity(key)})
     rate(session, refinement, rating)
     turned = calibration.is_levelled and session.settings.rotate
     session.log('info', f'correcting with {title(calibration)}; messages are in the frame '
@@ -105,7 +111,7 @@ def rated(calibration: Calibration, refinement: Refinement | None, rating: Ratin
             cast('dict[str, Any]', plain(whole)))
 
 
-def show_poses(session: State, *, store: bool, new_rest: bool = False) -> None:
+def show_poses(session: State, *, store: bool, new_rest: Dwell | None = None) -> None:
     """Add a task that stores the poses, and draws them with the next pose."""
     sensor = session.sensor
     poses = sensor.live.book.poses()
@@ -114,11 +120,13 @@ def show_poses(session: State, *, store: bool, new_rest: bool = False) -> None:
         session, sensor, poses, added, new_rest, session.files.store if store else None))
 
 
-def _draw_poses(session: State, sensor: Sensor, poses: Poses, added: int, new_rest: bool,
-                store: Store | None) -> Task:
+def _draw_poses(session: State, sensor: Sensor, poses: Poses, added: int,
+                new_rest: Dwell | None, store: Store | None) -> Task:
     """Store and draw poses, this number more than before; return the line of a new rest."""
-    guide, given = sensor.guide, (poses, session.units, session.settings.model)
-    due = added != 0 or guide.plan is None
+    guide = sensor.guide
+    missed = '' if new_rest is None else guide.rested(new_rest.mean, session.units)
+    due, given = added != 0 or guide.plan is None or guide.is_stale, (
+        poses, session.units, session.settings.model, tuple(guide.skipped))
     try:
         yield Files(nothing) if store is None else Files(store.save_poses, poses)
     except OSError as error:
@@ -131,9 +139,11 @@ def _draw_poses(session: State, sensor: Sensor, poses: Poses, added: int, new_re
     if plan is not None and sensor is session.sensor:
         guide.plan = plan
         session.events.append(ShowPoses(plan.up, plan.asked, session.frame_id or ''))
-    if not new_rest or sensor is not session.sensor:
+    if new_rest is None or sensor is not session.sensor:
         return ''
-    return guide.line(poses, session.units, next_action(session), added=added > 0)
+    session.log('warning', guide.axes_words, f'axes {guide.axes.tolist()}', math.inf)
+    line = guide.line(poses, session.units, next_action(session), added=added > 0)
+    return '; '.join(filter(None, (missed, line)))
 
 
 def load(session: State, store: Store, sensor: Sensor) -> Task:
@@ -145,6 +155,8 @@ def load(session: State, store: Store, sensor: Sensor) -> Task:
     try:
         calibration = yield Parse(store.load_calibration)
     except Exception as error:  # the node starts in any case
+        session.is_refused = isinstance(error, StoredCalibrationError) and not isinstance(
+            error, DamagedCalibrationError)
         problem = yield Files(unusable, store.calibration, error)
     if calibration is not None and calibration.stream not in ('', store.identity.topic):
         notes.append(f'{store.calibration} was made for {calibration.stream}, but it is used '

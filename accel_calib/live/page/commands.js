@@ -8,7 +8,7 @@ import { token } from './connection.js';
 import { buttonOf, withButtons } from './words.js';
 
 const SHOWN = 10000;  // time for which the answer of a command that succeeded is shown [ms]
-const MOVED = ['set_level', 'refine'];  // the last one comes first
+const MOVED = ['set_level', 'calibrate_at_rest', 'refine'];  // the last one comes first
 
 const buttonFor = (command) => document.querySelector(`#commands [data-command=${command}]`);
 
@@ -75,6 +75,7 @@ export class Commands {
       element(button.dataset.command === command ? 'main-commands' : 'more-commands')
         .prepend(button);
     }
+    buttonFor('calibrate_at_rest').hidden = command !== 'calibrate_at_rest';
     for (const button of this.#buttons) {  // Save is Accept while a calibration is offered
       button.classList.toggle('primary', button.dataset.command === command
         && button.parentElement.id !== 'more-commands');

@@ -9,7 +9,9 @@ import { buttonOf, capitalised, sideOf, withButtons } from './words.js';
 const LONG = ['fit', 'refine'];  // the other commands end before their name could be read
 
 /** Titles of the steps that are no pose and no button. */
-const TITLES = { connect: 'Waiting for data', unit: 'Check the unit', done: 'Done' };
+const TITLES = {
+  connect: 'Check the data', unit: 'Check the unit', still: 'Hold it still',
+  restart: 'Start it in another way', enable: 'Switch the correction on', done: 'Done' };
 
 /**
  * Return the next action: title, words, command, and whether it is a pose.
@@ -26,7 +28,7 @@ export function nextAction(progress, state, open) {
   }
   const { step, command, direction } = progress;
   const words = sentence(progress.advice);
-  if (step === 'accept') return offered(state.rating);
+  if (step === 'accept') return offered(state.rating, state.mounting);
   if (direction.length) {
     return action(`${capitalised(sideOf(direction))} up`, words, command, true);
   }
@@ -38,9 +40,9 @@ export function nextAction(progress, state, open) {
 
 const action = (title, words, command = '', isPose = false) => ({ title, words, command, isPose });
 
-function offered(rating) {
+function offered(rating, mounting) {
   if (!rating) return action('Accept it?', 'Its verdict comes in a moment.', 'save');
-  const words = sentence(rating.reason);
+  const words = [rating.reason, mounting].map(sentence).join(' ').trim();
   if (rating.rating === 'BAD') return action('Bad. Take it back?', words, 'undo');
   return action(`${capitalised(rating.rating.toLowerCase())}. Accept it?`, words, 'save');
 }

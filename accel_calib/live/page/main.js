@@ -108,10 +108,15 @@ function guide(captured) {
 
 function showNumbers(now) {
   text(element('poses'), countOf(now.poses, now.total));
-  text(element('coverage'), now.coverage === null ? '–' : `${Math.round(100 * now.coverage)} %`);
-  text(element('accuracy'), accuracyOf(now.accuracy, state?.counts_per_g));
-  text(element('length'), fixed(now.corrected ?? now.length, 4, ' g'));
-  text(element('temperature'), fixed(now.temperature, 1, ' °C'));
+  const numbers = {
+    coverage: now.coverage === null ? '–' : `${Math.round(100 * now.coverage)} %`,
+    accuracy: accuracyOf(now.accuracy, state?.counts_per_g),
+    length: fixed(now.corrected ?? now.length, 4, ' g'),
+    temperature: fixed(now.temperature, 1, ' °C') };
+  for (const [name, words] of Object.entries(numbers)) {
+    text(element(name), words);
+    element(name).parentElement.hidden = words === '–';
+  }
 }
 
 /** Return an accuracy [g] in mg, and in counts if the readings are counts. */

@@ -1,0 +1,302 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+What is the case with a session, and the next step.
+
+`conditions` is the one list, in the order in which to act. Its first entry is the next step, which
+the log, ``~/progress``, the answers of the services and the pages show. The diagnostics show all
+of it. What is over is in no entry.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+import math
+
+from .core import State
+from .pose_guide import calling, Condition, Level, NOT_FOLLOWED, NOT_KNOWN
+from .settings import context_topics
+from .stream import SILENT, StreamStatistics
+from ..calibrate import USES_LIMIT
+from ..compare import status
+from ..pipeline import FEWEST_IN_CONE, is_partial
+from ..table import column_of, is_quantity
+from ..text import counted
+from ..units import MG, Units
+
+_LEVEL = Condition('level', 'place the robot level, hold it still and call ~/set_level; a sensor '
+                   'alone is done', 'set_level')
+
+_FAR = 0.25
+"""Part of the range of a calibration beyond which poses are asked for."""
+
+_NEEDS_SAMPLES = ('poses', 'level', 'done', NOT_KNOWN.kind)
+"""Kinds of steps that need samples; the others use the poses so far."""
+
+
+def conditions(session: State) -> list[Condition]:
+    """Return what is the case and what to do about it; the next step is the first entry."""
+    step, files = _ordinary(session), list(_files(session))
+    around = [] if session.ended else [*_stream(session), *missing_context(session).values()]
+    of_use = list(_use(session))
+    if step.kind == 'level' and session.ended:  # nothing can be levelled any more
+        step = replace(step, kind='done', words='use the calibration', command='')
+    if step.kind not in _NEEDS_SAMPLES:
+        found = [step, *files, *around, *of_use]
+    elif step.kind == 'done':
+        found = [*files, *around, *of_use, step]
+        found.sort(key=lambda each: each is not step and each.kind == step.kind)
+    elif files and files[0].kind:
+        found = [*files, *around, step, *of_use]
+    else:  # whoever turns the sensor is told of the files, and goes on
+        told = '; '.join([each.words for each in files] + [step.words])
+        level = max([step.level, *(each.level for each in files)])
+        found = [*around, replace(step, words=told, level=level), *files, *of_use]
+    axes = session.sensor.guide.axes_words
+    return found + ([Condition('poses', axes, '', (), Level.WARN, 'stream', 'axes')] if axes
+                    else [])
+
+
+def next_action(session: State) -> Condition:
+    """Return the next step; `NOT_KNOWN` while the poses or the rating are being computed."""
+    return conditions(session)[0]
+
+
+def next_words(session: State) -> str:
+    """Return the next step as the end of an answer."""
+    action = next_action(session)
+    return f'; next: {action.words}' if action.words else ''
+
+
+# ----------------------------------------------------------------------------- poses and fits
+
+def _ordinary(session: State) -> Condition:
+    """Return the next step of a calibration of which nothing is in the way."""
+    step = _with_sensor(session)
+    refusal = session.refusal_of(step.command)
+    if refusal and step.kind != 'poses':
+        step = replace(step, words=refusal, command='')
+    if step.kind == 'poses' and step.level == Level.OK:
+        step = _within_reach(session, step)
+        held = slow_turn(session)
+        step = replace(step, words=f'{held}; {step.words}') if held else step
+    if session.sensor.calibration is None:
+        step = replace(step, level=max(step.level, Level.WARN))
+    return step
+
+
+def _with_sensor(session: State) -> Condition:
+    """Return the next step with the poses and calibrations of the sensor."""
+    sensor, rating = session.sensor, session.sensor.rating
+    if sensor.offered is not None:
+        verdict = '' if rating is None else f', {rating.name}: {rating.reason}'
+        return Condition('accept', f'a new calibration waits{verdict}; call ~/save to use and '
+                         'store it, or ~/undo to discard it', 'save')
+    if sensor.unsaved:
+        return replace(calling('save', 'the calibration in use is not stored'),
+                       level=Level.ERROR, concern='storage', name='unsaved')
+    if sensor.drift is not None and sensor.has_changed:
+        return Condition('poses', status(sensor.drift), sensor.drift.remedy[1], (),
+                         Level.WARN, 'drift')
+    if sensor.calibration is not None and rating is None:
+        return NOT_KNOWN
+    if rating is not None and rating.name == 'GOOD':
+        if sensor.calibration is not None and not sensor.calibration.is_levelled:
+            return _LEVEL
+        return Condition('done', rating.next.text if rating.next.kind == 'done' else
+                         'use the calibration')
+    return _with_poses(session)
+
+
+def _with_poses(session: State) -> Condition:
+    """Return the next step without a calibration that is good."""
+    sensor, rating, guide = session.sensor, session.sensor.rating, session.sensor.guide
+    if rating is not None and rating.findings and rating.findings[0].kind == 'flat_pose':
+        return Condition('level', f'{rating.reason}; if it is mounted so, place it level again '
+                         'and call ~/set_level once more', 'set_level')
+    if refusal := session.refusal_of('poses'):
+        return Condition('poses', refusal)
+    is_fitted = 0 < guide.poses == sensor.fitted_poses  # to all poses
+    if rating is None or not is_fitted or guide.planned is not None:
+        return guide.action
+    if rating.next.kind == 'poses' and guide.action.direction:
+        return replace(guide.action, words=f'{rating.reason}; {guide.action.words}')
+    return calling(rating.next.kind, rating.next.text)
+
+
+def _within_reach(session: State, step: Condition) -> Condition:
+    """Return a step that a robot which cannot be turned further can do, too."""
+    guide, present = session.sensor.guide, session.sensor.present
+    is_refused = bool(session.refusal_of('poses'))
+    if not (is_refused or guide.is_stuck(session.statistics.stamp)):
+        return step
+    if present is None and not is_refused and guide.poses >= FEWEST_IN_CONE and not (
+            session.refusal_of('fit')):
+        return replace(step, words=f'{step.words}; if it cannot be turned further, call ~/fit',
+                       command='fit')
+    if present is None and not session.refusal_of('calibrate_at_rest'):
+        return replace(step, words=f'{step.words}; if it cannot be turned over, place the robot '
+                       'level, hold it still and call ~/calibrate_at_rest',
+                       command='calibrate_at_rest')
+    if present is None or not (is_partial(present) or guide.missed >= NOT_FOLLOWED):
+        return step
+    return (Condition('done', f'use the calibration in these orientations; for others: '
+                      f'{step.words}') if present.is_levelled else _LEVEL)
+
+
+def slow_turn(session: State) -> str:
+    """Return that the sensor turns slowly, and what to do; empty if it is still or shaken."""
+    statistics, live = session.statistics, session.sensor.live
+    if live.still or session.units.is_native or statistics.age > SILENT:
+        return ''
+    rate = statistics.turn_rate(live.detector.threshold, session.units.per_g)
+    return f'turning slowly, {rate:.1f} °/s: rest it on something' if rate else ''
+
+
+# ----------------------------------------------------------------------------- files and use
+
+def _files(session: State) -> Iterator[Condition]:
+    """Yield what is wrong with the files; of a kind only if the calibration must wait for it."""
+    if session.problem:
+        kind = 'restart' if session.files.problem or session.is_refused else ''
+        yield Condition(kind, session.problem, '', (), Level.ERROR)
+    store = session.files.store
+    if store is not None and not store.is_writable():
+        yield Condition('', f'{session.files.path} cannot be written: correct the permissions, or '
+                        'restart the node with another calibration_file', '', (), Level.ERROR,
+                        'storage')
+
+
+def _use(session: State) -> Iterator[Condition]:
+    """Yield what is wrong with the use of the calibration."""
+    if not session.enabled:
+        yield Condition('enable', 'correction switched off, raw messages are published: call '
+                        '~/enable with true to correct them', '', (), Level.WARN)
+    for key, each in session.sensor.limits_left(session.context).items():
+        beyond = max(each.low - each.least, each.most - each.high)
+        kind = 'poses' if beyond > _FAR * (each.high - each.low) else 'done'
+        yield Condition(kind, f'{each.words}: {USES_LIMIT}; capture poses there and call '
+                        '~/refine', 'refine', (), Level.WARN, name=f'range of {key}')
+
+
+# ----------------------------------------------------------------------------- samples
+
+def missing_context(session: State) -> dict[str, Condition]:
+    """Return by column of the context why it is missing, and what follows."""
+    calibration, found = session.sensor.calibration, dict[str, Condition]()
+    needs = () if calibration is None else calibration.model.needs
+    wanted = [*context_topics(session.settings), *(
+        key for key in needs if is_quantity(key) or key in ('temperature', 'supply_voltage'))]
+    for column in filter(session.around.is_missing, dict.fromkeys(wanted)):
+        follows = ''
+        if column in session.around.values:
+            follows = '; the last value holds'
+        elif column in needs:
+            value = session.around.assumed.get(column, math.nan)
+            follows = f'; {value:.4g} {column_of(column).unit}'.rstrip() + ' is used instead'
+        found[column] = Condition(
+            'connect', f'no {column} arrives: {_why_missing(session, column)}{follows}', '', (),
+            Level.WARN, 'stream', column)
+    return found
+
+
+def _why_missing(session: State, column: str) -> str:
+    if column in session.missing:
+        return session.missing[column]
+    if session.publishers is None:
+        return 'the samples do not have it'
+    return (thermometer_words(session) if column == 'temperature' else
+            f"start the node with context:=['{column}:=TOPIC'], and its topic")
+
+
+def thermometer_words(session: State) -> str:
+    """Return how the node would get a temperature."""
+    topics = ' or '.join(session.thermometers)
+    return session.missing.get('temperature') or (
+        f'restart the node with temperature:={topics}' if topics else
+        'publish the temperature of the sensor on the topic temperature')
+
+
+_LASTS = 5.0
+"""Time after which a dropped message is over [s]."""
+
+_DROPPED = {
+    'not_finite': ('message', 'with NaN, infinite or absurd readings: check the driver'),
+    'foreign': ('message', 'of another sensor: use a separate topic for each sensor'),
+    'implausible': ('corrected message', 'with implausible values: check the calibration')}
+"""Kinds of dropped messages: what was dropped, and what to do."""
+
+_LIKELY_G = (0.2, 5.0)
+"""Range of |a| [g]; outside of it the unit is probably wrong."""
+
+_WITHOUT_GRAVITY_G = 0.07
+"""Mean |a| below which no unit makes the readings those of a sensor that measures gravity [g]."""
+
+_UNITS = (('g', 0.8, 1.2), ('m/s2', 8.0, 12.0))
+"""Units with the lowest and highest |reading| of a resting sensor in this unit."""
+
+
+def _stream(session: State) -> Iterator[Condition]:
+    """Yield what is wrong with the messages, and what to do."""
+    statistics, names = session.statistics, session.publishers or ()
+    told = {'mismatches': '; '.join(session.mismatches),
+            'silence' if session.publishers else 'no_publisher': _silence(session)}
+    if len(names) > 1:
+        told['publishers'] = (
+            f'{"two" if len(names) == 2 else len(names)} publishers on the topic {session.topic}: '
+            f'{", ".join(names)}; expected one sensor: stop the others, or give each sensor its '
+            'own topic; a driver that was killed disappears after about 20 s')
+    told['stamps'] = statistics.stamp_fault
+    told['unit'] = _wrong_unit(statistics, session.units)
+    if statistics.dropped_ago < _LASTS:
+        told |= {kind: f'dropped {counted(statistics.dropped[kind], what)} {why}'
+                 for kind, (what, why) in _DROPPED.items() if statistics.dropped[kind]}
+    told['vibration'] = '' if told['unit'] else _vibration(session)
+    kinds = {'unit': 'unit', 'vibration': 'still'}
+    for name, words in told.items():
+        if words:
+            yield Condition(kinds.get(name, 'connect'), words, '', (), Level.WARN, 'stream',
+                            name)
+
+
+def _silence(session: State) -> str:
+    topic, publishers = session.topic, session.publishers
+    if session.mismatches or (
+            min(session.statistics.age, session.statistics.dropped_ago) <= SILENT):
+        return ''
+    if publishers is None:
+        return (f'{topic} sends no samples: check the board, its cable and its program; the poses '
+                'are kept')
+    if publishers:
+        return (f'no Imu messages on {topic}, although {publishers[0]} publishes there: check '
+                'the driver')
+    there = f', such as {" or ".join(session.imus)}' if session.imus else ''
+    return (f'no Imu messages on {topic}, and no publisher: start the driver, or remap '
+            f'imu/data_raw to its topic{there}')
+
+
+def _wrong_unit(statistics: StreamStatistics, units: Units) -> str:
+    length, size = statistics.length_g(units), statistics.length
+    if not (length < _LIKELY_G[0] or length > _LIKELY_G[1]):
+        return ''
+    if length < _WITHOUT_GRAVITY_G and not units.is_native:
+        return (f'|a| is {length:.3g} g, expected about 1 g at rest: this is linear acceleration, '
+                'gravity removed: let the driver publish what the accelerometer reads')
+    likely = next((name for name, low, high in _UNITS if low < size < high), 'native')
+    return (f'|a| is {length:.3g} g, expected about 1 g at rest: start the node with '
+            f'units:={likely}')
+
+
+def _vibration(session: State) -> str:
+    """Return that the sensor stays in one direction without a rest, and which limit takes it."""
+    live, statistics, units = session.sensor.live, session.statistics, session.units
+    limit, spread = live.detector.threshold, statistics.shaken(session.units.per_g)
+    if not math.isfinite(limit) or spread <= limit or live.still or units.is_native:
+        return ''
+    return (f'no rest: the readings vary by {spread / units.per_g * MG:.1f} mg, a rest by at most '
+            f'{limit / units.per_g * MG:.1f} mg: rest the sensor on something and stop what '
+            f'vibrates; if it always does, restart the node with still_std_max:='
+            f'{1.5 * spread / units.per_g * session.settings.gravity:.2g}')

@@ -1,0 +1,142 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Persons who cannot do what the guide asks for end in a calibration, or in one named reason."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from accel_calib.errors import InputError
+from accel_calib.session import conditions, state
+from driven import Driver, GRAVITY, Person
+from inside import next_action
+import numpy as np
+import pytest
+
+pytestmark = pytest.mark.usefixtures('home')
+
+OFFSET, GAIN = np.array([0.03, -0.02, 0.05]), np.diag([1.01, 0.99, 1.02])
+MOST_SECONDS = 90.0
+
+
+def reading(axes: Any = None, scale: float = 1.0, gravity: float = 1.0) -> Callable[..., Any]:
+    """Return the sensor of a driver with these axes, in another unit, or without gravity."""
+    axes = np.eye(3) if axes is None else np.array(axes, float)
+    return lambda up, temperature: scale * axes @ (GAIN @ np.asarray(up) * gravity + (
+        OFFSET if gravity else 0.0))
+
+
+def within(degrees: float) -> Callable[[Any], bool]:
+    return lambda up: bool(up[2] >= np.cos(np.radians(degrees)))
+
+
+@dataclass(frozen=True)
+class Case:
+    """A person: the sensor, what can be done, the last step, and the condition that is named."""
+
+    ends: str
+    named: str = ''
+    sensor: Callable[..., Any] = reading()
+    about: dict[str, Any] = field(default_factory=dict)
+    change: Callable[[Driver], object] = lambda driver: None
+    seconds: float = MOST_SECONDS
+
+
+def silent(driver: Driver) -> None:
+    feed = driver.feed
+
+    def now(readings: Any, **given: Any) -> None:
+        if driver.now < 5.0:
+            feed(readings, **given)
+        else:
+            driver.tick(2.0)
+
+    driver.feed = now
+
+
+def refusing(driver: Driver) -> None:
+    def refused() -> Any:
+        raise InputError('the disk has no place', 'free some')
+        yield
+
+    driver.session.commands.__dict__.update(fit=refused, calibrate_at_rest=refused)
+
+
+def slowed(pace: float) -> Callable[[Driver], object]:
+    return lambda driver: setattr(driver, 'pace', pace)
+
+
+SWAPPED, INVERTED = [[0, 1, 0], [1, 0, 0], [0, 0, 1]], np.diag([1, 1, -1])
+TURNED = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+
+PERSONS = {
+    'flat': Case('done', about={'can_reach': within(0.5)}),
+    'tilts by 30°': Case('done', about={'can_reach': within(30.0)}, seconds=60.0),
+    'tilts by 12°': Case('done', about={'can_reach': within(12.0)}, seconds=60.0),
+    'one axis': Case('done', about={'can_reach': lambda up: abs(up[0]) < 0.1}),
+    'swapped': Case('done', 'axes', reading(SWAPPED), seconds=300.0),
+    'inverted': Case('done', 'axes', reading(INVERTED), seconds=300.0),
+    'turned': Case('done', 'axes', reading(TURNED), seconds=300.0),
+    'vibrates': Case('still', 'vibration', about={'shaken': 0.04}),
+    'silent': Case('connect', 'no_publisher', change=silent),
+    'no clock': Case('connect', 'stamps', change=slowed(0.0)),
+    'stamps in ms as ns': Case('connect', 'stamps', change=slowed(1e-6)),
+    'stamps in ns as s': Case('connect', 'stamps', change=slowed(1e9)),
+    'g as m/s²': Case('unit', 'unit', reading(scale=1.0 / GRAVITY)),
+    'mg as m/s²': Case('unit', 'unit', reading(scale=1000.0 / GRAVITY)),
+    'no gravity': Case('unit', 'unit', reading(gravity=0.0)),
+    'refusing services': Case('fit', about={}, change=refusing, seconds=300.0)}
+
+
+@pytest.mark.parametrize('name', PERSONS)
+def test_every_person_ends_in_a_calibration_or_in_one_named_reason(name: str) -> None:
+    case, driver = PERSONS[name], Driver()
+    case.change(driver)
+    person = Person(driver, case.sensor, **case.about)
+    assert person.follow(seconds=case.seconds) == case.ends, person.steps
+    driver.tick()
+    found = conditions(driver.session)
+    assert case.named in [each.name for each in found]
+    now, words = state.progress(driver.session), dict(state.figures(driver.session))
+    assert (now.advice, now.step) == (found[0].words, found[0].kind)
+    assert words['next'] == now.advice
+    if case.named:
+        wrong = next(each for each in found if each.name == case.named)
+        assert wrong.words in driver.finding(wrong.concern).words
+        assert wrong.words in driver.logged('warning')
+    if case.ends == 'done':
+        assert driver.calibration.is_levelled
+        np.testing.assert_allclose(np.linalg.norm(driver.sensor.gravity), GRAVITY, rtol=5e-3)
+    assert len(person.called) == len(set(person.called)) or case.ends == 'done'
+
+
+def test_axes_of_a_driver_are_named_after_two_rests_and_poses_are_asked_for_as_they_read(
+        ) -> None:
+    for axes, words in ((INVERTED, 'the z axis of the readings is probably inverted'),
+                        (SWAPPED, '+x reads +y, +y reads +x')):
+        driver = Driver(sensor=words[4:9])
+        person = Person(driver, reading(axes))
+        person.follow(seconds=60.0)
+        assert words in driver.logged('warning')
+        lines = driver.logged('info').splitlines()
+        missed = [line for line in lines if line.startswith('asked for ')]
+        assert 2 <= len(missed) <= 4, missed
+        assert 'the sensor reads ' in missed[0]
+        assert np.array_equal(driver.sensor.guide.axes, axes)
+
+
+def test_words_and_direction_come_from_one_pose() -> None:
+    driver = Driver()
+    person = Person(driver, reading())
+    person.rest(person.flat)
+    for _ in range(12):
+        action = next_action(driver.session)
+        if not action.direction:
+            break
+        signs = ' '.join(f'{"+" if part > 0 else "-"}{axis}' for axis, part in zip(
+            'xyz', action.direction, strict=True) if part)
+        assert f'({signs})' in action.words
+        person.rest(action.direction)
+    driver.ask('fit')
+    assert not next_action(driver.session).direction or '(' in next_action(driver.session).words
