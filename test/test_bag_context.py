@@ -11,7 +11,7 @@ from accel_calib.errors import InputError
 from accel_calib.logs import LogOptions, open_log
 from accel_calib.messages import correct_bag
 from accel_calib.stored import write_calibration
-from accel_calib.table import concatenated, Recording
+from accel_calib.table import concatenated, quantity_key, Recording
 from bag_files import fill, header, IMU, imu, writer_of
 from inside import main
 import numpy as np
@@ -75,7 +75,7 @@ def write(folder: Path, topics: Mapping[str, tuple[str, Values]], kind: str = 'm
 
 
 def read(path: Path, **asked: str) -> tuple[Recording, tuple[str, ...]]:
-    with open_log(path, LogOptions(**asked)) as opened:
+    with open_log(path, LogOptions(context=asked)) as opened:
         return concatenated(list(opened.blocks)), opened.notes
 
 
@@ -93,7 +93,7 @@ def test_a_number_without_stamp_has_the_time_of_its_receipt(number: str, kind: s
     whole = number == 'Int16'
     value = (lambda seconds: round(100 * warming(seconds)) // 100) if whole else warming
     path = write(tmp_path, {'/imu/temp': (f'std_msgs/msg/{number}', value)}, kind)
-    found, notes = read(path, temperature_topic='/imu/temp')
+    found, notes = read(path, temperature='/imu/temp')
     np.testing.assert_allclose(found['temperature'], EXPECTED, atol=1.0 if whole else 1e-5)
     assert len(notes) == 1
     assert all(each in notes[0] for each in ('/imu/temp', f'/{number}', 'no stamp'))
@@ -106,7 +106,7 @@ def test_a_number_without_stamp_has_the_time_of_its_receipt(number: str, kind: s
 def test_times_of_receipt_are_converted_to_the_clock_of_the_imu(
         msgtype: str, clock: Mapping[str, int], tmp_path: Path) -> None:
     found, notes = read(write(tmp_path, {'/t': (msgtype, warming)}, **clock),
-                        temperature_topic='/t')
+                        temperature='/t')
     assert found['time'][0] == clock.get('stamped', RECEIVED) * 1e-9
     np.testing.assert_allclose(found['temperature'], EXPECTED, atol=1e-5)
     assert 'have no stamp' in notes[0]
@@ -118,8 +118,8 @@ PRESSURE = {'/pressure': ('sensor_msgs/msg/FluidPressure', lambda seconds: 10132
 
 @pytest.mark.parametrize(('topics', 'words'), [
     ({'/imu/temp': (FLOAT, warming), '/speed': (FLOAT, warming)},
-     ['topic /imu/temp (std_msgs/msg/Float32)', '--temperature-topic /imu/temp']),
-    ({'/a/t': WARM, '/b/t': WARM}, ['topics /a/t (', ', /b/t (', '--temperature-topic TOPIC']),
+     ['topic /imu/temp (std_msgs/msg/Float32)', '--context temperature:=/imu/temp']),
+    ({'/a/t': WARM, '/b/t': WARM}, ['topics /a/t (', ', /b/t (', '--context temperature:=TOPIC']),
     (PRESSURE, ['topic /pressure (', 'a pressure is no temperature']),
     ({'/t': ('sensor_msgs/msg/Temperature', lambda seconds: np.nan)},
      ['40 messages on /t (sensor_msgs/msg/Temperature)'])])
@@ -137,8 +137,8 @@ def test_of_several_temperatures_that_of_the_imu_is_used(tmp_path: Path) -> None
     found, notes = read(path)
     np.testing.assert_allclose(found['temperature'], EXPECTED, atol=1e-9)
     assert len(notes) == 1
-    assert notes[0].endswith(' --temperature-topic /motor/temperature')
-    found, _ = read(path, temperature_topic='/motor/temperature')
+    assert notes[0].endswith(' --context temperature:=/motor/temperature')
+    found, _ = read(path, temperature='/motor/temperature')
     assert set(found['temperature']) == {70.0}
 
 
@@ -147,35 +147,37 @@ def test_the_voltage_of_a_battery_is_the_supply_where_it_is_named(kind: str,
                                                                   tmp_path: Path) -> None:
     path = write(tmp_path, {
         '/battery': ('sensor_msgs/msg/BatteryState', lambda seconds: 12.0 - seconds)}, kind)
-    found, notes = read(path, supply_topic='/battery')
+    found, notes = read(path, supply_voltage='/battery')
     np.testing.assert_allclose(found['supply_voltage'], 12.0 - (EXPECTED - 20.0) / 2.0, atol=1e-5)
     assert notes == ()
     found, notes = read(path)
     assert 'supply_voltage' not in found
     assert len(notes) == 1
-    assert notes[0].endswith(' --supply-topic /battery')
+    assert notes[0].endswith(' --context supply_voltage:=/battery')
 
 
 @pytest.mark.parametrize('kind', ['mcap', 'sqlite3', 'bag'])
 def test_fields_of_a_type_of_the_user_are_found(kind: str, tmp_path: Path) -> None:
     path = write(tmp_path, {'/board': (OWN, warming)}, kind)
-    found, notes = read(path, temperature_topic='/board', supply_topic='/board')
+    found, notes = read(path, temperature='/board', supply_voltage='/board')
     np.testing.assert_allclose(found['temperature'], EXPECTED, atol=1e-5)
     assert set(found['supply_voltage']) == {5.0}
     assert notes == ()
-    found, _ = read(path, temperature_topic='/board:analog.load')
+    found, _ = read(path, temperature='/board/analog/load')
     assert set(found['temperature']) == {1.0}
+    found, notes = read(path, load='/board/analog.load')
+    assert set(found[quantity_key('load')]) == {1.0}
     with pytest.raises(InputError, match='has the numbers analog.vcc, analog.load, imu_temp, '
                                          'errors, expected none; name another topic, or the '
-                                         'field with --temperature-topic /board:FIELD'):
-        read(path, temperature_topic='/board:none')
+                                         'field with --context temperature:=/board/FIELD'):
+        read(path, temperature='/board/none')
 
 
 def test_kelvin_and_millivolts_are_converted_and_noted(tmp_path: Path) -> None:
     path = write(tmp_path, {
         '/k': ('std_msgs/msg/Float64', lambda seconds: 273.15 + warming(seconds)),
         '/mv': ('std_msgs/msg/UInt16', lambda seconds: 3300)})
-    found, notes = read(path, temperature_topic='/k', supply_topic='/mv')
+    found, notes = read(path, temperature='/k', supply_voltage='/mv')
     np.testing.assert_allclose(found['temperature'], EXPECTED, atol=1e-5)
     np.testing.assert_allclose(found['supply_voltage'], 3.3)
     assert any('/k ' in note and note.endswith(' as K') for note in notes)
@@ -195,7 +197,7 @@ def test_a_topic_without_a_temperature_is_refused(
         topics: Mapping[str, tuple[str, Values]], asked: str, words: str, tmp_path: Path) -> None:
     path = write(tmp_path, topics)
     with pytest.raises(InputError, match=words):
-        read(path, temperature_topic=asked)
+        read(path, temperature=asked)
 
 
 def test_a_bag_is_corrected_with_a_named_temperature(
@@ -207,10 +209,10 @@ def test_a_bag_is_corrected_with_a_named_temperature(
                                          'on the temperature; name the topic with'):
         correct_bag(path, thermal, out)
     notes: list[str] = []
-    options = LogOptions(temperature_topic='/imu/temp')
+    options = LogOptions(context={'temperature': '/imu/temp'})
     assert correct_bag(path, thermal, out, options, note=notes.append) == COUNT
     assert 'have no stamp' in notes[0]
-    raw, found = read(path, temperature_topic='/imu/temp')[0], read(out)[0]
+    raw, found = read(path, temperature='/imu/temp')[0], read(out)[0]
     expected = thermal.correct(raw.reading / 9.80665, {'temperature': raw['temperature']})
     np.testing.assert_allclose(found.reading, expected * 9.80665, atol=1e-9)
     assert np.ptp(found.reading, axis=0).max() > 0.05
@@ -218,7 +220,7 @@ def test_a_bag_is_corrected_with_a_named_temperature(
     write_calibration(tmp_path / 'c.yaml', thermal)
     given = ['apply', str(path), '-c', str(tmp_path / 'c.yaml'), '-o', str(tmp_path / 'other')]
     assert main(given) == 2
-    assert main([*given, '--temperature-topic', '/imu/temp']) == 0
+    assert main([*given, '--context', 'temperature:=/imu/temp']) == 0
     assert 'corrected 400 samples' in capsys.readouterr().out
 
 

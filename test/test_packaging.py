@@ -26,7 +26,7 @@ ROSDEP_KEYS = {
     'pyserial': 'python3-serial',
     'pytest': 'python3-pytest',
     'rich': 'python3-rich',
-    'rosbags': 'python3-rosbags-pip',
+    'rosbags': '',  # not in Ubuntu; the nodes do not import it, and who reads bags is told
     'scipy': 'python3-scipy',
     'segno': '',  # has no key; without it there is no QR code
 }

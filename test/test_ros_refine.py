@@ -102,9 +102,10 @@ def test_each_type_of_context_is_read_and_what_cannot_be_read_is_said(bench: Any
     publishers = {name: (bench.node.create_publisher(kind, topic, 10), value)
                   for name, (topic, kind, value) in TOPICS.items()}
     entries = [f'{name.split()[0]}:=/{topic}' for name, (topic, *_) in TOPICS.items()]
-    bench.calibrator(context=[*entries, 'text:=/imu/data_raw', 'none:=/nowhere'])
-    wanted = ('no text arrives: /imu/data_raw has the type sensor_msgs/Imu, expected '
-              'sensor_msgs/BatteryState, ', 'no none arrives: there is no topic /nowhere',
+    bench.calibrator(context=[*entries, 'text:=/imu/data_raw', 'none:=/nowhere',
+                              'spread:=/rotor/variance'])
+    wanted = ('no text arrives: /imu/data_raw has the type sensor_msgs/Imu with the numbers '
+              'orientation.x, ', 'no none arrives: there is no topic /nowhere',
               'topics with a number: /air, /battery, /die, /load, /rotor')
 
     def said() -> bool:
@@ -117,7 +118,7 @@ def test_each_type_of_context_is_read_and_what_cannot_be_read_is_said(bench: Any
     shown = {value.key: value.value for value in diagnostics[-1].status[0].values}
     for name, (_, value) in publishers.items():
         assert shown[name] == f'{value:.3f}'
-    assert shown['none'] == 'not known'
+    assert (shown['none'], shown['spread']) == ('not known', '0.000')
 
 
 CURVE = [2e-3, -1e-3, 3e-3, 1e-3, 2e-3, -2e-3, 15.0, 35.0]

@@ -213,7 +213,7 @@ def _check_range(cells: Poses) -> None:
     if np.isnan(low):
         raise InputError('the log has no temperature, expected that of the sensor', 'record it, '
                          'or name its column with --columns temperature=NAME, or its topic with '
-                         '--temperature-topic')
+                         '--context temperature:=TOPIC')
     if high - low < LEAST_RANGE:
         raise InputError(f'the temperature is {low:.1f} to {high:.1f} °C, expected a range of at '
                          f'least {LEAST_RANGE:g} °C', 'cool the board in a freezer, and record '

@@ -36,7 +36,7 @@ from ..capture import CaptureSettings
 from ..disk import replaceable, STANDARD_OUTPUT, write_atomically
 from ..effects import know_file
 from ..errors import AccelCalibError, InputError, known_error, RefusedFitError, saying
-from ..logs import LogOptions, OpenLog
+from ..logs import LogOptions, named_topics, OpenLog
 from ..pipeline import Intake, options_for, poses_of
 from ..stored import calibration_from, OF_FILE, read_calibration, read_prior
 from ..table import Poses
@@ -366,7 +366,8 @@ def given(record: Any, args: argparse.Namespace) -> dict[str, Any]:
 def log_options(args: argparse.Namespace, calibration: Calibration | None = None) -> LogOptions:
     """Return how to read a log; in the unit of a calibration if the log states none."""
     columns = {ours: theirs for each in args.columns for ours, theirs in each.items()}
-    return options_for(calibration, LogOptions(**{**given(LogOptions, args), 'columns': columns}))
+    return options_for(calibration, LogOptions(**{
+        **given(LogOptions, args), 'columns': columns, 'context': named_topics(args.context)}))
 
 
 def settings(args: argparse.Namespace) -> dict[str, Any]:

@@ -196,10 +196,9 @@ def add_log(made: Parser) -> None:
                   'archive or Excel file, if there are several'},
         'sensor': {'help': 'name of the sensor: frame_id of its messages, or its number in a '
                    'flight log (default: the name in the log)'},
-        'temperature_topic': {'metavar': 'TOPIC[:FIELD]', 'help': 'topic of the temperature, for '
-                              'a bag without sensor_msgs/Temperature or with several'},
-        'supply_topic': {'metavar': 'TOPIC[:FIELD]', 'help': 'topic of the supply voltage, for a '
-                         'bag'},
+        'context': {'action': 'append', 'default': [], 'metavar': 'COLUMN:=TOPIC[/FIELD]',
+                    'help': 'topic of a bag with a number that may act on the sensor, such as '
+                    'temperature:=/imu/temp; can be repeated'},
         **units()})
 
 

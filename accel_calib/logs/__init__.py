@@ -14,7 +14,7 @@ from .autopilot import ARDUPILOT_REFERENCE, ByAxis, DEGREE, PER_MILLION
 from .bag import imus_of, open_bag
 from .bag_samples import messages_of, Track
 from .child import parts_of
-from .columns import LogOptions
+from .columns import LogOptions, named_topics, topic_and_field
 from .containers import Frame, Piped
 from .formats import BAG, FORMATS, is_bag, open_log, OpenLog, Progress, SUFFIXES
 from .names import NAMES
@@ -29,9 +29,9 @@ from .serialized import (
 __all__ = ['ACCELERATION', 'ACCELERATION_COVARIANCE', 'ANGULAR_VELOCITY',
            'ANGULAR_VELOCITY_COVARIANCE', 'ARDUPILOT_REFERENCE', 'BAG', 'DEGREE', 'FORMATS',
            'IMU_DOUBLES', 'LITTLE_ENDIAN', 'NAMES', 'NAME_AT', 'NINE', 'ORIENTATION',
-           'ORIENTATION_COVARIANCE', 'PER_MILLION', 'STAMP', 'STAMP_AT',
-           'SUFFIXES', 'THREE', 'ByAxis', 'Frame', 'Layout', 'LineReader', 'LogOptions',
-           'Messages', 'OpenLog', 'Piped', 'Progress', 'Track', 'are_untimed_samples',
-           'doubles_at', 'imus_of', 'is_bag', 'joined', 'layout_of', 'layout_with', 'messages_of',
-           'open_bag', 'open_log', 'parts_of', 'put_doubles', 'read_poses', 'read_recording',
-           'renamed', 'samples_of', 'write_blocks', 'write_table']
+           'ORIENTATION_COVARIANCE', 'PER_MILLION', 'STAMP', 'STAMP_AT', 'SUFFIXES', 'THREE',
+           'ByAxis', 'Frame', 'Layout', 'LineReader', 'LogOptions', 'Messages', 'OpenLog', 'Piped',
+           'Progress', 'Track', 'are_untimed_samples', 'doubles_at', 'imus_of', 'is_bag', 'joined',
+           'layout_of', 'layout_with', 'messages_of', 'named_topics', 'open_bag', 'open_log',
+           'parts_of', 'put_doubles', 'read_poses', 'read_recording', 'renamed', 'samples_of',
+           'topic_and_field', 'write_blocks', 'write_table']

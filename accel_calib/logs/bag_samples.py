@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
+import math
 from pathlib import Path
 import re
 from typing import Any, TYPE_CHECKING
@@ -27,6 +28,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from .bag import Bag, BLOCK, imus_of, NUMBERS, open_bag, Received, TEMPERATURE
+from .columns import topic_and_field
 from .serialized import doubles_at, NANO, stamps_of
 from ..errors import InputError
 from ..table import concatenated, Floats, Recording
@@ -54,7 +56,7 @@ _SAME_CLOCK_S = 60.0
 @dataclass(frozen=True)
 class Quantity:
     """
-    A quantity that is known beside the readings: its column, its name and its option.
+    A quantity that is known beside the readings: its column and its name.
 
     `fields` are names of fields that hold it, the best first, and `parts` are parts of the name of
     a topic or field that is likely to hold it. `units` are the name of a unit, its lowest and
@@ -64,20 +66,26 @@ class Quantity:
 
     key: str
     words: str
-    option: str
     fields: tuple[str, ...]
     parts: tuple[str, ...]
     units: tuple[tuple[str, float, float, float, float], ...]
 
 
 QUANTITIES = (
-    Quantity('temperature', 'temperature', '--temperature-topic', ('temperature', 'temp'),
+    Quantity('temperature', 'temperature', ('temperature', 'temp'),
              ('temp', 'therm'), (('°C', -100.0, 200.0, 1.0, 0.0),
                                  ('K', 200.0, 450.0, 1.0, -273.15))),
-    Quantity('supply_voltage', 'supply voltage', '--supply-topic',
+    Quantity('supply_voltage', 'supply voltage',
              ('supply_voltage', 'voltage', 'volt', 'vdd', 'vcc'),
              ('volt', 'vdd', 'vcc', 'supply', 'battery'),
              (('V', 0.5, 200.0, 1.0, 0.0), ('mV', 200.0, 2e5, 1e-3, 0.0))))
+
+
+def _quantity(column: str) -> Quantity:
+    """Return the quantity of a column; one of the user has any unit."""
+    anything = (('', -math.inf, math.inf, 1.0, 0.0),)
+    return next((each for each in QUANTITIES if each.key == column), Quantity(
+        column, column.replace('_', ' '), (column,), (column.lower(),), anything))
 
 
 @dataclass(frozen=True)
@@ -144,14 +152,14 @@ def _received(block: Sequence[Received]) -> Floats:
 def context_of(bag: Bag, imu: str, sensor: str, options: LogOptions
                ) -> tuple[list[ContextTopic], list[str]]:
     """
-    Return the topics with temperature and supply voltage, and notes about them and about others.
+    Return the topics with a number beside the readings, and notes about them and about others.
 
     Parameters
     ----------
     bag, imu, sensor
         The open bag; topic and frame_id of the readings.
     options : LogOptions
-        The topics to use. By default, the temperature is that of the only topic of type
+        The topics to use. Without one, the temperature is that of the only topic of type
         sensor_msgs/Temperature, or of the only one with the frame_id or in the namespace of the
         Imu.
 
@@ -163,8 +171,8 @@ def context_of(bag: Bag, imu: str, sensor: str, options: LogOptions
     """
     used: list[ContextTopic] = []
     notes: list[str] = []
-    topics = options.temperature_topic, options.supply_topic
-    for quantity, asked in zip(QUANTITIES, topics, strict=True):
+    for quantity in dict.fromkeys([*QUANTITIES, *map(_quantity, options.context)]):
+        asked = options.context.get(quantity.key, '')
         found = (_asked(bag, quantity, asked) if asked else
                  _own(bag, imu, sensor) if quantity.key == 'temperature' else None)
         if found is not None:
@@ -176,12 +184,12 @@ def context_of(bag: Bag, imu: str, sensor: str, options: LogOptions
 
 
 def _asked(bag: Bag, quantity: Quantity, asked: str) -> ContextTopic:
-    topic, _, field = asked.partition(':')
+    topic, field = topic_and_field(asked, {c.topic for c in bag.reader.connections})
     known = [connection for connection in bag.reader.connections if connection.topic == topic]
     if not known:
         others = sorted({f'{c.topic} ({c.msgtype})' for c in bag.reader.connections})
         raise InputError(f'{bag.path} has the topics {some(others)}, expected {topic}',
-                         f'choose one of them with {quantity.option}')
+                         f'choose one of them with --context {quantity.key}:=TOPIC')
     return ContextTopic(bag, quantity, topic, known[0].msgtype,
                         _field(bag, quantity, known[0], field))
 
@@ -200,7 +208,8 @@ def _field(bag: Bag, quantity: Quantity, connection: Connection, asked: str) -> 
     have = f'the numbers {some(numbers)}' if numbers else 'no single number'
     raise InputError(
         f'{bag.path}: topic {what} has {have}, expected {asked or f"one {quantity.words}"}',
-        f'name another topic, or the field with {quantity.option} {connection.topic}:FIELD')
+        f'name another topic, or the field with --context {quantity.key}:='
+        f'{connection.topic}/FIELD')
 
 
 def _own(bag: Bag, imu: str, sensor: str) -> ContextTopic | None:
@@ -265,10 +274,10 @@ def _not_used(bag: Bag, quantity: Quantity, used: ContextTopic | None) -> list[s
     named = [f'{topic} ({msgtype})' for topic, msgtype in topics.items()]
     if len(named) == 1:
         return [f'topic {named[0]} looks like a {quantity.words} and is not used: name it with '
-                f'{quantity.option} {next(iter(topics))}']
+                f'--context {quantity.key}:={next(iter(topics))}']
     if named:
         return [f'topics {some(named)} look like a {quantity.words} and are not used: name '
-                f'one with {quantity.option} TOPIC']
+                f'one with --context {quantity.key}:=TOPIC']
     pressures = bag.topics(_PRESSURE)
     if used is None and pressures and quantity.key == 'temperature':
         return [f'{listed("topic", pressures)} ({_PRESSURE}): a pressure is no temperature, and '
@@ -323,14 +332,14 @@ def _needed(bag: Bag, needs: Collection[str], used: Sequence[ContextTopic], note
             ) -> dict[str, Track]:
     """Return all values of the quantities that a calibration needs; InputError without one."""
     topics, tracks = {source.quantity: source for source in used}, {}
-    for quantity in QUANTITIES:
+    for quantity in dict.fromkeys([*QUANTITIES, *topics]):
         if quantity.key not in needs:
             continue
         if quantity not in topics:
             raise InputError(f'{bag.path} has no {quantity.words} in a topic that is used'
                              f'{"".join(f"; {line}" for line in notes)}, but the calibration '
-                             f'depends on the {quantity.words}', 'name the topic with '
-                             f'{quantity.option}, or use a calibration without it')
+                             f'depends on the {quantity.words}', 'name the topic with --context '
+                             f'{quantity.key}:=TOPIC, or use a calibration without it')
         track = tracks[quantity.key] = topics[quantity].track()
         if not len(track.time):
             raise InputError(f'{bag.path}: {topics[quantity].topic} has no finite number, '

@@ -11,7 +11,7 @@ the names cannot tell apart are an error, because a wrong choice would give a wr
 """
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 import re
 from typing import Literal
@@ -31,6 +31,35 @@ FRACTION = 'time_ns'
 
 _MAY_LACK = ('temperature', 'supply_voltage')
 """Columns that rows of a partial table may lack."""
+
+def named_topics(entries: Iterable[str]) -> dict[str, str]:
+    """
+    Return the topic, with its field if one is named, of each column of the context.
+
+    An entry is ``column:=topic`` or ``column:=topic/field``; InputError if one is not usable.
+
+    """
+    topics: dict[str, str] = {}
+    for entry in filter(None, entries):
+        column, _, topic = (part.strip() for part in entry.partition(':='))
+        known = column in (*_MAY_LACK, quantity_key(column))
+        if not (known and column and topic) or column in topics:
+            raise InputError(
+                f'context has the entry {entry!r}, expected column:=topic or column:=topic/field, '
+                f'each column once: {", ".join(_MAY_LACK)}, or a new name of letters, digits and '
+                '_', 'correct the entry')
+        topics[column] = topic
+    return topics
+
+
+def topic_and_field(asked: str, topics: Container[str]) -> tuple[str, str]:
+    """Return the topic that a text names among those that exist, and the field or ''."""
+    topic, field_of = asked, ''
+    while topic and topic not in topics:
+        topic, _, last = topic.rpartition('/')
+        field_of = f'{last}.{field_of}' if field_of else last
+    return (topic, field_of) if topic else (asked, '')
+
 
 CONTEXT = (*RATE, 'temperature', 'supply_voltage')
 """Columns that are used only where they are plain."""
@@ -68,8 +97,8 @@ class LogOptions:
         Imu topic of a bag, message of a flight log, or table of an archive or Excel file.
     sensor : str
         frame_id of the messages of a bag, or number of the sensor of a flight log.
-    temperature_topic, supply_topic : str
-        Topics of temperature and supply voltage of a bag, ``TOPIC`` or ``TOPIC:FIELD``.
+    context : mapping of str to str
+        Topics of a bag with a number beside the readings, by column: as `named_topics` returns.
     in_child : bool
         Whether a binary file is read in a child process with limits, rather than in this one.
     partial : bool
@@ -86,8 +115,7 @@ class LogOptions:
     gravity: float = STANDARD_GRAVITY
     topic: str = ''
     sensor: str = ''
-    temperature_topic: str = ''
-    supply_topic: str = ''
+    context: Mapping[str, str] = field(default_factory=dict)
     in_child: bool = True
     partial: bool = False
 

@@ -348,7 +348,8 @@ _EXPORT, _VEHICLE = 'export it as CSV with ', 'copy it from the vehicle again'
 _ZIP = rb'PK\x03\x04'
 
 FORMATS = (
-    Format('a bag', ('.mcap', '.db3', '.bag'), b'', opened=_bag, module='rosbags.rosbag2',
+    Format('a bag', ('.mcap', '.db3', '.bag'), b'', opened=_bag, needs='rosbags',
+           module='rosbags.rosbag2',
            again='use another bag, or one file of it; ros2 bag reindex may repair this one'),
     Format('a PX4 log', ('.ulg',), rb'ULog\x01\x12\x35', read_ulg, 'pyulog', opened=_flight,
            again=_VEHICLE),
@@ -429,12 +430,12 @@ def is_bag(path: Path) -> bool:
 
 def _format_of(path: Path) -> Format:
     """Return the format of a file; InputError if it is none that is read."""
-    if is_bag(path):
-        return BAG
-    with path.open('rb') as file:
-        head = file.read(_HEAD)
-        file.seek(max(file.tell(), path.stat().st_size - _TAIL))
-        known = recognised(path, head + file.read())
+    known = BAG
+    if not is_bag(path):
+        with path.open('rb') as file:
+            head = file.read(_HEAD)
+            file.seek(max(file.tell(), path.stat().st_size - _TAIL))
+            known = recognised(path, head + file.read())
     if known.advice:
         raise InputError(f'{path} is {known.name}, expected a log or a table that is read',
                          known.advice.format(path.name))

@@ -14,9 +14,11 @@ encoding (byte order) is serialized again in the usual encoding and then process
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
 from itertools import groupby
 import math
 import operator
+import re
 from time import monotonic
 from typing import Any, TYPE_CHECKING
 
@@ -24,19 +26,19 @@ import numpy as np
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.validate_topic_name import validate_topic_name
-from sensor_msgs.msg import BatteryState, FluidPressure, Imu, Temperature
-from std_msgs.msg import Float32, Float64
+from sensor_msgs.msg import Imu
 
 from .declare import published_by_others, SENSOR
 from ..calibrate import Calibration
 from ..errors import AccelCalibError, InputError
 from ..logs import (
     ACCELERATION, IMU_DOUBLES, joined, Layout, layout_of, LITTLE_ENDIAN, NAME_AT, samples_of,
-    THREE)
+    THREE, topic_and_field)
 from ..messages.correction import motion_of, output_frame, Rewriter
 from ..messages.one_reading import Triple
 from ..session import BATCH, CalibratorSettings, columns_of, context_topics, Session
 from ..table import Floats
+from ..text import some
 
 if TYPE_CHECKING:
     from rclpy.node import Node
@@ -74,12 +76,36 @@ class Output:
                                      sensor.temperatures.stream(calibration.model))
 
 
-_NUMBERS: dict[str, tuple[Any, tuple[str, ...]]] = {
-    'sensor_msgs/msg/BatteryState': (BatteryState, ('voltage', 'current', 'temperature')),
-    'sensor_msgs/msg/FluidPressure': (FluidPressure, ('fluid_pressure',)),
-    'sensor_msgs/msg/Temperature': (Temperature, ('temperature',)),
-    'std_msgs/msg/Float32': (Float32, ('data',)), 'std_msgs/msg/Float64': (Float64, ('data',))}
-"""Types of context, with their fields: the first one, or one that the name of the column has."""
+_USUAL = ('data', 'voltage', 'fluid_pressure', 'temperature')
+"""Fields that are read of messages with several numbers, unless another one is named."""
+
+_WITH_A_NUMBER = tuple(f'{package}/msg/{name}' for package, names in (
+    ('sensor_msgs', ('BatteryState', 'FluidPressure', 'Temperature')),
+    ('std_msgs', ('Float32', 'Float64'))) for name in names)
+"""Types whose topics are named to the user."""
+
+_NUMBER = re.compile(r'(float|double|u?int)\d*')
+
+
+def _fields_of(kind: Any, before: str = '') -> list[str]:
+    """Return the fields of a type of messages that are single numbers, such as ``state.load``."""
+    found = []
+    for name, of_field in kind.get_fields_and_field_types().items():
+        if _NUMBER.fullmatch(of_field):
+            found.append(before + name)
+        elif re.fullmatch(r'\w+/\w+', of_field) and of_field != 'std_msgs/Header':
+            inner = _type_of(of_field.replace('/', '/msg/'))
+            found += [] if inner is None else _fields_of(inner, f'{before}{name}.')
+    return found
+
+
+def _type_of(name: str) -> Any:
+    """Return the class of a type such as ``std_msgs/msg/Float64``; None if it is not installed."""
+    package, _, kind = name.split('/')
+    try:
+        return getattr(import_module(f'{package}.msg'), kind)
+    except (ImportError, AttributeError):
+        return None
 
 
 class ContextTopics:
@@ -92,38 +118,48 @@ class ContextTopics:
 
     def __init__(self, node: Node, settings: CalibratorSettings) -> None:
         self._node, self._waiting = node, dict[str, str]()
-        for column, topic in context_topics(settings).items():
+        for column, asked in context_topics(settings).items():
+            topic, _, field = asked.rpartition('/')  # a field within a field is no name
+            whole, field = (topic, f'/{field}') if '.' in field and topic else (asked, '')
             try:
-                validate_topic_name(topic)
+                validate_topic_name(whole)
             except InvalidTopicNameException as error:
-                raise InputError(f'context has the topic {topic!r}, which is not a name: '
+                raise InputError(f'context has the topic {asked!r}, which is not a name: '
                                  f'{str(error).splitlines()[0]}', 'correct the entry') from error
-            self._waiting[column] = node.resolve_topic_name(topic)
+            self._waiting[column] = node.resolve_topic_name(whole) + field
 
     def look(self, session: Session) -> None:
         """Subscribe to the topics that exist by now, and note why others do not arrive."""
         types = dict(self._node.get_topic_names_and_types()) if self._waiting else {}
-        for column, topic in list(self._waiting.items()):
-            known = [name for name in types.get(topic, ()) if name in _NUMBERS]
-            if known:
-                del self._waiting[column]
-                kind, fields = _NUMBERS[known[0]]
-                field = next((each for each in fields if each in column), fields[0])
-                self._node.create_subscription(
-                    kind, topic, lambda message, column=column, field=field: session.around.take(
-                        column, getattr(message, field)), SENSOR)
-                session.missing[column] = f'nothing comes on {topic} ({_short(known[0])})'
-            else:
-                session.missing[column] = self._why(topic, types.get(topic, ()))
+        for column, asked in list(self._waiting.items()):
+            topic, field = topic_and_field(asked, types)
+            kinds = types.get(topic, [])
+            kind = _type_of(kinds[0]) if len(kinds) == 1 else None
+            numbers = [] if kind is None else _fields_of(kind)
+            fields = [field] if field in numbers else [] if field else (
+                [each for each in _USUAL if each in numbers and (each in column)]
+                or [each for each in numbers if each in column] or (
+                    [each for each in _USUAL if each in numbers] or numbers[:len(numbers) == 1]))
+            if not fields:
+                session.missing[column] = self._why(topic, field, kinds, numbers)
+                continue
+            del self._waiting[column]
+            value = operator.attrgetter(fields[0])
+            self._node.create_subscription(
+                kind, topic, lambda message, column=column, value=value: session.around.take(
+                    column, float(value(message))), SENSOR)
+            session.missing[column] = f'nothing comes on {topic} ({_short(kinds[0])})'
 
-    def _why(self, topic: str, types: Sequence[str]) -> str:
+    def _why(self, topic: str, field: str, types: Sequence[str], numbers: Sequence[str]) -> str:
         """Return why a topic cannot be used, and which ones can be."""
-        others = sorted({each for topics in published_by_others(self._node, _NUMBERS)
+        others = sorted({each for topics in published_by_others(self._node, _WITH_A_NUMBER)
                          for each in topics})
         usable = f'; topics with a number: {", ".join(others)}' if others else ''
-        found = (f'{topic} has the type {" and ".join(map(_short, types))}, expected '
-                 f'{", ".join(map(_short, _NUMBERS))}: ' if types else
-                 f'there is no topic {topic}: start its driver, or ')
+        found = f'there is no topic {topic}: start its driver, or '
+        if types:
+            have = f'the numbers {some(numbers)}' if numbers else 'no number that can be read'
+            found = (f'{topic} has the type {" and ".join(map(_short, types))} with {have}, '
+                     f'expected {field or "one, or its name after the topic"}: ')
         return f'{found}correct context, and restart the node{usable}'
 
 

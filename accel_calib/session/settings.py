@@ -24,7 +24,7 @@ from typing import Any, TYPE_CHECKING, TypeVar
 from ..capture import CaptureSettings, CONTEXT, REPEATED, Repeated, settings_from
 from ..effects import know_file, MODELS
 from ..errors import InputError
-from ..table import quantity_key
+from ..logs import named_topics
 from ..units import (
     FrameName, FRAMES, is_native, Method, METHODS, MODEL_NAMES, STANDARD_GRAVITY, UNIT_NAMES,
     UnitName, units_of)
@@ -159,10 +159,9 @@ class CalibratorSettings:
     publish_tf: bool = parameter(
         False, 'Publish the levelled frame on /tf_static, as a child of the frame of the sensor')
     context: list[str] = parameter(
-        [''], 'Further topics with a number that may act on the sensor, as column:=topic, such as '
-        "['supply_voltage:=battery', 'rotor_temperature:=/motor/temp']. Types: BatteryState, "
-        'FluidPressure and Temperature of sensor_msgs, Float32 and Float64 of std_msgs. ~/refine '
-        'tries each column as a cause')
+        [''], 'Further topics with a number that may act on the sensor, as column:=topic or, of a '
+        "message with several numbers, column:=topic/field, such as ['supply_voltage:=battery', "
+        "'rotor_temperature:=/motor/state/temperature']. ~/refine tries each column as a cause")
     gyro_bias: bool = parameter(
         False, 'Subtract the bias of the gyro, measured at rest, from the angular velocity',
         live=True)
@@ -230,18 +229,8 @@ def own_effects(settings: CalibratorSettings) -> tuple[str, ...]:
 
 
 def context_topics(settings: CalibratorSettings) -> dict[str, str]:
-    """Return the topic of each column of `context`; InputError if an entry is not usable."""
-    topics: dict[str, str] = {}
-    for entry in filter(None, settings.context):
-        column, _, topic = (part.strip() for part in entry.partition(':='))
-        known = column in (*CONTEXT, quantity_key(column))
-        if not (known and column and topic) or column in topics:
-            raise InputError(
-                f'context has the entry {entry!r}, expected column:=topic, each column once: '
-                f'{", ".join(CONTEXT)}, or a new name of letters, digits and _',
-                'correct the entry')
-        topics[column] = topic
-    return topics
+    """Return the topic of each column of `context`, as `logs.named_topics`."""
+    return named_topics(settings.context)
 
 
 def columns_of(settings: CalibratorSettings) -> tuple[str, ...]:
