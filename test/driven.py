@@ -124,6 +124,7 @@ class Person:
         self.driver, self.sensor, self.warming, self.flat = driver, sensor, warming, flat
         self.can_reach, self.shaken = can_reach, shaken
         self.temperature, self.steps, self.called = 25.0, [], []
+        self.times: list[float] = []
         self._up, self._rng = np.array(flat, float), np.random.default_rng(5)
 
     def rest(self, up: Any, seconds: float = 2.0) -> None:
@@ -159,6 +160,7 @@ class Person:
             assert (now.step, now.advice, now.command) == (
                 action.kind, action.words, action.command)
             self.steps.append(action.kind)
+            self.times.append(self.driver.now)
             if action.kind == 'done':
                 break
             if now.direction and self.can_reach(np.array(now.direction)):

@@ -5,14 +5,18 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
+import resource
+import signal
 from typing import Any
 
 from accel_calib.errors import InputError
 from accel_calib.session import conditions, state
 from driven import Driver, GRAVITY, Person
-from inside import next_action
+from inside import next_action, spread_directions
 import numpy as np
 import pytest
+from shared import Stored
 
 pytestmark = pytest.mark.usefixtures('home')
 
@@ -140,3 +144,69 @@ def test_words_and_direction_come_from_one_pose() -> None:
         person.rest(action.direction)
     driver.ask('fit')
     assert not next_action(driver.session).direction or '(' in next_action(driver.session).words
+
+
+def test_a_calibration_for_another_start_of_the_node_is_not_set_aside_by_the_next_step(
+        stored: Stored, tmp_path: Path) -> None:
+    path = stored(unit='native')
+    before = path.read_bytes()
+    driver = Driver(calibration_file=str(path))
+    person = Person(driver, reading())
+    assert person.follow(seconds=60.0) == 'restart'
+    assert person.called == []
+    assert path.read_bytes() == before
+    assert 'restart the node with units of the calibration' in next_action(driver.session).words
+    driver.ask('reset')
+    assert next_action(driver.session).kind == 'poses'
+
+
+def test_the_correction_and_the_range_of_the_calibration_come_before_done() -> None:
+    driver = Driver(sensor='warm')
+    person = Person(driver, lambda up, warm: reading()(up, warm) + 1e-3 * (warm - 25.0),
+                    warming=0.5)
+    assert person.follow() == 'done'
+    assert 'offset_temperature' in driver.calibration.model.effects
+    driver.session.commands.enable(False)
+    assert next_action(driver.session).kind == 'enable'
+    driver.session.commands.enable(True)
+    person.warming, person.temperature = 0.0, 60.0
+    person.rest(person.flat, 4.0)
+    action = next_action(driver.session)
+    assert (action.kind, action.command, action.level) == ('poses', 'refine', 1)
+    assert action.words in driver.finding('calibration').words
+
+
+def test_bursts_of_absurd_readings_are_said_while_they_last_and_only_counted_then() -> None:
+    driver = Driver(sensor='bursts')
+    person = Person(driver, reading())
+    person.follow()
+    driver.feed(np.full((10, 3), np.nan))
+    assert next_action(driver.session).name == 'not_finite'
+    assert driver.finding('stream').level == 1
+    person.rest(person.flat, 8.0)
+    assert next_action(driver.session).kind == 'done'
+    assert driver.finding('stream').level == 0
+    assert dict(state.figures(driver.session))['readings not finite'] == '10'
+
+
+def test_a_calibration_that_cannot_be_stored_leaves_no_file_and_is_asked_for_until_it_is(
+        home: Path) -> None:
+    driver = Driver(sensor='full')
+    person = Person(driver, reading())
+    for up in spread_directions(16):
+        person.rest(up)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
+        with pytest.raises(InputError, match='in use but could not be stored'):
+            driver.ask('fit')
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    folder = driver.session.files.store.calibration.parent
+    assert [path.name for path in folder.iterdir() if 'before' in path.name] == []
+    assert driver.calibration is not None
+    action = next_action(driver.session)
+    assert (action.kind, action.command, action.level) == ('save', 'save', 2)
+    driver.ask('save')
+    assert next_action(driver.session).kind == 'level'

@@ -9,7 +9,7 @@ from typing import Any
 
 from accel_calib.effects import empirical_name
 from accel_calib.stored import read_calibration, write_calibration
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from inside import spread_directions
 from inside_ros import force_of
 import numpy as np
@@ -119,6 +119,28 @@ def test_each_type_of_context_is_read_and_what_cannot_be_read_is_said(bench: Any
     for name, (_, value) in publishers.items():
         assert shown[name] == f'{value:.3f}'
     assert (shown['none'], shown['spread']) == ('not known', '0.000')
+
+
+def test_without_a_thermometer_the_middle_of_the_range_corrects_and_is_said(
+        bench: Any, readings: Readings, stored: Stored) -> None:
+    path = stored(sensor='imu_link')
+    calibration = with_effects(
+        read_calibration(path), {'offset_temperature': [0.01, -0.015, 0.02]}, 1e-14,
+        temperature=np.linspace(20.0, 40.0, 20))
+    write_calibration(path, calibration)
+    progress = bench.listen(DiagnosticStatus, '/calibrator/progress', latched=True)
+    bench.calibrator(calibration_file=str(path))
+    reading = readings([[0.0, 0.6, 0.8]])[0]
+    found = bench.exchange(bench.came_out, lambda: bench.imu(reading))
+    expected = calibration.apply(reading[np.newaxis], temperature=[30.0])[0]
+    np.testing.assert_allclose(force_of(found), expected, atol=1e-6)
+
+    def told() -> bool:
+        return bool(progress) and 'no temperature arrives' in progress[-1].message
+
+    bench.send_until(lambda: bench.imu(reading), told)
+    assert progress[-1].level == DiagnosticStatus.WARN
+    assert progress[-1].message.endswith('30 °C is used instead')
 
 
 CURVE = [2e-3, -1e-3, 3e-3, 1e-3, 2e-3, -2e-3, 15.0, 35.0]
