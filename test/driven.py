@@ -104,7 +104,7 @@ class Driver:
         return '\n'.join(line.words for line in self.log if line.severity == severity)
 
     def finding(self, name: str) -> Any:
-        return next(each for each in checks(self.session) if each.name == name)
+        return next(each for each in checks(self.session) if each.concern == name)
 
 
 class Person:

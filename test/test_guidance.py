@@ -7,6 +7,7 @@ import json
 from typing import Any
 
 from accel_calib.errors import RefusedFitError
+from accel_calib.session import Surroundings
 from driven import Driver, GRAVITY, Person
 from inside import next_action, spread_directions
 import numpy as np
@@ -72,7 +73,7 @@ def test_an_effect_of_temperature_leads_to_refine_and_is_kept_by_a_fit() -> None
 def test_without_messages_or_in_another_unit_the_stream_comes_first() -> None:
     driver = Driver()
     assert next_action(driver.session).kind == 'connect'
-    driver.session.imus = ('/camera/imu',)
+    driver.session.surroundings = Surroundings(imus=('/camera/imu',))
     assert next_action(driver.session).words.endswith(' /camera/imu')
     person = Person(driver, lambda up, temperature: GRAVITY * healthy(up, temperature))
     person.rest(person.flat)
@@ -165,7 +166,7 @@ def test_an_upside_down_sensor_is_asked_about_once_unless_its_mounting_is_given(
 
 def test_an_effect_far_beyond_those_of_parts_is_reported_and_not_used() -> None:
     driver = Driver()
-    driver.session.thermometers = ('/board/temperature', '/cpu')
+    driver.session.surroundings = Surroundings(thermometers=('/board/temperature', '/cpu'))
 
     def unseen(up: Any, temperature: float) -> Any:
         return healthy(up, temperature) + 3.0 * EFFECT * (temperature - 25.0)

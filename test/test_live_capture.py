@@ -202,6 +202,8 @@ def test_rest_that_is_reported_late_does_not_hide_the_ongoing_rest(stored: Store
     assert sensor.drift.count == 2
     sensor.end(late, 0.001)
     assert sensor.drift.count == 2
+    sensor.update(replace(late, end=late.end + 1e3), 0.001)  # by a clock that has jumped
+    assert sensor.drift.count == 2
 
 
 def test_remainder_of_a_rest_is_what_came_after_its_part() -> None:

@@ -61,8 +61,8 @@ def silent(driver: Driver) -> None:
 
 def refusing(driver: Driver) -> None:
     def refused() -> Any:
+        yield from ()
         raise InputError('the disk has no place', 'free some')
-        yield
 
     driver.session.commands.__dict__.update(fit=refused, calibrate_at_rest=refused)
 

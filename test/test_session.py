@@ -14,7 +14,7 @@ from accel_calib.calibrate import level, set_heading
 from accel_calib.errors import InputError, StoredCalibrationError
 from accel_calib.finding import Finding, has, LEVELS
 from accel_calib.logs import read_poses, write_table
-from accel_calib.session import CalibratorSettings, changed, Level, state
+from accel_calib.session import CalibratorSettings, changed, Level, state, Surroundings
 from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import Poses
 from driven import Driver, RATE
@@ -568,7 +568,8 @@ def test_a_quantity_is_a_column_of_poses_and_its_last_value_holds_when_it_stops(
         return np.array(driver.sensor.force_of(tuple(reading), {'motor_current': current}))
 
     np.testing.assert_allclose(force(2.0), force(10.0), atol=1e-3)
-    driver.session.missing['motor_current'] = 'nothing comes on /motor/current'
+    driver.session.surroundings = Surroundings(
+        missing={'motor_current': 'nothing comes on /motor/current'})
     around.take('motor_current', 10.0)
     line = 'no motor_current arrives: nothing comes on /motor/current; the last value holds'
     for seconds, count in ((29.0, 0), (2.0, 1), (20.0, 1)):

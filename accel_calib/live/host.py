@@ -37,7 +37,8 @@ from ..messages.one_reading import Triple
 from ..report import calibration_page, STORED
 from ..session import (
     Answer, BATCH, CalibratorSettings, CallSoon, Commands, Compute, conditions, Event, Level, Log,
-    Result, Session, Severity, ShowPoses, state, Task, Throttle, title, words_of_state, Worker)
+    Result, Session, Severity, ShowPoses, state, Surroundings, Task, Throttle, title,
+    words_of_state, Worker)
 from ..stored.exports import export, Exported
 from ..table import Floats
 
@@ -254,7 +255,7 @@ class Host:
         self._due = Throttle()
         self.session = Session(settings, source.name)
         self.session.found = source.findings
-        self.session.publishers = None
+        self.session.surroundings = Surroundings(publishers=None)
         self._worker = Worker(self.session, self._tasks.put, self._show, self._flush)
         self.exchange = Exchange(self.session, self._worker, self._tasks.put)
         try:
@@ -296,7 +297,7 @@ class Host:
 
     def _end(self, severity: Severity, words: str) -> None:
         """Show why no more samples come."""
-        self.session.ended = True
+        self.session.surroundings = Surroundings(publishers=None, ended=True)
         self._show_problem(words, severity, words)
 
     def _report_source(self) -> None:

@@ -18,6 +18,7 @@ EventsExecutor.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import partial
 from queue import SimpleQueue
 from time import monotonic
@@ -46,8 +47,9 @@ from ..errors import AccelCalibError
 from ..live import check_installed
 from ..messages.correction import output_frame
 from ..session import (
-    CalibratorSettings, CallSoon, Check, checks, COMMANDS, context_topics, Event, figures, Level,
-    Log, Mounting, next_action, Result, Session, ShowPoses, state, Still, Task, Worker, worst)
+    CalibratorSettings, CallSoon, checks, COMMANDS, Condition, context_topics, Event, figures,
+    Level, Log, Mounting, next_action, Result, Session, ShowPoses, state, Still, Surroundings,
+    Task, Worker, worst)
 from ..table import Floats
 
 if TYPE_CHECKING:
@@ -203,12 +205,12 @@ class Calibrator:
             session.set_mounting(rotation.T)
 
     def _on_tick(self) -> None:
-        self.session.publishers = tuple(
-            map(name_of, self._node.get_publishers_info_by_topic(self._topic)))
-        self.session.imus, self.session.thermometers = published_by_others(
-            self._node, ('sensor_msgs/msg/Imu', 'sensor_msgs/msg/Temperature'))
-        self.session.mismatches = mismatches(self._node)
-        self._context.look(self.session)
+        node = self._node
+        imus, thermometers = published_by_others(
+            node, ('sensor_msgs/msg/Imu', 'sensor_msgs/msg/Temperature'))
+        self.session.surroundings = Surroundings(
+            tuple(map(name_of, node.get_publishers_info_by_topic(self._topic))), imus,
+            thermometers, mismatches(node), self._context.look(self.session))
         self.stream.flush_if_due()
         self.session.tick()
         self._on_transforms()
@@ -226,9 +228,10 @@ class Calibrator:
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._diagnostics.publish(array)
 
-    def _status(self, check: Check, values: Iterable[tuple[str, str]] = ()) -> DiagnosticStatus:
+    def _status(self, check: Condition, values: Iterable[tuple[str, str]] = ()
+                ) -> DiagnosticStatus:
         return DiagnosticStatus(
-            level=bytes([check.level]), name=f'{self._name}: {check.name}', message=check.words,
+            level=bytes([check.level]), name=f'{self._name}: {check.concern}', message=check.words,
             hardware_id=self.session.name,
             values=[KeyValue(key=key, value=value) for key, value in values])
 
@@ -253,8 +256,8 @@ class Calibrator:
     def _show_progress(self) -> None:
         self._progress_at = monotonic()
         now = state.progress(self.session)
-        level = next_action(self.session).level
-        self._progress.publish(self._status(Check('progress', level, now.advice), now.figures()))
+        step = replace(next_action(self.session), concern='progress')
+        self._progress.publish(self._status(step, now.figures()))
 
     def _show(self, event: Event) -> None:
         if self._page is not None:

@@ -117,7 +117,7 @@ class ContextTopics:
     """
 
     def __init__(self, node: Node, settings: CalibratorSettings) -> None:
-        self._node, self._waiting = node, dict[str, str]()
+        self._node, self._waiting, self._missing = node, dict[str, str](), dict[str, str]()
         for column, asked in context_topics(settings).items():
             topic, _, field = asked.rpartition('/')  # a field within a field is no name
             whole, field = (topic, f'/{field}') if '.' in field and topic else (asked, '')
@@ -128,8 +128,8 @@ class ContextTopics:
                                  f'{str(error).splitlines()[0]}', 'correct the entry') from error
             self._waiting[column] = node.resolve_topic_name(whole) + field
 
-    def look(self, session: Session) -> None:
-        """Subscribe to the topics that exist by now, and note why others do not arrive."""
+    def look(self, session: Session) -> dict[str, str]:
+        """Subscribe to the topics that exist by now; return why a column does not arrive."""
         types = dict(self._node.get_topic_names_and_types()) if self._waiting else {}
         for column, asked in list(self._waiting.items()):
             topic, field = topic_and_field(asked, types)
@@ -141,14 +141,15 @@ class ContextTopics:
                 or [each for each in numbers if each in column] or (
                     [each for each in _USUAL if each in numbers] or numbers[:len(numbers) == 1]))
             if not fields:
-                session.missing[column] = self._why(topic, field, kinds, numbers)
+                self._missing[column] = self._why(topic, field, kinds, numbers)
                 continue
             del self._waiting[column]
             value = operator.attrgetter(fields[0])
             self._node.create_subscription(
                 kind, topic, lambda message, column=column, value=value: session.around.take(
                     column, float(value(message))), SENSOR)
-            session.missing[column] = f'nothing comes on {topic} ({_short(kinds[0])})'
+            self._missing[column] = f'nothing comes on {topic} ({_short(kinds[0])})'
+        return self._missing
 
     def _why(self, topic: str, field: str, types: Sequence[str], numbers: Sequence[str]) -> str:
         """Return why a topic cannot be used, and which ones can be."""

@@ -17,21 +17,23 @@ one way.
 from . import state
 from .commands import COMMANDS, Commands
 from .conditions import conditions, next_action
-from .pose_guide import Level
+from .core import Surroundings
+from .pose_guide import Condition, Level
 from .sensor import title
 from .session import BATCH, Session
 from .settings import (
     CalibratorSettings, changed, columns_of, context_topics, default_of, expected, parameter,
     Settings, WEB_PORT)
-from .state import Check, checks, figures, Progress, words_of_state, worst
+from .state import checks, figures, Progress, words_of_state, worst
 from .store import ros_home
 from .worker import (
     Answer, answered, CallSoon, Compute, Event, Files, Log, Mounting, nothing, Result, Severity,
     ShowPoses, Step, Still, Task, Throttle, Worker, WorkerProcess)
 
-__all__ = ['BATCH', 'COMMANDS', 'WEB_PORT', 'Answer', 'CalibratorSettings', 'CallSoon', 'Check',
-           'Commands', 'Compute', 'Event', 'Files', 'Level', 'Log', 'Throttle', 'Mounting',
-           'Progress', 'Result', 'Session', 'Settings', 'Severity', 'ShowPoses', 'Step', 'Still',
-           'Task', 'Worker', 'WorkerProcess', 'answered', 'changed', 'checks', 'columns_of',
-           'conditions', 'context_topics', 'default_of', 'expected', 'figures', 'next_action',
-           'nothing', 'parameter', 'ros_home', 'state', 'title', 'words_of_state', 'worst']
+__all__ = ['BATCH', 'COMMANDS', 'WEB_PORT', 'Answer', 'CalibratorSettings', 'CallSoon', 'Commands',
+           'Compute', 'Condition', 'Event', 'Files', 'Level', 'Log', 'Mounting', 'Progress',
+           'Result', 'Session', 'Settings', 'Severity', 'ShowPoses', 'Step', 'Still',
+           'Surroundings', 'Task', 'Throttle', 'Worker', 'WorkerProcess', 'answered', 'changed',
+           'checks', 'columns_of', 'conditions', 'context_topics', 'default_of', 'expected',
+           'figures', 'next_action', 'nothing', 'parameter', 'ros_home', 'state', 'title',
+           'words_of_state', 'worst']

@@ -40,9 +40,10 @@ _NEEDS_SAMPLES = ('poses', 'level', 'done', NOT_KNOWN.kind)
 def conditions(session: State) -> list[Condition]:
     """Return what is the case and what to do about it; the next step is the first entry."""
     step, files = _ordinary(session), list(_files(session))
-    around = [] if session.ended else [*_stream(session), *missing_context(session).values()]
+    ended = session.surroundings.ended
+    around = [] if ended else [*_stream(session), *missing_context(session).values()]
     of_use = list(_use(session))
-    if step.kind == 'level' and session.ended:  # nothing can be levelled any more
+    if step.kind == 'level' and ended:  # nothing can be levelled any more
         step = replace(step, kind='done', words='use the calibration', command='')
     if step.kind not in _NEEDS_SAMPLES:
         found = [step, *files, *around, *of_use]
@@ -204,18 +205,18 @@ def missing_context(session: State) -> dict[str, Condition]:
 
 
 def _why_missing(session: State, column: str) -> str:
-    if column in session.missing:
-        return session.missing[column]
-    if session.publishers is None:
-        return 'the samples do not have it'
-    return (thermometer_words(session) if column == 'temperature' else
-            f"start the node with context:=['{column}:=TOPIC'], and its topic")
+    around = session.surroundings
+    return around.missing.get(column) or (
+        'the samples do not have it' if around.publishers is None else
+        thermometer_words(session) if column == 'temperature' else
+        f"start the node with context:=['{column}:=TOPIC'], and its topic")
 
 
 def thermometer_words(session: State) -> str:
     """Return how the node would get a temperature."""
-    topics = ' or '.join(session.thermometers)
-    return session.missing.get('temperature') or (
+    around = session.surroundings
+    topics = ' or '.join(around.thermometers)
+    return around.missing.get('temperature') or (
         f'restart the node with temperature:={topics}' if topics else
         'publish the temperature of the sensor on the topic temperature')
 
@@ -241,9 +242,10 @@ _UNITS = (('g', 0.8, 1.2), ('m/s2', 8.0, 12.0))
 
 def _stream(session: State) -> Iterator[Condition]:
     """Yield what is wrong with the messages, and what to do."""
-    statistics, names = session.statistics, session.publishers or ()
-    told = {'mismatches': '; '.join(session.mismatches),
-            'silence' if session.publishers else 'no_publisher': _silence(session)}
+    statistics, around = session.statistics, session.surroundings
+    names = around.publishers or ()
+    told = {'mismatches': '; '.join(around.mismatches),
+            'silence' if names else 'no_publisher': _silence(session)}
     if len(names) > 1:
         told['publishers'] = (
             f'{"two" if len(names) == 2 else len(names)} publishers on the topic {session.topic}: '
@@ -263,8 +265,9 @@ def _stream(session: State) -> Iterator[Condition]:
 
 
 def _silence(session: State) -> str:
-    topic, publishers = session.topic, session.publishers
-    if session.mismatches or (
+    topic, around = session.topic, session.surroundings
+    publishers = around.publishers
+    if around.mismatches or (
             min(session.statistics.age, session.statistics.dropped_ago) <= SILENT):
         return ''
     if publishers is None:
@@ -273,7 +276,7 @@ def _silence(session: State) -> str:
     if publishers:
         return (f'no Imu messages on {topic}, although {publishers[0]} publishes there: check '
                 'the driver')
-    there = f', such as {" or ".join(session.imus)}' if session.imus else ''
+    there = f', such as {" or ".join(around.imus)}' if around.imus else ''
     return (f'no Imu messages on {topic}, and no publisher: start the driver, or remap '
             f'imu/data_raw to its topic{there}')
 

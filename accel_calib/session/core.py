@@ -4,7 +4,8 @@
 """What a session knows: the state that its commands, its reports and its pages read."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 import math
 
 from .sensor import Sensor
@@ -17,6 +18,34 @@ from ..errors import InputError
 from ..finding import Finding
 from ..table import Floats
 from ..units import FrameName, units_of
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """
+    What ROS, or the program behind a page, knows of the samples.
+
+    Parameters
+    ----------
+    publishers : tuple of str or None
+        Names of the nodes that publish the messages; None: the samples come from a board.
+    imus, thermometers : tuple of str
+        Topics with messages of Imus and of temperatures that other nodes publish.
+    mismatches : tuple of str
+        Publishers and subscribers with another QoS, which exchange no messages with this node.
+    missing : mapping of str to str
+        Why a column of the parameter `context` does not arrive.
+    ended : bool
+        Whether no more samples can come, because a recording has ended.
+
+    """
+
+    publishers: tuple[str, ...] | None = ()
+    imus: tuple[str, ...] = ()
+    thermometers: tuple[str, ...] = ()
+    mismatches: tuple[str, ...] = ()
+    missing: Mapping[str, str] = field(default_factory=dict)
+    ended: bool = False
 
 
 class State:
@@ -50,18 +79,10 @@ class State:
         Spread of the last samples, relative to the largest of a still sensor.
     given : (3, 3) array or None
         Mounting ΔR that is known from elsewhere.
-    publishers : tuple of str or None
-        Names of the nodes that publish the messages; None: the samples come from a board.
-    missing : dict of str to str
-        Why a column of the parameter `context` does not arrive, for the log.
-    imus, thermometers : tuple of str
-        Topics with messages of Imus and of temperatures that other nodes publish.
-    mismatches : tuple of str
-        Publishers and subscribers with another QoS, which exchange no messages with this node.
+    surroundings : Surroundings
+        What is known of the graph of ROS, or of a board.
     computing : int
         Number of fits and refinements that are running.
-    ended : bool
-        Whether no more samples can come, because a recording has ended.
     events : deque of Event
         What the session reports, in order; whoever shows it removes it.
     throttle : Throttle
@@ -90,14 +111,10 @@ class State:
         self.problem, self.is_refused = '', False
         self._refusals: dict[str, tuple[str, tuple[object, ...]]] = {}
         self.found: tuple[Finding, ...] = ()
-        self.missing: dict[str, str] = {}
-        self.publishers: tuple[str, ...] | None = ()
-        self.mismatches: tuple[str, ...] = ()
-        self.imus: tuple[str, ...] = ()
-        self.thermometers: tuple[str, ...] = ()
+        self.surroundings = Surroundings()
         self.enabled, self.still, self.still_since = True, False, math.nan
         self.stillness = math.nan
-        self.computing, self.ended = 0, False
+        self.computing = 0
         self.own = own_effects(settings)
         self.given: Floats | None = (
             mounting_of(settings.mounting_rpy) if any(settings.mounting_rpy) else None)

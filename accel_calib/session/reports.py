@@ -32,7 +32,7 @@ class Reports:
         """Report what has changed; to be called about once per second."""
         session, statistics = self._session, self._session.statistics
         now = {each.name: each for each in conditions(session) if each.name and each.level}
-        waits = not statistics.messages and not session.mismatches
+        waits = not statistics.messages and not session.surroundings.mismatches
         for name, each in now.items():
             if name not in self._told:
                 session.throttle.forget(name)
@@ -49,8 +49,8 @@ class Reports:
         if (turn := slow_turn(session)) and session.settings.auto_capture:
             session.log('info', f'no pose yet: {turn}', 'slow_turn', AGAIN)
         topics = context_topics(session.settings)
-        if (session.thermometers and statistics.messages and 'temperature' not in topics
-                and math.isnan(session.around.temperature)):
+        if (session.surroundings.thermometers and statistics.messages
+                and 'temperature' not in topics and math.isnan(session.around.temperature)):
             session.log('warning', f'no temperature arrives; {thermometer_words(session)}',
                         'thermometers', 10.0 * FAULT_AGAIN)
         for column in topics:

@@ -191,7 +191,8 @@ class Sensor:
         before = self._counted
         if before is None or not overlap(before, rest) or rest.samples < before.samples:
             return rest
-        return rest_after(before, rest) if rest.end - before.end >= _SHORT_REST else None
+        is_longer = rest.end - before.end >= _SHORT_REST and rest.samples > before.samples
+        return rest_after(before, rest) if is_longer else None
 
     def _with(self, rest: Dwell, least: float) -> Drift | None:
         """Return the state of the monitor after what was not counted yet of a rest."""

@@ -180,16 +180,7 @@ def _unit(vector: Sequence[float], length: float) -> tuple[float, ...]:
     return tuple(part / length for part in vector) if 0.0 < length < math.inf else ()
 
 
-@dataclass(frozen=True)
-class Check:
-    """The result of one check: name, severity and text."""
-
-    name: str
-    level: Level
-    words: str
-
-
-def checks(session: State) -> list[Check]:
+def checks(session: State) -> list[Condition]:
     """Return the results of all checks, one for each concern."""
     sensor, found = session.sensor, conditions(session)
     drift = sensor.drift
@@ -204,21 +195,20 @@ def checks(session: State) -> list[Check]:
                    words) for concern, words in fine.items()]
 
 
-def _check(concern: str, wrong: Sequence[Condition], fine: str) -> Check:
+def _check(concern: str, wrong: Sequence[Condition], fine: str) -> Condition:
     said = list(dict.fromkeys(each.words for each in wrong))
     if wrong and not any(each.name or each.level == Level.ERROR for each in wrong):
         said = [': '.join(filter(None, [fine, *said[:1]])), *said[1:]]
-    return Check(concern, max([Level.OK, *(each.level for each in wrong)]),
-                 '; '.join(said) or fine)
+    return Condition('', '; '.join(said) or fine, concern=concern,
+                     level=max([Level.OK, *(each.level for each in wrong)]))
 
 
-def worst(session: State) -> Check:
+def worst(session: State) -> Condition:
     """Return the check of the first of the most severe conditions, or the state if all is OK."""
     first = max(conditions(session), key=lambda each: each.level)
-    if not first.level:
-        return Check('state', first.level, words_of_state(session))
-    words = next(each.words for each in checks(session) if each.name == first.concern)
-    return Check('state', first.level, words)
+    words = words_of_state(session) if not first.level else next(
+        each.words for each in checks(session) if each.concern == first.concern)
+    return Condition('', words, level=first.level, concern='state')
 
 
 def words_of_state(session: State) -> str:
