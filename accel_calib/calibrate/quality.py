@@ -127,13 +127,9 @@ def quality_of(fit: Fit, units: Units, directions: Floats) -> Quality:
     """Return figures of a fit; `directions` are up in each of its poses, (n, 3) unit vectors."""
     vectors = 'reference' in fit.poses_g
     held_out = _held_out(fit)
-    floor = None
-    if fit.noise_known:  # the fit absorbs a part of the noise
-        data = fit.by_pose
-        own = np.trace(data.own, axis1=1, axis2=2) - (data.columns.shape[1] - data.rows)
-        floor = rms(fit.equations.scale * np.sqrt(np.maximum(own, 0.0))) * MG
     return Quality(*_residuals(fit.model, fit.poses_g, units, vectors),
-                   None if held_out is None else rms(held_out) * MG, floor,
+                   None if held_out is None else rms(held_out) * MG,
+                   rms(fit.noise_g) * MG if fit.noise_known else None,
                    fit.chi2 / fit.dof if fit.noise_known and fit.dof > 0 else None,
                    coverage(directions))
 

@@ -244,6 +244,13 @@ class Fit:
         return by_pose(self.residual, self.columns, self.equations.pose, prior)
 
     @cached_property
+    def noise_g(self) -> Floats:
+        """(n,) residual of each pose that noise alone causes [g]; the fit absorbs a part of it."""
+        data = self.by_pose
+        own = np.trace(data.own, axis1=1, axis2=2) - (data.columns.shape[1] - data.rows)
+        return np.asarray(self.equations.scale * np.sqrt(np.maximum(own, 0.0)))
+
+    @cached_property
     def _triangle(self) -> tuple[Floats, Floats]:
         """(m, q) R of the QR decomposition of the scaled columns, block by block; the scales."""
         columns, size = _scaled(self.columns)

@@ -26,7 +26,7 @@ from ..calibrate import determines, NORM_MODELS, with_history
 from ..effects import (
     Context, Effect, effect_named, factors_of, included, kind_of, linear_model, Model)
 from ..estimate import Equations, estimate, Fit, kinds, left_out, NotConvergedError
-from ..geometry import unit
+from ..geometry import rms, unit
 from ..table import Floats, Poses
 from ..units import MG
 
@@ -238,10 +238,10 @@ class State:
 
     def gap_mg(self, residual: Floats) -> float:
         """Return the RMS over the new poses of (m,) residuals of the equations [mg]."""
-        of_poses = self.fit.equations.of_poses(residual)
-        if 'new' in self.poses_g:
-            of_poses = of_poses[self.poses_g['new'] > 0.0]
-        return float(np.sqrt(np.mean(of_poses ** 2))) * MG
+        return rms(self._of_new(self.fit.equations.of_poses(residual))) * MG
+
+    def _of_new(self, of_poses: Floats) -> Floats:
+        return of_poses[self.poses_g['new'] > 0.0] if 'new' in self.poses_g else of_poses
 
     def mg_of_poses(self, residual: Floats) -> Floats:
         """Return the (n,) residuals of poses from (m,) residuals of the equations [mg]."""
@@ -255,10 +255,7 @@ class State:
     @property
     def floor_mg(self) -> float | None:
         """Return the residual expected of a correct model [mg]; None if the noise is unknown."""
-        if not self.fit.noise_known:
-            return None
-        count = len(self.residual)
-        return self.gap_mg(np.full(count, np.sqrt(self.dof / count)))
+        return rms(self._of_new(self.fit.noise_g)) * MG if self.fit.noise_known else None
 
 
 def is_noise(rss: float, dof: float) -> bool:
