@@ -146,12 +146,15 @@ def test_words_and_direction_come_from_one_pose() -> None:
     assert not next_action(driver.session).direction or '(' in next_action(driver.session).words
 
 
+@pytest.mark.parametrize('count', [0, 20])
 def test_a_calibration_for_another_start_of_the_node_is_not_set_aside_by_the_next_step(
-        stored: Stored, tmp_path: Path) -> None:
+        stored: Stored, count: int) -> None:
     path = stored(unit='native')
     before = path.read_bytes()
     driver = Driver(calibration_file=str(path))
     person = Person(driver, reading())
+    for up in spread_directions(count):
+        person.rest(up)
     assert person.follow(seconds=60.0) == 'restart'
     assert person.called == []
     assert path.read_bytes() == before

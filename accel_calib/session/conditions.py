@@ -39,10 +39,11 @@ _NEEDS_SAMPLES = ('poses', 'level', 'done', NOT_KNOWN.kind)
 
 def conditions(session: State) -> list[Condition]:
     """Return what is the case and what to do about it; the next step is the first entry."""
-    step, files = _ordinary(session), list(_files(session))
+    step, files, of_use = _ordinary(session), list(_files(session)), list(_use(session))
+    blocks = bool(session.files.problem) or session.is_refused
+    first, files = (files[:1], files[1:]) if blocks else ([], files)
     ended = session.surroundings.ended
     around = [] if ended else [*_stream(session), *missing_context(session).values()]
-    of_use = list(_use(session))
     if step.kind == 'level' and ended:  # nothing can be levelled any more
         step = replace(step, kind='done', words='use the calibration', command='')
     if step.kind not in _NEEDS_SAMPLES:
@@ -50,15 +51,13 @@ def conditions(session: State) -> list[Condition]:
     elif step.kind == 'done':
         found = [*files, *around, *of_use, step]
         found.sort(key=lambda each: each is not step and each.kind == step.kind)
-    elif files and files[0].kind:
-        found = [*files, *around, step, *of_use]
     else:  # whoever turns the sensor is told of the files, and goes on
         told = '; '.join([each.words for each in files] + [step.words])
         level = max([step.level, *(each.level for each in files)])
         found = [*around, replace(step, words=told, level=level), *files, *of_use]
     axes = session.sensor.guide.axes_words
-    return found + ([Condition('poses', axes, '', (), Level.WARN, 'stream', 'axes')] if axes
-                    else [])
+    return [*first, *found, *([Condition('poses', axes, '', (), Level.WARN, 'stream', 'axes')]
+                              if axes else [])]
 
 
 def next_action(session: State) -> Condition:
@@ -160,15 +159,14 @@ def slow_turn(session: State) -> str:
 # ----------------------------------------------------------------------------- files and use
 
 def _files(session: State) -> Iterator[Condition]:
-    """Yield what is wrong with the files; of a kind only if the calibration must wait for it."""
+    """Yield what is wrong with the files."""
     if session.problem:
-        kind = 'restart' if session.files.problem or session.is_refused else ''
-        yield Condition(kind, session.problem, '', (), Level.ERROR)
+        yield Condition('restart', session.problem, '', (), Level.ERROR)
     store = session.files.store
     if store is not None and not store.is_writable():
-        yield Condition('', f'{session.files.path} cannot be written: correct the permissions, or '
-                        'restart the node with another calibration_file', '', (), Level.ERROR,
-                        'storage')
+        yield Condition(
+            'save', f'{session.files.path} cannot be written: correct the permissions, or restart '
+            'the node with another calibration_file', '', (), Level.ERROR, 'storage')
 
 
 def _use(session: State) -> Iterator[Condition]:
