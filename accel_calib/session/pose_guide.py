@@ -55,6 +55,10 @@ NOT_FOLLOWED = 3
 _FEWEST_WRONG = 2
 """Smallest number of wrong answers that show swapped or inverted axes."""
 
+_AGREES = math.cos(math.radians(25.0))
+"""All answers must be within 25° of those with such axes: whoever turns the sensor in an own order
+agrees by chance in 1 % of the orders."""
+
 
 class Level(IntEnum):
     """Severity, as in diagnostic_msgs/DiagnosticStatus."""
@@ -165,6 +169,9 @@ _AXES = sorted((np.eye(3)[list(order)] * signs for order in permutations(range(3
                 for signs in product((1.0, -1.0), repeat=3)),
                key=lambda axes: np.sum(np.diag(axes) != 1.0) + 0.1 * np.sum(axes < 0.0))
 """The 48 ways in which axes can be swapped and inverted, the most likely first: reading = A up."""
+
+_SIMPLE = 7
+"""Number of them with no, or with one axis inverted, or two swapped."""
 
 
 class Guide:
@@ -292,8 +299,9 @@ class Guide:
         telling = np.min(np.abs(asked @ asked.T)) < _APART and not lies_in_cone(
             np.vstack([up, read]))
         if telling and np.sum(np.sum(read * asked, axis=1) < _FOLLOWED) >= _FEWEST_WRONG:
-            for axes in _AXES:
-                if np.all(np.sum(read * (asked @ axes.T), axis=1) >= _FOLLOWED):
+            likely = _AXES if len(asked) > _FEWEST_WRONG else _AXES[:_SIMPLE]
+            for axes in likely:
+                if np.all(np.sum(read * (asked @ axes.T), axis=1) >= _AGREES):
                     return axes
         return _AXES[0]
 
