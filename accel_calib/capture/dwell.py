@@ -246,7 +246,10 @@ def _reasons(table: Records, rule: Rule, tiny: Floats
              'frozen': np.all(tiny >= table['std'].T, axis=0) & (not rule.repeats),
              'shaking': np.any(limit < table['lowest'].T, axis=0), 'slope': sloping}
     quiet = ~np.any(list(found.values()), axis=0)
-    across, along = (_excess(table[name], quiet) for name in ('excess', 'along'))
+    # The excess of the noise of each mean, estimated from all dwells.
+    own = np.stack([table['excess'], table['along']])
+    common = np.median(own[:, quiet], axis=1, keepdims=True) if quiet.any() else 1.0
+    across, along = np.maximum(np.maximum(common, 1.0), own / _OWN_EXCESS)
     found['turning'], sure = _by_gyro(table, quiet, rule)
     turn = np.sqrt(np.sum(slope**2, axis=0)) + SURE * table['error'] * np.sqrt(across)
     found['noisy'] = ~sure & ~((turn < TURN_G * scale) | (scale == 0.0))
@@ -254,12 +257,6 @@ def _reasons(table: Records, rule: Rule, tiny: Floats
     found['length'] = np.zeros(len(table), bool)
     found['length'][good] = ~rule.reads_gravity(table['mean'][:, :3][good])
     return quiet, np.minimum(across, along), np.select(list(found.values()), list(found), '')
-
-
-def _excess(own: Floats, quiet: NDArray[np.bool_]) -> Floats:
-    """Return the excess of the noise of each mean, estimated from all dwells."""
-    common = float(np.median(own[quiet])) if quiet.any() else 1.0
-    return np.asarray(np.maximum(max(1.0, common), own / _OWN_EXCESS))
 
 
 def _by_gyro(table: Records, quiet: NDArray[np.bool_], rule: Rule
@@ -395,28 +392,14 @@ class Tracker:
         longest = self._settings.max_dwell / chunks.length
         self._longest = max(int(longest), self._shortest) if math.isfinite(longest) else 0
 
-    def feed(self, chunks: Records) -> list[OngoingDwell]:
-        """Return the dwells that end with these chunks, of a `chunk_type`."""
-        self._waiting = chained(self._waiting, chunks)
-        return list(self._decide(last=False))
+    def feed(self, chunks: Records = _NONE, *, last: bool = False) -> Iterator[OngoingDwell]:
+        """
+        Yield the dwells that end with these chunks, of a `chunk_type`, or with those before.
 
-    def close(self) -> list[OngoingDwell]:
-        """End the ongoing dwell because no chunk follows, and return all dwells that end."""
-        return [*self._decide(last=True), *self._end()]
+        A chunk is decided once its verdict is final; each is, if these are the last ones.
 
-    def current(self) -> OngoingDwell | None:
-        """Return the ongoing dwell as if it ended now, or None if it is too short."""
-        if not len(self._waiting) or not self._waiting['still'][-1]:
-            return None
-        twin = copy.copy(self)
-        twin._dwell = copy.copy(self._dwell)
-        list(twin._decide(last=True))
-        found = twin._finished()
-        return None if found is None or found.short else found
-
-    def _decide(self, last: bool) -> Iterator[OngoingDwell]:
-        """Yield the dwells that end with the chunks whose verdict is final."""
-        waiting = self._waiting
+        """
+        waiting = chained(self._waiting, chunks)
         verdict = _verdict(waiting, last)
         edges = np.flatnonzero(np.diff(verdict)) + 1
         for start, stop in zip([0, *edges], [*edges, len(verdict)]):
@@ -424,6 +407,20 @@ class Tracker:
                 part = waiting[start:stop]
                 yield from self._extend(part) if verdict[start] else self._skip(part)
         self._waiting = waiting[len(verdict):]
+
+    def close(self) -> list[OngoingDwell]:
+        """End the ongoing dwell because no chunk follows, and return all dwells that end."""
+        return [*self.feed(last=True), *self._end()]
+
+    def current(self) -> OngoingDwell | None:
+        """Return the ongoing dwell as if it ended now, or None if it is too short."""
+        if not len(self._waiting) or not self._waiting['still'][-1]:
+            return None
+        twin = copy.copy(self)
+        twin._dwell = copy.copy(self._dwell)
+        list(twin.feed(last=True))
+        found = twin._finished()
+        return None if found is None or found.short else found
 
     def _skip(self, chunks: Records) -> Iterator[OngoingDwell]:
         self._pause += len(chunks)

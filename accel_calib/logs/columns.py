@@ -32,6 +32,7 @@ FRACTION = 'time_ns'
 _MAY_LACK = ('temperature', 'supply_voltage')
 """Columns that rows of a partial table may lack."""
 
+
 def named_topics(entries: Iterable[str]) -> dict[str, str]:
     """
     Return the topic, with its field if one is named, of each column of the context.
