@@ -178,7 +178,7 @@ class Rule:
     def scale(self) -> float:
         """Return the reading of 1 g; for native units half the range at rest, 0 if not known."""
         return self._per_g if self.known else float(_half_range(
-            self._lowest, self._highest, self._floor[:3]))
+            self._lowest, self._highest, self._floors[int(self.repeats), :3]))
 
     @property
     def steps(self) -> tuple[float, float]:
@@ -186,15 +186,11 @@ class Rule:
         reading, rate = np.where(np.isfinite(self._step), self._step, 0.0).tolist()
         return reading, rate
 
-    @property
-    def _floor(self) -> Floats:
-        """Return the (6,) smallest variances of a stretch so far."""
-        return np.asarray(self._floors[int(self.repeats)])
-
     def noise_of(self, mean: Floats) -> Floats:
         """Return the variance of the noise of the sensor as known now, for (6, n) means."""
         axes = len(mean)
-        noise = at_least(self._floor[:axes, np.newaxis], self._step[:, np.newaxis], mean)
+        noise = at_least(self._floors[int(self.repeats), :axes, np.newaxis],
+                         self._step[:, np.newaxis], mean)
         return at_least_any(np.fmax(noise, self.least[:axes, np.newaxis]), np.asarray(self.scale))
 
     def limit_of(self, noise: Floats, ratio: float = VARIANCE_RATIO,

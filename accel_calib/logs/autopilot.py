@@ -35,6 +35,7 @@ first message in order of preference whose samples are dense enough for the capt
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 import math
 import re
@@ -153,18 +154,20 @@ class Parameters:
     """
 
     def __init__(self, stated: Iterable[tuple[Any, str, Any]], unit: float) -> None:
-        self._stated = [(float(time) * unit, name, float(value)) for time, name, value in stated
-                        if _MATTER.match(name) and _is_number(time) and _is_number(value)]
+        self.stated: list[tuple[float, str, float]] = []
         self.used: dict[str, float] = {}
-
-    def __bool__(self) -> bool:
-        return bool(self._stated)
+        for time, name, value in stated:
+            if _MATTER.match(name):
+                with suppress(ValueError):  # a damaged line of text, or a damaged parameter
+                    when, number = float(time) * unit, float(value)
+                    if math.isfinite(when) and math.isfinite(number):
+                        self.stated.append((when, name, number))
 
     def spans(self) -> Iterator[tuple[float, float, Values]]:
         """Yield from when to when which values hold; the first of each holds from the start."""
-        values = {name: value for _, name, value in reversed(self._stated)}
+        values = {name: value for _, name, value in reversed(self.stated)}
         start = -np.inf
-        for time, name, value in self._stated:
+        for time, name, value in self.stated:
             if values[name] != value and not _AT_BOOT.match(name):
                 yield start, time, dict(values)
                 values[name], start = value, time
@@ -196,13 +199,6 @@ Correction = Callable[[Values], ByAxis]
 """Function that returns the correction of some values, or raises UnknownCorrectionError."""
 
 
-def _is_number(value: float | str | bytes) -> bool:
-    try:
-        return math.isfinite(float(value))
-    except ValueError:  # a damaged line of text, or a damaged parameter
-        return False
-
-
 def raw_columns(columns: Mapping[str, Floats], parameters: Parameters, correction: Correction
                 ) -> dict[str, Floats]:
     """Return columns with the readings of the sensor in its own axes; rates are only turned."""
@@ -218,7 +214,7 @@ def raw_columns(columns: Mapping[str, Floats], parameters: Parameters, correctio
         found['reading'][which] = old.raw(found['reading'][which], temperature[which])
         if 'rate' in found:
             found['rate'][which] = found['rate'][which] @ old.rotation
-    if not parameters:
+    if not parameters.stated:
         raise UnknownCorrectionError('its parameters are not in the log')
     return found
 

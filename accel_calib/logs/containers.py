@@ -226,17 +226,16 @@ class Frame:
                        if isinstance(about.get(name), str | Mapping) and about[name])
 
         def lines() -> Bytes:
-            cells = [_plain(values) for values in columns.values()]
             yield head.encode()
-            yield from csv_of(chain([list(columns)], zip(*cells, strict=True)))
+            parts = []
+            for values in columns.values():
+                is_date = getattr(values.dtype, 'kind', '') == 'M'
+                cells = np.asarray(values, 'M8[ns]' if is_date else None)
+                if cells.dtype.kind == 'M':
+                    cells = np.datetime_as_string(cells)  # in UTC
+                elif cells.dtype.kind == 'm':
+                    cells = cells / np.timedelta64(1, 's')
+                parts.append(cells.tolist())
+            yield from csv_of(chain([list(columns)], zip(*parts, strict=True)))
 
         return Member('', len(columns) * len(self.data) * CELL_BYTES, lines)
-
-
-def _plain(values: Any) -> list[Any]:
-    """Return a column as numbers or text; dates in UTC, durations in s."""
-    is_date = getattr(values.dtype, 'kind', '') == 'M'
-    cells = np.asarray(values, 'M8[ns]' if is_date else None)
-    if cells.dtype.kind == 'M':
-        return np.datetime_as_string(cells).tolist()
-    return (cells / np.timedelta64(1, 's') if cells.dtype.kind == 'm' else cells).tolist()

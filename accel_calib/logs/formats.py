@@ -36,7 +36,7 @@ from .dialect import shown
 from .flight import DATAFLASH, read_dataflash, read_ulg
 from .names import meaning, record_instead
 from .quantities import are_samples, are_untimed_samples, decided, Quantities
-from .text import open_text, PEEKED, TextTable
+from .text import PEEKED, text_table, TextTable
 from ..disk import check_regular, FIRST_LINE
 from ..errors import DamagedLogError, InputError, needing, saying
 from ..finding import Finding
@@ -186,8 +186,7 @@ def _opened(file: LogFile, member: Member, options: LogOptions) -> Iterator[Text
         if inside is not TEXT:
             raise InputError(f'{path} holds {name}, {inside.name}, expected a table of text',
                              containers.UNPACK)
-        with open_text(path / member.name, options, raw, member.size) as text:
-            yield text
+        yield text_table(path / member.name, options, raw, member.size)
 
 
 def _member_of(file: LogFile, members: Sequence[Member], options: LogOptions

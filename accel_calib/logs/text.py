@@ -12,7 +12,6 @@ The rows are read once, in blocks, so the memory needed does not depend on the l
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from functools import partial
 import io
 from itertools import chain, islice
@@ -47,18 +46,16 @@ _QUOTED_LINES = 20
 """Largest number of lines of one quoted cell."""
 
 
-@contextmanager
-def open_text(path: Path, options: LogOptions, raw: io.BufferedReader[Any], size: int
-              ) -> Iterator[TextTable]:
-    """Open the text table of a file of this size [bytes]; see `layout_of`."""
+def text_table(path: Path, options: LogOptions, raw: io.BufferedReader[Any], size: int
+               ) -> TextTable:
+    """Return the text table of an open file of this size [bytes]; see `layout_of`."""
     encoding = _encoding(raw.peek())
-    with io.TextIOWrapper(raw, encoding, errors='replace', newline=None) as text:
-        head = _head(path, text)
-        rows: Iterator[str] = text
-        if label := first_label(head):
-            rows = _readings(chain(head, text), label)
-            head = list(islice(rows, _HEAD_LINES))
-        yield TextTable(path, head, rows, options, encoding, size)
+    text = io.TextIOWrapper(raw, encoding, errors='replace', newline=None)
+    head, rows = _head(path, text), iter(text)
+    if label := first_label(head):
+        rows = _readings(chain(head, text), label)
+        head = list(islice(rows, _HEAD_LINES))
+    return TextTable(path, head, rows, options, encoding, size)
 
 
 def _readings(lines: Iterable[str], label: str) -> Iterator[str]:
