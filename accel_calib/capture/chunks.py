@@ -249,12 +249,10 @@ def repeated_extremes(reading: Floats, starts: Indices, highest: Floats) -> tupl
 
 
 _LEARN = 16  # intervals from which the period is estimated
-_SAMPLES = 2  # smallest number of samples in a chunk
 _MISSING_SECONDS = 0.5  # a longer interval, also longer than _MISSING_PERIODS, is an interruption
 _MISSING_PERIODS = 5.0
 _BACK_SECONDS = 0.01  # a step back by less, or by less than _BACK_PERIODS, is jitter
 _BACK_PERIODS = 2.0
-_INTERRUPTIONS_MAX = 10_000
 _PENDING_MAX = 200_000  # largest number of samples in a chunk; with more, the clock has stopped
 
 
@@ -312,7 +310,7 @@ class Chunker:
         self._origin: Floats = np.empty(0)
         self._length = self._epoch = self._latest = self._period = 0.0
         self._pending: Floats = np.empty(0)
-        self.interruptions: deque[Interruption] = deque(maxlen=_INTERRUPTIONS_MAX)
+        self.interruptions: deque[Interruption] = deque(maxlen=10_000)
         self.restart()
 
     def feed(self, samples: Floats, last: bool) -> Iterator[Chunks]:
@@ -363,7 +361,7 @@ class Chunker:
         steps = np.diff(time[:_LEARN + 1])
         median = float(np.median(steps))
         self._period = median if median > 0.0 else max(float(np.mean(steps)), 0.0)
-        self._length = max(self._shortest, _SAMPLES * self._period)
+        self._length = max(self._shortest, 2.0 * self._period)  # two samples
         self._epoch = self._latest = float(time[0])
         return True
 

@@ -40,11 +40,6 @@ from ..units import Units
 _BLOCK = 1 << 14     # samples summed at a time; they fit in the cache
 _AT_ONCE = 1 << 17   # samples passed to the detector at a time
 
-_MISSING_MAX = 10_000
-
-_EARLIER = 100
-"""Number of earlier dwells that are used in the test of a new dwell."""
-
 
 class StillDetector:
     """
@@ -69,7 +64,7 @@ class StillDetector:
         self._least, self._largest = np.full(4, np.inf), np.full(4, -np.inf)  # x, y, z, |reading|²
         self.refused: tuple[Rest, ...] = ()
         self._mean = np.full(6, np.nan)
-        self._missing: deque[Rest] = deque(maxlen=_MISSING_MAX)
+        self._missing: deque[Rest] = deque(maxlen=10_000)
 
     def push(self, samples: Floats) -> list[Dwell]:
         """
@@ -98,8 +93,9 @@ class StillDetector:
 
     def close(self) -> list[Dwell]:
         """End the ongoing dwell, because the stream is interrupted; return it if it is still."""
-        found = [*self._feed([np.empty((4, 0))], last=True), *self._leave()]
+        found = [*self._feed([np.empty((4, 0))], last=True), *self._tracker.close()]
         self._chunker.restart()
+        self.still = False
         return self._ended(found)
 
     def current(self) -> Dwell | None:
@@ -164,7 +160,7 @@ class StillDetector:
             self._measure(block[1:4])
         for chunks in together(whole):
             if chunks.fresh:
-                yield from self._leave()
+                yield from self._tracker.close()
                 self._tracker.start(chunks)
             verdict = self._rule.feed(chunks)
             self._miss(verdict, chunks.length)
@@ -172,7 +168,8 @@ class StillDetector:
             self.still = bool(verdict['still'][-1])
             self._mean = chunks.origin
         if self._chunker.fresh:  # the stamps were interrupted: what is known of the rest is over
-            yield from self._leave()
+            self.still = False
+            yield from self._tracker.close()
 
     def _measure(self, reading: Floats) -> None:
         """Note the ranges of (3, n) readings; zeros are missing samples."""
@@ -183,10 +180,6 @@ class StillDetector:
         if len(square):
             self._least = np.minimum(self._least, np.append(reading.min(axis=1), square.min()))
             self._largest = np.maximum(self._largest, np.append(reading.max(axis=1), square.max()))
-
-    def _leave(self) -> list[OngoingDwell]:
-        self.still = False
-        return self._tracker.close()
 
     def _keep(self, ended: Iterable[OngoingDwell]) -> int:
         """Store the figures of these dwells, and return their number."""
@@ -209,7 +202,8 @@ class StillDetector:
         return [each for each in every if not each.reason]
 
     def _beside(self, found: Records, earlier: Records) -> list[Dwell]:
-        earlier = earlier[-_EARLIER:]
+        """Return dwells as they are judged together with the last 100 of the earlier ones."""
+        earlier = earlier[-100:]
         return judged(chained(earlier, found), self._rule, self._context, len(earlier))
 
     def _miss(self, verdict: Records, length: float) -> None:

@@ -224,8 +224,20 @@ def judged(table: Records, rule: Rule, context: Sequence[str], first: int = 0) -
                 + np.maximum(left[:, np.newaxis], 1e-2 * tiny**2))
     count = np.sum(rounded**2, axis=0) / np.sum(variance, axis=0)
     rate_std = np.maximum(np.sqrt(table['average'][:, 3:]), rate_step / math.sqrt(12.0))
-    return [_dwell(context, *each) for each in zip(*(part[first:] for part in (
-        table, rounded.T.copy(), count, rate_std, reason, ends)), strict=True)]
+    found = []
+    for each, own, n, own_rate, why, at_limit in zip(*(part[first:] for part in (
+            table, rounded.T.copy(), count, rate_std, reason, ends)), strict=True):
+        around: dict[str, float | Floats] = {
+            name: value for name, value in zip(context, each['around'].tolist(), strict=True)
+            if math.isfinite(value)}
+        mean = each['mean'].copy()
+        if np.isfinite(mean).all():
+            around['rate'] = mean[3:]
+        found.append(Dwell(
+            float(each['begin']), float(each['end']), float(each['time']), mean[:3], own, float(n),
+            int(each['samples']), around, int(each['orientation']), rate_std=own_rate,
+            reason=str(why), at_limit=bool(at_limit)))
+    return found
 
 
 def _reasons(table: Records, rule: Rule, tiny: Floats
@@ -279,19 +291,6 @@ def _by_gyro(table: Records, quiet: NDArray[np.bool_], rule: Rule
     alive = np.all(table['average'].T[3:] > 0.0, axis=0)
     sure = known & alive & (tilting < _GYRO_RATE) & (_SPREADS * spread < _GYRO_RATE)
     return known & (tilting > max(_GYRO_RATE, 2.0 * _SPREADS * spread)), sure
-
-
-def _dwell(context: Sequence[str], found: Any, std: Floats, count: float, rate_std: Floats,
-           reason: str, at_limit: bool) -> Dwell:
-    known: dict[str, float | Floats] = {
-        name: value for name, value in zip(context, found['around'].tolist(), strict=True)
-        if math.isfinite(value)}
-    mean = found['mean'].copy()
-    if np.isfinite(mean).all():
-        known['rate'] = mean[3:]
-    return Dwell(float(found['begin']), float(found['end']), float(found['time']), mean[:3], std,
-                 float(count), int(found['samples']), known, int(found['orientation']),
-                 rate_std=rate_std, reason=str(reason), at_limit=bool(at_limit))
 
 
 CELLS = 256

@@ -96,7 +96,6 @@ _ABOUT = {
 """What a log is, what its temperature is, and what to do if the correction is not known."""
 
 _SLOTS, _THERMAL = range(4), 'TC_A'
-_ARDUPILOT_INSTANCES = (1, 2, 3)
 _NAMED = 3
 
 Values = Mapping[str, float]
@@ -254,7 +253,7 @@ def px4_correction(parameters: Parameters, autopilot: Autopilot, release: tuple[
 
 def ardupilot_correction(parameters: Parameters, instance: int, values: Values) -> ByAxis:
     """Return the correction of ArduPilot for an accelerometer, numbered from 1."""
-    if instance not in _ARDUPILOT_INSTANCES:
+    if instance not in (1, 2, 3):
         raise UnknownCorrectionError(f'parameters of accelerometer {instance} are not read')
     start, thermal_start = f'INS_ACC{"" if instance == 1 else instance}', f'INS_TCAL{instance}_'
     offset = parameters.three(values, f'{start}OFFS_{{}}', 0.0)

@@ -261,7 +261,7 @@ def _received(file: LogFile, stream: Any, ended: Callable[[], int]) -> Iterator[
 class _Server:
     """The process that forks a child for each file."""
 
-    def __init__(self) -> None:
+    def __init__(self, _: int) -> None:
         self._turn = Lock()
         self._process: subprocess.Popen[bytes] | None = None
         atexit.register(self.close)
@@ -308,10 +308,8 @@ class _Server:
             self._process = None
 
 
-@cache
-def _server(pid: int) -> _Server:
-    """Return the server of this process; a copy that was forked needs another one."""
-    return _Server()
+_server = cache(_Server)
+"""The server of the process with an id; a copy of it that was forked needs another one."""
 
 
 def serve() -> None:

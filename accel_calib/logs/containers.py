@@ -45,7 +45,6 @@ CELL_BYTES = 18
 """Bytes of a number as text, about."""
 
 _PIECE, _ENCRYPTED = 1 << 16, 1
-_MAGIC = 10
 
 
 def _open_zstd(path: Path) -> Any:
@@ -113,7 +112,7 @@ def _pieces(opened: Callable[[], Any]) -> Bytes:
 def text(path: Path, _: ExitStack) -> list[Member]:
     """Return the only table of a file, unpacked if it is packed."""
     with path.open('rb') as file:
-        head = file.read(_MAGIC)
+        head = file.read(10)
     unpack = next((opened for first, opened in PACKED.values() if re.match(first, head)),
                   io.FileIO)
     return [Member('', path.stat().st_size, partial(_pieces, partial(unpack, path)))]

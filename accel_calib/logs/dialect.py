@@ -38,12 +38,9 @@ DELIMITERS = (';', '\t', '|', ',', '')
 """Delimiters in the order of preference; the empty one is any run of blanks."""
 
 _DELIMITER_WORDS = {'\t': 'tab', '': 'blanks', '|': "'|'", ';': "';'"}
-_COMMENTS = ('#', '//', '%')
 _TRIED_LINES = 200
-"""Number of lines from which the delimiter and the decimal mark are found."""
-
-_SAMPLE_ROWS = 200
-"""Number of first rows in `Layout.sample`."""
+"""Number of lines from which the delimiter and the decimal mark are found, and of the rows in
+`Layout.sample`."""
 
 _RATE = re.compile(
     r'(?:rate|frequency|\bodr|\bfs|\bat)\b(?:[^\w\n]{0,12}(\d+(?:\.\d+)?)[ ,;\t]?(k?)Hz\b|'
@@ -71,7 +68,6 @@ _LIKE_NUMBER = re.compile(r'[-+]?(?:(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?|nan
                           re.ASCII | re.IGNORECASE)
 _DECIMAL = re.compile(r'[-+]?\d*([.,])\d+(?:[eE][-+]?\d+)?', re.ASCII)
 _UNREADABLE = re.compile('[\x00-\x08\x0e-\x1a\x1c-\x1f\x7f\ufffd]')
-_UNREADABLE_SHARE = 0.3
 _SHOWN_CHARACTERS = 40
 _EXAMPLE = 'such as time,ax,ay,az and one row for each pose or sample'
 
@@ -261,7 +257,7 @@ def first_label(head: Sequence[str]) -> str:
 
 def is_comment(line: str) -> bool:
     """Return whether a line is a comment."""
-    return line.startswith(_COMMENTS)
+    return line.startswith(('#', '//', '%'))
 
 
 def short(text: str) -> str:
@@ -284,7 +280,7 @@ def layout_of(path: Path, head: Sequence[str], is_header: IsHeader, encoding: st
 
     """
     bad = sum(len(_UNREADABLE.findall(line)) for line in head)
-    if bad > _UNREADABLE_SHARE * sum(map(len, head)):
+    if bad > 0.3 * sum(map(len, head)):
         raise InputError(f'{path} is not a text file, expected a CSV table',
                          'use a CSV table or a bag')
     if all(line.isspace() or line[0] == '#' for line in head):
@@ -319,7 +315,7 @@ def layout_of(path: Path, head: Sequence[str], is_header: IsHeader, encoding: st
                if match}
     return Layout(path, found.dialect, min(decimal, default=''), found.header, units_row,
                   _width(found.header, rows), start, encoding, _about(path, head), tuple(notes),
-                  tuple(map(tuple, rows[:_SAMPLE_ROWS])), rate_hz)
+                  tuple(map(tuple, rows[:_TRIED_LINES])), rate_hz)
 
 
 def _rate_below_start(rows: Sequence[Sequence[str]]) -> float | None:

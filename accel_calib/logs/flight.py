@@ -67,7 +67,6 @@ _RAW, _FILTERED = 'sensor_accel', 'vehicle_acceleration'
 _MORE = {'sensor_combined': (_RELATIVE,), 'vehicle_imu': tuple(PX4_SPANS.values())}
 _NEEDED = {name: {*chain(*fields.values()), *_MORE.get(name, ())}
            for name, fields in PX4_FIELDS.items()}
-_ALSO = ('sensor_gyro', 'sensor_selection')
 
 
 class _WholeReads(io.BufferedReader):
@@ -138,7 +137,7 @@ def _px4_messages(path: Path
     from pyulog import ULog
 
     with _WholeReads(io.FileIO(path)) as file:
-        log = ULog(file, [*PX4_MESSAGES, *_ALSO])
+        log = ULog(file, [*PX4_MESSAGES, 'sensor_gyro', 'sensor_selection'])
     found = []
     for data in log.data_list:
         stamps = data.data['timestamp']
@@ -223,7 +222,13 @@ def read_dataflash(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
         (message, message.fields[name]) for message in found for name in ('T', 'Temp')
         if (message.name, message.instance) == ('IMU', chosen.instance)
         and np.any(message.fields.get(name, 0.0))))
-    parameters, number = _parameters(tables.get('PARM', {})), chosen.instance + 1
+    stated, number = tables.get('PARM', {}), chosen.instance + 1
+    stamp = next((key for key in _STAMPS if key in stated), '')
+    rows = (zip(*(stated[key].tolist() for key in (stamp, 'Name', 'Value')))
+            if stamp and {'Name', 'Value'} <= set(stated) else ())  # damaged ones are left out
+    parameters = Parameters((
+        (time, name.decode('latin-1') if isinstance(name, bytes) else str(name), value)
+        for time, name, value in rows), _STAMPS.get(stamp, 1.0))
     *_, (_, _, values) = parameters.spans()
     device = values.get(f'INS_ACC{"" if number == 1 else number}_ID', 0.0)
     warm = values.get(f'INS_TCAL{number}_ENABLE', 0.0) != 0.0
@@ -250,17 +255,6 @@ def _ardupilot_messages(tables: Mapping[str, _Table]) -> list[Message]:
             found.append(Message(match[1], instance, fields,
                                  fields[stamp].astype(float) * _STAMPS[stamp]))
     return found
-
-
-def _parameters(table: _Table) -> Parameters:
-    """Return the messages PARM, in order; damaged ones are left out."""
-    stamp = next((key for key in _STAMPS if key in table), '')
-    if not stamp or not {'Name', 'Value'} <= set(table):
-        return Parameters((), 1.0)
-    rows = zip(*(table[key].tolist() for key in (stamp, 'Name', 'Value')))
-    return Parameters((
-        (time, name.decode('latin-1') if isinstance(name, bytes) else str(name), value)
-        for time, name, value in rows), _STAMPS[stamp])
 
 
 def _binary(path: Path) -> tuple[dict[str, _Table], list[str]]:

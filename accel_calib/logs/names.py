@@ -504,7 +504,7 @@ def _closest(fitting: Sequence[LogFormat], header: Sequence[str]) -> LogFormat:
 def check_sensor(header: Sequence[str], path: Path) -> None:
     """Check the name of a file, if its maker gives the files of all sensors the same columns."""
     layout = recognise(header)  # also where the user names another format
-    if layout and _is_named(path, layout.other_sensors):
+    if layout and _file(path.name) in map(_file, layout.other_sensors):
         raise InputError(f'{path} is the log of another sensor ({path.stem}), expected readings '
                          'of an accelerometer', layout.record)
 
@@ -520,14 +520,13 @@ def record_instead(header: Sequence[str], path: Path) -> str:
     given = {folded(name) for name in header}
     for layout in FORMATS:
         marks = {folded(name) for name in layout.without_gravity if not name.endswith('.csv')}
-        if (marks and marks <= given) or (layout.plain and layout.fits(header)
-                                          and _is_named(path, layout.without_gravity)):
+        if (marks and marks <= given) or (
+                layout.plain and layout.fits(header)
+                and _file(path.name) in map(_file, layout.without_gravity)):
             return layout.record
     return ''
 
 
-def _is_named(path: Path, names: Sequence[str]) -> bool:
-    def stem(name: str) -> str:
-        return folded(name).replace(' ', '').removesuffix('.csv')
-
-    return stem(path.name) in map(stem, names)
+def _file(name: str) -> str:
+    """Return the name of a file without spelling and suffix, which programs change."""
+    return folded(name).replace(' ', '').removesuffix('.csv')

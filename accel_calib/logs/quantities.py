@@ -227,16 +227,13 @@ def _are_exchanged(made: Quantities, first: Cells) -> bool:
     if ('rate' not in made.chosen.sources
             or rests_of(made.numbers(first, 'reading'), samples=True).unit is not None):
         return False
-    reading, rate = (_steadiness(made.numbers(first, key)) for key in ('reading', 'rate'))
-    return rate > _STEADY and rate > _STEADIER * reading
-
-
-def _steadiness(values: Floats) -> float:
-    """Return the median length of (n, 3) vectors, relative to its scatter over them."""
-    length = np.linalg.norm(values, axis=1)
-    middle = float(np.median(length))
-    scatter = float(np.median(np.abs(length - middle)))
-    return middle / scatter if scatter > 0.0 else math.inf if middle > 0.0 else 0.0
+    steady = {}  # median length of the vectors, relative to its scatter
+    for key in ('reading', 'rate'):
+        length = np.linalg.norm(made.numbers(first, key), axis=1)
+        middle = float(np.median(length))
+        scatter = float(np.median(np.abs(length - middle)))
+        steady[key] = middle / scatter if scatter > 0.0 else math.inf if middle > 0.0 else 0.0
+    return steady['rate'] > max(_STEADY, _STEADIER * steady['reading'])
 
 
 def modulus_of(values: Floats) -> float:
@@ -463,10 +460,7 @@ def _radius(still: Floats) -> float:
     # |m|² = 2 c·m + (r² - |c|²) is linear in the centre c.
     rows = np.column_stack([2.0 * centred, np.ones(len(centred))])
     found = np.linalg.lstsq(rows, np.sum(centred**2, axis=1), rcond=None)[0]
-    square = float(found[3] + found[:3] @ found[:3])
-    if square <= 0.0:
-        return math.nan
-    radius = math.sqrt(square)
+    radius = math.sqrt(max(float(found[3] + found[:3] @ found[:3]), 0.0))
     off = np.linalg.norm(centred - found[:3], axis=1) - radius
     on_sphere = float(np.sqrt(np.mean(off**2))) < _OFF_SPHERE * radius
     return radius * size if on_sphere else math.nan

@@ -253,12 +253,8 @@ def _tables(path: Path, held: Mapping[str, _Held], advice: str) -> list[Member]:
                 column = column if column.ndim == 2 else column[:, np.newaxis]
                 is_wide = column.shape[0] < column.shape[1]  # with one column per sample
                 arrays['/'.join(filter(None, (name, field)))] = column.T if is_wide else column
-    return [_table(name, group) for name, group in _groups(arrays).items()]
-
-
-def _groups(arrays: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return arrays of one length together, or each alone if their names tell no accelerometer."""
-    groups: dict[str, dict[str, Any]] = {}
+    # Arrays of one length together, or each alone if their names tell no accelerometer.
+    tables: list[Member] = []
     by_length: dict[int, dict[str, Any]] = {}
     for name, values in arrays.items():
         by_length.setdefault(len(values), {})[name] = values
@@ -266,11 +262,12 @@ def _groups(arrays: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         header = [cell for name, values in group.items() for cell in _names(name, values)]
         alone = len(group) == 1 and len(header) in _BY_ORDER
         if is_log_header(LogOptions(), header) and not alone:
-            groups[', '.join(group)] = group
+            tables.append(_table(', '.join(group), header, *group.values()))
         else:
-            groups |= {name: {'': values} for name, values in group.items()
-                       if values.shape[1] in _BY_ORDER}
-    return groups or {name: {name: values} for name, values in arrays.items()}
+            tables += [_table(name, [], values) for name, values in group.items()
+                       if values.shape[1] in _BY_ORDER]
+    return tables or [_table(name, _names(name, values), values)
+                      for name, values in arrays.items()]
 
 
 def _names(name: str, values: Any) -> list[str]:
@@ -280,8 +277,7 @@ def _names(name: str, values: Any) -> list[str]:
     return [f'{name}{end}' for end in ends]
 
 
-def _table(name: str, group: Mapping[str, Any]) -> Member:
-    header = [cell for each, values in group.items() for cell in _names(each, values)]
-    table = np.hstack([values.astype(float) for values in group.values()])
+def _table(name: str, header: list[str], *arrays: Any) -> Member:
+    table = np.hstack([values.astype(float) for values in arrays])
     rows = [header] if header else []
     return Member(name, table.size * CELL_BYTES, lambda: csv_of(chain(rows, table.tolist())))

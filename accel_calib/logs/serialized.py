@@ -103,7 +103,6 @@ def _layout_named(name: bytes) -> Layout:
 Bytes = NDArray[np.uint8]
 Indices = NDArray[np.int64]
 
-_TRAILING = 3  # bytes of padding that a CDR message may end with
 NANO = 1e-9
 
 
@@ -163,7 +162,8 @@ def joined(raws: Sequence[bytes | memoryview], doubles: int, name: str, *, ros2:
             head[swapped] = head[swapped].byteswap()
     begin = begin_of(head[:, 3].astype(np.int64), ros2=ros2)
     extra = size - begin - 8 * doubles
-    _check((extra >= 0) & (extra <= (_TRAILING if ros2 else 0)), size, name, before)
+    # A CDR message may end with up to 3 bytes of padding.
+    _check((extra >= 0) & (extra <= (3 if ros2 else 0)), size, name, before)
     return Messages(data, start, stop, head, start + begin, swapped, ros2)
 
 

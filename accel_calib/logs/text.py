@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 import io
-from itertools import chain, islice
+from itertools import chain, islice, pairwise
 from pathlib import Path
 import re
 from typing import Any
@@ -134,16 +134,14 @@ class TextTable:
     def blocks(self) -> Iterator[Cells]:
         """Yield blocks of rows; InputError without rows, or for a bad cell or number of cells."""
         found = 0
-        lines = list(islice(self._lines, ROWS))
-        while lines:
-            following = list(islice(self._lines, ROWS))
+        parts = iter(lambda: list(islice(self._lines, ROWS)), [])
+        for lines, following in pairwise(chain(parts, [[]])):
             self.more = bool(following)
             cells = self.read(lines, last=not following)
             self.characters = sum(map(len, lines))
             found += len(cells.row)
             if len(cells.row):
                 yield cells
-            lines = following
         if not found:
             raise InputError(f'{self.layout.path} has a header line but no rows, expected one row '
                              'for each pose or sample', 'add the rows')
