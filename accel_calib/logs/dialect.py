@@ -16,6 +16,7 @@ Dates are those of ISO 8601, ``2026-01-31T12:00:00.250Z``, with a blank for the 
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 import csv
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
@@ -239,11 +240,9 @@ def _seconds(text: str) -> float | None:
 def _day(date: str) -> float | None:
     """Return the seconds from 1970 to a day, or None if there is no such day."""
     for form in _DAYS:
-        try:
+        with suppress(ValueError):  # It has another form.
             day = datetime.strptime(date.replace('/', '-'), form)
-        except ValueError:  # It has another form.
-            continue
-        return day.replace(tzinfo=timezone.utc).timestamp()
+            return day.replace(tzinfo=timezone.utc).timestamp()
     return None
 
 
@@ -433,12 +432,10 @@ def _about(path: Path, head: Sequence[str]) -> dict[str, Any]:
     for line in head:
         name, colon, text = line[1:].partition(':')
         if line[0] == '#' and colon and name.strip() in ABOUT:
-            try:
+            with suppress(TypeError, ValueError):  # an ordinary comment
                 value = read_json(text)
                 about[name.strip()] = Autopilot(**value) if 'autopilot' in name else (
                     '' if value is None else str(value))
-            except (TypeError, ValueError):
-                continue  # an ordinary comment
     if about.get('units', '') not in ('', *UNIT_NAMES):
         raise InputError(f'{path} has the units {about["units"]!r}, expected one of '
                          f'{", ".join(UNIT_NAMES)}', 'correct that line or remove it')

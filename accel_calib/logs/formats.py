@@ -134,7 +134,7 @@ def _checked(path: Path, blocks: Iterator[Recording], units: Units) -> Iterator[
 @contextmanager
 def _binary(known: 'Format', path: Path, options: LogOptions) -> Iterator[OpenLog]:
     """Open a binary file in a child process."""
-    with parts_of(known.file(path), _parts, options, in_child=options.in_child) as parts:
+    with parts_of(known.file(path), _parts, known, options, in_child=options.in_child) as parts:
         head = next(parts)
         notes, findings = list(head.pop('noted')), tuple(head.pop('findings'))
 
@@ -148,9 +148,8 @@ def _binary(known: 'Format', path: Path, options: LogOptions) -> Iterator[OpenLo
         yield OpenLog(blocks(), **head, noted=lambda: tuple(notes), findings=findings)
 
 
-def _parts(path: Path, options: LogOptions) -> Generator[Any]:
+def _parts(path: Path, known: 'Format', options: LogOptions) -> Generator[Any]:
     """Yield the fields of an `OpenLog`, its blocks, and its notes at the end."""
-    known = _format_of(path)
     with known.opened(known, path, options) as log, saying(log.read_as):
         head = {**vars(log), 'noted': log.noted()}
         del head['blocks']

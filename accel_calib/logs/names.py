@@ -222,10 +222,9 @@ def _parted(words: list[str]) -> list[str]:
 
 
 def _axis(words: list[str], brackets: Sequence[str]) -> tuple[int | None, list[str]]:
-    named = [k for k, word in enumerate(words) if word in _AXES]
-    if named:
-        k = named[-1]
-        return _AXES[words[k]], words[:k] + words[k + 1:]
+    for k, word in reversed([*enumerate(words)]):
+        if word in _AXES:
+            return _AXES[word], words[:k] + words[k + 1:]
     for inner in map(str.casefold, brackets):
         if inner in _NUMBERED:
             return _NUMBERED[inner], words

@@ -31,6 +31,7 @@ from .names import DEGREE, meaning, READING, record_instead, unit_of, ZEROS
 from .times import Clock, clock_of
 from ..errors import InputError, saying
 from ..finding import Finding
+from ..geometry import sphere_through
 from ..table import COLUMNS, Floats
 from ..text import one_line
 from ..units import STANDARD_GRAVITY, UnitName, Units, units_of
@@ -457,13 +458,8 @@ def _radius(still: Floats) -> float:
     scales = np.linalg.svd(centred, compute_uv=False)
     if scales[2] < _SPREAD * scales[0]:
         return math.nan
-    # |m|² = 2 c·m + (r² - |c|²) is linear in the centre c.
-    rows = np.column_stack([2.0 * centred, np.ones(len(centred))])
-    found = np.linalg.lstsq(rows, np.sum(centred**2, axis=1), rcond=None)[0]
-    radius = math.sqrt(max(float(found[3] + found[:3] @ found[:3]), 0.0))
-    off = np.linalg.norm(centred - found[:3], axis=1) - radius
-    on_sphere = float(np.sqrt(np.mean(off**2))) < _OFF_SPHERE * radius
-    return radius * size if on_sphere else math.nan
+    radius, off = sphere_through(centred)
+    return radius * size if off < _OFF_SPHERE * radius else math.nan
 
 
 def are_samples(columns: Mapping[str, NDArray[Any]]) -> bool:

@@ -12,6 +12,7 @@ The rows are read once, in blocks, so the memory needed does not depend on the l
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from functools import partial
 import io
 from itertools import chain, islice, pairwise
@@ -189,20 +190,18 @@ class TextTable:
                 return None
             texts = ['\t'.join([row[k] for k in columns]) for row in rows]
             delimiter, columns, breaks = '\t', tuple(range(len(columns))), len(columns) - 1
-        if {line.count(delimiter) if delimiter else len(line.split()) - 1
-                for line in texts} != {breaks}:
-            return None
-        if any(not is_clock(dialect.cells(line)[k])
-               for k in self.columns.dates for line in lines):
+        widths = {line.count(delimiter) if delimiter else len(line.split()) - 1 for line in texts}
+        if widths != {breaks} or any(not is_clock(dialect.cells(line)[k])
+                                     for k in self.columns.dates for line in lines):
             return None
         if delimiter != ',' and layout.decimal != '.':
             texts = [line.replace(',', '.') for line in texts]
-        try:
+        with suppress(ValueError):
             values = np.loadtxt(texts, delimiter=delimiter or None, usecols=columns, ndmin=2,
                                 comments=None, quotechar=None)
-        except ValueError:
-            return None
-        return values if len(values) == len(lines) and np.isfinite(values).all() else None
+            if len(values) == len(lines) and np.isfinite(values).all():
+                return values
+        return None
 
     def _good(self, lines: Sequence[str], rows: NDArray[np.int64],
               place: Sequence[int]) -> list[int]:
