@@ -48,7 +48,8 @@ class StillDetector:
     `keep` is the number of finished dwells to keep; None: all. `context` are the keys of the
     further columns of the samples: temperature, supply voltage, and quantities. `still` is whether
     the sensor is still now. `refused` are the rests that ended in the last `push` or `close`, and
-    are no poses. `known` is what another detector of these samples found.
+    are no poses, and `missing` the most recent times at which samples are missing, at most 10,000.
+    `known` is what another detector of these samples found.
 
     """
 
@@ -64,7 +65,7 @@ class StillDetector:
         self._least, self._largest = np.full(4, np.inf), np.full(4, -np.inf)  # x, y, z, |reading|²
         self.refused: tuple[Rest, ...] = ()
         self._mean = np.full(6, np.nan)
-        self._missing: deque[Rest] = deque(maxlen=10_000)
+        self.missing: deque[Rest] = deque(maxlen=10_000)
 
     def push(self, samples: Floats) -> list[Dwell]:
         """
@@ -124,11 +125,6 @@ class StillDetector:
         """Return the range of |reading| and that of the axis with the largest one."""
         shortest, longest = np.sqrt([self._least[3], max(self._largest[3], 0.0)]).tolist()
         return Lengths(shortest, longest, float(np.max(self._largest[:3] - self._least[:3])))
-
-    @property
-    def missing(self) -> tuple[Rest, ...]:
-        """Return the most recent times at which samples are missing, at most 10,000."""
-        return tuple(self._missing)
 
     @property
     def threshold(self) -> float:
@@ -214,10 +210,10 @@ class StillDetector:
                 begin -= (CHUNKS_PER_WINDOW - 1) * length
             elif not each['sums']['zeros']:
                 continue
-            last = self._missing[-1] if self._missing else None
+            last = self.missing[-1] if self.missing else None
             if last is not None and last.reason == kind and begin <= last.end + length:
-                begin = self._missing.pop().start
-            self._missing.append(Rest(begin, float(each['end']), kind))
+                begin = self.missing.pop().start
+            self.missing.append(Rest(begin, float(each['end']), kind))
 
 
 @dataclass(frozen=True)
