@@ -19,10 +19,9 @@ counted, because noise also reaches new extremes.
 """
 
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
 from functools import cache
-from itertools import pairwise
 import math
 from typing import Any, get_args, Literal, NamedTuple
 
@@ -289,14 +288,6 @@ class Chunks:
     length: float
     period: float
     fresh: bool
-
-
-def together(found: Sequence[Chunks]) -> Iterator[Chunks]:
-    """Yield the chunks with those of the same segment joined."""
-    starts = [k for k, each in enumerate(found) if each.fresh or k == 0]
-    for start, stop in pairwise([*starts, len(found)]):
-        yield replace(found[start],
-                      records=chained(*(each.records for each in found[start:stop])))
 
 
 class Chunker:

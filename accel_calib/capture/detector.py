@@ -18,7 +18,7 @@ is moved outwards by this distance.
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import chain, pairwise
 import math
 from typing import Any
 
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from .account import MISSING, Rest
 from .chunks import (
     CaptureSettings, chained, Chunker, Chunks, CHUNKS_PER_WINDOW, CONTEXT, Interruption, MOTION,
-    Records, together)
+    Records)
 from .dwell import Dwell, figures, figures_type, judged, OngoingDwell, Tracker
 from .levels import Known
 from .rule import Rule
@@ -153,8 +153,18 @@ class StillDetector:
         whole = list[Chunks]()
         for block in blocks:
             whole += self._chunker.feed(block, last)
-            self._measure(block[1:4])
-        for chunks in together(whole):
+            x, y, z = reading = block[1:4]
+            square = x * x + y * y + z * z
+            if not np.all(square):  # zeros are missing samples
+                reading, square = reading[:, square > 0.0], square[square > 0.0]
+            if len(square):
+                self._least = np.minimum(self._least, np.append(reading.min(axis=1), square.min()))
+                self._largest = np.maximum(
+                    self._largest, np.append(reading.max(axis=1), square.max()))
+        starts = [k for k, each in enumerate(whole) if each.fresh or k == 0]
+        for start, stop in pairwise([*starts, len(whole)]):  # the chunks of one segment
+            chunks = replace(whole[start],
+                             records=chained(*(each.records for each in whole[start:stop])))
             if chunks.fresh:
                 yield from self._tracker.close()
                 self._tracker.start(chunks)
@@ -166,16 +176,6 @@ class StillDetector:
         if self._chunker.fresh:  # the stamps were interrupted: what is known of the rest is over
             self.still = False
             yield from self._tracker.close()
-
-    def _measure(self, reading: Floats) -> None:
-        """Note the ranges of (3, n) readings; zeros are missing samples."""
-        x, y, z = reading
-        square = x * x + y * y + z * z
-        if not np.all(square):
-            reading, square = reading[:, square > 0.0], square[square > 0.0]
-        if len(square):
-            self._least = np.minimum(self._least, np.append(reading.min(axis=1), square.min()))
-            self._largest = np.maximum(self._largest, np.append(reading.max(axis=1), square.max()))
 
     def _keep(self, ended: Iterable[OngoingDwell]) -> int:
         """Store the figures of these dwells, and return their number."""
@@ -306,10 +306,9 @@ def samples_of(recording: Recording, start: int, stop: int, context: Sequence[st
     width = MOTION if 'rate' in recording else 4
     if any(name in recording for name in context):
         width = MOTION + len(context)
-    samples = np.empty((width, len(time)))
+    samples = np.full((width, len(time)), np.nan)
     samples[0] = time
     samples[1:4] = recording.reading[which].T
-    samples[4:] = np.nan
     if 'rate' in recording:
         samples[4:7] = recording['rate'][which].T
     for row, name in enumerate(context, start=MOTION):

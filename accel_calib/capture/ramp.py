@@ -189,7 +189,8 @@ def ramp_of(cells: Poses) -> Ramp:
     warm, rate = stretches['temperature'], stretches['temperature_rate']
     limit = _MOVING * float(np.quantile(np.abs(rate), 0.95))
     rising, falling = warm[rate > limit], warm[rate < -limit]
-    both = len(rising) > 0 and len(falling) > 0 and bool(  # over a range that both share
+    # Whether the temperature rises and falls over a range that both share.
+    both = len(rising) > 0 and len(falling) > 0 and bool(
         min(rising.max(), falling.max()) - max(rising.min(), falling.min())
         >= _OVERLAP * np.ptp(warm))
     slow = (np.abs(rate) * 60.0 <= FASTEST) | both

@@ -186,9 +186,6 @@ class Piped(str):
         made.data = data
         return made
 
-    def __getnewargs__(self) -> tuple[bytes]:  # type: ignore[override]
-        return (self.data,)
-
     @property
     def table(self) -> Member:
         """Return the log as a table."""

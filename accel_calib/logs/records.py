@@ -38,9 +38,6 @@ from ..text import read_json
 _MOST_BYTES, _LONGEST_LINE = 1 << 25, 1 << 20
 """Largest JSON file that is read as a whole [bytes], and longest line of a record [characters]."""
 
-_FIRST_RECORDS = 4000
-"""Number of first records whose series are known."""
-
 _SERIES = ('sensor', 'topic', 'type', 'measurement')
 """Keys whose text names the series of a record."""
 
@@ -121,8 +118,8 @@ def lines(parse: Callable[[str], tuple[str, Record]], path: Path, _: ExitStack) 
 
 def _series(name: str, size: int, records: Callable[[], Iterator[tuple[str, Record]]]
             ) -> Iterator[Member]:
-    """Yield a table for each of the series of records."""
-    for series in dict.fromkeys(each for each, _ in islice(records(), _FIRST_RECORDS)):
+    """Yield a table for each of the series of the first 4000 records."""
+    for series in dict.fromkeys(each for each, _ in islice(records(), 4000)):
         yield Member('.'.join(filter(None, (name, series))), size, partial(_rows, series, records))
 
 

@@ -43,9 +43,6 @@ PEEKED = 1 << 16
 _BLANK = ' \t\r\n,;|'
 """Characters of a row without any value, as spreadsheets write at the end of a table."""
 
-_QUOTED_LINES = 20
-"""Largest number of lines of one quoted cell."""
-
 
 def text_table(path: Path, options: LogOptions, raw: io.BufferedReader[Any], size: int
                ) -> TextTable:
@@ -239,11 +236,11 @@ class TextTable:
 
 
 def _joined_quotes(lines: list[str]) -> list[str]:
-    """Return lines with quoted cells of several lines joined."""
+    """Return lines with quoted cells of several lines, at most 20, joined."""
     joined: list[str] = []
     k = 0
     while k < len(lines):
-        last = min(k + _QUOTED_LINES, len(lines)) if lines[k].count('"') % 2 else k
+        last = min(k + 20, len(lines)) if lines[k].count('"') % 2 else k
         end = next((j for j in range(k + 1, last) if lines[j].count('"') % 2), k)
         joined.append(''.join(lines[k:end + 1]))
         k = end + 1
