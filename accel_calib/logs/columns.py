@@ -30,7 +30,7 @@ FRACTION = 'time_ns'
 """Key of a column with the nanoseconds of a time in whole seconds."""
 
 _MAY_LACK = ('temperature', 'supply_voltage')
-"""Columns that rows of a partial table may lack."""
+"""Columns of the context, which rows of a partial table may lack."""
 
 
 def named_topics(entries: Iterable[str]) -> dict[str, str]:
@@ -61,9 +61,6 @@ def topic_and_field(asked: str, topics: Container[str]) -> tuple[str, str]:
         field_of = f'{last}.{field_of}' if field_of else last
     return (topic, field_of) if topic else (asked, '')
 
-
-CONTEXT = (*RATE, 'temperature', 'supply_voltage')
-"""Columns that are used only where they are plain."""
 
 _FIRST_ROWS = 5
 """Number of rows that show whether a column has numbers, dates or other text."""
@@ -258,7 +255,7 @@ def _sources(layout: Layout, given: Mapping[str, str]) -> dict[str, Source]:
         found = {**_contexts(layout, found), **found}
     # What is not asked for, and holds other text than numbers, does not stand in the way.
     plain = {ours: source for ours, source in found.items()
-             if ours not in CONTEXT or ours in given or source.name == ours
+             if ours not in (*RATE, *_MAY_LACK) or ours in given or source.name == ours
              or _are_numbers(layout.first(source.index)[:_FIRST_ROWS])}
     return {ours: source for ours, source in plain.items() if given.get(ours, ours)}
 
@@ -397,7 +394,7 @@ def _contexts(layout: Layout, found: Mapping[str, Source]) -> dict[str, Source]:
                      if count == max(shared) and shared.count(count) == 1}
         more |= {name: _source(layout, k) for triple in gyros.values()
                  for name, k in zip(RATE, triple)}
-    for key in ('temperature', 'supply_voltage'):
+    for key in _MAY_LACK:
         which = _named(key, header)
         if key not in found and len(which) == 1:
             more[key] = _source(layout, which[0])
