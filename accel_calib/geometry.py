@@ -105,6 +105,19 @@ def over_axes(values: Floats) -> Floats:
     return np.sqrt(np.mean(values ** 2, axis=1)) if values.ndim > 1 else values
 
 
+def sphere_through(points: Floats) -> tuple[float, float]:
+    """
+    Return the radius of the sphere, or the circle, nearest to (n, k) points, and the RMS distance.
+
+    |m|² = 2 c·m + (r² - |c|²) is linear in the centre c.
+
+    """
+    columns = np.column_stack([2.0 * points, np.ones(len(points))])
+    values = np.linalg.lstsq(columns, np.sum(points**2, axis=1), rcond=None)[0]
+    radius = math.sqrt(max(float(values[-1] + values[:-1] @ values[:-1]), 0.0))
+    return radius, rms(np.linalg.norm(points - values[:-1], axis=1) - radius)
+
+
 def unit(vectors: Floats) -> Floats:
     """Return (…, 3) vectors scaled to length 1; zero vectors stay zero."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300)

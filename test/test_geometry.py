@@ -6,6 +6,7 @@ import re
 
 from accel_calib.calibrate import dilution, error_left_in, fit_poses, identifiability, next_pose
 from accel_calib.errors import RefusedFitError
+from accel_calib.geometry import sphere_through
 from accel_calib.table import Poses
 from inside import (
     determines, missing_poses, model_with, poses_needed, predict, refuse_if_unfit,
@@ -130,3 +131,14 @@ def test_next_poses_have_words_and_are_far_fewer_than_random_poses():
     at_random = [identifiability('10', random_directions(12, np.random.default_rng(seed)))
                  .mean_dilution for seed in range(50)]
     assert np.median(at_random) > 1.4
+
+
+@pytest.mark.parametrize('directions', [FACES, RING[:, :2]])
+def test_points_on_a_sphere_or_a_circle_have_its_radius(directions):
+    radius, off = sphere_through(3.0 * directions + 0.5)
+    assert radius == pytest.approx(3.0)
+    assert off < 1e-12
+
+
+def test_points_that_are_all_the_same_have_no_radius():
+    assert sphere_through(np.zeros((6, 3))) == (0.0, 0.0)

@@ -4,7 +4,6 @@
 """The account of every rest of a recording: whether it became a pose, or why not."""
 
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +12,7 @@ from .chunks import CaptureSettings
 from ..finding import Finding
 from ..text import counted
 
-REASONS: Mapping[str, tuple[str, str]] = MappingProxyType({
+REASONS: Mapping[str, tuple[str, str]] = {
     'zeros': ('samples are missing: they are 0 on all axes', 'check the driver and the cable'),
     'frozen': ('samples are missing: the last reading is repeated, though no other rest repeats '
                'it', 'check the driver and the cable'),
@@ -30,7 +29,7 @@ REASONS: Mapping[str, tuple[str, str]] = MappingProxyType({
               'long in each pose'),
     'length': ('a length that is not that of gravity', 'check the unit, or accept them with a '
                'wider --still-norm-tolerance'),
-    'repeated': ('an earlier orientation', '')})
+    'repeated': ('an earlier orientation', '')}
 """Why a rest is no pose, and what to do about it."""
 
 MISSING = ('', 'zeros', 'frozen', 'quiet')

@@ -19,10 +19,9 @@ counted, because noise also reaches new extremes.
 """
 
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
 from functools import cache
-from itertools import pairwise
 import math
 from typing import Any, get_args, Literal, NamedTuple
 
@@ -249,12 +248,10 @@ def repeated_extremes(reading: Floats, starts: Indices, highest: Floats) -> tupl
 
 
 _LEARN = 16  # intervals from which the period is estimated
-_SAMPLES = 2  # smallest number of samples in a chunk
 _MISSING_SECONDS = 0.5  # a longer interval, also longer than _MISSING_PERIODS, is an interruption
 _MISSING_PERIODS = 5.0
 _BACK_SECONDS = 0.01  # a step back by less, or by less than _BACK_PERIODS, is jitter
 _BACK_PERIODS = 2.0
-_INTERRUPTIONS_MAX = 10_000
 _PENDING_MAX = 200_000  # largest number of samples in a chunk; with more, the clock has stopped
 
 
@@ -293,14 +290,6 @@ class Chunks:
     fresh: bool
 
 
-def together(found: Sequence[Chunks]) -> Iterator[Chunks]:
-    """Yield the chunks with those of the same segment joined."""
-    starts = [k for k, each in enumerate(found) if each.fresh or k == 0]
-    for start, stop in pairwise([*starts, len(found)]):
-        yield replace(found[start],
-                      records=chained(*(each.records for each in found[start:stop])))
-
-
 class Chunker:
     """Convert samples in any blocks, with this number of columns of context, to chunks."""
 
@@ -312,7 +301,7 @@ class Chunker:
         self._origin: Floats = np.empty(0)
         self._length = self._epoch = self._latest = self._period = 0.0
         self._pending: Floats = np.empty(0)
-        self.interruptions: deque[Interruption] = deque(maxlen=_INTERRUPTIONS_MAX)
+        self.interruptions: deque[Interruption] = deque(maxlen=10_000)
         self.restart()
 
     def feed(self, samples: Floats, last: bool) -> Iterator[Chunks]:
@@ -322,20 +311,27 @@ class Chunker:
         If they are the last ones, the period is estimated from few samples, too.
 
         """
-        pending = _joined(self._pending, samples)
+        parts = [self._pending, samples]
+        if len(parts[0]) != len(parts[1]):  # columns that one of both lacks are NaN there
+            rows = max(map(len, parts))
+            parts = [np.pad(each, ((0, rows - len(each)), (0, 0)), constant_values=np.nan)
+                     for each in parts]
+        pending = np.concatenate(parts, axis=1)
         if not self._origin.size and pending.size:
             first = np.nan_to_num(pending[1:7, 0])
             self._origin = np.pad(first, (0, 6 - len(first)))
         while self._learned(pending[0], last):
-            cut, in_order = self._first_break(pending[0])
-            edges = self._edges(pending[0, :cut], in_order)
-            if edges[-1]:
-                yield self._chunks(pending[:, :edges[-1]], edges[:-1])
+            time = self._before_break(pending[0])
+            index = np.floor((time - self._epoch) / self._length)
+            starts = np.append(0, np.flatnonzero(index[1:] != index[:-1]) + 1)
+            if stop := int(starts[-1]):  # where the last chunk starts, which is not complete
+                self._latest = float(time[stop - 1])
+                yield self._chunks(pending[:, :stop], starts[:-1])
                 self.fresh = False
-            if cut == pending.shape[1]:
-                pending = pending[:, edges[-1]:]
+            if len(time) == pending.shape[1]:
+                pending = pending[:, stop:]
                 break
-            pending = pending[:, cut:]
+            pending = pending[:, len(time):]
             self.restart()
         self._pending = pending
         if pending.shape[1] > _PENDING_MAX and self._period >= 0.0:
@@ -356,37 +352,25 @@ class Chunker:
         steps = np.diff(time[:_LEARN + 1])
         median = float(np.median(steps))
         self._period = median if median > 0.0 else max(float(np.mean(steps)), 0.0)
-        self._length = max(self._shortest, _SAMPLES * self._period)
+        self._length = max(self._shortest, 2.0 * self._period)  # two samples
         self._epoch = self._latest = float(time[0])
         return True
 
-    def _first_break(self, time: Floats) -> tuple[int, bool]:
-        """Return the index of the first interruption, and whether the stamps are in order."""
+    def _before_break(self, time: Floats) -> Floats:
+        """Return the stamps before the first interruption, jitter replaced by the latest one."""
         missing = max(_MISSING_SECONDS, _MISSING_PERIODS * self._period)
         step: Floats = time[1:] - time[:-1]
         first = time[0] - self._latest
         if step.min(initial=first) >= 0.0 and step.max(initial=first) <= missing:
-            return len(time), True
-        before = np.maximum.accumulate(np.concatenate([[self._latest], time]))[:-1]
-        step = time - before
+            return time
+        ordered = np.maximum.accumulate(np.append(self._latest, time))
+        step = time - ordered[:-1]
         back = max(_BACK_SECONDS, _BACK_PERIODS * self._period)
-        breaks = np.flatnonzero((step > missing) | (step < -back))
-        if not len(breaks):
-            return len(time), False
-        cut = int(breaks[0])
-        self.interruptions.append(Interruption(
-            float(before[cut]), 'gap' if step[cut] > 0.0 else 'jump_back', float(step[cut])))
-        return cut, False
-
-    def _edges(self, time: Floats, in_order: bool) -> Indices:
-        """Return the index of the first sample of each chunk; the last one is not complete."""
-        if not in_order:
-            time = np.maximum.accumulate(np.append(self._latest, time))[1:]
-        index = np.floor((time - self._epoch) / self._length)
-        edges = np.flatnonzero(index[1:] != index[:-1]) + 1
-        if len(edges):
-            self._latest = float(time[edges[-1] - 1])
-        return np.append(0, edges)
+        for cut in np.flatnonzero((step > missing) | (step < -back)).tolist():
+            self.interruptions.append(Interruption(
+                float(ordered[cut]), 'gap' if step[cut] > 0.0 else 'jump_back', float(step[cut])))
+            return ordered[1:cut + 1]
+        return ordered[1:]
 
     def _chunks(self, samples: Floats, starts: Indices) -> Chunks:
         found = sums_of(samples, starts, self._epoch, self._origin, self._kind)
@@ -398,14 +382,3 @@ class Chunker:
                 self._least[which] = min(self._least[which], float(step.min()))
                 found['step'][:, which] = step
         return Chunks(found, self._epoch, self._origin, self._length, self._period, self.fresh)
-
-
-def _joined(one: Floats, other: Floats) -> Floats:
-    """Concatenate samples; columns that one part lacks are NaN there."""
-    if not one.size:
-        return other
-    if len(one) != len(other):
-        rows = max(len(one), len(other))
-        one, other = (np.pad(each, ((0, rows - len(each)), (0, 0)), constant_values=np.nan)
-                      for each in (one, other))
-    return np.concatenate([one, other], axis=1)

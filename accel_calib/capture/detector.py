@@ -18,7 +18,7 @@ is moved outwards by this distance.
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import chain, pairwise
 import math
 from typing import Any
 
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from .account import MISSING, Rest
 from .chunks import (
     CaptureSettings, chained, Chunker, Chunks, CHUNKS_PER_WINDOW, CONTEXT, Interruption, MOTION,
-    Records, together)
+    Records)
 from .dwell import Dwell, figures, figures_type, judged, OngoingDwell, Tracker
 from .levels import Known
 from .rule import Rule
@@ -40,11 +40,6 @@ from ..units import Units
 _BLOCK = 1 << 14     # samples summed at a time; they fit in the cache
 _AT_ONCE = 1 << 17   # samples passed to the detector at a time
 
-_MISSING_MAX = 10_000
-
-_EARLIER = 100
-"""Number of earlier dwells that are used in the test of a new dwell."""
-
 
 class StillDetector:
     """
@@ -53,7 +48,8 @@ class StillDetector:
     `keep` is the number of finished dwells to keep; None: all. `context` are the keys of the
     further columns of the samples: temperature, supply voltage, and quantities. `still` is whether
     the sensor is still now. `refused` are the rests that ended in the last `push` or `close`, and
-    are no poses. `known` is what another detector of these samples found.
+    are no poses, and `missing` the most recent times at which samples are missing, at most 10,000.
+    `known` is what another detector of these samples found.
 
     """
 
@@ -69,7 +65,7 @@ class StillDetector:
         self._least, self._largest = np.full(4, np.inf), np.full(4, -np.inf)  # x, y, z, |reading|²
         self.refused: tuple[Rest, ...] = ()
         self._mean = np.full(6, np.nan)
-        self._missing: deque[Rest] = deque(maxlen=_MISSING_MAX)
+        self.missing: deque[Rest] = deque(maxlen=10_000)
 
     def push(self, samples: Floats) -> list[Dwell]:
         """
@@ -98,8 +94,9 @@ class StillDetector:
 
     def close(self) -> list[Dwell]:
         """End the ongoing dwell, because the stream is interrupted; return it if it is still."""
-        found = [*self._feed([np.empty((4, 0))], last=True), *self._leave()]
+        found = [*self._feed([np.empty((4, 0))], last=True), *self._tracker.close()]
         self._chunker.restart()
+        self.still = False
         return self._ended(found)
 
     def current(self) -> Dwell | None:
@@ -130,11 +127,6 @@ class StillDetector:
         return Lengths(shortest, longest, float(np.max(self._largest[:3] - self._least[:3])))
 
     @property
-    def missing(self) -> tuple[Rest, ...]:
-        """Return the most recent times at which samples are missing, at most 10,000."""
-        return tuple(self._missing)
-
-    @property
     def threshold(self) -> float:
         """
         Return the largest standard deviation of a still window now [unit of the readings].
@@ -161,10 +153,20 @@ class StillDetector:
         whole = list[Chunks]()
         for block in blocks:
             whole += self._chunker.feed(block, last)
-            self._measure(block[1:4])
-        for chunks in together(whole):
+            x, y, z = reading = block[1:4]
+            square = x * x + y * y + z * z
+            if not np.all(square):  # zeros are missing samples
+                reading, square = reading[:, square > 0.0], square[square > 0.0]
+            if len(square):
+                self._least = np.minimum(self._least, np.append(reading.min(axis=1), square.min()))
+                self._largest = np.maximum(
+                    self._largest, np.append(reading.max(axis=1), square.max()))
+        starts = [k for k, each in enumerate(whole) if each.fresh or k == 0]
+        for start, stop in pairwise([*starts, len(whole)]):  # the chunks of one segment
+            chunks = replace(whole[start],
+                             records=chained(*(each.records for each in whole[start:stop])))
             if chunks.fresh:
-                yield from self._leave()
+                yield from self._tracker.close()
                 self._tracker.start(chunks)
             verdict = self._rule.feed(chunks)
             self._miss(verdict, chunks.length)
@@ -172,21 +174,8 @@ class StillDetector:
             self.still = bool(verdict['still'][-1])
             self._mean = chunks.origin
         if self._chunker.fresh:  # the stamps were interrupted: what is known of the rest is over
-            yield from self._leave()
-
-    def _measure(self, reading: Floats) -> None:
-        """Note the ranges of (3, n) readings; zeros are missing samples."""
-        x, y, z = reading
-        square = x * x + y * y + z * z
-        if not np.all(square):
-            reading, square = reading[:, square > 0.0], square[square > 0.0]
-        if len(square):
-            self._least = np.minimum(self._least, np.append(reading.min(axis=1), square.min()))
-            self._largest = np.maximum(self._largest, np.append(reading.max(axis=1), square.max()))
-
-    def _leave(self) -> list[OngoingDwell]:
-        self.still = False
-        return self._tracker.close()
+            self.still = False
+            yield from self._tracker.close()
 
     def _keep(self, ended: Iterable[OngoingDwell]) -> int:
         """Store the figures of these dwells, and return their number."""
@@ -209,7 +198,8 @@ class StillDetector:
         return [each for each in every if not each.reason]
 
     def _beside(self, found: Records, earlier: Records) -> list[Dwell]:
-        earlier = earlier[-_EARLIER:]
+        """Return dwells as they are judged together with the last 100 of the earlier ones."""
+        earlier = earlier[-100:]
         return judged(chained(earlier, found), self._rule, self._context, len(earlier))
 
     def _miss(self, verdict: Records, length: float) -> None:
@@ -220,10 +210,10 @@ class StillDetector:
                 begin -= (CHUNKS_PER_WINDOW - 1) * length
             elif not each['sums']['zeros']:
                 continue
-            last = self._missing[-1] if self._missing else None
+            last = self.missing[-1] if self.missing else None
             if last is not None and last.reason == kind and begin <= last.end + length:
-                begin = self._missing.pop().start
-            self._missing.append(Rest(begin, float(each['end']), kind))
+                begin = self.missing.pop().start
+            self.missing.append(Rest(begin, float(each['end']), kind))
 
 
 @dataclass(frozen=True)
@@ -316,10 +306,9 @@ def samples_of(recording: Recording, start: int, stop: int, context: Sequence[st
     width = MOTION if 'rate' in recording else 4
     if any(name in recording for name in context):
         width = MOTION + len(context)
-    samples = np.empty((width, len(time)))
+    samples = np.full((width, len(time)), np.nan)
     samples[0] = time
     samples[1:4] = recording.reading[which].T
-    samples[4:] = np.nan
     if 'rate' in recording:
         samples[4:7] = recording['rate'][which].T
     for row, name in enumerate(context, start=MOTION):

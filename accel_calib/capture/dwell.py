@@ -224,8 +224,20 @@ def judged(table: Records, rule: Rule, context: Sequence[str], first: int = 0) -
                 + np.maximum(left[:, np.newaxis], 1e-2 * tiny**2))
     count = np.sum(rounded**2, axis=0) / np.sum(variance, axis=0)
     rate_std = np.maximum(np.sqrt(table['average'][:, 3:]), rate_step / math.sqrt(12.0))
-    return [_dwell(context, *each) for each in zip(*(part[first:] for part in (
-        table, rounded.T.copy(), count, rate_std, reason, ends)), strict=True)]
+    found = []
+    for each, own, n, own_rate, why, at_limit in zip(*(part[first:] for part in (
+            table, rounded.T.copy(), count, rate_std, reason, ends)), strict=True):
+        around: dict[str, float | Floats] = {
+            name: value for name, value in zip(context, each['around'].tolist(), strict=True)
+            if math.isfinite(value)}
+        mean = each['mean'].copy()
+        if np.isfinite(mean).all():
+            around['rate'] = mean[3:]
+        found.append(Dwell(
+            float(each['begin']), float(each['end']), float(each['time']), mean[:3], own, float(n),
+            int(each['samples']), around, int(each['orientation']), rate_std=own_rate,
+            reason=str(why), at_limit=bool(at_limit)))
+    return found
 
 
 def _reasons(table: Records, rule: Rule, tiny: Floats
@@ -246,7 +258,10 @@ def _reasons(table: Records, rule: Rule, tiny: Floats
              'frozen': np.all(tiny >= table['std'].T, axis=0) & (not rule.repeats),
              'shaking': np.any(limit < table['lowest'].T, axis=0), 'slope': sloping}
     quiet = ~np.any(list(found.values()), axis=0)
-    across, along = (_excess(table[name], quiet) for name in ('excess', 'along'))
+    # The excess of the noise of each mean, estimated from all dwells.
+    own = np.stack([table['excess'], table['along']])
+    common = np.median(own[:, quiet], axis=1, keepdims=True) if quiet.any() else 1.0
+    across, along = np.maximum(np.maximum(common, 1.0), own / _OWN_EXCESS)
     found['turning'], sure = _by_gyro(table, quiet, rule)
     turn = np.sqrt(np.sum(slope**2, axis=0)) + SURE * table['error'] * np.sqrt(across)
     found['noisy'] = ~sure & ~((turn < TURN_G * scale) | (scale == 0.0))
@@ -254,12 +269,6 @@ def _reasons(table: Records, rule: Rule, tiny: Floats
     found['length'] = np.zeros(len(table), bool)
     found['length'][good] = ~rule.reads_gravity(table['mean'][:, :3][good])
     return quiet, np.minimum(across, along), np.select(list(found.values()), list(found), '')
-
-
-def _excess(own: Floats, quiet: NDArray[np.bool_]) -> Floats:
-    """Return the excess of the noise of each mean, estimated from all dwells."""
-    common = float(np.median(own[quiet])) if quiet.any() else 1.0
-    return np.asarray(np.maximum(max(1.0, common), own / _OWN_EXCESS))
 
 
 def _by_gyro(table: Records, quiet: NDArray[np.bool_], rule: Rule
@@ -282,19 +291,6 @@ def _by_gyro(table: Records, quiet: NDArray[np.bool_], rule: Rule
     alive = np.all(table['average'].T[3:] > 0.0, axis=0)
     sure = known & alive & (tilting < _GYRO_RATE) & (_SPREADS * spread < _GYRO_RATE)
     return known & (tilting > max(_GYRO_RATE, 2.0 * _SPREADS * spread)), sure
-
-
-def _dwell(context: Sequence[str], found: Any, std: Floats, count: float, rate_std: Floats,
-           reason: str, at_limit: bool) -> Dwell:
-    known: dict[str, float | Floats] = {
-        name: value for name, value in zip(context, found['around'].tolist(), strict=True)
-        if math.isfinite(value)}
-    mean = found['mean'].copy()
-    if np.isfinite(mean).all():
-        known['rate'] = mean[3:]
-    return Dwell(float(found['begin']), float(found['end']), float(found['time']), mean[:3], std,
-                 float(count), int(found['samples']), known, int(found['orientation']),
-                 rate_std=rate_std, reason=str(reason), at_limit=bool(at_limit))
 
 
 CELLS = 256
@@ -395,28 +391,14 @@ class Tracker:
         longest = self._settings.max_dwell / chunks.length
         self._longest = max(int(longest), self._shortest) if math.isfinite(longest) else 0
 
-    def feed(self, chunks: Records) -> list[OngoingDwell]:
-        """Return the dwells that end with these chunks, of a `chunk_type`."""
-        self._waiting = chained(self._waiting, chunks)
-        return list(self._decide(last=False))
+    def feed(self, chunks: Records = _NONE, *, last: bool = False) -> Iterator[OngoingDwell]:
+        """
+        Yield the dwells that end with these chunks, of a `chunk_type`, or with those before.
 
-    def close(self) -> list[OngoingDwell]:
-        """End the ongoing dwell because no chunk follows, and return all dwells that end."""
-        return [*self._decide(last=True), *self._end()]
+        A chunk is decided once its verdict is final; each is, if these are the last ones.
 
-    def current(self) -> OngoingDwell | None:
-        """Return the ongoing dwell as if it ended now, or None if it is too short."""
-        if not len(self._waiting) or not self._waiting['still'][-1]:
-            return None
-        twin = copy.copy(self)
-        twin._dwell = copy.copy(self._dwell)
-        list(twin._decide(last=True))
-        found = twin._finished()
-        return None if found is None or found.short else found
-
-    def _decide(self, last: bool) -> Iterator[OngoingDwell]:
-        """Yield the dwells that end with the chunks whose verdict is final."""
-        waiting = self._waiting
+        """
+        waiting = chained(self._waiting, chunks)
         verdict = _verdict(waiting, last)
         edges = np.flatnonzero(np.diff(verdict)) + 1
         for start, stop in zip([0, *edges], [*edges, len(verdict)]):
@@ -424,6 +406,20 @@ class Tracker:
                 part = waiting[start:stop]
                 yield from self._extend(part) if verdict[start] else self._skip(part)
         self._waiting = waiting[len(verdict):]
+
+    def close(self) -> list[OngoingDwell]:
+        """End the ongoing dwell because no chunk follows, and return all dwells that end."""
+        return [*self.feed(last=True), *self._end()]
+
+    def current(self) -> OngoingDwell | None:
+        """Return the ongoing dwell as if it ended now, or None if it is too short."""
+        if not len(self._waiting) or not self._waiting['still'][-1]:
+            return None
+        twin = copy.copy(self)
+        twin._dwell = copy.copy(self._dwell)
+        list(twin.feed(last=True))
+        found = twin._finished()
+        return None if found is None or found.short else found
 
     def _skip(self, chunks: Records) -> Iterator[OngoingDwell]:
         self._pause += len(chunks)

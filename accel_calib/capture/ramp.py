@@ -173,17 +173,31 @@ def ramp_of(cells: Poses) -> Ramp:
         If the cells cannot show what the temperature does; see the module.
 
     """
+    low, high = range_of(cells, 'temperature')
+    if np.isnan(low):
+        raise InputError('the log has no temperature, expected that of the sensor', 'record it, '
+                         'or name its column with --columns temperature=NAME, or its topic with '
+                         '--context temperature:=TOPIC')
+    if high - low < LEAST_RANGE:
+        raise InputError(f'the temperature is {low:.1f} to {high:.1f} °C, expected a range of at '
+                         f'least {LEAST_RANGE:g} °C', 'cool the board in a freezer, and record '
+                         'while it warms up to room temperature')
     still = _is_still(cells)
-    _check_range(cells)
     _check_direction(cells, still)
     stretches = _averaged(cells.take(np.isfinite(cells['temperature']) & still))
     _check_jumps(stretches)
-    warm_rate, both = stretches['temperature_rate'], _rises_and_falls(stretches)
-    slow = (np.abs(warm_rate) * 60.0 <= FASTEST) | both
-    if np.sum(slow) < LEAST_RESTS or np.ptp(stretches['temperature'][slow]) < LEAST_RANGE:
+    warm, rate = stretches['temperature'], stretches['temperature_rate']
+    limit = _MOVING * float(np.quantile(np.abs(rate), 0.95))
+    rising, falling = warm[rate > limit], warm[rate < -limit]
+    # Whether the temperature rises and falls over a range that both share.
+    both = len(rising) > 0 and len(falling) > 0 and bool(
+        min(rising.max(), falling.max()) - max(rising.min(), falling.min())
+        >= _OVERLAP * np.ptp(warm))
+    slow = (np.abs(rate) * 60.0 <= FASTEST) | both
+    if np.sum(slow) < LEAST_RESTS or np.ptp(warm[slow]) < LEAST_RANGE:
         raise InputError(
             f'the ramp is too fast for the thermometer: the temperature changes by up to '
-            f'{np.max(np.abs(warm_rate)) * 60.0:.0f} °C/min, expected at most {FASTEST:g} °C/min '
+            f'{np.max(np.abs(rate)) * 60.0:.0f} °C/min, expected at most {FASTEST:g} °C/min '
             f'over a range of {LEAST_RANGE:g} °C', 'put the board into a closed box while it '
             'warms up')
     notes = []
@@ -195,29 +209,6 @@ def ramp_of(cells: Poses) -> Ramp:
                      f'temperature changes by more than {FASTEST:g} °C/min')
     return Ramp(stretches.take(slow), both,
                 float(cells['time'][-1] - cells['time'][0]), tuple(notes))
-
-
-def _rises_and_falls(stretches: Poses) -> bool:
-    """Return whether the temperature rises and falls over a range that both share."""
-    warm, rate = stretches['temperature'], stretches['temperature_rate']
-    limit = _MOVING * float(np.quantile(np.abs(rate), 0.95))
-    rising, falling = warm[rate > limit], warm[rate < -limit]
-    if not len(rising) or not len(falling):
-        return False
-    shared = min(rising.max(), falling.max()) - max(rising.min(), falling.min())
-    return bool(shared >= _OVERLAP * np.ptp(warm))
-
-
-def _check_range(cells: Poses) -> None:
-    low, high = range_of(cells, 'temperature')
-    if np.isnan(low):
-        raise InputError('the log has no temperature, expected that of the sensor', 'record it, '
-                         'or name its column with --columns temperature=NAME, or its topic with '
-                         '--context temperature:=TOPIC')
-    if high - low < LEAST_RANGE:
-        raise InputError(f'the temperature is {low:.1f} to {high:.1f} °C, expected a range of at '
-                         f'least {LEAST_RANGE:g} °C', 'cool the board in a freezer, and record '
-                         'while it warms up to room temperature')
 
 
 def _check_direction(cells: Poses, still: NDArray[np.bool_]) -> None:

@@ -52,7 +52,7 @@ from numpy.typing import NDArray
 
 from .chunks import CaptureSettings, chained, Chunks, CHUNKS_PER_WINDOW, Records
 from .levels import Known, Levels
-from .trend import Columns, columns_of, oscillation, sliding_max, sliding_sum, Stretch, stretch
+from .trend import columns_of, oscillation, sliding_max, sliding_sum, Stretch, stretch
 from ..table import Floats
 from ..units import Units
 
@@ -178,7 +178,7 @@ class Rule:
     def scale(self) -> float:
         """Return the reading of 1 g; for native units half the range at rest, 0 if not known."""
         return self._per_g if self.known else float(_half_range(
-            self._lowest, self._highest, self._floor[:3]))
+            self._lowest, self._highest, self._floors[int(self.repeats), :3]))
 
     @property
     def steps(self) -> tuple[float, float]:
@@ -186,15 +186,11 @@ class Rule:
         reading, rate = np.where(np.isfinite(self._step), self._step, 0.0).tolist()
         return reading, rate
 
-    @property
-    def _floor(self) -> Floats:
-        """Return the (6,) smallest variances of a stretch so far."""
-        return np.asarray(self._floors[int(self.repeats)])
-
     def noise_of(self, mean: Floats) -> Floats:
         """Return the variance of the noise of the sensor as known now, for (6, n) means."""
         axes = len(mean)
-        noise = at_least(self._floor[:axes, np.newaxis], self._step[:, np.newaxis], mean)
+        noise = at_least(self._floors[int(self.repeats), :axes, np.newaxis],
+                         self._step[:, np.newaxis], mean)
         return at_least_any(np.fmax(noise, self.least[:axes, np.newaxis]), np.asarray(self.scale))
 
     def limit_of(self, noise: Floats, ratio: float = VARIANCE_RATIO,
@@ -224,7 +220,11 @@ class Rule:
         columns = columns_of(sums, axes, chunks.origin)
         mean, recent = columns.mean[:, -size:], columns.level[:, -size:]
         seen = {length: stretch(columns, length, size, chunks.length) for length in SLOPE_CHUNKS}
-        zero, equal = windows_without_readings(columns)
+        # Windows that have samples of zeros, and those of one reading, as 1.
+        zero = sliding_max(columns.zeros, CHUNKS_PER_WINDOW)
+        constant = (columns.repeats == columns.count - 1.0).astype(float)
+        equal = ((sliding_sum(constant, CHUNKS_PER_WINDOW) == CHUNKS_PER_WINDOW)
+                 & np.all(columns.level[:3] <= _tiny(columns.mean[:3]), axis=0)).astype(float)
         gaps = (zero, zero + equal, np.where(columns.level[3:] == 0.0, 1.0, 0.0))
         noise, varied = self._learn(seen[LONG], mean, judged['step'].T, *(
             sliding_max(each, LONG - CHUNKS_PER_WINDOW + 1)[..., -size:] > 0.0 for each in gaps))
@@ -380,15 +380,6 @@ def _half_range(low: Floats, high: Floats, noise: Floats) -> Floats:
     return np.where(turned, half, 0.0)
 
 
-def windows_without_readings(sums: Columns) -> tuple[Floats, Floats]:
-    """Return the (n,) windows that have samples of zeros, and those of one reading, as 1."""
-    zero = sliding_max(sums.zeros, CHUNKS_PER_WINDOW)
-    constant = (sums.repeats == sums.count - 1.0).astype(float)
-    equal = ((sliding_sum(constant, CHUNKS_PER_WINDOW) == CHUNKS_PER_WINDOW)
-             & np.all(sums.level[:3] <= _tiny(sums.mean[:3]), axis=0))
-    return zero, equal.astype(float)
-
-
 def at_least(floor: Floats, step: Floats, mean: Floats) -> Floats:
     """
     Return (axes, n) variances raised to the smallest ones that resolution and mean allow.
@@ -433,9 +424,6 @@ def at_least_any(noise: Floats, scale: Floats) -> Floats:
 _TWO_VALUES = 0.1128
 """Variance of rounded samples [steps²] below which they alternate between two values."""
 
-_SOLVED = 30
-"""Steps of the iteration for larger variances; each divides the error by 2.4 or more."""
-
 
 def rounding_left(variance: Floats) -> Floats:
     """
@@ -446,6 +434,6 @@ def rounding_left(variance: Floats) -> Floats:
     """
     small = np.pi * variance**2 + 1.0 / 12.0 - variance
     left = np.zeros_like(variance)
-    for _ in range(_SOLVED):
+    for _ in range(30):  # each step divides the error by 2.4 or more
         left = np.exp(-4.0 * np.pi**2 * (variance - 1.0 / 12.0 + left)) / (2.0 * np.pi**2)
     return np.where(variance < _TWO_VALUES, small, left)

@@ -22,7 +22,7 @@ import numpy as np
 
 from ..effects import AXES
 from ..errors import RefusedFitError
-from ..geometry import unit
+from ..geometry import sphere_through, unit
 from ..table import Floats
 from ..text import short
 from ..units import Units
@@ -81,7 +81,8 @@ def check_axes(reading: Floats, units: Units) -> None:
     wide = np.max(np.linalg.norm(flat, axis=1)) > _WIDE * one_g  # not a cap of the sphere
     if units.is_native:  # 1 g is not known: a flat piece that is no cap is as good as a wide one
         wide |= sizes[2] < _FLATTER * sizes[1]
-    if sizes[2] > _FLAT * sizes[1] or not wide or _is_circle(flat):
+    radius, off = sphere_through(flat)
+    if sizes[2] > _FLAT * sizes[1] or not wide or off < _OFF_CIRCLE * radius:
         return
     normal = np.abs(turn[2])
     largest = int(np.argmax(normal))
@@ -144,14 +145,3 @@ def check_measured(lengths: Lengths, units: Units) -> None:
             f'to {short(100.0 * (high - low) / high)} %: they are computed, as the gravity of a '
             'phone is, and not measured; expected readings of an accelerometer',
             'record the accelerometer itself, with gravity')
-
-
-def _is_circle(flat: Floats) -> bool:
-    """Return whether (n, 2) points lie on a circle."""
-    columns = np.column_stack([flat, np.ones(len(flat))])
-    square = np.sum(flat**2, axis=1)
-    values = np.linalg.lstsq(columns, square, rcond=None)[0]
-    centre = values[:2] / 2.0
-    radius = float(np.sqrt(max(values[2] + centre @ centre, 1e-300)))
-    off = np.linalg.norm(flat - centre, axis=1) - radius
-    return bool(np.sqrt(np.mean(off**2)) < _OFF_CIRCLE * radius)

@@ -91,11 +91,6 @@ def sliding_max(values: Floats, length: int) -> Floats:
     return _folded(values, length, lambda one, other, apart: np.maximum(one, other))
 
 
-def _weighted(one: Floats, other: Floats, apart: int) -> Floats:
-    """Return the sums Σ x and Σ k x of two windows in a row, from those of each."""
-    return np.stack([one[0] + other[0], one[1] + other[1] + apart * other[0]])
-
-
 def _folded(values: Floats, length: int, fold: Callable[[Floats, Floats, int], Floats]) -> Floats:
     """Return what windows of this length hold, from the parts and how far they are apart."""
     count = values.shape[-1] - length + 1
@@ -117,7 +112,9 @@ def lines(values: Floats, length: int) -> Line:
     if values.shape[-1] == length:
         centred = values - values.sum(axis=1, keepdims=True) / length
         return lines_through(centred[:, np.newaxis])
-    total, weighted = _folded(np.stack([values, np.zeros_like(values)]), length, _weighted)
+    total, weighted = _folded(  # Σ x and Σ k x of two windows in a row, from those of each
+        np.stack([values, np.zeros_like(values)]), length, lambda one, other, apart: np.stack(
+            [one[0] + other[0], one[1] + other[1] + apart * other[0]]))
     first, last = values[..., :1 - length], values[..., length - 1:]
     square = sliding_sum(values * values, length)
     product = sliding_sum(values[..., :-1] * values[..., 1:], length - 1)

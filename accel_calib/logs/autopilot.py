@@ -35,6 +35,7 @@ first message in order of preference whose samples are dense enough for the capt
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 import math
 import re
@@ -87,8 +88,14 @@ _AT_BOOT = re.compile(r'AHRS_|CUST_ROT')
 """Parameters that take effect when the vehicle is booted again."""
 
 _TURNS = re.compile('ROT|ORIENTATION|BOARD')
+_ABOUT = {
+    'px4': ('PX4 log', 'temperature of the sensor', 'read sensor_accel, which CAL_ACC does not '
+            'correct (add 4 or 64 to SDLOG_PROFILE to log it at 10 Hz)'),
+    'ardupilot': ('ArduPilot log', 'temperature T',
+                  'take the log from the vehicle whole: it begins with all parameters')}
+"""What a log is, what its temperature is, and what to do if the correction is not known."""
+
 _SLOTS, _THERMAL = range(4), 'TC_A'
-_ARDUPILOT_INSTANCES = (1, 2, 3)
 _NAMED = 3
 
 Values = Mapping[str, float]
@@ -146,18 +153,20 @@ class Parameters:
     """
 
     def __init__(self, stated: Iterable[tuple[Any, str, Any]], unit: float) -> None:
-        self._stated = [(float(time) * unit, name, float(value)) for time, name, value in stated
-                        if _MATTER.match(name) and _is_number(time) and _is_number(value)]
+        self.stated: list[tuple[float, str, float]] = []
         self.used: dict[str, float] = {}
-
-    def __bool__(self) -> bool:
-        return bool(self._stated)
+        for time, name, value in stated:
+            if _MATTER.match(name):
+                with suppress(ValueError):  # a damaged line of text, or a damaged parameter
+                    when, number = float(time) * unit, float(value)
+                    if math.isfinite(when) and math.isfinite(number):
+                        self.stated.append((when, name, number))
 
     def spans(self) -> Iterator[tuple[float, float, Values]]:
         """Yield from when to when which values hold; the first of each holds from the start."""
-        values = {name: value for _, name, value in reversed(self._stated)}
+        values = {name: value for _, name, value in reversed(self.stated)}
         start = -np.inf
-        for time, name, value in self._stated:
+        for time, name, value in self.stated:
             if values[name] != value and not _AT_BOOT.match(name):
                 yield start, time, dict(values)
                 values[name], start = value, time
@@ -189,13 +198,6 @@ Correction = Callable[[Values], ByAxis]
 """Function that returns the correction of some values, or raises UnknownCorrectionError."""
 
 
-def _is_number(value: float | str | bytes) -> bool:
-    try:
-        return math.isfinite(float(value))
-    except ValueError:  # a damaged line of text, or a damaged parameter
-        return False
-
-
 def raw_columns(columns: Mapping[str, Floats], parameters: Parameters, correction: Correction
                 ) -> dict[str, Floats]:
     """Return columns with the readings of the sensor in its own axes; rates are only turned."""
@@ -211,28 +213,23 @@ def raw_columns(columns: Mapping[str, Floats], parameters: Parameters, correctio
         found['reading'][which] = old.raw(found['reading'][which], temperature[which])
         if 'rate' in found:
             found['rate'][which] = found['rate'][which] @ old.rotation
-    if not parameters:
+    if not parameters.stated:
         raise UnknownCorrectionError('its parameters are not in the log')
     return found
 
 
-def px4_slot(parameters: Parameters, device: int, name: str = 'CAL_ACC') -> int | None:
+def px4_slot(stated: Iterable[Values], device: int, name: str = 'CAL_ACC') -> int | None:
     """Return n of CAL_ACCn or TC_An of a device; None if PX4 has none of it in use."""
-    return next((slot for _, _, values in parameters.spans()
-                 for slot in _slots(values, device, name) if device), None)
+    return next((slot for values in stated if name != _THERMAL or values.get('TC_A_ENABLE') == 1
+                 for slot in _SLOTS if device and values.get(f'{name}{slot}_ID') == device), None)
 
 
-def _slots(values: Values, device: int, name: str) -> list[int]:
-    used = name != _THERMAL or values.get('TC_A_ENABLE') == 1
-    return [slot for slot in _SLOTS if used and values.get(f'{name}{slot}_ID') == device]
-
-
-def px4_correction(parameters: Parameters, device: int, release: tuple[int, int] | None,
+def px4_correction(parameters: Parameters, autopilot: Autopilot, release: tuple[int, int] | None,
                    values: Values) -> ByAxis:
-    """Return the correction of PX4 for the accelerometer with this id, of a known release."""
-    if not device:
+    """Return the correction of PX4 for an accelerometer, of a known release."""
+    device, slot = autopilot.device_id, autopilot.instance
+    if device is None:
         raise UnknownCorrectionError('the log does not state the device id of the accelerometer')
-    slot = px4_slot(parameters, device)
     start = 'uncalibrated ' if slot is None else f'CAL_ACC{slot}_'
     offset = parameters.three(values, f'{start}{{}}OFF', 0.0)
     scale = _scale(parameters.three(values, f'{start}{{}}SCALE', 1.0))
@@ -243,9 +240,10 @@ def px4_correction(parameters: Parameters, device: int, release: tuple[int, int]
         raise UnknownCorrectionError(f'PX4 {release[0]}.{release[1]} numbers rotation '
                                      f'{number:.0f} in another way')
     level = parameters.three(values, 'SENS_BOARD_{}_OFF', 0.0)
-    rotation = _rotation(level) @ _numbered('SENS_BOARD_ROT', number, _ROTATIONS)
-    slots = _slots(values, device, _THERMAL)
-    start = f'{_THERMAL}{slots[0]}_' if slots else 'uncalibrated '
+    rotation = (rotation_from_rpy(*np.radians(level))
+                @ _numbered('SENS_BOARD_ROT', number, _ROTATIONS))
+    slot = px4_slot([values], device, _THERMAL)
+    start = 'uncalibrated ' if slot is None else f'{_THERMAL}{slot}_'
     constant, *thermal = (np.array([parameters.lookup(values, f'{start}X{order}_{axis}', 0.0)
                                     for axis in range(3)]) for order in range(DEGREE + 1))
     limits = values.get(f'{start}TMIN', 0.0), values.get(f'{start}TMAX', 100.0)
@@ -255,7 +253,7 @@ def px4_correction(parameters: Parameters, device: int, release: tuple[int, int]
 
 def ardupilot_correction(parameters: Parameters, instance: int, values: Values) -> ByAxis:
     """Return the correction of ArduPilot for an accelerometer, numbered from 1."""
-    if instance not in _ARDUPILOT_INSTANCES:
+    if instance not in (1, 2, 3):
         raise UnknownCorrectionError(f'parameters of accelerometer {instance} are not read')
     start, thermal_start = f'INS_ACC{"" if instance == 1 else instance}', f'INS_TCAL{instance}_'
     offset = parameters.three(values, f'{start}OFFS_{{}}', 0.0)
@@ -271,8 +269,9 @@ def ardupilot_correction(parameters: Parameters, instance: int, values: Values) 
     if lacking:
         raise UnknownCorrectionError(
             f'AHRS_ORIENTATION is {number:.0f}, and the log lacks {lacking[0]}')
-    rotation = (_rotation([parameters.lookup(values, name, 0.0) for name in names]) if names
-                else _numbered('AHRS_ORIENTATION', number, _OF_ARDUPILOT))
+    rotation = (rotation_from_rpy(*np.radians([
+        parameters.lookup(values, name, 0.0) for name in names])) if names
+        else _numbered('AHRS_ORIENTATION', number, _OF_ARDUPILOT))
     found = ByAxis(offset, scale, thermal, ARDUPILOT_REFERENCE, limits, rotation)
     # The firmware adds the polynomial at CALTEMP, so that it is zero there.
     at_offset = values.get(f'INS_ACC{instance}_CALTEMP', -300.0)
@@ -283,11 +282,7 @@ def _numbered(name: str, number: float, known: Mapping[int, Sequence[float]]) ->
     """Return the rotation with a number."""
     if int(number) not in known:
         raise UnknownCorrectionError(f'{name} is {number:.0f}, a rotation that is not known')
-    return _rotation(known[int(number)])
-
-
-def _rotation(degrees: Sequence[float] | Floats) -> Floats:
-    return rotation_from_rpy(*np.radians(degrees))
+    return rotation_from_rpy(*np.radians(known[int(number)]))
 
 
 def _scale(scale: Floats) -> Floats:
@@ -333,30 +328,6 @@ class FlightLog:
 
 
 @dataclass(frozen=True)
-class AsSensed:
-    """Columns of a flight log without the correction of the vehicle, if that is known."""
-
-    columns: Mapping[str, Floats]
-    autopilot: Autopilot
-    turned: bool = False
-    notes: tuple[str, ...] = ()
-
-
-def as_sensed(columns: Mapping[str, Floats], parameters: Parameters, autopilot: Autopilot,
-              correction: Correction, advice: str) -> AsSensed:
-    """Return columns without the correction, or as they are with a note why that is not known."""
-    try:
-        raw = raw_columns(columns, parameters, correction)
-    except UnknownCorrectionError as err:
-        return AsSensed(columns, replace(autopilot, corrected=str(err)), notes=(
-            f'readings are left as the vehicle corrected them ({err}), so do not load an export '
-            f'of their calibration into it; {advice}',))
-    undone = (f'the correction by the vehicle is undone: {parameters.words}',)
-    return AsSensed(raw, autopilot, any(map(_TURNS.search, parameters.used)),
-                    undone if parameters.words else ())
-
-
-@dataclass(frozen=True)
 class Choice:
     """The message to read, the name of its sensor, and notes on the messages that are not."""
 
@@ -364,18 +335,27 @@ class Choice:
     sensor: str
     notes: Sequence[str]
 
-    def log(self, kind: str, found: AsSensed, temperature: str, notes: Iterable[str]
-            ) -> FlightLog:
-        """Return the log; `temperature` describes that column, if there is one."""
-        chosen = self.message
-        axes = ('axes of the sensor, before the rotation of the board' if found.turned else
-                'x forward, y right, z down')
+    def log(self, columns: Mapping[str, Floats], autopilot: Autopilot, parameters: Parameters,
+            correction: Correction | None, notes: Iterable[str]) -> FlightLog:
+        """Return the log without a correction, or with a note why that is not known."""
+        chosen, more, axes = self.message, list[str](), 'x forward, y right, z down'
+        kind, temperature, advice = _ABOUT[autopilot.firmware]
+        try:
+            columns = raw_columns(columns, parameters, correction) if correction else columns
+        except UnknownCorrectionError as err:
+            autopilot = replace(autopilot, corrected=str(err))
+            more.append(f'readings are left as the vehicle corrected them ({err}), so do not load '
+                        f'an export of their calibration into it; {advice}')
+        else:
+            if parameters.words:
+                more.append(f'the correction by the vehicle is undone: {parameters.words}')
+            if any(map(_TURNS.search, parameters.used)):
+                axes = 'axes of the sensor, before the rotation of the board'
         read_as = f'{kind}, {chosen} at {chosen.rate_hz:.4g} Hz, m/s2, {axes}'
-        if 'temperature' in found.columns:
+        if 'temperature' in columns:
             read_as += f', {temperature}'
-        recording = Recording(found.columns, numbered(found.columns), 'm/s2', self.sensor,
-                              found.autopilot)
-        return FlightLog(recording, read_as, (*notes, *self.notes, *found.notes))
+        recording = Recording(columns, numbered(columns), 'm/s2', self.sensor, autopilot)
+        return FlightLog(recording, read_as, (*notes, *self.notes, *more))
 
     def rates(self, time: Floats, sources: Iterable[Message], names: Sequence[str]
               ) -> dict[str, Floats]:

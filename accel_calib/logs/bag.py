@@ -53,8 +53,6 @@ LARGEST = 1e6
 _BLOCK_BYTES = 1 << 24
 """Number of bytes above which a block ends."""
 
-_JOURNALS = ('-wal', '-journal')
-
 NUMBERS = ('float32', 'float64', 'int8', 'uint8', 'int16', 'uint16', 'int32', 'uint32', 'int64',
            'uint64')
 _TIMES = ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time', 'builtin_interfaces/msg/Duration')
@@ -284,7 +282,7 @@ def _readable(path: Path, stack: ExitStack) -> tuple[Path, list[str]]:
                      f'{stored[0].name} is read without it']
             path, = stored
     databases = [each for each in stored if each.suffix == '.db3']
-    journals = [journal for each in databases for suffix in _JOURNALS
+    journals = [journal for each in databases for suffix in ('-wal', '-journal')
                 if (journal := each.with_name(each.name + suffix)).is_file()
                 and journal.stat().st_size]
     if journals:

@@ -81,13 +81,6 @@ QUANTITIES = (
              (('V', 0.5, 200.0, 1.0, 0.0), ('mV', 200.0, 2e5, 1e-3, 0.0))))
 
 
-def _quantity(column: str) -> Quantity:
-    """Return the quantity of a column; one of the user has any unit."""
-    anything = (('', -math.inf, math.inf, 1.0, 0.0),)
-    return next((each for each in QUANTITIES if each.key == column), Quantity(
-        column, column.replace('_', ' '), (column,), (column.lower(),), anything))
-
-
 @dataclass(frozen=True)
 class Track:
     """Finite values of a quantity, in order of time [s]."""
@@ -171,7 +164,11 @@ def context_of(bag: Bag, imu: str, sensor: str, options: LogOptions
     """
     used: list[ContextTopic] = []
     notes: list[str] = []
-    for quantity in dict.fromkeys([*QUANTITIES, *map(_quantity, options.context)]):
+    known = {each.key for each in QUANTITIES}
+    of_user = (Quantity(column, column.replace('_', ' '), (column,), (column.lower(),),
+                        (('', -math.inf, math.inf, 1.0, 0.0),))
+               for column in options.context if column not in known)
+    for quantity in (*QUANTITIES, *of_user):
         asked = options.context.get(quantity.key, '')
         found = (_asked(bag, quantity, asked) if asked else
                  _own(bag, imu, sensor) if quantity.key == 'temperature' else None)
@@ -190,26 +187,20 @@ def _asked(bag: Bag, quantity: Quantity, asked: str) -> ContextTopic:
         others = sorted({f'{c.topic} ({c.msgtype})' for c in bag.reader.connections})
         raise InputError(f'{bag.path} has the topics {some(others)}, expected {topic}',
                          f'choose one of them with --context {quantity.key}:=TOPIC')
-    return ContextTopic(bag, quantity, topic, known[0].msgtype,
-                        _field(bag, quantity, known[0], field))
-
-
-def _field(bag: Bag, quantity: Quantity, connection: Connection, asked: str) -> str:
-    numbers = bag.numbers(connection)
+    numbers = bag.numbers(known[0])
     last = {path: path.rpartition('.')[2].lower() for path in numbers}
-    choices = [[path for path in numbers if path == asked]] if asked else [
+    choices = [[path for path in numbers if path == field]] if field else [
         *([path for path in numbers if last[path] == name] for name in quantity.fields),
         [path for path in numbers if any(part in last[path] for part in quantity.parts)],
         list(numbers) if len(numbers) == 1 else []]
     fields = next(filter(None, choices), [])
     if len(fields) == 1:
-        return fields[0]
-    what = f'{connection.topic} ({connection.msgtype})'
+        return ContextTopic(bag, quantity, topic, known[0].msgtype, fields[0])
     have = f'the numbers {some(numbers)}' if numbers else 'no single number'
     raise InputError(
-        f'{bag.path}: topic {what} has {have}, expected {asked or f"one {quantity.words}"}',
-        f'name another topic, or the field with --context {quantity.key}:='
-        f'{connection.topic}/FIELD')
+        f'{bag.path}: topic {topic} ({known[0].msgtype}) has {have}, expected '
+        f'{field or f"one {quantity.words}"}', 'name another topic, or the field with --context '
+        f'{quantity.key}:={topic}/FIELD')
 
 
 def _own(bag: Bag, imu: str, sensor: str) -> ContextTopic | None:

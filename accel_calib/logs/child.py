@@ -166,8 +166,11 @@ def parts_of(file: LogFile, function: Callable[..., Generator[Any]], *given: Any
         server, stream = _server(os.getpid()), stack.enter_context(ours.makefile('rb'))
         stack.enter_context(ours)
         with theirs:
-            pid = server.start(file, theirs)
-        ended = cache(partial(server.end, pid))
+            pid = server.ask(file.module.encode() or b'-', theirs.fileno())
+        if not pid:
+            raise InputError(f'{file.path} cannot be read: its reader, {sys.executable}, does not '
+                             'start', 'check the installation of Python')
+        ended = cache(partial(server.ask, pid.to_bytes(_PID_BYTES, 'little')))
         stack.callback(ended)
         with suppress(ConnectionError):  # its end is found when the first part is read
             ours.sendall(pickle.dumps((file, function, given, task)))
@@ -258,23 +261,20 @@ def _received(file: LogFile, stream: Any, ended: Callable[[], int]) -> Iterator[
 class _Server:
     """The process that forks a child for each file."""
 
-    def __init__(self) -> None:
+    def __init__(self, _: int) -> None:
         self._turn = Lock()
         self._process: subprocess.Popen[bytes] | None = None
         atexit.register(self.close)
 
-    def start(self, file: LogFile, stream: socket.socket) -> int:
-        """Start a child that reads its task from a stream, and return its process id."""
-        if pid := self._asked(file.module.encode() or b'-', stream.fileno()):
-            return pid
-        raise InputError(f'{file.path} cannot be read: its reader, {sys.executable}, does not '
-                         'start', 'check the installation of Python')
+    def ask(self, request: bytes, *streams: int) -> int:
+        """
+        Start or end a child; 0 if the server does not answer.
 
-    def end(self, pid: int) -> int:
-        """End a child at once unless it has ended, and return its exit status."""
-        return self._asked(pid.to_bytes(_PID_BYTES, 'little'))
+        With a stream, the request is a module to import, and the id of a child is returned that
+        reads its task from the stream. Otherwise it is the id of a child, which is ended at once
+        unless it has ended, and its exit status is returned.
 
-    def _asked(self, request: bytes, *streams: int) -> int:
+        """
         with self._turn:
             try:
                 if self._process is None:
@@ -308,10 +308,8 @@ class _Server:
             self._process = None
 
 
-@cache
-def _server(pid: int) -> _Server:
-    """Return the server of this process; a copy that was forked needs another one."""
-    return _Server()
+_server = cache(_Server)
+"""The server of the process with an id; a copy of it that was forked needs another one."""
 
 
 def serve() -> None:

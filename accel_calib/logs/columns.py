@@ -30,7 +30,8 @@ FRACTION = 'time_ns'
 """Key of a column with the nanoseconds of a time in whole seconds."""
 
 _MAY_LACK = ('temperature', 'supply_voltage')
-"""Columns that rows of a partial table may lack."""
+"""Columns of the context, which rows of a partial table may lack."""
+
 
 def named_topics(entries: Iterable[str]) -> dict[str, str]:
     """
@@ -60,9 +61,6 @@ def topic_and_field(asked: str, topics: Container[str]) -> tuple[str, str]:
         field_of = f'{last}.{field_of}' if field_of else last
     return (topic, field_of) if topic else (asked, '')
 
-
-CONTEXT = (*RATE, 'temperature', 'supply_voltage')
-"""Columns that are used only where they are plain."""
 
 _FIRST_ROWS = 5
 """Number of rows that show whether a column has numbers, dates or other text."""
@@ -245,14 +243,19 @@ def _sources(layout: Layout, given: Mapping[str, str]) -> dict[str, Source]:
     header = layout.header
     found = _given(layout, given)
     if set(READING) <= set(header) and not set(READING) & set(found):
-        found = {**_own(layout), **found}
+        for name, count in Counter(header).items():
+            if count > 1 and name in OURS:
+                raise InputError(f'{layout.path} has {count} columns {name}, expected one',
+                                 'remove or rename the others')
+        found = {**{name: _source(layout, header.index(name)) for own in COLUMNS.values()
+                    if not own.made and {*own.names} <= {*header} for name in own.names}, **found}
     elif not set(READING) <= set(found):
         found = {**(_readings(layout) if header else _by_order(layout)), **found}
     if header:
         found = {**_contexts(layout, found), **found}
     # What is not asked for, and holds other text than numbers, does not stand in the way.
     plain = {ours: source for ours, source in found.items()
-             if ours not in CONTEXT or ours in given or source.name == ours
+             if ours not in (*RATE, *_MAY_LACK) or ours in given or source.name == ours
              or _are_numbers(layout.first(source.index)[:_FIRST_ROWS])}
     return {ours: source for ours, source in plain.items() if given.get(ours, ours)}
 
@@ -307,16 +310,6 @@ def _by_order(layout: Layout) -> dict[str, Source]:
     return {name: Source(k, str(k + 1)) for k, name in enumerate(orders[layout.width])}
 
 
-def _own(layout: Layout) -> dict[str, Source]:
-    for name, count in Counter(layout.header).items():
-        if count > 1 and name in OURS:
-            raise InputError(f'{layout.path} has {count} columns {name}, expected one',
-                             'remove or rename the others')
-    index = {name: k for k, name in enumerate(layout.header)}
-    return {name: _source(layout, index[name]) for own in COLUMNS.values()
-            if not own.made and index.keys() >= set(own.names) for name in own.names}
-
-
 def _readings(layout: Layout) -> dict[str, Source]:
     header = layout.header
     groups = list(_triples('reading', header).values())
@@ -325,15 +318,15 @@ def _readings(layout: Layout) -> dict[str, Source]:
     plain = [triple for triple in with_gravity if not LINEAR_WORDS & words[triple[0]]]
     whole = [triple for triple in plain if WHOLE_WORDS & words[triple[0]]]
     if groups and not with_gravity:
-        raise InputError(f'{layout.path} has {_listed(layout, groups[0])} only, linear '
-                         'acceleration, gravity removed, by its name; expected an accelerometer',
-                         'record the acceleration with gravity, often called raw or total '
-                         'acceleration')
+        raise InputError(f'{layout.path} has {", ".join(map(layout.name, groups[0]))} only, '
+                         'linear acceleration, gravity removed, by its name; expected an '
+                         'accelerometer', 'record the acceleration with gravity, often called raw '
+                         'or total acceleration')
     groups = whole or plain or with_gravity or _bare(header)
     if len(groups) == 1:
         return {name: _source(layout, k) for name, k in zip(READING, groups[0])}
     if groups:
-        names = ' and '.join(_listed(layout, triple) for triple in groups[:3])
+        names = ' and '.join(', '.join(map(layout.name, triple)) for triple in groups[:3])
         # A name that several columns have is replaced by the number.
         choice = ','.join(f'{name}={header[k] if header.count(header[k]) == 1 else k + 1}'
                           for name, k in zip(READING, groups[0]))
@@ -344,10 +337,6 @@ def _readings(layout: Layout) -> dict[str, Source]:
     raise InputError(f'{layout.path} has the columns {shown(header)}{lacks}, expected three '
                      'of an accelerometer, such as ax, ay, az or accX, accY, accZ',
                      'name them with --columns ax=NAME,ay=NAME,az=NAME')
-
-
-def _listed(layout: Layout, triple: Sequence[int]) -> str:
-    return ', '.join(map(layout.name, triple))
 
 
 def _named(quantity: str, header: Sequence[str]) -> list[int]:
@@ -396,9 +385,16 @@ def _contexts(layout: Layout, found: Mapping[str, Source]) -> dict[str, Source]:
             clocks[k], header[k].casefold() == 'time', {*WORDS['time']}.issuperset(
                 meaning(header[k]).group), bool(meaning(header[k]).unit), -k))
         more |= {'time': _source(layout, best), **_fraction(layout, best)}
-    if RATE[0] not in found:
-        more |= {name: _source(layout, k) for name, k in zip(RATE, _rates(header, found))}
-    for key in ('temperature', 'supply_voltage'):
+    if RATE[0] not in found:  # the gyro that belongs to the accelerometer, if it is plain
+        gyros = _triples('rate', header)
+        if len(gyros) > 1:
+            own = set(meaning(found[READING[0]].name).group) if READING[0] in found else set()
+            shared = [len(own.intersection(group)) for group in gyros]
+            gyros = {group: triple for (group, triple), count in zip(gyros.items(), shared)
+                     if count == max(shared) and shared.count(count) == 1}
+        more |= {name: _source(layout, k) for triple in gyros.values()
+                 for name, k in zip(RATE, triple)}
+    for key in _MAY_LACK:
         which = _named(key, header)
         if key not in found and len(which) == 1:
             more[key] = _source(layout, which[0])
@@ -459,17 +455,6 @@ def _fraction(layout: Layout, best: int) -> dict[str, Source]:
             if other.group == known.group and unit_of('time', other.unit) == ('ns', 1e-9):
                 return {FRACTION: _source(layout, k)}
     return {}
-
-
-def _rates(header: Sequence[str], found: Mapping[str, Source]) -> list[int]:
-    """Return the columns of the gyro that belongs to the accelerometer, if it is plain."""
-    groups = list(_triples('rate', header).items())
-    if len(groups) > 1:
-        own = set(meaning(found[READING[0]].name).group) if READING[0] in found else set()
-        shared = [len(own.intersection(group)) for group, _ in groups]
-        groups = [group for group, count in zip(groups, shared)
-                  if count == max(shared) and shared.count(count) == 1]
-    return groups[0][1] if groups else []
 
 
 def unused(columns: Chosen) -> list[str]:

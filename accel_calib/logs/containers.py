@@ -45,7 +45,6 @@ CELL_BYTES = 18
 """Bytes of a number as text, about."""
 
 _PIECE, _ENCRYPTED = 1 << 16, 1
-_MAGIC = 10
 
 
 def _open_zstd(path: Path) -> Any:
@@ -113,7 +112,7 @@ def _pieces(opened: Callable[[], Any]) -> Bytes:
 def text(path: Path, _: ExitStack) -> list[Member]:
     """Return the only table of a file, unpacked if it is packed."""
     with path.open('rb') as file:
-        head = file.read(_MAGIC)
+        head = file.read(10)
     unpack = next((opened for first, opened in PACKED.values() if re.match(first, head)),
                   io.FileIO)
     return [Member('', path.stat().st_size, partial(_pieces, partial(unpack, path)))]
@@ -187,9 +186,6 @@ class Piped(str):
         made.data = data
         return made
 
-    def __getnewargs__(self) -> tuple[bytes]:  # type: ignore[override]
-        return (self.data,)
-
     @property
     def table(self) -> Member:
         """Return the log as a table."""
@@ -226,17 +222,16 @@ class Frame:
                        if isinstance(about.get(name), str | Mapping) and about[name])
 
         def lines() -> Bytes:
-            cells = [_plain(values) for values in columns.values()]
             yield head.encode()
-            yield from csv_of(chain([list(columns)], zip(*cells, strict=True)))
+            parts = []
+            for values in columns.values():
+                is_date = getattr(values.dtype, 'kind', '') == 'M'
+                cells = np.asarray(values, 'M8[ns]' if is_date else None)
+                if cells.dtype.kind == 'M':
+                    cells = np.datetime_as_string(cells)  # in UTC
+                elif cells.dtype.kind == 'm':
+                    cells = cells / np.timedelta64(1, 's')
+                parts.append(cells.tolist())
+            yield from csv_of(chain([list(columns)], zip(*parts, strict=True)))
 
         return Member('', len(columns) * len(self.data) * CELL_BYTES, lines)
-
-
-def _plain(values: Any) -> list[Any]:
-    """Return a column as numbers or text; dates in UTC, durations in s."""
-    is_date = getattr(values.dtype, 'kind', '') == 'M'
-    cells = np.asarray(values, 'M8[ns]' if is_date else None)
-    if cells.dtype.kind == 'M':
-        return np.datetime_as_string(cells).tolist()
-    return (cells / np.timedelta64(1, 's') if cells.dtype.kind == 'm' else cells).tolist()

@@ -16,6 +16,7 @@ Dates are those of ISO 8601, ``2026-01-31T12:00:00.250Z``, with a blank for the 
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 import csv
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
@@ -38,12 +39,9 @@ DELIMITERS = (';', '\t', '|', ',', '')
 """Delimiters in the order of preference; the empty one is any run of blanks."""
 
 _DELIMITER_WORDS = {'\t': 'tab', '': 'blanks', '|': "'|'", ';': "';'"}
-_COMMENTS = ('#', '//', '%')
 _TRIED_LINES = 200
-"""Number of lines from which the delimiter and the decimal mark are found."""
-
-_SAMPLE_ROWS = 200
-"""Number of first rows in `Layout.sample`."""
+"""Number of lines from which the delimiter and the decimal mark are found, and of the rows in
+`Layout.sample`."""
 
 _RATE = re.compile(
     r'(?:rate|frequency|\bodr|\bfs|\bat)\b(?:[^\w\n]{0,12}(\d+(?:\.\d+)?)[ ,;\t]?(k?)Hz\b|'
@@ -71,7 +69,6 @@ _LIKE_NUMBER = re.compile(r'[-+]?(?:(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?|nan
                           re.ASCII | re.IGNORECASE)
 _DECIMAL = re.compile(r'[-+]?\d*([.,])\d+(?:[eE][-+]?\d+)?', re.ASCII)
 _UNREADABLE = re.compile('[\x00-\x08\x0e-\x1a\x1c-\x1f\x7f\ufffd]')
-_UNREADABLE_SHARE = 0.3
 _SHOWN_CHARACTERS = 40
 _EXAMPLE = 'such as time,ax,ay,az and one row for each pose or sample'
 
@@ -243,11 +240,9 @@ def _seconds(text: str) -> float | None:
 def _day(date: str) -> float | None:
     """Return the seconds from 1970 to a day, or None if there is no such day."""
     for form in _DAYS:
-        try:
+        with suppress(ValueError):  # It has another form.
             day = datetime.strptime(date.replace('/', '-'), form)
-        except ValueError:  # It has another form.
-            continue
-        return day.replace(tzinfo=timezone.utc).timestamp()
+            return day.replace(tzinfo=timezone.utc).timestamp()
     return None
 
 
@@ -261,7 +256,7 @@ def first_label(head: Sequence[str]) -> str:
 
 def is_comment(line: str) -> bool:
     """Return whether a line is a comment."""
-    return line.startswith(_COMMENTS)
+    return line.startswith(('#', '//', '%'))
 
 
 def short(text: str) -> str:
@@ -284,7 +279,7 @@ def layout_of(path: Path, head: Sequence[str], is_header: IsHeader, encoding: st
 
     """
     bad = sum(len(_UNREADABLE.findall(line)) for line in head)
-    if bad > _UNREADABLE_SHARE * sum(map(len, head)):
+    if bad > 0.3 * sum(map(len, head)):
         raise InputError(f'{path} is not a text file, expected a CSV table',
                          'use a CSV table or a bag')
     if all(line.isspace() or line[0] == '#' for line in head):
@@ -319,7 +314,7 @@ def layout_of(path: Path, head: Sequence[str], is_header: IsHeader, encoding: st
                if match}
     return Layout(path, found.dialect, min(decimal, default=''), found.header, units_row,
                   _width(found.header, rows), start, encoding, _about(path, head), tuple(notes),
-                  tuple(map(tuple, rows[:_SAMPLE_ROWS])), rate_hz)
+                  tuple(map(tuple, rows[:_TRIED_LINES])), rate_hz)
 
 
 def _rate_below_start(rows: Sequence[Sequence[str]]) -> float | None:
@@ -437,12 +432,10 @@ def _about(path: Path, head: Sequence[str]) -> dict[str, Any]:
     for line in head:
         name, colon, text = line[1:].partition(':')
         if line[0] == '#' and colon and name.strip() in ABOUT:
-            try:
+            with suppress(TypeError, ValueError):  # an ordinary comment
                 value = read_json(text)
                 about[name.strip()] = Autopilot(**value) if 'autopilot' in name else (
                     '' if value is None else str(value))
-            except (TypeError, ValueError):
-                continue  # an ordinary comment
     if about.get('units', '') not in ('', *UNIT_NAMES):
         raise InputError(f'{path} has the units {about["units"]!r}, expected one of '
                          f'{", ".join(UNIT_NAMES)}', 'correct that line or remove it')

@@ -46,8 +46,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .autopilot import (
-    ardupilot_correction, as_sensed, AsSensed, at, ByAxis, choose, FlightLog, Message, Parameters,
-    px4_correction, px4_slot, sound, UnknownCorrectionError, Values, vectors)
+    ardupilot_correction, at, ByAxis, choose, FlightLog, Message, Parameters, px4_correction,
+    px4_slot, sound, UnknownCorrectionError, Values, vectors)
 from .names import MICRO, PX4_FIELDS, PX4_SPANS
 from ..errors import InputError
 from ..table import Autopilot, Floats
@@ -62,14 +62,11 @@ PX4_MESSAGES, ARDUPILOT_MESSAGES = tuple(PX4_FIELDS), ('IMU', 'ACC')
 _INVALID = 0x7fffffff
 """Relative timestamp of sensor_combined without a valid sample of the accelerometer."""
 
-_PX4_ADVICE = ('read sensor_accel, which CAL_ACC does not correct (add 4 or 64 to SDLOG_PROFILE '
-               'to log it at 10 Hz)')
 _RELATIVE = 'accelerometer_timestamp_relative'
 _RAW, _FILTERED = 'sensor_accel', 'vehicle_acceleration'
 _MORE = {'sensor_combined': (_RELATIVE,), 'vehicle_imu': tuple(PX4_SPANS.values())}
 _NEEDED = {name: {*chain(*fields.values()), *_MORE.get(name, ())}
            for name, fields in PX4_FIELDS.items()}
-_ALSO = ('sensor_gyro', 'sensor_selection')
 
 
 class _WholeReads(io.BufferedReader):
@@ -108,23 +105,30 @@ def read_ulg(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
     if not len(time):
         raise InputError(f'{path}: no row of {chosen} is valid, expected samples',
                          'name another message with --topic')
-    if chosen.name == _RAW:
+    device, is_raw = _device(chosen, found), chosen.name == _RAW
+    warm = [message for message in found
+            if message.name == _RAW and 'temperature' in message.fields]
+    if is_raw:
         gyros = (message for message in found
                  if (message.name, message.instance) == ('sensor_gyro', chosen.instance))
         columns |= choice.rates(time, gyros, ('x', 'y', 'z'))
-    columns |= _px4_temperature(chosen, time, found)
-    device = _device(chosen, found)
-    autopilot = Autopilot('px4', px4_slot(parameters, device), device or None,
-                          px4_slot(parameters, device, 'TC_A'))
+        warm = [message for message in warm if message.instance == chosen.instance]
+    else:  # the sensor_accel of the same device, or the only one
+        warm = ([message for message in warm if device and _device(message) == device]
+                or (warm if len(warm) == 1 else []))
+    columns |= at(time, 'temperature', ((message, message.fields['temperature'])
+                                        for message in warm[:1]))
+    stated = [values for _, _, values in parameters.spans()]
+    autopilot = Autopilot('px4', px4_slot(stated, device), device or None,
+                          px4_slot(stated, device, 'TC_A'))
 
     def correction(values: Values) -> ByAxis:
         if chosen.name == _FILTERED:
             raise UnknownCorrectionError(f'{chosen.name} lacks the bias that PX4 estimates')
-        return px4_correction(parameters, device, release, values)
+        return px4_correction(parameters, autopilot, release, values)
 
-    sensed = (AsSensed(columns, autopilot) if chosen.name == _RAW else
-              as_sensed(columns, parameters, autopilot, correction, _PX4_ADVICE))
-    return choice.log('PX4 log', sensed, 'temperature of the sensor', (*notes, *invalid))
+    return choice.log(columns, autopilot, parameters, None if is_raw else correction,
+                      (*notes, *invalid))
 
 
 def _px4_messages(path: Path
@@ -133,9 +137,15 @@ def _px4_messages(path: Path
     from pyulog import ULog
 
     with _WholeReads(io.FileIO(path)) as file:
-        log = ULog(file, [*PX4_MESSAGES, *_ALSO])
-        found = [Message(data.name, data.multi_id, data.data, _px4_time(data.data))
-                 for data in log.data_list if len(data.data['timestamp'])]
+        log = ULog(file, [*PX4_MESSAGES, 'sensor_gyro', 'sensor_selection'])
+    found = []
+    for data in log.data_list:
+        stamps = data.data['timestamp']
+        if 'timestamp_sample' in data.data and np.all(data.data['timestamp_sample'] > 0):
+            stamps = data.data['timestamp_sample']
+        if len(stamps):
+            found.append(Message(data.name, data.multi_id, data.data,
+                                 stamps.astype(float) * MICRO))
     notes = []
     if log.file_corruption:
         notes.append('the log is damaged in part; its sound part is read')
@@ -146,14 +156,6 @@ def _px4_messages(path: Path
     stated = chain(((0, *each) for each in log.initial_parameters.items()), log.changed_parameters)
     return found, Parameters(stated, MICRO), (
         (release >> 24, release >> 16 & 0xff) if isinstance(release, int) else None), notes
-
-
-def _px4_time(fields: Mapping[str, NDArray[Any]]) -> Floats:
-    """Return the time of the samples [s]; timestamp_sample where it is set."""
-    stamps = fields['timestamp']
-    if 'timestamp_sample' in fields and np.all(fields['timestamp_sample'] > 0):
-        stamps = fields['timestamp_sample']
-    return stamps.astype(float) * MICRO
 
 
 def _px4_samples(message: Message) -> tuple[dict[str, Floats], list[str]]:
@@ -181,24 +183,9 @@ def _device(chosen: Message, found: Sequence[Message] = ()) -> int:
     return int(stated[0][-1]) if stated and np.ptp(stated[0]) == 0 else 0
 
 
-def _px4_temperature(chosen: Message, time: Floats, found: Sequence[Message]) -> dict[str, Floats]:
-    """Return the temperature that sensor_accel of the same device reports."""
-    sources = [message for message in found
-               if message.name == _RAW and 'temperature' in message.fields]
-    device = _device(chosen, found)
-    same = [message for message in sources if device and _device(message) == device]
-    if chosen.name == _RAW:
-        same = [message for message in sources if message.instance == chosen.instance]
-    elif not same and len(sources) == 1:
-        same = sources
-    return at(time, 'temperature', ((message, message.fields['temperature'])
-                                    for message in same[:1]))
-
-
 # --------------------------------------------------------------------------------- ArduPilot
 
 _READING, _RATES = ('AccX', 'AccY', 'AccZ'), ('GyrX', 'GyrY', 'GyrZ')
-_ARDUPILOT_ADVICE = 'take the log from the vehicle whole: it begins with all parameters'
 _MOST_SENSORS = 255
 _NAME = re.compile(r'PARM|(IMU|ACC|GYR)([1-9]?)')
 DATAFLASH = b'\xa3\x95\x80'
@@ -235,14 +222,19 @@ def read_dataflash(path: Path, topic: str = '', sensor: str = '') -> FlightLog:
         (message, message.fields[name]) for message in found for name in ('T', 'Temp')
         if (message.name, message.instance) == ('IMU', chosen.instance)
         and np.any(message.fields.get(name, 0.0))))
-    parameters, number = _parameters(tables.get('PARM', {})), chosen.instance + 1
+    stated, number = tables.get('PARM', {}), chosen.instance + 1
+    stamp = next((key for key in _STAMPS if key in stated), '')
+    rows = (zip(*(stated[key].tolist() for key in (stamp, 'Name', 'Value')))
+            if stamp and {'Name', 'Value'} <= set(stated) else ())  # damaged ones are left out
+    parameters = Parameters((
+        (time, name.decode('latin-1') if isinstance(name, bytes) else str(name), value)
+        for time, name, value in rows), _STAMPS.get(stamp, 1.0))
     *_, (_, _, values) = parameters.spans()
     device = values.get(f'INS_ACC{"" if number == 1 else number}_ID', 0.0)
     warm = values.get(f'INS_TCAL{number}_ENABLE', 0.0) != 0.0
     autopilot = Autopilot('ardupilot', number, int(device) or None, number if warm else None)
-    sensed = as_sensed(columns, parameters, autopilot,
-                       partial(ardupilot_correction, parameters, number), _ARDUPILOT_ADVICE)
-    return choice.log('ArduPilot log', sensed, 'temperature T', (*notes, *dropped))
+    return choice.log(columns, autopilot, parameters,
+                      partial(ardupilot_correction, parameters, number), (*notes, *dropped))
 
 
 def _ardupilot_messages(tables: Mapping[str, _Table]) -> list[Message]:
@@ -263,17 +255,6 @@ def _ardupilot_messages(tables: Mapping[str, _Table]) -> list[Message]:
             found.append(Message(match[1], instance, fields,
                                  fields[stamp].astype(float) * _STAMPS[stamp]))
     return found
-
-
-def _parameters(table: _Table) -> Parameters:
-    """Return the messages PARM, in order; damaged ones are left out."""
-    stamp = next((key for key in _STAMPS if key in table), '')
-    if not stamp or not {'Name', 'Value'} <= set(table):
-        return Parameters((), 1.0)
-    rows = zip(*(table[key].tolist() for key in (stamp, 'Name', 'Value')))
-    return Parameters((
-        (time, name.decode('latin-1') if isinstance(name, bytes) else str(name), value)
-        for time, name, value in rows), _STAMPS[stamp])
 
 
 def _binary(path: Path) -> tuple[dict[str, _Table], list[str]]:

@@ -36,7 +36,7 @@ from .dialect import shown
 from .flight import DATAFLASH, read_dataflash, read_ulg
 from .names import meaning, record_instead
 from .quantities import are_samples, are_untimed_samples, decided, Quantities
-from .text import open_text, PEEKED, TextTable
+from .text import PEEKED, text_table, TextTable
 from ..disk import check_regular, FIRST_LINE
 from ..errors import DamagedLogError, InputError, needing, saying
 from ..finding import Finding
@@ -134,7 +134,7 @@ def _checked(path: Path, blocks: Iterator[Recording], units: Units) -> Iterator[
 @contextmanager
 def _binary(known: 'Format', path: Path, options: LogOptions) -> Iterator[OpenLog]:
     """Open a binary file in a child process."""
-    with parts_of(known.file(path), _parts, options, in_child=options.in_child) as parts:
+    with parts_of(known.file(path), _parts, known, options, in_child=options.in_child) as parts:
         head = next(parts)
         notes, findings = list(head.pop('noted')), tuple(head.pop('findings'))
 
@@ -148,9 +148,8 @@ def _binary(known: 'Format', path: Path, options: LogOptions) -> Iterator[OpenLo
         yield OpenLog(blocks(), **head, noted=lambda: tuple(notes), findings=findings)
 
 
-def _parts(path: Path, options: LogOptions) -> Generator[Any]:
+def _parts(path: Path, known: 'Format', options: LogOptions) -> Generator[Any]:
     """Yield the fields of an `OpenLog`, its blocks, and its notes at the end."""
-    known = _format_of(path)
     with known.opened(known, path, options) as log, saying(log.read_as):
         head = {**vars(log), 'noted': log.noted()}
         del head['blocks']
@@ -186,8 +185,7 @@ def _opened(file: LogFile, member: Member, options: LogOptions) -> Iterator[Text
         if inside is not TEXT:
             raise InputError(f'{path} holds {name}, {inside.name}, expected a table of text',
                              containers.UNPACK)
-        with open_text(path / member.name, options, raw, member.size) as text:
-            yield text
+        yield text_table(path / member.name, options, raw, member.size)
 
 
 def _member_of(file: LogFile, members: Sequence[Member], options: LogOptions

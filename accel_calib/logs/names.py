@@ -222,10 +222,9 @@ def _parted(words: list[str]) -> list[str]:
 
 
 def _axis(words: list[str], brackets: Sequence[str]) -> tuple[int | None, list[str]]:
-    named = [k for k, word in enumerate(words) if word in _AXES]
-    if named:
-        k = named[-1]
-        return _AXES[words[k]], words[:k] + words[k + 1:]
+    for k, word in reversed([*enumerate(words)]):
+        if word in _AXES:
+            return _AXES[word], words[:k] + words[k + 1:]
     for inner in map(str.casefold, brackets):
         if inner in _NUMBERED:
             return _NUMBERED[inner], words
@@ -504,7 +503,7 @@ def _closest(fitting: Sequence[LogFormat], header: Sequence[str]) -> LogFormat:
 def check_sensor(header: Sequence[str], path: Path) -> None:
     """Check the name of a file, if its maker gives the files of all sensors the same columns."""
     layout = recognise(header)  # also where the user names another format
-    if layout and _is_named(path, layout.other_sensors):
+    if layout and _file(path.name) in map(_file, layout.other_sensors):
         raise InputError(f'{path} is the log of another sensor ({path.stem}), expected readings '
                          'of an accelerometer', layout.record)
 
@@ -520,14 +519,13 @@ def record_instead(header: Sequence[str], path: Path) -> str:
     given = {folded(name) for name in header}
     for layout in FORMATS:
         marks = {folded(name) for name in layout.without_gravity if not name.endswith('.csv')}
-        if (marks and marks <= given) or (layout.plain and layout.fits(header)
-                                          and _is_named(path, layout.without_gravity)):
+        if (marks and marks <= given) or (
+                layout.plain and layout.fits(header)
+                and _file(path.name) in map(_file, layout.without_gravity)):
             return layout.record
     return ''
 
 
-def _is_named(path: Path, names: Sequence[str]) -> bool:
-    def stem(name: str) -> str:
-        return folded(name).replace(' ', '').removesuffix('.csv')
-
-    return stem(path.name) in map(stem, names)
+def _file(name: str) -> str:
+    """Return the name of a file without spelling and suffix, which programs change."""
+    return folded(name).replace(' ', '').removesuffix('.csv')

@@ -31,6 +31,7 @@ from .names import DEGREE, meaning, READING, record_instead, unit_of, ZEROS
 from .times import Clock, clock_of
 from ..errors import InputError, saying
 from ..finding import Finding
+from ..geometry import sphere_through
 from ..table import COLUMNS, Floats
 from ..text import one_line
 from ..units import STANDARD_GRAVITY, UnitName, Units, units_of
@@ -227,16 +228,13 @@ def _are_exchanged(made: Quantities, first: Cells) -> bool:
     if ('rate' not in made.chosen.sources
             or rests_of(made.numbers(first, 'reading'), samples=True).unit is not None):
         return False
-    reading, rate = (_steadiness(made.numbers(first, key)) for key in ('reading', 'rate'))
-    return rate > _STEADY and rate > _STEADIER * reading
-
-
-def _steadiness(values: Floats) -> float:
-    """Return the median length of (n, 3) vectors, relative to its scatter over them."""
-    length = np.linalg.norm(values, axis=1)
-    middle = float(np.median(length))
-    scatter = float(np.median(np.abs(length - middle)))
-    return middle / scatter if scatter > 0.0 else math.inf if middle > 0.0 else 0.0
+    steady = {}  # median length of the vectors, relative to its scatter
+    for key in ('reading', 'rate'):
+        length = np.linalg.norm(made.numbers(first, key), axis=1)
+        middle = float(np.median(length))
+        scatter = float(np.median(np.abs(length - middle)))
+        steady[key] = middle / scatter if scatter > 0.0 else math.inf if middle > 0.0 else 0.0
+    return steady['rate'] > max(_STEADY, _STEADIER * steady['reading'])
 
 
 def modulus_of(values: Floats) -> float:
@@ -460,16 +458,8 @@ def _radius(still: Floats) -> float:
     scales = np.linalg.svd(centred, compute_uv=False)
     if scales[2] < _SPREAD * scales[0]:
         return math.nan
-    # |m|² = 2 c·m + (r² - |c|²) is linear in the centre c.
-    rows = np.column_stack([2.0 * centred, np.ones(len(centred))])
-    found = np.linalg.lstsq(rows, np.sum(centred**2, axis=1), rcond=None)[0]
-    square = float(found[3] + found[:3] @ found[:3])
-    if square <= 0.0:
-        return math.nan
-    radius = math.sqrt(square)
-    off = np.linalg.norm(centred - found[:3], axis=1) - radius
-    on_sphere = float(np.sqrt(np.mean(off**2))) < _OFF_SPHERE * radius
-    return radius * size if on_sphere else math.nan
+    radius, off = sphere_through(centred)
+    return radius * size if off < _OFF_SPHERE * radius else math.nan
 
 
 def are_samples(columns: Mapping[str, NDArray[Any]]) -> bool:

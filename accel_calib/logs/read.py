@@ -31,8 +31,6 @@ from ..errors import InputError
 from ..table import check_values, column_of, COLUMNS, concatenated, Poses, Recording, Table
 from ..text import counted, one_line
 
-_DIGITS = '.12g'
-
 
 def read_poses(path: Path, *, partial: bool = False) -> Poses:
     """
@@ -95,7 +93,7 @@ def _as_text(values: NDArray[Any]) -> list[list[str]]:
     """Return the columns of an array as text, with enough digits for all sensors."""
     if values.dtype.kind in 'US':
         return [values.tolist()]
-    digits = '.16g' if values.ndim == 1 else _DIGITS  # stamps need all digits
+    digits = '.16g' if values.ndim == 1 else '.12g'  # stamps need all digits
     return [['' if value != value else format(value, digits) for value in column.tolist()]
             for column in np.atleast_2d(values.T)]
 

@@ -38,9 +38,6 @@ from ..text import read_json
 _MOST_BYTES, _LONGEST_LINE = 1 << 25, 1 << 20
 """Largest JSON file that is read as a whole [bytes], and longest line of a record [characters]."""
 
-_FIRST_RECORDS = 4000
-"""Number of first records whose series are known."""
-
 _SERIES = ('sensor', 'topic', 'type', 'measurement')
 """Keys whose text names the series of a record."""
 
@@ -121,8 +118,8 @@ def lines(parse: Callable[[str], tuple[str, Record]], path: Path, _: ExitStack) 
 
 def _series(name: str, size: int, records: Callable[[], Iterator[tuple[str, Record]]]
             ) -> Iterator[Member]:
-    """Yield a table for each of the series of records."""
-    for series in dict.fromkeys(each for each, _ in islice(records(), _FIRST_RECORDS)):
+    """Yield a table for each of the series of the first 4000 records."""
+    for series in dict.fromkeys(each for each, _ in islice(records(), 4000)):
         yield Member('.'.join(filter(None, (name, series))), size, partial(_rows, series, records))
 
 
@@ -253,12 +250,8 @@ def _tables(path: Path, held: Mapping[str, _Held], advice: str) -> list[Member]:
                 column = column if column.ndim == 2 else column[:, np.newaxis]
                 is_wide = column.shape[0] < column.shape[1]  # with one column per sample
                 arrays['/'.join(filter(None, (name, field)))] = column.T if is_wide else column
-    return [_table(name, group) for name, group in _groups(arrays).items()]
-
-
-def _groups(arrays: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return arrays of one length together, or each alone if their names tell no accelerometer."""
-    groups: dict[str, dict[str, Any]] = {}
+    # Arrays of one length together, or each alone if their names tell no accelerometer.
+    tables: list[Member] = []
     by_length: dict[int, dict[str, Any]] = {}
     for name, values in arrays.items():
         by_length.setdefault(len(values), {})[name] = values
@@ -266,11 +259,12 @@ def _groups(arrays: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         header = [cell for name, values in group.items() for cell in _names(name, values)]
         alone = len(group) == 1 and len(header) in _BY_ORDER
         if is_log_header(LogOptions(), header) and not alone:
-            groups[', '.join(group)] = group
+            tables.append(_table(', '.join(group), header, *group.values()))
         else:
-            groups |= {name: {'': values} for name, values in group.items()
-                       if values.shape[1] in _BY_ORDER}
-    return groups or {name: {name: values} for name, values in arrays.items()}
+            tables += [_table(name, [], values) for name, values in group.items()
+                       if values.shape[1] in _BY_ORDER]
+    return tables or [_table(name, _names(name, values), values)
+                      for name, values in arrays.items()]
 
 
 def _names(name: str, values: Any) -> list[str]:
@@ -280,8 +274,7 @@ def _names(name: str, values: Any) -> list[str]:
     return [f'{name}{end}' for end in ends]
 
 
-def _table(name: str, group: Mapping[str, Any]) -> Member:
-    header = [cell for each, values in group.items() for cell in _names(each, values)]
-    table = np.hstack([values.astype(float) for values in group.values()])
+def _table(name: str, header: list[str], *arrays: Any) -> Member:
+    table = np.hstack([values.astype(float) for values in arrays])
     rows = [header] if header else []
     return Member(name, table.size * CELL_BYTES, lambda: csv_of(chain(rows, table.tolist())))

@@ -103,7 +103,6 @@ def _layout_named(name: bytes) -> Layout:
 Bytes = NDArray[np.uint8]
 Indices = NDArray[np.int64]
 
-_TRAILING = 3  # bytes of padding that a CDR message may end with
 NANO = 1e-9
 
 
@@ -163,7 +162,8 @@ def joined(raws: Sequence[bytes | memoryview], doubles: int, name: str, *, ros2:
             head[swapped] = head[swapped].byteswap()
     begin = begin_of(head[:, 3].astype(np.int64), ros2=ros2)
     extra = size - begin - 8 * doubles
-    _check((extra >= 0) & (extra <= (_TRAILING if ros2 else 0)), size, name, before)
+    # A CDR message may end with up to 3 bytes of padding.
+    _check((extra >= 0) & (extra <= (3 if ros2 else 0)), size, name, before)
     return Messages(data, start, stop, head, start + begin, swapped, ros2)
 
 
@@ -184,17 +184,13 @@ def stamps_of(messages: Messages) -> Floats:
 
 def frame_ids(messages: Messages) -> list[str]:
     """Return the frame_id of each message; only one item if all are equal."""
-    length = messages.head[:, 3].astype(np.int64)
+    length, first = messages.head[:, 3].astype(np.int64), messages.start + LETTERS_AT
     if np.all(length == length[0]):
-        names = _rows_at(messages.data, messages.start + LETTERS_AT, int(length[0]))
+        names = _rows_at(messages.data, first, int(length[0]))
         if np.all(names == names[0]):
-            return [_text(names[0].tobytes())]
-    places = zip((messages.start + LETTERS_AT).tolist(), length.tolist(), strict=True)
-    return [_text(messages.data[place:place + size].tobytes()) for place, size in places]
-
-
-def _text(name: bytes) -> str:
-    return name.rstrip(b'\0').decode(errors='replace')
+            length, first = length[:1], first[:1]
+    return [messages.data[place:place + size].tobytes().rstrip(b'\0').decode(errors='replace')
+            for place, size in zip(first.tolist(), length.tolist(), strict=True)]
 
 
 def doubles_at(messages: Messages, which: slice) -> Floats:

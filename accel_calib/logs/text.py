@@ -12,10 +12,10 @@ The rows are read once, in blocks, so the memory needed does not depend on the l
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import suppress
 from functools import partial
 import io
-from itertools import chain, islice
+from itertools import chain, islice, pairwise
 from pathlib import Path
 import re
 from typing import Any
@@ -43,22 +43,17 @@ PEEKED = 1 << 16
 _BLANK = ' \t\r\n,;|'
 """Characters of a row without any value, as spreadsheets write at the end of a table."""
 
-_QUOTED_LINES = 20
-"""Largest number of lines of one quoted cell."""
 
-
-@contextmanager
-def open_text(path: Path, options: LogOptions, raw: io.BufferedReader[Any], size: int
-              ) -> Iterator[TextTable]:
-    """Open the text table of a file of this size [bytes]; see `layout_of`."""
+def text_table(path: Path, options: LogOptions, raw: io.BufferedReader[Any], size: int
+               ) -> TextTable:
+    """Return the text table of an open file of this size [bytes]; see `layout_of`."""
     encoding = _encoding(raw.peek())
-    with io.TextIOWrapper(raw, encoding, errors='replace', newline=None) as text:
-        head = _head(path, text)
-        rows: Iterator[str] = text
-        if label := first_label(head):
-            rows = _readings(chain(head, text), label)
-            head = list(islice(rows, _HEAD_LINES))
-        yield TextTable(path, head, rows, options, encoding, size)
+    text = io.TextIOWrapper(raw, encoding, errors='replace', newline=None)
+    head, rows = _head(path, text), iter(text)
+    if label := first_label(head):
+        rows = _readings(chain(head, text), label)
+        head = list(islice(rows, _HEAD_LINES))
+    return TextTable(path, head, rows, options, encoding, size)
 
 
 def _readings(lines: Iterable[str], label: str) -> Iterator[str]:
@@ -137,16 +132,14 @@ class TextTable:
     def blocks(self) -> Iterator[Cells]:
         """Yield blocks of rows; InputError without rows, or for a bad cell or number of cells."""
         found = 0
-        lines = list(islice(self._lines, ROWS))
-        while lines:
-            following = list(islice(self._lines, ROWS))
+        parts = iter(lambda: list(islice(self._lines, ROWS)), [])
+        for lines, following in pairwise(chain(parts, [[]])):
             self.more = bool(following)
             cells = self.read(lines, last=not following)
             self.characters = sum(map(len, lines))
             found += len(cells.row)
             if len(cells.row):
                 yield cells
-            lines = following
         if not found:
             raise InputError(f'{self.layout.path} has a header line but no rows, expected one row '
                              'for each pose or sample', 'add the rows')
@@ -194,20 +187,18 @@ class TextTable:
                 return None
             texts = ['\t'.join([row[k] for k in columns]) for row in rows]
             delimiter, columns, breaks = '\t', tuple(range(len(columns))), len(columns) - 1
-        if {line.count(delimiter) if delimiter else len(line.split()) - 1
-                for line in texts} != {breaks}:
-            return None
-        if any(not is_clock(dialect.cells(line)[k])
-               for k in self.columns.dates for line in lines):
+        widths = {line.count(delimiter) if delimiter else len(line.split()) - 1 for line in texts}
+        if widths != {breaks} or any(not is_clock(dialect.cells(line)[k])
+                                     for k in self.columns.dates for line in lines):
             return None
         if delimiter != ',' and layout.decimal != '.':
             texts = [line.replace(',', '.') for line in texts]
-        try:
+        with suppress(ValueError):
             values = np.loadtxt(texts, delimiter=delimiter or None, usecols=columns, ndmin=2,
                                 comments=None, quotechar=None)
-        except ValueError:
-            return None
-        return values if len(values) == len(lines) and np.isfinite(values).all() else None
+            if len(values) == len(lines) and np.isfinite(values).all():
+                return values
+        return None
 
     def _good(self, lines: Sequence[str], rows: NDArray[np.int64],
               place: Sequence[int]) -> list[int]:
@@ -245,11 +236,11 @@ class TextTable:
 
 
 def _joined_quotes(lines: list[str]) -> list[str]:
-    """Return lines with quoted cells of several lines joined."""
+    """Return lines with quoted cells of several lines, at most 20, joined."""
     joined: list[str] = []
     k = 0
     while k < len(lines):
-        last = min(k + _QUOTED_LINES, len(lines)) if lines[k].count('"') % 2 else k
+        last = min(k + 20, len(lines)) if lines[k].count('"') % 2 else k
         end = next((j for j in range(k + 1, last) if lines[j].count('"') % 2), k)
         joined.append(''.join(lines[k:end + 1]))
         k = end + 1
