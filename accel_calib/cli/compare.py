@@ -7,7 +7,6 @@ import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from rich.table import Table
@@ -17,7 +16,7 @@ from .frame import (
     stored_calibration)
 from .output import error_line, NARROW, progress, short_if_known, table, Verdict
 from ..calibrate import verify
-from ..compare import compare, Comparison, History, history_of
+from ..compare import compare, History, history_of
 from ..errors import InputError
 from ..findings import (
     change_in_words, GAINS, in_words, OFFSETS, rate_comparison, rate_noise, rate_verification)
@@ -81,31 +80,23 @@ def run_compare(args: argparse.Namespace) -> Done:
     rating = rate_comparison(comparison)
     models = [calibration.name for calibration in calibrations]
     outlier = comparison.outlier
+    lines = [
+        table('Corrected |a| minus the mean of the others [mg]',
+              ('run', 'model', 'RMS', 'expected', 'largest', 'p'),
+              ((f'{number} {path}', model, f'{run.rms_mg:.3g}', f'{run.expected_mg:.3g}',
+                f'{run.largest_mg:.3g}', f'{run.p_value:.2g}') for number, (path, model, run) in
+               enumerate(zip(paths, models, comparison.runs, strict=True), 1))),
+        table('Spread of the parameters over the runs', ('', 'mean', 'spread', 'stated', 'ratio'),
+              parameter_rows(comparison)),
+        *(f'note: {note}' for note in comparison.notes),
+        *filter(None, [comparison.tilt_words])]
+    if not comparison.agree and len(comparison.runs) == 2:
+        lines.append('a third run would show which one differs')
     result = {**asdict(comparison), 'outlier': None if outlier is None else outlier + 1,
               'runs': [{'file': path, 'model': model, **asdict(run)} for path, model, run in
                        zip(paths, models, comparison.runs, strict=True)]}
-    return Done(result, _comparison_lines(paths, models, comparison), rating,
-                status=0 if comparison.agree else FAILED,
+    return Done(result, lines, rating, status=0 if comparison.agree else FAILED,
                 page=partial(comparison_page, comparison, rating, paths, calibrations))
-
-
-def _comparison_lines(paths: list[Path], models: list[str], comparison: Comparison
-                      ) -> Iterator[Any]:
-    yield table(
-        'Corrected |a| minus the mean of the others [mg]',
-        ('run', 'model', 'RMS', 'expected', 'largest', 'p'),
-        ((f'{number} {path}', model, f'{run.rms_mg:.3g}', f'{run.expected_mg:.3g}',
-          f'{run.largest_mg:.3g}', f'{run.p_value:.2g}') for number, (path, model, run) in
-         enumerate(zip(paths, models, comparison.runs, strict=True), 1)))
-    yield table(
-        'Spread of the parameters over the runs', ('', 'mean', 'spread', 'stated', 'ratio'),
-        parameter_rows(comparison))
-    for note in comparison.notes:
-        yield f'note: {note}'
-    if comparison.tilt_words:
-        yield comparison.tilt_words
-    if not comparison.agree and len(comparison.runs) == 2:
-        yield 'a third run would show which one differs'
 
 
 def run_history(args: argparse.Namespace) -> Done:
