@@ -32,6 +32,7 @@ import numpy as np
 import scipy
 
 from .curve import Counts, shares, Spread
+from ..geometry import rms
 from ..units import Floats, is_native, STANDARD_GRAVITY
 
 COMPONENTS = ('quantisation', 'noise_density', 'bias_instability', 'random_walk', 'drift')
@@ -132,7 +133,8 @@ def fit_components(variances: Floats, lengths: Counts, spread: Spread) -> Fitted
     free = [c for c in _EVERY if c in _WANTED or curve.rise(_EVERY, c) > _RISE[c]]
     rises = np.array([curve.rise(free, c) if c in free else 0.0 for c in _EVERY])
     found = curve.solve(free)
-    large = curve.parts(found.squares) >= _LEAST_SHARE
+    parts = shape[first:last + 1] * found.squares
+    large = np.max(parts / parts.sum(axis=1, keepdims=True), axis=0) >= _LEAST_SHARE
     seen = (found.squares > 0.0) & large & (rises > _RISE)
     if last - first + 1 < _LONG_RANGE:
         seen[2:] = False
@@ -187,11 +189,6 @@ class _RangeFit:
         """Return the probability of χ²."""
         freedom = len(self._variances) - int(np.sum(found.squares > 0.0))
         return float(scipy.stats.chi2.sf(found.chi_square, max(freedom, 1)))
-
-    def parts(self, squares: Floats) -> Floats:
-        """Return the largest part of the variance of each component."""
-        each = self._shape * squares
-        return np.asarray(np.max(each / each.sum(axis=1, keepdims=True), axis=0))
 
     def component(self, found: _Solution, which: int, seen: bool) -> Component:
         """Return one component, or its upper limit."""
@@ -375,7 +372,7 @@ class NoiseFigures:
             return np.nan, np.nan
         values, sds = (np.array([getattr(each, name) for each in found])
                        for name in ('value', 'sd'))
-        common = float(np.sqrt(np.mean(values**2)))
+        common = rms(values)
         return common, float(np.sqrt(np.sum((values * sds)**2))) / (len(found) * common)
 
 

@@ -24,11 +24,10 @@ import numpy as np
 import scipy
 
 from .components import (
-    AxisNoise, COMPONENTS, FIGURES, fit_components, Fitted, Kind, KINDS, LEVEL, NoiseFigures,
-    shown_unit)
+    AxisNoise, COMPONENTS, FIGURES, fit_components, Kind, KINDS, LEVEL, NoiseFigures, shown_unit)
 from .curve import (
-    allan_variances, check_allantools, coarse_step, Counts, FLAT, longest_rest, LongRest, octaves,
-    shares, Spread, spread_of)
+    allan_variances, check_allantools, coarse_step, FLAT, longest_rest, LongRest, octaves, shares,
+    Spread, spread_of)
 from ..table import Floats, Recording
 from ..units import is_native, STANDARD_GRAVITY, Units
 
@@ -92,11 +91,7 @@ def _axis_notes(axis: AxisNoise) -> Iterator[str]:
         hourly = _three(drift.value * scale * _HOUR)
         yield (f'a steady drift of {hourly} {unit} per hour raises the curve at long τ '
                '(warm-up?); it is not part of the figures')
-    yield from _departures(axis)
-
-
-def _departures(axis: AxisNoise) -> Iterator[str]:
-    """Yield where the curve is not that of the components."""
+    # Where the curve is not that of the components.
     ratio = axis.deviation / axis.model - 1.0
     below = ratio[axis.tau < axis.used[0]]
     above = ratio[axis.tau > axis.used[1]]
@@ -163,16 +158,12 @@ _NEEDED: Mapping[str, Callable[[AxisNoise, LongRest], tuple[float, str]]] = dict
 
 def _needs_rest(seconds: float, rest: LongRest) -> tuple[float, str]:
     """Return a length, and the words for it."""
-    about = (f'more than {duration(_TOO_LONG)}' if seconds > _TOO_LONG
-             else f'about {duration(_rounded(seconds))}')
-    return seconds, f'needs {about} at rest, this has {duration(rest.seconds)}'
-
-
-def _rounded(seconds: float) -> float:
-    """Return a duration rounded up to one or two digits of its unit."""
+    # Rounded up to one or two digits of its unit.
     unit = next(each for each in (_HOUR, _MINUTE, 1.0) if seconds >= 2.0 * each or each == 1.0)
     step = unit * (1.0 if seconds < 10.0 * unit else 5.0 if seconds < 60.0 * unit else 50.0)
-    return float(np.ceil(seconds / step - 1e-9) * step)
+    about = (f'more than {duration(_TOO_LONG)}' if seconds > _TOO_LONG
+             else f'about {duration(float(np.ceil(seconds / step - 1e-9) * step))}')
+    return seconds, f'needs {about} at rest, this has {duration(rest.seconds)}'
 
 
 def duration(seconds: float) -> str:
@@ -261,7 +252,13 @@ def _axis(kind: Kind, axis: str, unit: str, values: Floats, rate: float, spread:
     fitted = fit_components(variances, lengths, spread)
     covariance = spread.covariance(fitted.squares)
     expected = shares(lengths) @ fitted.squares
-    low, high = _band(variances, lengths, fitted, spread)
+    # Beyond the range the form is not known: a random walk has the fewest degrees of freedom.
+    forms = (fitted.squares, np.array([0.0, 0.0, 0.0, 1.0, 0.0]))
+    within, beyond = (2.0 * (shares(lengths) @ squares)**2 / np.diag(spread.covariance(squares))
+                      for squares in forms)
+    freedom = np.where(np.arange(len(variances)) > fitted.last, beyond, within)
+    low, high = (np.sqrt(variances * freedom / scipy.stats.chi2.ppf(part, freedom))
+                 for part in (0.5 + 0.5 * LEVEL, 0.5 - 0.5 * LEVEL))
     tau = lengths / rate
     across = np.diff(np.eye(len(lengths)), axis=0)
     relative = covariance / np.outer(expected, expected)
@@ -273,20 +270,6 @@ def _axis(kind: Kind, axis: str, unit: str, values: Floats, rate: float, spread:
          for name, each in zip(COMPONENTS, fitted.components, strict=True)},
         (float(tau[fitted.first]), float(tau[fitted.last])), fitted.p_value,
         coarse_step(values, size * float(np.sqrt(variances[0]))))
-
-
-def _band(variances: Floats, lengths: Counts, fitted: Fitted, spread: Spread
-          ) -> tuple[Floats, Floats]:
-    """Return the 95 % interval of the Allan deviations from their degrees of freedom."""
-    # Beyond the range the form is not known: a random walk has the fewest degrees of freedom.
-    forms = (fitted.squares, np.array([0.0, 0.0, 0.0, 1.0, 0.0]))
-    within, beyond = (2.0 * (shares(lengths) @ squares)**2 / np.diag(spread.covariance(squares))
-                      for squares in forms)
-    freedom = np.where(np.arange(len(variances)) > fitted.last, beyond, within)
-    tail = 0.5 - 0.5 * LEVEL
-    low, high = (np.sqrt(variances * freedom / scipy.stats.chi2.ppf(part, freedom))
-                 for part in (1.0 - tail, tail))
-    return low, high
 
 
 def _temperatures(rest: LongRest) -> tuple[float, float] | None:
