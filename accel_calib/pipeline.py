@@ -353,11 +353,17 @@ def calibrated(poses: Poses, units: Units, plan: Plan = Plan()) -> Outcome:
         refinement, line = _refinement(chosen, units, plan, date)
     if refinement is not None and refinement.steps and not refinement.refusal:
         calibration = refinement.calibration
-    if plan.before is not None and plan.flat is None:
-        calibration = _mounted_as(plan.before, calibration)
-    else:
+    before = plan.before
+    if before is None or plan.flat is not None:
         calibration = level_by_rows(calibration, poses, plan.frame, _row(poses, plan.flat),
                                     plan.nose_down)
+    elif before.is_levelled:
+        context = before.typical_context(1)
+        flat = flat_direction(before.frame) * before.force_per_g
+        headed = replace(calibration, model=Model(calibration.model.values, before.rotation),
+                         frame=before.frame)
+        calibration = level(headed, before.predict(flat[np.newaxis], context)[0], before.frame,
+                            context)
     return Outcome(calibration, refinement, line)
 
 
@@ -368,7 +374,8 @@ def _fit(poses: Poses, units: Units, plan: Plan, date: str) -> Calibration:
     if before is not None and is_refined(before):
         from .refine import refitted
         return refitted(before, poses, sensor=plan.sensor, date=date)
-    if plan.in_cone and (before is None or is_partial(before)) and _lie_in_cone(poses, units):
+    if (plan.in_cone and (before is None or is_partial(before)) and not units.is_native
+            and len(poses) >= FEWEST_IN_CONE and lies_in_cone(directions_of(poses, units))):
         return fit_partial(poses, units, sensor=plan.sensor, date=date)
     return fit_poses(poses, units, model=plan.model, method=plan.method, sensor=plan.sensor,
                      date=date)
@@ -382,23 +389,6 @@ def is_refined(calibration: Calibration) -> bool:
 def is_partial(calibration: Calibration) -> bool:
     """Return whether a calibration is not a full fit: a mounting alone, or a fit to a cone."""
     return calibration.method == PRIOR or not calibration.model.effects
-
-
-def _lie_in_cone(poses: Poses, units: Units) -> bool:
-    return (not units.is_native and len(poses) >= FEWEST_IN_CONE
-            and lies_in_cone(directions_of(poses, units)))
-
-
-def _mounted_as(before: Calibration, calibration: Calibration) -> Calibration:
-    """Return a calibration with the levelled frame and the mounting of the one before it."""
-    if not before.is_levelled:
-        return calibration
-    context = before.typical_context(1)
-    flat = flat_direction(before.frame) * before.force_per_g
-    reading = before.predict(flat[np.newaxis], context)[0]
-    headed = replace(calibration, model=Model(calibration.model.values, before.rotation),
-                     frame=before.frame)
-    return level(headed, reading, before.frame, context)
 
 
 @dataclass(frozen=True)
@@ -458,38 +448,33 @@ def thermally_calibrated(logs: Sequence[Intake | RampIntake], plan: Plan = Plan(
     read_as = ', '.join(dict.fromkeys(each.read_as for each in logs if each.read_as))
     with saying(read_as):
         ramps = [each for each in logs if isinstance(each, RampIntake)]
-        turned = _turned_over(logs)
-        _check_one_sensor([*(each.ramp.stretches for each in ramps),
-                           *([] if turned is None else [turned.poses])])
+        turned = [each for each in logs if isinstance(each, Intake)]
+        _check_logs(ramps, turned)
         curve = curve_of([each.ramp for each in ramps])
-        if turned is None:
-            made = thermal_alone(curve, ramps[0].units, sensor=plan.sensor, date=now())
-            rows = made.poses
-        else:
-            rows, units = turned.poses, turned.units
+        if turned:
+            rows, units = turned[0].poses, turned[0].units
             fitted = calibrated(without_curve(curve, rows, units), units, replace(
                 plan, refined=False, flat=None, nose_down=None)).calibration
             made = with_curve(fitted, curve, rows)
+        else:
+            made = thermal_alone(curve, ramps[0].units, sensor=plan.sensor, date=now())
+            rows = made.poses
         levelled = level_by_rows(made, made.poses, plan.frame, _row(rows, plan.flat),
                                  plan.nose_down)
         return ThermalOutcome(levelled, curve, logs, read_as)
 
 
-def _turned_over(logs: Sequence[Intake | RampIntake]) -> Intake | None:
-    """Return the one log of poses, if there is one; raise InputError without a ramp."""
-    turned = [each for each in logs if isinstance(each, Intake)]
-    if len(turned) == len(logs):
+def _check_logs(ramps: Sequence[RampIntake], turned: Sequence[Intake]) -> None:
+    """Refuse logs without a ramp, with several logs of poses, or of several sensors."""
+    if not ramps:
         raise InputError(f'{counted(len(turned), "log")} of poses in many directions, expected '
                          'one of a still board whose temperature changes', 'record the board '
                          'while it warms up from the freezer, and give this log, too')
     if len(turned) > 1:
         raise InputError(f'{len(turned)} logs are of poses in many directions, expected at most '
                          'one', 'leave out the others')
-    return turned[0] if turned else None
-
-
-def _check_one_sensor(tables: Sequence[Poses]) -> None:
-    """Refuse tables of several sensors, by device id in an autopilot, or else by name."""
+    tables = [*(each.ramp.stretches for each in ramps), *(each.poses for each in turned)]
+    # A sensor is known by its device id in an autopilot, or else by its name.
     devices = {each.autopilot.device_id for each in tables if each.autopilot} - {None}
     names = {each.sensor for each in tables if not each.autopilot} - {''}
     for known in (devices, names):
