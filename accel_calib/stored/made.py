@@ -260,22 +260,16 @@ def _by_effect(calibration: Calibration, label: str, make: Callable[[Calibration
     found = [Loss('', f'{label} has no sensitivity: leaves {ideal:.2g} mg', ideal)]
     for name, values in calibration.model.values.items():
         part = float(np.sqrt(max(left({name: values}) ** 2 - ideal ** 2, 0.0)))
-        words = _lacking(name, values, made, left)
+        effect = effect_named(name)
+        parameters, shape = effect.split(values)
+        what = effect.words.partition(',')[0]
+        words = f'has no {what}'
+        if name in made.rounded:
+            words = f'rounds the {what} to {made.rounded[name]}'
+        elif effect.is_lagged(shape) and left({name: effect.filled(parameters)}) < LEAST_LOSS_MG:
+            words = f'has no lag ({shape[0]:.0f} s) in the {what}'
         found.append(Loss(name, f'{label} {words}: leaves {part:.2g} mg', part))
     return [loss for loss in found if loss.leaves_mg >= LEAST_LOSS_MG]
-
-
-def _lacking(name: str, values: Floats, made: Made, left: Callable[[dict[str, Floats]], float]
-             ) -> str:
-    """Return what a format does with an effect that it does not hold."""
-    effect = effect_named(name)
-    parameters, shape = effect.split(values)
-    words = effect.words.partition(',')[0]
-    if name in made.rounded:
-        return f'rounds the {words} to {made.rounded[name]}'
-    if effect.is_lagged(shape) and left({name: effect.filled(parameters)}) < LEAST_LOSS_MG:
-        return f'has no lag ({shape[0]:.0f} s) in the {words}'
-    return f'has no {words}'
 
 
 def difference_mg(calibration: Calibration, made: Made) -> float:
