@@ -34,9 +34,8 @@ the sensors are within the distance that contains half of a normal distribution.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TypeVar
 from urllib.parse import unquote
 
 import numpy as np
@@ -74,8 +73,6 @@ COLUMNS = ('key', 'sensor_model', 'recording', 'date', 'status', 'error', 'advic
            'prior_covariance', *(column for name in NAMES for column in (name, f'{name}.sd')))
 """Columns of the rows of recordings from which a digest is made."""
 
-
-_Item = TypeVar('_Item')
 
 Odd = tuple[str, str, float, float]
 """Sensor, name of a value, the value, and its distance from the median in spreads."""
@@ -144,14 +141,6 @@ class Digest:
     typical: list[Typical]
 
 
-def _grouped(items: Iterable[_Item], key: Callable[[_Item], str]) -> dict[str, list[_Item]]:
-    """Return the items by their key, in the order in which they are."""
-    found: dict[str, list[_Item]] = defaultdict(list)
-    for each in items:
-        found[key(each)].append(each)
-    return found
-
-
 def digest_of(name: str, store: Store) -> Digest:
     """Return the digest of a sensor by the name of its folder; it runs on a worker."""
     return digest(unquote(name), store.of_sensor(name, COLUMNS))
@@ -160,25 +149,21 @@ def digest_of(name: str, store: Store) -> Digest:
 def digest(sensor: str, rows: Sequence[Row]) -> Digest:
     """Return the digest of the rows of a sensor, in order of date; without a name, no values."""
     named = rows if sensor != UNKNOWN else ()
-    good = alike(named)
-    values, differences = _values_of(good) if good else (None, [])
+    good, known, differences = alike(named), None, []
+    if good:
+        values, deviations = table_of(good)
+        known = Values(
+            np.mean(values, axis=0), np.sqrt(np.sum(deviations ** 2, axis=0)) / len(good),
+            {each['name']: each['value'] for each in good[-1]['parameters']
+             if each['name'].partition('.')[0] not in LADDER})
+        away = values - np.median(values, axis=0)
+        differences = [(row['date'][:7], change) for row, change in zip(good, away, strict=True)
+                       if row.get('date') and len(good) > 1]
     return Digest(
         sensor, model_of(rows), Counter(row['rating'] or row['status'] for row in rows),
         [row for row in rows if row['status'] != 'ok'][:MOST_ERRORS],
-        sum(bool(row['calibration']) for row in rows) - len(good), values, differences,
+        sum(bool(row['calibration']) for row in rows) - len(good), known, differences,
         typical_of(named))
-
-
-def _values_of(rows: Sequence[Row]) -> tuple[Values, list[tuple[str, Floats]]]:
-    """Return the values of rows that can be compared, and their differences by month."""
-    values, deviations = table_of(rows)
-    away = values - np.median(values, axis=0)
-    effects = {each['name']: each['value'] for each in rows[-1]['parameters']
-               if each['name'].partition('.')[0] not in LADDER}
-    return (Values(np.mean(values, axis=0), np.sqrt(np.sum(deviations ** 2, axis=0)) / len(rows),
-                   effects),
-            [(row['date'][:7], change) for row, change in zip(rows, away, strict=True)
-             if row.get('date') and len(rows) > 1])
 
 
 @dataclass(frozen=True)
@@ -260,11 +245,13 @@ def rating_of(known: Overview, sensors: Sequence[Row]) -> Rating:
 
 def shared_effects(values: Mapping[str, Values]) -> list[str]:
     """Return a line per value beyond V and W that two or more sensors have, with its range."""
-    found = _grouped((each for own in values.values() for each in own.effects.items()),
-                     lambda each: each[0])
+    found: dict[str, list[float]] = defaultdict(list)
+    for own in values.values():
+        for name, value in own.effects.items():
+            found[name].append(value)
     lines = []
     for name, known in sorted(found.items(), key=lambda each: -len(each[1])):
-        low, high = np.quantile([value for _, value in known], [0.1, 0.9])
+        low, high = np.quantile(known, [0.1, 0.9])
         _, factor, unit = scale_of(name)
         if len(known) > 1:
             lines.append(f'{len(known)} of {counted(len(values), "sensor")}: {name} '
@@ -300,11 +287,12 @@ def typical_of(rows: Iterable[Row]) -> list[Typical]:
 
 def priors_of(sensors: Iterable[Typical]) -> dict[str, FleetPrior]:
     """Return the typical values of the models with at least `FEWEST` sensors."""
-    by_model = _grouped(sensors, lambda each: each[0])
-    return {model: FleetPrior(model, len(chosen), estimated(
-        np.array([values for _, values, _ in chosen]),
-        np.array([covariance for _, _, covariance in chosen])))
-        for model, chosen in sorted(by_model.items()) if len(chosen) >= FEWEST}
+    by_model: dict[str, list[list[Floats]]] = defaultdict(list)
+    for model, *known in sensors:
+        by_model[model].append(known)
+    return {model: FleetPrior(model, len(chosen), estimated(*(
+        np.array(each) for each in zip(*chosen))))
+            for model, chosen in sorted(by_model.items()) if len(chosen) >= FEWEST}
 
 
 def estimated(values: Floats, covariances: Floats) -> Prior:

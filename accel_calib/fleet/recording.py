@@ -136,31 +136,23 @@ def _is_bag_folder(path: Path) -> bool:
 def _addresses(text: str) -> Iterator[Input]:
     """Yield the recordings of an address, in order."""
     system, path = _system(text)
+    magic = '*[' if '://' in path else _MAGIC  # ? begins the query of an address of the web
+    root = PurePosixPath(path)
+    first = next((k for k, part in enumerate(root.parts) if set(part) & set(magic)), None)
+    files, folders = list[str](), [path]
     with _as_input_error(text):
-        root, found = _found_at(system, path)
-    for each in sorted(found):
+        if first is not None:
+            root = PurePosixPath(*root.parts[:first])
+            found = system.glob(path, detail=True).items()
+            files, folders = ([each for each, about in found if about['type'] == kind]
+                              for kind in ('file', 'directory'))
+        elif system.isfile(path):
+            root, files, folders = root.parent, [path], []
+        for folder in folders:
+            files += [each for each in system.find(folder) if each.lower().endswith(SUFFIXES)]
+    for each in sorted(files):
         yield Input(system.unstrip_protocol(each),
                     PurePosixPath(each).relative_to(root).as_posix())
-
-
-def _found_at(system: Any, path: str) -> tuple[PurePosixPath, list[str]]:
-    """Return the folder above the recordings, and their paths in the file system."""
-    magic = '*[' if '://' in path else _MAGIC  # ? begins the query of an address of the web
-    parts = PurePosixPath(path).parts
-    first = next((k for k, part in enumerate(parts) if set(part) & set(magic)), None)
-    if first is None and system.isfile(path):
-        return PurePosixPath(path).parent, [path]
-    if first is None:
-        return PurePosixPath(path), _files_below(system, path)
-    found = system.glob(path, detail=True).items()
-    files = [each for each, about in found if about['type'] == 'file']
-    below = [file for each, about in found if about['type'] == 'directory'
-             for file in _files_below(system, each)]
-    return PurePosixPath(*parts[:first]), files + below
-
-
-def _files_below(system: Any, path: str) -> list[str]:
-    return [each for each in system.find(path) if each.lower().endswith(SUFFIXES)]
 
 
 @contextmanager
@@ -391,23 +383,20 @@ def row_of(found: Input, path: Path, options: Options) -> tuple[Row, Calibration
     except OSError:
         raise  # it may be possible to read it later
     except Exception as err:  # also a defect of this program must not stop the other recordings
-        return row | _failed(known_error(err), str(path), found.path), None
+        error = known_error(err)
+        message = error.message.replace(str(path), found.path)  # the path can be that of a copy
+        return row | {'status': 'error', 'error': message, 'advice': error.advice}, None
     calibration = replace(outcome.calibration, date=row['date'])
     stored = outcome.rating.name != 'BAD'
     return row | _figures(intake, outcome), calibration if stored else None
-
-
-def _failed(error: AccelCalibError, copy: str = '', name: str = '') -> Row:
-    """Return the columns of an error, with the name of a recording for that of its copy."""
-    message = error.message.replace(copy, name) if copy else error.message
-    return {'status': 'error', 'error': message, 'advice': error.advice}
 
 
 def unread_row(found: Input, options: Options, error: AccelCalibError) -> Row:
     """Return the row of a recording that could not be read."""
     if (written := as_text(found.path)) != found.path:
         found = Input(written, '')
-    return _about(found, options, None, None) | _failed(error) | {'status': 'unread'}
+    return _about(found, options, None, None) | {
+        'status': 'unread', 'error': error.message, 'advice': error.advice}
 
 
 def as_text(name: str) -> str:

@@ -296,7 +296,8 @@ def mapped(client: Client, function: Callable[..., Any], items: Iterable[_Item],
     """
     from distributed import as_completed, KilledWorker
 
-    rest, suspects, pace = iter(items), list[_Item](), _Pace()
+    rest, suspects = iter(items), list[_Item]()
+    size, mean_s = 1, _TASK_S  # number of items per task, and the mean duration of an item [s]
     waiting: dict[Any, list[_Item]] = {}
     done, workers = as_completed(loop=client.loop), _Workers(client)
     limit = _AHEAD * max(sum(client.nthreads().values()), 1)
@@ -306,7 +307,7 @@ def mapped(client: Client, function: Callable[..., Any], items: Iterable[_Item],
             alone = bool(suspects)
         most = 1 if alone else 0 if suspects else limit
         while len(waiting) < most and (batch := [suspects.pop()] if alone else
-                                       list(islice(rest, pace.size))):
+                                       list(islice(rest, size))):
             future = client.submit(_each, KNOWN_CODE, function, batch, *others, pure=False)
             waiting[future] = batch
             done.add(future)
@@ -326,7 +327,8 @@ def mapped(client: Client, function: Callable[..., Any], items: Iterable[_Item],
                 continue
             results, seconds = [err], 0.0
         del future  # so that the scheduler forgets it
-        pace.add(len(batch), seconds)
+        mean_s += _NEWEST * (seconds / len(batch) - mean_s)
+        size = max(1, min(_MOST_TOGETHER, int(_TASK_S / max(mean_s, 1e-9))))
         yield from zip(batch, results, strict=True)
 
 
@@ -388,19 +390,6 @@ def _each(code: Mapping[str, bytes], function: Callable[..., Any], batch: Sequen
         except Exception as err:  # the program decides
             results.append(err)
     return results, time.perf_counter() - begin
-
-
-class _Pace:
-    """The number of items per task: about `_TASK_S` of work, beginning with one item."""
-
-    def __init__(self) -> None:
-        self.size = 1
-        self._seconds = _TASK_S
-
-    def add(self, count: int, seconds: float) -> None:
-        """Add a task of this many items; the newest tasks count most."""
-        self._seconds += _NEWEST * (seconds / count - self._seconds)
-        self.size = max(1, min(_MOST_TOGETHER, int(_TASK_S / max(self._seconds, 1e-9))))
 
 
 # ----------------------------------------------------------------------------- one recording

@@ -357,7 +357,11 @@ def _compared(calibrations: Sequence[Calibration], rows: Sequence[Row]) -> Row:
         if back or most is None or change.comparison.p_value >= limit:
             back = False  # no change, or from the odd one back to the others
             continue
-        lasting[k + 1] = for_good = steady.stays(k, limit)
+        for_good = None  # not known of the newest calibration
+        if k + 2 < len(history.moments):
+            for_good = (steady.changed(k, k + 2, limit) is not None
+                        and history.between(k, k + 2).p_value < limit)
+        lasting[k + 1] = for_good
         back = for_good is False
         row = rows[order[k + 1]]
         changes.append({'key': row['key'], 'date': row['date'], 'parameter': most.name,
@@ -404,13 +408,6 @@ class _Steady:
         most = int(np.argmax(far))
         least = -scipy.special.ndtri(limit / (2.0 * len(far)))
         return values[most] if far[most] > least else None
-
-    def stays(self, before: int, limit: float) -> bool | None:
-        """Return whether the calibration after the next differs, too; None if there is none."""
-        if before + 2 >= len(self.at):
-            return None
-        return (self.changed(before, before + 2, limit) is not None
-                and self.history.between(before, before + 2).p_value < limit)
 
 
 def years_of(history: History) -> Floats | None:
