@@ -158,19 +158,14 @@ def terms_of(names: tuple[str, ...]) -> Terms:
             raise ValueError(f'effect is {name!r}, expected one of {", ".join(EFFECTS)}')
     effects = tuple(effect_named(name) for name in names)
     used = sorted({term.monomial for effect in effects for term in effect.terms} | {ONE})
-    parts, rows = (_consecutive(map(len, each)) for each in (
-        [effect.values for effect in effects], [effect.terms for effect in effects]))
+    ends = [[0, *accumulate(map(len, each))] for each in (
+        [effect.values for effect in effects], [effect.terms for effect in effects])]
+    parts, rows = (tuple(map(slice, each, each[1:])) for each in ends)
     place, axis, value, weight = np.array([
         (used.index(term.monomial), term.axis, part.start + term.parameter, term.weight)
         for effect, part in zip(effects, parts) for term in effect.terms]).reshape(-1, 4).T
     return Terms(names, effects, parts, rows, tuple(used), place.astype(np.intp),
                  axis.astype(np.intp), value.astype(np.intp), weight)
-
-
-def _consecutive(sizes: Iterable[int]) -> tuple[slice, ...]:
-    """Return the slices of these sizes in a row."""
-    ends = [0, *accumulate(sizes)]
-    return tuple(map(slice, ends, ends[1:]))
 
 
 def _sums(index: Indices, size: int) -> Floats:
@@ -311,14 +306,6 @@ class _Change(NamedTuple):
     shape: Floats
     place: int
 
-    def of_factors(self, alone: Floats, scales: Floats, context: Context) -> Floats:
-        """Return the derivative of the factors by the value; arguments from `Model`."""
-        if self.effect is None or self.effect.factor is None:
-            return alone[self.rows] * alone[self.place]
-        change = difference(self.effect.factor, context, self.shape, self.place,
-                            self.effect.bounds)
-        return np.nan_to_num(change) * scales[self.rows]
-
 
 @dataclass(frozen=True, eq=False)
 class Model(Record):
@@ -366,9 +353,9 @@ class Model(Record):
 
     @cached_property
     def needs(self) -> tuple[str, ...]:
-        """Keys of the context that the model needs."""
-        return tuple(dict.fromkeys(key for effect, shape in self._by_effect
-                                   for key in effect.needs_of(shape)))
+        """Keys of the context that the model needs; a lag needs the time."""
+        return tuple(dict.fromkeys(key for effect, shape in self._by_effect for key in (
+            *effect.needs, *(['time'] if effect.is_lagged(shape) else []))))
 
     @cached_property
     def over(self) -> tuple[str, ...]:
@@ -503,8 +490,14 @@ class Model(Record):
         scales = self._scales(alone)
         found = [plain * (alone * scales)]
         for each in self._changes:
+            if each.effect is None or each.effect.factor is None:
+                change = alone[each.rows] * alone[each.place]
+            else:
+                change = np.nan_to_num(difference(
+                    each.effect.factor, context, each.shape, each.place, each.effect.bounds)
+                    ) * scales[each.rows]
             values = self.vector[self.terms.value[each.rows]][:, np.newaxis]
-            found.append(plain[each.rows] * values * each.of_factors(alone, scales, context))
+            found.append(plain[each.rows] * values * change)
         return replace(self.rows, terms=np.concatenate(found))
 
     @cached_property

@@ -129,14 +129,10 @@ class OneReading:
     def spread_basis(self, known: Known, u: Triple) -> Floats:
         """Return the (m, 3 p) basis of each monomial times a root of the covariance."""
         model = self._calibration.model
-        basis = model.basis_of(model.terms.weight[:, np.newaxis], _one_row(known),
-                               np.array([u]))
+        row = {key: np.asarray(value, float)[np.newaxis] for key, value in known.items()}
+        basis = model.basis_of(model.terms.weight[:, np.newaxis], row, np.array([u]))
         which, rows = self._spread_rows
         return np.asarray((which * basis.terms[:, 0]) @ rows)
-
-
-def _one_row(known: Known) -> dict[str, Floats]:
-    return {key: np.asarray(value, float)[np.newaxis] for key, value in known.items()}
 
 
 def _factor(effect: Effect, known: Known, shape: Any) -> Any:
