@@ -29,7 +29,7 @@ from .pipeline import calibrated, calibrated_log, captured_from, Flat, options_f
 from .refine import refine as find_effects, Refinement as Refinement
 from .stored import read_calibration, write_calibration
 from .table import (
-    check_units, check_values, data_frame, Floats, in_unit, LARGEST, median_length, numbered,
+    check_units, check_values, data_frame, in_unit, LARGEST, median_length, numbered,
     Poses as Poses, Recording as Recording, Table)
 from .text import now
 from .units import FrameName, Method, STANDARD_GRAVITY, UnitName, units_of
@@ -573,7 +573,11 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
     # The attitude transforms from sensor to robot axes, ΔR from robot to sensor axes.
     rotation = mounting_of(np.radians(np.asarray(mounting, float)))
     model = model_with(effects, rotation)
-    up = _directions(poses) if directions is None else np.asarray(directions, float)
+    if directions is None:  # in mixed order
+        mixed = np.random.default_rng(poses).permutation(spread_directions(poses)[1:])
+        up = np.vstack([[[0.0, 0.0, 1.0]], mixed])
+    else:
+        up = np.asarray(directions, float)
     rng, warm = np.random.default_rng(seed), np.asarray(temperature, float)
     if recording:
         found: Table = simulate_recording(model, up, rng, noise_g=noise, rate_hz=rate, dwell=dwell,
@@ -603,13 +607,6 @@ def _check_within(**numbers: tuple[float, float, float]) -> None:
         if not least <= value <= most:
             raise InputError(f'{name} is {str(value)[:_LONGEST_NUMBER]}, expected {least:g} to '
                              f'{most:g}', f'correct {name}')
-
-
-def _directions(count: int) -> Floats:
-    """Return directions spread over the sphere, in mixed order; the first direction is flat."""
-    others = spread_directions(count)[1:]
-    mixed = np.random.default_rng(count).permutation(others)
-    return np.vstack([[[0.0, 0.0, 1.0]], mixed])
 
 
 def _is_log(given: object) -> bool:

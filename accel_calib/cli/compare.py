@@ -21,7 +21,7 @@ from ..errors import InputError
 from ..findings import (
     change_in_words, GAINS, in_words, OFFSETS, rate_comparison, rate_noise, rate_verification)
 from ..logs import open_log
-from ..noise import check_allantools, duration, noise_of, NoiseFigures, to_json, whole
+from ..noise import check_allantools, duration, noise_of, to_json, whole
 from ..pipeline import Correction
 from ..report import calibration_page
 from ..report.stability import (
@@ -166,21 +166,15 @@ def run_noise(args: argparse.Namespace) -> Done:
         units = units_of('g') if units.is_native else units
     with progress('axes') as moved:
         found = noise_of(recording, units, args.gravity, moved)
-    return Done({'recording': args.recording, **to_json(found)}, [*lines, *_noise_lines(found)],
-                rate_noise(found), page=partial(noise_page, found, str(args.recording)))
-
-
-def _noise_lines(found: NoiseFigures) -> Iterator[str | Table]:
-    """Yield the figures by axis, the notes, and the figures for Kalibr."""
-    yield (f'rest of {duration(found.seconds)}: {counted(found.samples, "sample")} at '
-           f'{found.rate:.5g} Hz')
+    shown: list[str | Table] = [*lines, f'rest of {duration(found.seconds)}: '
+                                f'{counted(found.samples, "sample")} at {found.rate:.5g} Hz']
     for kind in found.kinds:
         axes = found.of(kind)
         rows = list(figure_rows(axes))
-        yield table(kind, ('', *(axis.axis for axis in axes)), (
-            (f'{label}, {unit}', *cells[:-1]) for label, unit, cells in rows), **NARROW)
-        yield from (f'typical {label}: {cells[-1]} {unit}'
-                    for label, unit, cells in rows if cells[-1])
-    yield from (f'note: {note}' for note in found.notes)
-    yield from need_lines(found)
-    yield from kalibr_lines(found)
+        shown.append(table(kind, ('', *(axis.axis for axis in axes)), (
+            (f'{label}, {unit}', *cells[:-1]) for label, unit, cells in rows), **NARROW))
+        shown += [f'typical {label}: {cells[-1]} {unit}'
+                  for label, unit, cells in rows if cells[-1]]
+    shown += [*(f'note: {note}' for note in found.notes), *need_lines(found), *kalibr_lines(found)]
+    return Done({'recording': args.recording, **to_json(found)}, shown, rate_noise(found),
+                page=partial(noise_page, found, str(args.recording)))

@@ -31,7 +31,6 @@ from ..text import counted, listed, now, short, with_sd
 from ..units import MG
 
 if TYPE_CHECKING:
-    from ..fleet import Summary
     from ..refine import Refinement
 
 
@@ -87,31 +86,24 @@ def _thermal_done(args: argparse.Namespace, logs: Sequence[Path], outcome: Therm
     calibration = outcome.calibration
     lines = [*(line for each in outcome.logs for line in each.lines), *notes]
     is_whole = any(isinstance(each, Intake) for each in outcome.logs)
+    curve, values = outcome.curve, Table(title='Effects of temperature', show_header=False)
+    for each in effect_figures(calibration):
+        values.add_row(each.label, with_sd(each.value, each.sd), each.unit)
+    low, high = curve.range_c
+    errors = [*curve.held_out_mg.values()]
     return _done(
         args, outcome,
         {'file': list(logs), **calibration_json(calibration, outlook(calibration, 'auto')),
-         'read_as': outcome.read_as, 'read_lines': lines, 'thermal': curve_json(outcome.curve)},
-        shown=[*_curve_lines(outcome),
+         'read_as': outcome.read_as, 'read_lines': lines, 'thermal': curve_json(curve)},
+        shown=[values if curve.model.effects else
+               'the offset does not change with the temperature',
+               f'degree {curve.degree} from {low:.1f} to {high:.1f} °C: {short(curve.change_mg)} '
+               f'-> {short(curve.residual_mg)} mg, uncertainty up to {short(curve.band_mg)} mg',
+               f'held-out parts of the log: {short(errors[0])} -> {short(errors[-1])} mg',
                *(_tables(calibration) if is_whole and args.verbose else ())],
         page=partial(thermal_page, outcome, list(map(str, logs)), stored=str(args.output),
                      notes=lines),
         notes=lines)
-
-
-def _curve_lines(outcome: ThermalOutcome) -> Iterator[Any]:
-    """Yield the effects of temperature as a table, and lines."""
-    curve, values = outcome.curve, Table(title='Effects of temperature', show_header=False)
-    low, high = curve.range_c
-    for each in effect_figures(outcome.calibration):
-        values.add_row(each.label, with_sd(each.value, each.sd), each.unit)
-    if curve.model.effects:
-        yield values
-    else:
-        yield 'the offset does not change with the temperature'
-    yield (f'degree {curve.degree} from {low:.1f} to {high:.1f} °C: {short(curve.change_mg)} -> '
-           f'{short(curve.residual_mg)} mg, uncertainty up to {short(curve.band_mg)} mg')
-    errors = [*curve.held_out_mg.values()]
-    yield f'held-out parts of the log: {short(errors[0])} -> {short(errors[-1])} mg'
 
 
 def plan_of(args: argparse.Namespace, **more: Any) -> Plan:
@@ -295,21 +287,16 @@ def run_fleet(args: argparse.Namespace) -> Done:
         with progress('recordings') as moved:
             summary = run(client, found, asked, Store(args.output.absolute()), moved,
                           args.time_limit or LIMIT_S)
-    return Done({'recordings': len(found), **{name: summary.counts[name] for name in STATUS},
-                 'sensors': summary.sensors}, _summary_lines(summary, args.output),
-                summary.rating)
-
-
-def _summary_lines(summary: Summary, output: Path) -> Iterator[str]:
-    """Yield the summary as lines of text."""
     counts = summary.counts
-    yield (f'{counts["ok"]} calibrated, {counts["error"]} with an error, {counts["unread"]} '
-           f'could not be read, {counts["skipped"]} skipped because they are done')
-    for path in summary.damaged:
-        yield f'note: a file of the results was damaged and was made again; it is now {path}'
-    for row in summary.sensors:
-        for change in row['changes']:
-            if change['for_good']:
-                yield (f'{row["sensor"]} changed for good at {change["date"]}: '
-                       f'{change["parameter"]} (p = {change["p_value"]:.2g})')
-    yield f'{counted(len(summary.sensors), "sensor")}, stored in {output}'
+    return Done(
+        {'recordings': len(found), **{name: counts[name] for name in STATUS},
+         'sensors': summary.sensors},
+        [f'{counts["ok"]} calibrated, {counts["error"]} with an error, {counts["unread"]} '
+         f'could not be read, {counts["skipped"]} skipped because they are done',
+         *(f'note: a file of the results was damaged and was made again; it is now {path}'
+           for path in summary.damaged),
+         *(f'{row["sensor"]} changed for good at {change["date"]}: {change["parameter"]} '
+           f'(p = {change["p_value"]:.2g})'
+           for row in summary.sensors for change in row['changes'] if change['for_good']),
+         f'{counted(len(summary.sensors), "sensor")}, stored in {args.output}'],
+        summary.rating)

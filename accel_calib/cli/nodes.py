@@ -15,13 +15,13 @@ that they can be read from a distance. Two columns of the terminal, or half a ro
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 import math
 import signal
 import sys
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
@@ -38,7 +38,6 @@ from ..geometry import words_of
 from ..units import MG
 
 if TYPE_CHECKING:
-    from ..ros.demo import Outcome
     from ..ros.watch import Show
     from ..session import Progress
 
@@ -123,24 +122,18 @@ def run_demo(args: argparse.Namespace) -> Done:
         for name, value in errors.items():
             quantity, unit = name.split('_')
             found[f'{quantity}_{when}_{unit}'] = value
-    return Done(found, _demo_lines(outcome, before, after),
-                status=0 if outcome.succeeded else FAILED)
-
-
-def _demo_lines(outcome: Outcome, before: Mapping[str, float], after: Mapping[str, float]
-                ) -> Iterator[Any]:
-    """Yield a table of the errors, and whether the hidden effect was found if there is one."""
     columns = (('imu/data_calibrated', 'after ~/refine') if outcome.hidden else
                ('imu/data_raw', 'imu/data_calibrated'))
-    yield table(
+    shown: list[str | Table] = [table(
         f'Errors at {outcome.rests} rests in other poses, after {outcome.seconds:.0f} s',
         ('', *columns), ((words, f'{before[name]:.3g}', f'{after[name]:.3g}')
-                         for name, words in _ERRORS.items()))
+                         for name, words in _ERRORS.items()))]
     if outcome.hidden:
         named = ', '.join(outcome.found) or 'nothing'
         lag = f' with a lag of {outcome.lag_s:.1f} s' if outcome.lag_s else ''
         passed = 'found' if outcome.hidden in outcome.found else 'NOT found'
-        yield f'{passed}: hidden was {outcome.hidden}, ~/refine added {named}{lag}'
+        shown.append(f'{passed}: hidden was {outcome.hidden}, ~/refine added {named}{lag}')
+    return Done(found, shown, status=0 if outcome.succeeded else FAILED)
 
 
 # ----------------------------------------------------------------------------- watch

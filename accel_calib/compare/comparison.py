@@ -39,7 +39,14 @@ def _notes_of(given: Sequence[Comparable], names: tuple[str, ...], deviation: Fl
               noisier: Sequence[int]) -> Iterator[str]:
     """Yield notes that limit the meaning; the (n, t) deviation is 0 where a model omits one."""
     calibrations = [run.calibration for run in given]
-    yield from _shared(calibrations)
+    rows = [{tuple(row) for row in (run.poses.reading / run.force_per_g).round(7).tolist()}
+            for run in calibrations]
+    for (i, first), (j, second) in combinations(enumerate(rows, 1), 2):
+        common, least = len(first & second), min(len(first), len(second))
+        if common:
+            what = 'all their poses' if common == least else counted(common, 'pose')
+            yield (f'runs {i} and {j} share {what}: they are not independent, so their agreement '
+                   'means little')
     for k, run in enumerate(given, 1):
         if run.calibration is not run.sure:
             yield (f'run {k} (model {run.calibration.name}) omits parameters of model '
@@ -55,18 +62,6 @@ def _notes_of(given: Sequence[Comparable], names: tuple[str, ...], deviation: Fl
     for k in noisier:
         yield (f'the poses of run {k + 1} repeat significantly worse than those of the others: '
                'the run has less weight')
-
-
-def _shared(calibrations: Sequence[Calibration]) -> Iterator[str]:
-    """Yield notes about runs with common poses."""
-    rows = [{tuple(row) for row in (run.poses.reading / run.force_per_g).round(7).tolist()}
-            for run in calibrations]
-    for (i, first), (j, second) in combinations(enumerate(rows, 1), 2):
-        common, least = len(first & second), min(len(first), len(second))
-        if common:
-            what = 'all their poses' if common == least else counted(common, 'pose')
-            yield (f'runs {i} and {j} share {what}: they are not independent, so their agreement '
-                   'means little')
 
 
 def _left_out(names: tuple[str, ...], deviation: Floats) -> Iterator[str]:
