@@ -42,8 +42,6 @@ Data = Any
 _MOST_ROWS = 10_000_000
 """Largest number of simulated rows, which take some 2 GB."""
 
-_LONGEST_NUMBER = 40
-
 
 class Calibration(_Calibration):
     """
@@ -605,7 +603,7 @@ def _check_within(**numbers: tuple[float, float, float]) -> None:
     """Check numbers by their names, each with its least and its largest value."""
     for name, (value, least, most) in numbers.items():
         if not least <= value <= most:
-            raise InputError(f'{name} is {str(value)[:_LONGEST_NUMBER]}, expected {least:g} to '
+            raise InputError(f'{name} is {str(value)[:40]}, expected {least:g} to '
                              f'{most:g}', f'correct {name}')
 
 

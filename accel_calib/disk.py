@@ -35,7 +35,6 @@ _STALE_S = 3600.0
 """Age of a temporary file that no process writes any more [s]."""
 
 _LONGEST_NAME = 200
-_WRITABLE = 0o222
 
 
 def previous(path: Path) -> Path:
@@ -124,7 +123,7 @@ def replaceable(path: Path) -> os.stat_result | None:
     if not stat.S_ISREG(old.st_mode):
         raise InputError(f'{path} is not a regular file, expected one that can be replaced',
                          'choose another name')
-    if not old.st_mode & _WRITABLE:
+    if not old.st_mode & 0o222:
         raise InputError(f'{path} is write-protected, expected a file that may be replaced',
                          'choose another name, or allow writing with chmod u+w')
     return old

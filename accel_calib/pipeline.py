@@ -56,7 +56,8 @@ class Intake:
     Poses of a table or captured from a recording, with the unit of their readings.
 
     `read_as` is how the log was read, empty if nothing was assumed. `notes` are what was left out
-    of the log, and `captured` how the poses were captured, if they were.
+    of the log, and `captured` how the poses were captured, if they were. `ramp` is that of a still
+    board, whose stretches are the poses [g]; None for poses in many directions.
 
     """
 
@@ -65,6 +66,7 @@ class Intake:
     read_as: str = ''
     notes: tuple[str, ...] = ()
     captured: tuple[str, ...] = ()
+    ramp: Ramp | None = None
 
     @property
     def said(self) -> str:
@@ -202,28 +204,9 @@ def _nothing_still(source: str, found: Captured, units: Units, asked: CaptureSet
                       f'hold the sensor still in each pose for some seconds; {tried}')
 
 
-@dataclass(frozen=True)
-class RampIntake:
-    """The ramp of a still board; other fields as those of `Intake`."""
-
-    ramp: Ramp
-    units: Units
-    read_as: str = ''
-    notes: tuple[str, ...] = ()
-
-    @property
-    def lines(self) -> tuple[str, ...]:
-        """Return `read_as`, the range of the temperature and the notes."""
-        low, high = range_of(self.ramp.stretches, 'temperature')
-        words = (f'a still board for {self.ramp.seconds / 60.0:.0f} min, from {low:.1f} to '
-                 f'{high:.1f} °C')
-        return tuple(filter(None, (self.read_as and f'read as: {self.read_as}', words,
-                                   *self.notes, *self.ramp.notes)))
-
-
 def ramp_or_poses(source: Path | Piped | Frame, options: LogOptions = LogOptions(),
                   settings: Mapping[str, Any] = {},
-                  progress: Progress = lambda done, count: None) -> Intake | RampIntake:
+                  progress: Progress = lambda done, count: None) -> Intake:
     """
     Return the ramp of a still board, or the poses of a log in many directions.
 
@@ -235,8 +218,17 @@ def ramp_or_poses(source: Path | Piped | Frame, options: LogOptions = LogOptions
             ', '.join(filter(None, (log.read_as, *log.notes)))):
         cells = _cells(log, log.watched(progress))
         if cells is not None and not is_turned_over(cells):
-            return RampIntake(ramp_of(cells), log.units, log.read_as, log.notes)
+            return _ramp_intake(cells, log)
     return poses_of(source, options, settings, progress)
+
+
+def _ramp_intake(cells: Poses, log: OpenLog) -> Intake:
+    """Return the ramp of a still board from the samples of a log in cells."""
+    ramp = ramp_of(cells)
+    low, high = range_of(ramp.stretches, 'temperature')
+    words = f'a still board for {ramp.seconds / 60.0:.0f} min, from {low:.1f} to {high:.1f} °C'
+    return Intake(ramp.stretches, log.units, log.read_as,
+                  captured=(words, *log.notes, *ramp.notes), ramp=ramp)
 
 
 def _cells(log: OpenLog, samples: Iterable[Recording]) -> Poses | None:
@@ -397,7 +389,7 @@ class ThermalOutcome:
 
     calibration: Calibration
     curve: Curve
-    logs: Sequence[Intake | RampIntake]
+    logs: Sequence[Intake]
     read_as: str
 
     @cached_property
@@ -421,19 +413,17 @@ def calibrated_log(source: Source, options: LogOptions, found: Intake, plan: Pla
         with _opened(source, options) as log:
             cells = _cells(log, log.blocks)
             if cells is not None and np.ptp(range_of(cells, 'temperature')) >= LEAST_RANGE:
-                return thermally_calibrated([
-                    RampIntake(ramp_of(cells), log.units, log.read_as, log.notes)], plan)
+                return thermally_calibrated([_ramp_intake(cells, log)], plan)
     return calibrated(poses, found.units, plan)
 
 
-def thermally_calibrated(logs: Sequence[Intake | RampIntake], plan: Plan = Plan()
-                         ) -> ThermalOutcome:
+def thermally_calibrated(logs: Sequence[Intake], plan: Plan = Plan()) -> ThermalOutcome:
     """
     Fit the offset over temperature to ramps of a still board, and a calibration to poses, if any.
 
     Parameters
     ----------
-    logs : sequence of Intake or RampIntake
+    logs : sequence of Intake
         One or more ramps, each in its own orientation, and at most one log of poses of the same
         sensor in many directions, with their temperature. Its unit is that of the calibration.
     plan : Plan
@@ -447,33 +437,32 @@ def thermally_calibrated(logs: Sequence[Intake | RampIntake], plan: Plan = Plan(
     """
     read_as = ', '.join(dict.fromkeys(each.read_as for each in logs if each.read_as))
     with saying(read_as):
-        ramps = [each for each in logs if isinstance(each, RampIntake)]
-        turned = [each for each in logs if isinstance(each, Intake)]
-        _check_logs(ramps, turned)
-        curve = curve_of([each.ramp for each in ramps])
+        turned = [each for each in logs if each.ramp is None]
+        _check_logs(logs, len(turned))
+        curve = curve_of([each.ramp for each in logs if each.ramp is not None])
         if turned:
             rows, units = turned[0].poses, turned[0].units
             fitted = calibrated(without_curve(curve, rows, units), units, replace(
                 plan, refined=False, flat=None, nose_down=None)).calibration
             made = with_curve(fitted, curve, rows)
         else:
-            made = thermal_alone(curve, ramps[0].units, sensor=plan.sensor, date=now())
+            made = thermal_alone(curve, logs[0].units, sensor=plan.sensor, date=now())
             rows = made.poses
         levelled = level_by_rows(made, made.poses, plan.frame, _row(rows, plan.flat),
                                  plan.nose_down)
         return ThermalOutcome(levelled, curve, logs, read_as)
 
 
-def _check_logs(ramps: Sequence[RampIntake], turned: Sequence[Intake]) -> None:
-    """Refuse logs without a ramp, with several logs of poses, or of several sensors."""
-    if not ramps:
-        raise InputError(f'{counted(len(turned), "log")} of poses in many directions, expected '
+def _check_logs(logs: Sequence[Intake], turned: int) -> None:
+    """Refuse logs without a ramp, with several logs of poses (`turned`), or of several sensors."""
+    if turned == len(logs):
+        raise InputError(f'{counted(turned, "log")} of poses in many directions, expected '
                          'one of a still board whose temperature changes', 'record the board '
                          'while it warms up from the freezer, and give this log, too')
-    if len(turned) > 1:
-        raise InputError(f'{len(turned)} logs are of poses in many directions, expected at most '
+    if turned > 1:
+        raise InputError(f'{turned} logs are of poses in many directions, expected at most '
                          'one', 'leave out the others')
-    tables = [*(each.ramp.stretches for each in ramps), *(each.poses for each in turned)]
+    tables = [each.poses for each in logs]
     # A sensor is known by its device id in an autopilot, or else by its name.
     devices = {each.autopilot.device_id for each in tables if each.autopilot} - {None}
     names = {each.sensor for each in tables if not each.autopilot} - {''}

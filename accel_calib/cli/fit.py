@@ -85,7 +85,7 @@ def _thermal_done(args: argparse.Namespace, logs: Sequence[Path], outcome: Therm
 
     calibration = outcome.calibration
     lines = [*(line for each in outcome.logs for line in each.lines), *notes]
-    is_whole = any(isinstance(each, Intake) for each in outcome.logs)
+    is_whole = any(each.ramp is None for each in outcome.logs)
     curve, values = outcome.curve, Table(title='Effects of temperature', show_header=False)
     for each in effect_figures(calibration):
         values.add_row(each.label, with_sd(each.value, each.sd), each.unit)

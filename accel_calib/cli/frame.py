@@ -60,8 +60,6 @@ _KINDS = {'calibration': rb'format: accel_calib', 'page': rb'<!DOCTYPE html',
           'export': rb'(?s).*(written by accel-calib|accel_calib) export'}
 """Beginning of a file of each kind."""
 
-_HEAD = 4096
-
 _MOST_NOTES = 5
 """Largest number of notes without ``--verbose``."""
 
@@ -337,7 +335,7 @@ def check_target(target: Target, inputs: Iterable[Path], *, force: bool) -> None
     if force or not target.kind or not path.is_file():
         return
     with path.open('rb') as file:
-        head = file.read(_HEAD)
+        head = file.read(4096)
     # Text in an array of NumPy has three zero bytes beside each letter.
     if head.strip() and not re.match(_KINDS[target.kind], head.replace(b'\0', b'')):
         raise InputError(f'{option} {path} exists and is no {target.kind} of accel_calib, '

@@ -66,8 +66,6 @@ _EFFICIENCY = 0.37
 _SAMPLE = 400
 """Differences of a month that are kept."""
 
-_SEED = 1
-
 COLUMNS = ('key', 'sensor_model', 'recording', 'date', 'status', 'error', 'advice', 'rating',
            'calibration', 'determined', 'effects', 'parameters', 'prior_values',
            'prior_covariance', *(column for name in NAMES for column in (name, f'{name}.sd')))
@@ -192,7 +190,7 @@ class Overview:
 
 def overview(digests: Iterable[Digest]) -> Overview:
     """Return the statistics of the sensors, which are in order of their names."""
-    found, rng = Overview(), np.random.default_rng(_SEED)
+    found, rng = Overview(), np.random.default_rng(1)
     for each in digests:
         found.counts.update(each.counts)
         found.errors += each.errors[:MOST_ERRORS - len(found.errors)]
@@ -269,8 +267,6 @@ _SURE = 50.0
 _DOF = 4.0
 """Degrees of freedom of the distribution over sensors; few give odd sensors little weight."""
 
-_STEPS = 200
-_CONVERGED = 1e-8
 _LEAST_SPREAD_G = 1e-5
 """Smallest spread over sensors [g], far below that of any sensors."""
 
@@ -301,10 +297,10 @@ def estimated(values: Floats, covariances: Floats) -> Prior:
     mean = np.median(values, axis=0)
     spread = np.median(np.abs(values - mean), axis=0) / 0.6745 + _LEAST_SPREAD_G
     covariance: Floats = np.diag(spread ** 2)
-    for _ in range(_STEPS):
+    for _ in range(200):
         before = covariance
         mean, covariance = _step(values, covariances, mean, covariance)
-        if np.max(np.abs(covariance - before)) <= _CONVERGED * np.max(covariance):
+        if np.max(np.abs(covariance - before)) <= 1e-8 * np.max(covariance):
             break
     share = count / (count + _SURE)
     shrunk = share * covariance + (1.0 - share) * np.diag(np.diag(covariance))

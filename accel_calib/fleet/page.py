@@ -201,10 +201,6 @@ def _not_shown(count: int, what: str) -> str:
 
 # ----------------------------------------------------------------------------- figures
 
-_PARTS = (0.05, 0.25, 0.5, 0.75, 0.95)
-"""Quantiles of the drift of a fleet."""
-
-_MOST_BARS = 40
 _ROOM = 6.0
 """Range of a histogram, in distances of the 10 % and 90 % quantiles from the median."""
 
@@ -218,7 +214,6 @@ _MOST_DATES = 40
 _FEW = 12
 """Number of calibrations up to which each has a marker."""
 
-_FEWEST_MONTHS = 3
 _COLOURS = (AFTER, THIRD, BEFORE)
 
 
@@ -244,7 +239,7 @@ def _draw_histogram(panel: Any, name: str, column: Floats, odd: Sequence[Odd]) -
     low, middle, high = np.quantile(values, [0.1, 0.5, 0.9])
     reach = _ROOM * max(high - middle, middle - low) or float(np.max(np.abs(values - middle)))
     shown = values[np.abs(values - middle) <= reach]
-    bars = int(np.clip(2.0 * np.sqrt(len(shown)), 5, _MOST_BARS))
+    bars = int(np.clip(2.0 * np.sqrt(len(shown)), 5, 40))
     heights, edges = np.histogram(shown, bars)
     panel.stairs(heights, edges, fill=True, color=AFTER, alpha=0.45)
     panel.axvline(middle, color=BEFORE, linewidth=1.2)
@@ -280,8 +275,8 @@ def _short_name(name: str) -> str:
 
 def _of_months(prefix: str, known: OfModel) -> Iterator[Drawing]:
     """Yield the drift of all sensors of a model together, as bands of quantiles by month."""
-    months, found = known.months.quantiles(_PARTS)
-    if len(months) < _FEWEST_MONTHS:
+    months, found = known.months.quantiles((0.05, 0.25, 0.5, 0.75, 0.95))
+    if len(months) < 3:
         return
     days = np.array([f'{month}-15' for month in months], 'datetime64[D]').astype(float)
     for key, words, names in GROUPS:

@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 _MAGIC = '*?['
-_BLOCK = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -206,7 +205,7 @@ def content_hash(path: Path) -> str:
             name = os.fsencode(each.relative_to(path).as_posix())
             made.update(b'%d:%b%d:' % (len(name), name, each.stat().st_size))
         with each.open('rb') as file:
-            while block := file.read(_BLOCK):
+            while block := file.read(1 << 20):
                 made.update(block)
     return made.hexdigest()
 
@@ -303,7 +302,6 @@ Row = dict[str, Any]
 
 _TEXTS = ('key', 'content', 'recording', 'sensor_model', 'version', 'date', 'date_from', 'status',
           'error', 'advice', 'rating', 'rating_reason', 'model', 'refined', 'units', 'calibration')
-_COUNTS = ('poses', 'poses_used')
 _NUMBERS = ('rms_before_mg', 'rms_after_mg', 'held_out_rms_mg', 'noise_floor_mg', 'coverage',
             'temperature', 'seconds',
             *(column for name in NAMES for column in (name, f'{name}.sd')))
@@ -318,14 +316,14 @@ def schema() -> pa.Schema:
     """Return the columns of a row; the sensor is the name of its folder."""
     import pyarrow as pa
 
-    texts, numbers = pa.list_(pa.string()), pa.list_(pa.float64())
-    parameter = pa.struct([('name', pa.string()), ('value', pa.float64()), ('sd', pa.float64())])
+    text, count, number = pa.string(), pa.int64(), pa.float64()
+    parameter = pa.struct([('name', text), ('value', number), ('sd', number)])
     return pa.schema([
-        *((name, pa.string()) for name in _TEXTS), *((name, pa.int64()) for name in _COUNTS),
-        *((name, pa.float64()) for name in _NUMBERS), ('determined', pa.bool_()),
-        ('effects', texts), ('warnings', texts),
-        ('parameters', pa.list_(parameter)), ('prior_values', numbers),
-        ('prior_covariance', numbers)])
+        *((name, text) for name in _TEXTS), ('poses', count), ('poses_used', count),
+        *((name, number) for name in _NUMBERS), ('determined', pa.bool_()),
+        ('effects', pa.list_(text)), ('warnings', pa.list_(text)),
+        ('parameters', pa.list_(parameter)), ('prior_values', pa.list_(number)),
+        ('prior_covariance', pa.list_(number))])
 
 
 @dataclass(frozen=True)

@@ -67,8 +67,6 @@ _MOST_TOGETHER = 20
 _NEWEST = 0.2
 """Weight of the newest task in the mean duration of a recording."""
 
-_CONNECT_S = 30.0
-
 STATUS = ('ok', 'error', 'unread', 'skipped')
 """What can happen to a recording; unread: it could not be read, and is tried again."""
 
@@ -144,7 +142,7 @@ def cluster(address: str = '', workers: int | None = None) -> Iterator[Client]:
                     n_workers=workers, threads_per_worker=1, host=_HERE,
                     dashboard_address=f'{_HERE}:0', silence_logs='ERROR'))
             client = stack.enter_context(Client(
-                address or started, timeout=_CONNECT_S, set_as_default=False))
+                address or started, timeout=30.0, set_as_default=False))
         except (OSError, ValueError) as err:
             if not address:
                 raise

@@ -41,7 +41,6 @@ _Bend = tuple[int, float, Callable[[float, float, float], float],
               Callable[[float, float, float], Triple]]
 """Axis, coefficient, value and gradient of a bending term with its context fixed."""
 
-_NO_BEND = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 _SLOW = 3
 """Iterations after which the slope is computed at the present force."""
 
@@ -181,7 +180,7 @@ class AtReading:
         """
         undone = _affine([part / self._owner.per_g for part in inverse], offset)
         turn, bend, near, far = self._owner.turn, self._bend, CONVERGED_G, LARGEST_FORCE_G
-        a, b, c, d, e, f, g, h, i = _NO_BEND
+        a, b, c, d, e, f, g, h, i = 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0
 
         def correct(x: float, y: float, z: float) -> Triple:
             nonlocal a, b, c, d, e, f, g, h, i

@@ -48,11 +48,8 @@ because the few averages at long τ have a skewed distribution.
 """
 
 _EVERY = [0, 1, 2, 3, 4]
-_WANTED = [1, 2, 3]
 _MARGIN = (2, 1)
 """Further octaves that are dropped at the start and at the end, if one had to be."""
-
-_FLOOR = 1e-6
 
 LEAST_P = 5e-3
 """Smallest probability of χ² for a range of τ, otherwise shorter ranges are tried."""
@@ -67,7 +64,6 @@ _LEAST_RANGE = 5
 """Smallest number of octaves in a range."""
 
 _ROUNDS = 12
-_CONVERGED = 1e-3
 LEVEL = 0.95
 """Probability of intervals; upper limits are one-sided."""
 
@@ -130,7 +126,7 @@ def fit_components(variances: Floats, lengths: Counts, spread: Spread) -> Fitted
     shape = shares(lengths)
     first, last = _range(variances, shape, spread)
     curve = _RangeFit(variances, shape, spread, slice(first, last + 1))
-    free = [c for c in _EVERY if c in _WANTED or curve.rise(_EVERY, c) > _RISE[c]]
+    free = [c for c in _EVERY if COMPONENTS[c] in FIGURES or curve.rise(_EVERY, c) > _RISE[c]]
     rises = np.array([curve.rise(free, c) if c in free else 0.0 for c in _EVERY])
     found = curve.solve(free)
     parts = shape[first:last + 1] * found.squares
@@ -161,7 +157,7 @@ class _RangeFit:
 
     def noisy(self, squares: Floats) -> Floats:
         """Return the squares with some white noise: without noise there is no covariance."""
-        least = _FLOOR * float(np.min(self._variances / self._shape[:, 1]))
+        least = 1e-6 * float(np.min(self._variances / self._shape[:, 1]))
         return np.where(np.arange(len(squares)) == 1, np.maximum(squares, least), squares)
 
     def solve(self, free: list[int]) -> _Solution:
@@ -173,7 +169,7 @@ class _RangeFit:
             before, squares = squares, np.zeros(len(COMPONENTS))
             shape, variances = self._whitened(before)
             squares[free] = scipy.optimize.nnls(shape[:, free], variances)[0]
-            if np.all(np.abs(squares - before) <= _CONVERGED * before):
+            if np.all(np.abs(squares - before) <= 1e-3 * before):
                 break
         shape, variances = self._whitened(squares)
         left = variances - shape @ squares

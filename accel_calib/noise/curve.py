@@ -98,8 +98,6 @@ _UNEVEN = 0.1
 _COARSE = 1.0
 """Noise in units of the step of the output below which rounding changes the noise."""
 
-_MOST_STEPS = 4096
-
 _BLOCK_S = 1.0
 """Length of the averages in which a coarse record is searched for a rest [s]."""
 
@@ -316,7 +314,7 @@ def _averaged(recording: Recording) -> Iterator[tuple[Recording, Recording]]:
 def coarse_step(values: Floats, noise: float) -> float:
     """Return the step of the output if the noise of a sample is smaller, otherwise 0."""
     levels = np.unique(values[:1_000_000])
-    if len(levels) > _MOST_STEPS:
+    if len(levels) > 4096:
         return 0.0
     gaps = np.diff(levels)
     # Rounding of a computation leaves gaps that are not steps.

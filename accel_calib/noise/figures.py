@@ -48,9 +48,6 @@ _DISTURBED = ('the curve at long τ has another form (temperature or disturbance
 
 _WHITE_SAMPLES = 500
 
-_LONGER = 4.0
-"""Two octaves."""
-
 _DEPARTS = 0.1
 """Part of the deviation by which a curve departs visibly from its components."""
 
@@ -140,7 +137,7 @@ def _need_of(axis: AxisNoise, figure: str, rest: LongRest) -> tuple[float, str]:
             seconds = max(_INSTABILITY_S, hidden)
         if _disturbed(axis):
             return np.inf, _DISTURBED
-        seconds = max(seconds, _LONGER * rest.seconds)
+        seconds = max(seconds, 4.0 * rest.seconds)  # two octaves more
     # Rounded up to one or two digits of its unit.
     unit = next(each for each in (_HOUR, _MINUTE, 1.0) if seconds >= 2.0 * each or each == 1.0)
     step = unit * (1.0 if seconds < 10.0 * unit else 5.0 if seconds < 60.0 * unit else 50.0)
