@@ -24,8 +24,8 @@ from ..errors import InputError
 from ..findings import (
     calibration_json, curve_json, effect_figures, linear_figures, rate_refinement, refinement_json)
 from ..pipeline import (
-    calibrated, calibrated_log, Intake, Outcome, Plan, ramp_or_poses, thermally_calibrated,
-    ThermalOutcome)
+    calibrated, calibrated_log, Intake, Outcome, Plan, ramp_or_poses, RampIntake,
+    thermally_calibrated, ThermalOutcome)
 from ..stored import write_calibration
 from ..text import counted, listed, now, short, with_sd
 from ..units import MG
@@ -85,7 +85,7 @@ def _thermal_done(args: argparse.Namespace, logs: Sequence[Path], outcome: Therm
 
     calibration = outcome.calibration
     lines = [*(line for each in outcome.logs for line in each.lines), *notes]
-    is_whole = any(each.ramp is None for each in outcome.logs)
+    is_whole = any(not isinstance(each, RampIntake) for each in outcome.logs)
     curve, values = outcome.curve, Table(title='Effects of temperature', show_header=False)
     for each in effect_figures(calibration):
         values.add_row(each.label, with_sd(each.value, each.sd), each.unit)
