@@ -157,31 +157,25 @@ def _captured(source: Source, log: OpenLog, options: LogOptions, settings: Mappi
             found = capture(again.blocks, log.units, asked, found.known)
     check_measured(found.lengths, log.units)
     count, findings = len(found.poses), account_of(found.rests, asked)
-    limit, more = _wider(source, found, log.units, options, settings) if count < _FEW else (0.0, 0)
-    finds = f'{more} with still_std_max {limit:.3g}'
+    limit, more = 0.0, 0  # the narrowest wider limit that finds enough poses, and how many
+    for factor in _WIDER if count < _FEW else ():
+        wider = float(f'{factor * max(found.threshold, found.quietest):.2g}')
+        if math.isfinite(wider) and more < _FEW:
+            widened = settings_from({**settings, 'still_std_max': wider}, log.units)
+            with _opened(source, options) as again:
+                finds = len(capture(again.blocks, log.units, widened, found.known).poses)
+            if finds > more:
+                limit, more = wider, finds
+    advice = f'{more} with still_std_max {limit:.3g}'
     if not count:
         name = 'the recording' if isinstance(source, Recording) else str(source)
-        raise _nothing_still(name, found, log.units, asked, findings, finds if more else '')
+        raise _nothing_still(name, found, log.units, asked, findings, advice if more else '')
     lines = [f'captured {counted(count, "pose")} from {counted(found.recorded, "sample")} in '
              f'{found.seconds:.0f} s']
     if more >= 2 * count:
-        lines.append(f'{counted(count, "pose")} only, {finds}')
+        lines.append(f'{counted(count, "pose")} only, {advice}')
     return Intake(replace(found.poses, units=log.units.name, findings=(*log.findings, *findings)),
                   log.units, log.read_as, log.noted(), tuple(lines)), found
-
-
-def _wider(source: Source, found: Captured, units: Units, options: LogOptions,
-           settings: Mapping[str, Any]) -> tuple[float, int]:
-    """Return a wider limit and the number of poses with it; the narrowest that finds enough."""
-    tried = (0.0, 0)
-    for factor in _WIDER:
-        limit = float(f'{factor * max(found.threshold, found.quietest):.2g}')
-        if math.isfinite(limit) and tried[1] < _FEW:
-            asked = settings_from({**settings, 'still_std_max': limit}, units)
-            with _opened(source, options) as again:
-                count = len(capture(again.blocks, units, asked, found.known).poses)
-            tried = max(tried, (limit, count), key=lambda each: each[1])
-    return tried
 
 
 def _nothing_still(source: str, found: Captured, units: Units, asked: CaptureSettings,

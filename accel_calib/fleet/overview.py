@@ -298,8 +298,15 @@ def estimated(values: Floats, covariances: Floats) -> Prior:
     spread = np.median(np.abs(values - mean), axis=0) / 0.6745 + _LEAST_SPREAD_G
     covariance: Floats = np.diag(spread ** 2)
     for _ in range(200):
-        before = covariance
-        mean, covariance = _step(values, covariances, mean, covariance)
+        before, away = covariance, values - mean  # a step of expectation maximisation
+        gain = covariance @ np.linalg.inv(covariance + covariances)  # (n, p, p)
+        weight = (_DOF + size) / (_DOF + _squared(away, covariance + covariances))
+        likely = np.einsum('npq,nq->np', gain, away)
+        centre = mean + weight @ likely / np.sum(weight)
+        off = mean + likely - centre
+        spread = np.einsum('n,np,nq->pq', weight, off, off) + np.sum(
+            covariance - gain @ covariance, axis=0)
+        mean, covariance = centre, (spread + spread.T) / (2.0 * count)
         if np.max(np.abs(covariance - before)) <= 1e-8 * np.max(covariance):
             break
     share = count / (count + _SURE)
@@ -313,17 +320,3 @@ def _squared(away: Floats, covariances: Floats) -> Floats:
     """Return the (n,) squared distances, per (n, p, p) covariance."""
     solved = np.linalg.solve(covariances, away[:, :, np.newaxis])[:, :, 0]
     return np.einsum('np,np->n', away, solved)
-
-
-def _step(values: Floats, covariances: Floats, mean: Floats, covariance: Floats
-          ) -> tuple[Floats, Floats]:
-    """Return mean and covariance after a step of expectation maximisation."""
-    away = values - mean
-    gain = covariance @ np.linalg.inv(covariance + covariances)  # (n, p, p)
-    likely = np.einsum('npq,nq->np', gain, away)
-    weight = (_DOF + values.shape[1]) / (_DOF + _squared(away, covariance + covariances))
-    left = covariance - gain @ covariance
-    centre = mean + weight @ likely / np.sum(weight)
-    off = mean + likely - centre
-    spread = np.einsum('n,np,nq->pq', weight, off, off) + np.sum(left, axis=0)
-    return centre, (spread + spread.T) / (2.0 * len(values))
