@@ -29,7 +29,7 @@ from .pipeline import calibrated, calibrated_log, captured_from, Flat, options_f
 from .refine import refine as find_effects, Refinement as Refinement
 from .stored import read_calibration, write_calibration
 from .table import (
-    check_units, check_values, data_frame, Floats, in_unit, LARGEST, median_length, numbered,
+    check_units, check_values, data_frame, in_unit, LARGEST, median_length, numbered,
     Poses as Poses, Recording as Recording, Table)
 from .text import now
 from .units import FrameName, Method, STANDARD_GRAVITY, UnitName, units_of
@@ -41,8 +41,6 @@ Data = Any
 
 _MOST_ROWS = 10_000_000
 """Largest number of simulated rows, which take some 2 GB."""
-
-_LONGEST_NUMBER = 40
 
 
 class Calibration(_Calibration):
@@ -573,7 +571,11 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
     # The attitude transforms from sensor to robot axes, ΔR from robot to sensor axes.
     rotation = mounting_of(np.radians(np.asarray(mounting, float)))
     model = model_with(effects, rotation)
-    up = _directions(poses) if directions is None else np.asarray(directions, float)
+    if directions is None:  # in mixed order
+        mixed = np.random.default_rng(poses).permutation(spread_directions(poses)[1:])
+        up = np.vstack([[[0.0, 0.0, 1.0]], mixed])
+    else:
+        up = np.asarray(directions, float)
     rng, warm = np.random.default_rng(seed), np.asarray(temperature, float)
     if recording:
         found: Table = simulate_recording(model, up, rng, noise_g=noise, rate_hz=rate, dwell=dwell,
@@ -601,15 +603,8 @@ def _check_within(**numbers: tuple[float, float, float]) -> None:
     """Check numbers by their names, each with its least and its largest value."""
     for name, (value, least, most) in numbers.items():
         if not least <= value <= most:
-            raise InputError(f'{name} is {str(value)[:_LONGEST_NUMBER]}, expected {least:g} to '
+            raise InputError(f'{name} is {str(value)[:40]}, expected {least:g} to '
                              f'{most:g}', f'correct {name}')
-
-
-def _directions(count: int) -> Floats:
-    """Return directions spread over the sphere, in mixed order; the first direction is flat."""
-    others = spread_directions(count)[1:]
-    mixed = np.random.default_rng(count).permutation(others)
-    return np.vstack([[[0.0, 0.0, 1.0]], mixed])
 
 
 def _is_log(given: object) -> bool:

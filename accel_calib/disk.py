@@ -35,7 +35,6 @@ _STALE_S = 3600.0
 """Age of a temporary file that no process writes any more [s]."""
 
 _LONGEST_NAME = 200
-_WRITABLE = 0o222
 
 
 def previous(path: Path) -> Path:
@@ -72,7 +71,14 @@ def write_atomically(path: Path, write: Callable[[TextIO], object], *,
         os.fsync(file.fileno())
         if keep_before and target.exists():
             copy_atomically(target, previous(target))
-    _flush_folder(target.parent)
+    folder = os.open(target.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)  # so that the renamed file survives a loss of power
+    except OSError as err:
+        err.filename = str(target.parent)
+        raise
+    finally:
+        os.close(folder)
     # The file is written in any case: a leftover that stays does no harm.
     remove_leftovers(target, older_than=_STALE_S)
 
@@ -117,7 +123,7 @@ def replaceable(path: Path) -> os.stat_result | None:
     if not stat.S_ISREG(old.st_mode):
         raise InputError(f'{path} is not a regular file, expected one that can be replaced',
                          'choose another name')
-    if not old.st_mode & _WRITABLE:
+    if not old.st_mode & 0o222:
         raise InputError(f'{path} is write-protected, expected a file that may be replaced',
                          'choose another name, or allow writing with chmod u+w')
     return old
@@ -136,18 +142,6 @@ def remove_leftovers(path: Path, older_than: float = 0.0) -> list[OSError]:
         except OSError as error:
             failed.append(error)
     return failed
-
-
-def _flush_folder(folder: Path) -> None:
-    """Flush a folder, so that a renamed file survives a loss of power."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    except OSError as err:
-        err.filename = str(folder)
-        raise
-    finally:
-        os.close(handle)
 
 
 _KINDS = {stat.S_IFDIR: 'a folder', stat.S_IFIFO: 'a pipe (FIFO)', stat.S_IFSOCK: 'a socket',

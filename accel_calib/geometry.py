@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 
 from .table import Floats
 
-_VERTICAL = 1e-9
-
 
 def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Floats:
     """
@@ -43,7 +41,7 @@ def rpy_of(rotation: Floats) -> tuple[float, float, float]:
 
     """
     pitch = math.atan2(-rotation[2, 0], math.hypot(rotation[0, 0], rotation[1, 0]))
-    if math.hypot(rotation[2, 1], rotation[2, 2]) < _VERTICAL:
+    if math.hypot(rotation[2, 1], rotation[2, 2]) < 1e-9:
         return 0.0, pitch, math.atan2(-rotation[0, 1], rotation[1, 1])
     return (math.atan2(rotation[2, 1], rotation[2, 2]), pitch,
             math.atan2(rotation[1, 0], rotation[0, 0]))
@@ -81,13 +79,11 @@ def angle_of(rotation: Floats) -> float:
     return math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))
 
 
-_GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
-
-
 def spread_directions(count: int) -> Floats:
     """Return (count, 3) unit vectors spread evenly over the sphere (Fibonacci lattice)."""
     z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
-    radius, angle = np.sqrt(1.0 - z ** 2), _GOLDEN_ANGLE * np.arange(count)
+    golden_angle = np.pi * (3.0 - np.sqrt(5.0))
+    radius, angle = np.sqrt(1.0 - z ** 2), golden_angle * np.arange(count)
     return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
 
 

@@ -157,31 +157,25 @@ def _captured(source: Source, log: OpenLog, options: LogOptions, settings: Mappi
             found = capture(again.blocks, log.units, asked, found.known)
     check_measured(found.lengths, log.units)
     count, findings = len(found.poses), account_of(found.rests, asked)
-    limit, more = _wider(source, found, log.units, options, settings) if count < _FEW else (0.0, 0)
-    finds = f'{more} with still_std_max {limit:.3g}'
+    limit, more = 0.0, 0  # the narrowest wider limit that finds enough poses, and how many
+    for factor in _WIDER if count < _FEW else ():
+        wider = float(f'{factor * max(found.threshold, found.quietest):.2g}')
+        if math.isfinite(wider) and more < _FEW:
+            widened = settings_from({**settings, 'still_std_max': wider}, log.units)
+            with _opened(source, options) as again:
+                finds = len(capture(again.blocks, log.units, widened, found.known).poses)
+            if finds > more:
+                limit, more = wider, finds
+    advice = f'{more} with still_std_max {limit:.3g}'
     if not count:
         name = 'the recording' if isinstance(source, Recording) else str(source)
-        raise _nothing_still(name, found, log.units, asked, findings, finds if more else '')
+        raise _nothing_still(name, found, log.units, asked, findings, advice if more else '')
     lines = [f'captured {counted(count, "pose")} from {counted(found.recorded, "sample")} in '
              f'{found.seconds:.0f} s']
     if more >= 2 * count:
-        lines.append(f'{counted(count, "pose")} only, {finds}')
+        lines.append(f'{counted(count, "pose")} only, {advice}')
     return Intake(replace(found.poses, units=log.units.name, findings=(*log.findings, *findings)),
                   log.units, log.read_as, log.noted(), tuple(lines)), found
-
-
-def _wider(source: Source, found: Captured, units: Units, options: LogOptions,
-           settings: Mapping[str, Any]) -> tuple[float, int]:
-    """Return a wider limit and the number of poses with it; the narrowest that finds enough."""
-    tried = (0.0, 0)
-    for factor in _WIDER:
-        limit = float(f'{factor * max(found.threshold, found.quietest):.2g}')
-        if math.isfinite(limit) and tried[1] < _FEW:
-            asked = settings_from({**settings, 'still_std_max': limit}, units)
-            with _opened(source, options) as again:
-                count = len(capture(again.blocks, units, asked, found.known).poses)
-            tried = max(tried, (limit, count), key=lambda each: each[1])
-    return tried
 
 
 def _nothing_still(source: str, found: Captured, units: Units, asked: CaptureSettings,
@@ -203,27 +197,15 @@ def _nothing_still(source: str, found: Captured, units: Units, asked: CaptureSet
 
 
 @dataclass(frozen=True)
-class RampIntake:
-    """The ramp of a still board; other fields as those of `Intake`."""
+class RampIntake(Intake):
+    """The ramp of a still board; the poses are its stretches [g]."""
 
-    ramp: Ramp
-    units: Units
-    read_as: str = ''
-    notes: tuple[str, ...] = ()
-
-    @property
-    def lines(self) -> tuple[str, ...]:
-        """Return `read_as`, the range of the temperature and the notes."""
-        low, high = range_of(self.ramp.stretches, 'temperature')
-        words = (f'a still board for {self.ramp.seconds / 60.0:.0f} min, from {low:.1f} to '
-                 f'{high:.1f} °C')
-        return tuple(filter(None, (self.read_as and f'read as: {self.read_as}', words,
-                                   *self.notes, *self.ramp.notes)))
+    ramp: Ramp = field(kw_only=True)
 
 
 def ramp_or_poses(source: Path | Piped | Frame, options: LogOptions = LogOptions(),
                   settings: Mapping[str, Any] = {},
-                  progress: Progress = lambda done, count: None) -> Intake | RampIntake:
+                  progress: Progress = lambda done, count: None) -> Intake:
     """
     Return the ramp of a still board, or the poses of a log in many directions.
 
@@ -235,8 +217,17 @@ def ramp_or_poses(source: Path | Piped | Frame, options: LogOptions = LogOptions
             ', '.join(filter(None, (log.read_as, *log.notes)))):
         cells = _cells(log, log.watched(progress))
         if cells is not None and not is_turned_over(cells):
-            return RampIntake(ramp_of(cells), log.units, log.read_as, log.notes)
+            return _ramp_intake(cells, log)
     return poses_of(source, options, settings, progress)
+
+
+def _ramp_intake(cells: Poses, log: OpenLog) -> RampIntake:
+    """Return the ramp of a still board from the samples of a log in cells."""
+    ramp = ramp_of(cells)
+    low, high = range_of(ramp.stretches, 'temperature')
+    words = f'a still board for {ramp.seconds / 60.0:.0f} min, from {low:.1f} to {high:.1f} °C'
+    return RampIntake(ramp.stretches, log.units, log.read_as,
+                      captured=(words, *log.notes, *ramp.notes), ramp=ramp)
 
 
 def _cells(log: OpenLog, samples: Iterable[Recording]) -> Poses | None:
@@ -353,11 +344,17 @@ def calibrated(poses: Poses, units: Units, plan: Plan = Plan()) -> Outcome:
         refinement, line = _refinement(chosen, units, plan, date)
     if refinement is not None and refinement.steps and not refinement.refusal:
         calibration = refinement.calibration
-    if plan.before is not None and plan.flat is None:
-        calibration = _mounted_as(plan.before, calibration)
-    else:
+    before = plan.before
+    if before is None or plan.flat is not None:
         calibration = level_by_rows(calibration, poses, plan.frame, _row(poses, plan.flat),
                                     plan.nose_down)
+    elif before.is_levelled:
+        context = before.typical_context(1)
+        flat = flat_direction(before.frame) * before.force_per_g
+        headed = replace(calibration, model=Model(calibration.model.values, before.rotation),
+                         frame=before.frame)
+        calibration = level(headed, before.predict(flat[np.newaxis], context)[0], before.frame,
+                            context)
     return Outcome(calibration, refinement, line)
 
 
@@ -368,7 +365,8 @@ def _fit(poses: Poses, units: Units, plan: Plan, date: str) -> Calibration:
     if before is not None and is_refined(before):
         from .refine import refitted
         return refitted(before, poses, sensor=plan.sensor, date=date)
-    if plan.in_cone and (before is None or is_partial(before)) and _lie_in_cone(poses, units):
+    if (plan.in_cone and (before is None or is_partial(before)) and not units.is_native
+            and len(poses) >= FEWEST_IN_CONE and lies_in_cone(directions_of(poses, units))):
         return fit_partial(poses, units, sensor=plan.sensor, date=date)
     return fit_poses(poses, units, model=plan.model, method=plan.method, sensor=plan.sensor,
                      date=date)
@@ -384,30 +382,13 @@ def is_partial(calibration: Calibration) -> bool:
     return calibration.method == PRIOR or not calibration.model.effects
 
 
-def _lie_in_cone(poses: Poses, units: Units) -> bool:
-    return (not units.is_native and len(poses) >= FEWEST_IN_CONE
-            and lies_in_cone(directions_of(poses, units)))
-
-
-def _mounted_as(before: Calibration, calibration: Calibration) -> Calibration:
-    """Return a calibration with the levelled frame and the mounting of the one before it."""
-    if not before.is_levelled:
-        return calibration
-    context = before.typical_context(1)
-    flat = flat_direction(before.frame) * before.force_per_g
-    reading = before.predict(flat[np.newaxis], context)[0]
-    headed = replace(calibration, model=Model(calibration.model.values, before.rotation),
-                     frame=before.frame)
-    return level(headed, reading, before.frame, context)
-
-
 @dataclass(frozen=True)
 class ThermalOutcome:
     """A calibration with the offset over temperature, its curve, and the logs."""
 
     calibration: Calibration
     curve: Curve
-    logs: Sequence[Intake | RampIntake]
+    logs: Sequence[Intake]
     read_as: str
 
     @cached_property
@@ -431,13 +412,11 @@ def calibrated_log(source: Source, options: LogOptions, found: Intake, plan: Pla
         with _opened(source, options) as log:
             cells = _cells(log, log.blocks)
             if cells is not None and np.ptp(range_of(cells, 'temperature')) >= LEAST_RANGE:
-                return thermally_calibrated([
-                    RampIntake(ramp_of(cells), log.units, log.read_as, log.notes)], plan)
+                return thermally_calibrated([_ramp_intake(cells, log)], plan)
     return calibrated(poses, found.units, plan)
 
 
-def thermally_calibrated(logs: Sequence[Intake | RampIntake], plan: Plan = Plan()
-                         ) -> ThermalOutcome:
+def thermally_calibrated(logs: Sequence[Intake], plan: Plan = Plan()) -> ThermalOutcome:
     """
     Fit the offset over temperature to ramps of a still board, and a calibration to poses, if any.
 
@@ -457,39 +436,33 @@ def thermally_calibrated(logs: Sequence[Intake | RampIntake], plan: Plan = Plan(
     """
     read_as = ', '.join(dict.fromkeys(each.read_as for each in logs if each.read_as))
     with saying(read_as):
-        ramps = [each for each in logs if isinstance(each, RampIntake)]
-        turned = _turned_over(logs)
-        _check_one_sensor([*(each.ramp.stretches for each in ramps),
-                           *([] if turned is None else [turned.poses])])
-        curve = curve_of([each.ramp for each in ramps])
-        if turned is None:
-            made = thermal_alone(curve, ramps[0].units, sensor=plan.sensor, date=now())
-            rows = made.poses
-        else:
-            rows, units = turned.poses, turned.units
+        turned = [each for each in logs if not isinstance(each, RampIntake)]
+        _check_logs(logs, len(turned))
+        curve = curve_of([each.ramp for each in logs if isinstance(each, RampIntake)])
+        if turned:
+            rows, units = turned[0].poses, turned[0].units
             fitted = calibrated(without_curve(curve, rows, units), units, replace(
                 plan, refined=False, flat=None, nose_down=None)).calibration
             made = with_curve(fitted, curve, rows)
+        else:
+            made = thermal_alone(curve, logs[0].units, sensor=plan.sensor, date=now())
+            rows = made.poses
         levelled = level_by_rows(made, made.poses, plan.frame, _row(rows, plan.flat),
                                  plan.nose_down)
         return ThermalOutcome(levelled, curve, logs, read_as)
 
 
-def _turned_over(logs: Sequence[Intake | RampIntake]) -> Intake | None:
-    """Return the one log of poses, if there is one; raise InputError without a ramp."""
-    turned = [each for each in logs if isinstance(each, Intake)]
-    if len(turned) == len(logs):
-        raise InputError(f'{counted(len(turned), "log")} of poses in many directions, expected '
+def _check_logs(logs: Sequence[Intake], turned: int) -> None:
+    """Refuse logs without a ramp, with several logs of poses (`turned`), or of several sensors."""
+    if turned == len(logs):
+        raise InputError(f'{counted(turned, "log")} of poses in many directions, expected '
                          'one of a still board whose temperature changes', 'record the board '
                          'while it warms up from the freezer, and give this log, too')
-    if len(turned) > 1:
-        raise InputError(f'{len(turned)} logs are of poses in many directions, expected at most '
+    if turned > 1:
+        raise InputError(f'{turned} logs are of poses in many directions, expected at most '
                          'one', 'leave out the others')
-    return turned[0] if turned else None
-
-
-def _check_one_sensor(tables: Sequence[Poses]) -> None:
-    """Refuse tables of several sensors, by device id in an autopilot, or else by name."""
+    tables = [each.poses for each in logs]
+    # A sensor is known by its device id in an autopilot, or else by its name.
     devices = {each.autopilot.device_id for each in tables if each.autopilot} - {None}
     names = {each.sensor for each in tables if not each.autopilot} - {''}
     for known in (devices, names):

@@ -398,7 +398,15 @@ def check_values(columns: Mapping[str, NDArray[Any]], source: str, *, partial: b
         if partial and key in ('temperature', 'supply_voltage'):
             values = np.nan_to_num(values, nan=0.0, posinf=np.inf, neginf=-np.inf)
         if key in COLUMNS and key != 'label' and not np.all(np.abs(values) < LARGEST):
-            raise _beyond(key, values.reshape(len(values), -1), source)
+            by_row = values.reshape(len(values), -1)
+            sound = np.abs(by_row) < LARGEST
+            row = int(np.argmin(sound.all(axis=1)))
+            number = float(by_row[row][~sound[row]][0])
+            what = (f'the number {number:.3g}' if np.isfinite(number) else
+                    'a number that is not finite')
+            raise InputError(f'{source}: row {row + 1} of {", ".join(COLUMNS[key].names)} holds '
+                             f'{what}, expected finite numbers below {LARGEST:g}',
+                             'correct the row or remove it')
     if 'count' in columns and not np.all(columns['count'] > 0):
         raise InputError(f'{source}: column count holds numbers that are not above 0, expected '
                          'positive numbers', 'enter the number of samples of each pose')
@@ -407,16 +415,6 @@ def check_values(columns: Mapping[str, NDArray[Any]], source: str, *, partial: b
             one, two, three = COLUMNS[key].names
             raise InputError(f'{source}: column {one}, {two} or {three} holds negative numbers, '
                              'expected 0 or more', 'enter standard deviations')
-
-
-def _beyond(key: str, values: NDArray[Any], source: str) -> InputError:
-    sound = np.abs(values) < LARGEST
-    row = int(np.argmin(sound.all(axis=1)))
-    number = float(values[row][~sound[row]][0])
-    what = f'the number {number:.3g}' if np.isfinite(number) else 'a number that is not finite'
-    names = ', '.join(COLUMNS[key].names)
-    return InputError(f'{source}: row {row + 1} of {names} holds {what}, '
-                      f'expected finite numbers below {LARGEST:g}', 'correct the row or remove it')
 
 
 _LIKELY_G = (0.5, 2.0)
@@ -452,25 +450,21 @@ def check_units(poses: Table, units: Units, source: str = '') -> None:
                          f'{length:.4g}, expected about {units.per_g:.4g} at rest in '
                          f'{units.name}', advice)
     if 'reference' in poses:
-        _check_reference(median_length(poses['reference']), units)
+        per_g, words = ((1.0, 'in g, the unit of known forces for native readings')
+                        if units.is_native else
+                        (units.per_g, f'in {units.name}, the unit of the readings'))
+        length = median_length(poses['reference'])
+        if not _is_likely(length, per_g):
+            raise InputError(f'the length of the known forces ref_x,ref_y,ref_z is about '
+                             f'{length:.4g}, expected about {per_g:.4g} {words}',
+                             f'{_look(length)}multiply them by {per_g / max(length, 1e-12):.4g}'
+                             if length > 0.0 else 'fill the columns, or remove them')
 
 
 def median_length(vectors: Floats) -> float:
     """Return the median length of (n, 3) vectors."""
     with np.errstate(over='ignore'):
         return float(np.median(np.linalg.norm(vectors, axis=1)))
-
-
-def _check_reference(length: float, units: Units) -> None:
-    per_g, words = ((1.0, 'in g, the unit of known forces for native readings')
-                    if units.is_native else
-                    (units.per_g, f'in {units.name}, the unit of the readings'))
-    if _is_likely(length, per_g):
-        return
-    raise InputError(f'the length of the known forces ref_x,ref_y,ref_z is about {length:.4g}, '
-                     f'expected about {per_g:.4g} {words}',
-                     f'{_look(length)}multiply them by {per_g / max(length, 1e-12):.4g}'
-                     if length > 0.0 else 'fill the columns, or remove them')
 
 
 def _is_likely(length: float, per_g: float) -> bool:

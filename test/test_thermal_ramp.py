@@ -48,8 +48,10 @@ def curve(*logs: Recording) -> Curve:
 
 
 def thermal(*logs: Recording | Intake):
-    return thermally_calibrated([log if isinstance(log, Intake) else
-                                 RampIntake(stretches(log), MPS2) for log in logs])
+    ramps = [None if isinstance(log, Intake) else stretches(log) for log in logs]
+    return thermally_calibrated([
+        log if found is None else RampIntake(found.stretches, MPS2, ramp=found)
+        for log, found in zip(logs, ramps)])
 
 
 def coefficients(found: Curve):

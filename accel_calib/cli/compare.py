@@ -7,7 +7,6 @@ import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from rich.table import Table
@@ -17,12 +16,12 @@ from .frame import (
     stored_calibration)
 from .output import error_line, NARROW, progress, short_if_known, table, Verdict
 from ..calibrate import verify
-from ..compare import compare, Comparison, History, history_of
+from ..compare import compare, History, history_of
 from ..errors import InputError
 from ..findings import (
     change_in_words, GAINS, in_words, OFFSETS, rate_comparison, rate_noise, rate_verification)
 from ..logs import open_log
-from ..noise import check_allantools, duration, noise_of, NoiseFigures, to_json, whole
+from ..noise import check_allantools, duration, noise_of, to_json, whole
 from ..pipeline import Correction
 from ..report import calibration_page
 from ..report.stability import (
@@ -81,31 +80,23 @@ def run_compare(args: argparse.Namespace) -> Done:
     rating = rate_comparison(comparison)
     models = [calibration.name for calibration in calibrations]
     outlier = comparison.outlier
+    lines = [
+        table('Corrected |a| minus the mean of the others [mg]',
+              ('run', 'model', 'RMS', 'expected', 'largest', 'p'),
+              ((f'{number} {path}', model, f'{run.rms_mg:.3g}', f'{run.expected_mg:.3g}',
+                f'{run.largest_mg:.3g}', f'{run.p_value:.2g}') for number, (path, model, run) in
+               enumerate(zip(paths, models, comparison.runs, strict=True), 1))),
+        table('Spread of the parameters over the runs', ('', 'mean', 'spread', 'stated', 'ratio'),
+              parameter_rows(comparison)),
+        *(f'note: {note}' for note in comparison.notes),
+        *filter(None, [comparison.tilt_words])]
+    if not comparison.agree and len(comparison.runs) == 2:
+        lines.append('a third run would show which one differs')
     result = {**asdict(comparison), 'outlier': None if outlier is None else outlier + 1,
               'runs': [{'file': path, 'model': model, **asdict(run)} for path, model, run in
                        zip(paths, models, comparison.runs, strict=True)]}
-    return Done(result, _comparison_lines(paths, models, comparison), rating,
-                status=0 if comparison.agree else FAILED,
+    return Done(result, lines, rating, status=0 if comparison.agree else FAILED,
                 page=partial(comparison_page, comparison, rating, paths, calibrations))
-
-
-def _comparison_lines(paths: list[Path], models: list[str], comparison: Comparison
-                      ) -> Iterator[Any]:
-    yield table(
-        'Corrected |a| minus the mean of the others [mg]',
-        ('run', 'model', 'RMS', 'expected', 'largest', 'p'),
-        ((f'{number} {path}', model, f'{run.rms_mg:.3g}', f'{run.expected_mg:.3g}',
-          f'{run.largest_mg:.3g}', f'{run.p_value:.2g}') for number, (path, model, run) in
-         enumerate(zip(paths, models, comparison.runs, strict=True), 1)))
-    yield table(
-        'Spread of the parameters over the runs', ('', 'mean', 'spread', 'stated', 'ratio'),
-        parameter_rows(comparison))
-    for note in comparison.notes:
-        yield f'note: {note}'
-    if comparison.tilt_words:
-        yield comparison.tilt_words
-    if not comparison.agree and len(comparison.runs) == 2:
-        yield 'a third run would show which one differs'
 
 
 def run_history(args: argparse.Namespace) -> Done:
@@ -175,21 +166,15 @@ def run_noise(args: argparse.Namespace) -> Done:
         units = units_of('g') if units.is_native else units
     with progress('axes') as moved:
         found = noise_of(recording, units, args.gravity, moved)
-    return Done({'recording': args.recording, **to_json(found)}, [*lines, *_noise_lines(found)],
-                rate_noise(found), page=partial(noise_page, found, str(args.recording)))
-
-
-def _noise_lines(found: NoiseFigures) -> Iterator[str | Table]:
-    """Yield the figures by axis, the notes, and the figures for Kalibr."""
-    yield (f'rest of {duration(found.seconds)}: {counted(found.samples, "sample")} at '
-           f'{found.rate:.5g} Hz')
+    shown: list[str | Table] = [*lines, f'rest of {duration(found.seconds)}: '
+                                f'{counted(found.samples, "sample")} at {found.rate:.5g} Hz']
     for kind in found.kinds:
         axes = found.of(kind)
         rows = list(figure_rows(axes))
-        yield table(kind, ('', *(axis.axis for axis in axes)), (
-            (f'{label}, {unit}', *cells[:-1]) for label, unit, cells in rows), **NARROW)
-        yield from (f'typical {label}: {cells[-1]} {unit}'
-                    for label, unit, cells in rows if cells[-1])
-    yield from (f'note: {note}' for note in found.notes)
-    yield from need_lines(found)
-    yield from kalibr_lines(found)
+        shown.append(table(kind, ('', *(axis.axis for axis in axes)), (
+            (f'{label}, {unit}', *cells[:-1]) for label, unit, cells in rows), **NARROW))
+        shown += [f'typical {label}: {cells[-1]} {unit}'
+                  for label, unit, cells in rows if cells[-1]]
+    shown += [*(f'note: {note}' for note in found.notes), *need_lines(found), *kalibr_lines(found)]
+    return Done({'recording': args.recording, **to_json(found)}, shown, rate_noise(found),
+                page=partial(noise_page, found, str(args.recording)))

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
@@ -24,14 +24,13 @@ from ..errors import InputError
 from ..findings import (
     calibration_json, curve_json, effect_figures, linear_figures, rate_refinement, refinement_json)
 from ..pipeline import (
-    calibrated, calibrated_log, Intake, Outcome, Plan, ramp_or_poses, thermally_calibrated,
-    ThermalOutcome)
+    calibrated, calibrated_log, Intake, Outcome, Plan, ramp_or_poses, RampIntake,
+    thermally_calibrated, ThermalOutcome)
 from ..stored import write_calibration
 from ..text import counted, listed, now, short, with_sd
 from ..units import MG
 
 if TYPE_CHECKING:
-    from ..fleet import Summary
     from ..refine import Refinement
 
 
@@ -41,14 +40,13 @@ def run_fit(args: argparse.Namespace) -> Done:
         rows = rows_between(found.poses, args.rows) if args.rows else None
         outcome = calibrated(found.poses, found.units, plan_of(args, rows=rows, refined=False))
     calibration = outcome.calibration
-    ahead, (lines, stored) = outlook(calibration, args.model), store(args, outcome)
-    return Done(
-        {'file': args.poses, **calibration_json(calibration, ahead), 'read_as': found.read_as,
-         'read_lines': found.lines},
-        [*_tables(calibration), *lines], outcome.rating, status_of(outcome), stored,
-        partial(_page, args, args.poses, found, outcome),
-        notes=_fit_notes(calibration, f'model {calibration.name}: {calibration.reason}',
-                         f'next pose: {ahead.next_pose.words}', *found.lines))
+    ahead = outlook(calibration, args.model)
+    return _done(
+        args, outcome, {'file': args.poses, **calibration_json(calibration, ahead),
+                        'read_as': found.read_as, 'read_lines': found.lines},
+        shown=_tables(calibration), page=partial(_page, args, args.poses, found, outcome),
+        notes=[f'model {calibration.name}: {calibration.reason}',
+               f'next pose: {ahead.next_pose.words}', *found.lines])
 
 
 def run_calibrate(args: argparse.Namespace) -> Done:
@@ -59,14 +57,14 @@ def run_calibrate(args: argparse.Namespace) -> Done:
         return _thermal_done(args, [args.log], outcome,
                              'its temperature changes: fitted as by accel-calib thermal')
     calibration, refinement = outcome.calibration, outcome.refinement
-    lines, stored = store(args, outcome)
-    return Done(
+    return _done(
+        args, outcome,
         {'file': args.log, **calibration_json(calibration, outlook(calibration, 'auto')),
          'read_as': found.read_as, 'read_lines': found.lines, 'refined': outcome.line,
          'refinement': None if refinement is None else refinement_json(refinement)},
-        [*(_tables(calibration) if args.verbose else ()), *lines], outcome.rating,
-        status_of(outcome), stored, partial(_page, args, args.log, found, outcome),
-        notes=_fit_notes(calibration, outcome.line, *found.lines))
+        shown=_tables(calibration) if args.verbose else (),
+        page=partial(_page, args, args.log, found, outcome),
+        notes=[outcome.line, *found.lines])
 
 
 def run_thermal(args: argparse.Namespace) -> Done:
@@ -85,38 +83,27 @@ def _thermal_done(args: argparse.Namespace, logs: Sequence[Path], outcome: Therm
     """Store, and return what is done, with further notes on the logs."""
     from ..report import thermal_page
 
-    calibration, (left_out, stored) = outcome.calibration, store(args, outcome)
+    calibration = outcome.calibration
     lines = [*(line for each in outcome.logs for line in each.lines), *notes]
-    is_whole = any(isinstance(each, Intake) for each in outcome.logs)
-    return Done(
-        {'file': list(logs), **calibration_json(calibration, outlook(calibration, 'auto')),
-         'read_as': outcome.read_as, 'read_lines': lines, 'thermal': curve_json(outcome.curve)},
-        [*_curve_lines(outcome),
-         *(_tables(calibration) if is_whole and args.verbose else ()), *left_out],
-        outcome.rating, status_of(outcome), stored,
-        partial(thermal_page, outcome, list(map(str, logs)), stored=str(args.output), notes=lines),
-        notes=_fit_notes(calibration, *lines))
-
-
-def _curve_lines(outcome: ThermalOutcome) -> Iterator[Any]:
-    """Yield the effects of temperature as a table, and lines."""
+    is_whole = any(not isinstance(each, RampIntake) for each in outcome.logs)
     curve, values = outcome.curve, Table(title='Effects of temperature', show_header=False)
-    low, high = curve.range_c
-    for each in effect_figures(outcome.calibration):
+    for each in effect_figures(calibration):
         values.add_row(each.label, with_sd(each.value, each.sd), each.unit)
-    if curve.model.effects:
-        yield values
-    else:
-        yield 'the offset does not change with the temperature'
-    yield (f'degree {curve.degree} from {low:.1f} to {high:.1f} °C: {short(curve.change_mg)} -> '
-           f'{short(curve.residual_mg)} mg, uncertainty up to {short(curve.band_mg)} mg')
+    low, high = curve.range_c
     errors = [*curve.held_out_mg.values()]
-    yield f'held-out parts of the log: {short(errors[0])} -> {short(errors[-1])} mg'
-
-
-def status_of(outcome: Outcome | ThermalOutcome) -> int:
-    """Return the exit status for a calibration."""
-    return FAILED if outcome.rating.name == 'BAD' else 0
+    return _done(
+        args, outcome,
+        {'file': list(logs), **calibration_json(calibration, outlook(calibration, 'auto')),
+         'read_as': outcome.read_as, 'read_lines': lines, 'thermal': curve_json(curve)},
+        shown=[values if curve.model.effects else
+               'the offset does not change with the temperature',
+               f'degree {curve.degree} from {low:.1f} to {high:.1f} °C: {short(curve.change_mg)} '
+               f'-> {short(curve.residual_mg)} mg, uncertainty up to {short(curve.band_mg)} mg',
+               f'held-out parts of the log: {short(errors[0])} -> {short(errors[-1])} mg',
+               *(_tables(calibration) if is_whole and args.verbose else ())],
+        page=partial(thermal_page, outcome, list(map(str, logs)), stored=str(args.output),
+                     notes=lines),
+        notes=lines)
 
 
 def plan_of(args: argparse.Namespace, **more: Any) -> Plan:
@@ -129,15 +116,29 @@ def plan_of(args: argparse.Namespace, **more: Any) -> Plan:
     return plan
 
 
-def store(args: argparse.Namespace, outcome: Outcome | ThermalOutcome
-          ) -> tuple[list[str], list[Path]]:
-    """Write a calibration unless it is BAD; return why not, and the files written."""
-    if args.output is None:
-        return [], []
-    if outcome.rating.name == 'BAD' and not args.keep_bad:
-        return ['not stored, because it is BAD; to store it, use --keep-bad'], []
-    write_calibration(args.output, outcome.calibration)
-    return [], [args.output]
+def _done(args: argparse.Namespace, outcome: Outcome | ThermalOutcome, result: dict[str, Any], *,
+          shown: Iterable[Any], page: Callable[[], str], notes: Sequence[str]) -> Done:
+    """
+    Write a calibration unless it is BAD, and return what is done.
+
+    The rows left out are noted first; if they are several, their reasons come last.
+
+    """
+    is_bad, stored, left_out = outcome.rating.name == 'BAD', list[Path](), list[str]()
+    if is_bad and args.output is not None and not args.keep_bad:
+        left_out = ['not stored, because it is BAD; to store it, use --keep-bad']
+    elif args.output is not None:
+        write_calibration(args.output, outcome.calibration)
+        stored = [args.output]
+    rejected = outcome.calibration.rejected
+    reasons = [f'left out: row {each.row}: {each.reason}' for each in rejected]
+    if len(rejected) > 1:
+        rows = [each.row for each in rejected]
+        notes = [f'left out: {listed("row", rows)}', *notes, *reasons]
+    else:
+        notes = [*reasons, *notes]
+    return Done(result, [*shown, *left_out], outcome.rating, FAILED if is_bad else 0, stored, page,
+                notes=notes)
 
 
 def _page(args: argparse.Namespace, log: Path, found: Intake, outcome: Outcome) -> str:
@@ -157,15 +158,6 @@ def several_fit(results: Sequence[dict[str, Any]]) -> Iterator[str]:
         line = (f'{result["file"]} model {result["model"]}: {result["rms_before_mg"]:.3g} -> '
                 f'{result["rms_after_mg"]:.3g} mg, ')
         yield Verdict(f'{line}{result["rating"]}', result['rating'], len(line))
-
-
-def _fit_notes(calibration: Calibration, *notes: str) -> list[str]:
-    """Return notes with the rows left out before them; the reasons of several rows follow."""
-    lines = [f'left out: row {each.row}: {each.reason}' for each in calibration.rejected]
-    if len(lines) < 2:
-        return [*lines, *notes]
-    rows = [each.row for each in calibration.rejected]
-    return [f'left out: {listed("row", rows)}', *notes, *lines]
 
 
 def _tables(calibration: Calibration) -> Iterator[Any]:
@@ -295,21 +287,16 @@ def run_fleet(args: argparse.Namespace) -> Done:
         with progress('recordings') as moved:
             summary = run(client, found, asked, Store(args.output.absolute()), moved,
                           args.time_limit or LIMIT_S)
-    return Done({'recordings': len(found), **{name: summary.counts[name] for name in STATUS},
-                 'sensors': summary.sensors}, _summary_lines(summary, args.output),
-                summary.rating)
-
-
-def _summary_lines(summary: Summary, output: Path) -> Iterator[str]:
-    """Yield the summary as lines of text."""
     counts = summary.counts
-    yield (f'{counts["ok"]} calibrated, {counts["error"]} with an error, {counts["unread"]} '
-           f'could not be read, {counts["skipped"]} skipped because they are done')
-    for path in summary.damaged:
-        yield f'note: a file of the results was damaged and was made again; it is now {path}'
-    for row in summary.sensors:
-        for change in row['changes']:
-            if change['for_good']:
-                yield (f'{row["sensor"]} changed for good at {change["date"]}: '
-                       f'{change["parameter"]} (p = {change["p_value"]:.2g})')
-    yield f'{counted(len(summary.sensors), "sensor")}, stored in {output}'
+    return Done(
+        {'recordings': len(found), **{name: counts[name] for name in STATUS},
+         'sensors': summary.sensors},
+        [f'{counts["ok"]} calibrated, {counts["error"]} with an error, {counts["unread"]} '
+         f'could not be read, {counts["skipped"]} skipped because they are done',
+         *(f'note: a file of the results was damaged and was made again; it is now {path}'
+           for path in summary.damaged),
+         *(f'{row["sensor"]} changed for good at {change["date"]}: {change["parameter"]} '
+           f'(p = {change["p_value"]:.2g})'
+           for row in summary.sensors for change in row['changes'] if change['for_good']),
+         f'{counted(len(summary.sensors), "sensor")}, stored in {args.output}'],
+        summary.rating)

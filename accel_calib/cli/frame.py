@@ -60,8 +60,6 @@ _KINDS = {'calibration': rb'format: accel_calib', 'page': rb'<!DOCTYPE html',
           'export': rb'(?s).*(written by accel-calib|accel_calib) export'}
 """Beginning of a file of each kind."""
 
-_HEAD = 4096
-
 _MOST_NOTES = 5
 """Largest number of notes without ``--verbose``."""
 
@@ -147,28 +145,24 @@ def _done(args: argparse.Namespace) -> Done:
     args.own = () if path is None else know_file(path)
     done: Done = _function('run', args.command)(args)
     if page is not None and done.page is not None:
-        done = _with_page(done, page, done.page, beside=args.command in _WITH_PAGE)
+        from ..report import check_matplotlib, write_page
+
+        try:
+            check_matplotlib()
+            with working('drawing the page'):
+                write_page(page, done.page())
+            done = replace(done, stored=[*done.stored, page])
+        except (InputError, OSError) as err:  # beside a calibration, this is only noted
+            if not (args.command in _WITH_PAGE or done.stored):
+                raise
+            done = replace(done, shown=[*done.shown, f'no page {page}: {known_error(err)}'])
     if done.rating is not None:
         done = replace(done, result={**done.result, **rated(done.rating, args)})
     return done
 
 
-def _with_page(done: Done, page: Path, text_of: Callable[[], str], *, beside: bool) -> Done:
-    """Write the page; one that cannot be written beside a calibration is only noted."""
-    from ..report import check_matplotlib, write_page
-
-    try:
-        check_matplotlib()
-        with working('drawing the page'):
-            write_page(page, text_of())
-    except (InputError, OSError) as err:
-        if not (beside or done.stored):
-            raise
-        return replace(done, shown=[*done.shown, f'no page {page}: {known_error(err)}'])
-    return replace(done, stored=[*done.stored, page])
-
-
 def _run_one(args: argparse.Namespace) -> int:
+    """Run the command, and print the rating, then its findings and the notes, then the rest."""
     command, output, target = COMMANDS[args.command], console(args), getattr(args, 'json', None)
     try:
         done = _done(args)
@@ -180,25 +174,18 @@ def _run_one(args: argparse.Namespace) -> int:
             output.print(f'read as: {error["read_as"]}')
         raise
     write_json(target, done.result)
-    for each in (*(rating_lines(done.rating, args) if done.rating else ()), *_notes(done, args),
-                 *done.shown, *(f'stored in {path}' for path in done.stored
-                                if str(path) != STANDARD_OUTPUT)):
+    rating, verbose = done.rating, getattr(args, 'verbose', True)
+    findings = () if rating is None else rating.findings[rating.name != 'GOOD':]
+    notes = [*(f'note: {each.words if verbose else each.text}' for each in findings), *done.notes]
+    if not verbose and len(notes) > _MOST_NOTES:
+        more = len(notes) - _MOST_NOTES + 1
+        notes[_MOST_NOTES - 1:] = [f'{more} more lines with --verbose']
+    for each in (*(rating_lines(rating, args) if rating else ()), *notes, *done.shown,
+                 *(f'stored in {path}' for path in done.stored if str(path) != STANDARD_OUTPUT)):
         output.print(each)
     if done.refusal:
         raise RefusedFitError(f'{args.output} is not written: {done.refusal[0]}', done.refusal[1])
     return done.status
-
-
-def _notes(done: Done, args: argparse.Namespace) -> Iterator[str]:
-    """Yield the findings beside the reason of the rating, and the notes; only a few if short."""
-    rating, verbose = done.rating, getattr(args, 'verbose', True)
-    findings = () if rating is None else rating.findings[rating.name != 'GOOD':]
-    lines = [*(f'note: {each.words if verbose else each.text}' for each in findings), *done.notes]
-    if verbose or len(lines) <= _MOST_NOTES:
-        yield from lines
-    else:
-        yield from lines[:_MOST_NOTES - 1]
-        yield f'{len(lines) - _MOST_NOTES + 1} more lines with --verbose'
 
 
 def _attempt(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
@@ -348,7 +335,7 @@ def check_target(target: Target, inputs: Iterable[Path], *, force: bool) -> None
     if force or not target.kind or not path.is_file():
         return
     with path.open('rb') as file:
-        head = file.read(_HEAD)
+        head = file.read(4096)
     # Text in an array of NumPy has three zero bytes beside each letter.
     if head.strip() and not re.match(_KINDS[target.kind], head.replace(b'\0', b'')):
         raise InputError(f'{option} {path} exists and is no {target.kind} of accel_calib, '

@@ -15,13 +15,13 @@ that they can be read from a distance. Two columns of the terminal, or half a ro
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 import math
 import signal
 import sys
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
@@ -38,7 +38,6 @@ from ..geometry import words_of
 from ..units import MG
 
 if TYPE_CHECKING:
-    from ..ros.demo import Outcome
     from ..ros.watch import Show
     from ..session import Progress
 
@@ -123,24 +122,18 @@ def run_demo(args: argparse.Namespace) -> Done:
         for name, value in errors.items():
             quantity, unit = name.split('_')
             found[f'{quantity}_{when}_{unit}'] = value
-    return Done(found, _demo_lines(outcome, before, after),
-                status=0 if outcome.succeeded else FAILED)
-
-
-def _demo_lines(outcome: Outcome, before: Mapping[str, float], after: Mapping[str, float]
-                ) -> Iterator[Any]:
-    """Yield a table of the errors, and whether the hidden effect was found if there is one."""
     columns = (('imu/data_calibrated', 'after ~/refine') if outcome.hidden else
                ('imu/data_raw', 'imu/data_calibrated'))
-    yield table(
+    shown: list[str | Table] = [table(
         f'Errors at {outcome.rests} rests in other poses, after {outcome.seconds:.0f} s',
         ('', *columns), ((words, f'{before[name]:.3g}', f'{after[name]:.3g}')
-                         for name, words in _ERRORS.items()))
+                         for name, words in _ERRORS.items()))]
     if outcome.hidden:
         named = ', '.join(outcome.found) or 'nothing'
         lag = f' with a lag of {outcome.lag_s:.1f} s' if outcome.lag_s else ''
         passed = 'found' if outcome.hidden in outcome.found else 'NOT found'
-        yield f'{passed}: hidden was {outcome.hidden}, ~/refine added {named}{lag}'
+        shown.append(f'{passed}: hidden was {outcome.hidden}, ~/refine added {named}{lag}')
+    return Done(found, shown, status=0 if outcome.succeeded else FAILED)
 
 
 # ----------------------------------------------------------------------------- watch
@@ -229,49 +222,33 @@ def run_watch(args: argparse.Namespace) -> Done:
 @contextmanager
 def _output(bell: bool) -> Iterator[Show]:
     """Yield the function that shows the progress."""
-    console = Output()
-    if not sys.stdout.isatty() or console.is_dumb_terminal:
-        yield _Lines().show
-        return
-    with Live(console=console, auto_refresh=False, screen=True) as live:
-        shown = _Screen(live, bell)
-        yield shown.show
-    if shown.view is not None:
-        console.print(shown.view)  # the terminal returns to what it showed before
+    console, before = Output(), ''
+    last: Progress | None = None
+    view: RenderableType | None = None
 
-
-class _Lines:
-    """Output of a line for each change."""
-
-    def __init__(self) -> None:
-        self._last: Progress | None = None
-        self._problem = ''
-
-    def show(self, node: str, progress: Progress | None, problem: str) -> None:
-        """Print what has changed."""
-        if problem != self._problem:
+    def print_changes(node: str, progress: Progress | None, problem: str) -> None:
+        nonlocal last, before
+        if problem != before:
             print(problem or f'messages from {node} arrive again', flush=True)
         if progress is not None:
-            for line in changes(node, self._last, progress):
+            for line in changes(node, last, progress):
                 print(line, flush=True)
-        self._last, self._problem = progress, problem
+        last, before = progress, problem
 
+    def draw(node: str, progress: Progress | None, problem: str) -> None:
+        nonlocal last, view
+        if progress is not None and captured(last, progress) and bell:
+            console.bell()
+        last, view = progress, screen(node, progress, problem)
+        live.update(view, refresh=True)
 
-class _Screen:
-    """A screen that is drawn again, with a bell for each captured pose; it shows `view`."""
-
-    def __init__(self, live: Live, bell: bool) -> None:
-        self._live, self._bell = live, bell
-        self._last: Progress | None = None
-        self.view: RenderableType | None = None
-
-    def show(self, node: str, progress: Progress | None, problem: str) -> None:
-        """Draw the screen."""
-        if progress is not None and captured(self._last, progress) and self._bell:
-            self._live.console.bell()
-        self._last = progress
-        self.view = screen(node, progress, problem)
-        self._live.update(self.view, refresh=True)
+    if not sys.stdout.isatty() or console.is_dumb_terminal:
+        yield print_changes
+        return
+    with Live(console=console, auto_refresh=False, screen=True) as live:
+        yield draw
+    if view is not None:
+        console.print(view)  # the terminal returns to what it showed before
 
 
 def screen(node: str, progress: Progress | None, problem: str = '') -> RenderableType:
@@ -330,25 +307,23 @@ def service_call(node: str, name: str) -> str:
 
 def _rows(progress: Progress) -> list[_Row]:
     now, style = progress, GOOD if progress.still else BAD
+    stillness = 'no Imu messages yet'
+    if not math.isnan(now.stillness):
+        stillness = (f'{"still" if now.still else "moving"}, '
+                     f'{now.stillness:.{2 if now.stillness < 10.0 else 0}f} times the limit')
+    lengths = [f'{words}{each:.4f} g' for words, each in (
+        ('', now.length), ('corrected ', now.corrected)) if not math.isnan(each)]
     share = now.poses / max(now.poses, now.total, 1)
     dwell = (f'{now.dwell:.1f} s of {now.min_dwell:g} s'
              f'{", long enough" if now.dwell >= now.min_dwell else ""}')
     return [
-        _Row('stillness', _stillness(now), now.stillness / _SCALE, style, 1.0 / _SCALE),
+        _Row('stillness', stillness, now.stillness / _SCALE, style, 1.0 / _SCALE),
         _Row('dwell', dwell, now.dwell / now.min_dwell, style),
         _Row('poses', _count(now), share),
         _Row('coverage', f'{now.coverage:.0%} of the sphere', now.coverage),
-        _Row('accuracy', _accuracy(now)), _Row('|a|', _length(now)),
+        _Row('accuracy', _accuracy(now)), _Row('|a|', ', '.join(lengths) or 'not known'),
         *([] if math.isnan(now.temperature) else [
             _Row('temperature', f'{now.temperature:.1f} °C')])]
-
-
-def _stillness(progress: Progress) -> str:
-    if math.isnan(progress.stillness):
-        return 'no Imu messages yet'
-    digits = 2 if progress.stillness < 10.0 else 0
-    times = f'{progress.stillness:.{digits}f} times the limit'
-    return f'{"still" if progress.still else "moving"}, {times}'
 
 
 def _count(progress: Progress) -> str:
@@ -363,13 +338,6 @@ def _accuracy(progress: Progress) -> str:
     if math.isinf(progress.accuracy):
         return 'not determined by these poses'
     return f'{progress.accuracy * MG:.2g} mg expected'
-
-
-def _length(progress: Progress) -> str:
-    if math.isnan(progress.corrected):
-        return 'not known' if math.isnan(progress.length) else f'{progress.length:.4f} g'
-    raw = '' if math.isnan(progress.length) else f'{progress.length:.4f} g, '
-    return f'{raw}corrected {progress.corrected:.4f} g'
 
 
 def _direction(progress: Progress) -> str:

@@ -47,6 +47,7 @@ removal reduces T² most.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -254,8 +255,15 @@ def comparable(calibrations: Sequence[Calibration]) -> tuple[Comparable, ...]:
     _refuse_if_unlike(calibrations)
     names = {run.form.norm for run in calibrations}
     largest = max(names.intersection(NORM_MODELS), key=NORM_MODELS.index, default=NORM_MODELS[0])
-    every = [(run, _fitted_with(largest, run)) for run in calibrations]
-    return tuple(Comparable(run, sure, repeatability_of(sure)) for run, sure in every)
+    found = []
+    for run in calibrations:
+        sure = run
+        larger = NORM_MODELS[NORM_MODELS.index(run.name) + 1:] if run.name in NORM_MODELS else ()
+        if largest in larger and run.model.effects == run.form.effects:
+            with suppress(RefusedFitError):  # its poses do not determine the larger model
+                sure = fit_unknown(run.used_poses, run.units, largest, 'ml')
+        found.append(Comparable(run, sure, repeatability_of(sure)))
+    return tuple(found)
 
 
 def _refuse_if_unlike(calibrations: Sequence[Calibration]) -> None:
@@ -280,17 +288,6 @@ def _refuse_if_unlike(calibrations: Sequence[Calibration]) -> None:
         if not np.all(np.isfinite(run.covariance)):
             raise InputError(f'run {k} has no uncertainty, expected a finite covariance',
                              'fit it again with more poses')
-
-
-def _fitted_with(name: str, run: Calibration) -> Calibration:
-    """Return a fit of a larger model to the poses of a run, or the run if that is not possible."""
-    larger = NORM_MODELS[NORM_MODELS.index(run.name) + 1:] if run.name in NORM_MODELS else ()
-    if name not in larger or run.model.effects != run.form.effects:
-        return run
-    try:
-        return fit_unknown(run.used_poses, run.units, name, 'ml')
-    except RefusedFitError:
-        return run
 
 
 LEVEL = 0.03

@@ -35,27 +35,18 @@ _WARMER = 5.0
 """Difference of temperature between runs that causes a note [°C]."""
 
 
-def _contexts_of(calibrations: Sequence[Calibration]) -> list[Context]:
-    """Return the context for the comparison of each run, one row each: medians, and no motion."""
-    common = {key: np.array([np.mean([np.median(run.poses[key]) for run in calibrations
-                                      if key in run.poses])])
-              for key in _COMMON if any(key in run.poses for run in calibrations)}
-    contexts: list[Context] = []
-    for run in calibrations:
-        own: dict[str, Floats] = {'rate': np.zeros((1, 3)), 'previous': np.zeros((1, 3))}
-        if 'time' in run.poses:
-            own['time'] = np.array([np.median(run.poses['time'])])
-        if 'std' in run.poses:
-            own['std'] = run.units.to_g(np.median(run.poses['std'], axis=0))[np.newaxis]
-        contexts.append({**own, **common})
-    return contexts
-
-
 def _notes_of(given: Sequence[Comparable], names: tuple[str, ...], deviation: Floats,
               noisier: Sequence[int]) -> Iterator[str]:
     """Yield notes that limit the meaning; the (n, t) deviation is 0 where a model omits one."""
     calibrations = [run.calibration for run in given]
-    yield from _shared(calibrations)
+    rows = [{tuple(row) for row in (run.poses.reading / run.force_per_g).round(7).tolist()}
+            for run in calibrations]
+    for (i, first), (j, second) in combinations(enumerate(rows, 1), 2):
+        common, least = len(first & second), min(len(first), len(second))
+        if common:
+            what = 'all their poses' if common == least else counted(common, 'pose')
+            yield (f'runs {i} and {j} share {what}: they are not independent, so their agreement '
+                   'means little')
     for k, run in enumerate(given, 1):
         if run.calibration is not run.sure:
             yield (f'run {k} (model {run.calibration.name}) omits parameters of model '
@@ -71,18 +62,6 @@ def _notes_of(given: Sequence[Comparable], names: tuple[str, ...], deviation: Fl
     for k in noisier:
         yield (f'the poses of run {k + 1} repeat significantly worse than those of the others: '
                'the run has less weight')
-
-
-def _shared(calibrations: Sequence[Calibration]) -> Iterator[str]:
-    """Yield notes about runs with common poses."""
-    rows = [{tuple(row) for row in (run.poses.reading / run.force_per_g).round(7).tolist()}
-            for run in calibrations]
-    for (i, first), (j, second) in combinations(enumerate(rows, 1), 2):
-        common, least = len(first & second), min(len(first), len(second))
-        if common:
-            what = 'all their poses' if common == least else counted(common, 'pose')
-            yield (f'runs {i} and {j} share {what}: they are not independent, so their agreement '
-                   'means little')
 
 
 def _left_out(names: tuple[str, ...], deviation: Floats) -> Iterator[str]:
@@ -245,20 +224,43 @@ def compare_runs(given: Sequence[Comparable]) -> Comparison:
     stated = np.sqrt(np.maximum([np.diag(run.spread(names, run.given.sure.covariance))
                                  for run in prepared], 0.0))
     (chi2, rank), p_value = runs.squared, runs.p_value
+    parameters = []
+    for name, column, sds in zip(names, values.T, stated.T, strict=True):
+        spread, typical = float(np.std(column, ddof=1)), rms(sds)
+        parameters.append(Parameter(name, column, sds, spread,
+                                    spread / typical if typical > 0.0 else None))
+    up = np.array([run.free.axes[:, 2] for run in prepared if run.given.calibration.is_levelled])
+    tilt_deg = None
+    if len(up) > 1:
+        apart = np.max(np.linalg.norm(up[:, np.newaxis] - up, axis=2))
+        tilt_deg = float(np.degrees(2.0 * np.arcsin(apart / 2.0)))
     return Comparison(
         p_value >= LEVEL, p_value, chi2, rank, outlier(runs) if p_value < LEVEL else None,
-        _each(prepared, p_values(runs)),
-        tuple(_parameter(*column) for column in zip(names, values.T, stated.T, strict=True)),
-        _tilt_deg(prepared), tuple(_notes_of(given, names, stated, scaled.noisier)))
+        _each(prepared, p_values(runs)), tuple(parameters), tilt_deg,
+        tuple(_notes_of(given, names, stated, scaled.noisier)))
 
 
 def _prepared(given: Sequence[Comparable], covariances: Sequence[Floats]) -> list[_Prepared]:
-    """Return each calibration with its context and parameters in the common unit."""
+    """
+    Return each calibration with its context and parameters in the common unit.
+
+    The context is one row: medians over the poses, and no motion.
+
+    """
     calibrations = [run.calibration for run in given]
     per_g = float(np.mean([run.units.per_g for run in calibrations]))
+    common = {key: np.array([np.mean([np.median(run.poses[key]) for run in calibrations
+                                      if key in run.poses])])
+              for key in _COMMON if any(key in run.poses for run in calibrations)}
     found = []
-    for run, context, covariance in zip(given, _contexts_of(calibrations), covariances,
-                                        strict=True):
+    for run, covariance in zip(given, covariances, strict=True):
+        poses, still = run.calibration.poses, np.zeros((1, 3))
+        context: dict[str, Floats] = {'rate': still, 'previous': still, **common}
+        if 'time' in poses:
+            context['time'] = np.array([np.median(poses['time'])])
+        if 'std' in poses:
+            std = np.median(poses['std'], axis=0)
+            context['std'] = run.calibration.units.to_g(std)[np.newaxis]
         free = rotation_free(run.calibration, context, per_g)
         slope = rotation_free(run.sure, context, per_g).slope
         found.append(_Prepared(run, context, free, slope, covariance))
@@ -270,11 +272,6 @@ def _into(names: tuple[str, ...], run: RotationFree, rows: Floats) -> Floats:
     found = np.zeros((len(names), *rows.shape[1:]))
     found[[names.index(name) for name in run.names]] = rows
     return found
-
-
-def _parameter(name: str, values: Floats, stated: Floats) -> Parameter:
-    spread, typical = float(np.std(values, ddof=1)), rms(stated)
-    return Parameter(name, values, stated, spread, spread / typical if typical > 0.0 else None)
 
 
 def _each(prepared: Sequence[_Prepared], chances: Floats) -> tuple[Run, ...]:
@@ -294,15 +291,6 @@ def _each(prepared: Sequence[_Prepared], chances: Floats) -> tuple[Run, ...]:
                         float(np.abs(away[largest])) * MG, OVER_THE_SPHERE[largest],
                         float(chance)))
     return tuple(runs)
-
-
-def _tilt_deg(prepared: Sequence[_Prepared]) -> float | None:
-    """Return the largest angle between the directions of up of levelled runs [°]."""
-    up = [run.free.axes[:, 2] for run in prepared if run.given.calibration.is_levelled]
-    if len(up) < 2:
-        return None
-    apart = np.linalg.norm(np.array(up)[:, np.newaxis] - np.array(up), axis=2)
-    return float(np.degrees(2.0 * np.arcsin(np.max(apart) / 2.0)))
 
 
 _FIRST = datetime.min.replace(tzinfo=timezone.utc)
@@ -389,12 +377,17 @@ def history_of(calibrations: Sequence[Calibration]) -> History:
     if not undated:
         moments.sort(key=lambda moment: moment.when or _FIRST)
     ordered = tuple(runs[moment.index] for moment in moments)
-    whole = compare_runs(ordered)
+    whole, changes = compare_runs(ordered), []
+    for pair in pairwise(ordered):
+        comparison = compare_runs(pair)
+        steps = [(each.name, float(each.values[1] - each.values[0]),
+                  float(np.hypot(*each.stated_sd))) for each in comparison.parameters]
+        most = max(steps, key=lambda each: abs(each[1]) / each[2] if each[2] > 0.0 else 0.0)
+        changes.append(DatedChange(comparison, *most))
     notes = [f'calibration {number} has no date: the order is that of the input'
              for number in undated]
-    return History(tuple(moments), whole.parameters,
-                   tuple(_change_in(compare_runs(pair)) for pair in pairwise(ordered)),
-                   whole, (*notes, *whole.notes), ordered)
+    return History(tuple(moments), whole.parameters, tuple(changes), whole,
+                   (*notes, *whole.notes), ordered)
 
 
 def _moment(index: int, calibration: Calibration) -> Moment:
@@ -410,11 +403,3 @@ def _moment(index: int, calibration: Calibration) -> Moment:
                              'correct date: in the file') from None
         when = when.replace(tzinfo=when.tzinfo or timezone.utc).astimezone(timezone.utc)
     return Moment(index, when, calibration.name, warm, calibration.quality.rms_after_mg)
-
-
-def _change_in(comparison: Comparison) -> DatedChange:
-    """Return the change from the first to the second of two calibrations."""
-    changes = [(each.name, float(each.values[1] - each.values[0]),
-                float(np.hypot(*each.stated_sd))) for each in comparison.parameters]
-    most = max(changes, key=lambda each: abs(each[1]) / each[2] if each[2] > 0.0 else 0.0)
-    return DatedChange(comparison, *most)

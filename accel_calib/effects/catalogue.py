@@ -311,14 +311,11 @@ def empirical_name(carrier: str, variable: str, modes: Iterable[int]) -> str:
     return '-'.join([EMPIRICAL, carrier, variable, *map(str, modes)])
 
 
-_ONLY_CARRIER = {'force': 'offset', 'direction': 'force'}
-
-
 def curve_pairs(quantities: Iterable[str] = ()) -> Iterator[tuple[str, str]]:
     """Yield the carriers and variables of empirical curves; the quantities are variables, too."""
     for variable in (*VARIABLES, *quantities):
         for carrier in CARRIERS:
-            if carrier == _ONLY_CARRIER.get(variable, carrier):
+            if carrier == {'force': 'offset', 'direction': 'force'}.get(variable, carrier):
                 yield carrier, variable
 
 

@@ -286,10 +286,6 @@ class Effect:
         """Return whether the temperature of this effect lags behind, or runs ahead."""
         return bool(self.lagged) and bool(shape[0] != 0.0)
 
-    def needs_of(self, shape: Floats) -> tuple[str, ...]:
-        """Return the columns that the effect needs with this shape; a lag needs the time."""
-        return (*self.needs, 'time') if self.is_lagged(shape) else self.needs
-
     def over_of(self, shape: Floats) -> tuple[str, ...]:
         """Return the columns that the factor is a function of with this shape."""
         return (self.lagged,) if self.is_lagged(shape) else self.over or self.needs

@@ -33,8 +33,6 @@ _CONSTANTS = np.geomspace(0.05, 5.0, 93)
 _WAVES = np.arange(0.5, MODES + 1.0, 0.025)
 """Half waves of a sine that are tried in the range of the variable."""
 
-_COUNT = 201
-
 _Expression = Callable[[Sequence[float]], str]
 _Form = tuple[Floats, _Expression]
 """The (k, g) functions of a form, and the expression of their k factors."""
@@ -57,7 +55,7 @@ def formula_of(name: str, values: Floats, deviations: Mapping[str, float]) -> st
     whole, _, part = carrier.partition('.')
     names = (part,) if part else CARRIERS[whole]
     low, high = (-1.0, 1.0) if variable == 'force' else values[-2:].tolist()
-    share = np.linspace(0.0, 1.0, _COUNT)
+    share = np.linspace(0.0, 1.0, 201)
     waves = np.cos(np.pi * np.multiply.outer(np.array(modes), share))
     factors, sizes = (each[:len(names) * len(modes)].reshape(len(modes), len(names)).T * MG
                       for each in (values, spread))

@@ -49,8 +49,15 @@ class Terms:
     The t terms of a list of effects as arrays, so that a model adds all of them at once.
 
     `parts` are the values of each effect among all p values, and `rows` its terms. Each term has
-    its `place` in `monomials` (those of `MONOMIALS` that are used), the `axis` of the reading, the
-    place of its `value` among all values, and its constant factor `weight`.
+    its index `monomial` in `MONOMIALS` and its `place` in `monomials` (those that are used), the
+    `axis` of the reading, the place of its `value` among all values, and its constant factor
+    `weight`; (t,) arrays.
+
+    `to_affine` (12, t) sums the affine terms into V and, row by row, W - I, `to_value` (p, t) sums
+    terms by value, and `bends_to_axis` (3, b) sums by axis the terms `bending` (b,), which bend
+    with the force. `scaling` is the index of a term that scales gains, of its value, and (g,) of
+    the terms that it scales; None without one. `fixed` is whether all terms are independent of the
+    context, and `of_force` the names of own effects that are functions of the force, too.
 
     """
 
@@ -59,61 +66,18 @@ class Terms:
     parts: tuple[slice, ...]
     rows: tuple[slice, ...]
     monomials: tuple[int, ...]
+    monomial: Indices
     place: Indices
     axis: Indices
     value: Indices
     weight: Floats
-
-    @cached_property
-    def size(self) -> int:
-        """p, the number of values."""
-        return self.parts[-1].stop if self.parts else 0
-
-    @cached_property
-    def monomial(self) -> Indices:
-        """(t,) array, the index of each term in `MONOMIALS`."""
-        return np.array(self.monomials, np.intp)[self.place]
-
-    @cached_property
-    def to_affine(self) -> Floats:
-        """(12, t) array that sums the affine terms into V and, row by row, W - I."""
-        slot = np.where(self.monomial == ONE, self.axis,
-                        3 + 3 * self.axis + self.monomial - FORCE)
-        return _sums(np.where(self.monomial < AFFINE, slot, -1), 12)
-
-    @cached_property
-    def to_value(self) -> Floats:
-        """(p, t) array that sums terms by value."""
-        return _sums(self.value, self.size)
-
-    @cached_property
-    def bending(self) -> Indices:
-        """(b,) array, the terms that bend with the force."""
-        return np.flatnonzero(self.monomial >= AFFINE)
-
-    @cached_property
-    def bends_to_axis(self) -> Floats:
-        """(3, b) array that sums the bending terms by axis."""
-        return _sums(self.axis[self.bending], 3)
-
-    @cached_property
-    def scaling(self) -> tuple[int, int, Indices] | None:
-        """Index of a term that scales gains, of its value, and (g,) of the terms it scales."""
-        for effect, part, rows in zip(self.effects, self.parts, self.rows, strict=True):
-            if effect.scales:
-                gains = np.flatnonzero((self.monomial >= FORCE) & (self.monomial < AFFINE))
-                return rows.start, part.start, gains[(gains < rows.start) | (gains >= rows.stop)]
-        return None
-
-    @cached_property
-    def fixed(self) -> bool:
-        """Whether all terms are independent of the context."""
-        return all(effect.factor is None for effect in self.effects)
-
-    @cached_property
-    def of_force(self) -> tuple[str, ...]:
-        """Names of the own effects that are functions of the force, too."""
-        return tuple(name for name, effect in zip(self.names, self.effects) if effect.of_force)
+    to_affine: Floats
+    to_value: Floats
+    bending: Indices
+    bends_to_axis: Floats
+    scaling: tuple[int, int, Indices] | None
+    fixed: bool
+    of_force: tuple[str, ...]
 
     def monomials_at(self, u: Floats) -> Floats:
         """Return the (m, n) monomials of (n, 3) forces."""
@@ -158,19 +122,31 @@ def terms_of(names: tuple[str, ...]) -> Terms:
             raise ValueError(f'effect is {name!r}, expected one of {", ".join(EFFECTS)}')
     effects = tuple(effect_named(name) for name in names)
     used = sorted({term.monomial for effect in effects for term in effect.terms} | {ONE})
-    parts, rows = (_consecutive(map(len, each)) for each in (
-        [effect.values for effect in effects], [effect.terms for effect in effects]))
-    place, axis, value, weight = np.array([
-        (used.index(term.monomial), term.axis, part.start + term.parameter, term.weight)
-        for effect, part in zip(effects, parts) for term in effect.terms]).reshape(-1, 4).T
-    return Terms(names, effects, parts, rows, tuple(used), place.astype(np.intp),
-                 axis.astype(np.intp), value.astype(np.intp), weight)
-
-
-def _consecutive(sizes: Iterable[int]) -> tuple[slice, ...]:
-    """Return the slices of these sizes in a row."""
-    ends = [0, *accumulate(sizes)]
-    return tuple(map(slice, ends, ends[1:]))
+    ends = [[0, *accumulate(map(len, each))] for each in (
+        [effect.values for effect in effects], [effect.terms for effect in effects])]
+    parts, rows = (tuple(map(slice, each, each[1:])) for each in ends)
+    terms = [(term, part.start + term.parameter) for effect, part in zip(effects, parts)
+             for term in effect.terms]
+    monomial, place, axis, value = np.array([
+        (term.monomial, used.index(term.monomial), term.axis, at) for term, at in terms],
+        np.intp).reshape(-1, 4).T.copy()
+    is_affine = monomial < AFFINE
+    slot = np.where(monomial == ONE, axis, 3 + 3 * axis + monomial - FORCE)
+    bending = np.flatnonzero(~is_affine)
+    scaling: tuple[int, int, Indices] | None = None
+    for effect, part, own in zip(effects, parts, rows):
+        if effect.scales:
+            gains = np.flatnonzero((monomial >= FORCE) & is_affine)
+            scaling = own.start, part.start, gains[(gains < own.start) | (gains >= own.stop)]
+            break
+    return Terms(
+        names, effects, parts, rows, tuple(used), monomial, place, axis, value,
+        weight=np.array([term.weight for term, _ in terms], float),
+        to_affine=_sums(np.where(is_affine, slot, -1), 12),
+        to_value=_sums(value, ends[0][-1]), bending=bending,
+        bends_to_axis=_sums(axis[bending], 3), scaling=scaling,
+        fixed=all(effect.factor is None for effect in effects),
+        of_force=tuple(name for name, effect in zip(names, effects) if effect.of_force))
 
 
 def _sums(index: Indices, size: int) -> Floats:
@@ -311,14 +287,6 @@ class _Change(NamedTuple):
     shape: Floats
     place: int
 
-    def of_factors(self, alone: Floats, scales: Floats, context: Context) -> Floats:
-        """Return the derivative of the factors by the value; arguments from `Model`."""
-        if self.effect is None or self.effect.factor is None:
-            return alone[self.rows] * alone[self.place]
-        change = difference(self.effect.factor, context, self.shape, self.place,
-                            self.effect.bounds)
-        return np.nan_to_num(change) * scales[self.rows]
-
 
 @dataclass(frozen=True, eq=False)
 class Model(Record):
@@ -366,9 +334,9 @@ class Model(Record):
 
     @cached_property
     def needs(self) -> tuple[str, ...]:
-        """Keys of the context that the model needs."""
-        return tuple(dict.fromkeys(key for effect, shape in self._by_effect
-                                   for key in effect.needs_of(shape)))
+        """Keys of the context that the model needs; a lag needs the time."""
+        return tuple(dict.fromkeys(key for effect, shape in self._by_effect for key in (
+            *effect.needs, *(['time'] if effect.is_lagged(shape) else []))))
 
     @cached_property
     def over(self) -> tuple[str, ...]:
@@ -409,7 +377,7 @@ class Model(Record):
     @cached_property
     def fitted(self) -> NDArray[np.bool_]:
         """(p,) mask of the values that a fit changes."""
-        found = np.zeros(self.terms.size, bool)
+        found = np.zeros(len(self.vector), bool)
         for part, (effect, shape) in zip(self.terms.parts, self._by_effect, strict=True):
             end = part.stop - len(shape)
             found[part.start:end] = True
@@ -503,8 +471,14 @@ class Model(Record):
         scales = self._scales(alone)
         found = [plain * (alone * scales)]
         for each in self._changes:
+            if each.effect is None or each.effect.factor is None:
+                change = alone[each.rows] * alone[each.place]
+            else:
+                change = np.nan_to_num(difference(
+                    each.effect.factor, context, each.shape, each.place, each.effect.bounds)
+                    ) * scales[each.rows]
             values = self.vector[self.terms.value[each.rows]][:, np.newaxis]
-            found.append(plain[each.rows] * values * each.of_factors(alone, scales, context))
+            found.append(plain[each.rows] * values * change)
         return replace(self.rows, terms=np.concatenate(found))
 
     @cached_property
@@ -515,7 +489,7 @@ class Model(Record):
         value = np.concatenate([terms.value, *(np.full(len(every[each.rows]), each.value)
                                                for each in self._changes)])
         return Basis(terms.weight[which, np.newaxis], terms.place[which], terms.axis[which],
-                     _sums(value, terms.size))
+                     _sums(value, len(self.vector)))
 
     @cached_property
     def _changes(self) -> tuple[_Change, ...]:

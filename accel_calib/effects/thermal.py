@@ -389,27 +389,21 @@ class ThermalStream:
         if not len(order):
             return found
         moments, warm = time[order], temperature[order]
-        before = self._before(float(moments[0]), float(warm[0]))
-        moments = np.maximum(moments, before[0])
-        for key, values in self._columns(before, moments, warm).items():
-            found[key][order] = values
-        self._set_value(float(moments[-1]), float(warm[-1]))
-        return found
-
-    def _columns(self, before: tuple[float, float], time: Floats, temperature: Floats
-                 ) -> dict[str, Floats]:
-        """Return the columns of sorted samples, and keep the low passes of the last one."""
-        rate = self._rates(time, temperature) if self._uses_rate else np.zeros(len(time))
-        times, warm = np.append(before[0], time), np.append(before[1], temperature)
-        found = {'temperature_rate': rate} if self._gives_rate else {}
+        before, warm_before = self._before(float(moments[0]), float(warm[0]))
+        moments = np.maximum(moments, before)
+        rate = self._rates(moments, warm) if self._uses_rate else np.zeros(len(moments))
+        if self._gives_rate:
+            found['temperature_rate'][order] = rate
+        step, rise = np.diff(moments, prepend=before), np.diff(warm, prepend=warm_before)
         for key, lag in self._lags.items():
             if lag.of_sensor:
-                found[key] = temperature + lag.seconds * rate
+                found[key][order] = warm + lag.seconds * rate
                 continue
-            steps = _behind(np.diff(times), np.diff(warm), lag.seconds, None)
-            behind = _decayed(times, steps, lag.seconds, self._behind[key])[1:]
-            found[key] = temperature - behind
+            behind = _decayed(np.append(before, moments), _behind(step, rise, lag.seconds, None),
+                              lag.seconds, self._behind[key])[1:]
+            found[key][order] = warm - behind
             self._behind[key] = float(behind[-1])
+        self._set_value(float(moments[-1]), float(warm[-1]))
         return found
 
     def _rates(self, time: Floats, temperature: Floats) -> Floats:

@@ -34,9 +34,8 @@ the sensors are within the distance that contains half of a normal distribution.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TypeVar
 from urllib.parse import unquote
 
 import numpy as np
@@ -67,15 +66,11 @@ _EFFICIENCY = 0.37
 _SAMPLE = 400
 """Differences of a month that are kept."""
 
-_SEED = 1
-
 COLUMNS = ('key', 'sensor_model', 'recording', 'date', 'status', 'error', 'advice', 'rating',
            'calibration', 'determined', 'effects', 'parameters', 'prior_values',
            'prior_covariance', *(column for name in NAMES for column in (name, f'{name}.sd')))
 """Columns of the rows of recordings from which a digest is made."""
 
-
-_Item = TypeVar('_Item')
 
 Odd = tuple[str, str, float, float]
 """Sensor, name of a value, the value, and its distance from the median in spreads."""
@@ -144,14 +139,6 @@ class Digest:
     typical: list[Typical]
 
 
-def _grouped(items: Iterable[_Item], key: Callable[[_Item], str]) -> dict[str, list[_Item]]:
-    """Return the items by their key, in the order in which they are."""
-    found: dict[str, list[_Item]] = defaultdict(list)
-    for each in items:
-        found[key(each)].append(each)
-    return found
-
-
 def digest_of(name: str, store: Store) -> Digest:
     """Return the digest of a sensor by the name of its folder; it runs on a worker."""
     return digest(unquote(name), store.of_sensor(name, COLUMNS))
@@ -160,25 +147,21 @@ def digest_of(name: str, store: Store) -> Digest:
 def digest(sensor: str, rows: Sequence[Row]) -> Digest:
     """Return the digest of the rows of a sensor, in order of date; without a name, no values."""
     named = rows if sensor != UNKNOWN else ()
-    good = alike(named)
-    values, differences = _values_of(good) if good else (None, [])
+    good, known, differences = alike(named), None, []
+    if good:
+        values, deviations = table_of(good)
+        known = Values(
+            np.mean(values, axis=0), np.sqrt(np.sum(deviations ** 2, axis=0)) / len(good),
+            {each['name']: each['value'] for each in good[-1]['parameters']
+             if each['name'].partition('.')[0] not in LADDER})
+        away = values - np.median(values, axis=0)
+        differences = [(row['date'][:7], change) for row, change in zip(good, away, strict=True)
+                       if row.get('date') and len(good) > 1]
     return Digest(
         sensor, model_of(rows), Counter(row['rating'] or row['status'] for row in rows),
         [row for row in rows if row['status'] != 'ok'][:MOST_ERRORS],
-        sum(bool(row['calibration']) for row in rows) - len(good), values, differences,
+        sum(bool(row['calibration']) for row in rows) - len(good), known, differences,
         typical_of(named))
-
-
-def _values_of(rows: Sequence[Row]) -> tuple[Values, list[tuple[str, Floats]]]:
-    """Return the values of rows that can be compared, and their differences by month."""
-    values, deviations = table_of(rows)
-    away = values - np.median(values, axis=0)
-    effects = {each['name']: each['value'] for each in rows[-1]['parameters']
-               if each['name'].partition('.')[0] not in LADDER}
-    return (Values(np.mean(values, axis=0), np.sqrt(np.sum(deviations ** 2, axis=0)) / len(rows),
-                   effects),
-            [(row['date'][:7], change) for row, change in zip(rows, away, strict=True)
-             if row.get('date') and len(rows) > 1])
 
 
 @dataclass(frozen=True)
@@ -207,7 +190,7 @@ class Overview:
 
 def overview(digests: Iterable[Digest]) -> Overview:
     """Return the statistics of the sensors, which are in order of their names."""
-    found, rng = Overview(), np.random.default_rng(_SEED)
+    found, rng = Overview(), np.random.default_rng(1)
     for each in digests:
         found.counts.update(each.counts)
         found.errors += each.errors[:MOST_ERRORS - len(found.errors)]
@@ -260,11 +243,13 @@ def rating_of(known: Overview, sensors: Sequence[Row]) -> Rating:
 
 def shared_effects(values: Mapping[str, Values]) -> list[str]:
     """Return a line per value beyond V and W that two or more sensors have, with its range."""
-    found = _grouped((each for own in values.values() for each in own.effects.items()),
-                     lambda each: each[0])
+    found: dict[str, list[float]] = defaultdict(list)
+    for own in values.values():
+        for name, value in own.effects.items():
+            found[name].append(value)
     lines = []
     for name, known in sorted(found.items(), key=lambda each: -len(each[1])):
-        low, high = np.quantile([value for _, value in known], [0.1, 0.9])
+        low, high = np.quantile(known, [0.1, 0.9])
         _, factor, unit = scale_of(name)
         if len(known) > 1:
             lines.append(f'{len(known)} of {counted(len(values), "sensor")}: {name} '
@@ -282,8 +267,6 @@ _SURE = 50.0
 _DOF = 4.0
 """Degrees of freedom of the distribution over sensors; few give odd sensors little weight."""
 
-_STEPS = 200
-_CONVERGED = 1e-8
 _LEAST_SPREAD_G = 1e-5
 """Smallest spread over sensors [g], far below that of any sensors."""
 
@@ -300,11 +283,12 @@ def typical_of(rows: Iterable[Row]) -> list[Typical]:
 
 def priors_of(sensors: Iterable[Typical]) -> dict[str, FleetPrior]:
     """Return the typical values of the models with at least `FEWEST` sensors."""
-    by_model = _grouped(sensors, lambda each: each[0])
-    return {model: FleetPrior(model, len(chosen), estimated(
-        np.array([values for _, values, _ in chosen]),
-        np.array([covariance for _, _, covariance in chosen])))
-        for model, chosen in sorted(by_model.items()) if len(chosen) >= FEWEST}
+    by_model: dict[str, list[list[Floats]]] = defaultdict(list)
+    for model, *known in sensors:
+        by_model[model].append(known)
+    return {model: FleetPrior(model, len(chosen), estimated(*(
+        np.array(each) for each in zip(*chosen))))
+            for model, chosen in sorted(by_model.items()) if len(chosen) >= FEWEST}
 
 
 def estimated(values: Floats, covariances: Floats) -> Prior:
@@ -313,10 +297,17 @@ def estimated(values: Floats, covariances: Floats) -> Prior:
     mean = np.median(values, axis=0)
     spread = np.median(np.abs(values - mean), axis=0) / 0.6745 + _LEAST_SPREAD_G
     covariance: Floats = np.diag(spread ** 2)
-    for _ in range(_STEPS):
-        before = covariance
-        mean, covariance = _step(values, covariances, mean, covariance)
-        if np.max(np.abs(covariance - before)) <= _CONVERGED * np.max(covariance):
+    for _ in range(200):
+        before, away = covariance, values - mean  # a step of expectation maximisation
+        gain = covariance @ np.linalg.inv(covariance + covariances)  # (n, p, p)
+        weight = (_DOF + size) / (_DOF + _squared(away, covariance + covariances))
+        likely = np.einsum('npq,nq->np', gain, away)
+        centre = mean + weight @ likely / np.sum(weight)
+        off = mean + likely - centre
+        spread = np.einsum('n,np,nq->pq', weight, off, off) + np.sum(
+            covariance - gain @ covariance, axis=0)
+        mean, covariance = centre, (spread + spread.T) / (2.0 * count)
+        if np.max(np.abs(covariance - before)) <= 1e-8 * np.max(covariance):
             break
     share = count / (count + _SURE)
     shrunk = share * covariance + (1.0 - share) * np.diag(np.diag(covariance))
@@ -329,17 +320,3 @@ def _squared(away: Floats, covariances: Floats) -> Floats:
     """Return the (n,) squared distances, per (n, p, p) covariance."""
     solved = np.linalg.solve(covariances, away[:, :, np.newaxis])[:, :, 0]
     return np.einsum('np,np->n', away, solved)
-
-
-def _step(values: Floats, covariances: Floats, mean: Floats, covariance: Floats
-          ) -> tuple[Floats, Floats]:
-    """Return mean and covariance after a step of expectation maximisation."""
-    away = values - mean
-    gain = covariance @ np.linalg.inv(covariance + covariances)  # (n, p, p)
-    likely = np.einsum('npq,nq->np', gain, away)
-    weight = (_DOF + values.shape[1]) / (_DOF + _squared(away, covariance + covariances))
-    left = covariance - gain @ covariance
-    centre = mean + weight @ likely / np.sum(weight)
-    off = mean + likely - centre
-    spread = np.einsum('n,np,nq->pq', weight, off, off) + np.sum(left, axis=0)
-    return centre, (spread + spread.T) / (2.0 * len(values))

@@ -146,29 +146,24 @@ def _typical(fleet: FleetPrior) -> str:
 
 def _changes(sensors: Sequence[Row]) -> str:
     """Return the section of the sensors whose calibrations differ."""
-    rows = [line for row in sensors for line in _change_lines(row)]
-    if not rows:
-        return ''
-    return section('Sensors that changed', paragraph(
+    rows = []
+    for row in sensors:
+        sensor, drift = row['sensor'], row.get('drift')
+        for change in row['changes']:
+            date, path = (change['date'] or '')[:10], change.get('recording') or ''
+            rows.append((sensor, f'{date} {path}'.strip(), _change_words(change),
+                         _LASTING[change['for_good']]))
+        if drift and drift['p_value'] < _DRIFTS:
+            words = change_words(drift['parameter'], drift['per_year'], drift['sd'])
+            rows.append((sensor, '', f'{words} per year', 'drift'))
+        elif not row['changes']:
+            rows.append((sensor, '', 'no step or drift that is significant alone', ''))
+    return '' if not rows else section('Sensors that changed', paragraph(
         f'The calibrations of {counted(len(sensors), "sensor")} differ by more than their '
         'uncertainty. A change is for good if the next calibration differs from the values before '
         'it, too.'), scroll_table(
         'Sensors that changed', ('sensor', 'first recording after it', 'change', 'lasts'),
         rows[:_MOST], '', long=len(rows) > _LONG), _not_shown(len(rows) - _MOST, 'line'))
-
-
-def _change_lines(row: Row) -> Iterator[tuple[str, str, str, str]]:
-    """Yield the changes of a sensor, or its drift."""
-    sensor, drift = row['sensor'], row.get('drift')
-    for change in row['changes']:
-        date, path = (change['date'] or '')[:10], change.get('recording') or ''
-        yield (sensor, f'{date} {path}'.strip(), _change_words(change),
-               _LASTING[change['for_good']])
-    if drift and drift['p_value'] < _DRIFTS:
-        words = change_words(drift['parameter'], drift['per_year'], drift['sd'])
-        yield sensor, '', f'{words} per year', 'drift'
-    elif not row['changes']:
-        yield sensor, '', 'no step or drift that is significant alone', ''
 
 
 def _over_time(store: Store, sensors: Sequence[Row], differ: Sequence[Row],
@@ -206,10 +201,6 @@ def _not_shown(count: int, what: str) -> str:
 
 # ----------------------------------------------------------------------------- figures
 
-_PARTS = (0.05, 0.25, 0.5, 0.75, 0.95)
-"""Quantiles of the drift of a fleet."""
-
-_MOST_BARS = 40
 _ROOM = 6.0
 """Range of a histogram, in distances of the 10 % and 90 % quantiles from the median."""
 
@@ -223,7 +214,6 @@ _MOST_DATES = 40
 _FEW = 12
 """Number of calibrations up to which each has a marker."""
 
-_FEWEST_MONTHS = 3
 _COLOURS = (AFTER, THIRD, BEFORE)
 
 
@@ -249,20 +239,16 @@ def _draw_histogram(panel: Any, name: str, column: Floats, odd: Sequence[Odd]) -
     low, middle, high = np.quantile(values, [0.1, 0.5, 0.9])
     reach = _ROOM * max(high - middle, middle - low) or float(np.max(np.abs(values - middle)))
     shown = values[np.abs(values - middle) <= reach]
-    bars = int(np.clip(2.0 * np.sqrt(len(shown)), 5, _MOST_BARS))
+    bars = int(np.clip(2.0 * np.sqrt(len(shown)), 5, 40))
     heights, edges = np.histogram(shown, bars)
     panel.stairs(heights, edges, fill=True, color=AFTER, alpha=0.45)
     panel.axvline(middle, color=BEFORE, linewidth=1.2)
     panel.text(0.01, 0.95, name.partition('.')[2], transform=panel.transAxes, va='top')
     panel.locator_params(axis='y', integer=True, nbins=3)
-    if odd:
-        _draw_odd(panel, name, odd, middle, reach, 0.12 * max(float(np.max(heights)), 1.0))
-
-
-def _draw_odd(panel: Any, name: str, odd: Sequence[Odd], middle: float, reach: float,
-              height: float) -> None:
-    """Mark the odd sensors, at the edge if they are farther than `reach` from the middle."""
-    zero, factor, _ = scale_of(name)
+    if not odd:
+        return
+    # The odd sensors are marked, at the edge if they are farther away.
+    height = 0.12 * max(float(np.max(heights)), 1.0)
     at = (np.array([each[2] for each in odd]) - zero) * factor
     places = np.clip(at, middle - reach, middle + reach)
     panel.plot(places, np.full(len(at), height), 'v', color=ACCENT, gid=name, markersize=7.0,
@@ -289,8 +275,8 @@ def _short_name(name: str) -> str:
 
 def _of_months(prefix: str, known: OfModel) -> Iterator[Drawing]:
     """Yield the drift of all sensors of a model together, as bands of quantiles by month."""
-    months, found = known.months.quantiles(_PARTS)
-    if len(months) < _FEWEST_MONTHS:
+    months, found = known.months.quantiles((0.05, 0.25, 0.5, 0.75, 0.95))
+    if len(months) < 3:
         return
     days = np.array([f'{month}-15' for month in months], 'datetime64[D]').astype(float)
     for key, words, names in GROUPS:
@@ -328,7 +314,14 @@ def _of_sensor(name: str, sensor: str, rows: Sequence[Row], changes: Sequence[Ma
             for place, change in marked:
                 panel.axvline(at[place], color=ACCENT, linewidth=1.4, linestyle='-'
                               if change['for_good'] else (0, (2, 3)))
-        hover = _mark_changes(panels[0], shown, at, marked)
+        hover: dict[str, Marks] = {}
+        if marked:
+            along = at[[place for place, _ in marked]]
+            panels[0].plot(along, np.full(len(along), panels[0].get_ylim()[1]), 'v', color=ACCENT,
+                           gid='changes', clip_on=False, **EDGE)
+            hover['changes'] = tuple(
+                Mark(f'{shown[place]["recording"]}: {_change_words(change)}, '
+                     f'{_LASTING[change["for_good"]]}') for place, change in marked)
         label_dates(panels[-1], at, 'date of the recording', dated=dated)
         legend_below(figure, 3, *panels[0].get_legend_handles_labels())
     return Drawing(name, f'{sensor}: calibrations over time with 95 % band', figure, hover)
@@ -345,18 +338,6 @@ def _draw_group(panel: Any, names: Sequence[str], at: Floats, values: Floats, de
         panel.plot(at, middle, color=_COLOURS[k], linewidth=1.2, label='xyz'[k],
                    marker='o' if len(at) <= _FEW else None, markersize=2.5)
     return unit
-
-
-def _mark_changes(panel: Any, rows: Sequence[Row], at: Floats,
-                  changes: Sequence[tuple[int, Mapping[str, Any]]]) -> dict[str, Marks]:
-    """Mark the recordings with changes; return the texts of the marks."""
-    if not changes:
-        return {}
-    places = [place for place, _ in changes]
-    panel.plot(at[places], np.full(len(places), panel.get_ylim()[1]), 'v', color=ACCENT,
-               gid='changes', clip_on=False, **EDGE)
-    return {'changes': tuple(Mark(f'{rows[place]["recording"]}: {_change_words(change)}, '
-                                  f'{_LASTING[change["for_good"]]}') for place, change in changes)}
 
 
 def _change_words(change: Mapping[str, Any]) -> str:

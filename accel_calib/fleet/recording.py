@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 _MAGIC = '*?['
-_BLOCK = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -136,31 +135,23 @@ def _is_bag_folder(path: Path) -> bool:
 def _addresses(text: str) -> Iterator[Input]:
     """Yield the recordings of an address, in order."""
     system, path = _system(text)
+    magic = '*[' if '://' in path else _MAGIC  # ? begins the query of an address of the web
+    root = PurePosixPath(path)
+    first = next((k for k, part in enumerate(root.parts) if set(part) & set(magic)), None)
+    files, folders = list[str](), [path]
     with _as_input_error(text):
-        root, found = _found_at(system, path)
-    for each in sorted(found):
+        if first is not None:
+            root = PurePosixPath(*root.parts[:first])
+            found = system.glob(path, detail=True).items()
+            files, folders = ([each for each, about in found if about['type'] == kind]
+                              for kind in ('file', 'directory'))
+        elif system.isfile(path):
+            root, files, folders = root.parent, [path], []
+        for folder in folders:
+            files += [each for each in system.find(folder) if each.lower().endswith(SUFFIXES)]
+    for each in sorted(files):
         yield Input(system.unstrip_protocol(each),
                     PurePosixPath(each).relative_to(root).as_posix())
-
-
-def _found_at(system: Any, path: str) -> tuple[PurePosixPath, list[str]]:
-    """Return the folder above the recordings, and their paths in the file system."""
-    magic = '*[' if '://' in path else _MAGIC  # ? begins the query of an address of the web
-    parts = PurePosixPath(path).parts
-    first = next((k for k, part in enumerate(parts) if set(part) & set(magic)), None)
-    if first is None and system.isfile(path):
-        return PurePosixPath(path).parent, [path]
-    if first is None:
-        return PurePosixPath(path), _files_below(system, path)
-    found = system.glob(path, detail=True).items()
-    files = [each for each, about in found if about['type'] == 'file']
-    below = [file for each, about in found if about['type'] == 'directory'
-             for file in _files_below(system, each)]
-    return PurePosixPath(*parts[:first]), files + below
-
-
-def _files_below(system: Any, path: str) -> list[str]:
-    return [each for each in system.find(path) if each.lower().endswith(SUFFIXES)]
 
 
 @contextmanager
@@ -214,7 +205,7 @@ def content_hash(path: Path) -> str:
             name = os.fsencode(each.relative_to(path).as_posix())
             made.update(b'%d:%b%d:' % (len(name), name, each.stat().st_size))
         with each.open('rb') as file:
-            while block := file.read(_BLOCK):
+            while block := file.read(1 << 20):
                 made.update(block)
     return made.hexdigest()
 
@@ -311,7 +302,6 @@ Row = dict[str, Any]
 
 _TEXTS = ('key', 'content', 'recording', 'sensor_model', 'version', 'date', 'date_from', 'status',
           'error', 'advice', 'rating', 'rating_reason', 'model', 'refined', 'units', 'calibration')
-_COUNTS = ('poses', 'poses_used')
 _NUMBERS = ('rms_before_mg', 'rms_after_mg', 'held_out_rms_mg', 'noise_floor_mg', 'coverage',
             'temperature', 'seconds',
             *(column for name in NAMES for column in (name, f'{name}.sd')))
@@ -326,14 +316,14 @@ def schema() -> pa.Schema:
     """Return the columns of a row; the sensor is the name of its folder."""
     import pyarrow as pa
 
-    texts, numbers = pa.list_(pa.string()), pa.list_(pa.float64())
-    parameter = pa.struct([('name', pa.string()), ('value', pa.float64()), ('sd', pa.float64())])
+    text, count, number = pa.string(), pa.int64(), pa.float64()
+    parameter = pa.struct([('name', text), ('value', number), ('sd', number)])
     return pa.schema([
-        *((name, pa.string()) for name in _TEXTS), *((name, pa.int64()) for name in _COUNTS),
-        *((name, pa.float64()) for name in _NUMBERS), ('determined', pa.bool_()),
-        ('effects', texts), ('warnings', texts),
-        ('parameters', pa.list_(parameter)), ('prior_values', numbers),
-        ('prior_covariance', numbers)])
+        *((name, text) for name in _TEXTS), ('poses', count), ('poses_used', count),
+        *((name, number) for name in _NUMBERS), ('determined', pa.bool_()),
+        ('effects', pa.list_(text)), ('warnings', pa.list_(text)),
+        ('parameters', pa.list_(parameter)), ('prior_values', pa.list_(number)),
+        ('prior_covariance', pa.list_(number))])
 
 
 @dataclass(frozen=True)
@@ -391,23 +381,20 @@ def row_of(found: Input, path: Path, options: Options) -> tuple[Row, Calibration
     except OSError:
         raise  # it may be possible to read it later
     except Exception as err:  # also a defect of this program must not stop the other recordings
-        return row | _failed(known_error(err), str(path), found.path), None
+        error = known_error(err)
+        message = error.message.replace(str(path), found.path)  # the path can be that of a copy
+        return row | {'status': 'error', 'error': message, 'advice': error.advice}, None
     calibration = replace(outcome.calibration, date=row['date'])
     stored = outcome.rating.name != 'BAD'
     return row | _figures(intake, outcome), calibration if stored else None
-
-
-def _failed(error: AccelCalibError, copy: str = '', name: str = '') -> Row:
-    """Return the columns of an error, with the name of a recording for that of its copy."""
-    message = error.message.replace(copy, name) if copy else error.message
-    return {'status': 'error', 'error': message, 'advice': error.advice}
 
 
 def unread_row(found: Input, options: Options, error: AccelCalibError) -> Row:
     """Return the row of a recording that could not be read."""
     if (written := as_text(found.path)) != found.path:
         found = Input(written, '')
-    return _about(found, options, None, None) | _failed(error) | {'status': 'unread'}
+    return _about(found, options, None, None) | {
+        'status': 'unread', 'error': error.message, 'advice': error.advice}
 
 
 def as_text(name: str) -> str:

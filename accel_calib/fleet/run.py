@@ -67,8 +67,6 @@ _MOST_TOGETHER = 20
 _NEWEST = 0.2
 """Weight of the newest task in the mean duration of a recording."""
 
-_CONNECT_S = 30.0
-
 STATUS = ('ok', 'error', 'unread', 'skipped')
 """What can happen to a recording; unread: it could not be read, and is tried again."""
 
@@ -144,7 +142,7 @@ def cluster(address: str = '', workers: int | None = None) -> Iterator[Client]:
                     n_workers=workers, threads_per_worker=1, host=_HERE,
                     dashboard_address=f'{_HERE}:0', silence_logs='ERROR'))
             client = stack.enter_context(Client(
-                address or started, timeout=_CONNECT_S, set_as_default=False))
+                address or started, timeout=30.0, set_as_default=False))
         except (OSError, ValueError) as err:
             if not address:
                 raise
@@ -296,7 +294,8 @@ def mapped(client: Client, function: Callable[..., Any], items: Iterable[_Item],
     """
     from distributed import as_completed, KilledWorker
 
-    rest, suspects, pace = iter(items), list[_Item](), _Pace()
+    rest, suspects = iter(items), list[_Item]()
+    size, mean_s = 1, _TASK_S  # number of items per task, and the mean duration of an item [s]
     waiting: dict[Any, list[_Item]] = {}
     done, workers = as_completed(loop=client.loop), _Workers(client)
     limit = _AHEAD * max(sum(client.nthreads().values()), 1)
@@ -306,7 +305,7 @@ def mapped(client: Client, function: Callable[..., Any], items: Iterable[_Item],
             alone = bool(suspects)
         most = 1 if alone else 0 if suspects else limit
         while len(waiting) < most and (batch := [suspects.pop()] if alone else
-                                       list(islice(rest, pace.size))):
+                                       list(islice(rest, size))):
             future = client.submit(_each, KNOWN_CODE, function, batch, *others, pure=False)
             waiting[future] = batch
             done.add(future)
@@ -326,7 +325,8 @@ def mapped(client: Client, function: Callable[..., Any], items: Iterable[_Item],
                 continue
             results, seconds = [err], 0.0
         del future  # so that the scheduler forgets it
-        pace.add(len(batch), seconds)
+        mean_s += _NEWEST * (seconds / len(batch) - mean_s)
+        size = max(1, min(_MOST_TOGETHER, int(_TASK_S / max(mean_s, 1e-9))))
         yield from zip(batch, results, strict=True)
 
 
@@ -388,19 +388,6 @@ def _each(code: Mapping[str, bytes], function: Callable[..., Any], batch: Sequen
         except Exception as err:  # the program decides
             results.append(err)
     return results, time.perf_counter() - begin
-
-
-class _Pace:
-    """The number of items per task: about `_TASK_S` of work, beginning with one item."""
-
-    def __init__(self) -> None:
-        self.size = 1
-        self._seconds = _TASK_S
-
-    def add(self, count: int, seconds: float) -> None:
-        """Add a task of this many items; the newest tasks count most."""
-        self._seconds += _NEWEST * (seconds / count - self._seconds)
-        self.size = max(1, min(_MOST_TOGETHER, int(_TASK_S / max(self._seconds, 1e-9))))
 
 
 # ----------------------------------------------------------------------------- one recording

@@ -70,28 +70,24 @@ _NEEDED: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Store:
-    """The folder of the results; all workers must see it under this name."""
+    """
+    The folder of the results; all workers must see it under this name.
+
+    It has the data set in ``recordings``, rows to be merged in ``pending``, and the keys of rows
+    that are merged in ``done``.
+
+    """
 
     folder: Path
-
-    @property
-    def rows(self) -> Path:
-        """Return the folder of the Parquet data set."""
-        return self.folder / 'recordings'
 
     @property
     def sensors_file(self) -> Path:
         """Return the file of the rows of all sensors."""
         return self.folder / _SENSORS
 
-    @property
-    def pending(self) -> Path:
-        """Return the folder of the rows that are not in the data set yet."""
-        return self.folder / 'pending'
-
     def data(self, name: str) -> Path:
         """Return the Parquet file of a sensor, by the name of its folder."""
-        return self.rows / f'sensor={name}' / _DATA
+        return self.folder / 'recordings' / f'sensor={name}' / _DATA
 
     def has(self, key: str) -> bool:
         """Return whether the result with this key is in the data set."""
@@ -106,7 +102,7 @@ class Store:
         """
         import pyarrow as pa
 
-        folder = self.pending / as_folder(row['sensor'])
+        folder = self.folder / 'pending' / as_folder(row['sensor'])
         folder.mkdir(parents=True, exist_ok=True)
         text = json.dumps(row)
         pa.Table.from_pylist([json.loads(text)], schema())
@@ -115,7 +111,7 @@ class Store:
 
     def waiting(self) -> list[str]:
         """Return the folders of sensors with pending rows, in order."""
-        return sorted(each.name for each in self.pending.glob('*') if each.is_dir())
+        return sorted(each.name for each in self.folder.glob('pending/*') if each.is_dir())
 
     def merge(self, name: str) -> None:
         """
@@ -125,7 +121,7 @@ class Store:
         the next `merge` completes it.
 
         """
-        folder = self.pending / name
+        folder = self.folder / 'pending' / name
         paths = sorted(folder.glob('*.json'), key=lambda path: path.stat().st_mtime)
         new = [_pending_row(path) for path in paths]
         old, newest = self.of_sensor(name), {row['content']: row for row in new}
@@ -143,7 +139,7 @@ class Store:
 
     def finish(self, name: str) -> None:
         """Remove the pending rows of a sensor that are in the data set."""
-        folder = self.pending / name
+        folder = self.folder / 'pending' / name
         if not folder.exists():
             return
         for path in folder.iterdir():  # with temporary files of killed workers
@@ -167,7 +163,7 @@ class Store:
     def forget_lost(self) -> None:
         """Remove the marks of results of which a file is gone, so that they are made again."""
         known = {os.fsencode(each.parent.name.partition('=')[2])
-                 for each in self.rows.glob(f'sensor=*/{_DATA}')}
+                 for each in self.folder.glob(f'recordings/sensor=*/{_DATA}')}
         for mark in self.folder.glob('done/*/*'):
             name, _, calibration = mark.read_bytes().partition(b'\n')
             if name not in known or not (self.folder / os.fsdecode(calibration)).exists():
@@ -198,7 +194,7 @@ class Store:
 
     def sensors(self) -> list[str]:
         """Return the folders of all sensors in the data set, in order."""
-        names = (each.name.partition('=')[2] for each in self.rows.glob('sensor=*'))
+        names = (each.name.partition('=')[2] for each in self.folder.glob('recordings/sensor=*'))
         return sorted(name for name in names if name != UNREAD)
 
     def _mark(self, key: str) -> Path:
@@ -357,7 +353,11 @@ def _compared(calibrations: Sequence[Calibration], rows: Sequence[Row]) -> Row:
         if back or most is None or change.comparison.p_value >= limit:
             back = False  # no change, or from the odd one back to the others
             continue
-        lasting[k + 1] = for_good = steady.stays(k, limit)
+        for_good = None  # not known of the newest calibration
+        if k + 2 < len(history.moments):
+            for_good = (steady.changed(k, k + 2, limit) is not None
+                        and history.between(k, k + 2).p_value < limit)
+        lasting[k + 1] = for_good
         back = for_good is False
         row = rows[order[k + 1]]
         changes.append({'key': row['key'], 'date': row['date'], 'parameter': most.name,
@@ -404,13 +404,6 @@ class _Steady:
         most = int(np.argmax(far))
         least = -scipy.special.ndtri(limit / (2.0 * len(far)))
         return values[most] if far[most] > least else None
-
-    def stays(self, before: int, limit: float) -> bool | None:
-        """Return whether the calibration after the next differs, too; None if there is none."""
-        if before + 2 >= len(self.at):
-            return None
-        return (self.changed(before, before + 2, limit) is not None
-                and self.history.between(before, before + 2).p_value < limit)
 
 
 def years_of(history: History) -> Floats | None:

@@ -235,18 +235,18 @@ def _added(imus: _Imus, writer: Any) -> list[Any]:
     for each in imus.known['connections']:
         key = str([each[name] for name in ('topic', 'msgtype', 'msgdef', 'ext')])
         if key not in made:
-            made[key] = writer.add_connection(each['topic'], each['msgtype'], **(
-                _about_in_2 if imus.ros2 else _about_in_1)(**each))
+            made[key] = writer.add_connection(each['topic'], each['msgtype'], **_about(
+                each, ros2=imus.ros2))
         outputs.append(made[key])
     return outputs
 
 
-def _about_in_1(msgdef: str, digest: str, ext: Sequence[Any], **_: str) -> dict[str, Any]:
-    return {'msgdef': msgdef, 'md5sum': digest, **dict(zip(('callerid', 'latching'), ext))}
-
-
-def _about_in_2(msgtype: str, msgdef: str, digest: str, ext: Sequence[Any], **_: str
-                ) -> dict[str, Any]:
+def _about(connection: Mapping[str, Any], *, ros2: bool) -> dict[str, Any]:
+    """Return what a writer needs to know of a connection."""
+    msgtype, msgdef, digest, ext = (connection[key] for key in (
+        'msgtype', 'msgdef', 'digest', 'ext'))
+    if not ros2:
+        return {'msgdef': msgdef, 'md5sum': digest, **dict(zip(('callerid', 'latching'), ext))}
     from rosbags.rosbag2.metadata import parse_qos
     from rosbags.typesys import get_typestore, Stores
 

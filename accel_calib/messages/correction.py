@@ -140,7 +140,6 @@ _FORCE, _FRONT, _WHOLE = (struct.Struct(each) for each in ('<12d', '<4d72s3d72s'
 _ABSENT = struct.pack('<d', -1.0)
 _UNKNOWN = bytes(72)
 _NONE: Triple = (0.0, 0.0, 0.0)
-_PER_MESSAGE = {'time', 'rate'}
 
 
 class _Seen(NamedTuple):
@@ -194,7 +193,7 @@ class Rewriter:
         self._calibration = OneReading(calibration, scale)
         self._needs, self._neutral = calibration.model.needs, calibration.model.neutral
         self._thermal = thermal if thermal is not None else thermal_stream(calibration.model)
-        self._per_message = bool(_PER_MESSAGE.intersection(self._needs))
+        self._per_message = bool({'time', 'rate'}.intersection(self._needs))
         self._at = None if self._needs else self._calibration.at({})
         self._context: Mapping[str, float] | None = None
         self._around: list[float | None] = []

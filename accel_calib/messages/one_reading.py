@@ -41,7 +41,6 @@ _Bend = tuple[int, float, Callable[[float, float, float], float],
               Callable[[float, float, float], Triple]]
 """Axis, coefficient, value and gradient of a bending term with its context fixed."""
 
-_NO_BEND = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 _SLOW = 3
 """Iterations after which the slope is computed at the present force."""
 
@@ -129,14 +128,10 @@ class OneReading:
     def spread_basis(self, known: Known, u: Triple) -> Floats:
         """Return the (m, 3 p) basis of each monomial times a root of the covariance."""
         model = self._calibration.model
-        basis = model.basis_of(model.terms.weight[:, np.newaxis], _one_row(known),
-                               np.array([u]))
+        row = {key: np.asarray(value, float)[np.newaxis] for key, value in known.items()}
+        basis = model.basis_of(model.terms.weight[:, np.newaxis], row, np.array([u]))
         which, rows = self._spread_rows
         return np.asarray((which * basis.terms[:, 0]) @ rows)
-
-
-def _one_row(known: Known) -> dict[str, Floats]:
-    return {key: np.asarray(value, float)[np.newaxis] for key, value in known.items()}
 
 
 def _factor(effect: Effect, known: Known, shape: Any) -> Any:
@@ -185,7 +180,7 @@ class AtReading:
         """
         undone = _affine([part / self._owner.per_g for part in inverse], offset)
         turn, bend, near, far = self._owner.turn, self._bend, CONVERGED_G, LARGEST_FORCE_G
-        a, b, c, d, e, f, g, h, i = _NO_BEND
+        a, b, c, d, e, f, g, h, i = 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0
 
         def correct(x: float, y: float, z: float) -> Triple:
             nonlocal a, b, c, d, e, f, g, h, i

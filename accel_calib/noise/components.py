@@ -32,6 +32,7 @@ import numpy as np
 import scipy
 
 from .curve import Counts, shares, Spread
+from ..geometry import rms
 from ..units import Floats, is_native, STANDARD_GRAVITY
 
 COMPONENTS = ('quantisation', 'noise_density', 'bias_instability', 'random_walk', 'drift')
@@ -47,11 +48,8 @@ because the few averages at long τ have a skewed distribution.
 """
 
 _EVERY = [0, 1, 2, 3, 4]
-_WANTED = [1, 2, 3]
 _MARGIN = (2, 1)
 """Further octaves that are dropped at the start and at the end, if one had to be."""
-
-_FLOOR = 1e-6
 
 LEAST_P = 5e-3
 """Smallest probability of χ² for a range of τ, otherwise shorter ranges are tried."""
@@ -66,7 +64,6 @@ _LEAST_RANGE = 5
 """Smallest number of octaves in a range."""
 
 _ROUNDS = 12
-_CONVERGED = 1e-3
 LEVEL = 0.95
 """Probability of intervals; upper limits are one-sided."""
 
@@ -129,10 +126,11 @@ def fit_components(variances: Floats, lengths: Counts, spread: Spread) -> Fitted
     shape = shares(lengths)
     first, last = _range(variances, shape, spread)
     curve = _RangeFit(variances, shape, spread, slice(first, last + 1))
-    free = [c for c in _EVERY if c in _WANTED or curve.rise(_EVERY, c) > _RISE[c]]
+    free = [c for c in _EVERY if COMPONENTS[c] in FIGURES or curve.rise(_EVERY, c) > _RISE[c]]
     rises = np.array([curve.rise(free, c) if c in free else 0.0 for c in _EVERY])
     found = curve.solve(free)
-    large = curve.parts(found.squares) >= _LEAST_SHARE
+    parts = shape[first:last + 1] * found.squares
+    large = np.max(parts / parts.sum(axis=1, keepdims=True), axis=0) >= _LEAST_SHARE
     seen = (found.squares > 0.0) & large & (rises > _RISE)
     if last - first + 1 < _LONG_RANGE:
         seen[2:] = False
@@ -159,7 +157,7 @@ class _RangeFit:
 
     def noisy(self, squares: Floats) -> Floats:
         """Return the squares with some white noise: without noise there is no covariance."""
-        least = _FLOOR * float(np.min(self._variances / self._shape[:, 1]))
+        least = 1e-6 * float(np.min(self._variances / self._shape[:, 1]))
         return np.where(np.arange(len(squares)) == 1, np.maximum(squares, least), squares)
 
     def solve(self, free: list[int]) -> _Solution:
@@ -171,7 +169,7 @@ class _RangeFit:
             before, squares = squares, np.zeros(len(COMPONENTS))
             shape, variances = self._whitened(before)
             squares[free] = scipy.optimize.nnls(shape[:, free], variances)[0]
-            if np.all(np.abs(squares - before) <= _CONVERGED * before):
+            if np.all(np.abs(squares - before) <= 1e-3 * before):
                 break
         shape, variances = self._whitened(squares)
         left = variances - shape @ squares
@@ -187,11 +185,6 @@ class _RangeFit:
         """Return the probability of χ²."""
         freedom = len(self._variances) - int(np.sum(found.squares > 0.0))
         return float(scipy.stats.chi2.sf(found.chi_square, max(freedom, 1)))
-
-    def parts(self, squares: Floats) -> Floats:
-        """Return the largest part of the variance of each component."""
-        each = self._shape * squares
-        return np.asarray(np.max(each / each.sum(axis=1, keepdims=True), axis=0))
 
     def component(self, found: _Solution, which: int, seen: bool) -> Component:
         """Return one component, or its upper limit."""
@@ -375,7 +368,7 @@ class NoiseFigures:
             return np.nan, np.nan
         values, sds = (np.array([getattr(each, name) for each in found])
                        for name in ('value', 'sd'))
-        common = float(np.sqrt(np.mean(values**2)))
+        common = rms(values)
         return common, float(np.sqrt(np.sum((values * sds)**2))) / (len(found) * common)
 
 

@@ -98,8 +98,6 @@ _UNEVEN = 0.1
 _COARSE = 1.0
 """Noise in units of the step of the output below which rounding changes the noise."""
 
-_MOST_STEPS = 4096
-
 _BLOCK_S = 1.0
 """Length of the averages in which a coarse record is searched for a rest [s]."""
 
@@ -186,7 +184,11 @@ def spread_of(lengths: Counts, samples: int) -> Spread:
     gamma, weight = np.zeros((len(lags), 4, most)), np.zeros((len(lags), most))
     for p, (i, j, lag) in enumerate(zip(first, second, lags, strict=True)):
         gamma[p, :, :len(lag)] = _between(lag, lengths[i], lengths[j])
-        weight[p, :len(lag)] = _weights(lag, lengths[i], lengths[j], samples)
+        # The weight of γ² is 2/(n_i n_j) times the number of pairs.
+        counts = [float(samples + 1 - 2 * lengths[k]) for k in (i, j)]
+        pairs = np.minimum(min(counts), samples + 1.0 - lengths[i] - lengths[j] - lag)
+        width = np.convolve(np.diff(lag), [0.5, 0.5])  # of the trapezoidal rule
+        weight[p, :len(lag)] = 4.0 / (counts[0] * counts[1]) * width * np.maximum(pairs, 0.0)
     of_mean = np.zeros((_RANDOM, len(lengths), len(lengths)))
     of_mean[:, first, second] = 0.5 * np.einsum('pg,pcg->cp', weight, gamma) * (
         lengths[first] * lengths[second])
@@ -204,32 +206,21 @@ def _lags(one: int, two: int, samples: int) -> Counts:
     return np.unique(np.concatenate([around[(around >= 0) & (around <= last)], [0, last]]))
 
 
-def _weights(lag: Counts, one: int, two: int, samples: int) -> Floats:
-    """Return the weights of γ² at the lags: 2/(n_i n_j) times the number of pairs."""
-    counts = samples + 1 - 2 * one, samples + 1 - 2 * two
-    pairs = np.minimum(min(counts), samples + 1 - one - two - lag).astype(float)
-    width = np.convolve(np.diff(lag), [0.5, 0.5])  # of the trapezoidal rule
-    return 4.0 / (float(counts[0]) * float(counts[1])) * width * np.maximum(pairs, 0.0)
-
-
 def _between(lag: Counts, one: int, two: int) -> Floats:
     """Return the (4, g) covariance of two differences for components of size 1."""
     total = np.zeros((4, len(lag)))
     for a, weight_a in zip((-1, 0, 1), _SECOND, strict=True):
         for b, weight_b in zip((-1, 0, 1), _SECOND, strict=True):
-            total += weight_a * weight_b * _generalised(lag + a * one - b * two)
+            # c(t), the generalised covariance of the integral.
+            t = np.abs(lag + a * one - b * two).astype(float)
+            log = np.log(np.maximum(t, 1.0))
+            total += weight_a * weight_b * np.array([
+                (t == 0.0).astype(float), -0.5 * t, t**2 * log / (2.0 * np.pi), t**3 / 12.0])
     # Rounding would exceed the small differences at long lags: all but flicker noise is 0 there.
     total[:, lag > one + two] *= _FLICKER
     far = lag > _FAR * (one + two)
     total[2, far] = -(float(one) * float(two) / lag[far])**2 / np.pi
     return total / (2.0 * float(one) * float(two))
-
-
-def _generalised(lag: Counts) -> Floats:
-    """Return the (4, g) generalised covariance c(t) of the integral, for size 1."""
-    t = np.abs(lag).astype(float)
-    log = np.log(np.maximum(t, 1.0))
-    return np.array([(t == 0.0).astype(float), -0.5 * t, t**2 * log / (2.0 * np.pi), t**3 / 12.0])
 
 
 @dataclass(frozen=True)
@@ -323,7 +314,7 @@ def _averaged(recording: Recording) -> Iterator[tuple[Recording, Recording]]:
 def coarse_step(values: Floats, noise: float) -> float:
     """Return the step of the output if the noise of a sample is smaller, otherwise 0."""
     levels = np.unique(values[:1_000_000])
-    if len(levels) > _MOST_STEPS:
+    if len(levels) > 4096:
         return 0.0
     gaps = np.diff(levels)
     # Rounding of a computation leaves gaps that are not steps.

@@ -16,7 +16,7 @@ curve rises over two octaves. Common parts need hours.
 
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import product
 from typing import Any
 
@@ -24,11 +24,10 @@ import numpy as np
 import scipy
 
 from .components import (
-    AxisNoise, COMPONENTS, FIGURES, fit_components, Fitted, Kind, KINDS, LEVEL, NoiseFigures,
-    shown_unit)
+    AxisNoise, COMPONENTS, FIGURES, fit_components, Kind, KINDS, LEVEL, NoiseFigures, shown_unit)
 from .curve import (
-    allan_variances, check_allantools, coarse_step, Counts, FLAT, longest_rest, LongRest, octaves,
-    shares, Spread, spread_of)
+    allan_variances, check_allantools, coarse_step, FLAT, longest_rest, LongRest, octaves, shares,
+    Spread, spread_of)
 from ..table import Floats, Recording
 from ..units import is_native, STANDARD_GRAVITY, Units
 
@@ -48,9 +47,6 @@ _DISTURBED = ('the curve at long τ has another form (temperature or disturbance
               'constant temperature')
 
 _WHITE_SAMPLES = 500
-
-_LONGER = 4.0
-"""Two octaves."""
 
 _DEPARTS = 0.1
 """Part of the deviation by which a curve departs visibly from its components."""
@@ -92,11 +88,7 @@ def _axis_notes(axis: AxisNoise) -> Iterator[str]:
         hourly = _three(drift.value * scale * _HOUR)
         yield (f'a steady drift of {hourly} {unit} per hour raises the curve at long τ '
                '(warm-up?); it is not part of the figures')
-    yield from _departures(axis)
-
-
-def _departures(axis: AxisNoise) -> Iterator[str]:
-    """Yield where the curve is not that of the components."""
+    # Where the curve is not that of the components.
     ratio = axis.deviation / axis.model - 1.0
     below = ratio[axis.tau < axis.used[0]]
     above = ratio[axis.tau > axis.used[1]]
@@ -119,60 +111,44 @@ def needs_of(axes: Sequence[AxisNoise], rest: LongRest) -> dict[tuple[Kind, str]
     """Return why figures are not seen, and what to do."""
     longest: dict[tuple[Kind, str], tuple[float, str]] = {}
     for axis in axes:
-        for figure, need_of in _NEEDED.items():
+        for figure in FIGURES:
             if not axis.figures[figure].seen:
-                need = need_of(axis, rest)
-                key = axis.kind, figure
+                need, key = _need_of(axis, figure, rest), (axis.kind, figure)
                 longest[key] = max(longest.get(key, need), need)
     return {key: words for key, (_, words) in longest.items()}
 
 
-def _white_need(axis: AxisNoise, rest: LongRest) -> tuple[float, str]:
-    """Return the length of a rest for white noise, with words; infinite if none shows it."""
-    if rest.samples < _WHITE_SAMPLES:
-        return _needs_rest(_WHITE_SAMPLES / rest.rate, rest)
-    return np.inf, ('the curve does not fall with slope -1/2 at the shortest τ '
-                    f'({duration(axis.tau[0])}); record at a higher rate, with more digits')
-
-
-def _instability_need(axis: AxisNoise, rest: LongRest) -> tuple[float, str]:
-    """Return the length of a rest for the flat part of the curve."""
-    if axis.figures['random_walk'].seen:
-        return np.inf, 'the random walk hides it: the curve has no flat part'
-    white = axis.figures['noise_density']
-    flat = FLAT * axis.figures['bias_instability'].upper**2
-    hidden = _LENGTH_FOR_B * white.value**2 / flat if white.seen else 0.0
-    return _long_need(axis, rest, max(_INSTABILITY_S, hidden))
-
-
-def _long_need(axis: AxisNoise, rest: LongRest, seconds: float = _WALK_S) -> tuple[float, str]:
-    """Return a length that is also longer than the rest, unless longer ones do not help."""
-    if _disturbed(axis):
-        return np.inf, _DISTURBED
-    return _needs_rest(max(seconds, _LONGER * rest.seconds), rest)
+def _need_of(axis: AxisNoise, figure: str, rest: LongRest) -> tuple[float, str]:
+    """Return the length of a rest that shows a figure, with words; infinite if none shows it."""
+    if figure == 'noise_density':
+        if rest.samples >= _WHITE_SAMPLES:
+            return np.inf, ('the curve does not fall with slope -1/2 at the shortest τ '
+                            f'({duration(axis.tau[0])}); record at a higher rate, with more '
+                            'digits')
+        seconds = _WHITE_SAMPLES / rest.rate
+    else:
+        seconds = _WALK_S
+        if figure == 'bias_instability':
+            if axis.figures['random_walk'].seen:
+                return np.inf, 'the random walk hides it: the curve has no flat part'
+            white = axis.figures['noise_density']
+            flat = FLAT * axis.figures['bias_instability'].upper**2
+            hidden = _LENGTH_FOR_B * white.value**2 / flat if white.seen else 0.0
+            seconds = max(_INSTABILITY_S, hidden)
+        if _disturbed(axis):
+            return np.inf, _DISTURBED
+        seconds = max(seconds, 4.0 * rest.seconds)  # two octaves more
+    # Rounded up to one or two digits of its unit.
+    unit = next(each for each in (_HOUR, _MINUTE, 1.0) if seconds >= 2.0 * each or each == 1.0)
+    step = unit * (1.0 if seconds < 10.0 * unit else 5.0 if seconds < 60.0 * unit else 50.0)
+    about = (f'more than {duration(_TOO_LONG)}' if seconds > _TOO_LONG
+             else f'about {duration(float(np.ceil(seconds / step - 1e-9) * step))}')
+    return seconds, f'needs {about} at rest, this has {duration(rest.seconds)}'
 
 
 def _disturbed(axis: AxisNoise) -> bool:
     """Return whether the curve at long τ is not that of the components."""
     return bool(axis.tau[-1] > axis.used[1])
-
-
-_NEEDED: Mapping[str, Callable[[AxisNoise, LongRest], tuple[float, str]]] = dict(
-    zip(FIGURES, (_white_need, _instability_need, _long_need)))
-
-
-def _needs_rest(seconds: float, rest: LongRest) -> tuple[float, str]:
-    """Return a length, and the words for it."""
-    about = (f'more than {duration(_TOO_LONG)}' if seconds > _TOO_LONG
-             else f'about {duration(_rounded(seconds))}')
-    return seconds, f'needs {about} at rest, this has {duration(rest.seconds)}'
-
-
-def _rounded(seconds: float) -> float:
-    """Return a duration rounded up to one or two digits of its unit."""
-    unit = next(each for each in (_HOUR, _MINUTE, 1.0) if seconds >= 2.0 * each or each == 1.0)
-    step = unit * (1.0 if seconds < 10.0 * unit else 5.0 if seconds < 60.0 * unit else 50.0)
-    return float(np.ceil(seconds / step - 1e-9) * step)
 
 
 def duration(seconds: float) -> str:
@@ -224,7 +200,8 @@ def noise_of(recording: Recording, units: Units, gravity: float = STANDARD_GRAVI
     lengths = octaves(rest.samples)
     spread = spread_of(lengths, rest.samples)
     axes, notes = [], list(rest.notes)
-    rad_s = _in_rad_s(rest)
+    density = np.std(np.diff(rest.values[3:]), axis=1) / np.sqrt(2.0 * rest.rate)
+    rad_s = bool(np.all(density < _MOST_RATE))
     if not rad_s:
         notes.append('the angular rates are not in rad/s, because their noise is too large: they '
                      'are taken as native')
@@ -238,19 +215,14 @@ def noise_of(recording: Recording, units: Units, gravity: float = STANDARD_GRAVI
             notes.append(f'{kind} {axis}: all samples of the rest are the same, so that the axis '
                          'shows no noise; record with more digits or a smaller range')
         progress(k + 1, len(rest.values))
-    temperature = _temperatures(rest)
+    temperature = None
+    if rest.temperature is not None and np.isfinite(rest.temperature).any():
+        known = rest.temperature[np.isfinite(rest.temperature)]
+        means = [float(np.mean(part)) for part in np.array_split(known, min(100, len(known)))]
+        temperature = min(means), max(means)
     return NoiseFigures(
         tuple(axes), rest.start, rest.seconds, rest.samples, rest.rate, temperature,
         (*notes, *notes_of(axes, temperature)), needs_of(axes, rest))
-
-
-def _in_rad_s(rest: LongRest) -> bool:
-    """Return whether the noise of the rates is that of a gyro in rad/s."""
-    rates = rest.values[3:]
-    if not len(rates):
-        return True
-    density = np.std(np.diff(rates), axis=1) / np.sqrt(2.0 * rest.rate)
-    return bool(np.all(density < _MOST_RATE))
 
 
 def _axis(kind: Kind, axis: str, unit: str, values: Floats, rate: float, spread: Spread
@@ -261,7 +233,13 @@ def _axis(kind: Kind, axis: str, unit: str, values: Floats, rate: float, spread:
     fitted = fit_components(variances, lengths, spread)
     covariance = spread.covariance(fitted.squares)
     expected = shares(lengths) @ fitted.squares
-    low, high = _band(variances, lengths, fitted, spread)
+    # Beyond the range the form is not known: a random walk has the fewest degrees of freedom.
+    forms = (fitted.squares, np.array([0.0, 0.0, 0.0, 1.0, 0.0]))
+    within, beyond = (2.0 * (shares(lengths) @ squares)**2 / np.diag(spread.covariance(squares))
+                      for squares in forms)
+    freedom = np.where(np.arange(len(variances)) > fitted.last, beyond, within)
+    low, high = (np.sqrt(variances * freedom / scipy.stats.chi2.ppf(part, freedom))
+                 for part in (0.5 + 0.5 * LEVEL, 0.5 - 0.5 * LEVEL))
     tau = lengths / rate
     across = np.diff(np.eye(len(lengths)), axis=0)
     relative = covariance / np.outer(expected, expected)
@@ -273,29 +251,6 @@ def _axis(kind: Kind, axis: str, unit: str, values: Floats, rate: float, spread:
          for name, each in zip(COMPONENTS, fitted.components, strict=True)},
         (float(tau[fitted.first]), float(tau[fitted.last])), fitted.p_value,
         coarse_step(values, size * float(np.sqrt(variances[0]))))
-
-
-def _band(variances: Floats, lengths: Counts, fitted: Fitted, spread: Spread
-          ) -> tuple[Floats, Floats]:
-    """Return the 95 % interval of the Allan deviations from their degrees of freedom."""
-    # Beyond the range the form is not known: a random walk has the fewest degrees of freedom.
-    forms = (fitted.squares, np.array([0.0, 0.0, 0.0, 1.0, 0.0]))
-    within, beyond = (2.0 * (shares(lengths) @ squares)**2 / np.diag(spread.covariance(squares))
-                      for squares in forms)
-    freedom = np.where(np.arange(len(variances)) > fitted.last, beyond, within)
-    tail = 0.5 - 0.5 * LEVEL
-    low, high = (np.sqrt(variances * freedom / scipy.stats.chi2.ppf(part, freedom))
-                 for part in (1.0 - tail, tail))
-    return low, high
-
-
-def _temperatures(rest: LongRest) -> tuple[float, float] | None:
-    """Return the lowest and highest mean temperature of a hundredth of the rest."""
-    if rest.temperature is None or not np.isfinite(rest.temperature).any():
-        return None
-    known = rest.temperature[np.isfinite(rest.temperature)]
-    means = [float(np.mean(part)) for part in np.array_split(known, min(100, len(known)))]
-    return min(means), max(means)
 
 
 _CURVE = ('axis', 'unit', 'tau', 'deviation', 'low', 'high', 'model', 'slope', 'slope_sd', 'used',
@@ -321,28 +276,19 @@ def to_json(found: NoiseFigures) -> dict[str, Any]:
         'temperature': found.temperature, 'notes': found.notes}
     for kind in KINDS:
         axes = found.of(kind)
+        native = any(is_native(axis.unit) for axis in axes)
         result[f'{kind}_unit'] = axes[0].unit if axes else None
         for figure in FIGURES:
-            result.update(_figure_json(found, kind, figure))
+            name, by_axis = f'{kind}_{figure}', {axis.axis: axis.figures[figure] for axis in axes}
+            every = [by_axis.get(axis) for axis in 'xyz'] if axes else []
+            result[name], result[f'{name}_sd'] = (
+                (None, None) if native else found.common(kind, figure))
+            for end, field in (('', 'value'), ('_sd', 'sd'), ('_interval', 'interval'),
+                               ('_upper', 'upper')):
+                result[f'{name}_axes{end}'] = [each and getattr(each, field) for each in every]
+            result[f'{name}_reason'] = (
+                _NATIVE_REASON[kind] if native else found.needs.get((kind, figure)) if axes else
+                f'the recording has no {kind} with noise')
     result['curves'] = [{'sensor': axis.kind, **{name: getattr(axis, name) for name in _CURVE}}
                         for axis in found.axes]
     return result
-
-
-def _figure_json(found: NoiseFigures, kind: Kind, figure: str) -> dict[str, Any]:
-    axes = {axis.axis: axis.figures[figure] for axis in found.of(kind)}
-    every = [axes.get(axis) for axis in 'xyz'] if axes else []
-    native = any(is_native(axis.unit) for axis in found.of(kind))
-    value, sd = (None, None) if native else found.common(kind, figure)
-    reason = found.needs.get((kind, figure))
-    if native:
-        reason = _NATIVE_REASON[kind]
-    elif not axes:
-        reason = f'the recording has no {kind} with noise'
-    name = f'{kind}_{figure}'
-    return {name: value, f'{name}_sd': sd,
-            f'{name}_axes': [each and each.value for each in every],
-            f'{name}_axes_sd': [each and each.sd for each in every],
-            f'{name}_axes_interval': [each and each.interval for each in every],
-            f'{name}_axes_upper': [each and each.upper for each in every],
-            f'{name}_reason': reason}

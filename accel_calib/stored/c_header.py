@@ -109,6 +109,7 @@ def _value(polynomial: Floats, s: Floats) -> Floats:
 
 
 def _header_of(calibration: Calibration) -> Header:
+    """Return the numbers of a header, with as many repetitions as it needs."""
     low, high = temperature_range(calibration) or (REFERENCE_TEMPERATURE,) * 2
     middle, half = (low + high) / 2.0, max((high - low) / 2.0, 1e-3)
     count, units = 4 * _LARGEST_DEGREE, calibration.units
@@ -121,22 +122,19 @@ def _header_of(calibration: Calibration) -> Header:
     for part in (vec_v, mat_w, bend):
         part[np.abs(part) < _NOTHING_G] = 0.0
     terms, which = here.terms, here.terms.bending
-    made = Header(
+    found = Header(
         vec_v=single(units.from_g(vec_v)), mat_w=single(mat_w), bend=single(bend),
         monomial=np.array(terms.monomials, np.intp)[terms.place[which]], axis=terms.axis[which],
         inverse=single(np.linalg.inv(mat_w[0])),
         turn=single(calibration.rotation.T * calibration.force_per_g),
         per_g=float(np.float32(units.per_g)), middle=float(np.float32(middle)),
         half=float(np.float32(half)), steps=0)
-    return made if made.is_affine else _with_steps(made, calibration)
-
-
-def _with_steps(header: Header, calibration: Calibration) -> Header:
-    """Return the header with as many repetitions as it needs."""
+    if found.is_affine:
+        return found
     grid = steady_grid(calibration, 3, _BEYOND)
-    before = header.force(grid.reading, grid.temperature)
+    before = found.force(grid.reading, grid.temperature)
     for steps in range(1, _LARGEST_STEPS + 1):
-        found = replace(header, steps=steps)
+        found = replace(found, steps=steps)
         after = found.force(grid.reading, grid.temperature)
         if np.max(np.abs(after - before)) < _SMALL_G * calibration.force_per_g:
             return found

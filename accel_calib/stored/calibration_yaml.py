@@ -30,8 +30,7 @@ from ..calibrate import (
     Rejected, RejectedKind, SampleNoise, STORED_METHODS, with_history)
 from ..disk import FIRST_LINE, FORMAT, write_atomically
 from ..effects import (
-    CHANGES, Effect, effect_named, factors_of, is_effect, Model, MODELS, parameter_names,
-    PROCESSES)
+    CHANGES, effect_named, factors_of, is_effect, Model, MODELS, parameter_names, PROCESSES)
 from ..errors import (
     AccelCalibError, DamagedCalibrationError, InputError, OwnEffectError, RefusedFitError,
     StoredCalibrationError)
@@ -193,7 +192,15 @@ def _checked(data: bytes, name: str) -> Calibration:
                                      f'first line "{FIRST_LINE}"', 'use a file that fit wrote')
     text = decoded(data)
     content = read_plain(text)
-    _check_version(content, name)
+    if not isinstance(content, Mapping):
+        raise ValueError('it is not a YAML mapping')
+    version = content.get('version')
+    if not isinstance(version, int) or isinstance(version, bool) or version < 1:
+        raise ValueError(f'its version is {shown(version)}')
+    if version != _VERSION:
+        raise StoredCalibrationError(f'{name} has version {version}, expected {_VERSION}',
+                                     'fit the poses again' if version < _VERSION else
+                                     'update accel_calib, or fit the poses again')
     _check_known(content, name)
     with np.errstate(all='ignore'):  # the checks refuse what is not finite
         calibration = gated(_calibration(content))
@@ -201,11 +208,8 @@ def _checked(data: bytes, name: str) -> Calibration:
     body, found, digest = text.rpartition(_CHECKSUM)
     if not found:
         raise ValueError('its last line, the checksum, is missing')
-    if digest.strip() == _digest(body.rstrip()):
-        return calibration
-    other = _other_correction(content, calibration)
-    _check_keys(content, calibration)
-    return replace(calibration, noted=(*calibration.noted, OF_FILE['edited'], *other))
+    return (calibration if digest.strip() == _digest(body.rstrip()) else
+            _edited(calibration, content))
 
 
 def _check_known(content: Mapping[str, Any], name: str) -> None:
@@ -231,20 +235,20 @@ def _check_own(calibration: Calibration, content: Mapping[str, Any], name: str) 
                 'another definition', 'use that definition, or refine again')
 
 
-def _check_version(content: Any, name: str) -> None:
-    if not isinstance(content, Mapping):
-        raise ValueError('it is not a YAML mapping')
-    version = content.get('version')
-    if not isinstance(version, int) or isinstance(version, bool) or version < 1:
-        raise ValueError(f'its version is {shown(version)}')
-    if version != _VERSION:
-        raise StoredCalibrationError(f'{name} has version {version}, expected {_VERSION}',
-                                     'fit the poses again' if version < _VERSION else
-                                     'update accel_calib, or fit the poses again')
-
-
-def _check_keys(content: Mapping[str, Any], calibration: Calibration) -> None:
-    """Refuse unknown keys in a file that was changed: a damaged key would be ignored."""
+def _edited(calibration: Calibration, content: Mapping[str, Any]) -> Calibration:
+    """Return the calibration of a file that was changed, with what does not match as findings."""
+    noted = [*calibration.noted, OF_FILE['edited']]
+    if content.get('correction') is not None:
+        try:
+            stated = value_at(content, 'correction', dict)
+            offset, matrix = array_at(stated, 'offset', (3,)), array_at(stated, 'matrix', (3, 3))
+        except (KeyError, ValueError) as err:
+            raise ValueError(f'correction: {err}') from err
+        scale = float(np.max(np.abs(calibration.matrix)))
+        if not (np.allclose(offset, calibration.offset, 0.0, _SAME * calibration.units.per_g)
+                and np.allclose(matrix, calibration.matrix, 0.0, _SAME * scale)):
+            noted.append(OF_FILE['correction_in_file'])
+    # Unknown keys are refused: a damaged key would be ignored.
     written = {**dict.fromkeys(_NOT_ALWAYS), **_content(calibration)}
     for place, found, known in (('', content, written), *(
             (f'of {key} ', content.get(key), written[key]) for key in _MAPPINGS)):
@@ -252,21 +256,7 @@ def _check_keys(content: Mapping[str, Any], calibration: Calibration) -> None:
             if key not in (known or ()):
                 raise ValueError(f'the key {shown(key)} {place}is not known, expected one of '
                                  f'{", ".join(known or ())}')
-
-
-def _other_correction(content: Mapping[str, Any], calibration: Calibration) -> tuple[Finding, ...]:
-    """Return a finding if a file states a correction that is not that of its effects."""
-    if content.get('correction') is None:
-        return ()
-    try:
-        stated = value_at(content, 'correction', dict)
-        offset, matrix = array_at(stated, 'offset', (3,)), array_at(stated, 'matrix', (3, 3))
-    except (KeyError, ValueError) as err:
-        raise ValueError(f'correction: {err}') from err
-    scale = np.max(np.abs(calibration.matrix))
-    same = (np.allclose(offset, calibration.offset, 0.0, _SAME * calibration.units.per_g)
-            and np.allclose(matrix, calibration.matrix, 0.0, _SAME * float(scale)))
-    return () if same else (OF_FILE['correction_in_file'],)
+    return replace(calibration, noted=tuple(noted))
 
 
 def _calibration(content: Mapping[str, Any]) -> Calibration:
@@ -286,7 +276,11 @@ def _calibration(content: Mapping[str, Any]) -> Calibration:
         poses=_poses(value_at(content, 'poses', dict), _optional(
             content, 'autopilot', lambda stated: Autopilot(**stated))),
         rejected=rejected, reason=value_at(content, 'reason', str),
-        noted=tuple(map(_finding, values_at(content, 'findings', dict))),
+        noted=tuple(Finding(
+            rows=tuple(values_at(each, 'rows', int)), kind=choice_at(each, 'kind', tuple(KINDS)),
+            text=value_at(each, 'text', str), advice=value_at(each, 'advice', str),
+            level=choice_at(each, 'level', LEVELS))
+            for each in values_at(content, 'findings', dict)),
         gyro=_optional(content, 'gyro_bias', _gyro_bias),
         noise=_optional(content, 'noise', lambda stated: SampleNoise(*(
             array_at(stated, key, (3,), finite=False) for key in ('force', 'rate')))))
@@ -308,21 +302,21 @@ def _units(stated: Mapping[str, Any]) -> Units:
 
 
 def _effects(stated: Mapping[str, Any]) -> dict[str, Floats]:
+    """Return the values of effects; shape constants that are not stated are the usual ones."""
     for name in stated:
         if (len(name) > LONGEST_NAME or not is_effect(name) or name in CHANGES
                 or name in PROCESSES):
             raise ValueError(f'effect {shown(name)} is not in the catalogue')
-    return {name: _values(effect_named(name), value_at(stated, name, dict)) for name in stated}
-
-
-def _values(effect: Effect, stated: Mapping[str, Any]) -> Floats:
-    """Return the values of an effect; shape constants that are not stated are the usual ones."""
-    for key in stated:
-        if key not in (*effect.values, 'what', 'unit', *(('own_rms',) if effect.own else ())):
-            raise ValueError(f'the key {shown(key)} of an effect is not known, expected one of '
-                             f'{", ".join(effect.values)}')
-    known = {**dict(zip(effect.shape, effect.usual)), **stated}
-    return np.array([number_at(known, part, LARGEST) for part in effect.values])
+    found = {}
+    for name in stated:
+        effect, values = effect_named(name), value_at(stated, name, dict)
+        for key in values:
+            if key not in (*effect.values, 'what', 'unit', *(('own_rms',) if effect.own else ())):
+                raise ValueError(f'the key {shown(key)} of an effect is not known, expected one '
+                                 f'of {", ".join(effect.values)}')
+        known = {**dict(zip(effect.shape, effect.usual)), **values}
+        found[name] = np.array([number_at(known, part, LARGEST) for part in effect.values])
+    return found
 
 
 def _quality(stated: Mapping[str, Any]) -> Quality:
@@ -331,12 +325,6 @@ def _quality(stated: Mapping[str, Any]) -> Quality:
         each.name: None if each.name in optional and stated[each.name] is None
         else number_at(stated, each.name) for each in fields(Quality)}
     return Quality(**figures)
-
-
-def _finding(stated: Mapping[str, Any]) -> Finding:
-    rows = tuple(values_at(stated, 'rows', int))
-    return Finding(choice_at(stated, 'kind', tuple(KINDS)), value_at(stated, 'text', str),
-                   value_at(stated, 'advice', str), choice_at(stated, 'level', LEVELS), rows)
 
 
 def _gyro_bias(stated: Mapping[str, Any]) -> GyroBias:

@@ -50,7 +50,6 @@ _LARGEST_COUNT = 32767
 _UNIT_GAIN, _LARGEST_GAIN = 4096, 8192
 """The gain 1 of iNav, and the largest one of its settings.yaml."""
 
-_PX4_INSTANCES, _ARDUPILOT_INSTANCES = (0, 1, 2, 3), (1, 2, 3)
 _TO_FRD = np.array([1.0, -1.0, -1.0])
 """Signs of the axes x forward, y left, z up, in those of an autopilot."""
 
@@ -97,7 +96,7 @@ def _fit_by_axis(calibration: Calibration, options: Options, reference: float | 
 
 def px4(calibration: Calibration, options: Options) -> Made:
     """Return the parameters of PX4."""
-    place, instance, options = _place(calibration, options, 'px4', _PX4_INSTANCES, 'PX4')
+    place, instance, options = _place(calibration, options, 'px4', (0, 1, 2, 3), 'PX4')
     found = _fit_by_axis(calibration, options)
     prefix = f'CAL_ACC{instance}_'
     thermal = f'TC_A{instance if place.thermal is None else place.thermal}_'
@@ -118,8 +117,7 @@ def px4(calibration: Calibration, options: Options) -> Made:
 
 def ardupilot(calibration: Calibration, options: Options) -> Made:
     """Return the parameters of ArduPilot."""
-    place, instance, options = _place(
-        calibration, options, 'ardupilot', _ARDUPILOT_INSTANCES, 'ArduPilot')
+    place, instance, options = _place(calibration, options, 'ardupilot', (1, 2, 3), 'ArduPilot')
     found = _fit_by_axis(calibration, options, ARDUPILOT_REFERENCE)
     prefix = f'INS_ACC{"" if instance == 1 else instance}'
     # The firmware adds the polynomial at CALTEMP, so that it is zero there.

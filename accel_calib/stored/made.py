@@ -37,9 +37,6 @@ if TYPE_CHECKING:
 Correction = Callable[[Floats, Floats], Floats]
 """(n, 3) readings in the unit of the calibration, (n,) temperatures [°C] -> (n, 3) force [g]."""
 
-_TEMPERATURES = 9
-_POSES = 60
-_DIRECTIONS = 100
 LEAST_LOSS_MG = 0.005
 """Smaller losses are not mentioned: rounding to single precision causes about 0.0001 mg."""
 
@@ -176,7 +173,7 @@ def _steady_context(calibration: Calibration, temperature: Floats) -> Context:
             'time': np.full(count, time), 'supply_voltage': np.full(count, supply)}
 
 
-def steady_grid(calibration: Calibration, temperatures: int = _TEMPERATURES, size: float = 1.0
+def steady_grid(calibration: Calibration, temperatures: int = 9, size: float = 1.0
                 ) -> Grid:
     """Return forces of this size [g] over the sphere and the range of the temperature."""
     low, high = temperature_range(calibration) or (REFERENCE_TEMPERATURE, REFERENCE_TEMPERATURE)
@@ -260,22 +257,16 @@ def _by_effect(calibration: Calibration, label: str, make: Callable[[Calibration
     found = [Loss('', f'{label} has no sensitivity: leaves {ideal:.2g} mg', ideal)]
     for name, values in calibration.model.values.items():
         part = float(np.sqrt(max(left({name: values}) ** 2 - ideal ** 2, 0.0)))
-        words = _lacking(name, values, made, left)
+        effect = effect_named(name)
+        parameters, shape = effect.split(values)
+        what = effect.words.partition(',')[0]
+        words = f'has no {what}'
+        if name in made.rounded:
+            words = f'rounds the {what} to {made.rounded[name]}'
+        elif effect.is_lagged(shape) and left({name: effect.filled(parameters)}) < LEAST_LOSS_MG:
+            words = f'has no lag ({shape[0]:.0f} s) in the {what}'
         found.append(Loss(name, f'{label} {words}: leaves {part:.2g} mg', part))
     return [loss for loss in found if loss.leaves_mg >= LEAST_LOSS_MG]
-
-
-def _lacking(name: str, values: Floats, made: Made, left: Callable[[dict[str, Floats]], float]
-             ) -> str:
-    """Return what a format does with an effect that it does not hold."""
-    effect = effect_named(name)
-    parameters, shape = effect.split(values)
-    words = effect.words.partition(',')[0]
-    if name in made.rounded:
-        return f'rounds the {words} to {made.rounded[name]}'
-    if effect.is_lagged(shape) and left({name: effect.filled(parameters)}) < LEAST_LOSS_MG:
-        return f'has no lag ({shape[0]:.0f} s) in the {words}'
-    return f'has no {words}'
 
 
 def difference_mg(calibration: Calibration, made: Made) -> float:
@@ -296,8 +287,8 @@ def _full_grid(calibration: Calibration) -> Grid:
     poses = with_history(in_g(calibration.poses, calibration.units), model)
     known = calibration.held_context(poses.columns)
     rows = np.flatnonzero(np.isin(calibration.poses.row, calibration.used_poses.row))
-    rows = rows[np.unique(np.linspace(0, len(rows) - 1, _POSES).astype(int))]
-    directions = spread_directions(_DIRECTIONS)
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, 60).astype(int))]
+    directions = spread_directions(100)
     each = np.repeat(rows, len(directions))
     context: dict[str, Any] = {
         **_steady_context(calibration, np.full(len(each), REFERENCE_TEMPERATURE)),

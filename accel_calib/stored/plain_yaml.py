@@ -120,14 +120,11 @@ class _Reader:
             return self._scalar(event) if event.implicit[0] else one_line(event.value)
         if depth == MOST_DEPTH:
             raise self._refusal(event, f'it has more than {MOST_DEPTH} levels')
-        if isinstance(event, yaml.MappingStartEvent):
-            return self._mapping(depth + 1)
-        content = []
-        while not isinstance(event := next(self._events), yaml.SequenceEndEvent):
-            content.append(self._value(event, depth + 1))
-        return content
-
-    def _mapping(self, depth: int) -> dict[str, Any]:
+        if not isinstance(event, yaml.MappingStartEvent):
+            items = []
+            while not isinstance(event := next(self._events), yaml.SequenceEndEvent):
+                items.append(self._value(event, depth + 1))
+            return items
         content: dict[str, Any] = {}
         while not isinstance(event := next(self._events), yaml.MappingEndEvent):
             self._check(event)
@@ -137,7 +134,7 @@ class _Reader:
             if key in content:
                 raise self._refusal(event, f'the key {shown(key)} is stated twice, expected once')
             self._keys.append(key)
-            content[key] = self._value(next(self._events), depth)
+            content[key] = self._value(next(self._events), depth + 1)
             self._keys.pop()
         return content
 
