@@ -167,9 +167,12 @@ def sound_rows(poses: Poses, units: Units) -> tuple[Poses, tuple[Rejected, ...]]
     wild = ~(length <= _LARGEST_REST_G * scale)
     largest = np.zeros(len(poses)) if noise is None else np.max(noise, axis=1)
     bad = wild | ~(largest <= LARGEST_OFFSET_G * scale) & (scale > 0.0)
-    rejected = [Rejected(int(poses.row[k]), _why(reading[k]) if wild[k] else
-                         f'the uncertainty of the mean is {largest[k]:.3g}, so the sensor was not '
-                         'at rest') for k in np.flatnonzero(bad)]
+    rejected = []
+    for k in np.flatnonzero(bad):
+        shown = ', '.join(f'{value:.4g}' for value in reading[k])
+        rejected.append(Rejected(int(poses.row[k]), (
+            f'the reading ({shown}) is not plausible for an accelerometer at rest' if wild[k] else
+            f'the uncertainty of the mean is {largest[k]:.3g}, so the sensor was not at rest')))
     sound = poses.take(~bad) if rejected else poses
     check_axes(sound.reading, units)
     return sound, tuple(rejected)
@@ -198,12 +201,6 @@ def sure_rows(poses: Poses) -> tuple[Poses, tuple[Rejected, ...]]:
     return poses.take(~doubtful), tuple(
         Rejected(int(row), 'doubtful: the sensor may have moved', 'doubtful')
         for row in poses.row[doubtful])
-
-
-def _why(reading: Floats) -> str:
-    """Return why a reading is left out."""
-    shown = ', '.join(f'{value:.4g}' for value in reading)
-    return f'the reading ({shown}) is not plausible for an accelerometer at rest'
 
 
 def directions_of(poses: Poses, units: Units) -> Floats:
@@ -325,21 +322,18 @@ def _fit_rows(poses_g: Poses, name: str, method: Method) -> Fit:
         raise RefusedFitError(f'the poses are not on an ellipsoid, but model {name} needs one',
                               TAKE_ALL_SIDES)
     model = linear_model(MODELS[name].norm, mat_w, vec_v)
-    if MODELS[name].sensing_axes:
-        model = _of_the_report(model, poses_g)
+    if MODELS[name].sensing_axes:  # the least sum of (|a| - g)², eq. 17 of the ESGI'95 report
+        start = model
+
+        def point_at(values: Floats) -> Point:
+            tried = with_vector(start.effects, values)
+            u = sensor_force(tried, poses_g.reading, {})
+            rows = length_rows(tried, u, {})
+            return Point(np.linalg.norm(u, axis=1) - 1.0, tried.basis(u, {}).along(rows))
+
+        free = np.full(len(start.vector), np.inf)
+        model = with_vector(start.effects, solve(point_at, start.vector, -free, free)[0])
     return _in_own_axes(name, judge(model, poses_g))
-
-
-def _of_the_report(start: Model, poses_g: Poses) -> Model:
-    """Return model 10 with the least sum of (|a| - g)², eq. 17 of the ESGI'95 report."""
-    def point_at(values: Floats) -> Point:
-        model = with_vector(start.effects, values)
-        u = sensor_force(model, poses_g.reading, {})
-        rows = length_rows(model, u, {})
-        return Point(np.linalg.norm(u, axis=1) - 1.0, model.basis(u, {}).along(rows))
-
-    free = np.full(len(start.vector), np.inf)
-    return with_vector(start.effects, solve(point_at, start.vector, -free, free)[0])
 
 
 def _choose(fits: Mapping[str, Fit]) -> tuple[str, str]:
@@ -377,7 +371,14 @@ def rejected_by(model: Model, poses_g: Poses) -> tuple[Rejected, ...]:
 
 def fit_known(poses: Poses, units: Units, method: Method) -> Calibration:
     """Fit poses of known orientation; parameters and errors as in `fit_poses`."""
-    poses, reason = _with_reference(poses, units)
+    reason = 'the orientations are known'
+    if 'reference' not in poses:
+        reason, faces_up = 'the poses are the six faces', faces(poses.reading)
+        if faces_up is None:
+            raise RefusedFitError('the poses have no ref_x,ref_y,ref_z and are not the six faces, '
+                                  'but model 12 needs known orientations', 'add these columns, '
+                                  'use only the six faces (--rows), or use model 10')
+        poses = poses.with_columns(reference=faces_up * units.force_per_g)
     if method == 'ml':
         by_norm = _unless_placed_well(poses, units)
         if by_norm is not None:
@@ -430,19 +431,6 @@ def _rejected_known(fit: Fit, poses_g: Poses) -> tuple[Rejected, ...]:
                  for row, error in zip(poses_g.row, away, strict=True))
 
 
-def _with_reference(poses: Poses, units: Units) -> tuple[Poses, str]:
-    """Return the poses with their known forces, and a text about the source of the forces."""
-    if 'reference' in poses:
-        return poses, 'the orientations are known'
-    faces_up = faces(poses.reading)
-    if faces_up is None:
-        raise RefusedFitError('the poses have no ref_x,ref_y,ref_z and are not the six faces, '
-                              'but model 12 needs known orientations', 'add these columns, use '
-                              'only the six faces (--rows), or use model 10')
-    force = faces_up * units.force_per_g
-    return poses.with_columns(reference=force), 'the poses are the six faces'
-
-
 def _unless_placed_well(poses: Poses, units: Units) -> Calibration | None:
     """Fit by |force| = 1 g alone if it contradicts the known orientations; otherwise None."""
     units, directions = own_scale(poses, units), directions_of(poses, units)
@@ -458,7 +446,12 @@ def _unless_placed_well(poses: Poses, units: Units) -> Calibration | None:
     if np.linalg.det(rotation) < 0.0:  # mirrored axes: only W can show them
         return None
     away = unit(u) - known @ rotation.T
-    variance = _tangential_variance(fit, by_norm.covariance, u)
+    # The variance across the force, from the noise and from the uncertainty of the fit [g²].
+    moved = np.linalg.solve(fit.model.at({}).slope(u), fit.model.basis(u, {}).full)
+    spread = moved @ by_norm.covariance @ np.swapaxes(moved, 1, 2)
+    along = np.einsum('ni,nij,nj->n', unit(u), spread, unit(u))
+    own = 2.0 * fit.equations.scale ** 2 * fit.variance
+    variance = own + np.trace(spread, axis1=1, axis2=2) - along
     dof = 2.0 * len(away) - 3.0
     ratio = float(np.sum(away ** 2) / np.sum(variance)) * 2.0 * len(away) / dof
     chance = float(scipy.special.fdtrc(dof, fit.variance_dof, ratio))
@@ -495,12 +488,3 @@ def _rotation_onto(directions: Floats, known: Floats) -> Floats:
         away = np.linalg.norm(directions - known @ rotation.T, axis=1)
         weight = 1.0 / np.maximum(away, max(float(np.median(away)), _SMALL_ANGLE))
     return rotation
-
-
-def _tangential_variance(fit: Fit, covariance: Floats, u: Floats) -> Floats:
-    """Return the (n,) variance across the force u from noise and uncertainty of the fit [g²]."""
-    moved = np.linalg.solve(fit.model.at({}).slope(u), fit.model.basis(u, {}).full)
-    spread = moved @ covariance @ np.swapaxes(moved, 1, 2)
-    along = np.einsum('ni,nij,nj->n', unit(u), spread, unit(u))
-    own = 2.0 * fit.equations.scale ** 2 * fit.variance
-    return own + np.trace(spread, axis1=1, axis2=2) - along

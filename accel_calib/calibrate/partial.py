@@ -230,7 +230,10 @@ def _likely(poses_g: Poses, kept: Indices, knocked: int, prior: Prior, noise_g: 
             fit = estimate(model, used, prior, factor)
         except NotConvergedError:  # poses as precise as this contradict every common sensor
             break
-        model, evidence = fit.model, _log_evidence(fit, factor, prior)
+        model, columns = fit.model, fit.columns @ prior.root
+        deviation = 0.0 if fit.prior is None else float(np.sum(fit.prior.residual ** 2))
+        spread = factor * np.eye(len(columns)) + columns @ columns.T
+        evidence = -((fit.chi2 + deviation) / factor + float(np.linalg.slogdet(spread)[1])) / 2.0
         if factor == 1.0:
             evidence += _AS_STATED
         scale = float(np.median(fit.equations.scale))
@@ -239,14 +242,6 @@ def _likely(poses_g: Poses, kept: Indices, knocked: int, prior: Prior, noise_g: 
     if not found:
         raise NotConvergedError
     return max(found, key=lambda likely: likely.log_evidence)
-
-
-def _log_evidence(fit: Fit, factor: float, prior: Prior) -> float:
-    """Return the logarithm of the probability of the readings with this variance factor."""
-    columns = fit.columns @ prior.root
-    deviation = 0.0 if fit.prior is None else float(np.sum(fit.prior.residual ** 2))
-    spread = factor * np.eye(len(columns)) + columns @ columns.T
-    return -((fit.chi2 + deviation) / factor + float(np.linalg.slogdet(spread)[1])) / 2.0
 
 
 def posterior(values: Floats, covariance: Floats, fleet: FleetPrior

@@ -229,23 +229,16 @@ def fit_findings(fit: Fit, dilution: float) -> tuple[Finding, ...]:
             'beyond_noise', f'the residuals are {np.sqrt(fit.chi2 / fit.dof):.1f} times the noise '
             'of the pose means: poses repeat worse than the noise of their samples predicts, or '
             'the model lacks an effect', 'run refine to find the missing effect', step='refine'))
-    return (*found, *_hardly_checked(fit))
-
-
-def _hardly_checked(fit: Fit) -> Iterator[Finding]:
-    """Yield a finding about poses whose mistake the other poses do not show."""
-    if fit.dof == 0 or fit.prior is not None:
-        return
-    unseen = unseen_mistakes(fit)
-    rows = fit.poses_g.row[unseen > _UNSEEN_G].tolist()
-    if not rows:
-        return
-    largest = float(np.max(unseen))
-    size = f'a mistake of {largest * MG:.0f} mg' if largest < _WHOLE_G else 'any mistake'
-    yield Finding(
-        'hardly_checked', f'the other poses hardly check {listed("row", rows, _MOST_NAMED)}: '
-        f'{size} would move the result and not show',
-        'take one more pose in about the same orientation', 'USABLE', tuple(rows))
+    unseen = unseen_mistakes(fit) if fit.dof != 0 and fit.prior is None else np.zeros(0)
+    rows = fit.poses_g.row[:len(unseen)][unseen > _UNSEEN_G].tolist()
+    if rows:
+        largest = float(np.max(unseen))
+        size = f'a mistake of {largest * MG:.0f} mg' if largest < _WHOLE_G else 'any mistake'
+        found.append(Finding(
+            'hardly_checked', f'the other poses hardly check {listed("row", rows, _MOST_NAMED)}: '
+            f'{size} would move the result and not show',
+            'take one more pose in about the same orientation', 'USABLE', tuple(rows)))
+    return tuple(found)
 
 
 def rival_findings(found: tuple[Rival, ...], row: NDArray[np.int64]) -> Iterator[Finding]:

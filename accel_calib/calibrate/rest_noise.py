@@ -219,9 +219,10 @@ def gyro_bias_of(poses: Poses) -> GyroBias | None:
     warm = rests.columns.get('temperature', np.zeros(len(rests)))
     if len(rests) >= _ENOUGH and np.ptp(warm) > 0.0:
         line = np.column_stack([level, warm - warm.mean()])
-    sloping = _fitted([line] * 3, rests).is_sloping
-    chosen = _fitted([line if each else level for each in sloping], rests)
-    (bias, slope), (sd, _) = chosen.values, chosen.deviation
+    (_, slope), (_, slope_sd) = _fitted([line] * 3, rests)
+    limit = float(scipy.special.stdtrit(len(rests) - 2, 1.0 - _TAIL))
+    sloping = np.abs(slope) > limit * slope_sd
+    (bias, slope), (sd, _) = _fitted([line if each else level for each in sloping], rests)
     if np.any(np.abs(bias) >= LARGEST_BIAS) or np.any(sd >= _LARGEST_SD):
         return None
     if 'temperature' not in rests:
@@ -270,35 +271,14 @@ def _slope_of_pairs(values: Floats, temperature: Floats) -> Floats:
         order, middle[np.newaxis], axis=0), axis=0)[0])
 
 
-@dataclass(frozen=True)
-class _RateFit:
-    """(2, 3) bias and slope by axis, their variances, and (n, 3) residuals per deviation."""
+def _fitted(designs: Sequence[Floats], rests: Poses) -> tuple[Floats, Floats]:
+    """
+    Fit the rates of each axis with noise and scatter, by its (n, 1 or 2) design.
 
-    values: Floats
-    variance: Floats
-    residual: Floats
+    Return the (2, 3) bias and slope by axis, and their standard deviations, which include the
+    correlation of successive rests.
 
-    @property
-    def deviation(self) -> Floats:
-        """Return the standard deviations, including the correlation of successive rests."""
-        count, square = len(self.residual), float(np.sum(self.residual ** 2))
-        if count < _ENOUGH or square == 0.0:
-            return np.sqrt(self.variance)
-        neighbours = float(np.sum(self.residual[1:] * self.residual[:-1]))
-        # Without the mean, independent residuals have a correlation of -1/n.
-        correlation = min(max(neighbours / square + 1.0 / count, 0.0), _CORRELATION_MAX)
-        excess = (1.0 + correlation) / (1.0 - correlation)
-        return np.asarray(np.sqrt(self.variance * excess))
-
-    @property
-    def is_sloping(self) -> NDArray[np.bool_]:
-        """Return which axes have a significant slope."""
-        limit = float(scipy.special.stdtrit(len(self.residual) - 2, 1.0 - _TAIL))
-        return np.asarray(np.abs(self.values[1]) > limit * self.deviation[1])
-
-
-def _fitted(designs: Sequence[Floats], rests: Poses) -> _RateFit:
-    """Fit the rates of each axis with noise and scatter, by its (n, 1 or 2) design."""
+    """
     values, variance, residual = [], [], []
     for design, rate, noise in zip(designs, rests['rate'].T, _noise_of(rests).T, strict=True):
         count, size = design.shape
@@ -310,7 +290,14 @@ def _fitted(designs: Sequence[Floats], rests: Poses) -> _RateFit:
         values.append(np.pad(found, (0, 2 - size)))
         variance.append(np.pad(np.diag(covariance), (0, 2 - size)))
         residual.append(left / np.sqrt(noise + scatter))
-    return _RateFit(np.column_stack(values), np.column_stack(variance), np.column_stack(residual))
+    found, spread, left = map(np.column_stack, (values, variance, residual))
+    count, square = len(left), float(np.sum(left ** 2))
+    if count >= _ENOUGH and square > 0.0:
+        # Without the mean, independent residuals have a correlation of -1/n.
+        correlation = float(np.sum(left[1:] * left[:-1])) / square + 1.0 / count
+        correlation = min(max(correlation, 0.0), _CORRELATION_MAX)
+        spread = spread * ((1.0 + correlation) / (1.0 - correlation))
+    return found, np.sqrt(spread)
 
 
 def _weighted(design: Floats, rate: Floats, variance: Floats) -> tuple[Floats, Floats, Floats]:

@@ -380,8 +380,9 @@ def curve_of(ramps: Sequence[Ramp]) -> Curve:
     form: Form = {}
     errors = board.errors(form)
     held_out = {'': _held_out_mg(errors)}
-    while (found := _better_form(board, form, errors)) is not None:
-        form, errors = found
+    while better := [(each, own) for each in board.further(form)
+                     if board.is_better(own := board.errors(each), errors)]:
+        form, errors = min(better, key=lambda each: float(np.mean(each[1])))
         held_out[' + '.join(form)] = _held_out_mg(errors)
     form, errors = _without_idle(board, form, errors)
     held_out.pop(' + '.join(form), None)
@@ -418,13 +419,6 @@ def _joined(ramps: Sequence[Ramp]) -> _Board:
 
 def _held_out_mg(errors: Floats) -> float:
     return float(np.sqrt(np.mean(errors))) * MG
-
-
-def _better_form(board: _Board, form: Form, errors: Floats) -> tuple[Form, Floats] | None:
-    """Return the form that predicts held-out parts best, if it is clearly better than one."""
-    tried = [(each, board.errors(each)) for each in board.further(form)]
-    better = [each for each in tried if board.is_better(each[1], errors)]
-    return min(better, key=lambda each: float(np.mean(each[1]))) if better else None
 
 
 def _without_idle(board: _Board, form: Form, errors: Floats) -> tuple[Form, Floats]:
@@ -572,11 +566,16 @@ def with_curve(fitted: Calibration, curve: Curve, poses: Poses) -> Calibration:
     columns = judged.columns @ judged.ties.T
     move = -np.linalg.pinv(columns[:, :own]) @ columns[:, own:]
     of_curve = np.zeros((len(thermal.vector),) * 2)
-    rows = len(curve.model.vector) and len(of_curve)
-    of_curve[:rows, :rows] = curve.covariance[:rows, :rows]
+    known_size = len(curve.model.vector) and len(of_curve)
+    of_curve[:known_size, :known_size] = curve.covariance[:known_size, :known_size]
     covariance = np.block([[fitted.covariance + move @ of_curve @ move.T, move @ of_curve],
                            [of_curve @ move.T, of_curve]])
-    every = _together(poses, ramp_rows(curve, fitted.units))
+    rows = ramp_rows(curve, fitted.units)
+    own_rows = poses.with_columns(orientation=np.arange(1.0, len(poses) + 1.0))
+    every = replace(
+        poses, row=np.concatenate([poses.row, int(poses.row.max()) + rows.row]),
+        columns={key: np.concatenate([own_rows[key], values])
+                 for key, values in rows.columns.items() if key in own_rows})
     rejected = [each.row for each in fitted.rejected]
     kept_g = with_history(in_g(every.take(~np.isin(every.row, rejected)), fitted.units), model)
     made = record_of(
@@ -587,12 +586,3 @@ def with_curve(fitted: Calibration, curve: Curve, poses: Poses) -> Calibration:
         noted=(*fitted.noted, *findings_of_curve(curve)))
     return gated(replace(made, gyro=fitted.gyro, noise=fitted.noise, sensor=fitted.sensor,
                          date=fitted.date))
-
-
-def _together(poses: Poses, rows: Poses) -> Poses:
-    """Return poses followed by the rows of ramps, with the columns that both have."""
-    own = poses.with_columns(orientation=np.arange(1.0, len(poses) + 1.0))
-    row = np.concatenate([poses.row, int(poses.row.max()) + rows.row])
-    return replace(poses, row=row, columns={
-        key: np.concatenate([own[key], values]) for key, values in rows.columns.items()
-        if key in own})

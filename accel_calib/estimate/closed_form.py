@@ -189,31 +189,26 @@ def _ellipsoid(form: Form, beta: Floats) -> tuple[Floats, Floats]:
         return mat_w, (vectors @ along[..., np.newaxis])[..., 0]
 
 
+@np.errstate(all='ignore')
 def along_quadrics(values: Floats, step: Floats) -> Floats:
     """Return the (9,) values after a small step straight in A' and b' (model 10), or NaN."""
-    with np.errstate(all='ignore'):
-        try:
-            mat_w, vec_v = _stepped(values, step)
-        except np.linalg.LinAlgError:
-            return np.full(len(values), np.nan)
-    return linear_model('10', (mat_w + mat_w.T) / 2.0, vec_v).vector
-
-
-def _stepped(values: Floats, step: Floats) -> tuple[Floats, Floats]:
-    """Return W and V after a step; arguments as in `along_quadrics`."""
     mat_w, vec_v = with_vector(MODELS['10'].effects, values).linear_part
     turned, step_v = with_vector(MODELS['10'].effects, step).linear_part
     step_w = turned - _IDENTITY
-    mat_a = np.linalg.inv(mat_w @ mat_w)
-    step_a = -mat_a @ (step_w @ mat_w + mat_w @ step_w) @ mat_a
-    vec_b, step_b = mat_a @ vec_v, step_a @ vec_v + mat_a @ step_v
-    left = 1.0 - vec_v @ vec_b
-    change = (step_v @ vec_b + vec_v @ step_b) / left
-    mat_a = (mat_a * (1.0 + change) + step_a) / left
-    vec_b = (vec_b * (1.0 + change) + step_b) / left
-    centre = np.linalg.solve(mat_a, vec_b)
-    squared, axes = np.linalg.eigh(mat_a / (1.0 + centre @ vec_b))
-    return (axes / np.sqrt(squared)) @ axes.T, centre
+    try:
+        mat_a = np.linalg.inv(mat_w @ mat_w)
+        step_a = -mat_a @ (step_w @ mat_w + mat_w @ step_w) @ mat_a
+        vec_b, step_b = mat_a @ vec_v, step_a @ vec_v + mat_a @ step_v
+        left = 1.0 - vec_v @ vec_b
+        change = (step_v @ vec_b + vec_v @ step_b) / left
+        mat_a = (mat_a * (1.0 + change) + step_a) / left
+        vec_b = (vec_b * (1.0 + change) + step_b) / left
+        centre = np.linalg.solve(mat_a, vec_b)
+        squared, axes = np.linalg.eigh(mat_a / (1.0 + centre @ vec_b))
+    except np.linalg.LinAlgError:
+        return np.full(len(values), np.nan)
+    mat_w = (axes / np.sqrt(squared)) @ axes.T
+    return linear_model('10', (mat_w + mat_w.T) / 2.0, centre).vector
 
 
 _MOST_SUBSETS = 400

@@ -369,7 +369,14 @@ def _with_those_that_agree(name: str, poses_g: Poses, kept: Indices
     tried: set[bytes] = set()
     while (fit := _fit(name, poses_g, kept)) is not None:
         tried.add(kept.tobytes())
-        agreeing = np.flatnonzero(_agrees(fit, kept, poses_g))
+        data = judge(fit.model, poses_g).by_pose
+        leverage = np.einsum('nkp,pq,nkq->n', data.columns, fit.by_pose.spread, data.columns)
+        inside = np.isin(np.arange(len(poses_g)), kept)
+        spare = np.where(inside, np.maximum(1.0 - leverage, 1e-6), 1.0 + leverage)
+        belief = belief_beside(fit.dof, fit.chi2, fit.noise_known)
+        size = data.residual[:, 0] ** 2 / spare / ((belief + fit.chi2) / (belief + fit.dof))
+        agreeing = np.flatnonzero(
+            beyond(size, data.rows, belief + fit.dof) >= LEVEL / len(poses_g))
         if len(poses_g) - len(agreeing) > _most(name, len(poses_g)):
             return None
         if agreeing.tobytes() in tried or len(tried) == _ROUNDS:
@@ -390,17 +397,6 @@ def _most(name: str, count: int) -> int:
     """Return the largest number of poses that can be left out."""
     free = len(parameter_names(MODELS[name].effects))
     return _limit(count - free, count, 1)
-
-
-def _agrees(fit: Fit, kept: Indices, poses_g: Poses) -> NDArray[np.bool_]:
-    """Return which poses agree with a fit to the poses kept."""
-    data = judge(fit.model, poses_g).by_pose
-    leverage = np.einsum('nkp,pq,nkq->n', data.columns, fit.by_pose.spread, data.columns)
-    inside = np.isin(np.arange(len(poses_g)), kept)
-    spare = np.where(inside, np.maximum(1.0 - leverage, 1e-6), 1.0 + leverage)
-    belief = belief_beside(fit.dof, fit.chi2, fit.noise_known)
-    size = data.residual[:, 0] ** 2 / spare / ((belief + fit.chi2) / (belief + fit.dof))
-    return beyond(size, data.rows, belief + fit.dof) >= LEVEL / len(poses_g)
 
 
 class Rival(NamedTuple):

@@ -134,6 +134,8 @@ def change_in_words(name: str, change: float, sd: float) -> str:
 def calibration_json(calibration: Calibration, ahead: Outlook) -> dict[str, Any]:
     """Return a calibration for JSON, with what its poses determine; None: not known."""
     gyro, noise = calibration.gyro, calibration.noise
+    seen, asked = ahead.identifiability, ahead.next_pose
+    unseen = seen.open_parameters
     return {
         'model': calibration.name, 'method': calibration.method,
         'units': calibration.units.name, 'sensor': calibration.sensor,
@@ -147,19 +149,7 @@ def calibration_json(calibration: Calibration, ahead: Outlook) -> dict[str, Any]
         'warnings': calibration.warnings, **_own_names(calibration),
         'gyro_bias': gyro and gyro.bias, 'gyro_bias_sd': gyro and gyro.sd,
         'noise_force': noise and _known(noise.force), 'noise_rate': noise and _known(noise.rate),
-        **_outlook(ahead)}
-
-
-def _known(values: Floats) -> Floats | None:
-    return None if np.isnan(values).all() else values
-
-
-def _outlook(found: Outlook) -> dict[str, Any]:
-    """Return what the poses determine, and the next pose, for JSON."""
-    seen, asked = found.identifiability, found.next_pose
-    unseen = seen.open_parameters
-    return {
-        'uncertainty_mg': found.uncertainty_mg,
+        'uncertainty_mg': ahead.uncertainty_mg,
         'identifiability': {
             'model': seen.model, 'dilution': seen.dilution, 'mean_dilution': seen.mean_dilution,
             'parameters': {name: {'determined': name not in unseen, 'dilution': deviation}
@@ -168,6 +158,10 @@ def _outlook(found: Outlook) -> dict[str, Any]:
                              for open_ in seen.undetermined]},
         'next_pose': None if asked.direction is None else {
             'direction': asked.direction, 'words': asked.words}}
+
+
+def _known(values: Floats) -> Floats | None:
+    return None if np.isnan(values).all() else values
 
 
 def _own_names(calibration: Calibration) -> dict[str, Any]:

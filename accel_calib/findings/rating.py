@@ -62,23 +62,17 @@ def rate(calibration: Calibration, *, refinement: Refinement | None = None) -> R
     figures += ['noise not known' if noise is None else f'noise {mg(noise)}',
                 counted(len(expected.poses), 'pose'),
                 f'{100.0 * quality.coverage:.0f} % of the sphere']
-    return rated(findings_of(expected, refinement), good, ', '.join(figures),
-                 step_after(calibration))
-
-
-def rate_refinement(result: Refinement) -> Rating:
-    return rate(result.calibration, refinement=result)
-
-
-def findings_of(expected: Expected, refinement: Refinement | None) -> tuple[Finding, ...]:
-    """Return what is worth knowing about a calibration, that which decides its rating first."""
     named = [*_beyond_noise(expected, refinement), *_not_corrected(expected)]
     error = expected.inexact_mg if named else expected.error_mg
     own = [*_too_large(expected, refinement), *_figures_beyond_limits(expected, refinement),
            *_limited(expected), *_checked(expected), *named,
            *_inexact(expected, error, refinement)]
-    kinds = {each.kind for each in own}
-    return ranked((*own, *without(expected.calibration.noted, *kinds)))
+    noted = without(calibration.noted, *(each.kind for each in own))
+    return rated(ranked((*own, *noted)), good, ', '.join(figures), step_after(calibration))
+
+
+def rate_refinement(result: Refinement) -> Rating:
+    return rate(result.calibration, refinement=result)
 
 
 def _too_large(expected: Expected, refinement: Refinement | None) -> Iterator[Finding]:
@@ -271,9 +265,14 @@ def _remedy(expected: Expected, refinement: Refinement | None) -> NextStep:
 
 def step_after(calibration: Calibration) -> NextStep:
     """Return what to do with a good calibration."""
-    if calibration.is_levelled:
-        return NextStep('done', f'use the calibration; {temperature_words(calibration)}')
     poses, words = calibration.used_poses, 'place the robot level, and level the mounting by it'
+    if calibration.is_levelled:
+        low, high = range_of(poses, 'temperature')
+        room = max(SPAN.value - (high - low), 0.0) / 2.0
+        warm = 'record the temperature, too' if math.isnan(low) else (
+            f'fit again when the temperature leaves {math.floor(low - room)}..'
+            f'{math.ceil(high + room)} °C')
+        return NextStep('done', f'use the calibration; {warm}')
     if len(poses):
         up = directions_in(poses, calibration) @ flat_direction(calibration.frame)
         nearest = int(np.argmax(up))
@@ -282,16 +281,6 @@ def step_after(calibration: Calibration) -> NextStep:
             return NextStep('level', f'{words}; if it was level in row {row}, by this pose',
                             (row,))
     return NextStep('level', words)
-
-
-def temperature_words(calibration: Calibration) -> str:
-    """Return the range of temperature in which a calibration is valid."""
-    low, high = range_of(calibration.used_poses, 'temperature')
-    if math.isnan(low):
-        return 'record the temperature, too'
-    room = max(SPAN.value - (high - low), 0.0) / 2.0
-    return (f'fit again when the temperature leaves {math.floor(low - room)}..'
-            f'{math.ceil(high + room)} °C')
 
 
 # ----------------------------------------------------------------------------- other results

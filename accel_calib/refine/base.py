@@ -139,21 +139,18 @@ def sampled(poses: Poses) -> Poses:
     if len(poses) <= most:
         return poses
     new = poses['new'] > 0.0 if 'new' in poses else np.ones(len(poses), bool)
-    parts = [part[_kept(poses.take(part), most)]
-             for part in (np.flatnonzero(new), np.flatnonzero(~new))]
+    parts = []
+    for part in (np.flatnonzero(new), np.flatnonzero(~new)):
+        count = len(part)
+        kept = _spread(count, most)
+        if 'orientation' in poses and count > most:
+            group = np.unique(poses['orientation'][part], return_inverse=True)[1]
+            groups = int(group.max()) + 1
+            whole = np.flatnonzero(np.isin(group, _spread(groups, max(most * groups // count, 1))))
+            if most // 2 <= len(whole) <= 2 * most:
+                kept = whole  # all poses of some orientations
+        parts.append(part[kept])
     return poses.take(np.sort(np.concatenate(parts)))
-
-
-def _kept(poses: Poses, most: int) -> NDArray[np.intp]:
-    """Return the indices of the sample; poses of one orientation stay together if few enough."""
-    count = len(poses)
-    if 'orientation' in poses and count > most:
-        group = np.unique(poses['orientation'], return_inverse=True)[1]
-        groups = int(group.max()) + 1
-        kept = np.flatnonzero(np.isin(group, _spread(groups, max(most * groups // count, 1))))
-        if most // 2 <= len(kept) <= 2 * most:
-            return kept
-    return _spread(count, most)
 
 
 def _spread(count: int, wanted: int) -> NDArray[np.intp]:
@@ -302,23 +299,21 @@ def unclipped(poses_g: Poses, base: Model) -> tuple[State | None, Clipped | None
     linear = MODELS['10'].effects
     values = {name: part for name, part in base.values.items() if name not in included(linear)}
     values |= {name: np.zeros(3) for name in linear if name not in values}
-    if not any(_fits_better(model, plain, kept) for model in (base, Model(values))):
+    for model in (base, Model(values)):
+        fewer = fitted_state(model, with_history(kept, model))
+        if fewer is None or fewer.dof < 1:
+            continue
+        whole = fitted_state(model, with_history(plain, model))
+        if whole is None or whole.linear.score(
+                fewer.rss, float(len(plain) - len(kept)), 0.0) > _CLEARLY:
+            break
+    else:
         return None, None
     whole = fitted_state(base, with_history(plain, base))
     if whole is None:  # it converges only without the poses at the limit
         model = beginning(kept, base).model
         whole = State(judge(model, with_history(plain, model)))
     return whole, clip
-
-
-def _fits_better(model: Model, plain: Poses, kept: Poses) -> bool:
-    """Return whether a model fits the poses clearly better without those at the limit."""
-    fewer = fitted_state(model, with_history(kept, model))
-    if fewer is None or fewer.dof < 1:
-        return False
-    whole = fitted_state(model, with_history(plain, model))
-    return whole is None or bool(
-        whole.linear.score(fewer.rss, float(len(plain) - len(kept)), 0.0) > _CLEARLY)
 
 
 def off_grid(poses_g: Poses, base: Model) -> tuple[Poses, float | None]:
@@ -355,8 +350,13 @@ def beside_stored(poses_g: Poses, calibration: Calibration, model: Model) -> Pos
     new, old = ({tuple(row) for row in poses.reading.round(7).tolist()}  # files round
                 for poses in (poses_g, stored))
     shared, edited = not new.isdisjoint(old), has(calibration.noted, 'edited')
-    if shared and not edited and _agrees(calibration, poses_g):
-        return poses_g
+    if shared and not edited:
+        as_stored = Model(calibration.model.values)
+        fit = estimate(as_stored, poses_g)
+        excess = judge(as_stored, calibration.held(poses_g)).chi2 - fit.chi2
+        worse = max(fit.chi2 / max(fit.dof, 1), 1.0)
+        if excess / worse < scipy.special.chdtri(len(as_stored.vector), 1.0 - _SAME):
+            return poses_g  # a fit is no better than the calibration
     if shared or edited:  # with the readings that the calibration predicts in their directions
         here = calibration.model.at(stored.columns)
         stored = stored.with_columns(reading=here.reading(unit(here.force(stored.reading))))
@@ -387,12 +387,3 @@ def with_stored(poses: Poses, calibration: Calibration) -> Poses:
 
 def _rows(poses: Poses, stored: Poses) -> NDArray[np.int64]:
     return np.concatenate([poses.row, int(poses.row.max()) + 1 + np.arange(len(stored))])
-
-
-def _agrees(calibration: Calibration, poses_g: Poses) -> bool:
-    """Return whether a fit to the poses is no better than the calibration as stored."""
-    model = Model(calibration.model.values)
-    fit = estimate(model, poses_g)
-    excess = judge(model, calibration.held(poses_g)).chi2 - fit.chi2
-    worse = max(fit.chi2 / max(fit.dof, 1), 1.0)
-    return bool(excess / worse < scipy.special.chdtri(len(model.vector), 1.0 - _SAME))

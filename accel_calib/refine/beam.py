@@ -67,26 +67,22 @@ def explored(linear: Linear) -> list[Set]:
     """
     names = [name for name in linear.numbers_of if name in CHANGES]
     changes = [int(linear.numbers_of[name][0]) for name in names if name not in included(names)]
-    starts = {(), tuple(changes)}
-    return _distinct(found for start in starts for found in _from(Set.of(linear, start)))
-
-
-def _from(start: Set) -> list[Set]:
-    """Return the sets visited when effects are added to a set, in any order."""
-    front = _distinct(with_outliers([start]))
-    visited = list(front)
-    best, idle = max(chosen.score for chosen in front), 0
-    for _ in range(_LARGEST):
-        tested = (_with_best_shapes(new) for new in _larger(front))
-        front = _distinct(with_outliers(tested))[:_WIDTH]
-        if not front:
-            break
-        visited += [*front, *(fewer for new in front[:3] for fewer in _fewer(new))]
-        idle = 0 if front[0].score > best else idle + 1
-        best = max(best, front[0].score)
-        if idle == _PATIENCE:
-            break
-    return visited
+    visited: list[Set] = []
+    for start in {(), tuple(changes)}:
+        front = _distinct(with_outliers([Set.of(linear, start)]))
+        visited += front
+        best, idle = max(chosen.score for chosen in front), 0
+        for _ in range(_LARGEST):
+            tested = (_with_best_shapes(new) for new in _larger(front))
+            front = _distinct(with_outliers(tested))[:_WIDTH]
+            if not front:
+                break
+            visited += [*front, *(fewer for new in front[:3] for fewer in _fewer(new))]
+            idle = 0 if front[0].score > best else idle + 1
+            best = max(best, front[0].score)
+            if idle == _PATIENCE:
+                break
+    return _distinct(visited)
 
 
 def _fewer(chosen: Set) -> list[Set]:
@@ -147,8 +143,17 @@ def accepted(visited: Iterable[Set]) -> Iterator[Set]:
 
 def _larger(front: list[Set]) -> list[Set]:
     """Return the best sets with one effect more than those of a front."""
-    likely = sorted((each for before in front for each in _branches(before)),
-                    key=lambda each: -each[0])
+    likely: list[tuple[float, Set, int]] = []  # the largest possible score, a set, a new block
+    for before in front:
+        linear, scores = before.linear, before.scores_beside
+        tops: dict[str, tuple[float, int]] = {}
+        for effect, numbers in linear.numbers_of.items():
+            number = int(numbers[np.argmax(scores[numbers])])
+            if scores[number] > -np.inf and not _is_barred(linear.blocks[number], before.entries):
+                tops[effect] = round(float(scores[number]), _DECIMALS), number
+        likely += [(score + before.unusual, before, number) for score, number in sorted(
+            tops.values(), key=lambda each: -each[0])[:_BRANCHES]]
+    likely.sort(key=lambda each: -each[0])
     front[0].linear.products_with([number for _, _, number in likely[:_TESTED]])  # at once: fast
     best: list[Set] = []
     for most, before, number in likely:
@@ -156,18 +161,6 @@ def _larger(front: list[Set]) -> list[Set]:
             break
         best = _distinct([*best, before.extended(number)])[:_TESTED]
     return best
-
-
-def _branches(before: Set) -> Iterator[tuple[float, Set, int]]:
-    """Yield a set with the block of one more effect, and the largest score that they can have."""
-    linear, scores = before.linear, before.scores_beside
-    best: dict[str, tuple[float, int]] = {}
-    for effect, numbers in linear.numbers_of.items():
-        number = int(numbers[np.argmax(scores[numbers])])
-        if scores[number] > -np.inf and not _is_barred(linear.blocks[number], before.entries):
-            best[effect] = round(float(scores[number]), _DECIMALS), number
-    for score, number in sorted(best.values(), key=lambda each: -each[0])[:_BRANCHES]:
-        yield score + before.unusual, before, number
 
 
 def _is_barred(block: Block, present: Iterable[Block]) -> bool:

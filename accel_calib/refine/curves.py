@@ -411,24 +411,15 @@ def walk_beside(chosen: Set, process: Process) -> Walk:
         (linear.worth + np.maximum(rss, 1e-300)) / (linear.worth + chosen.rss + 1e-300))
     best = int(np.argmin(np.where(allowed, deviance, np.inf)))
     fall = float(-deviance[best])
-    return Walk(process, float(_RATIOS[best]), chosen.score + fall - _charge(linear),
-                fall - _fall_by_scatter(linear, residual, chosen.rss))
-
-
-def _fall_by_scatter(linear: Linear, residual: Floats, white: float) -> float:
-    """
-    Return twice the log of the likelihood ratio of an offset that scatters, which is no walk.
-
-    Poses that repeat worse than their samples have the same additional variance in g, which shows
-    most where the samples vary little.
-
-    """
+    # An offset that scatters is no walk: poses that repeat worse than their samples have the same
+    # additional variance in g, which shows most where the samples vary little.
     size = np.sum(linear.offset ** 2, axis=1)
     spread = 1.0 + _RATIOS[:, np.newaxis] * size / max(float(np.max(size)), 1e-300)
-    rss = (1.0 / spread) @ residual ** 2
-    deviance = np.sum(np.log(spread), axis=1) + (linear.worth + linear.dof) * np.log(
-        (linear.worth + rss + 1e-300) / (linear.worth + white + 1e-300))
-    return max(float(-np.min(deviance)), 0.0)
+    of_scatter = np.sum(np.log(spread), axis=1) + weight * np.log(
+        (linear.worth + (1.0 / spread) @ residual ** 2 + 1e-300)
+        / (linear.worth + chosen.rss + 1e-300))
+    return Walk(process, float(_RATIOS[best]), chosen.score + fall - _charge(linear),
+                fall - max(float(-np.min(of_scatter)), 0.0))
 
 
 def _charge(linear: Linear) -> float:
@@ -499,21 +490,10 @@ def probabilities(name: str, near: Near, *, usual: bool = True) -> dict[str, flo
         return {name: 1.0}
     whole = near.plain.worth + near.plain.dof
     certainty = max((whole - near.chosen.parameters) / whole, LEAST)
-    scores = _scores(name, near, 2.0 * np.log(LEAST) / certainty, usual=usual)
-    most = max(scores.values())
-    weights = {key: float(np.exp(certainty * (score - most) / 2.0))
-               for key, score in scores.items()}
-    total = sum(weights.values())
-    ordered = sorted(weights, key=lambda key: -weights[key])
-    return {key: weights[key] / total for key in ordered}
-
-
-def _scores(name: str, near: Near, least: float, *, usual: bool) -> dict[str, float]:
-    """Return the scores of the set with each effect in the place of a named one, above `least`."""
     back = 0.0 if usual else 1.0
     others = near.beside if name == WANDER else near.without(name)
     scores = {name: near.chosen.score + back * near.chosen.unusual}
-    least += scores[name] - back * others.unusual
+    least = 2.0 * np.log(LEAST) / certainty + scores[name] - back * others.unusual
     for number, likely in enumerate(others.scores_beside):
         effect = others.linear.blocks[number].effect
         if (likely > least and effect not in near.names
@@ -527,4 +507,9 @@ def _scores(name: str, near: Near, least: float, *, usual: bool) -> dict[str, fl
     for other in scores:
         own, unusual = near.fitted.get((name, other), (np.inf, 0.0))
         scores[other] = min(scores[other], own + back * unusual)
-    return scores
+    most = max(scores.values())
+    weights = {key: float(np.exp(certainty * (score - most) / 2.0))
+               for key, score in scores.items()}
+    total = sum(weights.values())
+    ordered = sorted(weights, key=lambda key: -weights[key])
+    return {key: weights[key] / total for key in ordered}

@@ -40,7 +40,7 @@ them costs, and the effects of the catalogue cost the same. Each pose that is le
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import accumulate, groupby
@@ -324,7 +324,7 @@ class Set:
         """Return the penalty for effects that are far larger than in common sensors."""
         if not self.blocks:
             return 0.0
-        largest = np.maximum.reduceat(np.abs(self._values), self._starts)
+        largest = np.array([np.max(np.abs(values)) for values in self.values.values()])
         typical = [each.entry.typical for each in self.entries]
         away = np.log(np.maximum(largest / typical, 1.0)) / _USUAL
         return float(np.sum(np.minimum(away ** 2, _MOST_UNUSUAL)))
@@ -345,20 +345,9 @@ class Set:
     @cached_property
     def values(self) -> dict[int, Floats]:
         """Return the (p,) values of the effect of each block."""
-        if not self.blocks:
-            return {}
-        return dict(zip(self.blocks, np.split(self._values, self._starts[1:]), strict=True))
-
-    @property
-    def _values(self) -> Floats:
-        """Return the values of all effects."""
-        return self.mix[len(self.root):] @ self.across[:, -1] / self.linear.sizes[self._index]
-
-    @property
-    def _starts(self) -> list[int]:
-        """Return the place of the first value of each effect."""
-        return [0, *accumulate(each.columns.stop - each.columns.start
-                               for each in self.entries[:-1])]
+        values = self.mix[len(self.root):] @ self.across[:, -1] / self.linear.sizes[self._index]
+        ends = accumulate(each.columns.stop - each.columns.start for each in self.entries)
+        return dict(zip(self.blocks, np.split(values, list(ends)), strict=False))
 
     @property
     def _index(self) -> list[int]:
@@ -434,32 +423,25 @@ class Set:
 def with_outliers(sets: Iterable[Set]) -> Iterator[Set]:
     """Yield sets of one problem as they are, and with the outliers that each leaves, if others."""
     sets = list(sets)
-    _find_outliers({frozenset(chosen.blocks): chosen for chosen in sets
-                    if frozenset(chosen.blocks) not in chosen.linear.outliers}.values())
+    new = {frozenset(chosen.blocks): Set.of(chosen.linear, chosen.blocks) if chosen.out else chosen
+           for chosen in sets if frozenset(chosen.blocks) not in chosen.linear.outliers}
+    if new:  # at once, which is faster
+        linear = sets[0].linear
+        parts = [by_pose(residual, np.hstack([linear.onto, onto]), linear.pose)
+                 for onto, residual in (whole.spanned for whole in new.values())]
+        basis = np.zeros((len(parts), *parts[0].residual.shape,
+                          max(part.columns.shape[2] for part in parts)))
+        for own, part in zip(basis, parts, strict=True):
+            own[:, :, :part.columns.shape[2]] = part.columns
+        found = outliers_among(np.stack([part.residual for part in parts]), basis, parts[0].rows,
+                               [linear.dof - int(whole.parameters) for whole in new.values()],
+                               linear.poses, noise_known=linear.worth > 0.0)
+        linear.outliers.update(zip(new, (tuple(out.tolist()) for out in found), strict=True))
     for chosen in sets:
         yield chosen
         out = chosen.linear.outliers[frozenset(chosen.blocks)]
         if out != chosen.out:
             yield Set.of(chosen.linear, chosen.blocks, out)
-
-
-def _find_outliers(sets: Collection[Set]) -> None:
-    """Find the outliers that sets of one problem leave, at once, which is faster."""
-    if not sets:
-        return
-    whole = [Set.of(chosen.linear, chosen.blocks) if chosen.out else chosen for chosen in sets]
-    linear, spanned = whole[0].linear, [chosen.spanned for chosen in whole]
-    parts = [by_pose(residual, np.hstack([linear.onto, onto]), linear.pose)
-             for onto, residual in spanned]
-    basis = np.zeros((len(parts), *parts[0].residual.shape,
-                      max(part.columns.shape[2] for part in parts)))
-    for own, part in zip(basis, parts, strict=True):
-        own[:, :, :part.columns.shape[2]] = part.columns
-    found = outliers_among(np.stack([part.residual for part in parts]), basis, parts[0].rows,
-                           [linear.dof - int(chosen.parameters) for chosen in whole],
-                           linear.poses, noise_known=linear.worth > 0.0)
-    linear.outliers.update((frozenset(chosen.blocks), tuple(out.tolist()))
-                           for chosen, out in zip(whole, found, strict=True))
 
 
 def _explained(products: Floats, along: Floats) -> tuple[Floats, Floats]:

@@ -169,9 +169,31 @@ def plan_poses(found: Found) -> PosePlan:
         return PosePlan()
     needs = {key for each in rivalries for name in each for key in effect_named(name).needs}
     varied = [key for key in (*VARIED, *sorted(filter(is_quantity, needs))) if key in needs]
-    poses_g, up, shown = _candidates(found.final.fit, varied)
-    contests = [_Contest.of(each, found.near, poses_g) for each in rivalries]
-    return _in_words(contests, up, shown, _chosen(contests))
+    so_far = found.final.poses_g
+    directions = np.vstack([ATTITUDES, spread_directions(_DIRECTIONS)])
+    settings = [dict(zip(varied, each, strict=True))  # those that are easier to set come first
+                for each in product(*(_levels(key, so_far) for key in varied))]
+    up = np.tile(directions, (len(settings), 1))
+    shown = [setting for setting in settings for _ in directions]
+    columns = _columns(so_far, up, shown)
+    columns['reading'] = found.final.model.at(columns).reading(up)
+    candidates = Poses(columns, np.arange(1, len(up) + 1))
+    contests = [_Contest.of(each, found.near, candidates) for each in rivalries]
+    chosen: list[tuple[int, _Contest]] = []  # candidates, each with the contest that it is for
+    left = list(contests)
+    while len(chosen) < MOST_POSES:
+        taken = [index for index, _ in chosen]
+        expected = {each: each.expected(taken) for each in left}
+        left = [each for each in left if expected[each] < ENOUGH]
+        if not left:
+            break
+        worst = min(left, key=expected.__getitem__)
+        gains = worst.gains(taken)
+        if np.max(gains) < _LEAST_GAIN:
+            left.remove(worst)
+        else:
+            chosen.append((int(np.argmax(gains >= _AS_GOOD * np.max(gains))), worst))
+    return _in_words(contests, up, shown, chosen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,17 +254,15 @@ class _Contest:
             roots.append(np.linalg.cholesky(np.eye(len(own)) + own @ spread @ own.T))
         # The same random readings for each plan.
         noise = np.random.default_rng(1).normal(size=(1000, means.shape[1]))
-        return sum(float(weight) * self._right(j, means, roots, noise)
-                   for j, weight in enumerate(self.weights))
-
-    def _right(self, right: int, means: Floats, roots: list[Floats], noise: Floats) -> float:
-        """Return the expected probability of one model if it is right."""
-        drawn = means[right] + noise @ roots[right].T
-        logs = np.array([np.log(weight) - np.sum(
-            np.linalg.solve(root, (drawn - mean).T) ** 2, axis=0) / 2.0
-            for weight, mean, root in zip(self.weights, means, roots, strict=True)])
-        parts = np.exp(logs - np.max(logs, axis=0))
-        return float(np.mean(parts[right] / np.sum(parts, axis=0)))
+        expected = 0.0
+        for right, probability in enumerate(self.weights.tolist()):
+            drawn = means[right] + noise @ roots[right].T
+            logs = np.array([np.log(weight) - np.sum(
+                np.linalg.solve(root, (drawn - mean).T) ** 2, axis=0) / 2.0
+                for weight, mean, root in zip(self.weights, means, roots, strict=True)])
+            parts = np.exp(logs - np.max(logs, axis=0))
+            expected += probability * float(np.mean(parts[right] / np.sum(parts, axis=0)))
+        return expected
 
 
 def _fits(name: str, found: Found) -> dict[str, tuple[float, Fit]]:
@@ -268,24 +288,6 @@ def _fits(name: str, found: Found) -> dict[str, tuple[float, Fit]]:
     if len(fits) < 2 or max(weights[each] for each in fits) >= ENOUGH * total:
         return {}
     return {each: (weights[each] / total, fit) for each, fit in fits.items()}
-
-
-def _candidates(fit: Fit, varied: Sequence[str]) -> tuple[Poses, Floats, list[dict[str, float]]]:
-    """
-    Return poses that can be taken, with the readings that a model predicts [g].
-
-    Return also the (c, 3) direction that points up, and the varied context of each; the time is
-    the wait after the last pose. Those that are easier to set come first.
-
-    """
-    directions = np.vstack([ATTITUDES, spread_directions(_DIRECTIONS)])
-    levels = [_levels(key, fit.poses_g) for key in varied]
-    settings = [dict(zip(varied, each, strict=True)) for each in product(*levels)]
-    up = np.tile(directions, (len(settings), 1))
-    shown = [setting for setting in settings for _ in directions]
-    columns = _columns(fit.poses_g, up, shown)
-    columns['reading'] = fit.model.at(columns).reading(up)
-    return Poses(columns, np.arange(1, len(up) + 1)), up, shown
 
 
 def _levels(key: str, poses_g: Poses) -> list[float]:
@@ -333,25 +335,6 @@ def _columns(poses_g: Poses, force: Floats, shown: Sequence[Mapping[str, float]]
     if 'new' in poses_g:
         found['new'] = np.ones(count)
     return {**found, 'previous': -force}  # turned from the opposite attitude
-
-
-def _chosen(contests: Sequence[_Contest]) -> list[tuple[int, _Contest]]:
-    """Return the chosen candidates, each with the contest for which it was chosen."""
-    chosen: list[tuple[int, _Contest]] = []
-    left = list(contests)
-    while len(chosen) < MOST_POSES:
-        taken = [index for index, _ in chosen]
-        expected = {each: each.expected(taken) for each in left}
-        left = [each for each in left if expected[each] < ENOUGH]
-        if not left:
-            break
-        worst = min(left, key=expected.__getitem__)
-        gains = worst.gains(taken)
-        if np.max(gains) < _LEAST_GAIN:
-            left.remove(worst)
-        else:
-            chosen.append((int(np.argmax(gains >= _AS_GOOD * np.max(gains))), worst))
-    return chosen
 
 
 def _in_words(contests: Sequence[_Contest], up: Floats, shown: Sequence[Mapping[str, float]],

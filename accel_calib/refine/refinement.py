@@ -220,30 +220,34 @@ def refine(poses: Poses, units: Units, *, base: str | Calibration | FleetPrior =
 
     """
     if isinstance(base, FleetPrior):
-        return _refine_with_fleet(poses, units, base, sensor, date, also)
-    check_units(poses, units)
-    if isinstance(base, Calibration):
-        check_sensor(base, poses.sensor)
-        check_sensor(base, sensor)
-    sure, doubts = sure_rows(poses)
-    with explained_by(poses.findings):
-        if doubts:
+        found = _refine_with_fleet(poses, units, base, also)
+    else:
+        check_units(poses, units)
+        if isinstance(base, Calibration):
+            check_sensor(base, poses.sensor)
+            check_sensor(base, sensor)
+        sure, doubts = sure_rows(poses)
+        with explained_by(poses.findings):
             try:
-                return _refine(poses, sure, doubts, units, base, sensor, date, also)
+                found = _refine(poses, sure, doubts, units, base, also)
             except RefusedFitError:
-                pass  # the fit needs the doubtful poses
-        return _refine(poses, poses, (), units, base, sensor, date, also)
+                if not doubts:
+                    raise
+                found = _refine(poses, poses, (), units, base, also)  # with the doubtful poses
+    made = found.calibration
+    return replace(found, calibration=replace(
+        made, sensor=sensor or poses.sensor or made.sensor, date=date or made.date))
 
 
 def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Units,
-            base: str | Calibration, sensor: str, date: str, also: tuple[str, ...]) -> Refinement:
+            base: str | Calibration, also: tuple[str, ...]) -> Refinement:
     """Return the refinement with some of the poses; the others are already rejected."""
     sound, unsound = sound_rows(used, units)
     if len(sound) < _LEAST_POSES:
         raise RefusedFitError(f'found {counted(len(sound), "sound pose")}, expected at least '
                               f'{_LEAST_POSES} to find an effect', 'take 24 poses or more')
     stored = base if isinstance(base, Calibration) else None
-    calibration = stored or base_of(poses, units, str(base), sensor=sensor, date=date)
+    calibration = stored or base_of(poses, units, str(base))
 
     def at(model: Model) -> Poses:
         known = with_history(in_g(sound, calibration.units), model)
@@ -272,7 +276,7 @@ def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Un
                      'disturbed poses among the others; choose rows to use others')
     note = (*(poses.findings if stored else ()), *((sample,) if len(poses_g) < total else ()))
     given = Given(poses, poses_g, stored is not None, (*rejected, *unsound), note)
-    return _record(calibration, found, given, sensor or poses.sensor, date)
+    return _record(calibration, found, given)
 
 
 def _along_ways(final: State, at: Callable[[Model], Poses]) -> Poses:
@@ -299,8 +303,7 @@ def _is_same_way(model: Model, *ways: Poses) -> bool:
     return bool(np.max(np.abs(one - other), initial=0.0) < _SAME_WAY_G)
 
 
-def _record(calibration: Calibration, found: Found, given: Given, sensor: str, date: str
-            ) -> Refinement:
+def _record(calibration: Calibration, found: Found, given: Given) -> Refinement:
     start, final = found.base, found.final
     if given.stored:  # as stored, without a fit
         kept = calibration.held(start.poses_g)
@@ -316,11 +319,10 @@ def _record(calibration: Calibration, found: Found, given: Given, sensor: str, d
     if found.clipped is not None:
         of_search += [Rejected(int(row), CLIPPED, 'clipped')
                       for row in given.poses_g.row[found.clipped.poses]]
-    rejected = tuple(sorted((*given.rejected, *(
-        each for each in of_search if each.row in given.poses.row)), key=lambda each: each.row))
-    outliers = tuple(each.row for each in rejected if each.kind != 'clipped')
-    refined, refusal = refined_calibration(calibration, final, found.added, given, rejected)
-    refined = replace(refined, sensor=sensor or refined.sensor, date=date or refined.date)
+    given = replace(given, rejected=(
+        *given.rejected, *(each for each in of_search if each.row in given.poses.row)))
+    refined, refusal = refined_calibration(calibration, final, found.added, given)
+    outliers = tuple(each.row for each in refined.rejected if each.kind != 'clipped')
     if refusal:
         steps = tuple(replace(step, parameters_sd={}) for step in steps)
     verdict, undecided = verdict_of(found, steps, refused=bool(refusal))
@@ -332,8 +334,8 @@ def _record(calibration: Calibration, found: Found, given: Given, sensor: str, d
         final.fit.equations.force, stages, plan, undecided, found.one_curve)
 
 
-def _refine_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, sensor: str, date: str,
-                       also: tuple[str, ...]) -> Refinement:
+def _refine_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, also: tuple[str, ...]
+                       ) -> Refinement:
     """
     Find effects beyond model 10, with the typical values of a fleet for model 10.
 
@@ -341,29 +343,26 @@ def _refine_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, sensor: st
     steps have the residuals of the search, which does not use the fleet.
 
     """
-    fitted = fit_with_fleet(poses, units, fleet, sensor=sensor, date=date)
+    fitted = fit_with_fleet(poses, units, fleet)
     try:
-        found = refine(poses, units, base=_BASE, sensor=sensor, date=date, also=also)
+        found = refine(poses, units, base=_BASE, also=also)
     except RefusedFitError as err:
         return _without_search(fitted, err.message, err.advice)
     if found.refusal:
         return _without_search(fitted, *found.refusal)
-    if found.calibration.model.effects == MODELS[_BASE].effects:
+    refined = found.calibration
+    if refined.model.effects == MODELS[_BASE].effects:
         return _with(found, fitted)
-    return _with(found, _combined(found.calibration, found.poses_g, fleet))
-
-
-def _combined(refined: Calibration, poses_g: Poses, fleet: FleetPrior) -> Calibration:
     values, covariance, findings = posterior(refined.model.vector, refined.covariance, fleet)
     model = with_vector(refined.model.effects, values)
-    fit = judge(model, poses_g.without_columns(*_ORIENTATION))
+    fit = judge(model, found.poses_g.without_columns(*_ORIENTATION))
     name = f' of model {fleet.model}' if fleet.model else ''
-    return with_rest_noise(gated(replace(
+    return _with(found, with_rest_noise(gated(replace(
         refined, model=Model(model.values, refined.model.rotation), covariance=covariance,
         method=FLEET, noted=(*findings, *refined.noted),
         quality=quality_of(fit, refined.units, unit(fit.equations.force)),
         reason=f'{refined.reason}; with the typical values of '
-               f'{counted(fleet.sensors, "sensor")}{name}')), refined.poses)
+               f'{counted(fleet.sensors, "sensor")}{name}')), refined.poses))
 
 
 def _with(found: Refinement, calibration: Calibration) -> Refinement:
@@ -399,23 +398,21 @@ def _of_fit(fitted: Calibration, poses_g: Poses, missing: tuple[tuple[str, str],
                       (), poses_g, fit.equations.force, (base,), PosePlan())
 
 
-def base_of(poses: Poses, units: Units, name: str, *, sensor: str = '', date: str = ''
-            ) -> Calibration:
-    """Return the base as a calibration; `sensor`, `date` and errors as in `fit_poses`."""
+def base_of(poses: Poses, units: Units, name: str) -> Calibration:
+    """
+    Return the base as a calibration; errors as in `fit_poses`.
+
+    The ideal sensor has a fitted offset and scale for native readings.
+
+    """
     if name not in BASES:
         raise ValueError(f'base is {name!r}, expected one of {BASES}')
-    if name == 'ideal':
-        return ideal(poses, units)
-    try:
-        return fit_poses(poses, units, model=name, sensor=sensor, date=date)
-    except RefusedFitError:
-        if name == 'auto' and 'orientation' in poses:
-            return ideal(poses, units)
-        raise
-
-
-def ideal(poses: Poses, units: Units) -> Calibration:
-    """Return the ideal sensor; for native readings with a fitted offset and scale."""
+    if name != 'ideal':
+        try:
+            return fit_poses(poses, units, model=name)
+        except RefusedFitError:
+            if name != 'auto' or 'orientation' not in poses:
+                raise
     values: dict[str, Floats] = {}
     if units.is_native:
         mat_w, vec_v = fit_sphere(poses.reading)
@@ -494,34 +491,27 @@ def refitted(before: Calibration, poses: Poses, *, sensor: str = '', date: str =
     if lacking:
         raise RefusedFitError(f'the poses have no {" or ".join(lacking)}, which the calibration '
                               'in use corrects for', 'record it, or call ~/reset')
-    final = _settled(before.model, poses_g)
+    kept, outlying = poses_g, np.zeros(0, np.intp)
+    for _ in range(_ROUNDS):
+        kept = kept.take(np.setdiff1d(np.arange(len(kept)), outlying))
+        final = fitted_state(Model(before.model.values), kept)
+        outlying = np.zeros(0, np.intp) if final is None else outliers(final.fit, len(poses_g))
+        if not len(outlying):
+            break
+    if final is None or len(outlying):
+        raise RefusedFitError('the effects of the calibration cannot be fitted to these poses, '
+                              'expected a fit that converges', TAKE_ALL_SIDES)
     out = [Rejected(int(row), 'outlier', 'outlier') for row in poses_g.row
            if row not in final.poses_g.row]
-    rejected = tuple(sorted((*doubts, *unsound, *out), key=lambda each: each.row))
-    given = Given(poses, poses_g, stored=True, rejected=rejected, notes=())
-    calibration, refusal = refined_calibration(before, final, (), given, rejected)
+    given = Given(poses, poses_g, stored=True, rejected=(*doubts, *unsound, *out), notes=())
+    calibration, refusal = refined_calibration(before, final, (), given)
     if refusal:
         raise RefusedFitError(*refusal)
     return replace(calibration, reason=before.reason, sensor=sensor or before.sensor, date=date)
 
 
-def _settled(model: Model, poses_g: Poses) -> State:
-    """Return the state of a model fitted to poses without the outliers."""
-    kept, out = poses_g, np.zeros(0, np.intp)
-    for _ in range(_ROUNDS):
-        kept = kept.take(np.setdiff1d(np.arange(len(kept)), out))
-        state = fitted_state(Model(model.values), kept)
-        if state is None:
-            break
-        out = outliers(state.fit, len(poses_g))
-        if not len(out):
-            return state
-    raise RefusedFitError('the effects of the calibration cannot be fitted to these poses, '
-                          'expected a fit that converges', TAKE_ALL_SIDES)
-
-
-def refined_calibration(base: Calibration, final: State, added: tuple[str, ...], given: Given,
-                        rejected: tuple[Rejected, ...]) -> tuple[Calibration, tuple[str, ...]]:
+def refined_calibration(base: Calibration, final: State, added: tuple[str, ...], given: Given
+                        ) -> tuple[Calibration, tuple[str, ...]]:
     """Return the refined calibration, and the refusal if it must not be used."""
     model, matrix = with_changes(final.model)
     kept, poses = final.poses_g, given.poses
@@ -540,7 +530,8 @@ def refined_calibration(base: Calibration, final: State, added: tuple[str, ...],
         base, model=Model(model.values, base.model.rotation),
         covariance=matrix @ final.fit.covariance @ matrix.T,
         quality=quality_of(at_poses, base.units, unit(at_poses.equations.force)), poses=poses,
-        rejected=rejected, noted=(*given.notes, *findings), method='ml',
+        rejected=tuple(sorted(given.rejected, key=lambda each: each.row)),
+        noted=(*given.notes, *findings), method='ml',
         reason=f'{base.reason}; refined: {names or "nothing added"}')
     if len(model.vector) > len(base.model.vector) and (
             final.dof < _LEAST_CHECKS or refined.quality.held_out_rms_mg is None):

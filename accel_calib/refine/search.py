@@ -45,7 +45,7 @@ from ..effects import (
     CHANGES, covariate_names, effect_named, EFFECTS, empirical_parts, factors_of, IN_PRODUCTS,
     included, LADDER, linear_values, Model, parameter_names, product_names, WANDER)
 from ..estimate import beside_scatter, kinds, scatter_of, stated
-from ..table import Floats, Poses
+from ..table import Poses
 
 _TIMED = 30.0
 """A curve over time must have a score better than a walk by this."""
@@ -258,24 +258,19 @@ def _is_coincidence(found: Found, name: str) -> bool:
         return False
     shape = entry.split(values[name])[1]
     factor, = factors_of(name, [shape], state.fit.context)
-    factors = _at_other_times(factor, state.poses_g)
+    count, poses_g = len(state.poses_g), state.poses_g
+    order = np.argsort(poses_g['time']) if 'time' in poses_g else np.arange(count)
+    away = factor[:, order] - np.mean(factor, axis=1, keepdims=True)
+    moved = np.array([np.roll(away, shift, axis=1) for shift in
+                      np.unique(np.linspace(1, count - 1, _SHIFTS).astype(int))])
+    alike = np.abs(np.sum(moved * away, axis=(1, 2))) > _ALIKE * np.sum(away ** 2)
+    factors = moved[~alike][:, :, np.argsort(order)]  # (s, t or 1, n)
     if len(factors) < 2:
         return False
     shifted = Candidate(name, (shape,) * len(factors), tuple(range(len(factors))), 1.0, factors)
     linear = linearised(state.fit, tuple(each for each in values if each != name), (shifted,))
     *others, own = Set.of(linear).gains()[0]
     return bool(max(others) > own)
-
-
-def _at_other_times(factor: Floats, poses_g: Poses) -> Floats:
-    """Return s cyclic shifts of a (t or 1, n) factor that hardly correlate with it, (s, …)."""
-    count = len(poses_g)
-    order = np.argsort(poses_g['time']) if 'time' in poses_g else np.arange(count)
-    away = factor[:, order] - np.mean(factor, axis=1, keepdims=True)
-    moved = np.array([np.roll(away, shift, axis=1) for shift in
-                      np.unique(np.linspace(1, count - 1, _SHIFTS).astype(int))])
-    alike = np.abs(np.sum(moved * away, axis=(1, 2))) > _ALIKE * np.sum(away ** 2)
-    return moved[~alike][:, :, np.argsort(order)]
 
 
 def _described(found: Found, start: State, poses_g: Poses) -> Found:

@@ -12,7 +12,7 @@ removes or exchanges them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -159,12 +159,7 @@ def _best_near(linear: Linear, trial: Trial, refused: set[frozenset[str]]) -> Ne
     if process is None or (linear.worth and not any(_in_time(best))
                            and is_all_noise(best.chosen)):
         return best
-    return _with_walk(best, process, best_of)
-
-
-def _with_walk(best: Near, process: Process, best_of: Callable[[Linear], Set]) -> Near:
-    """Return a set with a walk, if it has a better score than the set without one."""
-    linear, beside = best.plain, Set.of(best.plain)
+    beside = Set.of(linear)
     tried = [beside, best.chosen]
     for _ in range(_WALK_ROUNDS):
         walk = walk_beside(beside, process)

@@ -25,7 +25,7 @@ from .linear import Block, LEAST_OWN, Linear, orthonormal, outside_of
 from ..calibrate import determines, NORM_MODELS, with_history
 from ..effects import (
     Context, Effect, effect_named, factors_of, included, kind_of, linear_model, Model)
-from ..estimate import Equations, estimate, Fit, kinds, left_out, NotConvergedError
+from ..estimate import estimate, Fit, kinds, left_out, NotConvergedError
 from ..geometry import rms, unit
 from ..table import Floats, Poses
 from ..units import MG
@@ -141,13 +141,20 @@ def linearised(fit: Fit, base: tuple[str, ...], tried: Iterable[Candidate] = (),
     if further.values:
         residual = residual + near.columns(further) @ _amplitudes(further)
     onto = orthonormal(np.hstack([near.columns(held)[:, held.fitted], near.columns(beside)]))
-    residual = residual - onto @ (onto.T @ residual)
-    blocks, every, sizes = _blocks(near, onto, fit.context, further, tuple(tried))
-    every[-1] = residual
-    kinds = len({kind_of(block.effect) for block in blocks})
-    return Linear(onto, near.pose, blocks, every, sizes, WORTH if near.noise_known else 0.0,
+    tried = [each.beside(further.values.get(each.name), fit.context) for each in tried]
+    alike = Counter(kind_of(each.name) for each in tried)
+    widths = [len(each.shapes) * len(each.entry.parameters) for each in tried]
+    every, sizes = np.empty((sum(widths) + 1, len(near.pose))), np.empty(sum(widths))
+    every[-1] = residual - onto @ (onto.T @ residual)
+    blocks: list[Block] = []
+    for each, start, width in zip(tried, np.cumsum([0, *widths]).tolist(), widths):
+        own = slice(start, start + width)
+        columns, sizes[own] = outside_of(onto, near.columns_of(each.name, each.factors))
+        every[own] = columns.T
+        blocks += each.blocks(start, alike[kind_of(each.name)])
+    return Linear(onto, near.pose, tuple(blocks), every, sizes, WORTH if near.noise_known else 0.0,
                   near.count - onto.shape[1], float(every[-1] @ every[-1]),
-                  near.columns(Model({'offset': np.zeros(3)})), 2.0 * math.log(1.0 + kinds))
+                  near.columns(Model({'offset': np.zeros(3)})), 2.0 * math.log(1.0 + len(alike)))
 
 
 def left_open(state: State) -> Model:
@@ -169,22 +176,6 @@ def _amplitudes(model: Model) -> Floats:
     parts = [np.concatenate([values[:len(effect.parameters)], np.zeros(len(effect.shape))])
              for effect, values in zip(model.terms.effects, model.values.values(), strict=True)]
     return np.concatenate(parts)
-
-
-def _blocks(near: Equations, onto: Floats, context: Context, present: Model,
-            tried: Sequence[Candidate]) -> tuple[tuple[Block, ...], Floats, Floats]:
-    """Return the blocks of candidates, `every` of `Linear` without the residual, and `sizes`."""
-    alike = Counter(kind_of(each.name) for each in tried)
-    tried = [each.beside(present.values.get(each.name), context) for each in tried]
-    widths = [len(each.shapes) * len(each.entry.parameters) for each in tried]
-    every, sizes = np.empty((sum(widths) + 1, len(near.pose))), np.empty(sum(widths))
-    blocks: list[Block] = []
-    for each, start, width in zip(tried, np.cumsum([0, *widths]).tolist(), widths):
-        own = slice(start, start + width)
-        columns, sizes[own] = outside_of(onto, near.columns_of(each.name, each.factors))
-        every[own] = columns.T
-        blocks += each.blocks(start, alike[kind_of(each.name)])
-    return tuple(blocks), every, sizes
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from ..effects import (
     is_effect, kind_of, Model, parameter_names, PROCESSES, TO_SEPARATE, unit_of, value_unit,
     variable_of, variable_words, WANDER)
 from ..estimate import kinds
-from ..geometry import ATTITUDES, axes_of_signs
+from ..geometry import ATTITUDES, axes_of_signs, rms
 from ..table import column_of, Floats, Poses
 from ..text import counted, listed, with_minus, with_sd
 from ..units import MG
@@ -212,29 +212,23 @@ def steps_of(found: Found, start: State, date: str
     The base `start` is as fitted, or as stored at a date.
 
     """
-    states = _sequence(found, start)
-    of_output = _output_steps(found)
-    steps = (*of_output, *(_step(name, *pair, found, date) for name, pair in zip(
-        found.added, pairwise(states), strict=False)))
-    names = ('base', *(step.effect for step in steps))
-    at = (*states[:1] * len(of_output), *states)  # limit and grid leave the residuals
-    return steps, tuple(
-        Stage(name, state.mg_of_poses(beside_walk(found)[1] if name == WANDER
-                                      else state.fit.residual))
-        for name, state in zip(names, at, strict=True))
-
-
-def _sequence(found: Found, start: State) -> list[State]:
-    """Return the initial state and the state after each added effect."""
     states, values = [start], dict(found.base.model.values)
     names = [name for name in found.added if name != WANDER]
     for name in names[:-1]:
         nothing = np.zeros(len(effect_named(name).values))
         values = with_effect(values, name, found.final.model.values.get(name, nothing))
         states.append(fitted_state(Model(values), found.final.poses_g) or states[-1])
-    if names:
-        states.append(found.final)
-    return states if found.added[-1:] != (WANDER,) else [*states, states[-1]]
+    states += [found.final] if names else []
+    states += states[-1:] if WANDER in found.added[-1:] else []  # it changes no value
+    of_output = _output_steps(found)
+    steps = (*of_output, *(_step(name, *pair, found, date) for name, pair in zip(
+        found.added, pairwise(states), strict=False)))
+    titles = ('base', *(step.effect for step in steps))
+    at = (*states[:1] * len(of_output), *states)  # limit and grid leave the residuals
+    return steps, tuple(
+        Stage(name, state.mg_of_poses(beside_walk(found)[1] if name == WANDER
+                                      else state.fit.residual))
+        for name, state in zip(titles, at, strict=True))
 
 
 def _step(name: str, before: State, after: State, found: Found, date: str) -> Step:
@@ -323,7 +317,7 @@ def _curve(name: str, before: State, share_mg: Floats) -> str:
         values = before.poses_g[variable]
         parts = np.array_split(np.argsort(values, kind='stable'), 5)
         middle = [float(np.mean(values[part])) for part in parts]
-        size = [float(np.sqrt(np.mean(share_mg[part] ** 2))) for part in parts]
+        size = [rms(share_mg[part]) for part in parts]
         at = int(np.argmax(np.abs(np.diff(size))))
         words += (f', most between {middle[at]:.4g} and {middle[at + 1]:.4g} '
                   f'{unit_of(variable)}').rstrip()
@@ -363,8 +357,7 @@ def _range(column: str, values: Floats, share_mg: Floats) -> str:
         values = np.linalg.norm(values, axis=1)
     order = np.argsort(values, kind='stable')
     ends = max(1, len(order) // 5)
-    low, high = (float(np.sqrt(np.mean(share_mg[part] ** 2)))
-                 for part in (order[:ends], order[-ends:]))
+    low, high = rms(share_mg[order[:ends]]), rms(share_mg[order[-ends:]])
     span = f'{values[order[0]]:.4g} to {values[order[-1]]:.4g} {unit_of(column)}'.rstrip()
     return (f'over {column.replace("_", " ")} {span}: {low:.2g} mg RMS in the lowest fifth of the '
             f'poses, {high:.2g} mg in the highest')

@@ -376,26 +376,21 @@ def snippets(calibration: Calibration, stored: str) -> tuple[tuple[str, str], ..
     python = ('import accel_calib as ac\n\n'
               f'calibration = ac.load({stored!r})\n'
               f'force = calibration.apply(readings{known})  # (n, 3), {units}')
-    return (('ROS 2', ros), ('ROS 2 launch file', launch),
-            ('Python', python), ('C', _c(calibration)),
-            ('C header, Arduino, PX4, ArduPilot and others',
-             f'accel-calib export {shlex.quote(stored)} --to c -o calibration.h'))
-
-
-def _c(calibration: Calibration) -> str:
-    """Return a C99 function with offset, gain and mounting."""
     mat = calibration.rotation.T @ calibration.matrix
     rows = ',\n'.join(f'  {{{_floats(row)}}}' for row in mat)
     beyond = [name for name in calibration.model.effects if not effect_named(name).linear]
     note = '' if not beyond else (
         f'/* Without {", ".join(beyond)}:\n'
         '   accel-calib export --to c writes the terms that C can hold. */\n')
-    return (f'{note}static const float B[3] = {{{_floats(calibration.offset)}}};\n'
-            f'static const float M[3][3] = {{\n{rows}}};\n\n'
-            'static void accel_correct(const float raw[3], float a[3])\n{\n'
-            '  for (int i = 0; i < 3; ++i)\n'
-            '    a[i] = M[i][0] * (raw[0] - B[0]) + M[i][1] * (raw[1] - B[1])\n'
-            '         + M[i][2] * (raw[2] - B[2]);\n}')
+    c99 = (f'{note}static const float B[3] = {{{_floats(calibration.offset)}}};\n'
+           f'static const float M[3][3] = {{\n{rows}}};\n\n'
+           'static void accel_correct(const float raw[3], float a[3])\n{\n'
+           '  for (int i = 0; i < 3; ++i)\n'
+           '    a[i] = M[i][0] * (raw[0] - B[0]) + M[i][1] * (raw[1] - B[1])\n'
+           '         + M[i][2] * (raw[2] - B[2]);\n}')
+    return (('ROS 2', ros), ('ROS 2 launch file', launch), ('Python', python), ('C', c99),
+            ('C header, Arduino, PX4, ArduPilot and others',
+             f'accel-calib export {shlex.quote(stored)} --to c -o calibration.h'))
 
 
 def _floats(numbers: Floats) -> str:

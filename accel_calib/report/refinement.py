@@ -230,22 +230,37 @@ def of_curve(result: Refinement, step: int) -> Drawing:
 
 # ----------------------------------------------------------------------------- the ladder
 
-_Level = tuple[str, float, float | None]
-"""Name, residual and held-out residual [mg] of the base or after a step."""
-
-
 def ladder(result: Refinement) -> Drawing:
     """Draw the residual and the held-out residual of the base and after each step."""
     after = ', '.join(short(step.gap_after_mg) for step in result.steps)
     title = f'Residual of the base {short(result.gap_mg)} mg' + (
         f', then {after} mg' if after else '')
-    held_out = (result.steps[0].held_out_before_mg if result.steps
-                else result.calibration.quality.held_out_rms_mg)
-    levels: list[_Level] = [(base_words(result), result.gap_mg, held_out), *(
+    of_base = (result.steps[0].held_out_before_mg if result.steps
+               else result.calibration.quality.held_out_rms_mg)
+    levels = [(base_words(result), result.gap_mg, of_base), *(
         (f'+ {step.effect}', step.gap_after_mg, step.held_out_after_mg) for step in result.steps)]
     floor_mg = result.noise_floor_mg
     with drawn(1.25 + 0.52 * len(levels), width_inches=4.9, grid='x') as (figure, (panel,)):
-        _draw_levels(panel, levels)
+        height = np.arange(len(levels))
+        residuals = np.array([residual for _, residual, _ in levels])
+        held_out = np.array([np.nan if out is None else out for _, _, out in levels])
+        panel.step(residuals, height, where='post', color=FAINT, linewidth=2.0, zorder=1)
+        panel.plot(residuals, height, 'o', color=AFTER, markersize=9, label='all poses used',
+                   zorder=3)
+        if np.any(np.isfinite(held_out)):
+            panel.plot(held_out, height, 'o', color=AFTER, markersize=9, fillstyle='none',
+                       markeredgewidth=1.6, label='held out', zorder=3)
+        white = {'facecolor': PAPER, 'edgecolor': 'none', 'pad': 1.0}
+        for at, residual, out in zip(height, residuals, held_out, strict=True):
+            words = short(residual) + ('' if np.isnan(out) else f', held out {short(out)}')
+            panel.annotate(words, (np.nanmax([residual, out]), at), (9, 0), va='center',
+                           textcoords='offset points', fontsize=9.0, bbox=white)
+        for at, (name, _, _) in zip(height, levels, strict=True):
+            panel.text(0.005, at - 0.36, name, transform=panel.get_yaxis_transform(), va='center',
+                       fontweight='bold', fontsize=9.5, bbox=white)
+        panel.set_ylim(len(levels) - 0.55, -0.65)
+        panel.yaxis.set_visible(False)
+        panel.spines['left'].set_visible(False)
         if floor_mg:
             panel.axvline(floor_mg, color=ACCENT, linewidth=1.6, linestyle=(0, (5, 3)),
                           label=f'noise floor {short(floor_mg)} mg', zorder=1)
@@ -253,28 +268,6 @@ def ladder(result: Refinement) -> Drawing:
         panel.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), ncols=3, handletextpad=0.2,
                      columnspacing=0.9, handlelength=1.6, borderaxespad=0.0)
     return Drawing('ladder', title, figure)
-
-
-def _draw_levels(panel: Any, levels: Sequence[_Level]) -> None:
-    height = np.arange(len(levels))
-    residuals = np.array([residual for _, residual, _ in levels])
-    held_out = np.array([np.nan if out is None else out for _, _, out in levels])
-    panel.step(residuals, height, where='post', color=FAINT, linewidth=2.0, zorder=1)
-    panel.plot(residuals, height, 'o', color=AFTER, markersize=9, label='all poses used', zorder=3)
-    if np.any(np.isfinite(held_out)):
-        panel.plot(held_out, height, 'o', color=AFTER, markersize=9, fillstyle='none',
-                   markeredgewidth=1.6, label='held out', zorder=3)
-    white = {'facecolor': PAPER, 'edgecolor': 'none', 'pad': 1.0}
-    for at, residual, out in zip(height, residuals, held_out, strict=True):
-        words = short(residual) + ('' if np.isnan(out) else f', held out {short(out)}')
-        panel.annotate(words, (np.nanmax([residual, out]), at), (9, 0), va='center',
-                       textcoords='offset points', fontsize=9.0, bbox=white)
-    for at, (name, _, _) in zip(height, levels, strict=True):
-        panel.text(0.005, at - 0.36, name, transform=panel.get_yaxis_transform(), va='center',
-                   fontweight='bold', fontsize=9.5, bbox=white)
-    panel.set_ylim(len(levels) - 0.55, -0.65)
-    panel.yaxis.set_visible(False)
-    panel.spines['left'].set_visible(False)
 
 
 def _scale(panel: Any, values: Sequence[float]) -> None:

@@ -95,13 +95,6 @@ def with_thermal(poses_g: Poses, lagged: str, shape: Floats) -> Poses:
     return poses_g.with_columns(**found)
 
 
-def recorded(poses_g: Poses) -> list[Variable]:
-    """Return the variables of the context that change between poses."""
-    found = [variable_of(key, poses_g[key]) for key in (*_CONTEXT, *poses_g.quantities)
-             if key in poses_g]
-    return [variable for variable in found if np.ptp(variable.values) > 0.0]
-
-
 def variable_of(key: str, values: Floats) -> Variable:
     """Return a variable for the horizontal axis: (n,) values, or the (n, 3) ones of a vector."""
     if key == 'time':
@@ -220,7 +213,10 @@ def of_remainder(residuals: Residuals, prefix: str = 'remaining') -> Iterator[Dr
     if are_spread(residuals.force):
         yield sphere_map(residuals, f'{prefix}_sphere', title, limit, more=', by direction')
     poses_g = residuals.poses_g
-    variables = recorded(poses_g) or variables_of('quadratic', poses_g, residuals.force)
+    recorded = [variable_of(key, poses_g[key]) for key in (*_CONTEXT, *poses_g.quantities)
+                if key in poses_g]
+    variables = ([variable for variable in recorded if np.ptp(variable.values) > 0.0]
+                 or variables_of('quadratic', poses_g, residuals.force))
     for k in range(0, len(variables), _PANELS):
         yield against(residuals, variables[k:k + _PANELS], f'{prefix}_variables{k or ""}', title,
                       limit, AFTER)
@@ -241,7 +237,14 @@ def sphere_map(residuals: Residuals, name: str, title: str, limit: float, *, mor
                 cmap=DIVERGING if signed else SEQUENTIAL,
                 vmin=-limit if signed else 0.0, vmax=limit)
             hover[half] = tuple(marks[k] for k in here)
-            hover[f'out_{half}'] = _draw_left_out(disc, residuals, f'out_{half}', up)
+            out = _inside(residuals.left_out_force, up)
+            places, rows = _equal_area(residuals.left_out_force[out]), residuals.left_out.row[out]
+            disc.plot(*places.T, linestyle='none', marker='s', markersize=8, fillstyle='none',
+                      color=ACCENT, zorder=4, gid=f'out_{half}')
+            for place, row in zip(places, rows, strict=True):
+                disc.annotate(str(row), place, (5, 4), textcoords='offset points', fontsize=8.5,
+                              color=ACCENT, zorder=4)
+            hover[f'out_{half}'] = tuple(Mark(f'row {row}, left out', int(row)) for row in rows)
         add_bar(figure, scattered, discs, _label(signed=signed), orientation='horizontal',
                 shrink=0.8, pad=0.03)
     return Drawing(name, f'{title}{more}', figure, hover)
@@ -278,18 +281,6 @@ def _equal_area(force: Floats) -> Floats:
     """Return the (n, 2) positions of (n, 3) directions on the maps, which are unit discs."""
     towards = unit(force)
     return unit(towards[:, :2]) * np.sqrt(1.0 - np.abs(towards[:, 2:]))
-
-
-def _draw_left_out(disc: Any, residuals: Residuals, name: str, up: bool) -> Marks:
-    """Draw the poses left out as hollow squares with their rows, and return their texts."""
-    here = _inside(residuals.left_out_force, up)
-    places, rows = _equal_area(residuals.left_out_force[here]), residuals.left_out.row[here]
-    disc.plot(*places.T, linestyle='none', marker='s', markersize=8, fillstyle='none',
-              color=ACCENT, zorder=4, gid=name)
-    for place, row in zip(places, rows, strict=True):
-        disc.annotate(str(row), place, (5, 4), textcoords='offset points', fontsize=8.5,
-                      color=ACCENT, zorder=4)
-    return tuple(Mark(f'row {row}, left out', int(row)) for row in rows)
 
 
 def against(residuals: Residuals, variables: Sequence[Variable], name: str, title: str,

@@ -183,38 +183,34 @@ def of_parameters(comparison: Comparison, labels: Sequence[str]) -> Iterator[Dra
         found = [each for each in comparison.parameters if each.name in names]
         with drawn(HEIGHT_INCHES, f'{words} minus the mean of the runs', grid='y'
                    ) as (figure, (panel,)):
-            hover = _draw_parameters(panel, found, labels)
+            hover = {}
+            panel.axhline(0.0, color=FAINT, linewidth=1.2)
+            factor = np.array([scale_of(each.name)[1] for each in found])
+            for run, label in enumerate(labels):
+                at = np.arange(len(found)) + 0.6 * ((run + 0.5) / len(labels) - 0.5)
+                change = np.array([each.values[run] - np.mean(each.values) for each in found])
+                band = BAND * np.array([each.stated_sd[run] for each in found])
+                colour, name = _COLOURS[run % len(_COLOURS)], f'run{run}'
+                panel.vlines(at, (change - band) * factor, (change + band) * factor, color=colour)
+                panel.plot(at, change * factor, 'o', color=colour, gid=name, label=label, **EDGE)
+                hover[name] = tuple(Mark(f'{label}, ' + named_words(
+                    each.name, each.values[run], each.stated_sd[run])) for each in found)
+            panel.set_xticks(range(len(found)), [each.name.partition('.')[2] for each in found])
+            panel.set_ylabel(scale_of(found[0].name)[2])
             if len(labels) <= len(_COLOURS):
                 legend_below(figure, 2)
         yield Drawing(key, f'{words}: difference of each run from the mean, with 95 % band',
                       figure, hover)
 
 
-def _draw_parameters(panel: Any, found: Sequence[Parameter], labels: Sequence[str]
-                     ) -> dict[str, Marks]:
-    """Draw the differences of all runs, and return the texts of their markers."""
-    hover = {}
-    panel.axhline(0.0, color=FAINT, linewidth=1.2)
-    factor = np.array([scale_of(each.name)[1] for each in found])
-    for run, label in enumerate(labels):
-        at = np.arange(len(found)) + 0.6 * ((run + 0.5) / len(labels) - 0.5)
-        change = np.array([each.values[run] - np.mean(each.values) for each in found])
-        band = BAND * np.array([each.stated_sd[run] for each in found])
-        colour = _COLOURS[run % len(_COLOURS)]
-        panel.vlines(at, (change - band) * factor, (change + band) * factor, color=colour)
-        panel.plot(at, change * factor, 'o', color=colour, gid=f'run{run}', label=label, **EDGE)
-        hover[f'run{run}'] = tuple(Mark(f'{label}, ' + named_words(
-            each.name, each.values[run], each.stated_sd[run])) for each in found)
-    panel.set_xticks(range(len(found)), [each.name.partition('.')[2] for each in found])
-    panel.set_ylabel(scale_of(found[0].name)[2])
-    return hover
-
-
 def of_history(history: History) -> Iterator[Drawing]:
     """Yield offset, gain and cross-axis over the dates, with bands."""
     at, dated = places_of([None if moment.when is None else moment.when.timestamp()
                            for moment in history.moments])
-    warm = _temperatures(history)
+    warm = np.array([np.nan if moment.temperature is None else moment.temperature
+                     for moment in history.moments])
+    known = warm[np.isfinite(warm)]
+    varied = len(known) > 1 and bool(np.ptp(known) > _ONE_COLOUR)
     for key, words, names in GROUPS:
         found = [each for each in history.parameters if each.name in names and (
             names is not CROSS or np.any(each.stated_sd))]
@@ -223,10 +219,10 @@ def of_history(history: History) -> Iterator[Drawing]:
         title, hover = f'{words} over the dates, with 95 % band', dict[str, Marks]()
         with drawn(0.9 + 1.25 * len(found), title, len(found), sharex=True) as (figure, panels):
             for k, (panel, each) in enumerate(zip(panels, found, strict=True)):
-                markers = _draw_line(panel, each, at, warm)
+                markers = _draw_line(panel, each, at, warm if varied else None)
                 markers.set_gid(f'panel{k}')
                 hover[f'panel{k}'] = _marks(history, each)
-            if warm is not None:
+            if varied:
                 add_bar(figure, markers, panels, 'temperature [°C]', pad=0.02)
             label_dates(panels[-1], at, 'date of the fit', dated=dated)
         yield Drawing(f'history_{key}', title, figure, hover)
@@ -243,14 +239,6 @@ def places_of(stamps: Sequence[float | None]) -> tuple[Floats, bool]:
     days = np.array([np.nan if stamp is None else stamp / _DAY_S for stamp in stamps])
     dated = bool(np.all(np.isfinite(days))) and float(np.ptp(days)) > 0.0
     return (days if dated else np.arange(1.0, len(days) + 1.0)), dated
-
-
-def _temperatures(history: History) -> Floats | None:
-    """Return the temperature of each calibration, NaN if not known; None if it hardly changes."""
-    warm = np.array([np.nan if moment.temperature is None else moment.temperature
-                     for moment in history.moments])
-    known = warm[np.isfinite(warm)]
-    return warm if len(known) > 1 and np.ptp(known) > _ONE_COLOUR else None
 
 
 def _draw_line(panel: Any, each: Parameter, at: Floats, warm: Floats | None) -> Any:
