@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-import math
 from typing import Any
 
 import numpy as np
@@ -118,8 +117,9 @@ class Commands:
     def refine(self) -> Task:
         """Refine the calibration; use and store the refined calibration, or only offer it."""
         session = self.session
+        hint = '' if 'temperature' in session.around.values else thermometer_words(session)
         fitted = yield from _sound(session, 'refine', refined, session.units, session.name,
-                                   session.sensor.present, _hint(session), session.own)
+                                   session.sensor.present, hint, session.own)
         if fitted.refinement is not None:
             session.sensor.guide.follow(fitted.refinement.plan.poses)
         return (yield from self._use(fitted))
@@ -342,11 +342,6 @@ def _sound(session: State, name: str, function: Callable[..., Fitted], *given: A
         raise RefusedFitError(f'{found.words}; not used: {why}', advice)
     sensor.fitted_poses = count
     return found
-
-
-def _hint(session: State) -> str:
-    """Return how the node would get a temperature; empty if it has one."""
-    return '' if math.isfinite(session.around.temperature) else thermometer_words(session)
 
 
 def _levelled(session: State, calibration: Calibration, rest: Dwell) -> Calibration:

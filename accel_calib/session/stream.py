@@ -190,12 +190,8 @@ class StreamStatistics:
              'expected increasing stamps: check that only one driver publishes'),
             (not 1.0 / _OTHER_UNIT < factor < _OTHER_UNIT,
              f'advance by {stamped:.3g} s in {arrived:.1f} s of messages, about '
-             f'{_power_of_ten(factor)} times as much, expected seconds: the driver states them in '
+             f'1e{round(math.log10(max(factor, 1e-12)))} times as much, expected seconds: the driver states them in '
              'another unit: correct header.stamp')) if holds), '')
-
-
-def _power_of_ten(factor: float) -> str:
-    return f'1e{round(math.log10(factor))}' if factor > 0.0 else '0'
 
 
 AGAIN = 10.0
