@@ -190,8 +190,8 @@ class StreamStatistics:
              'expected increasing stamps: check that only one driver publishes'),
             (not 1.0 / _OTHER_UNIT < factor < _OTHER_UNIT,
              f'advance by {stamped:.3g} s in {arrived:.1f} s of messages, about '
-             f'1e{round(math.log10(max(factor, 1e-12)))} times as much, expected seconds: the driver states them in '
-             'another unit: correct header.stamp')) if holds), '')
+             f'1e{round(math.log10(max(factor, 1e-12)))} times as much, expected seconds: the '
+             'driver states them in another unit: correct header.stamp')) if holds), '')
 
 
 AGAIN = 10.0
