@@ -371,7 +371,7 @@ class _Finder:
         """
         line = self.head[k].removeprefix(';Headers,')
         cells = dialect.cells(line.lstrip('#/% ') if is_comment(line) else line)
-        if dialect.monitor and is_clock(cells[0]):
+        if dialect.monitor and cells and is_clock(cells[0]):
             cells[0] = 'time'
         return [] if len(cells) < 3 or any(map(_LIKE_NUMBER.fullmatch, cells)) else cells
 
