@@ -215,6 +215,13 @@ def test_the_serial_monitor_and_plotter_of_arduino_are_read(plot: bool, tmp_path
     check(log, made['reading'], made['time'], within_s=1e-6)
 
 
+def test_a_comment_without_text_before_the_lines_of_a_monitor_is_ignored(tmp_path: Path) -> None:
+    made = samples(poses=8, rest=30, turn=8)
+    text = ''.join(f'12:00:{when:06.3f} -> {x} {y} {z}\n'
+                   for when, (x, y, z) in zip(made['time'], rows_of(made['reading'])))
+    check(read_log(write(tmp_path, f'#\n{text}')), made['reading'], made['time'], within_s=1e-6)
+
+
 @pytest.mark.parametrize('blank', [',,,', ';;;', '""', '  ', '"","","",""', ' , ,,'])
 def test_rows_without_any_value_are_ignored(blank: str, tmp_path: Path) -> None:
     log = read_log(write(tmp_path, log_text() + f'{blank}\n' * 20))

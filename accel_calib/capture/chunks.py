@@ -357,7 +357,7 @@ class Chunker:
         return True
 
     def _before_break(self, time: Floats) -> Floats:
-        """Return the stamps before the first interruption, jitter replaced by the latest one."""
+        """Return the stamps before the first interruption; one that steps back is the latest."""
         missing = max(_MISSING_SECONDS, _MISSING_PERIODS * self._period)
         step: Floats = time[1:] - time[:-1]
         first = time[0] - self._latest
@@ -366,11 +366,13 @@ class Chunker:
         ordered = np.maximum.accumulate(np.append(self._latest, time))
         step = time - ordered[:-1]
         back = max(_BACK_SECONDS, _BACK_PERIODS * self._period)
-        for cut in np.flatnonzero((step > missing) | (step < -back)).tolist():
-            self.interruptions.append(Interruption(
-                float(ordered[cut]), 'gap' if step[cut] > 0.0 else 'jump_back', float(step[cut])))
-            return ordered[1:cut + 1]
-        return ordered[1:]
+        breaks = np.flatnonzero((step > missing) | (step < -back))
+        if not len(breaks):
+            return ordered[1:]
+        cut = int(breaks[0])
+        self.interruptions.append(Interruption(
+            float(ordered[cut]), 'gap' if step[cut] > 0.0 else 'jump_back', float(step[cut])))
+        return ordered[1:cut + 1]
 
     def _chunks(self, samples: Floats, starts: Indices) -> Chunks:
         found = sums_of(samples, starts, self._epoch, self._origin, self._kind)

@@ -269,9 +269,9 @@ def ardupilot_correction(parameters: Parameters, instance: int, values: Values) 
     if lacking:
         raise UnknownCorrectionError(
             f'AHRS_ORIENTATION is {number:.0f}, and the log lacks {lacking[0]}')
-    rotation = (rotation_from_rpy(*np.radians([
-        parameters.lookup(values, name, 0.0) for name in names])) if names
-        else _numbered('AHRS_ORIENTATION', number, _OF_ARDUPILOT))
+    degrees = [parameters.lookup(values, name, 0.0) for name in names]
+    rotation = (rotation_from_rpy(*np.radians(degrees)) if names
+                else _numbered('AHRS_ORIENTATION', number, _OF_ARDUPILOT))
     found = ByAxis(offset, scale, thermal, ARDUPILOT_REFERENCE, limits, rotation)
     # The firmware adds the polynomial at CALTEMP, so that it is zero there.
     at_offset = values.get(f'INS_ACC{instance}_CALTEMP', -300.0)

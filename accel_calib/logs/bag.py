@@ -122,8 +122,11 @@ class Bag:
                       ros2=self.ros2, before=before)
 
     def frame_id(self, topic: str, msgtype: str = IMU) -> str:
-        """Return the frame_id of the first message of a topic; empty if there is none."""
+        """Return the frame_id of the first message of a topic; of an Imu there must be one."""
         block = self.first(topic, msgtype)
+        if not block and msgtype == IMU:
+            raise InputError(f'{self.path} has no message on {topic}, expected Imu messages',
+                             'record while the sensor publishes')
         return frame_ids(self.joined(block, topic, msgtype))[0] if block else ''
 
     def fields(self, msgtype: str, field: str, block: Sequence[Received]) -> tuple[Floats, Floats]:
@@ -166,13 +169,6 @@ class Bag:
                      f'has {len(topics)} Imu topics, expected one: {some(topics)}')
             raise InputError(f'{self.path} {found}', 'choose one of them with --topic')
         return topic or topics[0]
-
-    def first_frame_id(self, topic: str) -> str:
-        """Return the frame_id of the first message of an Imu topic; there must be one."""
-        if not self.first(topic):
-            raise InputError(f'{self.path} has no message on {topic}, expected Imu messages',
-                             'record while the sensor publishes')
-        return self.frame_id(topic)
 
     def lost(self, topic: str, found: int) -> list[str]:
         """Return a note if fewer messages of a topic were found than the bag states."""

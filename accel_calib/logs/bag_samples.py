@@ -351,7 +351,7 @@ def messages_of(path: Path, options: LogOptions, needs: Collection[str]) -> Gene
 
     with open_bag(path) as bag:
         topic = bag.imu_topic(options.topic)
-        sensor = bag.first_frame_id(topic)
+        sensor = bag.frame_id(topic)
         used, notes = context_of(bag, topic, sensor, options)
         tracks = _needed(bag, needs, used, notes)
         connections = bag.reader.connections

@@ -21,7 +21,8 @@ import numpy as np
 from .dialect import Cells, is_clock, is_number, Layout, shown
 from .names import (
     BARE, bare_name, check_sensor, COUNTERS, format_named, FREE_WORDS, is_unit, LINEAR_WORDS,
-    LogFormat, may_cause, meaning, OURS, RATE, READING, recognise, unit_of, WHOLE_WORDS, WORDS)
+    LogFormat, may_cause, Meaning, meaning, OURS, RATE, READING, recognise, unit_of, WHOLE_WORDS,
+    WORDS)
 from ..errors import InputError
 from ..table import COLUMNS, Floats, quantity_key
 from ..units import STANDARD_GRAVITY, UnitName
@@ -339,16 +340,16 @@ def _readings(layout: Layout) -> dict[str, Source]:
                      'name them with --columns ax=NAME,ay=NAME,az=NAME')
 
 
-def _named(quantity: str, header: Sequence[str]) -> list[int]:
-    """Return the indices of the columns whose names mean a quantity."""
-    return [k for k, name in enumerate(header[:MOST]) if meaning(name).quantity == quantity]
+def _named(quantity: str, header: Sequence[str]) -> dict[int, Meaning]:
+    """Return the meanings of the names that mean a quantity, by the index of their columns."""
+    return {k: meaning(name) for k, name in enumerate(header[:MOST])
+            if meaning(name).quantity == quantity}
 
 
 def _triples(quantity: str, header: Sequence[str]) -> dict[tuple[str, ...], list[int]]:
     """Return the columns of the three axes of each sensor of a quantity."""
     axes: dict[tuple[str, ...], dict[int, list[int]]] = {}
-    for k in _named(quantity, header):
-        known = meaning(header[k])
+    for k, known in _named(quantity, header).items():
         if known.axis is not None:
             axes.setdefault(known.group, {}).setdefault(known.axis, []).append(k)
     found: dict[tuple[str, ...], list[int]] = {}
@@ -367,8 +368,7 @@ def _bare(header: Sequence[str]) -> list[list[int]]:
     if 'w' in map(str.casefold, header):
         return []
     axes: dict[int, list[int]] = {}
-    for k in _named('', header):
-        known = meaning(header[k])
+    for k, known in _named('', header).items():
         if not known.unit and known.axis is not None and BARE.issuperset(known.group):
             axes.setdefault(known.axis, []).append(k)
     count = min(len(axes.get(axis, ())) for axis in range(3))
@@ -395,7 +395,7 @@ def _contexts(layout: Layout, found: Mapping[str, Source]) -> dict[str, Source]:
         more |= {name: _source(layout, k) for triple in gyros.values()
                  for name, k in zip(RATE, triple)}
     for key in _MAY_LACK:
-        which = _named(key, header)
+        which = [*_named(key, header)]
         if key not in found and len(which) == 1:
             more[key] = _source(layout, which[0])
     return more
@@ -439,8 +439,8 @@ def rates_beside(layout: Layout, time: Source) -> list[float]:
     counted = _counter(layout)
     if layout.rate_hz is not None:
         rates.append(layout.rate_hz / (_step_of(layout, counted.index) if counted else 1.0))
-    for k in _named('time', layout.header):
-        unit, step = unit_of('time', meaning(layout.header[k]).unit), _step_of(layout, k)
+    for k, known in _named('time', layout.header).items():
+        unit, step = unit_of('time', known.unit), _step_of(layout, k)
         if unit is not None and k != time.index and step > 0.0:
             rates.append(1.0 / (unit[1] * step))
     return rates
@@ -450,8 +450,7 @@ def _fraction(layout: Layout, best: int) -> dict[str, Source]:
     """Return the column of the nanoseconds beside whole seconds, as ROS stamps have it."""
     known = meaning(layout.header[best])
     if unit_of('time', known.unit) == ('s', 1.0):
-        for k in _named('time', layout.header):
-            other = meaning(layout.header[k])
+        for k, other in _named('time', layout.header).items():
             if other.group == known.group and unit_of('time', other.unit) == ('ns', 1e-9):
                 return {FRACTION: _source(layout, k)}
     return {}

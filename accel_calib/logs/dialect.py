@@ -356,17 +356,24 @@ class _Finder:
         for k, delimiter in ((k, each) for k in lettered for each in DELIMITERS):
             dialect = replace(self.dialect, delimiter=delimiter)
             cells = self._names(k, dialect)
-            if _are_names(cells) and self.is_header(cells):
+            if cells and self.is_header(cells):
                 row = next((dialect.cells(self.head[j]) for j in self.plain if j > k), [])
                 if len(row) == len(cells) or (delimiter and not is_comment(self.head[k])):
                     return _Found(dialect, tuple(cells), k + 1, k)
         return None
 
     def _names(self, k: int, dialect: Dialect) -> list[str]:
-        """Return the cells of a header line; a time in front of them is the name of the times."""
+        """
+        Return the cells of a header line; none if they are few or there are numbers.
+
+        A time of a monitor in front of them is the name of the times.
+
+        """
         line = self.head[k].removeprefix(';Headers,')
         cells = dialect.cells(line.lstrip('#/% ') if is_comment(line) else line)
-        return ['time', *cells[1:]] if dialect.monitor and is_clock(cells[0]) else cells
+        if dialect.monitor and cells and is_clock(cells[0]):
+            cells[0] = 'time'
+        return [] if len(cells) < 3 or any(map(_LIKE_NUMBER.fullmatch, cells)) else cells
 
     def unnamed(self) -> _Found | None:
         """Return the dialect in which most lines are rows of numbers, and their names, if any."""
@@ -391,7 +398,7 @@ class _Finder:
             return _Found(dialect, (*('time',) * dialect.monitor, *names), first)
         before = ((k, self._names(k, dialect)) for k in reversed(self.filled) if k < first)
         return next((_Found(dialect, tuple(cells), first, k) for k, cells in before
-                     if len(cells) == width and _are_names(cells)), _Found(dialect, (), first))
+                     if len(cells) == width), _Found(dialect, (), first))
 
     def narrow(self) -> _Found | None:
         """Return the first line as the names of a table with too few columns, or None."""
@@ -400,13 +407,8 @@ class _Finder:
         if not numbers:
             return None
         first = self.plain[0]
-        if numbers[0] == first:
-            return _Found(Dialect(','), (), first)
-        return _Found(Dialect(','), tuple(split(self.head[first], ',')), first + 1, first)
-
-
-def _are_names(cells: Sequence[str]) -> bool:
-    return len(cells) >= 3 and not any(map(_LIKE_NUMBER.fullmatch, cells))
+        names = () if numbers[0] == first else tuple(split(self.head[first], ','))
+        return _Found(Dialect(','), names, first + 1 if names else first, first)
 
 
 def _row_width(cells: Sequence[str]) -> tuple[int, int]:

@@ -96,7 +96,7 @@ class OpenLog:
 def _bag(_: 'Format', path: Path, options: LogOptions) -> Iterator[OpenLog]:
     with open_bag(path) as bag:
         topic = bag.imu_topic(options.topic)
-        sensor = options.sensor or bag.first_frame_id(topic)
+        sensor = options.sensor or bag.frame_id(topic)
         context, notes = context_of(bag, topic, sensor, options)
         notes = [*bag.notes, *notes]
         blocks = imu_samples(bag, topic, sensor, chosen=bool(options.sensor), context=context,

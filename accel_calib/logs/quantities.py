@@ -206,18 +206,20 @@ def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
         words = f'{compact(columns.names("rate"))} are a gyro by their values'
         made.said.append(words)
         made.findings.append(Finding('columns', words, 'name the columns in the first line'))
-    if 'time' in columns.sources:
+    there = dict.fromkeys(columns.sources, made.numbers(first, 'reading'))
+    if 'time' in there:
         made.clock = clock_of(columns, first, options)
         made.notes += made.clock.doubts
-    samples = _decide_samples(made, first, options)
+        samples = are_samples({**there, 'time': made.clock.seconds(first)})
+    else:
+        samples = bool(options.rate) or are_untimed_samples(there)
+        made.rate_hz = options.rate or (columns.layout.rate_hz if samples else None)
     made.clock.newest_first &= samples  # rows of poses keep their numbers
-    if 'time' in columns.sources and (samples or columns.names('time') != ['time']):
+    if 'time' in there and (samples or columns.names('time') != ['time']):
         made.said += [made.clock.words, *(each.text for each in made.clock.findings)]
     _decide_reading(made, first, options, samples=samples)
     _decide_rate(made, first)
-    _decide_temperature(made, first)
-    if 'supply_voltage' in columns.sources:
-        _convert_if_stated(made, 'supply_voltage', 'V')
+    _decide_context(made, first)
     made.notes += unused(columns)
     made.findings += made.clock.findings
     return made
@@ -310,16 +312,6 @@ def _decide_reading(made: Quantities, first: Cells, options: LogOptions, *, samp
         made.notes.append('nothing in the file says what the numbers are: they are taken for '
                           'those of an accelerometer in counts or volts; a magnetometer looks '
                           'alike')
-
-
-def _decide_samples(made: Quantities, first: Cells, options: LogOptions) -> bool:
-    """Return whether rows are samples, rather than poses; set their rate if they lack times."""
-    there = dict.fromkeys(made.chosen.sources, made.numbers(first, 'reading'))
-    if 'time' in there:
-        return are_samples({**there, 'time': made.clock.seconds(first)})
-    samples = are_untimed_samples(there)
-    made.rate_hz = options.rate or (made.chosen.layout.rate_hz if samples else None)
-    return samples or made.rate_hz is not None
 
 
 def _named(columns: Chosen) -> tuple[UnitName | Literal[''], float]:
@@ -551,28 +543,21 @@ def _units_at_rest(made: Quantities, first: Cells) -> dict[str, float] | None:
             and _GYRO_NOISE[0] < noise * factor < _GYRO_NOISE[1]}
 
 
-def _decide_temperature(made: Quantities, first: Cells) -> None:
+def _decide_context(made: Quantities, first: Cells) -> None:
     columns = made.chosen
-    if ('temperature' not in columns.sources
-            or _convert_if_stated(made, 'temperature', '°C')):
-        return
-    source, = columns.sources['temperature']
-    if columns.maker is not None or (source.name == 'temperature' and columns.layout.header):
-        return
-    middle = float(np.median(columns.numbers(first, 'temperature')))
-    if _LIKELY_TEMPERATURE_C[0] <= middle <= _LIKELY_TEMPERATURE_C[1]:
-        made.said.append(f'{source.name} in °C (assumed)')
-    else:
-        _leave_out(made, 'temperature', f'the temperature {source.name} has values of about '
-                   f'{middle:.4g} in a unit that is not known, and is',
-                   'state its unit in the name, such as temperature_K')
-
-
-def _convert_if_stated(made: Quantities, key: str, ours: str) -> bool:
-    """Convert a column whose name states another unit; return whether it states one."""
-    source, = made.chosen.sources[key]
-    unit, factor = unit_of(key, source.unit) or ('', 1.0)
-    if unit not in ('', ours):
-        made.scales[key] = factor, ZEROS.get(unit, 0.0)
-        made.said.append(f'{source.name} in {unit} -> {ours}')
-    return bool(unit)
+    for key, ours in (('temperature', '°C'), ('supply_voltage', 'V')):
+        for source in columns.sources.get(key, ()):
+            unit, factor = unit_of(key, source.unit) or ('', 1.0)
+            if unit not in ('', ours):
+                made.scales[key] = factor, ZEROS.get(unit, 0.0)
+                made.said.append(f'{source.name} in {unit} -> {ours}')
+            if (unit or key != 'temperature' or columns.maker is not None
+                    or (source.name == key and columns.layout.header)):
+                continue
+            middle = float(np.median(columns.numbers(first, key)))
+            if _LIKELY_TEMPERATURE_C[0] <= middle <= _LIKELY_TEMPERATURE_C[1]:
+                made.said.append(f'{source.name} in °C (assumed)')
+            else:
+                _leave_out(made, key, f'the temperature {source.name} has values of about '
+                           f'{middle:.4g} in a unit that is not known, and is',
+                           'state its unit in the name, such as temperature_K')
