@@ -543,23 +543,15 @@ class Outside:
     most: float
 
     @property
-    def name(self) -> str:
-        """Return the quantity in words."""
-        return _QUANTITIES[self.key][0] if self.key in _QUANTITIES else (
-            self.key.replace('_', ' '))
-
-    def range_words(self, low: float, high: float) -> str:
-        """Return a range, or one value, with its unit; times count from the first pose."""
-        _, unit, factor = _QUANTITIES.get(self.key, ('', column_of(self.key).unit, 1.0))
-        start = self.low if self.key == 'time' else 0.0
-        first, last = (f'{(value - start) * factor:.4g}' for value in (low, high))
-        return f'{first if first == last else f"{first} to {last}"} {unit}'.rstrip()
-
-    @property
     def words(self) -> str:
-        """Return what was found and what the range of the calibration is."""
-        return (f'{self.name} is {self.range_words(self.least, self.most)}, but the range of the '
-                f'calibration is {self.range_words(self.low, self.high)}')
+        """Return what was found, and the range of the calibration; times from the first pose."""
+        name, unit, factor = _QUANTITIES.get(self.key) or (
+            self.key.replace('_', ' '), column_of(self.key).unit, 1.0)
+        start, shown = self.low if self.key == 'time' else 0.0, []
+        for low, high in ((self.least, self.most), (self.low, self.high)):
+            first, last = (f'{(value - start) * factor:.4g}' for value in (low, high))
+            shown.append(f'{first if first == last else f"{first} to {last}"} {unit}'.rstrip())
+        return f'{name} is {shown[0]}, but the range of the calibration is {shown[1]}'
 
     @property
     def line(self) -> str:

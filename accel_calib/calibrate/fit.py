@@ -70,9 +70,6 @@ _WARN_CHI2 = 4.0
 
 CLIPPED = 'the reading is clipped at the limit of the sensor'
 
-_ROUNDS = 20
-_SMALL_ANGLE = 1e-6
-
 
 def fit_poses(poses: Poses, units: Units, *, model: str = 'auto', method: Method = 'ml',
               sensor: str = '', date: str = '') -> Calibration:
@@ -112,9 +109,9 @@ def fit_poses(poses: Poses, units: Units, *, model: str = 'auto', method: Method
                               'algebraic uses every row', 'remove the row, or use the method ml')
     inside, ended, limited = inside_rows(sound, units) if method == 'ml' else (sound, (), ())
     with explained_by(limited):
-        calibration, rejected = _without_doubtful(inside, (*rejected, *ended), units, model,
-                                                  method)
-        left_out = sorted((*rejected, *calibration.rejected), key=lambda pose: pose.row)
+        calibration, doubts = _without_doubtful(inside, units, model, method)
+        left_out = sorted((*rejected, *ended, *doubts, *calibration.rejected),
+                          key=lambda pose: pose.row)
         # The fitted table has references that the input may lack.
         every = calibration.poses if len(calibration.poses) == len(poses) else poses
         return finished(replace(
@@ -122,23 +119,23 @@ def fit_poses(poses: Poses, units: Units, *, model: str = 'auto', method: Method
             noted=(*wiring(calibration), *limited, *calibration.noted)), sensor, date)
 
 
-def _without_doubtful(poses: Poses, rejected: tuple[Rejected, ...], units: Units, model: str,
-                      method: Method) -> tuple[Calibration, tuple[Rejected, ...]]:
-    """Fit without the doubtful poses, if the other poses determine the same model."""
+def _without_doubtful(poses: Poses, units: Units, model: str, method: Method
+                      ) -> tuple[Calibration, tuple[Rejected, ...]]:
+    """Fit without the doubtful poses if the others determine the same model; return these, too."""
     every = _fitted(poses, units, model, method)
     sure, doubts = sure_rows(poses)
     if not doubts or method == 'algebraic':
-        return every, rejected
+        return every, ()
     try:
         without = _fitted(sure, units, model, method)
     except RefusedFitError:
         without = every
     if without is not every and (model != 'auto' or without.name == every.name):
-        return without, (*rejected, *doubts)
+        return without, doubts
     rows = tuple(pose.row for pose in doubts)
     return replace(every, noted=(*every.noted, Finding(
         'doubtful', f'the sensor may have moved during the poses of {listed("row", rows)}, and '
-        'the fit needs them', 'capture them again', 'USABLE', rows))), rejected
+        'the fit needs them', 'capture them again', 'USABLE', rows))), ()
 
 
 def _fitted(poses: Poses, units: Units, model: str, method: Method) -> Calibration:
@@ -482,9 +479,9 @@ def _placement(fit: Fit) -> Iterator[Finding]:
 def _rotation_onto(directions: Floats, known: Floats) -> Floats:
     """Return the orthogonal (3, 3) matrix R with directions = R known; robust to outliers."""
     weight = np.ones(len(directions))
-    for _ in range(_ROUNDS):
+    for _ in range(20):
         left, _, right = np.linalg.svd((directions * weight[:, np.newaxis]).T @ known)
         rotation: Floats = left @ right
         away = np.linalg.norm(directions - known @ rotation.T, axis=1)
-        weight = 1.0 / np.maximum(away, max(float(np.median(away)), _SMALL_ANGLE))
+        weight = 1.0 / np.maximum(away, max(float(np.median(away)), 1e-6))
     return rotation

@@ -73,10 +73,6 @@ _ARBITRARY_HEADING = Finding(
     'defines it is within 10° of the vertical', 'take a second pose with the nose of the robot '
     'down (~/set_heading or --nose-down), or give the mounting (mounting_rpy or base_frame)')
 
-_FORWARD_RIGHT_DOWN = np.diag([1.0, -1.0, -1.0])
-"""From forward-right-down to forward-left-up."""
-
-_SAME_HEADING = 1e-6
 _VERTICAL = 1e-9
 _DIGITS = 9
 _STEEP = np.cos(np.radians(10.0))
@@ -152,7 +148,7 @@ def in_frame(calibration: Calibration, frame: FrameName) -> Calibration:
         return calibration
     flat = rotation @ flat_direction(before)
     turned = mounting(flat, frame)
-    if not np.allclose(mounting(flat, before), rotation, atol=_SAME_HEADING):
+    if not np.allclose(mounting(flat, before), rotation, atol=1e-6):
         turned = with_heading(turned, rotation @ _NOSE_DOWN[before], frame)
     return replace(calibration, model=Model(calibration.model.values, turned), frame=frame)
 
@@ -172,8 +168,8 @@ def on_topics(calibration: Calibration, frame: str) -> Calibration:
                          'messages are specific force (REP-145), expected ros, ned or android',
                          'level the calibration again in one of them, or do not rotate')
     level_up = in_frame(calibration, 'ros')
-    return replace(level_up, model=Model(level_up.model.values,
-                                         level_up.rotation @ _FORWARD_RIGHT_DOWN))
+    to_left_up = np.diag([1.0, -1.0, -1.0])  # from forward-right-down
+    return replace(level_up, model=Model(level_up.model.values, level_up.rotation @ to_left_up))
 
 
 def mounting_of(rpy: Sequence[float]) -> Floats:
@@ -385,36 +381,31 @@ def fault_of(mat_q: Floats) -> str | None:
     if angle_of(mat_q) <= _NEAR:  # the angle of a mirror image is 90° or more
         return None
     nearest = max(_PERMUTATIONS, key=lambda one: float(np.sum(one * mat_q)))
-    if angle_of(mat_q @ nearest.T) <= _NEAR:
-        return _words(nearest)
-    if np.linalg.det(mat_q) > 0.0:
-        return f'the sensor is rotated by {_turn(mat_q.T)}'
-    return ('the readings are a mirror image: an axis has the wrong sign or two axes are swapped, '
-            'and the sensor is also rotated')
+    if angle_of(mat_q @ nearest.T) > _NEAR:
+        if np.linalg.det(mat_q) > 0.0:
+            return f'the sensor is rotated by {_turn(mat_q.T)}'
+        return ('the readings are a mirror image: an axis has the wrong sign or two axes are '
+                'swapped, and the sensor is also rotated')
+    read = zip(AXES, map(axes_of_signs, nearest), strict=True)
+    reads = ', '.join(f'{axis} reads {other}' for axis, other in read if other != f'+{axis}')
+    if np.linalg.det(nearest) > 0.0:
+        return f'the sensor is rotated by {_turn(nearest.T)} ({reads})'
+    diagonal = np.diag(nearest)
+    if np.all(diagonal == -1.0):
+        return ('all three axes have the wrong sign: the sensor reports gravity, which points '
+                'down, instead of specific force, which points up')
+    if np.count_nonzero(diagonal) == 3:
+        return f'the {AXES[int(np.argmin(diagonal))]} axis has the wrong sign ({reads})'
+    if np.all(nearest >= 0.0):
+        swapped = [axis for axis, own in zip(AXES, diagonal, strict=True) if own == 0.0]
+        return f'{" and ".join(swapped)} are swapped'
+    return f'the axes are permuted to a mirror image: {reads}'
 
 
 _PERMUTATIONS: list[Floats] = [
     np.diag(signs) @ np.eye(3)[list(order)]
     for order in permutations(range(3)) for signs in product((1.0, -1.0), repeat=3)]
 """The 48 signed permutations of the axes, including mirror images."""
-
-
-def _words(permutation: Floats) -> str:
-    """Return a description of a signed permutation that is not the identity."""
-    read = zip(AXES, map(axes_of_signs, permutation), strict=True)
-    reads = ', '.join(f'{axis} reads {other}' for axis, other in read if other != f'+{axis}')
-    if np.linalg.det(permutation) > 0.0:
-        return f'the sensor is rotated by {_turn(permutation.T)} ({reads})'
-    diagonal = np.diag(permutation)
-    if np.all(diagonal == -1.0):
-        return ('all three axes have the wrong sign: the sensor reports gravity, which points '
-                'down, instead of specific force, which points up')
-    if np.count_nonzero(diagonal) == 3:
-        return f'the {AXES[int(np.argmin(diagonal))]} axis has the wrong sign ({reads})'
-    if np.all(permutation >= 0.0):
-        swapped = [axis for axis, own in zip(AXES, diagonal, strict=True) if own == 0.0]
-        return f'{" and ".join(swapped)} are swapped'
-    return f'the axes are permuted to a mirror image: {reads}'
 
 
 def _turn(rotation: Floats) -> str:

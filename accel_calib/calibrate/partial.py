@@ -125,6 +125,12 @@ class FleetPrior:
     sensors: int
     prior: Prior
 
+    @property
+    def words(self) -> str:
+        """Return what the values are."""
+        name = f' of model {self.model}' if self.model else ''
+        return f'the typical values of {counted(self.sensors, "sensor")}{name}'
+
 
 @dataclass(frozen=True)
 class Candidate:
@@ -328,8 +334,16 @@ def fit_partial(poses: Poses, units: Units, *, sensor: str = '', date: str = '')
     reason = f'1 pose: {along}' if about.count == 1 else (
         f'the {about.count} poses lie within {about.cone.degrees:.0f}° of one direction: {along}, '
         f'and at each pose |a| to {_mg(about.among_g)}')
-    return finished(replace(calibration, reason=reason, noted=(
-        _open(about), *calibration.noted)), sensor, date)
+    gains = enumerated([f'±{100.0 * gain:.1f} % on {axis}'
+                        for axis, gain in zip(AXES, about.gain, strict=True)])
+    missing = turn_words(missing_poses(NAME, about.cone.axis[np.newaxis]))
+    left_open = Finding(
+        'open', f'open: offset along gravity ±{_mg(about.offset_along_g)}, across it '
+        f'±{_mg(about.offset_across_g)} ({about.tilt_deg:.1f}° of tilt until it is levelled), '
+        f'gain {gains}, cross-axis ±{100.0 * about.cross_axis:.1f} %; elsewhere on the sphere '
+        f'|a| is known to {_mg(about.elsewhere_g)}', f'to determine them, {missing}')
+    return finished(replace(calibration, reason=reason, noted=(left_open, *calibration.noted)),
+                    sensor, date)
 
 
 def fit_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, *, sensor: str = '',
@@ -351,9 +365,7 @@ def fit_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, *, sensor: str
                               'of the same model', 'check the unit and the poses, or fit without '
                               '--prior') from None
     calibration = _recorded(found, poses, sound, units, FLEET, rejected)
-    name = f' of model {fleet.model}' if fleet.model else ''
-    reason = (f'{counted(len(found.kept), "pose")} with the typical values of '
-              f'{counted(fleet.sensors, "sensor")}{name}')
+    reason = f'{counted(len(found.kept), "pose")} with {fleet.words}'
     return finished(replace(calibration, reason=reason, noted=(
         *(UNLIKE_FLEET,) * found.is_unlike, *calibration.noted)), sensor, date)
 
@@ -443,18 +455,6 @@ def _across(covariance: Floats, axis: Floats) -> float:
     """Return the largest standard deviation at right angles to an axis."""
     across = np.eye(3) - np.outer(axis, axis)
     return float(np.sqrt(np.max(np.linalg.eigvalsh(across @ covariance @ across))))
-
-
-def _open(about: Carried) -> Finding:
-    """Return what the poses leave open, and the poses that determine it."""
-    gains = enumerated([f'±{100.0 * gain:.1f} % on {axis}'
-                        for axis, gain in zip(AXES, about.gain, strict=True)])
-    missing = turn_words(missing_poses(NAME, about.cone.axis[np.newaxis]))
-    return Finding(
-        'open', f'open: offset along gravity ±{_mg(about.offset_along_g)}, across it '
-        f'±{_mg(about.offset_across_g)} ({about.tilt_deg:.1f}° of tilt until it is levelled), '
-        f'gain {gains}, cross-axis ±{100.0 * about.cross_axis:.1f} %; elsewhere on the sphere '
-        f'|a| is known to {_mg(about.elsewhere_g)}', f'to determine them, {missing}')
 
 
 def _mg(value_g: float) -> str:

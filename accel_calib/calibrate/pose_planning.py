@@ -247,9 +247,15 @@ def identifiability(name: str, directions: Floats, noise: Floats | None = None) 
     each = np.sqrt(np.sum(_times(axes.T ** 2, deviations ** 2), axis=1))
     seen = np.sum((_over_the_sphere(name) @ axes.T) ** 2, axis=1)
     errors = np.cumsum(_times(seen, deviations ** 2), axis=1)  # from all up to this one
-    open_ = np.sqrt(np.max(errors, axis=0)) > LARGEST_DILUTION
-    return Identifiability(name, dict(zip(names, map(float, each), strict=True)),
-                           _combinations(names, axes[open_]),
+    open_, found = axes[np.sqrt(np.max(errors, axis=0)) > LARGEST_DILUTION], []
+    if len(open_):  # as sparse combinations with the same span, each with its own pivot
+        pivots = scipy.linalg.qr(open_, mode='r', pivoting=True)[1][:len(open_)]
+        for row in unit(np.linalg.inv(open_[:, pivots])) @ open_:
+            order = [k for k in np.argsort(-np.abs(row), kind='stable') if abs(row[k]) > _SMALL]
+            sign = np.sign(row[order[0]])
+            found.append(Combination({names[k]: float(sign * row[k]) for k in order}))
+    found.sort(key=lambda each: names.index(next(iter(each.weights))))
+    return Identifiability(name, dict(zip(names, map(float, each), strict=True)), tuple(found),
                            float(np.sqrt(np.max(errors[:, -1]))),
                            float(np.sqrt(np.mean(errors[:, -1]))))
 
@@ -258,20 +264,6 @@ def _times(share: Floats, deviations: Floats) -> Floats:
     """Return the product; 0 times an infinite deviation is 0."""
     none = np.abs(share) < _NOTHING
     return np.where(none, 0.0, share) * np.where(none, 0.0, deviations)
-
-
-def _combinations(names: tuple[str, ...], axes: Floats) -> tuple[Combination, ...]:
-    """Return sparse combinations that span these (k, p) combinations."""
-    if not len(axes):
-        return ()
-    pivots = scipy.linalg.qr(axes, mode='r', pivoting=True)[1][:len(axes)]
-    mixed = np.linalg.inv(axes[:, pivots])  # each combination has its own pivot
-    found = []
-    for row in unit(mixed) @ axes:
-        order = [k for k in np.argsort(-np.abs(row), kind='stable') if abs(row[k]) > _SMALL]
-        sign = np.sign(row[order[0]])
-        found.append(Combination({names[k]: float(sign * row[k]) for k in order}))
-    return tuple(sorted(found, key=lambda each: names.index(next(iter(each.weights)))))
 
 
 def error_left_in(smaller: str, larger: str, directions: Floats, noise: Floats | None = None

@@ -288,7 +288,21 @@ def gated(calibration: Calibration) -> Calibration:
         raise RefusedFitError(
             f'the residual is {residual * MG:.3g} mg (RMS) after the fit, expected less than '
             f'{LARGEST_RESIDUAL_G * MG:.0f} mg: the poses are not on an ellipsoid', _CHECK_POSES)
-    return _with_uncertainty(calibration)
+    if calibration.method == PRIOR:
+        return calibration
+    uncertain = uncertainty_g(calibration)
+    if not uncertain <= LARGEST_UNCERTAINTY_G:
+        raise RefusedFitError(
+            f'the poses do not determine the calibration: the uncertainty of |a| is up to '
+            f'{uncertain * MG:.3g} mg, expected less than {LARGEST_UNCERTAINTY_G * MG:.0f} mg',
+            next((noted.words for noted in calibration.noted
+                  if noted.kind == 'outlier_not_certain'), TAKE_ALL_SIDES))
+    noted = without(calibration.noted, 'uncertainty')
+    if uncertain >= _WARN_UNCERTAINTY_G:
+        noted = (*noted, Finding(
+            'uncertainty', f'the uncertainty of |a| is up to {uncertain * MG:.2g} mg',
+            'take more poses, spread over the sphere'))
+    return replace(calibration, noted=noted)
 
 
 def _check_covariance(covariance: Floats) -> None:
@@ -371,21 +385,3 @@ def deviations_g(calibration: Calibration, up: Floats) -> Floats:
         return np.zeros(len(up))
     rows = model.basis(up, known).along(length_rows(model, up, known))
     return np.sqrt(np.maximum(np.sum(rows @ calibration.covariance * rows, axis=1), 0.0))
-
-
-def _with_uncertainty(calibration: Calibration) -> Calibration:
-    if calibration.method == PRIOR:
-        return calibration
-    uncertain = uncertainty_g(calibration)
-    if not uncertain <= LARGEST_UNCERTAINTY_G:
-        raise RefusedFitError(
-            f'the poses do not determine the calibration: the uncertainty of |a| is up to '
-            f'{uncertain * MG:.3g} mg, expected less than {LARGEST_UNCERTAINTY_G * MG:.0f} mg',
-            next((noted.words for noted in calibration.noted
-                  if noted.kind == 'outlier_not_certain'), TAKE_ALL_SIDES))
-    others = without(calibration.noted, 'uncertainty')
-    if uncertain < _WARN_UNCERTAINTY_G:
-        return replace(calibration, noted=others)
-    return replace(calibration, noted=(*others, Finding(
-        'uncertainty', f'the uncertainty of |a| is up to {uncertain * MG:.2g} mg',
-        'take more poses, spread over the sphere')))

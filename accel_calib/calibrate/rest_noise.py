@@ -71,8 +71,6 @@ _TAIL = 5e-4               # probability, on each side, of a rest left out or a 
 _CONFIDENCE = 0.975        # quantile at which the uncertainty of τ is included
 _NORMAL = 1.959964         # the same quantile of the normal distribution
 _CORRELATION_MAX = 0.9
-_ROUNDING = 1e-9
-_MOST_STEPS = 50
 _PAIRED = 200              # rests used for the slopes of pairs
 _TINY = 1e-30              # variance added to rests without noise [(rad/s)²]
 _MAD = 1.4826
@@ -315,12 +313,12 @@ def _scatter(design: Floats, rate: Floats, noise: Floats) -> float:
 
     """
     dof, scatter = design.shape[0] - design.shape[1], 0.0
-    for _ in range(_MOST_STEPS):
+    for _ in range(50):
         variance = noise + scatter
         squares = _weighted(design, rate, variance)[2] ** 2 / variance
         total = np.sum(squares)
         step = float(total * (total / dof - 1.0) / max(np.sum(squares / variance), 1e-300))
-        if step <= _ROUNDING * scatter:
+        if step <= 1e-9 * scatter:  # rounding
             break
         scatter += step
     return scatter

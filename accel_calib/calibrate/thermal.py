@@ -86,9 +86,6 @@ _BESIDE, _LEAST_G = 4, 0.001
 """Number of stretches on each side of a step that show it, and smallest step [g]; smaller ones are
 as likely a bend that the effects lack."""
 
-_LAG_STEPS = 10
-"""Steps of the fit of a lag, from the best one of the catalogue."""
-
 _ROWS, _ROWS_OF_RATE = 24, 72
 """Number of rows that stand for a ramp among the poses of a calibration; if the rate acts."""
 
@@ -289,14 +286,18 @@ class _Board:
         parts = dict(zip(form, solved[self.levels.shape[1]:], strict=True))
         model = Model({name: np.concatenate([part, form[name]]) for name, part in parts.items()})
         levels = np.kron(np.eye(3), self.levels).reshape(3, count, -1)
-        for _ in range(_LAG_STEPS if _lagged(form) else 1):
+        for _ in range(10 if _lagged(form) else 1):  # a lag, from the best one of the catalogue
             own = np.moveaxis(_basis(model, self.contexts)[..., model.fitted], 1, 0)
             design = np.concatenate([levels, own], axis=2).reshape(3 * count, -1)
             onto = np.linalg.pinv(design)
             vector = model.vector.copy()
             vector[model.fitted] += (onto @ (reading - self.predicted(model)).T.ravel())[
                 levels.shape[2]:]
-            model = _with_values(model, vector)
+            found = dict(zip(model.effects, (vector[part] for part in model.terms.parts)))
+            if model.lags:  # stay positive
+                found[_LINEAR][3] = np.clip(found[_LINEAR][3], *(
+                    np.array([0.5, 2.0]) * model.values[_LINEAR][3]))
+            model = Model(found)
         onto = onto[levels.shape[2]:].reshape(-1, 3, count)
         covariance = np.zeros((len(model.vector),) * 2)
         covariance[np.ix_(model.fitted, model.fitted)] = self._covariance(
@@ -355,15 +356,6 @@ class _Board:
 
 def _lagged(form: Form) -> bool:
     return _LINEAR in form and EFFECTS[_LINEAR].is_lagged(form[_LINEAR])
-
-
-def _with_values(model: Model, vector: Floats) -> Model:
-    """Return a model with other values; a lag stays positive."""
-    found = {name: vector[part] for name, part in zip(model.effects, model.terms.parts)}
-    if model.lags:
-        found[_LINEAR][3] = np.clip(found[_LINEAR][3], *(
-            np.array([0.5, 2.0]) * model.values[_LINEAR][3]))
-    return Model(found)
 
 
 def _basis(model: Model, contexts: Sequence[Context]) -> Floats:

@@ -128,10 +128,19 @@ def outliers_among(residual: Floats, basis: Floats, rows: Indices, dof: Sequence
     if max(limits) <= 0:
         return [np.zeros(0, np.intp)] * len(dof)
     own = np.eye(residual.shape[2]) - basis @ basis.swapaxes(2, 3)
-    if len(rows) > _MANY:
-        belief = belief_in(noise_known)
-        return [_far_out(_squared(residual[k], own[k]) / rows, rows, dof[k], limit, belief)
-                for k, limit in enumerate(limits)]
+    if len(rows) > _MANY:  # all at once, relative to the median
+        found, belief = [], belief_in(noise_known)
+        usual = np.where(rows == 1, _MEDIAN_OF_CHI2[1], _MEDIAN_OF_CHI2[3]) / rows
+        for k, limit in enumerate(limits):
+            squared = _squared(residual[k], own[k]) / rows
+            scale = float(np.median(squared / usual))
+            ratio = squared * (belief + dof[k]) / (belief + scale * dof[k])
+            least = scipy.special.fdtri(np.arange(1, most + 1), max(belief + dof[k], 1.0),
+                                        1.0 - LEVEL / len(rows))
+            extreme = np.flatnonzero(ratio > least[rows - 1])
+            largest = np.argsort(-ratio[extreme], kind='stable')[:max(limit, 0)]
+            found.append(np.sort(extreme[largest]))
+        return found
     flat = basis.reshape(len(basis), residual[0].size, -1)
     beside = residual.reshape(len(flat), -1, 1)
     residual = (beside - flat @ (flat.swapaxes(1, 2) @ beside)).reshape(residual.shape)
@@ -228,18 +237,6 @@ def _squared(residual: Floats, own: Floats) -> Floats:
         size, axes = np.linalg.eigh(own)
         along = np.sum(axes * residual[..., np.newaxis], axis=-2)
     return np.sum(along ** 2 / np.where(size > _LEAST_OWN, size, np.inf), axis=-1)
-
-
-def _far_out(size: Floats, rows: Indices, dof: int, limit: int, belief: float) -> Indices:
-    """Return the outliers among many poses, all at once, relative to the median."""
-    usual = np.where(rows == 1, _MEDIAN_OF_CHI2[1], _MEDIAN_OF_CHI2[3]) / rows
-    scale = float(np.median(size / usual))
-    size = size * (belief + dof) / (belief + scale * dof)
-    each_kind = np.arange(1, int(rows.max()) + 1)
-    least = scipy.special.fdtri(each_kind, max(belief + dof, 1.0), 1.0 - LEVEL / len(size))
-    extreme = np.flatnonzero(size > least[rows - 1])
-    largest = np.argsort(-size[extreme], kind='stable')[:max(limit, 0)]
-    return np.sort(extreme[largest])
 
 
 def fit_norm(name: str, poses_g: Poses) -> tuple[Fit, Indices]:
@@ -456,27 +453,19 @@ def _look_alikes(fit: Fit, kept: Indices, out: Indices, poses_g: Poses
     pull = np.linalg.eigvalsh(columns @ spread @ np.swapaxes(columns, 1, 2))[:, -1]
     inside = pull[:len(kept)] / np.maximum(1.0 - pull[:len(kept)], _ALONE)
     for place in len(kept) + np.flatnonzero(pull[len(kept):] * np.max(inside) >= _EXPLAINED):
-        # By Cauchy's inequality, the mistakes of the other poses have no look-alike.
-        part = _explained(data.residual[place], columns[place], columns[:len(kept)], spread)
+        # By Cauchy's inequality, the mistakes of the other poses have no look-alike. Of each pose
+        # kept, the part of the residuals by the mistake of this pose that its own explains:
+        own, others = columns[place], columns[:len(kept)]
+        onto = spread @ own.T
+        inverse = np.linalg.inv(np.eye(len(own)) + own @ onto)
+        beside = spread - onto @ inverse @ onto.T
+        left = np.eye(len(own)) - others @ beside @ np.swapaxes(others, 1, 2)
+        moved = others @ (beside @ (own.T @ data.residual[place]))
+        solved = np.linalg.pinv(left, _ALONE, hermitian=True) @ moved[:, :, np.newaxis]
+        part = np.sum(moved * solved[:, :, 0], axis=1) / max(
+            data.residual[place] @ inverse @ data.residual[place], 1e-300)
         for index in kept[part >= _EXPLAINED]:
             yield int(out[place - len(kept)]), int(index)
-
-
-def _explained(shift: Floats, own: Floats, others: Floats, spread: Floats) -> Floats:
-    """
-    Return the (n,) part of the residuals by a mistake of one pose that each other pose explains.
-
-    The mistake is `shift` (k,) per noise; `own` (k, q) and `others` (n, k, q) are derivatives, and
-    `spread` is (JᵀJ)⁻¹ of the others.
-
-    """
-    onto = spread @ own.T
-    inverse = np.linalg.inv(np.eye(len(own)) + own @ onto)
-    spread = spread - onto @ inverse @ onto.T
-    left = np.eye(len(own)) - others @ spread @ np.swapaxes(others, 1, 2)
-    moved = others @ (spread @ (own.T @ shift))
-    solved = np.linalg.pinv(left, _ALONE, hermitian=True) @ moved[:, :, np.newaxis]
-    return np.sum(moved * solved[:, :, 0], axis=1) / max(shift @ inverse @ shift, 1e-300)
 
 
 def _log_probability(fit: Fit, belief: float) -> float:

@@ -96,8 +96,17 @@ def scatter_of(fit: Fit, among: NDArray[np.bool_] | None = None) -> Scatter:
         return Scatter(0.0, 0.0, 0.0)
     middle = float(np.median(sigma))
     more = np.append(0.0, (middle * np.exp(_TRIED)) ** 2)
-    size, squares = _deviances(fit.residual[few] * sigma, np.linalg.qr(columns)[0],
-                               sigma ** 2 + more[:, np.newaxis])
+    # The (r,) logarithms of the determinants, and weighted squares, of the module: from the (m,)
+    # residual and an orthonormal basis (m, q) of the derivatives [g], and (r, m) variances.
+    residual, onto = fit.residual[few] * sigma, np.linalg.qr(columns)[0]
+    variance = sigma ** 2 + more[:, np.newaxis]
+    weight, width = 1.0 / variance, onto.shape[1]
+    products = (onto[:, :, np.newaxis] * onto[:, np.newaxis]).reshape(len(onto), width ** 2)
+    normal = (weight @ products).reshape(len(weight), width, width)
+    side = (residual * weight) @ onto
+    explained = np.sum(side * np.linalg.solve(normal, side[..., np.newaxis])[..., 0], axis=1)
+    size = np.sum(np.log(variance), axis=1) + np.linalg.slogdet(normal)[1]
+    squares = weight @ residual ** 2 - explained
     nothing = float(size[0] + squares[0])
     if squares[0] <= count:
         return Scatter(0.0, nothing, nothing)
@@ -106,23 +115,6 @@ def scatter_of(fit: Fit, among: NDArray[np.bool_] | None = None) -> Scatter:
     without = _lowest(size[0] + count * np.log(factor) + squares[0] / factor + prior)[1]
     log, least = _lowest(size[1:] + squares[1:] + prior)
     return Scatter(middle * float(np.exp(log)), least, min(nothing, without))
-
-
-def _deviances(residual: Floats, onto: Floats, variance: Floats) -> tuple[Floats, Floats]:
-    """
-    Return the (r,) logarithms of the determinants, and weighted squares, of the module.
-
-    `residual` (m,) and the orthonormal basis `onto` (m, q) of the derivatives are in g, and
-    `variance` is (r, m).
-
-    """
-    weight, count = 1.0 / variance, onto.shape[1]
-    products = (onto[:, :, np.newaxis] * onto[:, np.newaxis]).reshape(len(onto), count ** 2)
-    normal = (weight @ products).reshape(len(weight), count, count)
-    side = (residual * weight) @ onto
-    explained = np.sum(side * np.linalg.solve(normal, side[..., np.newaxis])[..., 0], axis=1)
-    return (np.sum(np.log(variance), axis=1) + np.linalg.slogdet(normal)[1],
-            weight @ residual ** 2 - explained)
 
 
 def _lowest(deviance: Floats) -> tuple[float, float]:

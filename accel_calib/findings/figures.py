@@ -135,7 +135,14 @@ def calibration_json(calibration: Calibration, ahead: Outlook) -> dict[str, Any]
     """Return a calibration for JSON, with what its poses determine; None: not known."""
     gyro, noise = calibration.gyro, calibration.noise
     seen, asked = ahead.identifiability, ahead.next_pose
-    unseen = seen.open_parameters
+    unseen, own_names = seen.open_parameters, dict[str, Any]()
+    if calibration.form.sensing_axes:  # names of the ESGI'95 report
+        axes = sensing_axes(calibration.gain, calibration.offset)
+        own_names = {'shifts': axes.shifts, 'scales': axes.scales,
+                     'angles': {'phi': axes.phi, 'psi': axes.psi, 'theta': axes.theta}}
+    elif 'reference' in calibration.poses:
+        own_names = {'matrix': calibration.gain @ calibration.model.rotation,
+                     'shift': calibration.offset}
     return {
         'model': calibration.name, 'method': calibration.method,
         'units': calibration.units.name, 'sensor': calibration.sensor,
@@ -146,7 +153,7 @@ def calibration_json(calibration: Calibration, ahead: Outlook) -> dict[str, Any]
         'poses_used': len(calibration.poses) - len(calibration.rejected),
         'poses_rejected': [asdict(rejected) for rejected in calibration.rejected],
         **asdict(calibration.quality), 'reason': calibration.reason,
-        'warnings': calibration.warnings, **_own_names(calibration),
+        'warnings': calibration.warnings, **own_names,
         'gyro_bias': gyro and gyro.bias, 'gyro_bias_sd': gyro and gyro.sd,
         'noise_force': noise and _known(noise.force), 'noise_rate': noise and _known(noise.rate),
         'uncertainty_mg': ahead.uncertainty_mg,
@@ -162,18 +169,6 @@ def calibration_json(calibration: Calibration, ahead: Outlook) -> dict[str, Any]
 
 def _known(values: Floats) -> Floats | None:
     return None if np.isnan(values).all() else values
-
-
-def _own_names(calibration: Calibration) -> dict[str, Any]:
-    """Return the parameters of models 9 and 12 with the names of the ESGI'95 report."""
-    if calibration.form.sensing_axes:
-        axes = sensing_axes(calibration.gain, calibration.offset)
-        return {'shifts': axes.shifts, 'scales': axes.scales,
-                'angles': {'phi': axes.phi, 'psi': axes.psi, 'theta': axes.theta}}
-    if 'reference' in calibration.poses:
-        return {'matrix': calibration.gain @ calibration.model.rotation,
-                'shift': calibration.offset}
-    return {}
 
 
 def refinement_json(result: Refinement) -> dict[str, Any]:

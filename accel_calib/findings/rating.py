@@ -378,16 +378,12 @@ def rate_comparison(comparison: Comparison) -> Rating:
                  NextStep('done', 'use the latest calibration'))
 
 
-_NOISY = 2.0
-"""White noise in units of the largest typical one that is worth a finding."""
-
-
 def rate_noise(found: NoiseFigures) -> Rating:
     """
     Rate the figures of a rest.
 
     GOOD if it shows white noise and random walk of every axis, USABLE if one of them is not seen
-    or the noise is larger than that of common parts, BAD without white noise.
+    or the noise is more than twice that of noisy common parts, BAD without white noise.
 
     """
     from ..noise import duration, shown_unit, TYPICAL, WORDS  # a fit alone does not load it
@@ -404,7 +400,7 @@ def rate_noise(found: NoiseFigures) -> Rating:
             found.needs[kind, name], 'BAD' if name == 'noise_density' else 'USABLE')
             for name in unseen[:1]]
         limits = TYPICAL.get((kind, 'noise_density', axes[0].unit))
-        if limits and density > _NOISY * limits[1]:
+        if limits and density > 2.0 * limits[1]:
             findings.append(Finding(
                 'noisy', f'the white noise of the {kind} is {density / limits[1]:.1f} times that '
                 'of noisy common parts', 'keep vibration and fans away, and record again',

@@ -314,7 +314,6 @@ _MODES = 60
 """Modes of each axis: the rest has less than 1 % of the variance of a random walk."""
 
 _RATIOS = np.geomspace(1e-4, 1e6, 81)
-_LARGEST_RATIO = 1e3
 _LEAST_WHITE = 0.5
 """Smallest part of the measured variance that remains for the noise of the poses."""
 
@@ -404,7 +403,7 @@ def walk_beside(chosen: Set, process: Process) -> Walk:
                           np.linalg.solve(normal, side[:, :, np.newaxis])[:, :, 0])
     rss = float(linear.residual @ linear.residual) - taken @ along ** 2 - explained
     dof = linear.dof - count
-    allowed = (rss >= _LEAST_WHITE * dof if linear.worth else _RATIOS <= _LARGEST_RATIO)
+    allowed = (rss >= _LEAST_WHITE * dof if linear.worth else _RATIOS <= 1e3)
     allowed[0] = True
     weight = linear.worth + linear.dof
     deviance = np.sum(np.log(spread), axis=1) + weight * np.log(

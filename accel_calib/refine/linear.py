@@ -324,7 +324,7 @@ class Set:
         """Return the penalty for effects that are far larger than in common sensors."""
         if not self.blocks:
             return 0.0
-        largest = np.array([np.max(np.abs(values)) for values in self.values.values()])
+        largest = np.array([np.max(np.abs(values)) for values in self._parts])
         typical = [each.entry.typical for each in self.entries]
         away = np.log(np.maximum(largest / typical, 1.0)) / _USUAL
         return float(np.sum(np.minimum(away ** 2, _MOST_UNUSUAL)))
@@ -345,9 +345,14 @@ class Set:
     @cached_property
     def values(self) -> dict[int, Floats]:
         """Return the (p,) values of the effect of each block."""
+        return dict(zip(self.blocks, self._parts, strict=True))
+
+    @cached_property
+    def _parts(self) -> Sequence[Floats]:
+        """Return the values of the effect of each block, in the order of the blocks."""
         values = self.mix[len(self.root):] @ self.across[:, -1] / self.linear.sizes[self._index]
         ends = accumulate(each.columns.stop - each.columns.start for each in self.entries)
-        return dict(zip(self.blocks, np.split(values, list(ends)), strict=False))
+        return np.split(values, list(ends))[:-1]
 
     @property
     def _index(self) -> list[int]:

@@ -58,9 +58,6 @@ _MOST_GAIN = 6.0
 _AS_GOOD = 0.95
 """Of candidates whose gain is this part of the best one, the easiest is taken."""
 
-_DIRECTIONS = 200
-"""Number of directions beside faces, edges and corners."""
-
 _COLDEST, _WARMEST = -20.0, 70.0
 """Range of the temperatures that are asked for [°C], unless the poses were outside of it."""
 
@@ -170,7 +167,7 @@ def plan_poses(found: Found) -> PosePlan:
     needs = {key for each in rivalries for name in each for key in effect_named(name).needs}
     varied = [key for key in (*VARIED, *sorted(filter(is_quantity, needs))) if key in needs]
     so_far = found.final.poses_g
-    directions = np.vstack([ATTITUDES, spread_directions(_DIRECTIONS)])
+    directions = np.vstack([ATTITUDES, spread_directions(200)])
     settings = [dict(zip(varied, each, strict=True))  # those that are easier to set come first
                 for each in product(*(_levels(key, so_far) for key in varied))]
     up = np.tile(directions, (len(settings), 1))

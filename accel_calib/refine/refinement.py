@@ -53,9 +53,6 @@ _ROUNDS = 6
 _SEARCHES = 3
 """Largest number of further searches along ways between poses that the one before corrects."""
 
-_SAME_WAY_G = 1e-5
-"""Largest difference of the readings along two ways that are the same [g]."""
-
 _NAMED = 4
 """Largest number of undetermined values that are named."""
 
@@ -298,9 +295,9 @@ def _along_ways(final: State, at: Callable[[Model], Poses]) -> Poses:
 
 
 def _is_same_way(model: Model, *ways: Poses) -> bool:
-    """Return whether the readings of a model along two ways between poses are the same."""
+    """Return whether the readings of a model along two ways differ by less than 1e-5 g."""
     one, other = (model.at(poses_g.columns).vec_v for poses_g in ways)
-    return bool(np.max(np.abs(one - other), initial=0.0) < _SAME_WAY_G)
+    return bool(np.max(np.abs(one - other), initial=0.0) < 1e-5)
 
 
 def _record(calibration: Calibration, found: Found, given: Given) -> Refinement:
@@ -356,13 +353,11 @@ def _refine_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, also: tupl
     values, covariance, findings = posterior(refined.model.vector, refined.covariance, fleet)
     model = with_vector(refined.model.effects, values)
     fit = judge(model, found.poses_g.without_columns(*_ORIENTATION))
-    name = f' of model {fleet.model}' if fleet.model else ''
     return _with(found, with_rest_noise(gated(replace(
         refined, model=Model(model.values, refined.model.rotation), covariance=covariance,
         method=FLEET, noted=(*findings, *refined.noted),
         quality=quality_of(fit, refined.units, unit(fit.equations.force)),
-        reason=f'{refined.reason}; with the typical values of '
-               f'{counted(fleet.sensors, "sensor")}{name}')), refined.poses))
+        reason=f'{refined.reason}; with {fleet.words}')), refined.poses))
 
 
 def _with(found: Refinement, calibration: Calibration) -> Refinement:

@@ -61,9 +61,6 @@ likely than several that act at once (Kass and Raftery 1995: very strong)."""
 _ALIKE = 0.5
 """Correlation of a quantity with itself, shifted in time, below which it counts as another one."""
 
-_SHIFTS = 100
-"""Largest number of shifts in time with which an effect is compared."""
-
 _MOST_VARIED = 8
 """Largest number of columns whose products are tried; more would cost too much in the score."""
 
@@ -231,17 +228,11 @@ def _search(poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
     found = found if fewer is None else replace(fewer, taken_back=chance)
     found = _described(found, start, poses_g)
     state, near = make_sound(found.final, found.near, trial, found.base.model, ladder)
-    return replace(found, final=state, near=near, walk=_walk(state, near),
-                   added=_added(ladder, state, near, found.curve))
-
-
-def _added(ladder: tuple[str, ...], state: State, near: Near, curve: Curve | None
-           ) -> tuple[str, ...]:
-    """Return the names of the effects that a model has beyond its base, in order."""
     there = {*state.model.values, *included(state.model.values), WANDER} - _of_a_turn(state)
-    names = (*ladder, *near.names, *(() if curve is None else (curve.name,)),
-             *(() if near.walk is None else (WANDER,)))
-    return tuple(name for name in names if name in there)
+    beyond = (*ladder, *near.names, *(() if found.curve is None else (found.curve.name,)),
+              *(() if near.walk is None else (WANDER,)))
+    return replace(found, final=state, near=near, walk=_walk(state, near),
+                   added=tuple(name for name in beyond if name in there))
 
 
 def _is_coincidence(found: Found, name: str) -> bool:
@@ -261,8 +252,8 @@ def _is_coincidence(found: Found, name: str) -> bool:
     count, poses_g = len(state.poses_g), state.poses_g
     order = np.argsort(poses_g['time']) if 'time' in poses_g else np.arange(count)
     away = factor[:, order] - np.mean(factor, axis=1, keepdims=True)
-    moved = np.array([np.roll(away, shift, axis=1) for shift in
-                      np.unique(np.linspace(1, count - 1, _SHIFTS).astype(int))])
+    shifts = np.unique(np.linspace(1, count - 1, 100).astype(int))  # 100 or fewer
+    moved = np.array([np.roll(away, shift, axis=1) for shift in shifts])
     alike = np.abs(np.sum(moved * away, axis=(1, 2))) > _ALIKE * np.sum(away ** 2)
     factors = moved[~alike][:, :, np.argsort(order)]  # (s, t or 1, n)
     if len(factors) < 2:
@@ -282,9 +273,15 @@ def _described(found: Found, start: State, poses_g: Poses) -> Found:
     curve = best_curve(found.final, poses_g, found.near.chosen.out)
     if curve is None:
         return found
-    alone = _alone(curve, found, poses_g)
-    if alone is not None:
-        return _described(alone, start, poses_g)
+    # It may replace the effects of its variable.
+    variable = empirical_parts(curve.name)[1]
+    entries = {name: effect_named(name) for name in found.near.names}
+    fewer = _less(found, [name for name, entry in entries.items()
+                          if (entry.over or entry.needs) == (variable,)])
+    if fewer is not None:
+        again = best_curve(fewer.final, poses_g, found.near.chosen.out)
+        if again is not None and empirical_parts(again.name)[1] == variable:
+            return _described(fewer, start, poses_g)
     walking = _walking(found)
     if walking is not None and not _is_better(curve, walking.near):
         return walking
@@ -344,16 +341,6 @@ def _less(found: Found, names: Collection[str]) -> Found | None:
     near = replace(found.near, walk=None, chosen=chosen.instead(blocks))
     fewer = replace(found, final=state, near=near, walk=None)
     return fewer if found.walk is None else _walking(fewer) or fewer
-
-
-def _alone(curve: Curve, found: Found, poses_g: Poses) -> Found | None:
-    """Return what was found without the effects of the variable of a curve that replaces them."""
-    variable = empirical_parts(curve.name)[1]
-    entries = {name: effect_named(name) for name in found.near.names}
-    fewer = _less(found, [name for name, entry in entries.items()
-                          if (entry.over or entry.needs) == (variable,)])
-    instead = None if fewer is None else best_curve(fewer.final, poses_g, found.near.chosen.out)
-    return fewer if instead and empirical_parts(instead.name)[1] == variable else None
 
 
 def _walking(found: Found) -> Found | None:

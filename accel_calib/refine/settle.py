@@ -34,9 +34,6 @@ _LADDER_ROUNDS = 20
 """The same for effects of the ladder, whose fits are short: several fail if few attitudes do not
 determine them."""
 
-_WALK_ROUNDS = 2
-"""Number of sets beside which a walk is estimated, each found beside the walk before."""
-
 _TREND = 15.0
 """A walk may have a score lower by this, if the other effects change with time and leave a gap."""
 
@@ -156,19 +153,19 @@ def _best_near(linear: Linear, trial: Trial, refused: set[frozenset[str]]) -> Ne
 
     process = trial.process(linear)
     best = Near(best_of(linear), linear, None, process)
-    if process is None or (linear.worth and not any(_in_time(best))
-                           and is_all_noise(best.chosen)):
+    in_time = ['time' in each.entry.needs for each in best.chosen.entries]
+    if process is None or (linear.worth and not any(in_time) and is_all_noise(best.chosen)):
         return best
     beside = Set.of(linear)
     tried = [beside, best.chosen]
-    for _ in range(_WALK_ROUNDS):
+    for _ in range(2):  # each set is found beside the walk before
         walk = walk_beside(beside, process)
         if walk.likelihood_ratio < SIGNIFICANT:
             break
         beside = best_of(walk.whitened(linear)).within(linear)
         tried.append(beside)
     most = best.chosen.score
-    if all(_in_time(best)) and not is_all_noise(best.chosen):
+    if all(in_time) and not is_all_noise(best.chosen):
         most -= _TREND  # what changes with time only, and not as known, wanders
     for beside in tried:
         walk = walk_beside(beside, process)
@@ -176,11 +173,6 @@ def _best_near(linear: Linear, trial: Trial, refused: set[frozenset[str]]) -> Ne
             most = walk.score
             best = replace(best, chosen=beside.within(walk.whitened(linear)), walk=walk)
     return best
-
-
-def _in_time(near: Near) -> list[bool]:
-    """Return which of the chosen effects change with time."""
-    return ['time' in each.entry.needs for each in near.chosen.entries]
 
 
 def _at(linear: Linear, names: tuple[str, ...], out: tuple[int, ...], process: Process | None,

@@ -50,9 +50,6 @@ if TYPE_CHECKING:
     from ..refine import Refinement
     from ..table import Poses
 
-_GRID = 100
-"""Points of a drawn curve."""
-
 STORED = 'calibration.yaml'
 """Name of the file of the calibration in the lines that use it, if it is not known."""
 
@@ -79,18 +76,13 @@ _STEP = 1e-6
 _SAME = 1e-9
 _PAIRS = ((0, 1), (0, 2), (1, 2))
 
-_USUAL_OFFSET = {'x': '±50 mg', 'y': '±50 mg', 'z': '±80 mg'}
-_USUAL_GAIN = '±3 %'
-_USUAL_CROSS_AXIS = '±2 %, 1.1°'
+_USUAL = {'x': '±50 mg', 'y': '±50 mg', 'z': '±80 mg', 'gain': '±3 %', 'angle': '±2 %, 1.1°'}
 _SOURCE = (
     'Usual: the initial tolerances of a common part, the MPU-6050 (data sheet PS-MPU-6000A, '
     'revision 3.4, section 6.2). For other effects: the typical size in the catalogue of effects.')
 
 _SMALL = 1e-3
 """Typical size below which a value is given in millionths."""
-
-_LONG_TABLE = 25
-"""Number of poses above which their table scrolls."""
 
 
 def refinement_page(result: Refinement, source: str) -> str:
@@ -199,7 +191,7 @@ def thermal_page(outcome: ThermalOutcome, sources: Sequence[str], *, stored: str
 
 def _of_axis(curve: Curve, axis: int) -> Drawing:
     """Draw the change of the reading of one axis over the temperature, with the curve."""
-    grid = np.linspace(*curve.range_c, _GRID)
+    grid = np.linspace(*curve.range_c, 100)
     line = curve.at(grid)[:, axis] * MG
     band = BAND * curve.deviation_at(grid)[:, axis] * MG
     hover: dict[str, Marks] = {}
@@ -288,7 +280,7 @@ def _linear_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
     scale, unit = (per_g, 'native') if native else (MG, 'mg')
     for axis, value, sd in zip(AXES, found[0], deviation[0], strict=True):
         if sd or value:
-            usual = '' if native else _USUAL_OFFSET[axis]
+            usual = '' if native else _USUAL[axis]
             yield f'offset {axis}', signed(value * scale, sd * scale, unit), usual
     equal = np.ptp(found[1]) < _SAME
     for axis, value, sd in zip(AXES[:1] if equal else AXES, found[1], deviation[1], strict=False):
@@ -296,12 +288,12 @@ def _linear_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
         if native:
             yield name, signed(value * per_g, sd * per_g, 'native per g'), ''
         elif sd or abs(value - 1.0) > _SAME:
-            yield name, signed((value - 1.0) * 100.0, sd * 100.0, '%'), _USUAL_GAIN
+            yield name, signed((value - 1.0) * 100.0, sd * 100.0, '%'), _USUAL['gain']
     for (i, j), value, sd in zip(_PAIRS, found[2], deviation[2], strict=True):
         if sd or abs(value - 90.0) > _SAME:
             words = signed(value - 90.0, sd)
             yield (f'angle {AXES[i]} to {AXES[j]}', f'90° {words[0]} {words[1:]}°',
-                   _USUAL_CROSS_AXIS)
+                   _USUAL['angle'])
 
 
 def _effect_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
@@ -350,7 +342,7 @@ def _pose_table(residuals: Residuals, calibration: Calibration) -> str:
     return section('Poses', paragraph(
         f'{counted(len(rows), "pose")}, with the residual before and after.'),
         scroll_table('Poses', head, [(str(row), *rows[row]) for row in sorted(rows)],
-                     long=len(rows) > _LONG_TABLE, poses=sorted(rows)))
+                     long=len(rows) > 25, poses=sorted(rows)))
 
 
 def _axis_cells(reading: Floats) -> list[list[str]]:

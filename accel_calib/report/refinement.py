@@ -38,13 +38,6 @@ from ..units import MG
 if TYPE_CHECKING:
     from ..refine import Refinement, Step
 
-_NOT_USED = 'The calibration of this page does not contain these effects.'
-
-_SAME_RESIDUAL = 0.01
-
-_GRID = 201
-"""Number of points of a curve."""
-
 
 def search_sections(result: Refinement, residuals: Residuals, *, used: bool) -> Iterator[str]:
     """
@@ -56,7 +49,9 @@ def search_sections(result: Refinement, residuals: Residuals, *, used: bool) -> 
 
     """
     if result.steps:
-        note = '' if used else ' '.join((_NOT_USED, *refusal_lines(result)))
+        note = '' if used else ' '.join((
+            'The calibration of this page does not contain these effects.',
+            *refusal_lines(result)))
         yield section('Effects that were found', paragraph(note), paragraph(verdict_words(result)),
                       figures([ladder(result)], 'wide'), kind='half')
         yield section('Steps', scroll_table(
@@ -68,7 +63,7 @@ def search_sections(result: Refinement, residuals: Residuals, *, used: bool) -> 
     for number, step in enumerate(result.steps, 1):
         yield _step(result, number, step)
     left = residuals_of_refinement(result)
-    if not np.isclose(left.rms_mg, residuals.rms_mg, rtol=_SAME_RESIDUAL):
+    if not np.isclose(left.rms_mg, residuals.rms_mg, rtol=0.01):
         yield section('What remains after the refinement', figures(of_remainder(left, 'refined')))
     rows = [(f'{effect_named(name).words} ({name})', needs) for name, needs in result.not_testable]
     yield section('What these data cannot show', scroll_table(
@@ -183,7 +178,7 @@ def curve_parts(result: Refinement, name: str) -> list[CurvePart]:
         f'{name}.{effect_named(name).parameters[0]}')
     values = calibration.model.values[name]
     low, high = values[count:] if variable != 'force' else (-1.0, 1.0)
-    at = np.linspace(low, high, _GRID)
+    at = np.linspace(low, high, 201)
     parts = []
     for k, own in enumerate(names):
         poses = (result.force[:, AXES.index(own)] if variable == 'force'

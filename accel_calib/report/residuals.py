@@ -187,23 +187,16 @@ def residuals_of_refinement(result: Refinement) -> Residuals:
 _INK_PER_POSE = 3500.0
 """Total area of the markers [points²]; markers are larger for fewer poses."""
 
-_LEAST_MG = 1e-3
-"""Smallest residual of a logarithmic axis [mg]."""
-
-_ROOM = 1.08
-_FEW_DIRECTIONS = 6
-_LEAST_LIMIT_MG = 1e-9
-
 
 def limit_mg(*residuals: Residuals) -> float:
-    """Return the end of a scale for residuals [mg]."""
+    """Return the end of a scale for residuals, 8 % beyond the largest [mg]."""
     largest = max(float(np.max(np.abs(found.after_mg))) for found in residuals)
-    return max(largest, _LEAST_LIMIT_MG) * _ROOM
+    return max(largest, 1e-9) * 1.08
 
 
 def are_spread(force: Floats) -> bool:
-    """Return whether the poses have enough different directions for a map."""
-    return len(np.unique(np.round(force, 1), axis=0)) >= _FEW_DIRECTIONS
+    """Return whether the poses have enough different directions for a map: 6 or more."""
+    return len(np.unique(np.round(force, 1), axis=0)) >= 6
 
 
 def of_remainder(residuals: Residuals, prefix: str = 'remaining') -> Iterator[Drawing]:
@@ -343,7 +336,8 @@ def _before_after_title(residuals: Residuals) -> str:
 def _draw_before_after(panel: Any, residuals: Residuals, floor_mg: float | None) -> None:
     for name, values, colour in (('before', residuals.before_mg, BEFORE),
                                  ('after', residuals.after_mg, AFTER)):
-        panel.plot(residuals.poses_g.row, np.maximum(np.abs(values), _LEAST_MG), 'o',
+        # A logarithmic axis has no 0.
+        panel.plot(residuals.poses_g.row, np.maximum(np.abs(values), 1e-3), 'o',
                    color=colour, gid=name, label=name, **EDGE,
                    markersize=float(np.clip(7.0 - len(values) / 60.0, 3.0, 7.0)))
     if floor_mg:

@@ -332,7 +332,12 @@ def figures(drawings: Iterable[Drawing], kind: str = 'pair', *, script: bool = T
 
 
 def _inline_svg(drawing: Drawing) -> str:
-    """Return a figure as SVG, for a page with several."""
+    """
+    Return a figure as SVG, for a page with several, with the texts of its markers.
+
+    Raise ValueError unless each marker has one.
+
+    """
     buffer = io.StringIO()
     with _styled():
         drawing.figure.savefig(buffer, format='svg', transparent=True,
@@ -341,7 +346,16 @@ def _inline_svg(drawing: Drawing) -> str:
     for part in root.iter():
         _make_inline(part, drawing.name)
     for name, marks in drawing.hover.items():
-        _add_marks(root, f'{drawing.name}-{name}', marks)
+        own = f'{drawing.name}-{name}'
+        group = next((part for part in root.iter('g') if part.get('id') == own), None)
+        markers = [] if group is None else list(group.iter('use'))
+        if len(markers) != len(marks):
+            raise ValueError(f'{own} has {len(markers)} markers, expected {len(marks)}')
+        for marker, mark in zip(markers, marks, strict=True):
+            marker.set('class', 'mark')
+            if mark.row:
+                marker.set('data-row', str(mark.row))
+            ElementTree.SubElement(marker, 'title').text = mark.words
     for part in list(root):
         if part.tag == 'metadata':
             root.remove(part)
@@ -366,16 +380,3 @@ def _make_inline(part: ElementTree.Element, prefix: str) -> None:
         for colour, variable in _VARIABLES.items():
             named['style'] = named['style'].replace(colour, f'var(--{variable})')
     part.attrib = named
-
-
-def _add_marks(root: ElementTree.Element, name: str, marks: Marks) -> None:
-    """Add the texts to a group of markers; raise ValueError unless each marker has one."""
-    group = next((part for part in root.iter('g') if part.get('id') == name), None)
-    markers = [] if group is None else list(group.iter('use'))
-    if len(markers) != len(marks):
-        raise ValueError(f'{name} has {len(markers)} markers, expected {len(marks)}')
-    for marker, mark in zip(markers, marks, strict=True):
-        marker.set('class', 'mark')
-        if mark.row:
-            marker.set('data-row', str(mark.row))
-        ElementTree.SubElement(marker, 'title').text = mark.words

@@ -156,10 +156,6 @@ GROUPS = (('offset', 'Zero-g offset', OFFSETS), ('gain', 'Gain minus 1', GAINS),
 
 _COLOURS = (AFTER, ACCENT, THIRD, BEFORE)
 
-_DAY_S = 86400.0
-_ONE_COLOUR = 0.5
-"""Range of temperatures that is drawn in one colour [°C]."""
-
 
 def spoken(name: str) -> str:
     """Return the name of a parameter in words, such as ``offset x``."""
@@ -210,7 +206,7 @@ def of_history(history: History) -> Iterator[Drawing]:
     warm = np.array([np.nan if moment.temperature is None else moment.temperature
                      for moment in history.moments])
     known = warm[np.isfinite(warm)]
-    varied = len(known) > 1 and bool(np.ptp(known) > _ONE_COLOUR)
+    varied = len(known) > 1 and bool(np.ptp(known) > 0.5)  # °C; otherwise in one colour
     for key, words, names in GROUPS:
         found = [each for each in history.parameters if each.name in names and (
             names is not CROSS or np.any(each.stated_sd))]
@@ -221,7 +217,11 @@ def of_history(history: History) -> Iterator[Drawing]:
             for k, (panel, each) in enumerate(zip(panels, found, strict=True)):
                 markers = _draw_line(panel, each, at, warm if varied else None)
                 markers.set_gid(f'panel{k}')
-                hover[f'panel{k}'] = _marks(history, each)
+                hover[f'panel{k}'] = tuple(Mark(
+                    f'{label}, {named_words(each.name, value, sd)}'
+                    + ('' if moment.temperature is None else f', {moment.temperature:.0f} °C'))
+                    for label, moment, value, sd in zip(history.labels, history.moments,
+                                                        each.values, each.stated_sd, strict=True))
             if varied:
                 add_bar(figure, markers, panels, 'temperature [°C]', pad=0.02)
             label_dates(panels[-1], at, 'date of the fit', dated=dated)
@@ -236,7 +236,7 @@ def places_of(stamps: Sequence[float | None]) -> tuple[Floats, bool]:
     otherwise numbers from 1.
 
     """
-    days = np.array([np.nan if stamp is None else stamp / _DAY_S for stamp in stamps])
+    days = np.array([np.nan if stamp is None else stamp / 86400.0 for stamp in stamps])
     dated = bool(np.all(np.isfinite(days))) and float(np.ptp(days)) > 0.0
     return (days if dated else np.arange(1.0, len(days) + 1.0)), dated
 
@@ -253,15 +253,6 @@ def _draw_line(panel: Any, each: Parameter, at: Floats, warm: Floats | None) -> 
     colours = np.where(np.isfinite(warm), warm, np.nanmean(warm))
     return panel.scatter(at, values, c=colours, cmap=THERMAL, edgecolors=INK, linewidths=0.5,
                          zorder=3, vmin=np.nanmin(warm), vmax=np.nanmax(warm))
-
-
-def _marks(history: History, each: Parameter) -> Marks:
-    """Return date, value and temperature of each calibration."""
-    return tuple(Mark(
-        f'{label}, {named_words(each.name, value, sd)}'
-        + ('' if moment.temperature is None else f', {moment.temperature:.0f} °C'))
-        for label, moment, value, sd in zip(history.labels, history.moments, each.values,
-                                            each.stated_sd, strict=True))
 
 
 def label_dates(panel: Any, at: Floats, label: str, *, dated: bool) -> None:
