@@ -84,8 +84,15 @@ class _Package(ModuleType):
     """
 
     def __getattr__(self, name: str) -> Any:
-        if name == '__version__':
-            self.__version__ = _version()
+        if name == '__version__':  # that of package.xml beside the package, or the installed one
+            source = Path(__file__).parent.parent / 'package.xml'
+            if source.is_file():
+                text = source.read_text(encoding='utf-8')
+                self.__version__ = text.partition('<version>')[2].partition('<')[0]
+            else:
+                from importlib.metadata import version  # slow, and not needed in a clone
+
+                self.__version__ = version(__name__)
             return self.__version__
         if name not in __all__:
             raise AttributeError(f'module {self.__name__!r} has no attribute {name!r}')
@@ -97,16 +104,6 @@ class _Package(ModuleType):
 
     def __dir__(self) -> list[str]:
         return sorted([*__all__, '__version__'])
-
-
-def _version() -> str:
-    """Return the version: that of package.xml beside the package, or of the installed package."""
-    source = Path(__file__).parent.parent / 'package.xml'
-    if source.is_file():
-        return source.read_text(encoding='utf-8').partition('<version>')[2].partition('<')[0]
-    from importlib.metadata import version  # slow, and not needed in a clone
-
-    return version(__name__)
 
 
 sys.modules[__name__].__class__ = _Package

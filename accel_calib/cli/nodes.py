@@ -59,17 +59,14 @@ def ended() -> Iterator[Callable[[], bool]]:
 
 
 def run_node(args: argparse.Namespace) -> Done:
-    """Run the calibrator until it is ended."""
-    from ..ros.run import calibrator
+    """Run the calibrator or the simulator until it is ended."""
+    from ..ros.run import calibrator, simulator
 
-    return Done(status=calibrator([args.command, *args.for_ros]))
+    start = simulator if args.command == 'simulator' else calibrator
+    return Done(status=start([args.command, *args.for_ros]))
 
 
-def run_simulator(args: argparse.Namespace) -> Done:
-    """Run the simulator until it is ended."""
-    from ..ros.run import simulator
-
-    return Done(status=simulator([args.command, *args.for_ros]))
+run_simulator = run_node
 
 
 def run_live(args: argparse.Namespace) -> Done:

@@ -372,7 +372,19 @@ def history_of(calibrations: Sequence[Calibration]) -> History:
 
     """
     runs = comparable(calibrations)
-    moments = [_moment(k, run) for k, run in enumerate(calibrations)]
+    moments = []
+    for k, run in enumerate(calibrations):
+        poses, when = run.used_poses, None
+        warm = float(np.median(poses['temperature'])) if 'temperature' in poses else None
+        if run.date:
+            try:
+                when = datetime.fromisoformat(run.date.replace('Z', '+00:00'))
+            except ValueError:
+                raise InputError(f'the date of calibration {k + 1} is {run.date!r}, expected a '
+                                 'date such as 2026-11-22T09:30:00+00:00',
+                                 'correct date: in the file') from None
+            when = when.replace(tzinfo=when.tzinfo or timezone.utc).astimezone(timezone.utc)
+        moments.append(Moment(k, when, run.name, warm, run.quality.rms_after_mg))
     undated = [moment.index + 1 for moment in moments if moment.when is None]
     if not undated:
         moments.sort(key=lambda moment: moment.when or _FIRST)
@@ -388,18 +400,3 @@ def history_of(calibrations: Sequence[Calibration]) -> History:
              for number in undated]
     return History(tuple(moments), whole.parameters, tuple(changes), whole,
                    (*notes, *whole.notes), ordered)
-
-
-def _moment(index: int, calibration: Calibration) -> Moment:
-    poses = calibration.used_poses
-    warm = float(np.median(poses['temperature'])) if 'temperature' in poses else None
-    date, when = calibration.date, None
-    if date:
-        try:
-            when = datetime.fromisoformat(date.replace('Z', '+00:00'))
-        except ValueError:
-            raise InputError(f'the date of calibration {index + 1} is {date!r}, expected a date '
-                             'such as 2026-11-22T09:30:00+00:00',
-                             'correct date: in the file') from None
-        when = when.replace(tzinfo=when.tzinfo or timezone.utc).astimezone(timezone.utc)
-    return Moment(index, when, calibration.name, warm, calibration.quality.rms_after_mg)

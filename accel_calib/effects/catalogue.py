@@ -340,8 +340,14 @@ def empirical_parts(name: str) -> tuple[str, str, tuple[int, ...]]:
 
 def _empirical(name: str) -> Effect:
     carrier, variable, modes = empirical_parts(name)
-    if variable == 'direction':
-        return _harmonic(modes)
+    if variable == 'direction':  # the gain of all axes as a sum of spherical harmonics
+        zones = [number for number, zone in enumerate(ZONES) if zone.degree in modes]
+        return Effect(
+            f'gain as a smooth function of {VARIABLES["direction"]}', 'empirical curve',
+            tuple(f'{degree}_{k}' for degree in modes for k in range(1, 2 * degree + 2)), 'g/g',
+            0.001, 0.5, tuple(Term(k, axis, ZONAL + 3 * number + axis)
+                              for k, number in enumerate(zones) for axis in range(3)),
+            family='force')
     whole, _, part = carrier.partition('.')
     parts, of_force = (part,) if part else CARRIERS[whole], variable == 'force'
     carried = [term._replace(parameter=parts.index(own)) for term in _CARRIED[whole]
@@ -357,16 +363,6 @@ def _empirical(name: str) -> Effect:
         return curve(family='force')
     return curve(factor=partial(_cosines, variable, modes, len(carried)), needs=(variable,),
                  shape=('low', 'high'), shapes=partial(_ends, variable))
-
-
-def _harmonic(degrees: tuple[int, ...]) -> Effect:
-    """Return the gain of all axes as a sum of spherical harmonics of the direction."""
-    zones = [number for number, zone in enumerate(ZONES) if zone.degree in degrees]
-    terms = tuple(Term(k, axis, ZONAL + 3 * number + axis)
-                  for k, number in enumerate(zones) for axis in range(3))
-    names = tuple(f'{degree}_{k}' for degree in degrees for k in range(1, 2 * degree + 2))
-    return Effect(f'gain as a smooth function of {VARIABLES["direction"]}', 'empirical curve',
-                  names, 'g/g', 0.001, 0.5, terms, family='force')
 
 
 def _variable(variable: str, context: Mapping[str, Any]) -> Floats:
