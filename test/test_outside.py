@@ -106,7 +106,7 @@ def test_session_logs_once_for_each_leaving(tmp_path, monkeypatch):
         driver.stamp += 3000.0
         driver.tick(61.0)
         told.append([line.words for line in driver.log
-                     if line.words.startswith('temperature has left')])
+                     if line.words.startswith('temperature is ')])
     assert [len(each) for each in told] == [0, 1, 0, 0, 0, 0, 1]
     assert ' 20 to 30 ' in told[1][0]
     assert ' 35 °C' in told[1][0]
