@@ -37,7 +37,8 @@ class Reports:
             if name not in self._told:
                 session.throttle.forget(name)
             session.log('info' if waits else 'warning', f'waiting: {each.words}' if waits else
-                        each.words, name, AGAIN if name in _OFTEN else FAULT_AGAIN)
+                        each.words, name, AGAIN if name in _OFTEN else
+                        FAULT_AGAIN if each.concern == 'stream' else math.inf)
         over = [(name, concern) for name, concern in self._told.items() if name not in now]
         for name, concern in over:
             if concern == 'stream' and name in session.around.values:
