@@ -10,7 +10,8 @@ The sets come from `test/generator.py`, which shares no code with the package::
     python benchmarks/refine.py --sets 1 --only lag
 
 Settings of the package are tuned with ``--seed 1``. Published figures are measured with seed 2028
-or above, on sets that nothing was tuned with.
+or above, on sets that nothing was tuned with. All rows take an hour or two: with ``--keep FOLDER``
+the rows that are done are kept there, and a second run goes on with the others.
 
 """
 
@@ -21,13 +22,14 @@ from collections.abc import Sequence
 import multiprocessing
 import os
 from pathlib import Path
+import pickle
 import sys
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')  # each process has one core
 
-from figures import markdown, parser, publish, table  # noqa: E402
+from figures import commit, markdown, parser, publish, table  # noqa: E402
 import numpy as np  # noqa: E402
 from refine_case import CARRIER, Case, Outcome, run  # noqa: E402
 from refine_lines import lines_of, said_lines  # noqa: E402
@@ -106,8 +108,13 @@ def _fresh_ratios(outcomes: Sequence[Outcome]) -> tuple[str, str]:
     return f'{base:.2f}', f'{noise:.2f}'
 
 
-def measured(cases: Sequence[Case], jobs: int) -> list[Outcome]:
-    """Run the cases in `jobs` processes."""
+def measured(cases: Sequence[Case], jobs: int, kept: Path | None) -> list[Outcome]:
+    """Run the cases in `jobs` processes, unless their outcomes are `kept` in a file."""
+    if kept is not None:
+        if not kept.exists():
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            kept.write_bytes(pickle.dumps(measured(cases, jobs, None)))
+        return pickle.loads(kept.read_bytes())
     if jobs == 1:
         return [run(case) for case in cases]
     with multiprocessing.get_context('spawn').Pool(jobs) as pool:
@@ -120,12 +127,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options.add_argument('--sets', type=int, default=20, help='sets of each kind in each row')
     options.add_argument('--only', action='append', choices=ROWS, help='only this row; repeatable')
     options.add_argument('--hidden', help='only sets in which this effect hides')
+    options.add_argument('--keep', type=Path, help='folder for the outcomes of rows, by commit')
     given = options.parse_args(arguments)
+    about = f'{commit()}-{given.sets}-{given.seed}-{given.hidden or "all"}'
     lines, everything = [], []
     for row in given.only or ROWS:
         cases = [case for case in cases_of(row, given.sets, given.seed)
                  if given.hidden is None or given.hidden in case.hidden]
-        outcomes = measured(cases, given.jobs)
+        outcomes = measured(cases, given.jobs, given.keep and given.keep / about / f'{row}.pickle')
         everything += outcomes
         if outcomes:
             lines += lines_of(row, outcomes)
