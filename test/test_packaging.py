@@ -100,8 +100,8 @@ def test_the_page_about_installation_lists_every_part_and_the_readme_those_that_
 def test_messages_name_packages_of_the_index(setup_py: dict[str, Any]) -> None:
     asked = {name for source in sources() for names in re.findall(r"needing\('([^']+)'", source)
              for name in names.split()} | {each.needs for each in FORMATS} - {''}
-    known = {name for extra in setup_py['extras_require'].values()
-             for name in distributions(extra)}
+    parts = [setup_py['install_requires'], *setup_py['extras_require'].values()]
+    known = {name for part in parts for name in distributions(part)}
     assert {'aiohttp', 'dask', 'pandas', 'pyulog'} <= asked <= known
     assert not [each for each in sources() if re.search(r'pip install .{0,4}accel_calib', each)]
 
