@@ -281,11 +281,13 @@ class Guide:
             return ''
         asked, read = plan.asked.direction, unit(mean - np.array(plan.zero or (0.0, 0.0, 0.0)))
         self._answers.append((asked, read))
-        if read @ self.axes @ asked >= _FOLLOWED:
+        wanted = self.axes @ asked
+        if read @ wanted >= _FOLLOWED:
             self.missed = 0
             return ''
         words = f'asked for {_signs(asked)}, the sensor reads {_signs(read)}'
-        self.skipped.append(self.axes @ asked)
+        if all(each @ wanted < _TAKEN for each in self.skipped):
+            self.skipped.append(wanted)
         self.missed, self.is_stale = self.missed + 1, True
         axes = self._likely_axes(plan.up)
         if not np.array_equal(axes, self.axes):
