@@ -27,8 +27,9 @@ from .pose_planning import (
     refuse_if_unfit, request_for, stated_uncertainty)
 from .quality import (
     deviations_g, errors_after, errors_before, fit_findings, gated, has_usual_gains, in_g,
-    LARGEST_OFFSET_G, OF_A_FIT, quality_of, record_of, uncertainty_g, Verification, verify)
-from .rest_noise import gyro_bias_of, GyroBias, sample_noise_of, SampleNoise, with_rest_noise
+    LARGEST_OFFSET_G, OF_A_FIT, quality_of, record_of, uncertainty_g, Verification, verify,
+    with_rest_noise)
+from .rest_noise import gyro_bias_of, GyroBias, sample_noise_of, SampleNoise
 from .thermal import Curve, curve_of, thermal_alone, with_curve, without_curve
 
 __all__ = ['CLIPPED', 'FLEET', 'LARGEST_DILUTION', 'LARGEST_OFFSET_G', 'NORM_MODELS', 'OF_A_FIT',

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from .calibration import Calibration, check_sensor, PRIOR, Quality, Rejected, with_history
 from .pose_planning import WEAK_DILUTION
-from .rest_noise import with_rest_noise
+from .rest_noise import gyro_bias_of, sample_noise_of
 from ..effects import correct, LADDER, length_rows, Model, sensor_force
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import believable, Fit, judge, left_out, Rival, unseen_mistakes
@@ -150,6 +150,19 @@ def record_of(fit: Fit, poses: Poses, units: Units, directions: Floats, name: st
         name, method, fit.model, units, poses.sensor, 'ros', '',
         fit.covariance if covariance is None else covariance, quality_of(fit, units, directions),
         poses, tuple(sorted(rejected, key=lambda pose: pose.row)), reason, noted)
+
+
+def with_rest_noise(calibration: Calibration, poses: Poses) -> Calibration:
+    """
+    Return a calibration with gyro bias and noise from the rests that it does not reject.
+
+    Figures that the rests do not determine are kept.
+
+    """
+    rejected = [pose.row for pose in calibration.rejected]
+    used = poses.take(~np.isin(poses.row, rejected))
+    return replace(calibration, gyro=gyro_bias_of(used) or calibration.gyro,
+                   noise=sample_noise_of(used) or calibration.noise)
 
 
 def errors_before(poses_g: Poses, units: Units, *, vectors: bool) -> Floats:

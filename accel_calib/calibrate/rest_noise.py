@@ -44,18 +44,14 @@ References
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 import scipy
 
 from ..table import Floats, Poses, range_of, Record
-
-if TYPE_CHECKING:
-    from .calibration import Calibration
 
 LARGEST_BIAS = 1.0
 """Largest bias of a gyro [rad/s]; a larger rate is in another unit, or is no rest."""
@@ -161,19 +157,6 @@ class SampleNoise(Record):
             if np.shape(values) != (3,) or np.any(values < 0.0) or np.any(np.isinf(values)):
                 raise ValueError(f'the noise of the {name} is {np.asarray(values).tolist()}, '
                                  'expected three numbers of 0 or more')
-
-
-def with_rest_noise(calibration: Calibration, poses: Poses) -> Calibration:
-    """
-    Return a calibration with gyro bias and noise from the rests that it does not reject.
-
-    Figures that the rests do not determine are kept.
-
-    """
-    rejected = [pose.row for pose in calibration.rejected]
-    used = poses.take(~np.isin(poses.row, rejected))
-    return replace(calibration, gyro=gyro_bias_of(used) or calibration.gyro,
-                   noise=sample_noise_of(used) or calibration.noise)
 
 
 def sample_noise_of(poses: Poses) -> SampleNoise | None:

@@ -26,7 +26,7 @@ from pathlib import Path
 import secrets
 import socket
 from threading import Thread
-from typing import Any, cast, TYPE_CHECKING
+from typing import Any, cast, Protocol, TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from aiohttp import web
@@ -43,7 +43,7 @@ from ..text import plain
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from .host import Exchange
+    from ..stored.exports import Exported
 
 PERIOD = 0.05
 """Interval between two messages of progress [s]."""
@@ -149,6 +149,20 @@ class Address:
             return name in self._hosts
 
 
+class Desk(Protocol):
+    """Who answers the viewers: a `host.Exchange`."""
+
+    show: Callable[[Message], object]
+
+    def ask(self, command: str, answer: Callable[[bool, Any], object]) -> None: ...
+
+    def page(self, answer: Callable[[bool, Any], object]) -> None: ...
+
+    def export(self, name: str, answer: Callable[[Exported | str], object]) -> None: ...
+
+    def warn(self, words: str) -> None: ...
+
+
 class PageServer:
     """
     The server of the live page; `desk` answers the viewers, in the thread of the server.
@@ -164,7 +178,7 @@ class PageServer:
 
     """
 
-    def __init__(self, desk: Exchange, host: str, port: int) -> None:
+    def __init__(self, desk: Desk, host: str, port: int) -> None:
         self._desk, self._host, self._port = desk, host, port
         self.token = secrets.token_urlsafe(16)
         self._loop: asyncio.AbstractEventLoop | None = None

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 import errno
 from http import HTTPStatus
@@ -33,16 +33,13 @@ import os
 from pathlib import Path
 import socket
 import sys
-from typing import Any, TYPE_CHECKING, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from aiohttp import web, WSCloseCode, WSMsgType
 
 from ..errors import InputError
 from ..session import COMMANDS as COMMANDS_OF_A_SESSION, ros_home
 from ..text import read_json
-
-if TYPE_CHECKING:
-    from .server import PageServer
 
 STUCK_S = 10.0
 """Time after which a viewer that takes no data, or does not answer, is closed [s]."""
@@ -79,6 +76,22 @@ Answered = TypeVar('Answered', bound=web.StreamResponse)
 
 _BUFFER = 65536
 """Size of the buffers of a viewer [bytes]; more waits in the viewer's task."""
+
+
+class Serving(Protocol):
+    """What connections and viewers need of their server."""
+
+    board: Any
+
+    def add(self, connection: Connection) -> None: ...
+
+    def remove(self, connection: Connection) -> None: ...
+
+    def report(self, what: str) -> None: ...
+
+    def admit(self, viewer: Viewer, token: str) -> None: ...
+
+    def ask(self, command: str, answer: Callable[[bool, str], object]) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -194,7 +207,7 @@ class Connection(web.RequestHandler):
 
     """
 
-    def __init__(self, server: PageServer, http: web.Server) -> None:
+    def __init__(self, server: Serving, http: web.Server) -> None:
         super().__init__(http, loop=asyncio.get_running_loop(),
                          access_log=None)  # type: ignore[arg-type]
         self._owner, self.stage, self.address = server, 0, ''
@@ -243,7 +256,7 @@ class Viewer:
 
     """
 
-    def __init__(self, server: PageServer, websocket: web.WebSocketResponse,
+    def __init__(self, server: Serving, websocket: web.WebSocketResponse,
                  connection: Connection) -> None:
         self._server, self._socket, self.connection = server, websocket, connection
         self._sent: dict[str, Message] = {}
