@@ -94,6 +94,10 @@ _NAMES = {*COLUMNS, 'force', *(name for column in COLUMNS.values() for name in c
 _KEY = re.compile(r'[^\W\d]\w{0,63}')
 
 
+CONTEXT = ('temperature', 'supply_voltage')
+"""Numbers beside the readings that the catalogue knows; others are quantities of the user."""
+
+
 def quantity_key(name: str) -> str:
     """Return the key of a column that is not in `COLUMNS`; empty if its name has none."""
     key = re.sub(r'[\W_]+', '_', name).strip('_')
@@ -391,12 +395,12 @@ def check_values(columns: Mapping[str, NDArray[Any]], source: str, *, partial: b
     """
     Check values; InputError if not finite or beyond any sensor, a count <= 0 or an sd < 0.
 
-    `partial`: single numbers beside the readings can be NaN.
+    `partial`: those of `CONTEXT` can be NaN.
 
     """
     for key, values in columns.items():
-        if partial and key in ('temperature', 'supply_voltage'):
-            values = np.nan_to_num(values, nan=0.0, posinf=np.inf, neginf=-np.inf)
+        if partial and key in CONTEXT:
+            values = np.where(np.isnan(values), 0.0, values)
         if key in COLUMNS and key != 'label' and not np.all(np.abs(values) < LARGEST):
             by_row = values.reshape(len(values), -1)
             sound = np.abs(by_row) < LARGEST

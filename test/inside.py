@@ -94,7 +94,7 @@ from accel_calib.ros.run import own_domain
 from accel_calib.session import store as session_store, worker
 from accel_calib.session.commands import (
     due as automatic_fits_due, fit as fit_in_node, poses_changed)
-from accel_calib.session.conditions import next_action
+from accel_calib.session.conditions import next_action, step_of
 from accel_calib.session.live_capture import LiveCapture, PoseBook, with_temperature
 from accel_calib.session.pose_guide import Guide, Plan, plan_for
 from accel_calib.session.sensor import rest_after, Sensor

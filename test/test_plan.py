@@ -12,7 +12,7 @@ from accel_calib.refine import PlannedPose, refine
 from accel_calib.table import Poses
 from generator import Setup, simulate, write_csv
 from inside import (
-    attitude_words, Guide, levels_of, model_with, NOTHING_TO_PLAN, Plan, simulate_poses)
+    attitude_words, Guide, levels_of, model_with, NOTHING_TO_PLAN, Plan, simulate_poses, step_of)
 import numpy as np
 import pytest
 from shared import G, random_directions, run, run_json
@@ -165,11 +165,11 @@ def test_the_node_asks_for_the_poses_of_the_plan_and_then_for_refine():
     guide_at(guide, [(0, 0, -1)])
     guide.follow([planned((0.0, 0.0, 1.0)), planned((0.0, 1.0, 0.0), temperature=40.0)])
     assert guide.plan.asked.direction.tolist() == [0.0, 0.0, 1.0]
-    assert guide.action.words.endswith(' cubic from odd_quadratic')
+    assert step_of(guide).words.endswith(' cubic from odd_quadratic')
     guide_at(guide, [(0, 0, -1), (0, 0.1, 1)])
-    assert ' at 40 °C' in guide.action.words
+    assert ' at 40 °C' in step_of(guide).words
     assert guide.plan.asked.direction.tolist() == [0.0, 1.0, 0.0]
     guide_at(guide, [(0, 0, -1), (0, 0.1, 1), (0, 1, 0)])
-    assert (guide.action.kind, guide.action.command) == ('refine', 'refine')
+    assert (step_of(guide).kind, step_of(guide).command) == ('refine', 'refine')
     guide_at(guide, [])
-    assert (guide.action.kind, guide.action.command) == ('poses', 'fit')
+    assert (step_of(guide).kind, step_of(guide).command) == ('poses', 'fit')

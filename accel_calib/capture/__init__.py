@@ -13,7 +13,7 @@ pose table. `ramp` makes the stretches of a still board whose temperature change
 """
 
 from .account import account_of, Rest
-from .chunks import CaptureSettings, CONTEXT, REPEATED, Repeated, settings_from
+from .chunks import CaptureSettings, REPEATED, Repeated, settings_from
 from .detector import capture, Captured, poses_from, samples_of, select, StillDetector
 from .dwell import Dwell
 from .ramp import (
@@ -21,7 +21,7 @@ from .ramp import (
 from .rule import rounding_left
 from .sensor import check_axes, check_measured, is_one_direction
 
-__all__ = ['CONTEXT', 'FASTEST', 'LEAST_RANGE', 'LEAST_RESTS', 'REPEATED', 'Captured',
+__all__ = ['FASTEST', 'LEAST_RANGE', 'LEAST_RESTS', 'REPEATED', 'Captured',
            'CaptureSettings', 'Dwell', 'Ramp', 'Repeated', 'Rest', 'StillDetector', 'account_of',
            'capture', 'cells_of', 'check_axes', 'check_measured', 'is_one_direction',
            'is_turned_over', 'poses_from', 'ramp_of', 'rests_in_cells', 'rounding_left',

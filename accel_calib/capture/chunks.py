@@ -126,9 +126,6 @@ Indices = NDArray[np.intp]
 Records = NDArray[Any]
 """One-dimensional structured array."""
 
-CONTEXT = ('temperature', 'supply_voltage')
-"""Columns that are averaged together with reading and rate, as quantities are."""
-
 MOTION = 7
 """Numbers of a sample before its context: time, reading, rate (NaN: none)."""
 

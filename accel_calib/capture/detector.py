@@ -27,14 +27,13 @@ from numpy.typing import NDArray
 
 from .account import MISSING, Rest
 from .chunks import (
-    CaptureSettings, chained, Chunker, Chunks, CHUNKS_PER_WINDOW, CONTEXT, Interruption, MOTION,
-    Records)
+    CaptureSettings, chained, Chunker, Chunks, CHUNKS_PER_WINDOW, Interruption, MOTION, Records)
 from .dwell import Dwell, figures, figures_type, judged, OngoingDwell, Tracker
 from .levels import Known
 from .rule import Rule
 from .sensor import Lengths
 from ..errors import InputError
-from ..table import ABOUT, Floats, numbered, Poses, Recording
+from ..table import ABOUT, CONTEXT, Floats, numbered, Poses, Recording
 from ..units import Units
 
 _BLOCK = 1 << 14     # samples summed at a time; they fit in the cache

@@ -24,14 +24,14 @@ from .names import (
     LogFormat, may_cause, Meaning, meaning, OURS, RATE, READING, recognise, unit_of, WHOLE_WORDS,
     WORDS)
 from ..errors import InputError
-from ..table import COLUMNS, Floats, quantity_key
+from ..table import COLUMNS, CONTEXT, Floats, quantity_key
 from ..units import STANDARD_GRAVITY, UnitName
 
 FRACTION = 'time_ns'
 """Key of a column with the nanoseconds of a time in whole seconds."""
 
-_MAY_LACK = ('temperature', 'supply_voltage')
-"""Columns of the context, which rows of a partial table may lack."""
+OF_POSES = {'count', 'orientation', 'std'}
+"""Columns that only poses have."""
 
 
 def named_topics(entries: Iterable[str]) -> dict[str, str]:
@@ -44,11 +44,11 @@ def named_topics(entries: Iterable[str]) -> dict[str, str]:
     topics: dict[str, str] = {}
     for entry in filter(None, entries):
         column, _, topic = (part.strip() for part in entry.partition(':='))
-        known = column in (*_MAY_LACK, quantity_key(column))
+        known = column in (*CONTEXT, quantity_key(column))
         if not (known and column and topic) or column in topics:
             raise InputError(
                 f'context has the entry {entry!r}, expected column:=topic or column:=topic/field, '
-                f'each column once: {", ".join(_MAY_LACK)}, or a new name of letters, digits and '
+                f'each column once: {", ".join(CONTEXT)}, or a new name of letters, digits and '
                 '_', 'correct the entry')
         topics[column] = topic
     return topics
@@ -140,7 +140,7 @@ class Chosen:
 
     `sources` are the columns by key of `COLUMNS`; those of ``KEY/`` divide the ones of a key, and
     ``instance`` is the number of the sensor. The others are indices: of the columns of numbers
-    that each row needs, of those of the `context` that rows may lack, of `labels`, of `dates`
+    that each row needs, of those of the `context` that poses may lack, of `labels`, of `dates`
     (times as text), and of further columns of numbers, the `quantities`.
 
     """
@@ -222,13 +222,14 @@ def _with_indices(layout: Layout, sources: Mapping[str, tuple[Source, ...]],
     dates = index['time'] if clocks and all(map(is_clock, clocks)) else ()
     texts = {'label', 'time'} if dates else {'label'}
     needed = {k for key, which in index.items() if key not in texts for k in which}
-    context = {k for key in _MAY_LACK for k in index.get(key, ())} if partial else set[int]()
+    of_poses = partial or bool(OF_POSES & index.keys())
+    context = {k for key in CONTEXT for k in index.get(key, ())} if of_poses else set[int]()
     used = {k for which in index.values() for k in which}
     quantities: dict[str, int] = {}  # the other columns of numbers that can be a cause
     for k, name in enumerate(() if maker else layout.header[:MOST]):
         free = k not in used and meaning(name).quantity in ('', *sources) and may_cause(name)
         cells = layout.first(k)
-        cells = list(filter(None, cells)) or cells if partial else cells
+        cells = list(filter(None, cells)) or cells if of_poses else cells
         if free and quantity_key(name) and _are_numbers(cells):
             quantities.setdefault(quantity_key(name), k)
     return Chosen(layout, sources, maker, tuple(sorted(needed - context)),
@@ -256,7 +257,7 @@ def _sources(layout: Layout, given: Mapping[str, str]) -> dict[str, Source]:
         found = {**_contexts(layout, found), **found}
     # What is not asked for, and holds other text than numbers, does not stand in the way.
     plain = {ours: source for ours, source in found.items()
-             if ours not in (*RATE, *_MAY_LACK) or ours in given or source.name == ours
+             if ours not in (*RATE, *CONTEXT) or ours in given or source.name == ours
              or _are_numbers(layout.first(source.index)[:_FIRST_ROWS])}
     return {ours: source for ours, source in plain.items() if given.get(ours, ours)}
 
@@ -394,7 +395,7 @@ def _contexts(layout: Layout, found: Mapping[str, Source]) -> dict[str, Source]:
                      if count == max(shared) and shared.count(count) == 1}
         more |= {name: _source(layout, k) for triple in gyros.values()
                  for name, k in zip(RATE, triple)}
-    for key in _MAY_LACK:
+    for key in CONTEXT:
         which = [*_named(key, header)]
         if key not in found and len(which) == 1:
             more[key] = _source(layout, which[0])

@@ -40,7 +40,7 @@ from .text import PEEKED, text_table, TextTable
 from ..disk import check_regular, FIRST_LINE
 from ..errors import DamagedLogError, InputError, needing, saying
 from ..finding import Finding
-from ..table import check_units, check_values, concatenated, Poses, Recording
+from ..table import check_units, check_values, concatenated, CONTEXT, Poses, Recording
 from ..text import some
 from ..units import Units, units_of
 
@@ -247,7 +247,7 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
     def converted() -> Iterator[Poses]:
         for block in chain((first,), cells):
             columns, row = quantities.columns(block)
-            check_values(columns, str(path), partial=options.partial)
+            check_values(columns, str(path), partial=bool(text.columns.context))
             yield Poses(columns, row, **{**text.layout.about, 'units': quantities.units.name})
 
     blocks, poses = converted(), None
@@ -274,8 +274,8 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
 
 def _pose_table(path: Path, poses: Poses, quantities: Quantities, *, partial: bool) -> Poses:
     """Return rows as poses, without quantities that are not numbers; refuse samples."""
-    lacking = [] if partial else [
-        key for key in poses.quantities if not np.isfinite(poses[key]).all()]
+    lacking = [] if partial else [key for key in (*CONTEXT, *poses.quantities)
+                                  if key in poses and not np.isfinite(poses[key]).all()]
     if lacking:
         quantities.notes.append(f'not used, because cells are not numbers: {some(lacking)}')
     if are_untimed_samples(poses.columns):

@@ -25,7 +25,7 @@ from typing import Any, cast, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from .columns import Chosen, LogOptions, unused
+from .columns import Chosen, LogOptions, OF_POSES, unused
 from .dialect import Cells
 from .names import DEGREE, meaning, READING, record_instead, unit_of, ZEROS
 from .times import Clock, clock_of
@@ -90,9 +90,6 @@ _SAME = 0.1
 
 _ONE_SIDE = 0.3
 """Readings of a sensor that is not turned scatter by less, relative to their length."""
-
-_OF_POSES = {'count', 'orientation', 'std'}
-"""Columns that only poses have."""
 
 _LIKELY_RATE = 20.0
 """Angular rates [rad/s] of a sensor that is turned by hand stay below this; in °/s they do not."""
@@ -456,7 +453,7 @@ def _radius(still: Floats) -> float:
 
 def are_samples(columns: Mapping[str, NDArray[Any]]) -> bool:
     """Return whether rows are samples: with time, not marked as poses, and dense or many."""
-    if 'time' not in columns or _OF_POSES & columns.keys() or len(columns['time']) < 2:
+    if 'time' not in columns or OF_POSES & columns.keys() or len(columns['time']) < 2:
         return False
     apart = abs(float(np.median(np.diff(columns['time']))))
     return apart < _SAMPLES_APART_S or len(columns['time']) > _MOST_POSES
@@ -471,7 +468,7 @@ def are_untimed_samples(columns: Mapping[str, NDArray[Any]]) -> bool:
 
     """
     readings = columns['reading']
-    if len(readings) < _FEW_POSES or ({'time'} | _OF_POSES) & columns.keys():
+    if len(readings) < _FEW_POSES or ({'time'} | OF_POSES) & columns.keys():
         return False
     step = np.linalg.norm(np.diff(readings, axis=0), axis=1)
     middle = np.median(readings, axis=0)

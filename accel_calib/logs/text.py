@@ -224,7 +224,8 @@ class TextTable:
         if len(cells) != layout.width:
             return f' has {counted(len(cells), "value")}, expected {layout.width}'
         comma = layout.decimal != '.' and (layout.dialect.delimiter != ',' or '"' in line)
-        for k in self.columns.needed:
+        present = [k for k in self.columns.context if cells[k].strip()]
+        for k in (*self.columns.needed, *present):
             if not is_number(cells[k].replace(',', '.') if comma else cells[k]):
                 return (f', column {layout.name(k)} is {short(cells[k])!r}, expected a finite '
                         'number')

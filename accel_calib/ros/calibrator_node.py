@@ -47,9 +47,9 @@ from ..errors import AccelCalibError
 from ..live import check_installed
 from ..messages.correction import output_frame
 from ..session import (
-    CalibratorSettings, CallSoon, checks, COMMANDS, Condition, context_topics, Event, figures,
-    Level, Log, Mounting, next_action, Result, Session, ShowPoses, state, Still, Surroundings,
-    Task, Worker, worst)
+    CalibratorSettings, CallSoon, checks, COMMANDS, Condition, context_topics, diagnostics, Event,
+    figures, Level, Log, Mounting, next_action, Result, Session, ShowPoses, state, Still,
+    Surroundings, Task, Worker)
 from ..table import Floats
 
 if TYPE_CHECKING:
@@ -221,10 +221,9 @@ class Calibrator:
             self._page.show_state()
 
     def _show_diagnostics(self) -> None:
-        found = checks(self.session)
+        first, *others = diagnostics(self.session)
         array = DiagnosticArray(status=[
-            self._status(worst(self.session), figures(self.session)),
-            *map(self._status, found)])
+            self._status(first, figures(self.session)), *map(self._status, others)])
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._diagnostics.publish(array)
 

@@ -84,6 +84,8 @@ _WITH_A_NUMBER = tuple(f'{package}/msg/{name}' for package, names in (
     ('std_msgs', ('Float32', 'Float64'))) for name in names)
 """Types whose topics are named to the user."""
 
+_TIMES = ('std_msgs/Header', 'builtin_interfaces/Time', 'builtin_interfaces/Duration')
+
 _NUMBER = re.compile(r'(float|double|u?int)\d*')
 
 
@@ -93,7 +95,7 @@ def _fields_of(kind: Any, before: str = '') -> list[str]:
     for name, of_field in kind.get_fields_and_field_types().items():
         if _NUMBER.fullmatch(of_field):
             found.append(before + name)
-        elif re.fullmatch(r'\w+/\w+', of_field) and of_field != 'std_msgs/Header':
+        elif re.fullmatch(r'\w+/\w+', of_field) and of_field not in _TIMES:
             inner = _type_of(of_field.replace('/', '/msg/'))
             found += [] if inner is None else _fields_of(inner, f'{before}{name}.')
     return found
@@ -136,10 +138,10 @@ class ContextTopics:
             kinds = types.get(topic, [])
             kind = _type_of(kinds[0]) if len(kinds) == 1 else None
             numbers = [] if kind is None else _fields_of(kind)
-            fields = [field] if field in numbers else [] if field else (
-                [each for each in _USUAL if each in numbers and (each in column)]
-                or [each for each in numbers if each in column] or (
-                    [each for each in _USUAL if each in numbers] or numbers[:len(numbers) == 1]))
+            fields = [each for each in numbers if each == field] if field else (
+                [each for each in numbers if each in column]
+                or [each for each in _USUAL if each in numbers]
+                or numbers[:len(numbers) == 1])
             if not fields:
                 self._missing[column] = self._why(topic, field, kinds, numbers)
                 continue

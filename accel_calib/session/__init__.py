@@ -16,15 +16,14 @@ one way.
 
 from . import state
 from .commands import COMMANDS, Commands
-from .conditions import conditions, next_action
+from .conditions import Condition, conditions, Level, next_action
 from .core import Surroundings
-from .pose_guide import Condition, Level
 from .sensor import title
 from .session import BATCH, Session
 from .settings import (
     CalibratorSettings, changed, columns_of, context_topics, default_of, expected, parameter,
     Settings, WEB_PORT)
-from .state import checks, figures, Progress, words_of_state, worst
+from .state import checks, diagnostics, figures, Progress, words_of_state
 from .store import ros_home
 from .worker import (
     Answer, answered, CallSoon, Compute, Event, Files, Log, Mounting, nothing, Result, Severity,
@@ -34,6 +33,6 @@ __all__ = ['BATCH', 'COMMANDS', 'WEB_PORT', 'Answer', 'CalibratorSettings', 'Cal
            'Compute', 'Condition', 'Event', 'Files', 'Level', 'Log', 'Mounting', 'Progress',
            'Result', 'Session', 'Settings', 'Severity', 'ShowPoses', 'Step', 'Still',
            'Surroundings', 'Task', 'Throttle', 'Worker', 'WorkerProcess', 'answered', 'changed',
-           'checks', 'columns_of', 'conditions', 'context_topics', 'default_of', 'expected',
-           'figures', 'next_action', 'nothing', 'parameter', 'ros_home', 'state', 'title',
-           'words_of_state', 'worst']
+           'checks', 'columns_of', 'conditions', 'context_topics', 'default_of', 'diagnostics',
+           'expected', 'figures', 'next_action', 'nothing', 'parameter', 'ros_home', 'state',
+           'title', 'words_of_state']

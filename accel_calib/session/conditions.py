@@ -13,19 +13,72 @@ of it. What is over is in no entry.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from enum import IntEnum
 import math
 
 from .core import State
-from .pose_guide import calling, Condition, Level, NOT_FOLLOWED, NOT_KNOWN
+from .pose_guide import Guide, NOT_FOLLOWED
 from .settings import context_topics
 from .stream import SILENT, StreamStatistics
 from ..calibrate import USES_LIMIT
 from ..compare import status
 from ..pipeline import FEWEST_IN_CONE, is_partial
-from ..table import column_of, is_quantity
+from ..table import column_of, CONTEXT, is_quantity
 from ..text import counted
 from ..units import MG, Units
+
+
+class Level(IntEnum):
+    """Severity, as in diagnostic_msgs/DiagnosticStatus."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+
+
+@dataclass(frozen=True)
+class Condition:
+    """
+    What is the case, and what to do about it.
+
+    Parameters
+    ----------
+    kind : str
+        Kind of the step, one of `accel_calib.finding.STEPS`; empty: not known yet.
+    words : str
+        What is the case and what to do.
+    command : str
+        Name of the service for it; may be empty.
+    direction : tuple of float
+        Direction to point up, a unit vector in the sensor axes; empty: none.
+    level : Level
+        Severity.
+    concern : str
+        The check of the diagnostics that it belongs to.
+    name : str
+        Name among all that can be wrong, for the log; empty: an ordinary step.
+
+    """
+
+    kind: str
+    words: str
+    command: str = ''
+    direction: tuple[float, ...] = ()
+    level: Level = Level.OK
+    concern: str = 'calibration'
+    name: str = ''
+
+
+_SERVICES = {'fit': 'fit', 'refine': 'refine', 'level': 'set_level', 'save': 'save'}
+"""Service for each kind of step that has one."""
+
+
+def calling(kind: str, text: str) -> Condition:
+    """Return a step with the call of its service."""
+    command = _SERVICES.get(kind, '')
+    return Condition(kind, f'{text}; call ~/{command}' if command else text, command)
+
 
 _LEVEL = Condition('level', 'place the robot level, hold it still and call ~/set_level; a sensor '
                    'alone is done', 'set_level')
@@ -33,7 +86,7 @@ _LEVEL = Condition('level', 'place the robot level, hold it still and call ~/set
 _FAR = 0.25
 """Part of the range of a calibration beyond which poses are asked for."""
 
-_NEEDS_SAMPLES = ('poses', 'level', 'done', NOT_KNOWN.kind)
+_NEEDS_SAMPLES = ('poses', 'level', 'done', '')
 """Kinds of steps that need samples; the others use the poses so far."""
 
 
@@ -43,25 +96,25 @@ def conditions(session: State) -> list[Condition]:
     blocks = bool(session.files.problem) or session.is_refused
     first, files = (files[:1], files[1:]) if blocks else ([], files)
     ended = session.surroundings.ended
-    around = [] if ended else [*_stream(session), *missing_context(session).values()]
+    around = [] if ended else [*_stream(session), *_context(session)]
     if step.kind == 'level' and ended:  # nothing can be levelled any more
         step = replace(step, kind='done', words='use the calibration', command='')
     if step.kind not in _NEEDS_SAMPLES:
         found = [step, *files, *around, *of_use]
     elif step.kind == 'done':
-        found = [*files, *around, *of_use, step]
-        found.sort(key=lambda each: each is not step and each.kind == step.kind)
+        to_do = [each for each in of_use if each.kind != 'done']
+        found = [*files, *around, *to_do, step, *(each for each in of_use if each not in to_do)]
     else:  # whoever turns the sensor is told of the files, and goes on
-        told = '; '.join([each.words for each in files] + [step.words])
+        told = '; '.join(filter(None, [*(each.words for each in files), step.words]))
         level = max([step.level, *(each.level for each in files)])
         found = [*around, replace(step, words=told, level=level), *files, *of_use]
-    axes = session.sensor.guide.axes_words
-    return [*first, *found, *([Condition('poses', axes, '', (), Level.WARN, 'stream', 'axes')]
-                              if axes else [])]
+    if axes := session.sensor.guide.axes_words:
+        found.append(Condition('poses', axes, level=Level.WARN, concern='stream', name='axes'))
+    return [*first, *found]
 
 
 def next_action(session: State) -> Condition:
-    """Return the next step; `NOT_KNOWN` while the poses or the rating are being computed."""
+    """Return the next step; without a kind while the poses or the rating are being computed."""
     return conditions(session)[0]
 
 
@@ -99,10 +152,10 @@ def _with_sensor(session: State) -> Condition:
         return replace(calling('save', 'the calibration in use is not stored'),
                        level=Level.ERROR, concern='storage', name='unsaved')
     if sensor.drift is not None and sensor.has_changed:
-        return Condition('poses', status(sensor.drift), sensor.drift.remedy[1], (),
-                         Level.WARN, 'drift')
+        return Condition('poses', status(sensor.drift), sensor.drift.remedy[1],
+                         level=Level.WARN, concern='drift')
     if sensor.calibration is not None and rating is None:
-        return NOT_KNOWN
+        return Condition('', '')
     if rating is not None and rating.name == 'GOOD':
         if sensor.calibration is not None and not sensor.calibration.is_levelled:
             return _LEVEL
@@ -119,12 +172,26 @@ def _with_poses(session: State) -> Condition:
                          'and call ~/set_level once more', 'set_level')
     if refusal := session.refusal_of('poses'):
         return Condition('poses', refusal)
-    is_fitted = 0 < guide.poses == sensor.fitted_poses  # to all poses
+    asked, is_fitted = step_of(guide), 0 < guide.poses == sensor.fitted_poses  # to all poses
     if rating is None or not is_fitted or guide.planned is not None:
-        return guide.action
-    if rating.next.kind == 'poses' and guide.action.direction:
-        return replace(guide.action, words=f'{rating.reason}; {guide.action.words}')
+        return asked
+    if rating.next.kind == 'poses' and asked.direction:
+        return replace(asked, words=f'{rating.reason}; {asked.words}')
     return calling(rating.next.kind, rating.next.text)
+
+
+def step_of(guide: Guide) -> Condition:
+    """Return what to do next with the poses; without a kind before the first choice."""
+    plan = guide.plan
+    if guide.planned == ():
+        return calling('refine', 'all poses of the plan are taken')
+    if plan is None:
+        return Condition('', '')
+    if plan.asked.direction is None:
+        return calling('fit', plan.asked.words)
+    words, command = (f'{plan.asked.words}, or call ~/fit', 'fit') if plan.asked.fits else (
+        plan.asked.words, '')
+    return Condition('poses', words, command, tuple(plan.asked.direction.tolist()))
 
 
 def _within_reach(session: State, step: Condition) -> Condition:
@@ -161,45 +228,44 @@ def slow_turn(session: State) -> str:
 def _files(session: State) -> Iterator[Condition]:
     """Yield what is wrong with the files."""
     if session.problem:
-        yield Condition('restart', session.problem, '', (), Level.ERROR)
+        yield Condition('restart', session.problem, level=Level.ERROR)
     store = session.files.store
     if store is not None and not store.is_writable():
         yield Condition(
             'save', f'{session.files.path} cannot be written: correct the permissions, or restart '
-            'the node with another calibration_file', '', (), Level.ERROR, 'storage')
+            'the node with another calibration_file', level=Level.ERROR, concern='storage')
 
 
 def _use(session: State) -> Iterator[Condition]:
     """Yield what is wrong with the use of the calibration."""
     if not session.enabled:
         yield Condition('enable', 'correction switched off, raw messages are published: call '
-                        '~/enable with true to correct them', '', (), Level.WARN)
+                        '~/enable with true to correct them', level=Level.WARN)
     for key, each in session.sensor.limits_left(session.context).items():
         beyond = max(each.low - each.least, each.most - each.high)
         kind = 'poses' if beyond > _FAR * (each.high - each.low) else 'done'
         yield Condition(kind, f'{each.words}: {USES_LIMIT}; capture poses there and call '
-                        '~/refine', 'refine', (), Level.WARN, name=f'range of {key}')
+                        '~/refine', 'refine', level=Level.WARN, name=f'range of {key}')
 
 
 # ----------------------------------------------------------------------------- samples
 
-def missing_context(session: State) -> dict[str, Condition]:
-    """Return by column of the context why it is missing, and what follows."""
-    calibration, found = session.sensor.calibration, dict[str, Condition]()
+def _context(session: State) -> Iterator[Condition]:
+    """Yield the columns of the context that are missing, why, and what follows."""
+    calibration, around = session.sensor.calibration, session.around
     needs = () if calibration is None else calibration.model.needs
     wanted = [*context_topics(session.settings), *(
-        key for key in needs if is_quantity(key) or key in ('temperature', 'supply_voltage'))]
-    for column in filter(session.around.is_missing, dict.fromkeys(wanted)):
+        key for key in needs if key in CONTEXT or is_quantity(key))]
+    for column in filter(around.is_missing, dict.fromkeys(wanted)):
         follows = ''
-        if column in session.around.values:
+        if column in around.values:
             follows = '; the last value holds'
         elif column in needs:
-            value = session.around.assumed.get(column, math.nan)
+            value = around.assumed.get(column, math.nan)
             follows = f'; {value:.4g} {column_of(column).unit}'.rstrip() + ' is used instead'
-        found[column] = Condition(
-            'connect', f'no {column} arrives: {_why_missing(session, column)}{follows}', '', (),
-            Level.WARN, 'stream', column)
-    return found
+        yield Condition(
+            'connect', f'no {column} arrives: {_why_missing(session, column)}{follows}',
+            level=Level.WARN, concern='stream', name=column)
 
 
 def _why_missing(session: State, column: str) -> str:
@@ -258,8 +324,8 @@ def _stream(session: State) -> Iterator[Condition]:
     kinds = {'unit': 'unit', 'vibration': 'still'}
     for name, words in told.items():
         if words:
-            yield Condition(kinds.get(name, 'connect'), words, '', (), Level.WARN, 'stream',
-                            name)
+            yield Condition(kinds.get(name, 'connect'), words, level=Level.WARN,
+                            concern='stream', name=name)
 
 
 def _silence(session: State) -> str:

@@ -143,7 +143,7 @@ class State:
     def _situation(self, command: str) -> tuple[object, ...]:
         """Return what a refusal of a command depends on."""
         sensor, rests = self.sensor, command in ('set_level', 'calibrate_at_rest')
-        return (id(sensor), len(sensor.live.book.poses()), sensor.changes,
+        return (sensor, len(sensor.live.book.poses()), sensor.changes,
                 rests and sensor.live.detector.current() is None)
 
     def log(self, severity: Severity, words: str, kind: str = '', once_in: float = 0.0) -> None:

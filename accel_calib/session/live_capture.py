@@ -25,10 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..capture import (
-    account_of, CaptureSettings, check_measured, CONTEXT, Dwell, poses_from, Rest, select,
-    StillDetector)
+    account_of, CaptureSettings, check_measured, Dwell, poses_from, Rest, select, StillDetector)
 from ..finding import Finding
-from ..table import Floats, Poses
+from ..table import CONTEXT, Floats, Poses
 from ..units import Units
 
 _SEPARATE = 64

@@ -20,7 +20,6 @@ from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from enum import IntEnum
 from itertools import permutations, product
 import math
 
@@ -58,59 +57,6 @@ _FEWEST_WRONG = 2
 _AGREES = math.cos(math.radians(25.0))
 """All answers must be within 25° of those with such axes: whoever turns the sensor in an own order
 agrees by chance in 1 % of the orders."""
-
-
-class Level(IntEnum):
-    """Severity, as in diagnostic_msgs/DiagnosticStatus."""
-
-    OK = 0
-    WARN = 1
-    ERROR = 2
-
-
-@dataclass(frozen=True)
-class Condition:
-    """
-    What is the case, and what to do about it.
-
-    Parameters
-    ----------
-    kind : str
-        Kind of the step, one of `accel_calib.finding.STEPS`; empty: not known yet.
-    words : str
-        What is the case and what to do.
-    command : str
-        Name of the service for it; may be empty.
-    direction : tuple of float
-        Direction to point up, a unit vector in the sensor axes; empty: none.
-    level : Level
-        Severity.
-    concern : str
-        The check of the diagnostics that it belongs to.
-    name : str
-        Name among all that can be wrong, for the log; empty: an ordinary step.
-
-    """
-
-    kind: str
-    words: str
-    command: str = ''
-    direction: tuple[float, ...] = ()
-    level: Level = Level.OK
-    concern: str = 'calibration'
-    name: str = ''
-
-
-NOT_KNOWN = Condition('', '')
-
-_SERVICES = {'fit': 'fit', 'refine': 'refine', 'level': 'set_level', 'save': 'save'}
-"""Service for each kind of step that has one."""
-
-
-def calling(kind: str, text: str) -> Condition:
-    """Return a step with the call of its service."""
-    command = _SERVICES.get(kind, '')
-    return Condition(kind, f'{text}; call ~/{command}' if command else text, command)
 
 
 @dataclass(frozen=True)
@@ -237,21 +183,6 @@ class Guide:
         self.planned, self._begun = tuple(planned) or None, self.poses
 
     @property
-    def action(self) -> Condition:
-        """Return what to do next with the poses; `NOT_KNOWN` before the first choice."""
-        if self.planned == ():
-            return calling('refine', 'all poses of the plan are taken')
-        plan = self.plan
-        if plan is None:
-            return NOT_KNOWN
-        asked = plan.asked
-        if asked.direction is None:
-            return calling('fit', asked.words)
-        words, command = (f'{asked.words}, or call ~/fit', 'fit') if asked.fits else (
-            asked.words, '')
-        return Condition('poses', words, command, tuple(asked.direction.tolist()))
-
-    @property
     def poses(self) -> int:
         """Return the number of poses for which the next pose was chosen."""
         return 0 if self._plan is None else self._plan.poses
@@ -312,33 +243,33 @@ class Guide:
         """Return how the axes are probably swapped or inverted; empty if they are not."""
         if self._is_usual:
             return ''
-        inverted = [f'{name} axis' for name, sign in zip('xyz', np.diag(self.axes), strict=True)
-                    if sign < 0.0]
-        if np.count_nonzero(np.diag(self.axes)) == 3:
-            what = (f'the {" and the ".join(inverted)} of the readings '
-                    f'{"is" if len(inverted) == 1 else "are"} probably inverted')
+        reads = {f'+{name}': _signs(read) for name, read in zip('xyz', self.axes.T)}
+        wrong = {name: read for name, read in reads.items() if name != read}
+        if all(name[1] == read[1] for name, read in wrong.items()):
+            what = (f'the {" and the ".join(f"{name[1]} axis" for name in wrong)} of the readings '
+                    f'{"is" if len(wrong) == 1 else "are"} probably inverted')
         else:
-            reads = {f'+{name}': _signs(read) for name, read in zip('xyz', self.axes.T)}
             what = 'the axes of the readings are probably swapped: ' + ', '.join(
-                f'{name} reads {read}' for name, read in reads.items() if name != read)
+                f'{name} reads {read}' for name, read in wrong.items())
         return (f'{what}; a calibration does not mind, but the mounting does: correct the driver, '
                 'and take the poses again')
 
-    def line(self, poses: Poses, units: Units, action: Condition, *, added: bool) -> str:
-        """Return the line about a rest that `added` a pose or repeats one; empty if no news."""
-        if self.plan is None or action is NOT_KNOWN:
-            return ''
-        more, total = action.kind == 'poses', self.plan.asked.total
+    def line(self, poses: Poses, units: Units, words: str, *, asks: bool, added: bool) -> str:
+        """
+        Return the line about a rest that `added` a pose or repeats one; empty if no news.
+
+        `words` are the next step, empty after the last one; `asks`: it is a pose.
+
+        """
         if not added:
-            return f'this rest repeats an earlier pose; next: {action.words}' if more else ''
-        count = f'{len(poses)} of about {total}' if more and len(poses) < total else (
-            f'{len(poses)}')
+            return f'this rest repeats an earlier pose; next: {words}' if asks else ''
+        total = 0 if self.plan is None else self.plan.asked.total
+        count = f'{len(poses)} of about {total}' if asks and len(poses) < total else len(poses)
         noise = ''
         if poses.noise is not None and not units.is_native:
             latest = poses.noise[int(np.argmax(poses['time']))]
             noise = f', {float(np.mean(units.to_g(latest))) * MG:.2f} mg'
-        then = '' if action.kind == 'done' else f', next: {action.words}'
-        return f'pose {count}{noise}{then}'
+        return f'pose {count}{noise}{f", next: {words}" if words else ""}'
 
 
 def _signs(up: Floats) -> str:

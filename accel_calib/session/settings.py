@@ -21,10 +21,11 @@ import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING, TypeVar
 
-from ..capture import CaptureSettings, CONTEXT, REPEATED, Repeated, settings_from
+from ..capture import CaptureSettings, REPEATED, Repeated, settings_from
 from ..effects import know_file, MODELS
 from ..errors import InputError
 from ..logs import named_topics
+from ..table import CONTEXT
 from ..units import (
     FrameName, FRAMES, is_native, Method, METHODS, MODEL_NAMES, STANDARD_GRAVITY, UNIT_NAMES,
     UnitName, units_of)

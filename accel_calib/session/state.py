@@ -18,9 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from .conditions import conditions, next_action, thermometer_words
+from .conditions import Condition, conditions, Level, next_action, thermometer_words
 from .core import State
-from .pose_guide import Condition, Level
 from .sensor import title
 from .settings import context_topics
 from .stream import SILENT
@@ -180,10 +179,23 @@ def _unit(vector: Sequence[float], length: float) -> tuple[float, ...]:
     return tuple(part / length for part in vector) if 0.0 < length < math.inf else ()
 
 
+def diagnostics(session: State) -> list[Condition]:
+    """Return the state, which is the first of the most severe conditions, and all `checks`."""
+    found = conditions(session)
+    by_concern = {each.concern: each for each in _checked(session, found)}
+    first = max(found, key=lambda each: each.level)
+    words = by_concern[first.concern].words if first.level else words_of_state(session)
+    return [Condition('', words, level=first.level, concern='state'), *by_concern.values()]
+
+
 def checks(session: State) -> list[Condition]:
     """Return the results of all checks, one for each concern."""
-    sensor, found = session.sensor, conditions(session)
-    drift = sensor.drift
+    return diagnostics(session)[1:]
+
+
+def _checked(session: State, found: Sequence[Condition]) -> Iterator[Condition]:
+    """Yield for each concern the conditions that are wrong, or that all is fine."""
+    sensor, drift = session.sensor, session.sensor.drift
     fine = {'stream': f'{session.statistics.rate:.1f} Hz on {session.topic}',
             'calibration': '' if sensor.calibration is None else title(sensor.calibration),
             'drift': 'no calibration yet' if drift is None else status(drift),
@@ -191,24 +203,13 @@ def checks(session: State) -> list[Condition]:
     if sensor.calibration is None and sensor.offered is None:
         count = counted(len(sensor.live.book.poses()), 'pose')
         fine['calibration'] = f'no calibration yet, captured {count}'
-    return [_check(concern, [each for each in found if each.concern == concern and each.level],
-                   words) for concern, words in fine.items()]
-
-
-def _check(concern: str, wrong: Sequence[Condition], fine: str) -> Condition:
-    said = list(dict.fromkeys(each.words for each in wrong))
-    if wrong and not any(each.name or each.level == Level.ERROR for each in wrong):
-        said = [': '.join(filter(None, [fine, *said[:1]])), *said[1:]]
-    return Condition('', '; '.join(said) or fine, concern=concern,
-                     level=max([Level.OK, *(each.level for each in wrong)]))
-
-
-def worst(session: State) -> Condition:
-    """Return the check of the first of the most severe conditions, or the state if all is OK."""
-    first = max(conditions(session), key=lambda each: each.level)
-    words = words_of_state(session) if not first.level else next(
-        each.words for each in checks(session) if each.concern == first.concern)
-    return Condition('', words, level=first.level, concern='state')
+    for concern, words in fine.items():
+        wrong = [each for each in found if each.concern == concern and each.level]
+        said = list(dict.fromkeys(each.words for each in wrong))
+        if not any(each.name or each.level == Level.ERROR for each in wrong):  # a mere step
+            said[:1] = [': '.join(filter(None, [words, *said[:1]]))]
+        yield Condition('', '; '.join(said), concern=concern,
+                        level=max([Level.OK, *(each.level for each in wrong)]))
 
 
 def words_of_state(session: State) -> str:
@@ -253,14 +254,7 @@ def figures(session: State) -> Iterator[tuple[str, str]]:
             yield 'temperature when calibrated [°C]', f'{low:.1f} to {high:.1f}'
     yield 'since last rest [s]', _number(math.nan if rest is None else (
         0.0 if live.still else max(0.0, counts.stamp - rest.end)))
-    yield from _pose_figures(session)
-    yield 'temperature [°C]', (_number(warm) if math.isfinite(warm)
-                               else f'not known: {thermometer_words(session)}')
-    for column in context_topics(session.settings):
-        unit = column_of(column).unit
-        if column != 'temperature':
-            yield f'{column} [{unit}]' if unit else column, _number(
-                session.around.values.get(column, math.nan))
+    yield from _figures_of_capture(session)
     yield 'still below [m/s² or native]', f'{live.detector.threshold:.4g}'
     yield 'mounting', session.mounting_words(sensor.calibration) or 'not known'
     gyro, noise = sensor.gyro, sensor.noise
@@ -272,8 +266,8 @@ def figures(session: State) -> Iterator[tuple[str, str]]:
         yield 'noise of angular velocity [rad/s]', _vector(noise.rate)
 
 
-def _pose_figures(session: State) -> Iterator[tuple[str, str]]:
-    live = session.sensor.live
+def _figures_of_capture(session: State) -> Iterator[tuple[str, str]]:
+    live, warm = session.sensor.live, session.around.temperature
     poses, breaks = live.book.poses(), live.detector.interruptions
     yield 'poses captured', str(len(poses))
     yield 'poses doubtful', str(int(np.sum(poses['doubtful'])) if 'doubtful' in poses else 0)
@@ -283,6 +277,13 @@ def _pose_figures(session: State) -> Iterator[tuple[str, str]]:
         f'{breaks[-1].kind}, {breaks[-1].seconds:.2f} s' if breaks else 'none')
     yield 'zeros or frozen readings [s]', (
         f'{sum(each.end - each.start for each in live.detector.missing):.1f}')
+    yield 'temperature [°C]', (_number(warm) if math.isfinite(warm)
+                               else f'not known: {thermometer_words(session)}')
+    for column in context_topics(session.settings):
+        unit = column_of(column).unit
+        if column != 'temperature':
+            yield f'{column} [{unit}]' if unit else column, _number(
+                session.around.values.get(column, math.nan))
 
 
 def _vector(values: Iterable[float]) -> str:

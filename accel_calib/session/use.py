@@ -16,17 +16,17 @@ import numpy as np
 
 from .conditions import next_action
 from .core import State
-from .pose_guide import NOT_KNOWN, plan_for
+from .pose_guide import plan_for
 from .sensor import Sensor, title
 from .store import Store, tidied, unusable, writing_advice
 from .stream import AGAIN
 from .worker import Compute, Files, Mounting, nothing, Parse, Result, Severity, ShowPoses, Task
 from ..calibrate import Calibration, in_frame, mounting_figures, on_topics, outlook
-from ..capture import CONTEXT, Dwell
+from ..capture import Dwell
 from ..errors import DamagedCalibrationError, StoredCalibrationError
 from ..findings import calibration_json, rate as rating_of, Rating, rating_json, refinement_json
 from ..refine import Refinement
-from ..table import is_quantity, Poses
+from ..table import CONTEXT, is_quantity, Poses
 from ..text import counted, plain
 
 _SEVERITY: dict[str, Severity] = {'GOOD': 'info', 'USABLE': 'warning', 'BAD': 'error'}
@@ -91,7 +91,7 @@ def _report_rating(session: State, sensor: Sensor, calibration: Calibration,
         return ''
     sensor.rating = rating
     action = next_action(session)
-    if action is not NOT_KNOWN:
+    if action.kind:
         found['in_use'] = sensor.offered is not calibration
         if calibration.is_levelled:
             found['mounting'] = mounting_figures(
@@ -142,7 +142,10 @@ def _draw_poses(session: State, sensor: Sensor, poses: Poses, added: int,
     if new_rest is None or sensor is not session.sensor:
         return ''
     session.log('warning', guide.axes_words, f'axes {guide.axes.tolist()}', math.inf)
-    line = guide.line(poses, session.units, next_action(session), added=added > 0)
+    action, line = next_action(session), ''
+    if action.kind:
+        line = guide.line(poses, session.units, '' if action.kind == 'done' else action.words,
+                          asks=action.kind == 'poses', added=added > 0)
     return '; '.join(filter(None, (missed, line)))
 
 

@@ -15,8 +15,7 @@ ends with the node in all cases, because its standard input is then closed. If t
 be started or dies, the node does the computation itself.
 
 `concurrent.futures.ProcessPoolExecutor` cannot end a call that runs, which the end of a node and
-the limit of a recording of a fleet need, and a call takes 0.15 ms in place of 0.03. pebble ends
-calls, but rosdep has no key for it.
+the limit of a recording of a fleet need. pebble can, but rosdep has no key for it.
 
 Calibrations are also formatted and parsed in the process, if it is free (`Parse`). Files are
 written in the node, which holds their lock: the process may live a little longer than the node.
