@@ -22,7 +22,7 @@ from tempfile import TemporaryDirectory
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 
-from accel_calib.geometry import spread_directions  # noqa: E402
+from accel_calib.geometry import ATTITUDES, spread_directions, unit  # noqa: E402
 from accel_calib.session import conditions  # noqa: E402
 from driven import Driver, GRAVITY, Person  # noqa: E402
 from figures import machine, markdown, parser, publish  # noqa: E402
@@ -40,6 +40,9 @@ reached, or what is in the way is named, within the limit. *Held*: the RMS error
 directions within reach is at most 1.96 times the stated one.
 
 {table}
+
+Of {orders} who turn a sound sensor in an own order of sides, of sides and edges, or of any
+directions, {told} were told that its axes are swapped or inverted.
 """
 
 
@@ -47,9 +50,12 @@ def main() -> None:
     given = parser(__doc__, sets=40, seed=1)
     args = given.parse_args()
     rows = [row_of(name, args.sets, args.seed) for name in persons.PERSONS]
+    told = [is_told(kind, np.random.default_rng([args.seed, k, kind]))
+            for kind in range(3) for k in range(3 * args.sets)]
     heads = ('person', 'ends', 'as expected', 'limit [s]', 'in time', 'median [s]', 'held')
     publish(_PAGE.format(command=' '.join(sys.argv[1:]), machine=machine(),
-                         table=markdown(heads, rows)), args.markdown)
+                         table=markdown(heads, rows), orders=len(told), told=sum(told)),
+            args.markdown)
 
 
 def row_of(name: str, sets: int, seed: int) -> tuple[object, ...]:
@@ -91,6 +97,22 @@ def run(case: persons.Case, rng: np.random.Generator) -> tuple[bool, float, floa
             held = float(np.sqrt(np.mean(error ** 2)) <= 1.96 * np.sqrt(np.mean(variance)))
         driver.session.close()
     return ended == case.ends and named, seconds, held
+
+
+def is_told(kind: int, rng: np.random.Generator) -> bool:
+    """Return whether axes are named though the person only turns in an own order."""
+    sides, edges = rng.permutation(ATTITUDES[:6]), rng.permutation(ATTITUDES[6:18])[:6]
+    order = (sides, np.vstack([sides, edges]), unit(rng.normal(size=(10, 3))))[kind]
+    with TemporaryDirectory() as home:
+        os.environ['ROS_HOME'] = home
+        driver, told = Driver(), False
+        person = Person(driver, persons.reading())
+        person._rng = rng
+        for up in order:
+            person.rest(up, 1.4)
+            told |= bool(driver.session.sensor.guide.axes_words)
+        driver.session.close()
+    return told
 
 
 if __name__ == '__main__':

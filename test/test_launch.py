@@ -296,6 +296,19 @@ def test_two_imus_have_their_own_topics_and_pages_and_share_the_thermometer(star
         '/left/temperature', '/right/temperature']
 
 
+@pytest.mark.parametrize('package', ['imu_filter_madgwick', 'robot_localization'])
+def test_no_node_is_started_where_a_filter_is_not_installed(
+        package: str, started: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def share(name: str) -> Path:
+        if name == package:
+            raise LookupError(name)
+        return ROOT
+
+    monkeypatch.setattr(sys.modules['ament_index_python.packages'], 'get_package_share_path', share)
+    with pytest.raises(LookupError, match=package):
+        described('with_filters')
+
+
 @pytest.mark.parametrize('namespace', ['', 'robot'])
 def test_filters_are_connected_from_the_raw_readings_to_the_odometry(
         namespace: str, started: Any) -> None:

@@ -215,3 +215,16 @@ def test_a_calibration_that_cannot_be_stored_leaves_no_file_and_is_asked_for_unt
     assert (action.kind, action.command, action.level) == ('save', 'save', 2)
     driver.ask('save')
     assert next_action(driver.session).kind == 'level'
+
+
+def test_no_step_is_named_while_the_rating_is_being_computed() -> None:
+    driver = Driver(sensor='rated')
+    person = Person(driver, reading())
+    for up in spread_directions(16):
+        person.rest(up)
+    driver.ask('fit')
+    driver.sensor.rating, lines = None, len(driver.log)
+    person.rest([0.3, 0.3, 0.9])
+    action = next_action(driver.session)
+    assert (action.kind, action.words) == ('', '')
+    assert not [line.words for line in driver.log[lines:] if 'next: ' in line.words]

@@ -13,7 +13,7 @@ from typing import Any
 from accel_calib.calibrate import level, set_heading
 from accel_calib.errors import InputError, StoredCalibrationError
 from accel_calib.finding import Finding, has, LEVELS
-from accel_calib.logs import read_poses, write_table
+from accel_calib.logs import open_log, read_poses, write_table
 from accel_calib.session import CalibratorSettings, changed, Level, state, Surroundings
 from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import Poses
@@ -612,6 +612,10 @@ def test_a_start_without_a_column_leaves_it_in_the_stored_poses(
         assert ('1 of 5 poses' in driver.logged('info')) is (k == 2 and bool(known))
         assert column not in driver.sensor.live.poses(()) or not lack
         driver.session.close()
+        if k == 1:
+            with open_log(driver.session.files.store.poses) as log:  # as a command reads it
+                assert column not in log.poses
+                assert [column in note for note in log.notes] == [True]
 
 
 def test_a_rest_that_is_no_pose_is_said_with_its_reason(readings: Readings) -> None:

@@ -55,8 +55,8 @@ _FEWEST_WRONG = 2
 """Smallest number of wrong answers that show swapped or inverted axes."""
 
 _AGREES = math.cos(math.radians(25.0))
-"""All answers must be within 25° of those with such axes: whoever turns the sensor in an own order
-agrees by chance in 1 % of the orders."""
+"""All answers must be within 25° of those with such axes. Whoever turns the sensor in an own order
+seldom agrees by chance (`benchmarks/persons.py`)."""
 
 
 @dataclass(frozen=True)
