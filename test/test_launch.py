@@ -304,7 +304,8 @@ def test_no_node_is_started_where_a_filter_is_not_installed(
             raise LookupError(name)
         return ROOT
 
-    monkeypatch.setattr(sys.modules['ament_index_python.packages'], 'get_package_share_path', share)
+    packages = sys.modules['ament_index_python.packages']
+    monkeypatch.setattr(packages, 'get_package_share_path', share)
     with pytest.raises(LookupError, match=package):
         described('with_filters')
 
