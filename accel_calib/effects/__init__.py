@@ -34,8 +34,8 @@ are those of IEEE 1293 (model equation of a linear accelerometer) and of data sh
 
 from .catalogue import (
     CARRIERS, CHANGES, covariate_names, COVARIATES, curve_pairs, curve_unit, effect_named, EFFECTS,
-    EMPIRICAL, empirical_name, empirical_parts, IN_PRODUCTS, included, is_effect, kind_of, LADDER,
-    modes_of, NOMINAL_SUPPLY, OFFSET_POWERS, parameter_names, PROCESSES, product_names,
+    EMPIRICAL, empirical_name, empirical_parts, included, is_effect, kind_of, LADDER, modes_of,
+    NOMINAL_SUPPLY, OFFSET_POWERS, parameter_names, PROCESSES, product_names,
     REFERENCE_TEMPERATURE, unit_of, value_unit, variable_of, variable_words, VARIABLES, WANDER)
 from .form import (
     AFFINE, AXES, by_axis, Context, CUBE, difference, Effect, fitted_places, FORCE, MODES,
@@ -51,7 +51,7 @@ from .thermal import acting_temperature, between_steps, rate_at, ThermalStream
 from .way import way_of, with_turns
 
 __all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CHANGES', 'CONVERGED_G', 'COVARIATES', 'CUBE',
-           'EFFECTS', 'EMPIRICAL', 'FORCE', 'IN_PRODUCTS', 'KNOWN_CODE', 'LADDER',
+           'EFFECTS', 'EMPIRICAL', 'FORCE', 'KNOWN_CODE', 'LADDER',
            'LARGEST_FORCE_G', 'LARGEST_ITERATIONS', 'MODELS', 'MODES', 'MONOMIALS',
            'NOMINAL_SUPPLY', 'ODD_SQUARE', 'OFFSET_POWERS', 'ONE', 'PROCESSES', 'PRODUCT',
            'REFERENCE_TEMPERATURE', 'SIZE', 'SQUARE', 'TO_SEPARATE', 'VARIABLES', 'WANDER',

@@ -24,7 +24,7 @@ from .form import (
     ALL_AXES, AXES, by_axis, Context, CROSS, CUBE, DEGREES, Effect, Factor, FORCE, matrix_terms,
     MODES, ODD_SQUARE, ONE, PRODUCTS, SIZE, SQUARE, Term, WAVE, ZONAL, ZONES)
 from .thermal import acting_temperature, rate_at
-from ..table import column_of, Floats, is_quantity
+from ..table import column_of, CONTEXT, Floats, is_quantity
 from ..units import MG, STANDARD_GRAVITY
 
 REFERENCE_TEMPERATURE = 25.0
@@ -392,10 +392,6 @@ COVARIATES = {'offset_covariate': ('offset', ONE, 'g/unit'),
 """What a covariate changes in proportion to a quantity: words, monomial, unit of its values."""
 
 _CURVED, _TIMES = '2', '*'
-IN_PRODUCTS = ('temperature', 'supply_voltage')
-"""Columns with effects of their own, whose products with others are covariates."""
-
-
 def covariate_names(quantities: Iterable[str]) -> Iterator[str]:
     """
     Yield the names of the covariates of quantities, such as ``offset_covariate-pressure``.
@@ -438,7 +434,7 @@ def _covariate(name: str) -> Effect:
     variable, *curved = rest.split('-')
     columns = tuple(variable.split(_TIMES))
     is_product = len(columns) == 2 and columns[0] < columns[1] and all(
-        is_quantity(column) or column in IN_PRODUCTS for column in columns)
+        is_quantity(column) or column in CONTEXT for column in columns)
     if not (is_quantity(variable) and curved in ([], [_CURVED])) and not (
             is_product and not curved):
         raise KeyError(name)

@@ -42,10 +42,10 @@ from .linear import LEVEL, Set
 from .settle import fit_without, make_sound, settle
 from .state import beginning, Candidate, fitted_state, linearised, State, without
 from ..effects import (
-    CHANGES, covariate_names, effect_named, EFFECTS, empirical_parts, factors_of, IN_PRODUCTS,
-    included, LADDER, linear_values, Model, parameter_names, product_names, WANDER)
+    CHANGES, covariate_names, effect_named, EFFECTS, empirical_parts, factors_of, included, LADDER,
+    linear_values, Model, parameter_names, product_names, WANDER)
 from ..estimate import beside_scatter, kinds, scatter_of, stated
-from ..table import Poses
+from ..table import CONTEXT, Poses
 
 _TIMED = 30.0
 """A curve over time must have a score better than a walk by this."""
@@ -206,7 +206,7 @@ def _search(poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
     names = (*_visible(begun, LADDER), *(name for name in EFFECTS if name not in LADDER),
              *also, *covariate_names(causes(poses_g)), *_visible(begun, CHANGES))
     state, near, trial = settle(begun, poses_g, fixed, names)
-    varied = {*causes(poses_g), *(column for column in IN_PRODUCTS if column in poses_g)}
+    varied = {*causes(poses_g), *(column for column in CONTEXT if column in poses_g)}
     if len(varied) <= _MOST_VARIED and (near.walk is not None or not state.is_noise):
         products = tuple(product_names(varied))
         beside = settle(begun, poses_g, fixed, (*names, *products))
