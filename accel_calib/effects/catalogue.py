@@ -392,6 +392,8 @@ COVARIATES = {'offset_covariate': ('offset', ONE, 'g/unit'),
 """What a covariate changes in proportion to a quantity: words, monomial, unit of its values."""
 
 _CURVED, _TIMES = '2', '*'
+
+
 def covariate_names(quantities: Iterable[str]) -> Iterator[str]:
     """
     Yield the names of the covariates of quantities, such as ``offset_covariate-pressure``.
