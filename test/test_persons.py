@@ -121,7 +121,10 @@ def test_axes_of_a_driver_are_named_after_two_rests_and_poses_are_asked_for_as_t
                         (SWAPPED, '+x reads +y, +y reads +x')):
         driver = Driver(sensor=words[4:9])
         person = Person(driver, reading(axes))
-        person.follow(seconds=60.0)
+        person.follow(seconds=25.0)
+        assert driver.shown is not None
+        asked = next_action(driver.session).direction
+        np.testing.assert_allclose(driver.shown.asked.direction, asked)
         assert words in driver.logged('warning')
         lines = driver.logged('info').splitlines()
         missed = [line for line in lines if line.startswith('asked for ')]

@@ -138,7 +138,8 @@ def _draw_poses(session: State, sensor: Sensor, poses: Poses, added: int,
         plan = plan_for(*given)
     if plan is not None and sensor is session.sensor:
         guide.plan = plan
-        session.events.append(ShowPoses(plan.up, plan.asked, session.frame_id or ''))
+        asked = plan.asked if guide.plan is None else guide.plan.asked  # as the next step asks
+        session.events.append(ShowPoses(plan.up, asked, session.frame_id or ''))
     if new_rest is None or sensor is not session.sensor:
         return ''
     session.log('warning', guide.axes_words, f'axes {guide.axes.tolist()}', math.inf)
