@@ -44,7 +44,7 @@ Sign and frames
 ---------------
 Forces are specific forces (REP-145): a sensor at rest reads +1 g on the axis that points up.
 The default levelled frame is that of REP-103 (x forward, y left, z up); see
-`accel_calib.calibrate.mounting` for the others.
+`accel_calib.calibration.mounting` for the others.
 
 Arrays are (n, 3): one row per pose or sample, columns x, y, z. A vector in frame a is `vec_a`;
 `mat_ab` transforms from frame b to frame a.
@@ -55,8 +55,6 @@ from __future__ import annotations
 
 from importlib import import_module
 from pathlib import Path
-import sys
-from types import ModuleType
 from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -73,37 +71,24 @@ __all__ = ['Calibration', 'Effect', 'Poses', 'Recording', 'Refinement', 'calibra
            'verify']
 
 
-class _Package(ModuleType):
-    """
-    This module. It imports each public name on first use.
+def __getattr__(name: str) -> Any:
+    """Import a public name on first use: ``accel-calib --help`` does not wait for numpy."""
+    if name == '__version__':  # that of package.xml beside the package, or the installed one
+        source = Path(__file__).parent.parent / 'package.xml'
+        if source.is_file():
+            text = source.read_text(encoding='utf-8')
+            value = text.partition('<version>')[2].partition('<')[0]
+        else:
+            from importlib.metadata import version  # slow, and not needed in a clone
 
-    ``accel-calib --help`` therefore does not wait for numpy. Some functions have the name of a
-    subpackage. Python sets a subpackage as an attribute on import; `__setattr__` prevents that it
-    replaces the function.
-
-    """
-
-    def __getattr__(self, name: str) -> Any:
-        if name == '__version__':  # that of package.xml beside the package, or the installed one
-            source = Path(__file__).parent.parent / 'package.xml'
-            if source.is_file():
-                text = source.read_text(encoding='utf-8')
-                self.__version__ = text.partition('<version>')[2].partition('<')[0]
-            else:
-                from importlib.metadata import version  # slow, and not needed in a clone
-
-                self.__version__ = version(__name__)
-            return self.__version__
-        if name not in __all__:
-            raise AttributeError(f'module {self.__name__!r} has no attribute {name!r}')
-        return getattr(import_module('.api', self.__name__), name)
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if not (name in __all__ and isinstance(value, ModuleType)):
-            super().__setattr__(name, value)
-
-    def __dir__(self) -> list[str]:
-        return sorted([*__all__, '__version__'])
+            value = version(__name__)
+    elif name in __all__:
+        value = getattr(import_module('.api', __name__), name)
+    else:
+        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+    globals()[name] = value
+    return value
 
 
-sys.modules[__name__].__class__ = _Package
+def __dir__() -> list[str]:
+    return sorted([*__all__, '__version__'])

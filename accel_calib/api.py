@@ -14,9 +14,9 @@ from typing import Any, Literal, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .calibrate import (
+from .calibration import (
     Calibration as _Calibration, mounting_of, Verification, verify as verify_calibration)
-from .compare import compare as compare_calibrations, Comparison
+from .comparison import compare as compare_calibrations, Comparison
 from .effects import know, model_with, OwnEffect, simulate_poses, simulate_recording
 from .errors import InputError
 from .finding import Finding
@@ -26,7 +26,7 @@ from .logs import (
     are_untimed_samples, Frame, LogOptions, read_poses as read_pose_table,
     read_recording as read_whole_recording)
 from .pipeline import calibrated, calibrated_log, captured_from, Flat, options_for, Plan, poses_of
-from .refine import refine as find_effects, Refinement as Refinement
+from .refinement import refine as find_effects, Refinement as Refinement
 from .stored import read_calibration, write_calibration
 from .table import (
     check_units, check_values, data_frame, in_unit, LARGEST, median_length, numbered,
@@ -267,7 +267,7 @@ def capture(recording: Source | Recording | Data, *, units: UnitName | None = No
     topic, sensor : str
         As in `read_recording`.
     **settings
-        Fields of `accel_calib.capture.CaptureSettings`, such as ``min_dwell=2.0``;
+        Fields of `accel_calib.stillness.CaptureSettings`, such as ``min_dwell=2.0``;
         ``still_std_max`` is in the unit of the readings. Also fields of
         `accel_calib.logs.LogOptions`, such as ``columns={'ax': 'acc_x'}``.
 

@@ -22,24 +22,24 @@ from typing import Any, Literal, TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from .calibrate import (
+from .calibration import (
     Calibration, check_sensor, Curve, curve_of, directions_of, fit_partial, fit_poses,
     fit_with_fleet, flat_direction, FleetPrior, level, level_by_rows, lies_in_cone, PRIOR,
     SampleContext, thermal_alone, with_curve, without_curve)
-from .capture import (
-    account_of, capture, Captured, CaptureSettings, cells_of, check_measured, is_one_direction,
-    is_turned_over, LEAST_RANGE, LEAST_RESTS, Ramp, ramp_of, rests_in_cells, settings_from)
 from .effects import Context, LADDER, Model, PROCESSES
 from .errors import InputError, RefusedFitError, saying
 from .finding import explained_by, Finding
 from .findings import rate, Rating
 from .logs import Frame, LogOptions, open_log, OpenLog, Piped, Progress
+from .stillness import (
+    account_of, capture, Captured, CaptureSettings, cells_of, check_measured, is_one_direction,
+    is_turned_over, LEAST_RANGE, LEAST_RESTS, Ramp, ramp_of, rests_in_cells, settings_from)
 from .table import check_units, Poses, range_of, Recording, Table
 from .text import counted, now, short
 from .units import FrameName, Method, UnitName, Units, units_of
 
 if TYPE_CHECKING:
-    from .refine import Refinement
+    from .refinement import Refinement
 
 Source = Path | Piped | Frame | Poses | Recording
 
@@ -102,7 +102,7 @@ def poses_of(source: Source, options: LogOptions = LogOptions(),
     options : LogOptions
         How to read the log; by default it is recognised.
     settings : mapping
-        Fields of `accel_calib.capture.CaptureSettings` for a recording.
+        Fields of `accel_calib.stillness.CaptureSettings` for a recording.
     progress : function of two int
         Called with the number of samples done and of all samples.
 
@@ -210,7 +210,7 @@ def ramp_or_poses(source: Path | Piped | Frame, options: LogOptions = LogOptions
     Return the ramp of a still board, or the poses of a log in many directions.
 
     Parameters and errors as in `poses_of`. Further InputErrors are those of a ramp
-    (`accel_calib.capture.ramp`).
+    (`accel_calib.stillness.ramp`).
 
     """
     with open_log(source, options) as log, saying(
@@ -363,7 +363,7 @@ def _fit(poses: Poses, units: Units, plan: Plan, date: str) -> Calibration:
     if plan.fleet is not None:
         return fit_with_fleet(poses, units, plan.fleet, sensor=plan.sensor, date=date)
     if before is not None and is_refined(before):
-        from .refine import refitted
+        from .refinement import refitted
         return refitted(before, poses, sensor=plan.sensor, date=date)
     if (plan.in_cone and (before is None or is_partial(before)) and not units.is_native
             and len(poses) >= FEWEST_IN_CONE and lies_in_cone(directions_of(poses, units))):
@@ -481,7 +481,7 @@ def _row(poses: Poses, flat: Flat) -> int | None:
 def _refinement(poses: Poses, units: Units, plan: Plan, date: str
                 ) -> tuple[Refinement | None, str]:
     """Return the search for effects, and a line about it; None if the poses are too few."""
-    from .refine import refine  # a fit alone does not load the search
+    from .refinement import refine  # a fit alone does not load the search
 
     try:
         found = refine(poses, units, base=plan.fleet or plan.before or 'auto', sensor=plan.sensor,

@@ -23,8 +23,8 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')
 
-from accel_calib.calibrate import Calibration, fit_poses  # noqa: E402
-from accel_calib.compare import compare, Comparison  # noqa: E402
+from accel_calib.calibration import Calibration, fit_poses  # noqa: E402
+from accel_calib.comparison import compare, Comparison  # noqa: E402
 from accel_calib.effects import Model, model_with, simulate_poses  # noqa: E402
 from accel_calib.geometry import rotation_from_rpy, spread_directions  # noqa: E402
 from accel_calib.table import Poses  # noqa: E402

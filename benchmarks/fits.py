@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')
 
-from accel_calib.calibrate import fit_poses  # noqa: E402
+from accel_calib.calibration import fit_poses  # noqa: E402
 from accel_calib.estimate import closed_form  # noqa: E402
 from accel_calib.table import Floats  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402

@@ -23,7 +23,7 @@ import sys
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from accel_calib.calibrate import fit_poses  # noqa: E402
+from accel_calib.calibration import fit_poses  # noqa: E402
 from accel_calib.effects import predict, sensor_force, simulate_poses  # noqa: E402
 from accel_calib.errors import RefusedFitError  # noqa: E402
 from accel_calib.estimate import closed_form, estimate, start_of  # noqa: E402

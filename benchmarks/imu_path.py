@@ -27,7 +27,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT)]
 
-from accel_calib.calibrate import Calibration, fit_poses, level  # noqa: E402
+from accel_calib.calibration import Calibration, fit_poses, level  # noqa: E402
 from accel_calib.effects import Model, model_with, simulate_poses  # noqa: E402
 from accel_calib.geometry import spread_directions  # noqa: E402
 from accel_calib.logs import write_table  # noqa: E402

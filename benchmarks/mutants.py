@@ -38,8 +38,8 @@ import coverage
 from figures import markdown, parser, publish
 
 ROOT = Path(__file__).resolve().parent.parent
-FOLDERS = ('calibrate', 'capture', 'compare', 'effects', 'estimate', 'findings', 'logs',
-           'messages', 'refine', 'session', 'stored')
+FOLDERS = ('calibration', 'comparison', 'effects', 'estimate', 'findings', 'logs',
+           'messages', 'refinement', 'session', 'stillness', 'stored')
 KINDS = re.compile(r'core/Replace(BinaryOperator|ComparisonOperator|UnaryOperator|AndWithOr'
                    r'|OrWithAnd)')
 ELSEWHERE = re.compile(

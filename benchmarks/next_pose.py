@@ -20,7 +20,7 @@ import sys
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from accel_calib.calibrate import directions_of, fit_poses, next_pose  # noqa: E402
+from accel_calib.calibration import directions_of, fit_poses, next_pose  # noqa: E402
 from accel_calib.effects import Model, predict, simulate_poses  # noqa: E402
 from accel_calib.errors import RefusedFitError  # noqa: E402
 from accel_calib.estimate import pose_noise  # noqa: E402

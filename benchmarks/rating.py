@@ -28,10 +28,10 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')
 
-from accel_calib.calibrate import Calibration, fit_poses  # noqa: E402
+from accel_calib.calibration import Calibration, fit_poses  # noqa: E402
 from accel_calib.errors import AccelCalibError  # noqa: E402
 from accel_calib.findings import Expected, GOOD_MG, rate, rate_refinement, Rating  # noqa: E402
-from accel_calib.refine import refine  # noqa: E402
+from accel_calib.refinement import refine  # noqa: E402
 from accel_calib.table import Floats, numbered, Poses  # noqa: E402
 from accel_calib.units import MG, units_of  # noqa: E402
 from figures import Line, markdown, parser, publish, table  # noqa: E402

@@ -24,8 +24,8 @@ import time
 import traceback
 from typing import Any
 
-from accel_calib.calibrate import fit_poses, verify
-from accel_calib.refine import refine
+from accel_calib.calibration import fit_poses, verify
+from accel_calib.refinement import refine
 from accel_calib.table import COLUMNS, Floats, Poses
 from accel_calib.units import units_of
 from generator import again, Setup, simulate, Simulated

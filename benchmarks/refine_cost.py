@@ -23,7 +23,7 @@ import time
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 
-from accel_calib.refine import refine  # noqa: E402
+from accel_calib.refinement import refine  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
 from figures import Line, machine, parser, publish, table  # noqa: E402
 from generator import Setup, simulate  # noqa: E402

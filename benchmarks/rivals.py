@@ -31,12 +31,12 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / 'test'), str(ROOT / 'docs')]
 os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')  # each process has one core
 
-from accel_calib.calibrate import fit_poses, in_g, with_history  # noqa: E402
+from accel_calib.calibration import fit_poses, in_g, with_history  # noqa: E402
 from accel_calib.effects import EFFECTS, factors_of  # noqa: E402
 from accel_calib.estimate import judge  # noqa: E402
 from accel_calib.geometry import rms  # noqa: E402
-from accel_calib.refine.linear import orthonormal, SEEN  # noqa: E402
-from accel_calib.refine.state import candidates  # noqa: E402
+from accel_calib.refinement.linear import orthonormal, SEEN  # noqa: E402
+from accel_calib.refinement.state import candidates  # noqa: E402
 from accel_calib.table import Floats, Poses  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
 from figures import commit, markdown, parser  # noqa: E402

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from accel_calib.calibrate import Calibration
+from accel_calib.calibration import Calibration
 from accel_calib.geometry import spread_directions
 from accel_calib.table import Floats, numbered, Poses
 from accel_calib.units import MG

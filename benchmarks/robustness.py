@@ -29,10 +29,10 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')  # each process has one core
 
-from accel_calib.calibrate import Calibration, fit_poses  # noqa: E402
-from accel_calib.capture import capture  # noqa: E402
+from accel_calib.calibration import Calibration, fit_poses  # noqa: E402
 from accel_calib.effects.simulate import path  # noqa: E402
 from accel_calib.errors import AccelCalibError  # noqa: E402
+from accel_calib.stillness import capture  # noqa: E402
 from accel_calib.table import Floats, numbered, Recording  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
 from directions import random_directions  # noqa: E402

@@ -29,7 +29,7 @@ from typing import Literal, NamedTuple
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 
-from accel_calib.calibrate import Calibration  # noqa: E402
+from accel_calib.calibration import Calibration  # noqa: E402
 from accel_calib.effects import Model, model_with, predict, simulate_recording  # noqa: E402
 from accel_calib.errors import AccelCalibError  # noqa: E402
 from accel_calib.finding import Finding, has  # noqa: E402

@@ -23,10 +23,10 @@ from typing import NamedTuple
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT)]
 
-from accel_calib.calibrate import fit_poses  # noqa: E402
-from accel_calib.capture import CaptureSettings, StillDetector  # noqa: E402
+from accel_calib.calibration import fit_poses  # noqa: E402
 from accel_calib.errors import AccelCalibError  # noqa: E402
 from accel_calib.logs import read_recording  # noqa: E402
+from accel_calib.stillness import CaptureSettings, StillDetector  # noqa: E402
 from accel_calib.table import Floats, numbered, Poses  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
 from figures import Line, markdown, parser, publish, table  # noqa: E402

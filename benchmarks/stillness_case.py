@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import itertools
 from typing import Literal, NamedTuple
 
-from accel_calib.capture import CaptureSettings, StillDetector
+from accel_calib.stillness import CaptureSettings, StillDetector
 from accel_calib.table import Floats
 from accel_calib.units import units_of
 import numpy as np

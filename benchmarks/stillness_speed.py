@@ -25,9 +25,9 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT)]
 os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')
 
-from accel_calib.calibrate import fit_poses  # noqa: E402
-from accel_calib.capture import capture, CaptureSettings, StillDetector  # noqa: E402
+from accel_calib.calibration import fit_poses  # noqa: E402
 from accel_calib.logs import read_recording  # noqa: E402
+from accel_calib.stillness import capture, CaptureSettings, StillDetector  # noqa: E402
 from accel_calib.table import Recording  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
 from figures import Line, machine, parser, publish, table  # noqa: E402

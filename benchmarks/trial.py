@@ -23,10 +23,10 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from accel_calib.calibrate import fit_poses  # noqa: E402
-from accel_calib.capture import capture  # noqa: E402
+from accel_calib.calibration import fit_poses  # noqa: E402
 from accel_calib.logs import open_log, read_poses, read_recording  # noqa: E402
 from accel_calib.messages import correct_bag  # noqa: E402
+from accel_calib.stillness import capture  # noqa: E402
 from accel_calib.stored import read_calibration  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
 
@@ -127,7 +127,7 @@ def table(csv: Path) -> dict[str, list[float]]:
 
 def refined(csv: Path) -> str:
     """Refine model 10 of a pose table, and return the verdict; only the refinement is timed."""
-    from accel_calib.refine import refine
+    from accel_calib.refinement import refine
 
     given = read_poses(csv)
     CLOCK.start()

@@ -24,8 +24,8 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT)]
 os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')
 
-from accel_calib.calibrate import Calibration, fit_poses  # noqa: E402
-from accel_calib.compare import compared, Drift, rest_errors  # noqa: E402
+from accel_calib.calibration import Calibration, fit_poses  # noqa: E402
+from accel_calib.comparison import compared, Drift, rest_errors  # noqa: E402
 from accel_calib.effects import Model, model_with, predict, simulate_poses  # noqa: E402
 from accel_calib.geometry import spread_directions  # noqa: E402
 from accel_calib.table import Floats  # noqa: E402

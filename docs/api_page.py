@@ -13,12 +13,12 @@ import re
 from typing import Any
 
 import accel_calib as ac
-from accel_calib.calibrate import GyroBias, Quality, Rejected, SampleNoise, Verification
-from accel_calib.capture import CaptureSettings
-from accel_calib.compare import Comparison, Parameter
-from accel_calib.compare.comparison import Run
+from accel_calib.calibration import GyroBias, Quality, Rejected, SampleNoise, Verification
+from accel_calib.comparison import Comparison, Parameter
+from accel_calib.comparison.comparison import Run
 import accel_calib.errors as errors
-from accel_calib.refine import PlannedPose, PosePlan, Stage, Step
+from accel_calib.refinement import PlannedPose, PosePlan, Stage, Step
+from accel_calib.stillness import CaptureSettings
 from accel_calib.units import Units
 
 FUNCTIONS = ('calibrate', 'capture', 'read_poses', 'read_recording', 'fit', 'refine', 'verify',

@@ -28,7 +28,7 @@ sys.path[:0] = [str(HERE.parent), str(HERE)]
 
 import accel_calib as ac  # noqa: E402
 from accel_calib.findings import effect_figures  # noqa: E402
-from accel_calib.refine import chance  # noqa: E402
+from accel_calib.refinement import chance  # noqa: E402
 from accel_calib.report.sheet import AFTER, BEFORE, drawn, EDGE  # noqa: E402
 from accel_calib.table import Floats  # noqa: E402
 from accel_calib.text import short, with_minus, with_sd  # noqa: E402

@@ -31,7 +31,7 @@ HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parent)]
 
 from accel_calib.api import simulate  # noqa: E402
-from accel_calib.calibrate import next_pose  # noqa: E402
+from accel_calib.calibration import next_pose  # noqa: E402
 from accel_calib.logs import write_table  # noqa: E402
 from accel_calib.table import Floats  # noqa: E402
 import numpy as np  # noqa: E402

@@ -23,7 +23,7 @@ import tempfile
 import time
 from typing import Any
 
-from accel_calib.calibrate import level
+from accel_calib.calibration import level
 from accel_calib.stored import write_calibration
 from inside import model_with, NODES, own_domain, simulate_recording
 import numpy as np

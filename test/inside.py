@@ -17,26 +17,22 @@ import os
 from pathlib import Path
 
 from accel_calib.api import in_units_of
-from accel_calib.calibrate import (
+from accel_calib.calibration import (
     Calibration, determines, mounting_figures, posterior, refuse_if_unfit, sound_rows)
-from accel_calib.calibrate.mounting import (
+from accel_calib.calibration.mounting import (
     axes_of, doubts_about_flat, fault_of, mounting, with_heading, with_heading_of)
-from accel_calib.calibrate.partial import carried, common_sensors, without_knocked
-from accel_calib.calibrate.pose_planning import (
+from accel_calib.calibration.partial import carried, common_sensors, without_knocked
+from accel_calib.calibration.pose_planning import (
     missing_poses, poses_needed, rows_of, shape_words, unseen)
-from accel_calib.capture import rounding_left
-from accel_calib.capture.chunks import repeated_extremes
-from accel_calib.capture.trend import (
-    _long_run as long_run, excess_of_means, lines_through, oscillation)
 from accel_calib.cli.commands import COMMANDS, HIDDEN as DEMO_CHOICES, parser
 from accel_calib.cli.main import main
 from accel_calib.cli.nodes import changes, screen, state
 from accel_calib.cli.options import in_one_line
 from accel_calib.cli.output import Output, shown
-from accel_calib.compare import NAMES as PARAMETER_NAMES, rotation_free
-from accel_calib.compare.agreement import (
+from accel_calib.comparison import NAMES as PARAMETER_NAMES, rotation_free
+from accel_calib.comparison.agreement import (
     on_one_scale, outlier, p_values, Repeatability, repeatability_of, Runs)
-from accel_calib.compare.drift import change, is_over, MEMORY as DRIFT_MEMORY
+from accel_calib.comparison.drift import change, is_over, MEMORY as DRIFT_MEMORY
 from accel_calib.disk import check_regular, previous
 from accel_calib.effects import (
     acting_temperature, correct, linear_model, Model, model_with, MODELS, parse_effect, predict,
@@ -72,19 +68,19 @@ from accel_calib.noise.curve import allan_variances, longest_rest, octaves, shar
 from accel_calib.pipeline import (
     calibrated as calibrated_by, Correction, Intake, is_partial, Plan as FitPlan, poses_of,
     RampIntake, thermally_calibrated)
-from accel_calib.refine import base as refine_base
-from accel_calib.refine.base import clipped, grid_step, off_grid, sampled, unclipped
-from accel_calib.refine.beam import accepted, explored, reshaped
-from accel_calib.refine.curves import (
+from accel_calib.refinement import base as refine_base
+from accel_calib.refinement.base import clipped, grid_step, off_grid, sampled, unclipped
+from accel_calib.refinement.beam import accepted, explored, reshaped
+from accel_calib.refinement.curves import (
     _grown as grown_curve, _rss_beside as rss_beside, best_curve, Curve, Near, probabilities,
     Process, process_of, SIGNIFICANT, Walk, walk_beside)
-from accel_calib.refine.linear import (
+from accel_calib.refinement.linear import (
     _RARE as RARE, Block, LEVEL as REFINE_LEVEL, Linear, outside_of, Set, with_outliers)
-from accel_calib.refine.plan import _levels as levels_of, NOTHING as NOTHING_TO_PLAN
-from accel_calib.refine.search import (
+from accel_calib.refinement.plan import _levels as levels_of, NOTHING as NOTHING_TO_PLAN
+from accel_calib.refinement.search import (
     _is_better as is_better_than_walk, _less as less, search as search_effects)
-from accel_calib.refine.state import beginning, candidates, fitted_state, linearised, WORTH
-from accel_calib.refine.steps import advice_for
+from accel_calib.refinement.state import beginning, candidates, fitted_state, linearised, WORTH
+from accel_calib.refinement.steps import advice_for
 from accel_calib.report.page import axis_figures, snippets
 from accel_calib.report.refinement import all_drawings, curve_parts
 from accel_calib.report.residuals import residuals_of, residuals_of_refinement
@@ -106,6 +102,10 @@ from accel_calib.session.store import (
 from accel_calib.session.stream import StreamStatistics, TemperatureHistory
 from accel_calib.session.use import adopt as use_calibration
 from accel_calib.session.worker import Worker, WorkerProcess
+from accel_calib.stillness import rounding_left
+from accel_calib.stillness.chunks import repeated_extremes
+from accel_calib.stillness.trend import (
+    _long_run as long_run, excess_of_means, lines_through, oscillation)
 from accel_calib.stored import calibration_yaml, plain_yaml
 from accel_calib.stored.calibration_yaml import calibration_bytes, calibration_from
 from accel_calib.stored.exports import (

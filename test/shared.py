@@ -19,7 +19,7 @@ import tracemalloc
 from typing import Any
 
 from accel_calib import simulate
-from accel_calib.calibrate import Calibration, fit_poses
+from accel_calib.calibration import Calibration, fit_poses
 from accel_calib.effects import effect_named
 from accel_calib.geometry import unit
 from accel_calib.session import Step

@@ -16,10 +16,10 @@ from pathlib import Path
 import re
 from typing import Any
 
-from accel_calib.calibrate import Calibration, fit_poses
-from accel_calib.capture import capture
+from accel_calib.calibration import Calibration, fit_poses
 from accel_calib.errors import DamagedCalibrationError
 from accel_calib.logs import write_table
+from accel_calib.stillness import capture
 from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import Autopilot, Recording
 from inside import (

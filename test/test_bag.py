@@ -7,11 +7,11 @@ from dataclasses import replace
 from functools import cache
 import re
 
-from accel_calib.calibrate import fit_poses, level
-from accel_calib.capture import capture
+from accel_calib.calibration import fit_poses, level
 from accel_calib.errors import InputError, StoredCalibrationError
 from accel_calib.logs import LogOptions, open_log, read_recording
 from accel_calib.messages import correct_bag
+from accel_calib.stillness import capture
 from accel_calib.units import units_of
 from bag_files import (
     check_refused, header, IMU, imu, MAKES, McapFile, RATE_NS, rosbag2, START, STORE, STRING,

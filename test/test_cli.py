@@ -10,7 +10,7 @@ import re
 import shutil
 import sys
 
-from accel_calib.capture import CaptureSettings
+from accel_calib.stillness import CaptureSettings
 from accel_calib.stored import read_calibration
 from inside import (
     CALIBRATOR, COMMAND, COMMANDS, main, parser, rotation_from_rpy, spread_directions)
@@ -220,7 +220,7 @@ def test_every_command_has_help_with_an_example(command, capsys):
 
 @pytest.mark.parametrize(('arguments', 'without'), [
     (['--help'], ['numpy', 'yaml', 'rich', 'jinja2']), (['fly'], ['numpy']),
-    (['fit', '{poses}'], ['matplotlib', 'rosbags', 'jinja2', 'accel_calib.refine',
+    (['fit', '{poses}'], ['matplotlib', 'rosbags', 'jinja2', 'accel_calib.refinement',
                           'accel_calib.report'])])
 def test_only_what_is_used_is_imported(arguments, without, poses):
     code = (f'import sys\nfrom {main.__module__} import main\n'

@@ -6,11 +6,11 @@
 from dataclasses import replace
 from typing import Any
 
-from accel_calib.calibrate import Calibration, fit_poses, level
-from accel_calib.capture import capture
-from accel_calib.compare import compare, compared, Drift, history_of, rest_errors, status
+from accel_calib.calibration import Calibration, fit_poses, level
+from accel_calib.comparison import compare, compared, Drift, history_of, rest_errors, status
 from accel_calib.estimate import estimate
 from accel_calib.logs import read_recording
+from accel_calib.stillness import capture
 from accel_calib.table import Floats, Poses
 from accel_calib.units import units_of
 from inside import (

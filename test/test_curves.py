@@ -5,12 +5,12 @@
 
 import re
 
-from accel_calib.calibrate import fit_poses
+from accel_calib.calibration import fit_poses
 from accel_calib.effects import (
     CARRIERS, effect_named, EMPIRICAL, empirical_name, empirical_parts, formula_of, is_effect,
     kind_of, MODES, modes_of, VARIABLES)
 from accel_calib.findings import rate
-from accel_calib.refine import refine
+from accel_calib.refinement import refine
 from accel_calib.report import calibration_page
 from inside import (
     beginning, best_curve, export, fitted_state, format_calibration, Model, parse_calibration,

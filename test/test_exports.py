@@ -10,7 +10,7 @@ import re
 import shutil
 import subprocess
 
-from accel_calib.calibrate import Calibration, GyroBias, Quality
+from accel_calib.calibration import Calibration, GyroBias, Quality
 from accel_calib.errors import InputError
 from accel_calib.units import Units, units_of
 from inside import (

@@ -8,7 +8,7 @@ import os
 import shutil
 import stat
 
-from accel_calib.calibrate import fit_poses
+from accel_calib.calibration import fit_poses
 from accel_calib.disk import write_atomically
 from accel_calib.errors import InputError
 from accel_calib.logs import read_poses, read_recording, write_table

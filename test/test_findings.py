@@ -8,12 +8,12 @@ import json
 import shlex
 
 import accel_calib as ac
-from accel_calib.calibrate import fit_partial, fit_poses, level, mounting_only, Rejected
+from accel_calib.calibration import fit_partial, fit_poses, level, mounting_only, Rejected
 from accel_calib.finding import Finding, KINDS, NextStep, ranked, without
 from accel_calib.findings import (
     Expected, figures_of, GOOD_MG, rate, rate_comparison, rate_refinement, rate_verification)
 from accel_calib.logs import write_table
-from accel_calib.refine import refine
+from accel_calib.refinement import refine
 from inside import (
     format_calibration, main, Model, model_with, number, parse_calibration, spread_directions)
 import numpy as np

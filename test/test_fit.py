@@ -8,7 +8,7 @@ from dataclasses import astuple, replace
 from itertools import product
 
 import accel_calib as ac
-from accel_calib.calibrate import fit_poses, in_g, outlook, verify
+from accel_calib.calibration import fit_poses, in_g, outlook, verify
 from accel_calib.errors import RefusedFitError
 from accel_calib.estimate import (
     estimate, fit_norm, judge, lower_triangular, NotConvergedError, originals, outliers_among,

@@ -10,8 +10,8 @@ from typing import Any
 from urllib.parse import unquote
 
 from accel_calib import simulate
-from accel_calib.calibrate import fit_poses, FleetPrior
-from accel_calib.compare import history_of
+from accel_calib.calibration import fit_poses, FleetPrior
+from accel_calib.comparison import history_of
 from accel_calib.estimate import Prior
 from accel_calib.findings import rate_fleet
 from accel_calib.fleet import Store

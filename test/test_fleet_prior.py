@@ -7,10 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from accel_calib.calibrate import fit_poses, fit_with_fleet, FleetPrior
+from accel_calib.calibration import fit_poses, fit_with_fleet, FleetPrior
 from accel_calib.errors import InputError
 from accel_calib.logs import write_table
-from accel_calib.refine import refine
+from accel_calib.refinement import refine
 from accel_calib.stored import read_calibration, read_prior, write_calibration, write_priors
 from accel_calib.table import Floats, Poses
 from accel_calib.units import Units

@@ -7,7 +7,7 @@ from dataclasses import replace
 import json
 from pathlib import Path
 
-from accel_calib.calibrate import fit_poses, gated
+from accel_calib.calibration import fit_poses, gated
 from accel_calib.errors import RefusedFitError
 from accel_calib.stored import OF_FILE, read_calibration
 from accel_calib.table import Poses

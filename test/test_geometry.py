@@ -4,7 +4,7 @@
 
 import re
 
-from accel_calib.calibrate import dilution, error_left_in, fit_poses, identifiability, next_pose
+from accel_calib.calibration import dilution, error_left_in, fit_poses, identifiability, next_pose
 from accel_calib.errors import RefusedFitError
 from accel_calib.geometry import sphere_through
 from accel_calib.table import Poses

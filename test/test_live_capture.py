@@ -7,9 +7,9 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
-from accel_calib.calibrate import fit_poses, level
-from accel_calib.capture import capture, CaptureSettings, Dwell, poses_from
+from accel_calib.calibration import fit_poses, level
 from accel_calib.session import CalibratorSettings
+from accel_calib.stillness import capture, CaptureSettings, Dwell, poses_from
 from accel_calib.stored import read_calibration
 from accel_calib.table import numbered, Recording
 from accel_calib.units import units_of

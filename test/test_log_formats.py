@@ -7,10 +7,10 @@ from pathlib import Path
 import re
 from typing import Any
 
-from accel_calib.calibrate import Calibration, fit_poses, level_by_rows
-from accel_calib.capture import capture
+from accel_calib.calibration import Calibration, fit_poses, level_by_rows
 from accel_calib.errors import InputError
 from accel_calib.logs import LogOptions
+from accel_calib.stillness import capture
 from accel_calib.table import Recording
 from data.logs import make
 from inside import format_named, read_dataflash, read_log, read_ulg

@@ -12,10 +12,10 @@ import tracemalloc
 from typing import Any
 
 import accel_calib as ac
-from accel_calib.calibrate import fit_poses
-from accel_calib.capture import capture
+from accel_calib.calibration import fit_poses
 from accel_calib.errors import InputError
 from accel_calib.logs import LogOptions, open_log
+from accel_calib.stillness import capture
 from accel_calib.table import Poses, Recording
 from inside import meaning, model_with, read_log, simulate_recording, spread_directions, unit_of
 import numpy as np

@@ -16,7 +16,7 @@ import os
 import pickle
 import struct
 
-from accel_calib.calibrate import of_samples, thermal_stream
+from accel_calib.calibration import of_samples, thermal_stream
 from accel_calib.effects import EFFECTS
 from accel_calib.errors import AccelCalibError, InputError
 from accel_calib.logs import (
@@ -341,7 +341,7 @@ def test_what_the_worker_has_computed_is_not_computed_again_after_levelling(tmp_
     stored = tmp_path / 'calibration.pickle'
     stored.write_bytes(pickle.dumps(calibration))
     code = ('import pickle, sys; from pathlib import Path; import numpy as np; '
-            'from accel_calib.calibrate import level; '
+            'from accel_calib.calibration import level; '
             'given = pickle.loads(Path(sys.argv[1]).read_bytes()); '
             'context = dict.fromkeys(("time", "temperature", "temperature_of_offset"), '
             'np.array([25.0])); '

@@ -3,7 +3,7 @@
 
 """The mounting: levelling, heading, and axes that are wired wrongly."""
 
-from accel_calib.calibrate import fit_poses, flat_direction
+from accel_calib.calibration import fit_poses, flat_direction
 from accel_calib.errors import InputError
 from accel_calib.geometry import angle_of
 from accel_calib.units import FRAMES

@@ -3,9 +3,9 @@
 
 """Recordings that are clipped or coarsely quantised: their poses, their noise, and the names."""
 
-from accel_calib.calibrate import fit_poses, in_g
-from accel_calib.capture import capture
+from accel_calib.calibration import fit_poses, in_g
 from accel_calib.logs import read_recording
+from accel_calib.stillness import capture
 from accel_calib.table import Poses
 from accel_calib.units import STANDARD_GRAVITY, Units
 from inside import (

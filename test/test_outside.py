@@ -6,7 +6,7 @@
 from dataclasses import replace
 import tracemalloc
 
-from accel_calib.calibrate import of_samples, outside, SampleContext
+from accel_calib.calibration import of_samples, outside, SampleContext
 from accel_calib.effects import empirical_name
 from accel_calib.logs import read_recording, write_blocks, write_table
 from accel_calib.stored import write_calibration

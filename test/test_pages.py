@@ -9,12 +9,12 @@ from pathlib import Path
 import re
 
 import accel_calib as ac
-from accel_calib.calibrate import verify
-from accel_calib.compare import compare, history_of
+from accel_calib.calibration import verify
+from accel_calib.comparison import compare, history_of
 from accel_calib.errors import InputError
 from accel_calib.finding import Finding, NextStep
 from accel_calib.findings import rate, rate_verification, Rating
-from accel_calib.refine import refine
+from accel_calib.refinement import refine
 from accel_calib.report import calibration_page, refinement_page
 from accel_calib.text import milli
 from accel_calib.units import Units

@@ -5,12 +5,12 @@
 
 from dataclasses import replace
 
-from accel_calib.calibrate import (
+from accel_calib.calibration import (
     directions_of, fit_partial, fit_poses, gated, level, lies_in_cone, mounting_only, PRIOR,
     verify)
 from accel_calib.errors import InputError, RefusedFitError
 from accel_calib.estimate import estimate
-from accel_calib.refine import refine
+from accel_calib.refinement import refine
 from accel_calib.table import Poses
 from faults.sample import sample
 from inside import (

@@ -7,8 +7,8 @@ import csv
 from dataclasses import replace
 import json
 
-from accel_calib.calibrate import NextPose
-from accel_calib.refine import PlannedPose, refine
+from accel_calib.calibration import NextPose
+from accel_calib.refinement import PlannedPose, refine
 from accel_calib.table import Poses
 from generator import Setup, simulate, write_csv
 from inside import (

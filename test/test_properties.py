@@ -5,7 +5,7 @@
 
 
 import accel_calib as ac
-from accel_calib.calibrate import Calibration, fit_poses, outlook
+from accel_calib.calibration import Calibration, fit_poses, outlook
 from accel_calib.effects import EFFECTS, empirical_name, modes_of, VARIABLES
 from accel_calib.errors import InputError, RefusedFitError
 from accel_calib.finding import has

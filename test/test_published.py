@@ -3,7 +3,7 @@
 
 """Closed forms and fits give the published numbers."""
 
-from accel_calib.calibrate import fit_poses, verify
+from accel_calib.calibration import fit_poses, verify
 from accel_calib.errors import RefusedFitError
 from accel_calib.estimate import closed_form, faces, fit_12, sensing_axes
 from accel_calib.logs import read_poses

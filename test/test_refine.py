@@ -8,7 +8,7 @@ import re
 import accel_calib as ac
 from accel_calib.effects import between_steps
 from accel_calib.logs import read_poses
-from accel_calib.refine import refine, values_of, verdict_words
+from accel_calib.refinement import refine, values_of, verdict_words
 import generator
 from inside import LARGEST_SAMPLE, model_with, simulate_poses, spread_directions
 import numpy as np

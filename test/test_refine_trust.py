@@ -8,10 +8,10 @@ import json
 import re
 
 import accel_calib as ac
-from accel_calib.calibrate import fit_poses, verify, with_history
+from accel_calib.calibration import fit_poses, verify, with_history
 from accel_calib.errors import RefusedFitError
 from accel_calib.logs import read_recording, write_table
-from accel_calib.refine import refine, verdict_words
+from accel_calib.refinement import refine, verdict_words
 from accel_calib.stored import write_calibration
 import generator
 from inside import (

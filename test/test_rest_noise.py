@@ -5,11 +5,11 @@
 
 from dataclasses import replace
 
-from accel_calib.calibrate import fit_poses, gyro_bias_of, GyroBias, level, sample_noise_of
-from accel_calib.capture import capture
+from accel_calib.calibration import fit_poses, gyro_bias_of, GyroBias, level, sample_noise_of
 from accel_calib.errors import InputError
 from accel_calib.logs import read_poses, read_recording, write_table
-from accel_calib.refine import refine
+from accel_calib.refinement import refine
+from accel_calib.stillness import capture
 from accel_calib.table import Poses, Recording
 from accel_calib.units import units_of
 from inside import (

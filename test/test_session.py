@@ -10,7 +10,7 @@ import re
 import shutil
 from typing import Any
 
-from accel_calib.calibrate import level, set_heading
+from accel_calib.calibration import level, set_heading
 from accel_calib.errors import InputError, StoredCalibrationError
 from accel_calib.finding import Finding, has, LEVELS
 from accel_calib.logs import open_log, read_poses, write_table

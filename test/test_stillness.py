@@ -5,10 +5,10 @@
 
 from dataclasses import replace
 
-from accel_calib.capture import (
-    capture, Captured, CaptureSettings, poses_from, select, StillDetector)
 from accel_calib.errors import InputError
 from accel_calib.logs import read_recording
+from accel_calib.stillness import (
+    capture, Captured, CaptureSettings, poses_from, select, StillDetector)
 from accel_calib.table import numbered, Recording
 from accel_calib.units import units_of
 from inside import (

@@ -16,8 +16,8 @@ PACKAGE = ROOT / 'accel_calib'
 
 LAYERS = (
     'one_thread text units < errors < disk finding < table < geometry < effects < logs '
-    '< capture estimate < calibrate < refine < compare noise < findings < stored < pipeline '
-    '< messages < report < api session < fleet live < ros < cli')
+    '< stillness estimate < calibration < refinement < comparison noise < findings < stored '
+    '< pipeline < messages < report < api session < fleet live < ros < cli')
 """Parts of the package, lowest first. Each part imports only from lower parts and itself."""
 
 RANKS = {part: rank for rank, layer in enumerate(LAYERS.split('<')) for part in layer.split()}

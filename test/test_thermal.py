@@ -3,7 +3,7 @@
 
 """Lag and rate of the temperature: known solutions, wavy temperatures, streams."""
 
-from accel_calib.calibrate import with_history
+from accel_calib.calibration import with_history
 from accel_calib.errors import InputError
 from accel_calib.estimate import estimate
 from inside import (

@@ -19,12 +19,12 @@ from pathlib import Path
 import sys
 
 import accel_calib as ac
-from accel_calib.calibrate import Curve, curve_of
-from accel_calib.capture import capture, cells_of, Ramp, ramp_of
+from accel_calib.calibration import Curve, curve_of
 from accel_calib.effects import OFFSET_POWERS
 from accel_calib.errors import InputError
 from accel_calib.logs import write_table
 from accel_calib.report import thermal_page
+from accel_calib.stillness import capture, cells_of, Ramp, ramp_of
 from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import Recording
 from accel_calib.units import MG, units_of

@@ -10,7 +10,7 @@ import re
 from typing import Any
 
 import accel_calib as ac
-from accel_calib.calibrate import fit_poses
+from accel_calib.calibration import fit_poses
 from accel_calib.errors import InputError
 from accel_calib.logs import LogOptions, read_recording, write_table
 from accel_calib.stored import write_calibration

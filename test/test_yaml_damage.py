@@ -10,7 +10,7 @@ import os
 from pathlib import Path
 import re
 
-from accel_calib.calibrate import Calibration, fit_poses, Rejected
+from accel_calib.calibration import Calibration, fit_poses, Rejected
 from accel_calib.effects import know, OwnEffect
 from accel_calib.errors import (
     AccelCalibError, DamagedCalibrationError, InputError, StoredCalibrationError)

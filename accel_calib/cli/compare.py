@@ -15,8 +15,8 @@ from .frame import (
     Done, FAILED, intake, log_options, rated, rating_lines, read_lines, rows_between,
     stored_calibration)
 from .output import error_line, NARROW, progress, short_if_known, table, Verdict
-from ..calibrate import verify
-from ..compare import compare, History, history_of
+from ..calibration import verify
+from ..comparison import compare, History, history_of
 from ..errors import InputError
 from ..findings import (
     change_in_words, GAINS, in_words, OFFSETS, rate_comparison, rate_noise, rate_verification)

@@ -18,7 +18,7 @@ from .frame import (
     console, Done, FAILED, given, intake, log_options, prior, rows_between, settings,
     stored_calibration)
 from .output import error_line, progress, short_if_known, table, Verdict, working
-from ..calibrate import Calibration, NORM_MODELS, outlook
+from ..calibration import Calibration, NORM_MODELS, outlook
 from ..effects import AXES, effect_named
 from ..errors import InputError
 from ..findings import (
@@ -31,7 +31,7 @@ from ..text import counted, listed, now, short, with_sd
 from ..units import MG
 
 if TYPE_CHECKING:
-    from ..refine import Refinement
+    from ..refinement import Refinement
 
 
 def run_fit(args: argparse.Namespace) -> Done:
@@ -191,7 +191,7 @@ def _tables(calibration: Calibration) -> Iterator[Any]:
 
 def run_refine(args: argparse.Namespace) -> Done:
     """Refine a calibration, and store it unless it is refused."""
-    from ..refine import verdict_words
+    from ..refinement import verdict_words
     from ..report import refinement_page
 
     found, result = _refined(args)
@@ -231,7 +231,7 @@ def run_report(args: argparse.Namespace) -> Done:
 
 def _refined(args: argparse.Namespace) -> tuple[Intake, Refinement]:
     """Refine with one log."""
-    from ..refine import refine  # a fit alone does not load the search
+    from ..refinement import refine  # a fit alone does not load the search
 
     stored = args.calibration and stored_calibration(args.calibration)
     with intake(args, args.poses, stored) as found, working('refining'):
@@ -254,7 +254,7 @@ def several_refine(results: Sequence[dict[str, Any]]) -> Iterator[str]:
 
 def _steps_table(result: Refinement) -> Table:
     """Return a table of the steps."""
-    from ..refine import base_words, chance, values_of
+    from ..refinement import base_words, chance, values_of
 
     table = Table(title=f'From {base_words(result)}: residuals in mg, held out in brackets',
                   show_lines=True)

@@ -31,13 +31,13 @@ from typing import Any, NamedTuple, TYPE_CHECKING
 from .commands import COMMANDS, next_command
 from .options import BAD_INPUT, STANDARD_INPUT
 from .output import Output, progress, Verdict, working
-from ..calibrate import Calibration, FleetPrior
-from ..capture import CaptureSettings
+from ..calibration import Calibration, FleetPrior
 from ..disk import replaceable, STANDARD_OUTPUT, write_atomically
 from ..effects import know_file
 from ..errors import AccelCalibError, InputError, known_error, RefusedFitError, saying
 from ..logs import LogOptions, named_topics, OpenLog
 from ..pipeline import Intake, options_for, poses_of
+from ..stillness import CaptureSettings
 from ..stored import calibration_from, OF_FILE, read_calibration, read_prior
 from ..table import Poses
 from ..text import counted, plain

@@ -204,7 +204,7 @@ def add_log(made: Parser) -> None:
 
 def add_capture(made: Parser) -> None:
     """Add the options of the capture of poses; none of them has a value by default."""
-    from ..capture import CaptureSettings, REPEATED
+    from ..stillness import CaptureSettings, REPEATED
 
     group = made.add_argument_group('capture of poses from a recording')
     add_fields(group, CaptureSettings, {

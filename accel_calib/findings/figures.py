@@ -26,11 +26,11 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 import scipy
 
-from ..calibrate import (
+from ..calibration import (
     Calibration, Curve, deviations_g, directions_in, error_left_in, free_parameters,
     identifiability, next_pose, NextPose, Outlook, PRIOR, Quality, stated_uncertainty,
     uncertainty_g, Verification)
-from ..compare import NAMES
+from ..comparison import NAMES
 from ..effects import AXES, effect_named, LADDER, Model, MODELS, predict, value_unit
 from ..estimate import pose_noise, sensing_axes, variance_factor
 from ..finding import Rating
@@ -40,7 +40,7 @@ from ..text import signed
 from ..units import MG
 
 if TYPE_CHECKING:
-    from ..refine import Refinement
+    from ..refinement import Refinement
 
 OFFSETS, GAINS, CROSS = NAMES[:3], NAMES[3:6], NAMES[6:]
 

@@ -20,8 +20,8 @@ from .figures import (
     BAD_ERROR, BOUND, CHANGED, COVERED, degrees, depends_on, Expected, FAR_OFF, GOOD_ERROR, HIDDEN,
     LEFT_OUT, MANY_OUT, MATTERS, mg, NEAR_FLAT, number, PER_OUTLIER, SPAN, TILT, TO_CHECK,
     TOO_EXACT, without_noise, WORST_ERROR)
-from ..calibrate import Calibration, directions_in, flat_direction, free_parameters, Verification
-from ..compare import LEVEL
+from ..calibration import Calibration, directions_in, flat_direction, free_parameters, Verification
+from ..comparison import LEVEL
 from ..effects import EMPIRICAL, kind_of, WANDER
 from ..errors import TAKE_ALL_SIDES
 from ..finding import Finding, NextStep, ranked, rated, Rating, without
@@ -31,9 +31,9 @@ from ..text import counted, listed
 from ..units import MG
 
 if TYPE_CHECKING:
-    from ..compare import Comparison
+    from ..comparison import Comparison
     from ..noise import NoiseFigures
-    from ..refine import Refinement
+    from ..refinement import Refinement
 
 _REFINE = NextStep('refine', 'run refine to find the missing effect')
 _CHECK = NextStep('poses', 'check what differs between the poses, clamp the sensor, and take the '

@@ -43,8 +43,8 @@ import scipy
 
 from .recording import Row, UNKNOWN
 from .sensors import alike, model_of, Store
-from ..calibrate import FleetPrior
-from ..compare import NAMES
+from ..calibration import FleetPrior
+from ..comparison import NAMES
 from ..effects import LADDER
 from ..estimate import Prior
 from ..findings import rate_fleet, Rating, scale_of

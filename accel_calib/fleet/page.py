@@ -24,8 +24,8 @@ from .overview import (
     not_agreeing, Odd, odd_sensors, OfModel, Overview, rating_of, shared_effects, table_of, Values)
 from .recording import Row
 from .sensors import alike, Store
-from ..calibrate import FleetPrior
-from ..compare import NAMES
+from ..calibration import FleetPrior
+from ..comparison import NAMES
 from ..effects import MODELS, parameter_names
 from ..findings import CROSS, scale_of
 from ..report.sheet import (

@@ -31,8 +31,8 @@ from urllib.parse import quote
 import numpy as np
 
 from .. import __version__
-from ..calibrate import Calibration, determines, directions_of, fit_poses
-from ..compare import NAMES, rotation_free
+from ..calibration import Calibration, determines, directions_of, fit_poses
+from ..comparison import NAMES, rotation_free
 from ..disk import check_regular
 from ..effects import KNOWN_CODE, MODELS
 from ..errors import AccelCalibError, InputError, known_error, RefusedFitError
@@ -338,7 +338,7 @@ class Options:
     log : LogOptions
         How to read the logs.
     settings : dict
-        Fields of `accel_calib.capture.CaptureSettings`.
+        Fields of `accel_calib.stillness.CaptureSettings`.
     refined : bool
         Look for effects beyond offset, gain and cross-axis.
     exports : tuple of str

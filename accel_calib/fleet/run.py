@@ -31,7 +31,7 @@ from .page import write_fleet_page
 from .recording import (
     as_folder, content_hash, Input, key_of, on_disk, Options, Row, row_of, unread_row)
 from .sensors import is_damaged, merge_sensor, read_parquet, Store, UNREAD, write_sensors
-from ..calibrate import Calibration, FleetPrior
+from ..calibration import Calibration, FleetPrior
 from ..disk import write_atomically
 from ..effects import know_code, KNOWN_CODE
 from ..errors import AccelCalibError, InputError, known_error, needing

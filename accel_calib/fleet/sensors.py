@@ -47,8 +47,8 @@ import numpy as np
 import scipy
 
 from .recording import as_folder, Row, schema, UNKNOWN
-from ..calibrate import Calibration
-from ..compare import History, history_of, LEVEL, Parameter
+from ..calibration import Calibration
+from ..comparison import History, history_of, LEVEL, Parameter
 from ..disk import write_atomically
 from ..effects import LADDER
 from ..errors import InputError, known_error

@@ -30,7 +30,7 @@ import numpy as np
 
 from .server import PAGE, PageServer, PERIOD
 from .viewer import Message
-from ..calibrate import angle_words, Calibration
+from ..calibration import angle_words, Calibration
 from ..errors import AccelCalibError, InputError, system_error
 from ..findings import rate, residual_figures
 from ..messages.one_reading import Triple

@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from ..capture import samples_of
 from ..errors import InputError, needing
 from ..finding import Finding
 from ..logs import LineReader, LogOptions, open_log
+from ..stillness import samples_of
 from ..table import Floats, Recording
 from ..units import Units
 
@@ -64,7 +64,7 @@ class Source:
     read_as : str
         How they are read, in one line; empty if nothing is assumed.
     blocks : iterator of (n, 9) array
-        The samples, as for `accel_calib.capture.StillDetector.push`. A block can be empty.
+        The samples, as for `accel_calib.stillness.StillDetector.push`. A block can be empty.
     findings : tuple of Finding
         What was decided by the first values, against what they seem to be.
     problem : callable

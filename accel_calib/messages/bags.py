@@ -27,7 +27,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from .correction import corrected, output_frame, output_scale
-from ..calibrate import Calibration, on_topics
+from ..calibration import Calibration, on_topics
 from ..disk import check_regular
 from ..errors import InputError
 from ..logs import (

@@ -42,7 +42,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .one_reading import AtReading, OneReading, Triple
-from ..calibrate import Calibration, of_samples, thermal_stream
+from ..calibration import Calibration, of_samples, thermal_stream
 from ..effects import ThermalStream
 from ..errors import InputError
 from ..geometry import quaternion_of
@@ -53,7 +53,7 @@ from ..logs import (
 from ..table import Floats
 
 if TYPE_CHECKING:
-    from ..calibrate import SampleNoise
+    from ..calibration import SampleNoise
 
 
 def output_scale(calibration: Calibration, gravity: float) -> float:

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from ..calibrate import Calibration
+from ..calibration import Calibration
 from ..effects import (
     AFFINE, check_context, CONVERGED_G, Effect, FORCE, LARGEST_FORCE_G, LARGEST_ITERATIONS,
     MONOMIALS, ONE, own_slope, too_large)

@@ -62,8 +62,8 @@ from importlib.util import find_spec
 import numpy as np
 from numpy.typing import NDArray
 
-from ..capture import CaptureSettings, StillDetector
 from ..errors import InputError
+from ..stillness import CaptureSettings, StillDetector
 from ..table import concatenated, Floats, numbered, Recording
 from ..text import counted
 from ..units import Units

@@ -32,22 +32,22 @@ from .sheet import (
     ACCENT, add_band, AFTER, BAND, block, Drawing, drawn, EDGE, figures, HEIGHT_INCHES, HINT,
     how_to_read, INK, legend_below, listing, Mark, Marks, numbers, paragraph, rated_sheet,
     scroll_table, section)
-from ..calibrate import Calibration, Curve, mounting_figures, outlook
+from ..calibration import Calibration, Curve, mounting_figures, outlook
 from ..effects import (
     AXES, effect_named, EMPIRICAL, empirical_parts, kind_of, REFERENCE_TEMPERATURE, value_unit,
     variable_words, with_vector)
 from ..findings import effect_figures, rate_refinement, residual_figures
 from ..geometry import coverage
-from ..refine import verdict_words
+from ..refinement import verdict_words
 from ..table import Floats
 from ..text import counted, milli, percentage, short, signed, with_minus
 from ..units import MG
 
 if TYPE_CHECKING:
-    from ..calibrate import Verification
+    from ..calibration import Verification
     from ..findings import Rating
     from ..pipeline import ThermalOutcome
-    from ..refine import Refinement
+    from ..refinement import Refinement
     from ..table import Poses
 
 STORED = 'calibration.yaml'

@@ -30,13 +30,13 @@ from ..effects import (
     AXES, CARRIERS, curve_unit, effect_named, EMPIRICAL, empirical_parts, parameter_names,
     variable_words)
 from ..geometry import over_axes
-from ..refine import base_words, chance, values_of, verdict_words
+from ..refinement import base_words, chance, values_of, verdict_words
 from ..table import Floats
 from ..text import short
 from ..units import MG
 
 if TYPE_CHECKING:
-    from ..refine import Refinement, Step
+    from ..refinement import Refinement, Step
 
 
 def search_sections(result: Refinement, residuals: Residuals, *, used: bool) -> Iterator[str]:

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from .sheet import (
     ACCENT, add_bar, AFTER, BEFORE, check_matplotlib, DISC, DIVERGING, Drawing, drawn, EDGE, FAINT,
     HEIGHT_INCHES, INK, legend_below, Mark, Marks, PAPER, RIM, SEQUENTIAL)
-from ..calibrate import Calibration, directions_in, errors_after, errors_before, in_g, with_history
+from ..calibration import (
+    Calibration, directions_in, errors_after, errors_before, in_g, with_history)
 from ..effects import acting_temperature, AXES, effect_named, rate_at, sensor_force
 from ..geometry import over_axes, rms, uncovered, unit
 from ..table import column_of, Floats, Poses
@@ -29,7 +30,7 @@ from ..text import milli, percentage, short, with_minus
 from ..units import MG
 
 if TYPE_CHECKING:
-    from ..refine import Refinement, Stage
+    from ..refinement import Refinement, Stage
 
 _CONTEXT = ('temperature', 'time', 'supply_voltage', 'std', 'rate')
 

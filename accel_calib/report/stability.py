@@ -24,7 +24,7 @@ from .sheet import (
     ACCENT, add_band, add_bar, AFTER, AXIS_COLOURS, BAND, BEFORE, Drawing, drawn, EDGE, FAINT,
     figures, HEIGHT_INCHES, HINT, how_to_read, INK, legend_below, listing, Mark, Marks, numbers,
     PAPER, paragraph, rated_sheet, scroll_table, section, THERMAL, THIRD)
-from ..compare import Comparison, History, Parameter
+from ..comparison import Comparison, History, Parameter
 from ..findings import (
     change_in_words, CROSS, GAINS, in_words, OFFSETS, rate_comparison, rate_noise, scale_of)
 from ..geometry import rms
@@ -34,7 +34,7 @@ from ..text import power_of_ten, short, with_minus, with_sd
 from ..units import is_native
 
 if TYPE_CHECKING:
-    from ..calibrate import Calibration
+    from ..calibration import Calibration
     from ..findings import Rating
 
 _LOOKS = dict(zip('xyz', zip(AXIS_COLOURS, 'os^')))

@@ -42,7 +42,7 @@ from .declare import (
     CALLS, declared, follow, LATCHED, mismatches, MountingBroadcaster, name_of,
     published_by_others, SENSOR, STREAM, watch_static)
 from .stream import ContextTopics, Stream
-from ..calibrate import NextPose
+from ..calibration import NextPose
 from ..errors import AccelCalibError
 from ..live import check_installed
 from ..messages.correction import output_frame

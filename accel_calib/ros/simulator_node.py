@@ -27,7 +27,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from .declare import declared, STREAM
-from ..calibrate import mounting_of, of_samples, thermal_stream
+from ..calibration import mounting_of, of_samples, thermal_stream
 from ..effects import model_with, parse_effect, predict, turn_between
 from ..geometry import spread_directions
 from ..session import parameter

@@ -29,7 +29,7 @@ from rclpy.validate_topic_name import validate_topic_name
 from sensor_msgs.msg import Imu
 
 from .declare import published_by_others, SENSOR
-from ..calibrate import Calibration
+from ..calibration import Calibration
 from ..errors import AccelCalibError, InputError
 from ..logs import (
     ACCELERATION, IMU_DOUBLES, joined, Layout, layout_of, LITTLE_ENDIAN, NAME_AT, samples_of,

@@ -27,14 +27,14 @@ from .settings import CalibratorSettings
 from .store import writing_advice
 from .use import adopt, rate, show_poses
 from .worker import Compute, Files, nothing, Parse, Part, Task
-from ..calibrate import angle_words, Calibration, fit_partial, level, mounting_only, set_heading
-from ..capture import Dwell, poses_from
+from ..calibration import angle_words, Calibration, fit_partial, level, mounting_only, set_heading
 from ..effects import Model
 from ..errors import AccelCalibError, InputError, RefusedFitError, StoredCalibrationError
 from ..findings import rate_refinement, Rating
 from ..geometry import angle_of, spread_directions
 from ..pipeline import calibrated, is_partial, is_refined, Plan
-from ..refine import refine, Refinement, shown_name, times_typical, verdict_words
+from ..refinement import refine, Refinement, shown_name, times_typical, verdict_words
+from ..stillness import Dwell, poses_from
 from ..table import Poses
 from ..text import counted, listed, now
 from ..units import MG, Units

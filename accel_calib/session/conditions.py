@@ -21,8 +21,8 @@ from .core import State
 from .pose_guide import Guide, NOT_FOLLOWED
 from .settings import context_topics
 from .stream import SILENT, StreamStatistics
-from ..calibrate import USES_LIMIT
-from ..compare import status
+from ..calibration import USES_LIMIT
+from ..comparison import status
 from ..pipeline import FEWEST_IN_CONE, is_partial
 from ..table import column_of, CONTEXT, is_quantity
 from ..text import counted

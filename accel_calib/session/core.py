@@ -13,7 +13,7 @@ from .settings import CalibratorSettings, own_effects
 from .store import SensorFiles
 from .stream import Around, StreamStatistics
 from .worker import Event, Log, Severity, Throttle
-from ..calibrate import Calibration, mounting_of, mounting_words, with_given_mounting
+from ..calibration import Calibration, mounting_of, mounting_words, with_given_mounting
 from ..errors import InputError
 from ..finding import Finding
 from ..table import Floats

@@ -24,9 +24,9 @@ from operator import is_, is_not
 import numpy as np
 from numpy.typing import NDArray
 
-from ..capture import (
-    account_of, CaptureSettings, check_measured, Dwell, poses_from, Rest, select, StillDetector)
 from ..finding import Finding
+from ..stillness import (
+    account_of, CaptureSettings, check_measured, Dwell, poses_from, Rest, select, StillDetector)
 from ..table import CONTEXT, Floats, Poses
 from ..units import Units
 

@@ -25,11 +25,11 @@ import math
 
 import numpy as np
 
-from ..calibrate import directions_of, lies_in_cone, next_pose, NextPose, request_for
+from ..calibration import directions_of, lies_in_cone, next_pose, NextPose, request_for
 from ..errors import RefusedFitError
 from ..estimate import fit_sphere, pose_noise
 from ..geometry import attitude_words, ATTITUDES, axes_of_signs, coverage, unit
-from ..refine import PlannedPose
+from ..refinement import PlannedPose
 from ..table import Floats, Poses
 from ..units import MG, Units
 

@@ -7,7 +7,7 @@ What belongs to one sensor; all of it is replaced when the sensor changes.
 Gravity is the mean corrected force of the last rest. It is subtracted while the sensor moves
 (Intan RHD2000 application note). This is accurate for motion near the orientation of that rest.
 
-Every rest is compared with 1 g (`accel_calib.compare.drift`) as soon as it is long enough. The
+Every rest is compared with 1 g (`accel_calib.comparison.drift`) as soon as it is long enough. The
 final average replaces this first comparison. A robot can stand for weeks, so each interval
 `LONG_REST` of a long rest counts as one rest.
 
@@ -24,15 +24,15 @@ from .live_capture import LiveCapture, LONG_REST, overlap
 from .pose_guide import Guide
 from .settings import CalibratorSettings, capture_settings, columns_of
 from .stream import TemperatureHistory
-from ..calibrate import Calibration, GyroBias, on_topics, Outside, outside, SampleNoise
-from ..capture import Dwell
-from ..compare import compared, Drift, rest_errors
+from ..calibration import Calibration, GyroBias, on_topics, Outside, outside, SampleNoise
+from ..comparison import compared, Drift, rest_errors
 from ..effects import Context
 from ..errors import InputError
 from ..findings import Rating
 from ..messages import output_scale
 from ..messages.one_reading import Known, OneReading, Triple
-from ..refine import Refinement
+from ..refinement import Refinement
+from ..stillness import Dwell
 from ..table import Floats
 from ..units import Units
 

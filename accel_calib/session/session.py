@@ -26,8 +26,8 @@ from .settings import CalibratorSettings
 from .stream import AGAIN, SILENT
 from .use import adopt, load, show_mounting, show_poses
 from .worker import answered, ShowPoses, Still, Task
-from ..calibrate import mounting_words
-from ..compare import status
+from ..calibration import mounting_words
+from ..comparison import status
 from ..table import Floats
 from ..text import counted
 
@@ -133,7 +133,7 @@ class Session(State):
         Parameters
         ----------
         samples : (n, 7 + k) array
-            As in `accel_calib.capture.StillDetector.push`, with the context of `columns_of`.
+            As in `accel_calib.stillness.StillDetector.push`, with the context of `columns_of`.
         arrived : float
             Arrival time of the last sample, by the steady clock [s].
 

@@ -21,10 +21,10 @@ import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING, TypeVar
 
-from ..capture import CaptureSettings, REPEATED, Repeated, settings_from
 from ..effects import know_file, MODELS
 from ..errors import InputError
 from ..logs import named_topics
+from ..stillness import CaptureSettings, REPEATED, Repeated, settings_from
 from ..table import CONTEXT
 from ..units import (
     FrameName, FRAMES, is_native, Method, METHODS, MODEL_NAMES, STANDARD_GRAVITY, UNIT_NAMES,

@@ -23,7 +23,7 @@ from .core import State
 from .sensor import title
 from .settings import context_topics
 from .stream import SILENT
-from ..compare import status
+from ..comparison import status
 from ..errors import InputError
 from ..finding import has
 from ..messages.one_reading import Triple

@@ -30,7 +30,7 @@ import stat
 import numpy as np
 
 from .settings import CalibratorSettings
-from ..calibrate import Calibration, check_sensor
+from ..calibration import Calibration, check_sensor
 from ..disk import check_regular, copy_atomically, remove_leftovers, write_atomically
 from ..errors import (
     AccelCalibError, crash_words, DamagedCalibrationError, FREE_SPACE, InputError, is_full,

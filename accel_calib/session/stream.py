@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .live_capture import LONG_REST
-from ..calibrate import thermal_stream
+from ..calibration import thermal_stream
 from ..effects import Context, Model, ThermalStream
 from ..table import Floats
 from ..units import Units

@@ -21,11 +21,11 @@ from .sensor import Sensor, title
 from .store import Store, tidied, unusable, writing_advice
 from .stream import AGAIN
 from .worker import Compute, Files, Mounting, nothing, Parse, Result, Severity, ShowPoses, Task
-from ..calibrate import Calibration, in_frame, mounting_figures, on_topics, outlook
-from ..capture import Dwell
+from ..calibration import Calibration, in_frame, mounting_figures, on_topics, outlook
 from ..errors import DamagedCalibrationError, StoredCalibrationError
 from ..findings import calibration_json, rate as rating_of, Rating, rating_json, refinement_json
-from ..refine import Refinement
+from ..refinement import Refinement
+from ..stillness import Dwell
 from ..table import CONTEXT, is_quantity, Poses
 from ..text import counted, plain
 

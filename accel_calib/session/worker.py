@@ -52,7 +52,7 @@ from traceback import format_exc
 from typing import Any, BinaryIO, cast, Literal, Protocol, TypeVar
 
 from .store import writing_advice
-from ..calibrate import NextPose
+from ..calibration import NextPose
 from ..effects import know_code, KNOWN_CODE
 from ..errors import AccelCalibError, InputError
 from ..one_thread import ONE_THREAD
@@ -69,7 +69,7 @@ _IDLE = 'idle'
 _ENVIRONMENT = {**ONE_THREAD, 'MALLOC_TRIM_THRESHOLD_': '131072'}
 """A set threshold is not adapted by glibc, so that freed arrays do not stay in the process."""
 
-_IMPORTED = ('accel_calib.refine', 'scipy.linalg', 'scipy.special')
+_IMPORTED = ('accel_calib.refinement', 'scipy.linalg', 'scipy.special')
 """Modules imported at the start, so that the first fit is as fast as later ones."""
 
 _START = ('import sys; sys.path[:] = filter(None, sys.path); '

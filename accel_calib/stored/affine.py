@@ -20,7 +20,7 @@ from dataclasses import replace
 import numpy as np
 
 from .made import affine_fit, frame_words, Made, unit_in_ascii
-from ..calibrate import Calibration
+from ..calibration import Calibration
 from ..units import STANDARD_GRAVITY
 
 

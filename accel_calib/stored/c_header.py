@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from .made import (
     frame_words, literal, Made, Options, polynomial, single, steady_at, steady_grid,
     temperature_range)
-from ..calibrate import Calibration
+from ..calibration import Calibration
 from ..effects import (
     CUBE, MONOMIALS, ODD_SQUARE, PRODUCT, REFERENCE_TEMPERATURE, SIZE, SQUARE, WAVE, ZONAL, ZONES)
 from ..errors import InputError

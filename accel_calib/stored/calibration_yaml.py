@@ -5,7 +5,7 @@
 Stored calibrations, and typical values of a fleet: readable, versioned YAML.
 
 The reader bounds size and nesting (`.plain_yaml`) and checks every value. The calibration then
-passes the same gate as a fit (`accel_calib.calibrate.gated`). The writer reads its own bytes, so
+passes the same gate as a fit (`accel_calib.calibration.gated`). The writer reads its own bytes, so
 that it stores nothing that the reader refuses. The last line of a file is a checksum of the text
 before it; it reveals a file that was edited by hand.
 
@@ -25,7 +25,7 @@ from .plain_yaml import (
     array_at, beginning_of, choice_at, decoded, MOST_BYTES, number_at, read_plain, shown, value_at,
     values_at)
 from .. import __version__
-from ..calibrate import (
+from ..calibration import (
     Calibration, FleetPrior, gated, GyroBias, in_g, LARGEST_OFFSET_G, mounting_figures, Quality,
     Rejected, RejectedKind, SampleNoise, STORED_METHODS, with_history)
 from ..disk import FIRST_LINE, FORMAT, write_atomically

@@ -31,14 +31,14 @@ from .flight_controllers import ardupilot, counts, px4
 from .made import difference_mg, Format, LEAST_LOSS_MG, Loss, losses_of, Made, Options, rendered
 from .noise_figures import Noise, noise_alone, openvins, read_noise
 from .. import __version__
-from ..calibrate import Calibration
+from ..calibration import Calibration
 from ..disk import write_atomically
 from ..errors import InputError
 from ..text import one_line
 from ..units import STANDARD_GRAVITY
 
 if TYPE_CHECKING:
-    from ..refine import PosePlan
+    from ..refinement import PosePlan
 
 __all__ = ['CALIBRATION_ALONE', 'FORMATS', 'Exported', 'Format', 'Loss', 'Noise', 'Options',
            'export', 'identifier', 'read_noise', 'write_plan']

@@ -37,7 +37,7 @@ from numpy.polynomial import Polynomial
 
 from .c_header import name_of
 from .made import Made, Options, polynomial, single, steady_at, steady_grid, temperature_range
-from ..calibrate import Calibration
+from ..calibration import Calibration
 from ..errors import InputError
 from ..logs import ARDUPILOT_REFERENCE, ByAxis, DEGREE, PER_MILLION
 from ..table import Autopilot, Firmware, Floats

@@ -23,7 +23,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from ..calibrate import Calibration, in_g, uncertainty_g, with_history
+from ..calibration import Calibration, in_g, uncertainty_g, with_history
 from ..effects import (
     AtContext, Context, effect_named, formula_of, Model, NOMINAL_SUPPLY, REFERENCE_TEMPERATURE)
 from ..geometry import angle_of, OVER_THE_SPHERE, spread_directions

@@ -17,7 +17,7 @@ from typing import Any, TypeGuard
 from .affine import affine
 from .made import Made, plain_text
 from .plain_yaml import beginning_of, decoded, shown
-from ..calibrate import Calibration
+from ..calibration import Calibration
 from ..errors import InputError
 from ..text import read_json
 from ..units import STANDARD_GRAVITY

@@ -9,7 +9,7 @@ import struct
 from typing import Any
 
 import accel_calib as ac
-from accel_calib.calibrate import Calibration, fit_poses, level, SampleNoise
+from accel_calib.calibration import Calibration, fit_poses, level, SampleNoise
 from accel_calib.logs import doubles_at, joined, layout_of, renamed, samples_of
 from accel_calib.messages import corrected, motion_of, output_frame, Rewriter
 from accel_calib.session import checks, state

@@ -6,14 +6,14 @@
 from collections.abc import Callable
 from typing import Any
 
-from accel_calib.calibrate import (
+from accel_calib.calibration import (
     Calibration, fit_partial, fit_poses, in_g, mounting_only, outlook, outside, verify,
     with_history)
-from accel_calib.compare import Drift
+from accel_calib.comparison import Drift
 from accel_calib.errors import AccelCalibError
 from accel_calib.estimate import estimate, Fit, judge
 from accel_calib.findings import Expected, rate
-from accel_calib.refine import refine
+from accel_calib.refinement import refine
 from accel_calib.table import Poses
 from accel_calib.units import Units
 from inside import (

@@ -9,10 +9,10 @@ from itertools import product
 from typing import Any
 
 import accel_calib as ac
-from accel_calib.calibrate import (
+from accel_calib.calibration import (
     Calibration, dilution, error_left_in, fit_poses, FleetPrior, gated, gyro_bias_of,
     identifiability, level, lies_in_cone, next_pose, Rejected, set_heading, with_given_mounting)
-from accel_calib.compare import compare
+from accel_calib.comparison import compare
 from accel_calib.effects import CHANGES, effect_named, EFFECTS, is_effect, MONOMIALS, PROCESSES
 from accel_calib.estimate import estimate, Prior, variance_factor
 from accel_calib.finding import Finding, LEVELS

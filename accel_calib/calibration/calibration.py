@@ -128,7 +128,7 @@ class Calibration(Record):
     name : str
         Name of the fitted model: 4, 7, 9, 10, 12 or ``ideal``.
     method : str
-        ``ml``, ``algebraic``, or ``prior`` (`accel_calib.calibrate.partial`).
+        ``ml``, ``algebraic``, or ``prior`` (`accel_calib.calibration.partial`).
     model : Model
         The effects with their values, and ΔR.
     units : Units

@@ -20,7 +20,7 @@ import numpy as np
 from .agreement import (
     Comparable, comparable, LEVEL, on_one_scale, outlier, p_values, rotation_free, RotationFree,
     Runs, SAME_G)
-from ..calibrate import Calibration
+from ..calibration import Calibration
 from ..effects import Context, length_rows, sensor_force
 from ..errors import InputError
 from ..geometry import OVER_THE_SPHERE, rms

@@ -48,7 +48,6 @@ import scipy
 from .calibration import Calibration, PRIOR, Quality, with_history
 from .fit import only_norm
 from .quality import finished, gated, in_g, record_of
-from ..capture import Ramp
 from ..effects import (
     Context, effect_named, EFFECTS, factors_of, Model, OFFSET_POWERS, REFERENCE_TEMPERATURE,
     sensor_force)
@@ -56,6 +55,7 @@ from ..errors import InputError
 from ..estimate import judge
 from ..finding import Finding
 from ..geometry import coverage, rms, unit
+from ..stillness import Ramp
 from ..table import Floats, numbered, Poses, range_of
 from ..units import MG, Units
 

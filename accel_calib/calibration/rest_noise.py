@@ -15,7 +15,7 @@ of the residuals have their expected sum (Paule and Mandel [1]_). For k rests, �
 as k - 1 squares make it. Its part of the variance is therefore multiplied by the square of the
 ratio of the Student to the normal quantile. Successive rests can have similar errors, if the bias
 drifts. With the correlation ρ between neighbours, the variance is multiplied by (1 + ρ) / (1 - ρ),
-as for slopes in `accel_calib.capture.trend`.
+as for slopes in `accel_calib.stillness.trend`.
 
 **Turning rests.** A sensor that turns steadily about the vertical has a constant reading. A rest
 is therefore left out if its rate on any axis is further from the others than noise and scatter

@@ -22,7 +22,7 @@ from .curves import Near, probabilities, Process, process_of, SIGNIFICANT, walk_
 from .linear import Linear, Set
 from .state import (
     Candidate, candidates, fitted_state, left_open, linearised, State, with_effect, without)
-from ..calibrate import has_usual_gains
+from ..calibration import has_usual_gains
 from ..effects import included, LADDER, Model, WANDER
 from ..estimate import judge
 from ..table import Poses

@@ -27,7 +27,7 @@ left out of the fit.
 **Grid.** Samples on a grid of step q, with less noise than the step, are constant or alternate
 between two multiples of q. Means of constant samples are multiples of q. A mean between two
 multiples has samples with a larger variance. Both show q. Averaging does not remove the error of
-such a mean. Its variance follows from that of the samples (see `accel_calib.capture.rule`). The
+such a mean. Its variance follows from that of the samples (see `accel_calib.stillness.rule`). The
 capture includes it in the noise of its poses; in other tables it is missing, and is added.
 
 """
@@ -41,12 +41,12 @@ from numpy.typing import NDArray
 import scipy
 
 from .state import beginning, fitted_state, State, without
-from ..calibrate import Calibration, in_g, with_history
-from ..capture import rounding_left
+from ..calibration import Calibration, in_g, with_history
 from ..effects import included, Model, MODELS
 from ..estimate import estimate, judge
 from ..finding import has
 from ..geometry import unit
+from ..stillness import rounding_left
 from ..table import Floats, Poses
 
 MOST = 6000

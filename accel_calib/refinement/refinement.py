@@ -4,12 +4,12 @@
 """
 The refinement of a calibration: from poses and a base to the record of the result.
 
-See `accel_calib.refine.search` for the method, and `.base` for a stored calibration as the base.
+See `.search` for the method, and `.base` for a stored calibration as the base.
 
 **Typical values of a fleet.** The search for effects is that without a fleet, because a fleet says
 nothing about effects beyond offset, gain and cross-axis. It needs more poses than model 10 has
 values. If it names effects, the fitted values are combined with the fleet
-(`accel_calib.calibrate.partial`): offset, gain and cross-axis move towards the fleet, and the
+(`accel_calib.calibration.partial`): offset, gain and cross-axis move towards the fleet, and the
 effects with them as far as the poses cannot distinguish them. Otherwise the result is the fit with
 the fleet. If the poses do not carry a search, the first advice states the reason, and all effects
 are listed as not testable.
@@ -30,7 +30,7 @@ from .search import Found, search
 from .state import fitted_state, is_noise, State
 from .steps import (
     advice_for, not_testable, plain_name, Stage, Step, steps_of, untestable, Verdict, verdict_of)
-from ..calibrate import (
+from ..calibration import (
     Calibration, check_sensor, CLIPPED, fit_findings, fit_poses, fit_with_fleet, FLEET, FleetPrior,
     gated, in_g, LARGEST_DILUTION, OF_A_FIT, only_norm, posterior, quality_of, record_of,
     refuse_if_unfit, Rejected, rejected_by, sound_rows, sure_rows, uncertainty_g, with_history,

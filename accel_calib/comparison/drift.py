@@ -34,7 +34,7 @@ from itertools import product
 
 import numpy as np
 
-from ..calibrate import Calibration
+from ..calibration import Calibration
 from ..effects import Context, length_rows, sensor_force
 from ..geometry import rms
 from ..table import Floats, range_of

@@ -35,7 +35,6 @@ from .pose_planning import (
     determines, dilution, free_parameters, LARGEST_DILUTION, NORM_MODELS, poses_needed,
     refuse_if_unfit, unseen, WEAK_DILUTION)
 from .quality import finished, fit_findings, in_g, LARGEST_OFFSET_G, record_of, rival_findings
-from ..capture import check_axes
 from ..effects import EFFECTS, length_rows, linear_model, Model, MODELS, sensor_force, with_vector
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import (
@@ -44,6 +43,7 @@ from ..estimate import (
     pose_noise, rivals, solve, start_of, stated, TIES, with_scatter_of)
 from ..finding import explained_by, Finding
 from ..geometry import rms, unit
+from ..stillness import check_axes
 from ..table import check_units, Poses
 from ..text import listed, short
 from ..units import Floats, Indices, Method, METHODS, MG, MODEL_NAMES, Units

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 import scipy
 
 from .linear import Block, LEAST_OWN, Linear, orthonormal, outside_of
-from ..calibrate import determines, NORM_MODELS, with_history
+from ..calibration import determines, NORM_MODELS, with_history
 from ..effects import (
     Context, Effect, effect_named, factors_of, included, kind_of, linear_model, Model)
 from ..estimate import estimate, Fit, kinds, left_out, NotConvergedError

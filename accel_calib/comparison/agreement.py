@@ -53,7 +53,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from ..calibrate import Calibration, fit_unknown, in_g, NORM_MODELS, with_history
+from ..calibration import Calibration, fit_unknown, in_g, NORM_MODELS, with_history
 from ..effects import Context, effect_named, Model, reading_of
 from ..errors import InputError, RefusedFitError
 from ..estimate import judge, scatter_of
