@@ -4,8 +4,7 @@
 """The public functions, such as ``ac.fit`` after ``import accel_calib as ac``."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields, replace
-from functools import cached_property
+from dataclasses import fields, replace
 import math
 from os import PathLike
 from pathlib import Path
@@ -15,22 +14,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .calibration import (
-    Calibration as _Calibration, mounting_of, Verification, verify as verify_calibration)
+    Calibration as Calibration, mounting_of, Verification, verify as verify_calibration)
 from .comparison import compare as compare_calibrations, Comparison
 from .effects import know, model_with, OwnEffect, simulate_poses, simulate_recording
 from .errors import InputError
-from .finding import Finding
-from .findings import figures_of, rate, Rating
 from .geometry import spread_directions
 from .logs import (
     are_untimed_samples, Frame, LogOptions, read_poses as read_pose_table,
     read_recording as read_whole_recording)
 from .pipeline import calibrated, calibrated_log, captured_from, Flat, options_for, Plan, poses_of
 from .refinement import refine as find_effects, Refinement as Refinement
-from .stored import read_calibration, write_calibration
+from .stored import read_calibration
 from .table import (
-    check_units, check_values, data_frame, in_unit, LARGEST, median_length, numbered,
-    Poses as Poses, Recording as Recording, Table)
+    check_units, check_values, in_unit, LARGEST, median_length, numbered, Poses as Poses,
+    Recording as Recording, Table)
 from .text import now
 from .units import FrameName, Method, STANDARD_GRAVITY, UnitName, units_of
 
@@ -41,126 +38,6 @@ Data = Any
 
 _MOST_ROWS = 10_000_000
 """Largest number of simulated rows, which take some 2 GB."""
-
-
-class Calibration(_Calibration):
-    """
-    A fitted model that corrects readings.
-
-    Two calibrations are equal if all but their dates are.
-
-    Attributes
-    ----------
-    offset : (3,) array
-        V, the zero-g offset, in the unit of the readings.
-    gain : (3, 3) array
-        W, dimensionless, or native units per g.
-    matrix : (3, 3) array
-        W⁻¹, in units of the reading.
-    rotation : (3, 3) array
-        ΔR, transforms from the levelled frame to the sensor frame.
-    covariance : (p, p) array
-        Covariance of the values named by `parameters` [g²].
-    quality : Quality
-        Residuals and other figures over the poses used.
-    noted : tuple of Finding
-        What was noted during the fit, when it was levelled, and when it was read.
-    rating : Rating
-        Whether it is good, and all findings about it.
-    gyro : GyroBias or None
-        Bias of the gyro at rest; None if the poses have no angular rates.
-    noise : SampleNoise or None
-        Noise of one sample at rest; None if it is not known.
-
-    """
-
-    @cached_property
-    def rating(self) -> Rating:
-        """Return whether the calibration is good: ``name``, ``reason``, ``next``, ``findings``."""
-        return rate(self)
-
-    @property
-    def findings(self) -> tuple[Finding, ...]:
-        """Return what is worth knowing, that which decides the rating first."""
-        return self.rating.findings
-
-    def to_dataframe(self) -> Any:
-        """
-        Return the figures as a pandas DataFrame: ``label``, ``unit``, ``value`` and ``sd`` by key.
-
-        Raises
-        ------
-        InputError
-            If pandas is not installed.
-
-        """
-        found = [asdict(each) for each in figures_of(self)]
-        keys = [each.pop('key') for each in found]
-        return data_frame({name: [each[name] for each in found] for name in found[0]}, keys)
-
-    def plot(self, axes: Any = None) -> Any:
-        """
-        Draw the residual of each pose without and with the calibration.
-
-        Parameters
-        ----------
-        axes : matplotlib axes, optional
-            Where to draw; by default a new figure.
-
-        Returns
-        -------
-        matplotlib axes
-            The axes; ``axes.figure`` is the figure.
-
-        Raises
-        ------
-        InputError
-            If matplotlib is not installed.
-
-        """
-        from .report import plot_residuals
-
-        return plot_residuals(self, axes)
-
-    def save(self, path: Source) -> None:
-        """
-        Write the calibration as YAML; the previous file is kept as ``<name>.before``.
-
-        Raises
-        ------
-        RefusedFitError
-            If the calibration is not plausible.
-        OSError
-            If the file cannot be written.
-
-        """
-        write_calibration(Path(path), self)
-
-    def report(self, path: Source) -> Refinement:
-        """
-        Refine the calibration on its own poses, and write a report of the result (HTML).
-
-        Returns
-        -------
-        Refinement
-            The result that the report shows.
-
-        Raises
-        ------
-        RefusedFitError
-            If the poses are too few to find an effect.
-        InputError
-            If matplotlib is not installed.
-        OSError
-            If the file cannot be written.
-
-        """
-        from .report import check_matplotlib, refinement_page, write_page
-
-        check_matplotlib()
-        result = find_effects(self.used_poses, self.units, base=self)
-        write_page(Path(path), refinement_page(result, ''))
-        return result
 
 
 def load(path: Source, *, also: Sequence[Effect] = ()) -> Calibration:
@@ -188,7 +65,7 @@ def load(path: Source, *, also: Sequence[Effect] = ()) -> Calibration:
 
     """
     know(also)
-    return _public(read_calibration(Path(path)))
+    return read_calibration(Path(path))
 
 
 def read_poses(path: Source) -> Poses:
@@ -338,7 +215,7 @@ def calibrate(log: Source | Poses | Recording | Data, *, units: UnitName | None 
                 also=know(also))
     source, options, asked = _asked(log, units, gravity, {'sensor': sensor, **settings})
     found = poses_of(source, options, asked)
-    return _public(calibrated_log(source, options, found, plan).calibration)
+    return calibrated_log(source, options, found, plan).calibration
 
 
 def fit(poses: Source | Poses | Data, *, units: UnitName | None = None,
@@ -387,7 +264,7 @@ def fit(poses: Source | Poses | Data, *, units: UnitName | None = None,
     plan = Plan(model=model, method=method, refined=False, flat=flat, nose_down=nose_down,
                 frame=frame, sensor=sensor)
     found = poses_of(*_asked(poses, units, gravity))
-    return _public(calibrated(found.poses, found.units, plan).calibration)
+    return calibrated(found.poses, found.units, plan).calibration
 
 
 def refine(poses: Source | Poses | Data, *, base: str | Calibration = 'auto',
@@ -426,18 +303,17 @@ def refine(poses: Source | Poses | Data, *, base: str | Calibration = 'auto',
 
     """
     names = know(also)
-    start: str | _Calibration = base
-    if isinstance(base, _Calibration):
+    start: str | Calibration = base
+    if isinstance(base, Calibration):
         start, table = _beside(base, poses, units)
         known = start.units
     else:
         read = poses_of(*_asked(poses, units, gravity))
         table, known = read.poses, read.units
-    found = find_effects(table, known, base=start, sensor=sensor, date=now(), also=names)
-    return replace(found, calibration=_public(found.calibration))
+    return find_effects(table, known, base=start, sensor=sensor, date=now(), also=names)
 
 
-def verify(poses: Source | Poses | Data, calibration: Source | _Calibration, *,
+def verify(poses: Source | Poses | Data, calibration: Source | Calibration, *,
            units: UnitName | None = None) -> Verification:
     """
     Compute the residuals of a calibration on poses that it was not fitted to.
@@ -464,13 +340,13 @@ def verify(poses: Source | Poses | Data, calibration: Source | _Calibration, *,
         only one of calibration and poses is in native units.
 
     """
-    stored = calibration if isinstance(calibration, _Calibration) else load(calibration)
+    stored = calibration if isinstance(calibration, Calibration) else load(calibration)
     known, table = _beside(stored, poses, units)
     check_units(table, known.units)
     return verify_calibration(known, table)
 
 
-def compare(calibrations: Sequence[Source | _Calibration]) -> Comparison:
+def compare(calibrations: Sequence[Source | Calibration]) -> Comparison:
     """
     Test whether calibrations of one sensor agree within their uncertainties.
 
@@ -490,7 +366,7 @@ def compare(calibrations: Sequence[Source | _Calibration]) -> Comparison:
         If the calibrations cannot be compared.
 
     """
-    return compare_calibrations([each if isinstance(each, _Calibration) else load(each)
+    return compare_calibrations([each if isinstance(each, Calibration) else load(each)
                                  for each in calibrations])
 
 
@@ -628,15 +504,15 @@ def _asked(given: Source | Poses | Recording | Data, units: UnitName | None,
     return source, options, {name: settings[name] for name in settings if name not in of_log}
 
 
-def _beside(calibration: _Calibration, given: Source | Poses | Data, units: UnitName | None
-            ) -> tuple[_Calibration, Poses]:
+def _beside(calibration: Calibration, given: Source | Poses | Data, units: UnitName | None
+            ) -> tuple[Calibration, Poses]:
     """Return a calibration in the unit of poses, and these poses."""
     source, options, settings = _asked(given, units)
     poses = poses_of(source, options_for(calibration, options), settings).poses
     return in_units_of(calibration, replace(poses, units=units or poses.units)), poses
 
 
-def in_units_of(calibration: _Calibration, table: Table) -> _Calibration:
+def in_units_of(calibration: Calibration, table: Table) -> Calibration:
     """
     Return the same calibration for the readings of a table.
 
@@ -665,8 +541,3 @@ def _array(given: Data) -> Poses:
                          'expected one row for each pose', 'pass a Recording, or a DataFrame with '
                          'a column time')
     return Poses(columns, numbered(columns))
-
-
-def _public(calibration: _Calibration) -> Calibration:
-    return Calibration(**{each.name: getattr(calibration, each.name)
-                          for each in fields(_Calibration)})

@@ -13,13 +13,14 @@ determine, and plans the next pose. `thermal` is for a still board whose tempera
 """
 
 from .calibration import (
-    Calibration, check_sensor, FLEET, of_samples, Outside, outside, PRIOR, Quality, Rejected,
-    RejectedKind, SampleContext, STORED_METHODS, thermal_stream, USES_LIMIT, with_history)
+    Calibration, check_sensor, FLEET, of_samples, PRIOR, Quality, Rejected, RejectedKind,
+    STORED_METHODS, thermal_stream, with_history)
 from .fit import (
     CLIPPED, directions_of, fit_poses, fit_unknown, only_norm, rejected_by, sound_rows, sure_rows)
 from .mounting import (
     angle_words, flat_direction, in_frame, level, level_by_rows, mounting_figures, mounting_of,
     mounting_words, on_topics, set_heading, with_given_mounting)
+from .outside import Outside, outside, SampleContext, USES_LIMIT
 from .partial import fit_partial, fit_with_fleet, FleetPrior, mounting_only, posterior
 from .pose_planning import (
     determines, dilution, directions_in, error_left_in, free_parameters, identifiability,

@@ -5,7 +5,7 @@
 The record of a calibration, and the context in which it corrects readings.
 
 Effects are not extrapolated: beyond the range of the poses, the correction uses the limit of the
-range (`Calibration.ranges`), and `Outside` says how far beyond it was. A curve over the vibration
+range (`Calibration.ranges`), and `.outside` says how far beyond it was. A curve over the vibration
 has a range, too. A single sample does not show its vibration, so that the correction uses the
 lower limit. The order of the poses determines the previous pose of each, for `hysteresis`, and the
 rate of the temperature, for `temperature_rate` and lags.
@@ -15,24 +15,26 @@ rate of the temperature, for `temperature_rate` and lags.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from html import escape
-from typing import Literal, TypeVar
+from importlib import import_module
+from os import PathLike
+from pathlib import Path
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .rest_noise import GyroBias, SampleNoise
 from ..effects import (
-    acting_temperature, AXES, between_steps, Context, correct, effect_named, Model, ModelForm,
-    MODELS, parameter_names, predict, rate_at, ThermalStream, variable_of, way_of, with_turns)
+    acting_temperature, AXES, between_steps, Context, correct, Model, ModelForm, MODELS,
+    parameter_names, predict, rate_at, ThermalStream, way_of, with_turns)
 from ..errors import InputError, RefusedFitError, StoredCalibrationError
-from ..finding import Finding
-from ..geometry import over_axes
-from ..table import column_of, Floats, in_unit, name_from, Poses, Record, Table
-from ..text import counted, one_line, table, with_sd
-from ..units import FrameName, METHODS, MG, UnitName, Units, units_of
+from ..finding import Finding, Rating
+from ..table import data_frame, Floats, in_unit, name_from, Poses, Record, Table
+from ..text import one_line, table, with_sd
+from ..units import FrameName, METHODS, UnitName, Units, units_of
 
 ORIENTED = '12'
 """The model of poses of known orientation."""
@@ -51,14 +53,6 @@ _THERMAL = ('temperature_rate', 'temperature_of_offset', 'temperature_of_gain')
 
 _HELD = ('time', 'temperature', *_THERMAL, 'supply_voltage')
 """Context that is limited to the range of the poses, as quantities are."""
-
-USES_LIMIT = 'the correction uses the limit of the range'
-
-_QUANTITIES: dict[str, tuple[str, str, float]] = {
-    'time': ('time since the start of the calibration', 'h', 1.0 / 3600.0),
-    'temperature_rate': ('rate of temperature', '°C/min', 60.0),
-    'std': ('vibration', 'mg', MG)}
-"""Name, unit and factor of the quantities that are not shown as in `accel_calib.table`."""
 
 _Known = TypeVar('_Known', bound=Table)
 
@@ -441,6 +435,97 @@ class Calibration(Record):
         return {**known, **{key: np.clip(known[key], *limits)
                             for key, limits in self.ranges.items() if key in known}}
 
+    @cached_property
+    def rating(self) -> Rating:
+        """Return whether the calibration is good: ``name``, ``reason``, ``next``, ``findings``."""
+        rating: Rating = _later('findings').rate(self)
+        return rating
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Return what is worth knowing, that which decides the rating first."""
+        return self.rating.findings
+
+    def to_dataframe(self) -> Any:
+        """
+        Return the figures as a pandas DataFrame: ``label``, ``unit``, ``value`` and ``sd`` by key.
+
+        Raises
+        ------
+        InputError
+            If pandas is not installed.
+
+        """
+        found = [asdict(each) for each in _later('findings').figures_of(self)]
+        keys = [each.pop('key') for each in found]
+        return data_frame({name: [each[name] for each in found] for name in found[0]}, keys)
+
+    def plot(self, axes: Any = None) -> Any:
+        """
+        Draw the residual of each pose without and with the calibration.
+
+        Parameters
+        ----------
+        axes : matplotlib axes, optional
+            Where to draw; by default a new figure.
+
+        Returns
+        -------
+        matplotlib axes
+            The axes; ``axes.figure`` is the figure.
+
+        Raises
+        ------
+        InputError
+            If matplotlib is not installed.
+
+        """
+        return _later('report').plot_residuals(self, axes)
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """
+        Write the calibration as YAML; the previous file is kept as ``<name>.before``.
+
+        Raises
+        ------
+        RefusedFitError
+            If the calibration is not plausible.
+        OSError
+            If the file cannot be written.
+
+        """
+        _later('stored').write_calibration(Path(path), self)
+
+    def report(self, path: str | PathLike[str]) -> Any:
+        """
+        Refine the calibration on its own poses, and write a report of the result (HTML).
+
+        Returns
+        -------
+        Refinement
+            The result that the report shows.
+
+        Raises
+        ------
+        RefusedFitError
+            If the poses are too few to find an effect.
+        InputError
+            If matplotlib is not installed.
+        OSError
+            If the file cannot be written.
+
+        """
+        pages = _later('report')
+        pages.check_matplotlib()
+        result = _later('refinement').refine(self.used_poses, self.units, base=self)
+        pages.write_page(Path(path), pages.refinement_page(result, ''))
+        return result
+
+
+def _later(part: str) -> Any:
+    """Import a part of the package that takes calibrations, when it is given one."""
+    return import_module(f'accel_calib.{part}')
+
 
 def of_samples(known: Context, count: int, model: Model,
                stream: ThermalStream | None = None) -> Context:
@@ -522,87 +607,3 @@ def _linear_rows(model: Model, u: Floats) -> Floats:
 def _deviation(rows: Floats, covariance: Floats) -> Floats:
     """Return the standard deviation of each of these (m, p) combinations of values."""
     return np.sqrt(np.maximum(np.einsum('ip,pq,iq->i', rows, covariance, rows), 0.0))
-
-
-@dataclass(frozen=True)
-class Outside:
-    """
-    A column of the context, compared with the range of a calibration.
-
-    `count` of all `samples` are outside of the range `low` to `high` of the poses. All samples
-    range from `least` to `most`.
-
-    """
-
-    key: str
-    count: int
-    samples: int
-    low: float
-    high: float
-    least: float
-    most: float
-
-    @property
-    def words(self) -> str:
-        """Return what was found, and the range of the calibration; times from the first pose."""
-        name, unit, factor = _QUANTITIES.get(self.key) or (
-            self.key.replace('_', ' '), column_of(self.key).unit, 1.0)
-        start, shown = self.low if self.key == 'time' else 0.0, []
-        for low, high in ((self.least, self.most), (self.low, self.high)):
-            first, last = (f'{(value - start) * factor:.4g}' for value in (low, high))
-            shown.append(f'{first if first == last else f"{first} to {last}"} {unit}'.rstrip())
-        return f'{name} is {shown[0]}, but the range of the calibration is {shown[1]}'
-
-    @property
-    def line(self) -> str:
-        """Return a line about a recording."""
-        return (f'{self.count} of {counted(self.samples, "sample")} are outside of the range of '
-                f'the calibration: {self.words}; {USES_LIMIT}')
-
-
-def outside(calibration: Calibration, known: Context) -> dict[str, Outside]:
-    """Return the comparison of each column that has a range; ``count`` is 0 if all are inside."""
-    found, ranges = {}, dict(calibration.ranges)
-    ends = [values[-2:] for name, values in calibration.model.values.items()
-            if variable_of(name) == 'std']
-    if ends:  # empirical curves over the vibration
-        ranges['std'] = float(np.max(ends, axis=0)[0]), float(np.min(ends, axis=0)[1])
-    for key, (low, high) in ranges.items():
-        values = over_axes(known[key]) if key in known else np.zeros(0)
-        values = values[np.isfinite(values)]
-        if len(values):
-            count = int(np.sum((values < low) | (values > high)))
-            found[key] = Outside(key, count, len(values), low, high, float(np.min(values)),
-                                 float(np.max(values)))
-    return found
-
-
-class SampleContext:
-    """The context of the samples of a log, block by block, and what leaves its ranges."""
-
-    def __init__(self, calibration: Calibration) -> None:
-        self._calibration = calibration
-        self._thermal = thermal_stream(calibration.model)
-        self._compared: dict[str, Outside] = {}
-        self.lacking = ''
-
-    def of(self, known: Context, count: int) -> Context:
-        """Return the context of the next block as `of_samples` does."""
-        model = self._calibration.model
-        context = of_samples(known, count, model, self._thermal)
-        self.lacking = ''
-        if lacking := [key for key in model.neutral if key not in known]:
-            names = [name for name in model.effects if {*effect_named(name).needs} & {*lacking}]
-            self.lacking = (f'the samples have no {" and ".join(lacking)}: {" and ".join(names)} '
-                            f'{"is" if len(names) == 1 else "are"} not corrected')
-        for key, block in outside(self._calibration, context).items():
-            before = self._compared.get(key)
-            self._compared[key] = block if before is None else replace(
-                block, count=before.count + block.count, samples=before.samples + block.samples,
-                least=min(before.least, block.least), most=max(before.most, block.most))
-        return context
-
-    @property
-    def left(self) -> list[Outside]:
-        """Return the quantities that have left the range of the calibration so far."""
-        return [each for each in self._compared.values() if each.count]

@@ -1,0 +1,107 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The context of samples, compared with the range of the poses of a calibration."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .calibration import Calibration, of_samples, thermal_stream
+from ..effects import Context, effect_named, variable_of
+from ..geometry import over_axes
+from ..table import column_of
+from ..text import counted
+from ..units import MG
+
+USES_LIMIT = 'the correction uses the limit of the range'
+
+_QUANTITIES: dict[str, tuple[str, str, float]] = {
+    'time': ('time since the start of the calibration', 'h', 1.0 / 3600.0),
+    'temperature_rate': ('rate of temperature', '°C/min', 60.0),
+    'std': ('vibration', 'mg', MG)}
+"""Name, unit and factor of the quantities that are not shown as in `accel_calib.table`."""
+
+
+@dataclass(frozen=True)
+class Outside:
+    """
+    A column of the context, compared with the range of a calibration.
+
+    `count` of all `samples` are outside of the range `low` to `high` of the poses. All samples
+    range from `least` to `most`.
+
+    """
+
+    key: str
+    count: int
+    samples: int
+    low: float
+    high: float
+    least: float
+    most: float
+
+    @property
+    def words(self) -> str:
+        """Return what was found, and the range of the calibration; times from the first pose."""
+        name, unit, factor = _QUANTITIES.get(self.key) or (
+            self.key.replace('_', ' '), column_of(self.key).unit, 1.0)
+        start, shown = self.low if self.key == 'time' else 0.0, []
+        for low, high in ((self.least, self.most), (self.low, self.high)):
+            first, last = (f'{(value - start) * factor:.4g}' for value in (low, high))
+            shown.append(f'{first if first == last else f"{first} to {last}"} {unit}'.rstrip())
+        return f'{name} is {shown[0]}, but the range of the calibration is {shown[1]}'
+
+    @property
+    def line(self) -> str:
+        """Return a line about a recording."""
+        return (f'{self.count} of {counted(self.samples, "sample")} are outside of the range of '
+                f'the calibration: {self.words}; {USES_LIMIT}')
+
+
+def outside(calibration: Calibration, known: Context) -> dict[str, Outside]:
+    """Return the comparison of each column that has a range; ``count`` is 0 if all are inside."""
+    found, ranges = {}, dict(calibration.ranges)
+    ends = [values[-2:] for name, values in calibration.model.values.items()
+            if variable_of(name) == 'std']
+    if ends:  # empirical curves over the vibration
+        ranges['std'] = float(np.max(ends, axis=0)[0]), float(np.min(ends, axis=0)[1])
+    for key, (low, high) in ranges.items():
+        values = over_axes(known[key]) if key in known else np.zeros(0)
+        values = values[np.isfinite(values)]
+        if len(values):
+            count = int(np.sum((values < low) | (values > high)))
+            found[key] = Outside(key, count, len(values), low, high, float(np.min(values)),
+                                 float(np.max(values)))
+    return found
+
+
+class SampleContext:
+    """The context of the samples of a log, block by block, and what leaves its ranges."""
+
+    def __init__(self, calibration: Calibration) -> None:
+        self._calibration = calibration
+        self._thermal = thermal_stream(calibration.model)
+        self._compared: dict[str, Outside] = {}
+        self.lacking = ''
+
+    def of(self, known: Context, count: int) -> Context:
+        """Return the context of the next block as `of_samples` does."""
+        model = self._calibration.model
+        context = of_samples(known, count, model, self._thermal)
+        self.lacking = ''
+        if lacking := [key for key in model.neutral if key not in known]:
+            names = [name for name in model.effects if {*effect_named(name).needs} & {*lacking}]
+            self.lacking = (f'the samples have no {" and ".join(lacking)}: {" and ".join(names)} '
+                            f'{"is" if len(names) == 1 else "are"} not corrected')
+        for key, block in outside(self._calibration, context).items():
+            before = self._compared.get(key)
+            self._compared[key] = block if before is None else replace(
+                block, count=before.count + block.count, samples=before.samples + block.samples,
+                least=min(before.least, block.least), most=max(before.most, block.most))
+        return context
+
+    @property
+    def left(self) -> list[Outside]:
+        """Return the quantities that have left the range of the calibration so far."""
+        return [each for each in self._compared.values() if each.count]
