@@ -17,6 +17,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from .statistics import rms
 from .table import Floats
 
 
@@ -91,16 +92,6 @@ OVER_THE_SPHERE = spread_directions(300)
 """Directions over which figures are averaged, (300, 3); not to be changed in place."""
 
 
-def rms(values: Floats) -> float:
-    """Return the root of the mean square of numbers."""
-    return float(np.sqrt(np.mean(values ** 2)))
-
-
-def over_axes(values: Floats) -> Floats:
-    """Return the (n,) values of a quantity; of (n, 3) vectors, the RMS over the axes."""
-    return np.sqrt(np.mean(values ** 2, axis=1)) if values.ndim > 1 else values
-
-
 def sphere_through(points: Floats) -> tuple[float, float]:
     """
     Return the radius of the sphere, or the circle, nearest to (n, k) points, and the RMS distance.
@@ -118,6 +109,9 @@ def unit(vectors: Floats) -> Floats:
     """Return (…, 3) vectors scaled to length 1; zero vectors stay zero."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300)
 
+
+TAKEN = np.cos(np.radians(17.0))
+"""A pose within 17° of one of `ATTITUDES` has taken it; its neighbours are 35° away."""
 
 ATTITUDES = unit(np.array(sorted((signs for signs in product((0.0, 1.0, -1.0), repeat=3)
                                   if any(signs)), key=np.count_nonzero)))

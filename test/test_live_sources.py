@@ -69,7 +69,8 @@ def samples(blocks: Iterator[Floats], count: int) -> Floats:
 
 def received(line: Callable[[int], str], count: int = 300, **options: Any) -> tuple[str, Floats]:
     """Return the unit and reading of the lines of a board, and so many of its samples."""
-    with (board(paced(line)) as port, open_source(port, LogOptions(**options)) as source):
+    with (board(paced(line)) as port,
+          open_source(port, LogOptions(**options), baud=9600) as source):
         return f'{source.units.name}, {source.read_as}', samples(source.blocks, count)
 
 
@@ -150,7 +151,7 @@ def test_a_rate_is_measured_also_if_lines_are_late_or_follow_a_boot(
 
     monkeypatch.setattr(*HEAD_OF_A_PORT, 2.0)
     monkeypatch.setattr(*MOST_OF_A_HEAD, 2000)  # fewer lines than the 400 of this time
-    with (board(paced(line, late)) as port, open_source(port, LogOptions()) as source):
+    with (board(paced(line, late)) as port, open_source(port, LogOptions(), baud=9600) as source):
         first = next(source.blocks)
         found = np.concatenate([first, samples(source.blocks, 450 - len(first))])
     assert 20 < len(first) < 400
@@ -182,7 +183,7 @@ def test_a_port_that_is_removed_is_waited_for_and_read_again(tmp_path: Path) -> 
 
     with ExitStack() as first, ExitStack() as opened:
         port.symlink_to(first.enter_context(board(paced(line))))
-        source = opened.enter_context(open_source(str(port), LogOptions()))
+        source = opened.enter_context(open_source(str(port), LogOptions(), baud=9600))
         assert len(samples(source.blocks, 100)) >= 100
         assert source.problem() == ''
         port.unlink()
@@ -219,7 +220,7 @@ def test_a_recording_is_played_in_real_time(
     assert not is_port(str(path))
     table = read_log(path, LogOptions(units='g')).table
     monkeypatch.setattr(*CLOCK_OF_A_SOURCE, clock)
-    with open_source(str(path), LogOptions(units='g'), speed=2.0) as source:
+    with open_source(str(path), LogOptions(units='g'), baud=9600, speed=2.0) as source:
         arrivals = [(clock.now - 50.0, block) for block in source.blocks]
     found = np.concatenate([block for _, block in arrivals])
     np.testing.assert_array_equal(found[:, 1:4], table.reading)

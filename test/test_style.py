@@ -15,9 +15,9 @@ ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / 'accel_calib'
 
 LAYERS = (
-    'one_thread text units < errors < disk finding < table < geometry < effects < logs '
-    '< stillness estimate < calibration < refinement < comparison noise < findings < stored '
-    '< pipeline < messages < report < api session < fleet live < ros < cli')
+    'one_thread text units < errors < disk finding < table < statistics < geometry < effects '
+    '< logs < stillness estimate < calibration < refinement < comparison noise < findings '
+    '< stored < pipeline < messages < report < api session < fleet live < ros < cli')
 """Parts of the package, lowest first. Each part imports only from lower parts and itself."""
 
 RANKS = {part: rank for rank, layer in enumerate(LAYERS.split('<')) for part in layer.split()}
@@ -25,7 +25,7 @@ ROS = re.compile(r'rclpy|ament_\w+|launch(_\w+)?|tf2_\w+|rosidl_\w+|\w+_(msgs|sr
 
 MODULES = sorted(PACKAGE.rglob('*.py'))
 BASE = {f'accel_calib.{name}' for name in (
-    'disk', 'errors', 'finding', 'geometry', 'table', 'text', 'units')}
+    'disk', 'errors', 'finding', 'geometry', 'statistics', 'table', 'text', 'units')}
 """Modules that tests import from directly."""
 
 FACES = {'accel_calib', *(f'accel_calib.{each.parent.name}'
@@ -59,6 +59,20 @@ def test_imports_point_one_way_and_only_the_nodes_import_ros() -> None:
         above = {other for other in inside - {part, '__version__'}
                  if other not in RANKS or RANKS[other] >= RANKS[part]}
         assert not above, f'{path} imports {above}, which is not below it in LAYERS'
+
+
+def test_no_constant_stands_in_two_files() -> None:
+    """Sizes of buffers, which are powers of two, and their largest number may be equal."""
+    found: dict[float, set[Path]] = {}
+    for path in MODULES:
+        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+            if isinstance(node, ast.Constant) and type(node.value) in (int, float):
+                digits = repr(node.value).partition('e')[0].replace('.', '').strip('0')
+                whole = node.value == int(node.value) and int(node.value)
+                if len(digits) > 3 and not (whole and (
+                        whole & (whole - 1) == 0 or whole & (whole + 1) == 0)):
+                    found.setdefault(node.value, set()).add(path)
+    assert not {value: paths for value, paths in found.items() if len(paths) > 1}
 
 
 def module_of(name: str) -> str:

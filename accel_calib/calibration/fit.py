@@ -42,7 +42,8 @@ from ..estimate import (
     lower_triangular, NotConvergedError, originals, outliers, outliers_or_scatter, Point,
     pose_noise, rivals, solve, start_of, stated, TIES, with_scatter_of)
 from ..finding import explained_by, Finding
-from ..geometry import rms, unit
+from ..geometry import unit
+from ..statistics import rms
 from ..stillness import check_axes
 from ..table import check_units, Poses
 from ..text import listed, short
@@ -455,7 +456,7 @@ def _unless_placed_well(poses: Poses, units: Units) -> Calibration | None:
     if not (ratio > _LEAST_RATIO and chance < _LEVEL_OF_PLACEMENT):  # the noise explains them
         return None
     angle = np.degrees(np.linalg.norm(away, axis=1))
-    words = (f'the known orientations differ by {np.sqrt(np.mean(angle ** 2)):.2g}° (RMS) from a '
+    words = (f'the known orientations differ by {rms(angle):.2g}° (RMS) from a '
              f'fit by |force| = 1 g, most in row {seen.row[np.argmax(angle)]} '
              f'({np.max(angle):.2g}°): the fit uses only |force| = 1 g, and the orientations '
              'determine only the rotation of the axes')

@@ -9,7 +9,7 @@ import numpy as np
 
 from .calibration import Calibration, of_samples, thermal_stream
 from ..effects import Context, effect_named, variable_of
-from ..geometry import over_axes
+from ..statistics import over_axes
 from ..table import column_of
 from ..text import counted
 from ..units import MG

@@ -49,7 +49,8 @@ from ..effects import EFFECTS, MODELS, parameter_names, with_vector
 from ..errors import RefusedFitError
 from ..estimate import pose_noise
 from ..finding import Finding
-from ..geometry import ATTITUDES, axes_of_signs, cone_of, distinct, OVER_THE_SPHERE, unit, words_of
+from ..geometry import (
+    ATTITUDES, axes_of_signs, cone_of, distinct, OVER_THE_SPHERE, TAKEN, unit, words_of)
 from ..table import Floats, Poses
 from ..text import counted
 from ..units import MG
@@ -91,9 +92,6 @@ _GOOD_DILUTION = 3.0
 
 _SPARE = 3
 """Poses beyond the fewest that determine a model, so that the fit can be checked."""
-
-_TAKEN = np.cos(np.radians(17.0))
-"""An orientation within 17° of a pose counts as taken; its neighbours are 35° away."""
 
 _CONE = 30.0
 """
@@ -384,7 +382,7 @@ def missing_poses(name: str, directions: Floats, noise: Floats | None = None) ->
 def _best(name: str, directions: Floats, information: Floats) -> Floats | None:
     """Return the untaken attitude that increases det M most, or None if all are taken."""
     up, rows = _attitudes(name)
-    free = np.max(up @ directions.T, axis=1, initial=-1.0) < _TAKEN
+    free = np.max(up @ directions.T, axis=1, initial=-1.0) < TAKEN
     if not np.any(free):
         return None
     to_come = np.linalg.inv(information + _mean_information(name))

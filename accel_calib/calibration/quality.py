@@ -33,7 +33,8 @@ from ..effects import correct, LADDER, length_rows, Model, sensor_force
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import believable, Fit, judge, left_out, Rival, unseen_mistakes
 from ..finding import Finding, without
-from ..geometry import coverage, OVER_THE_SPHERE, rms, unit
+from ..geometry import coverage, OVER_THE_SPHERE, unit
+from ..statistics import rms
 from ..table import Floats, in_unit, Poses
 from ..text import listed
 from ..units import MG, Units

@@ -51,6 +51,7 @@ import numpy as np
 from numpy.typing import NDArray
 import scipy
 
+from ..statistics import NORMAL_95, SIGMA_OF_MAD
 from ..table import Floats, Poses, range_of, Record
 
 LARGEST_BIAS = 1.0
@@ -65,11 +66,9 @@ _LARGEST_SD = 0.05
 _ENOUGH = 8                # fewest rests for a slope over temperature, and for a correlation
 _TAIL = 5e-4               # probability, on each side, of a rest left out or a slope by chance
 _CONFIDENCE = 0.975        # quantile at which the uncertainty of τ is included
-_NORMAL = 1.959964         # the same quantile of the normal distribution
 _CORRELATION_MAX = 0.9
 _PAIRED = 200              # rests used for the slopes of pairs
 _TINY = 1e-30              # variance added to rests without noise [(rad/s)²]
-_MAD = 1.4826
 _MAD_FEW = (1.0, 1.0, 1.196, 1.495, 1.363, 1.206, 1.200, 1.140, 1.129, 1.107)
 """Factors on the median absolute deviation of 0 to 9 values."""
 
@@ -229,7 +228,7 @@ def _agreeing(rests: Poses) -> NDArray[np.bool_]:
         left = left - temperature[:, np.newaxis] * _slope_of_pairs(left, temperature)
     left = np.abs(left - np.median(left, axis=0))
     factor = _MAD_FEW[count] if count < len(_MAD_FEW) else count / (count - 0.8)
-    spread = _MAD * factor * np.median(left, axis=0)
+    spread = SIGMA_OF_MAD * factor * np.median(left, axis=0)
     scatter = np.maximum(spread ** 2 - np.median(noise, axis=0), 0.0)
     limit = float(scipy.special.stdtrit(count - 1 - with_slope, 1.0 - _TAIL))
     return np.asarray(np.all(left ** 2 <= limit ** 2 * (noise + scatter), axis=1))
@@ -263,7 +262,7 @@ def _fitted(designs: Sequence[Floats], rests: Poses) -> tuple[Floats, Floats]:
     values, variance, residual = [], [], []
     for design, rate, noise in zip(designs, rests['rate'].T, _noise_of(rests).T, strict=True):
         count, size = design.shape
-        surplus = float(scipy.special.stdtrit(count - size, _CONFIDENCE)) / _NORMAL
+        surplus = float(scipy.special.stdtrit(count - size, _CONFIDENCE)) / NORMAL_95
         scatter = _scatter(design, rate, noise)
         found, inverse, left = _weighted(design, rate, noise + scatter)
         share = (noise + surplus ** 2 * scatter) / (noise + scatter) ** 2

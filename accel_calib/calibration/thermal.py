@@ -54,7 +54,8 @@ from ..effects import (
 from ..errors import InputError
 from ..estimate import judge
 from ..finding import Finding
-from ..geometry import coverage, rms, unit
+from ..geometry import coverage, unit
+from ..statistics import rms
 from ..stillness import Ramp
 from ..table import Floats, numbered, Poses, range_of
 from ..units import MG, Units

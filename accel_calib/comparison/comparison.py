@@ -23,7 +23,8 @@ from .agreement import (
 from ..calibration import Calibration
 from ..effects import Context, length_rows, sensor_force
 from ..errors import InputError
-from ..geometry import OVER_THE_SPHERE, rms
+from ..geometry import OVER_THE_SPHERE
+from ..statistics import rms
 from ..table import Floats
 from ..text import counted, listed
 from ..units import MG

@@ -36,7 +36,7 @@ import numpy as np
 
 from ..calibration import Calibration
 from ..effects import Context, length_rows, sensor_force
-from ..geometry import rms
+from ..statistics import rms, SIGMA_OF_MAD
 from ..table import Floats, range_of
 from ..text import counted
 from ..units import MG
@@ -156,7 +156,6 @@ def _described(kind: str, rests: int, clear: bool, error: Floats, covariance: Fl
 
 _LEAST_NOISE = 2e-5   # smallest noise of a rest [g]
 _LEARN = 0.02         # relative step of the scatter per rest; larger in the beginning
-_MEDIAN = 0.6745      # median of the absolute value of a standard normal variable
 _WARMER = 2.0         # temperatures outside of the range by more cause an advice [°C]
 
 
@@ -296,7 +295,7 @@ def _scatter(state: Drift, rests: tuple[RestError, ...]) -> float:
     covariance = _covariance(state, rests)
     stated = np.sqrt(covariance[0, 0] + covariance[1, 1] - 2.0 * covariance[0, 1])
     step = max(_LEARN, 2.0 / (state.count + 4.0))
-    more = abs(rests[0].error - rests[1].error) > _MEDIAN * stated
+    more = abs(rests[0].error - rests[1].error) > stated / SIGMA_OF_MAD
     return max(1.0, state.scatter * float(np.exp(step if more else -step)))
 
 

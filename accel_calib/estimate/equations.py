@@ -59,6 +59,7 @@ import scipy
 
 from ..effects import AtContext, Context, EachShape, Model, times
 from ..geometry import unit
+from ..statistics import NORMAL_95, over_axes
 from ..table import Poses
 from ..units import Floats, Indices
 
@@ -99,7 +100,6 @@ _RIGHT = 0.7
 """Prior probability that the measured noise is correct."""
 
 _INTERVAL = 0.95
-_NORMAL = 1.959964
 _SCALES = np.logspace(-2.0, 4.0, 121)
 _ONE = 40
 """Values of λ; index of λ = 1."""
@@ -337,7 +337,7 @@ class _Known:
     def __init__(self, model: Model, poses: _Kind) -> None:
         self._sigma, self._context = poses.s.ravel(), poses.context
         self.which, self.pose = poses.which, np.repeat(poses.which, 3)
-        self.force, self.scale = poses.context['reference'], np.sqrt(np.mean(poses.s ** 2, axis=1))
+        self.force, self.scale = poses.context['reference'], over_axes(poses.s)
         reading = model.at(self._context).reading(self.force)
         self.residual = (poses.reading - reading).ravel() / self._sigma
 
@@ -360,7 +360,7 @@ class _Shared:
         self._sigma, self._context, self._group = poses.s, poses.context, poses.group
         self._starts = np.flatnonzero(np.diff(poses.group, prepend=-1))
         self.which, self.pose = poses.which, np.repeat(poses.which, 3)
-        self.scale = np.sqrt(np.mean(poses.s ** 2, axis=1))
+        self.scale = over_axes(poses.s)
         here = model.at(self._context)
         self.force = unit(self._summed(here.force(poses.reading)))[self._group]
         for _ in range(_TURNS):
@@ -429,12 +429,12 @@ def variance_factor(chi2: float, dof: int, noise_known: bool) -> float:
     above = int(np.argmax(part >= _INTERVAL))
     share = (_INTERVAL - part[above - 1]) / (part[above] - part[above - 1])
     between = width[above - 1] * (width[above] / width[above - 1]) ** share
-    return float(between / _NORMAL) ** 2
+    return float(between / NORMAL_95) ** 2
 
 
 def _student(dof: float) -> float:
     """Return the squared ratio of the 95 % intervals of Student's t and a normal variable."""
-    return float(scipy.special.stdtrit(dof, 0.5 + _INTERVAL / 2.0) / _NORMAL) ** 2
+    return float(scipy.special.stdtrit(dof, 0.5 + _INTERVAL / 2.0) / NORMAL_95) ** 2
 
 
 def belief_beside(dof: int, chi2: float, noise_known: bool) -> float:

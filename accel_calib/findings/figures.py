@@ -34,7 +34,7 @@ from ..comparison import NAMES
 from ..effects import AXES, effect_named, LADDER, Model, MODELS, predict, value_unit
 from ..estimate import pose_noise, sensing_axes, variance_factor
 from ..finding import Rating
-from ..geometry import rms
+from ..statistics import rms
 from ..table import Floats
 from ..text import signed
 from ..units import MG

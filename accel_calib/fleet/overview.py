@@ -48,6 +48,7 @@ from ..comparison import NAMES
 from ..effects import LADDER
 from ..estimate import Prior
 from ..findings import rate_fleet, Rating, scale_of
+from ..statistics import SIGMA_OF_MAD
 from ..table import Floats
 from ..text import counted, short
 
@@ -59,7 +60,6 @@ FEWEST = 5
 
 _FALSE = 0.05
 _CHANCE = 0.01
-_MAD = 1.4826
 _EFFICIENCY = 0.37
 """Efficiency of the median distance as a measure of the spread (Rousseeuw and Croux 1993)."""
 
@@ -217,7 +217,7 @@ def odd_sensors(values: Mapping[str, Values]) -> list[Odd]:
     names, table = list(values), np.array([each.mean for each in values.values()])
     own = np.array([each.deviation for each in values.values()])
     away = table - np.median(table, axis=0)
-    spread = np.hypot(_MAD * np.median(np.abs(away), axis=0), own)
+    spread = np.hypot(SIGMA_OF_MAD * np.median(np.abs(away), axis=0), own)
     far = np.abs(away) / np.maximum(spread, 1e-9)
     limit = -scipy.special.stdtrit(_EFFICIENCY * len(names), _CHANCE / (2.0 * table.size))
     found = [(names[i], NAMES[k], float(table[i, k]), float(far[i, k]))
@@ -295,7 +295,7 @@ def estimated(values: Floats, covariances: Floats) -> Prior:
     """Return mean and covariance for another sensor, from (n, p) values, (n, p, p) covariances."""
     count, size = values.shape
     mean = np.median(values, axis=0)
-    spread = np.median(np.abs(values - mean), axis=0) / 0.6745 + _LEAST_SPREAD_G
+    spread = SIGMA_OF_MAD * np.median(np.abs(values - mean), axis=0) + _LEAST_SPREAD_G
     covariance: Floats = np.diag(spread ** 2)
     for _ in range(200):
         before, away = covariance, values - mean  # a step of expectation maximisation

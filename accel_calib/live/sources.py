@@ -88,7 +88,7 @@ def is_port(name: str) -> bool:
 
 
 @contextmanager
-def open_source(name: str, options: LogOptions, *, baud: int = 115200, speed: float = 1.0
+def open_source(name: str, options: LogOptions, *, baud: int, speed: float = 1.0
                 ) -> Iterator[Source]:
     """
     Open a serial port, or a recording.

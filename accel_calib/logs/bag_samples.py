@@ -29,6 +29,7 @@ import numpy as np
 
 from .bag import Bag, BLOCK, imus_of, NUMBERS, open_bag, Received, TEMPERATURE
 from .columns import topic_and_field
+from .names import ZEROS
 from .serialized import doubles_at, NANO, stamps_of
 from ..errors import InputError
 from ..table import concatenated, Floats, Recording
@@ -74,7 +75,7 @@ class Quantity:
 QUANTITIES = (
     Quantity('temperature', 'temperature', ('temperature', 'temp'),
              ('temp', 'therm'), (('°C', -100.0, 200.0, 1.0, 0.0),
-                                 ('K', 200.0, 450.0, 1.0, -273.15))),
+                                 ('K', 200.0, 450.0, 1.0, ZEROS['K']))),
     Quantity('supply_voltage', 'supply voltage',
              ('supply_voltage', 'voltage', 'volt', 'vdd', 'vcc'),
              ('volt', 'vdd', 'vcc', 'supply', 'battery'),

@@ -40,7 +40,8 @@ from .state import fitted_state, with_effect
 from .steps import percent, shown_name
 from ..effects import effect_named, Model, WANDER
 from ..estimate import Fit, judge, kinds
-from ..geometry import attitude_words, ATTITUDES, over_axes, spread_directions
+from ..geometry import attitude_words, ATTITUDES, spread_directions
+from ..statistics import over_axes
 from ..table import Floats, is_quantity, Poses
 
 VARIED = ('temperature', 'supply_voltage', 'time', 'std')

@@ -26,7 +26,8 @@ from ..calibration import determines, NORM_MODELS, with_history
 from ..effects import (
     Context, Effect, effect_named, factors_of, included, kind_of, linear_model, Model)
 from ..estimate import estimate, Fit, kinds, left_out, NotConvergedError
-from ..geometry import rms, unit
+from ..geometry import unit
+from ..statistics import rms
 from ..table import Floats, Poses
 from ..units import MG
 

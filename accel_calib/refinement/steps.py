@@ -30,7 +30,8 @@ from ..effects import (
     is_effect, kind_of, Model, parameter_names, PROCESSES, TO_SEPARATE, unit_of, value_unit,
     variable_of, variable_words, WANDER)
 from ..estimate import kinds
-from ..geometry import ATTITUDES, axes_of_signs, rms
+from ..geometry import ATTITUDES, axes_of_signs
+from ..statistics import rms
 from ..table import column_of, Floats, Poses
 from ..text import counted, listed, with_minus, with_sd
 from ..units import MG

@@ -29,8 +29,8 @@ from .sheet import (
 from ..effects import (
     AXES, CARRIERS, curve_unit, effect_named, EMPIRICAL, empirical_parts, parameter_names,
     variable_words)
-from ..geometry import over_axes
 from ..refinement import base_words, chance, values_of, verdict_words
+from ..statistics import over_axes
 from ..table import Floats
 from ..text import short
 from ..units import MG

@@ -24,7 +24,8 @@ from .sheet import (
 from ..calibration import (
     Calibration, directions_in, errors_after, errors_before, in_g, with_history)
 from ..effects import acting_temperature, AXES, effect_named, rate_at, sensor_force
-from ..geometry import over_axes, rms, uncovered, unit
+from ..geometry import uncovered, unit
+from ..statistics import over_axes, rms
 from ..table import column_of, Floats, Poses
 from ..text import milli, percentage, short, with_minus
 from ..units import MG

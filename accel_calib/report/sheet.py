@@ -34,6 +34,7 @@ from xml.etree import ElementTree
 from .. import __version__
 from ..disk import write_atomically
 from ..errors import InputError
+from ..statistics import NORMAL_95
 from ..table import Floats
 from ..text import table
 
@@ -199,7 +200,7 @@ AXIS_COLOURS = (AFTER, ACCENT, THIRD)
 HEIGHT_INCHES = 3.3
 WIDTH_INCHES = 4.8
 
-BAND = 1.96
+BAND = NORMAL_95
 """Half the width of a band, in standard deviations: 95 %."""
 
 EDGE: Any = {'markeredgecolor': PAPER, 'markeredgewidth': 0.4}

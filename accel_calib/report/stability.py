@@ -27,8 +27,8 @@ from .sheet import (
 from ..comparison import Comparison, History, Parameter
 from ..findings import (
     change_in_words, CROSS, GAINS, in_words, OFFSETS, rate_comparison, rate_noise, scale_of)
-from ..geometry import rms
 from ..noise import AxisNoise, duration, FIGURES, Kind, NoiseFigures, shown_unit, TYPICAL, WORDS
+from ..statistics import rms
 from ..table import Floats
 from ..text import power_of_ten, short, with_minus, with_sd
 from ..units import is_native

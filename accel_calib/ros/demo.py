@@ -43,7 +43,7 @@ from .declare import LATCHED, SENSOR
 from .run import own_domain
 from ..effects import parse_effect
 from ..errors import AccelCalibError
-from ..geometry import rms
+from ..statistics import rms
 from ..stored import read_calibration
 from ..table import Floats
 from ..text import counted

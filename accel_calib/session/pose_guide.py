@@ -28,13 +28,10 @@ import numpy as np
 from ..calibration import directions_of, lies_in_cone, next_pose, NextPose, request_for
 from ..errors import RefusedFitError
 from ..estimate import fit_sphere, pose_noise
-from ..geometry import attitude_words, ATTITUDES, axes_of_signs, coverage, unit
+from ..geometry import attitude_words, ATTITUDES, axes_of_signs, coverage, TAKEN, unit
 from ..refinement import PlannedPose
 from ..table import Floats, Poses
 from ..units import MG, Units
-
-_TAKEN = math.cos(math.radians(17.0))
-"""A pose within 17° of a planned one counts as taken, as for the next pose of a fit."""
 
 _FOLLOWED = math.cos(math.radians(30.0))
 """A rest within 30° of what was asked for has followed; the next orientations are 35° away."""
@@ -172,7 +169,7 @@ class Guide:
         elif self.planned:
             new = plan.up[self._begun:]
             self.planned = tuple(
-                each for each in self.planned if not np.any(new @ each.up >= _TAKEN))
+                each for each in self.planned if not np.any(new @ each.up >= TAKEN))
 
     @property
     def _is_usual(self) -> bool:
@@ -217,7 +214,7 @@ class Guide:
             self.missed = 0
             return ''
         words = f'asked for {_signs(asked)}, the sensor reads {_signs(read)}'
-        if all(each @ wanted < _TAKEN for each in self.skipped):
+        if all(each @ wanted < TAKEN for each in self.skipped):
             self.skipped.append(wanted)
         self.missed, self.is_stale = self.missed + 1, True
         axes = self._likely_axes(plan.up)

@@ -59,6 +59,7 @@ from .chunks import (
 from .rule import (
     DWELL_SLOPE_G, HORIZON, RELATIVE, rounding_left, Rule, STRENGTH, SURE, TURN_G, WEAK_STRENGTH)
 from .trend import excess_of_means, lines_through, strength_of
+from ..statistics import SIGMA_OF_MAD
 from ..table import Floats
 
 _FIGURES = [
@@ -150,7 +151,6 @@ _BIAS_DWELLS = 5    # fewest dwells that determine the bias of the gyro
 _GYRO_RATE = np.radians(0.25)
 """Mean rate minus the bias that indicates turning [rad/s]."""
 _SPREADS = 3.0      # standard deviations of the bias over the dwells that must be below this rate
-_MAD = 1.4826       # ratio of standard deviation to median absolute deviation
 
 
 @dataclass(frozen=True)
@@ -285,7 +285,7 @@ def _by_gyro(table: Records, quiet: NDArray[np.bool_], rule: Rule
     if not rule.known or known.sum() < _BIAS_DWELLS:
         return np.zeros_like(quiet), np.zeros_like(quiet)
     off = rates - np.median(rates[:, known], axis=1, keepdims=True)
-    spread = _MAD * float(np.max(np.median(np.abs(off[:, known]), axis=1)))
+    spread = SIGMA_OF_MAD * float(np.max(np.median(np.abs(off[:, known]), axis=1)))
     tilting = (np.linalg.norm(np.cross(off, up, axis=0), axis=0)
                / np.maximum(np.linalg.norm(up, axis=0), 1e-300))
     alive = np.all(table['average'].T[3:] > 0.0, axis=0)

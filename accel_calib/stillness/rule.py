@@ -53,6 +53,7 @@ from numpy.typing import NDArray
 from .chunks import CaptureSettings, chained, Chunks, CHUNKS_PER_WINDOW, Records
 from .levels import Known, Levels
 from .trend import columns_of, oscillation, sliding_max, sliding_sum, Stretch, stretch
+from ..statistics import rms
 from ..table import Floats
 from ..units import Units
 
@@ -363,7 +364,7 @@ def common_lengths(means_g: Floats) -> Floats | None:
         centre = -values[3:] / (2.0 * values[:3])
         radius = np.sqrt((1.0 + np.sum(values[:3] * centre**2)) / values[:3])
         lengths = np.linalg.norm((means_g - centre) / radius, axis=1)
-        if np.sqrt(np.mean((lengths[kept] - 1.0)**2)) < AGREE_G:
+        if rms(lengths[kept] - 1.0) < AGREE_G:
             return lengths if np.all(np.abs(centre) < LARGEST_OFFSET_G) else None
         left = columns[kept] @ values - 1.0
         own = np.maximum(1.0 - np.sum(onto**2, axis=1), 1e-9)

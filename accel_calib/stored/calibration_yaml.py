@@ -36,7 +36,7 @@ from ..errors import (
     StoredCalibrationError)
 from ..estimate import Prior
 from ..finding import Finding, KINDS, LEVELS, without
-from ..geometry import rms
+from ..statistics import rms
 from ..table import Autopilot, check_values, COLUMNS, Floats, is_quantity, LARGEST, Poses
 from ..text import counted, LONGEST_NAME, plain, some
 from ..units import FRAMES, MODEL_NAMES, UNIT_NAMES, Units
