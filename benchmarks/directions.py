@@ -4,7 +4,8 @@
 """Sensors, directions and poses, for benchmarks that draw them, and the error of a fit."""
 
 from accel_calib.effects import Model, model_with
-from accel_calib.geometry import rms, unit
+from accel_calib.geometry import unit
+from accel_calib.statistics import rms
 from accel_calib.table import Floats, numbered, Poses
 from accel_calib.units import MG
 import numpy as np

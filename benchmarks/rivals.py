@@ -34,9 +34,9 @@ os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')  # each process
 from accel_calib.calibration import fit_poses, in_g, with_history  # noqa: E402
 from accel_calib.effects import EFFECTS, factors_of  # noqa: E402
 from accel_calib.estimate import judge  # noqa: E402
-from accel_calib.geometry import rms  # noqa: E402
 from accel_calib.refinement.linear import orthonormal, SEEN  # noqa: E402
 from accel_calib.refinement.state import candidates  # noqa: E402
+from accel_calib.statistics import rms  # noqa: E402
 from accel_calib.table import Floats, Poses  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
 from figures import commit, markdown, parser  # noqa: E402
