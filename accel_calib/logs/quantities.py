@@ -178,6 +178,7 @@ class Quantities:
         return with_sign(values, self.modulus[key]) if key in self.modulus else values
 
 
+@np.errstate(over='ignore', invalid='ignore')  # numbers beyond any sensor are refused later
 def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
     """Return the conversion of the columns, from the first block of a log; see above."""
     made = Quantities(columns, units_of('m/s2', options.gravity), Clock(columns))

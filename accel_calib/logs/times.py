@@ -249,7 +249,8 @@ def _step_of(stamps: Floats) -> float:
         steps = -steps
     middle = float(np.median(steps))
     if middle > 0.0:  # the mean, because stamps can be rounded, but without interruptions
-        return float(np.mean(steps[(steps >= 0.0) & (steps <= _GAP * middle)]))
+        usual = steps[(steps >= 0.0) & (steps <= _GAP * middle)]
+        return float(np.mean(usual)) if len(usual) else middle
     return float(np.maximum(steps, 0.0).sum()) / len(steps)
 
 

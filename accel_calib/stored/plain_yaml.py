@@ -29,7 +29,7 @@ from yaml.resolver import Resolver
 
 from ..disk import check_regular
 from ..table import Floats
-from ..text import one_line
+from ..text import one_line, some
 
 # The first is eight times as fast, but not in every build of PyYAML.
 SafeLoader: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
@@ -200,7 +200,7 @@ def _checked(value: Any, where: str, kind: type[Kind]) -> Kind:
 def choice_at(content: Mapping[str, Any], key: str, choices: tuple[str, ...]) -> Any:
     """Return the text under a key, which must be one of the choices."""
     if content[key] not in choices:
-        raise ValueError(f'{key} is {shown(content[key])}, expected one of {", ".join(choices)}')
+        raise ValueError(f'{key} is {shown(content[key])}, expected one of {some(choices)}')
     return content[key]
 
 
