@@ -11,6 +11,7 @@ Each rule yields what it finds, with what removes it.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 import math
 from typing import TYPE_CHECKING
 
@@ -133,6 +134,10 @@ def _limited(expected: Expected) -> Iterator[Finding]:
     elif expected.is_partial:
         yield Finding('partial', 'the poses lie near one direction: in other orientations the '
                       f'error is up to {mg(expected.worst_mg)}', _more_poses(expected), 'USABLE')
+    for each in expected.calibration.noted:
+        if each.kind == 'limited' and expected.error_mg > BAD_ERROR.value:
+            yield replace(each, text=f'{each.text}; by the others alone the error may be '
+                          f'{mg(expected.error_mg)}', level='BAD')
     poses = expected.calibration.poses
     left_out = [each for each in expected.calibration.rejected if each.kind != 'clipped']
     if left_out and 100.0 * len(left_out) > LEFT_OUT.value * len(poses):
