@@ -68,7 +68,7 @@ setup(
         'fleet': FLEET,
         # Completion of the command line by the shell.
         'completion': ['argcomplete>=3.1.4,<4'],
-        'docs': ['sphinx<10', 'myst-parser<6', 'sphinx-rtd-theme<4'],
+        'docs': ['sphinx<10', 'myst-parser<6', 'pydata-sphinx-theme<0.25'],
         'test': ['aiohttp>=3.9.1,<4', 'allantools>=2024.4,<2025', 'argcomplete>=3.1.4,<4',
                  'h5py>=3.10,<4', 'hypothesis>=6.100,<7', 'imucal>=2.4,<3',
                  'matplotlib>=3.6,<3.12', 'openpyxl>=3.1.2,<4', 'pandas>=2.1.4,<4',

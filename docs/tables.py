@@ -2,11 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Make tables and API reference of the documentation, and the parameters: ``python docs/tables.py``.
+Make the tables of the documentation, and the parameters of the calibrator, from the code.
 
-A table stands between ``<!-- NAME -->`` and ``<!-- end -->`` in a page. The reference is the whole
-page ``api.md``, and the parameters of the calibrator are ``config/calibrator.yaml``. Tests compare
-all with the code. The package need not be installed.
+A line of a page that begins with ``<!-- NAME -->`` stands for the table ``NAME``: the site has the
+table in its place (`conf.py`), and ``python docs/tables.py NAME`` prints it. Measured tables stand
+in their page, between such a line and ``<!-- end -->``. ``python docs/tables.py`` writes
+``config/calibrator.yaml``; a test compares it with the code. The package need not be installed.
 
 """
 
@@ -21,7 +22,7 @@ import sys
 from textwrap import wrap
 
 HERE = Path(__file__).resolve().parent
-sys.path[:0] = [str(HERE.parent), str(HERE)]
+sys.path[:0] = [str(HERE.parent)]
 
 from accel_calib.effects import EFFECTS  # noqa: E402
 from accel_calib.finding import KINDS, STEPS  # noqa: E402
@@ -32,7 +33,6 @@ from accel_calib.session import CalibratorSettings  # noqa: E402
 from accel_calib.session.settings import default_of, expected  # noqa: E402
 from accel_calib.stored.exports import FORMATS as EXPORTS  # noqa: E402
 from accel_calib.table import COLUMNS  # noqa: E402
-import api_page  # noqa: E402
 
 
 def columns() -> Iterator[str]:
@@ -117,7 +117,6 @@ TABLES: Tables = {
     'columns': columns, 'effects': effects, 'exports': exports,
     'findings': partial(kinds, KINDS), 'formats': formats, 'names': names, 'rating': rating,
     'steps': partial(kinds, STEPS)}
-REFERENCE = 'api.md'
 PARAMETERS = HERE.parent / 'config' / 'calibrator.yaml'
 COMMENT = '    # '
 
@@ -137,21 +136,21 @@ def parameters() -> Iterator[str]:
 
 
 def with_tables(text: str, made: Tables = TABLES) -> str:
-    """Return the text of a page with its tables, by default those of the code."""
+    """Return the text of a page with tables, by default those of the code, in their places."""
     for name, table in made.items():
         rows = '\n'.join(table()).replace('\\', r'\\')
-        text = re.sub(rf'(<!-- {name} -->\n).*?(<!-- end -->)', rf'\1\n{rows}\n\n\2', text,
-                      flags=re.DOTALL)
+        text = re.sub(rf'^<!-- {name} -->(?:\n.*?<!-- end -->|[^\n]+)',
+                      f'<!-- {name} -->\n\n{rows}\n\n<!-- end -->', text,
+                      flags=re.MULTILINE | re.DOTALL)
     return text
 
 
 def main() -> None:
-    """Write reference and parameters, and the tables into all other pages."""
-    (HERE / REFERENCE).write_text(api_page.page(), encoding='utf-8')
-    PARAMETERS.write_text('\n'.join([*parameters(), '']), encoding='utf-8')
-    for page in sorted(HERE.glob('*.md')):
-        if page.name != REFERENCE:
-            page.write_text(with_tables(page.read_text(encoding='utf-8')), encoding='utf-8')
+    """Print the tables that are named, or write the parameters."""
+    for name in sys.argv[1:]:
+        sys.stdout.writelines(f'{line}\n' for line in TABLES[name]())
+    if not sys.argv[1:]:
+        PARAMETERS.write_text('\n'.join([*parameters(), '']), encoding='utf-8')
 
 
 if __name__ == '__main__':

@@ -159,7 +159,7 @@ def provide(name):
 
 @pytest.mark.parametrize('page', [
     page for page in PAGES if '```python' in text_of(page)
-    and page not in {'docs/api.md', 'docs/fleet.md'}])  # signatures; test_fleet.py runs it
+    and page != 'docs/fleet.md'])  # test_fleet.py runs it
 def test_snippets_of_python_run_and_print_what_the_page_shows(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for name in re.findall(r"'([\w./]+)'", text_of(page)):
