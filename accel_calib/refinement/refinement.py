@@ -29,13 +29,15 @@ from .plan import plan_poses, PosePlan
 from .search import Found, search
 from .state import fitted_state, is_noise, State
 from .steps import (
-    advice_for, not_testable, plain_name, Stage, Step, steps_of, untestable, Verdict, verdict_of)
+    advice_for, not_testable, Stage, Step, steps_of, unchanged, untestable, Verdict, verdict_of)
 from ..calibration import (
     Calibration, check_sensor, CLIPPED, fit_findings, fit_poses, fit_with_fleet, FLEET, FleetPrior,
     gated, in_g, LARGEST_DILUTION, OF_A_FIT, only_norm, posterior, quality_of, record_of,
     refuse_if_unfit, Rejected, rejected_by, sound_rows, sure_rows, uncertainty_g, with_history,
     with_rest_noise)
-from ..effects import CHANGES, included, Model, MODELS, parameter_names, PROCESSES, with_vector
+from ..effects import (
+    CHANGES, EffectKey, included, Model, MODELS, OwnEffect, parameter_names, PROCESSES,
+    with_vector)
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import fit_sphere, judge, NotConvergedError, outliers, variance_factor
 from ..finding import explained_by, Finding, without as without_kinds
@@ -117,6 +119,8 @@ class Refinement(Record):
     one_curve : tuple of str
         Two nonlinearities in the same proportion on each axis, as parts of one curve; or empty.
         The second one may not be named, and only show beside the first.
+    also : tuple of OwnEffect
+        Own effects of the user that were tried.
 
     """
 
@@ -136,6 +140,7 @@ class Refinement(Record):
     plan: PosePlan
     undecided: bool = False
     one_curve: tuple[str, ...] = ()
+    also: tuple[OwnEffect, ...] = ()
 
     def __repr__(self) -> str:
         names = ' + '.join([self.calibration.name, *(step.effect for step in self.steps)])
@@ -187,7 +192,7 @@ def base_words(result: Refinement) -> str:
 
 
 def refine(poses: Poses, units: Units, *, base: str | Calibration | FleetPrior = 'auto',
-           sensor: str = '', date: str = '', also: tuple[str, ...] = ()) -> Refinement:
+           sensor: str = '', date: str = '', also: tuple[OwnEffect, ...] = ()) -> Refinement:
     """
     Find effects that a model lacks, and add them to it.
 
@@ -203,8 +208,8 @@ def refine(poses: Poses, units: Units, *, base: str | Calibration | FleetPrior =
         of the same model are combined with model 10 of these poses.
     sensor, date : str
         Name of the sensor and date for the refined calibration.
-    also : tuple of str
-        Names of own effects of the user, which are tried beside the catalogue.
+    also : tuple of OwnEffect
+        Own effects of the user, which are tried beside the catalogue.
 
     Raises
     ------
@@ -237,7 +242,7 @@ def refine(poses: Poses, units: Units, *, base: str | Calibration | FleetPrior =
 
 
 def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Units,
-            base: str | Calibration, also: tuple[str, ...]) -> Refinement:
+            base: str | Calibration, also: tuple[OwnEffect, ...]) -> Refinement:
     """Return the refinement with some of the poses; the others are already rejected."""
     sound, unsound = sound_rows(used, units)
     if len(sound) < _LEAST_POSES:
@@ -328,10 +333,11 @@ def _record(calibration: Calibration, found: Found, given: Given) -> Refinement:
     return Refinement(
         verdict, final.floor_mg, start.gap_mg(start.fit.residual), final.gap_mg(final.residual),
         steps, outliers, missing, (*advice, *plan.advice), refined, refusal, final.poses_g,
-        final.fit.equations.force, stages, plan, undecided, found.one_curve)
+        final.fit.equations.force, stages, plan, undecided, found.one_curve,
+        found.also)
 
 
-def _refine_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, also: tuple[str, ...]
+def _refine_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, also: tuple[OwnEffect, ...]
                        ) -> Refinement:
     """
     Find effects beyond model 10, with the typical values of a fleet for model 10.
@@ -408,7 +414,7 @@ def base_of(poses: Poses, units: Units, name: str) -> Calibration:
         except RefusedFitError:
             if name != 'auto' or 'orientation' not in poses:
                 raise
-    values: dict[str, Floats] = {}
+    values: dict[EffectKey, Floats] = {}
     if units.is_native:
         mat_w, vec_v = fit_sphere(poses.reading)
         units = Units('native', float(mat_w[0, 0]))
@@ -425,9 +431,9 @@ def with_changes(model: Model) -> tuple[Model, Floats]:
     The (q, p) matrix maps the values of `model` to those of the result.
 
     """
-    effects: list[str] = []
+    effects: list[EffectKey] = []
     for name in sorted(model.effects, key=CHANGES.__contains__):  # the changes last
-        own = plain_name(name)
+        own = unchanged(name)
         contained = included((own,)).intersection(effects)
         if contained:
             effects[effects.index(contained.pop())] = own
@@ -435,7 +441,7 @@ def with_changes(model: Model) -> tuple[Model, Floats]:
             effects.append(own)
     names = parameter_names(tuple(effects))
     owners: list[tuple[str, ...]] = []
-    for own in map(plain_name, model.effects):  # of each value, those of the result it adds to
+    for own in map(unchanged, model.effects):  # of each value, those of the result it adds to
         whole = tuple(effect for effect in effects if own in included((effect,)))
         owners += [(value,) if own in effects else parameter_names(whole)
                    for value in parameter_names((own,))]
@@ -505,20 +511,19 @@ def refitted(before: Calibration, poses: Poses, *, sensor: str = '', date: str =
     return replace(calibration, reason=before.reason, sensor=sensor or before.sensor, date=date)
 
 
-def refined_calibration(base: Calibration, final: State, added: tuple[str, ...], given: Given
+def refined_calibration(base: Calibration, final: State, added: tuple[EffectKey, ...], given: Given
                         ) -> tuple[Calibration, tuple[str, ...]]:
     """Return the refined calibration, and the refusal if it must not be used."""
     model, matrix = with_changes(final.model)
     kept, poses = final.poses_g, given.poses
     if 'new' in kept:  # beside the poses of the stored calibration
-        unchanged = final.model.effects == model.effects
-        if unchanged and all(key in base.poses for key in model.needs):
+        if final.model.effects == model.effects and all(key in base.poses for key in model.needs):
             poses = with_stored(given.poses, base)
         else:
             kept = kept.take(kept['new'] > 0.0)
     at_poses = judge(model, kept if base.form.known_orientation
                      else kept.without_columns(*_ORIENTATION))
-    names = ', '.join(plain_name(name) for name in added)
+    names = ', '.join(str(unchanged(name)) for name in added)
     others = without_kinds(base.noted, *OF_A_FIT)
     findings = [each for each in others if not given.stored or each.kind == 'flat_pose']
     refined = replace(
