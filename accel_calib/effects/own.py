@@ -206,12 +206,13 @@ class OwnEffect(EffectRecord):
     def entry(self) -> Effect:
         over = tuple(key for key in self._columns if key != 'force')
         return Effect(
-            self.words, 'own effect', (_ALL,) if self.axes == _ALL else tuple(self.axes),
-            self.unit, self.typical, 0.5,
-            tuple(Term(k * (self.axes != _ALL), axis, ONE) for k, axis in enumerate(self._places)),
-            self._factor if self._columns else None,
-            tuple(dict.fromkeys(need for key in over for need in _NEEDS.get(key, (key,)))),
-            tuple(self.constants), self._shapes if self.constants else None, over=over,
+            words=self.words, term='own effect', unit=self.unit, typical=self.typical,
+            parameters=(_ALL,) if self.axes == _ALL else tuple(self.axes), plausible_g=0.5,
+            terms=tuple(Term(k * (self.axes != _ALL), axis, ONE)
+                        for k, axis in enumerate(self._places)),
+            factor=self._factor if self._columns else None, over=over,
+            needs=tuple(dict.fromkeys(need for key in over for need in _NEEDS.get(key, (key,)))),
+            shape=tuple(self.constants), shapes=self._shapes if self.constants else None,
             bounds=tuple((low, high) for low, high, *_ in self.constants.values()),
             of_force='force' in self._columns, own=True)
 

@@ -260,10 +260,11 @@ def _entry_of_covariate(covariate: Covariate) -> Effect:
             yield np.array([np.mean(values) for values in known])
 
     return Effect(
-        f'{what} that changes with {" times ".join(map(variable_words, columns))}',
-        f'coefficient of {covariate.variable}', names, unit, np.inf, 0.5, terms, departure,
-        columns, ('zero',) if len(columns) == 1 else tuple(f'zero_{each}' for each in columns),
-        means, (0.0,) * len(columns),
+        words=f'{what} that changes with {" times ".join(map(variable_words, columns))}',
+        term=f'coefficient of {covariate.variable}', parameters=names, unit=unit, typical=np.inf,
+        plausible_g=0.5, terms=terms, factor=departure, needs=columns, shapes=means,
+        shape=('zero',) if len(columns) == 1 else tuple(f'zero_{each}' for each in columns),
+        usual=(0.0,) * len(columns),
         includes=(replace(covariate, power=1),) if has_square else ())
 
 

@@ -221,7 +221,8 @@ def _accepted(score: float, chosen: Set, tried: int) -> FoundCurve | None:
     curve = replace(waves[0], modes=tuple(wave.modes[0] for wave in waves))
     values = np.concatenate([*(chosen.values[block] for block in blocks), first.shape])
     explained = 1.0 - _held_out(chosen) / max(_held_out(nothing), 1e-300)
-    return FoundCurve(curve, values, score, chosen.out, p_value, explained)
+    return FoundCurve(name=curve, values=values, score=score, out=chosen.out, p_value=p_value,
+                      explained=explained)
 
 
 def _held_out(chosen: Set) -> float:

@@ -128,16 +128,16 @@ class Refinement(Record):
     noise_floor_mg: float | None
     gap_mg: float
     remaining_gap_mg: float
-    steps: tuple[Step, ...]
     disturbed_poses: tuple[int, ...]
     not_testable: tuple[tuple[str, str], ...]
     advice: tuple[str, ...]
     calibration: Calibration
-    refusal: tuple[str, ...]
     poses_g: Poses
     force: Floats
     stages: tuple[Stage, ...]
-    plan: PosePlan
+    steps: tuple[Step, ...] = ()
+    refusal: tuple[str, ...] = ()
+    plan: PosePlan = PosePlan()
     undecided: bool = False
     one_curve: tuple[str, ...] = ()
     also: tuple[OwnEffect, ...] = ()
@@ -231,17 +231,18 @@ def refine(poses: Poses, units: Units, *, base: str | Calibration | FleetPrior =
         sure, doubts = sure_rows(poses)
         with explained_by(poses.findings):
             try:
-                found = _refine(poses, sure, doubts, units, base, also)
+                found = _refine(poses, sure, doubts, units, base=base, also=also)
             except RefusedFitError:
                 if not doubts:
                     raise
-                found = _refine(poses, poses, (), units, base, also)  # with the doubtful poses
+                # With the doubtful poses.
+                found = _refine(poses, poses, (), units, base=base, also=also)
     made = found.calibration
     return replace(found, calibration=replace(
         made, sensor=sensor or poses.sensor or made.sensor, date=date or made.date))
 
 
-def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Units,
+def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Units, *,
             base: str | Calibration, also: tuple[OwnEffect, ...]) -> Refinement:
     """Return the refinement with some of the poses; the others are already rejected."""
     sound, unsound = sound_rows(used, units)
@@ -277,8 +278,9 @@ def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Un
                      'over the table, to bound its time and memory; it does not look for '
                      'disturbed poses among the others; choose rows to use others')
     note = (*(poses.findings if stored else ()), *((sample,) if len(poses_g) < total else ()))
-    given = Given(poses, poses_g, stored is not None, (*rejected, *unsound), note)
-    return _record(calibration, found, given)
+    given = Given(poses, poses_g, stored=stored is not None, rejected=(*rejected, *unsound),
+                  notes=note)
+    return _conclude(calibration, found, given)
 
 
 def _along_ways(final: State, at: Callable[[Model], Poses]) -> Poses:
@@ -305,7 +307,8 @@ def _is_same_way(model: Model, *ways: Poses) -> bool:
     return bool(np.max(np.abs(one - other), initial=0.0) < 1e-5)
 
 
-def _record(calibration: Calibration, found: Found, given: Given) -> Refinement:
+def _conclude(calibration: Calibration, found: Found, given: Given) -> Refinement:
+    """Return the refinement of a calibration by what a search has found."""
     start, final = found.base, found.final
     if given.stored:  # as stored, without a fit
         kept = calibration.held(start.poses_g)
@@ -316,7 +319,8 @@ def _record(calibration: Calibration, found: Found, given: Given) -> Refinement:
     if verdict == 'no_gap' and calibration.reason != 'ideal' and not given.stored:
         alone = given.poses_g.take(np.isin(given.poses_g.row, calibration.used_poses.row))
         advice = advice_for(found, steps, missing, len(calibration.rejected))
-        return _of_fit(calibration, alone, missing, (*advice, *plan.advice))
+        state = State(judge(Model(calibration.model.values), alone))
+        return _record_of(calibration, state, missing, (*advice, *plan.advice))
     of_search = [*rejected_by(found.final.model, given.poses_g.take(found.outliers))]
     if found.clipped is not None:
         of_search += [Rejected(int(row), CLIPPED, 'clipped')
@@ -330,11 +334,11 @@ def _record(calibration: Calibration, found: Found, given: Given) -> Refinement:
     verdict, undecided = verdict_of(found, steps, refused=bool(refusal))
     advice = advice_for(found, steps, missing, len(outliers),
                         unexplained=verdict == 'unexplained' and not undecided)
-    return Refinement(
-        verdict, final.floor_mg, start.gap_mg(start.fit.residual), final.gap_mg(final.residual),
-        steps, outliers, missing, (*advice, *plan.advice), refined, refusal, final.poses_g,
-        final.fit.equations.force, stages, plan, undecided, found.one_curve,
-        found.also)
+    fitted = _record_of(refined, final, missing, (*advice, *plan.advice))
+    return replace(
+        fitted, verdict=verdict, undecided=undecided, steps=steps, stages=stages, plan=plan,
+        gap_mg=start.gap_mg(start.fit.residual), remaining_gap_mg=final.gap_mg(final.residual),
+        disturbed_poses=outliers, refusal=refusal, one_curve=found.one_curve, also=found.also)
 
 
 def _refine_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, also: tuple[OwnEffect, ...]
@@ -379,24 +383,26 @@ def _with(found: Refinement, calibration: Calibration) -> Refinement:
 def _without_search(fitted: Calibration, message: str, advice: str) -> Refinement:
     """Return the fit with the fleet as a refinement, with the reason why nothing was searched."""
     poses_g = in_g(fitted.used_poses, fitted.units)
-    found = _of_fit(
-        fitted, with_history(only_norm(poses_g), fitted.model),
-        not_testable(poses_g, {}, fitted.model.effects),
+    fit = judge(Model(fitted.model.values), with_history(only_norm(poses_g), fitted.model))
+    found = _record_of(
+        fitted, State(fit), not_testable(poses_g, {}, fitted.model.effects),
         (f'no effects were searched: {message}; the result is the fit with the fleet', advice))
-    fit, ratio = judge(Model(fitted.model.values), found.poses_g), fitted.quality.chi2_per_dof
+    ratio = fitted.quality.chi2_per_dof
     quiet = not ratio or is_noise(fit.chi2, fit.chi2 / ratio)
     return replace(found, verdict='no_gap' if quiet else 'unexplained',
                    noise_floor_mg=fitted.quality.noise_floor_mg)
 
 
-def _of_fit(fitted: Calibration, poses_g: Poses, missing: tuple[tuple[str, str], ...],
-            advice: tuple[str, ...]) -> Refinement:
-    """Return a fit as a refinement without steps; `poses_g` are the poses that it used."""
-    fit = judge(Model(fitted.model.values), poses_g)
-    state, out = State(fit), tuple(each.row for each in fitted.rejected)
-    gap_mg, base = state.gap_mg(fit.residual), Stage('base', state.mg_of_poses(fit.residual))
-    return Refinement('no_gap', state.floor_mg, gap_mg, gap_mg, (), out, missing, advice, fitted,
-                      (), poses_g, fit.equations.force, (base,), PosePlan())
+def _record_of(calibration: Calibration, state: State, missing: tuple[tuple[str, str], ...],
+               advice: tuple[str, ...]) -> Refinement:
+    """Return the record of a calibration, by the state of its poses, without a step."""
+    residual = state.fit.residual
+    return Refinement(
+        verdict='no_gap', noise_floor_mg=state.floor_mg, gap_mg=state.gap_mg(residual),
+        remaining_gap_mg=state.gap_mg(residual), not_testable=missing, advice=advice,
+        disturbed_poses=tuple(each.row for each in calibration.rejected), calibration=calibration,
+        poses_g=state.poses_g, force=state.fit.equations.force,
+        stages=(Stage('base', state.mg_of_poses(residual)),))
 
 
 def base_of(poses: Poses, units: Units, name: str) -> Calibration:

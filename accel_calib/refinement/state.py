@@ -153,9 +153,11 @@ def linearised(fit: Fit, base: tuple[EffectKey, ...], tried: Iterable[Candidate]
         columns, sizes[own] = outside_of(onto, near.columns_of(each.effect, each.factors))
         every[own] = columns.T
         blocks += each.blocks(start, alike[kind_of(each.effect)])
-    return Linear(onto, near.pose, tuple(blocks), every, sizes, WORTH if near.noise_known else 0.0,
-                  near.count - onto.shape[1], float(every[-1] @ every[-1]),
-                  near.columns(Model({'offset': np.zeros(3)})), 2.0 * math.log(1.0 + len(alike)))
+    return Linear(
+        onto=onto, pose=near.pose, blocks=tuple(blocks), every=every, sizes=sizes,
+        worth=WORTH if near.noise_known else 0.0, dof=near.count - onto.shape[1],
+        base_rss=float(every[-1] @ every[-1]), choice=2.0 * math.log(1.0 + len(alike)),
+        offset=near.columns(Model({'offset': np.zeros(3)})))
 
 
 def left_open(state: State) -> Model:

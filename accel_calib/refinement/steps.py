@@ -97,7 +97,7 @@ class Step:
 
     """
 
-    effect: str
+    effect: str = field(init=False)
     rivals: tuple[str, ...]
     probabilities: dict[str, float]
     data_probabilities: dict[str, float]
@@ -114,6 +114,7 @@ class Step:
     variable: str = field(init=False)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, 'effect', kind_of(self.name))
         object.__setattr__(self, 'variable', variable_of(self.name))
 
     @property
@@ -252,12 +253,14 @@ def _step(name: EffectKey, before: State, after: State, found: Found, date: str)
     if name in CHANGES:
         words = f'{_change(name, values, [*deviations.values()], date)}; {words}'
     shown = effect.shown(values)
-    return Step(kind_of(unchanged(name)), rivals, chances, by_data, shown,
-                {part: deviations[part] for part in shown if deviations[part]},
-                before.gap_mg(first), after.gap_mg(last),
-                before.gap_mg(first_held_out), after.gap_mg(held_out),
-                _p_value(name, found), words, unchanged(name),
-                formula_of(name, values, spread))
+    return Step(
+        name=unchanged(name), rivals=rivals, probabilities=chances, data_probabilities=by_data,
+        parameters=shown,
+        parameters_sd={part: deviations[part] for part in shown if deviations[part]},
+        gap_before_mg=before.gap_mg(first), gap_after_mg=after.gap_mg(last),
+        held_out_before_mg=before.gap_mg(first_held_out),
+        held_out_after_mg=after.gap_mg(held_out), p_value=_p_value(name, found), where=words,
+        formula=formula_of(name, values, spread))
 
 
 def _chances(name: EffectKey, found: Found, *, usual: bool) -> dict[str, float]:
@@ -293,10 +296,13 @@ def _output_steps(found: Found) -> list[Step]:
         causes.append(('quantisation', 'step', found.grid_g, after, 'pose means are multiples of '
                        f'{step_mg:.3g} mg, which causes {step_mg / np.sqrt(12.0):.2g} mg RMS per '
                        'axis'))
-    return [Step(name, (), {name: 1.0}, {name: 1.0}, {value_name: value}, {},
-                 before.gap_mg(before.residual), after.gap_mg(after.residual),
-                 before.gap_mg(before.held_out), after.gap_mg(after.held_out), 0.0, where, name)
-            for name, value_name, value, before, where in causes]
+    return [Step(
+        name=name, rivals=(), probabilities={name: 1.0}, data_probabilities={name: 1.0},
+        parameters={value_name: value}, parameters_sd={}, p_value=0.0, where=where,
+        gap_before_mg=before.gap_mg(before.residual), gap_after_mg=after.gap_mg(after.residual),
+        held_out_before_mg=before.gap_mg(before.held_out),
+        held_out_after_mg=after.gap_mg(after.held_out))
+        for name, value_name, value, before, where in causes]
 
 
 def beside_walk(found: Found) -> tuple[Floats, Floats]:
