@@ -174,6 +174,10 @@ def test_an_own_effect_is_simulated_named_stored_and_needed(tmp_path, capsys):
     assert 'needs the effect' in line
     assert '--also FILE.py' in line
     assert verified('--also', own) == (0, [])
+    capsys.readouterr()
+    assert run('compare', stored, stored, '--also', own) == 0
+    shown = next(line for line in capsys.readouterr().out.splitlines() if 'dead_band x' in line)
+    assert ' mg ' in shown  # of the unit g
     own.write_text(OWN.replace('0.05', '0.06'))
     status, (line,) = verified('--also', own)
     assert status == 2

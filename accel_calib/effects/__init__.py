@@ -34,7 +34,7 @@ are those of IEEE 1293 (model equation of a linear accelerometer) and of data sh
 
 from .catalogue import (
     CATALOGUE, CHANGES, EFFECTS, entry_of, included, LADDER, NOMINAL_SUPPLY, OFFSET_POWERS,
-    parameter_names, PROCESSES, REFERENCE_TEMPERATURE, WANDER)
+    parameter_names, ParameterName, PROCESSES, REFERENCE_TEMPERATURE, WANDER)
 from .form import (
     AFFINE, AXES, by_axis, Context, CUBE, difference, Effect, EffectKey, EffectRecord,
     fitted_places, FORCE, MODES, MONOMIALS, ODD_SQUARE, ONE, PRODUCT, SIZE, SQUARE, TO_SEPARATE,
@@ -58,11 +58,12 @@ __all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CATALOGUE', 'CHANGES', 'CONVERGED_G', 
            'PROCESSES', 'PRODUCT', 'REFERENCE_TEMPERATURE', 'SIZE', 'SQUARE', 'TO_SEPARATE',
            'VARIABLES', 'WANDER', 'WAVE', 'ZONAL', 'ZONES', 'AtContext', 'Context', 'Covariate',
            'EachShape', 'Effect', 'EffectKey', 'EffectRecord', 'EmpiricalCurve', 'Model',
-           'ModelForm', 'OwnEffect', 'ThermalStream', 'acting_temperature', 'between_steps',
-           'by_axis', 'check_context', 'correct', 'covariates_of', 'curves_over', 'difference',
-           'effect_named', 'effects_of_file', 'entry_of', 'factors_of', 'fitted_places',
-           'formula_of', 'included', 'kind_of', 'length_rows', 'linear_model', 'linear_values',
-           'model_with', 'modes_of', 'own_effects', 'own_slope', 'parameter_names', 'parse_effect',
-           'predict', 'products_of', 'rate_at', 'reading_of', 'sensor_force', 'simulate_poses',
-           'simulate_recording', 'times', 'too_large', 'turn_between', 'unit_of', 'value_unit',
-           'variable_of', 'variable_words', 'way_of', 'with_turns', 'with_vector']
+           'ModelForm', 'OwnEffect', 'ParameterName', 'ThermalStream', 'acting_temperature',
+           'between_steps', 'by_axis', 'check_context', 'correct', 'covariates_of', 'curves_over',
+           'difference', 'effect_named', 'effects_of_file', 'entry_of', 'factors_of',
+           'fitted_places', 'formula_of', 'included', 'kind_of', 'length_rows', 'linear_model',
+           'linear_values', 'model_with', 'modes_of', 'own_effects', 'own_slope',
+           'parameter_names', 'parse_effect', 'predict', 'products_of', 'rate_at', 'reading_of',
+           'sensor_force', 'simulate_poses', 'simulate_recording', 'times', 'too_large',
+           'turn_between', 'unit_of', 'value_unit', 'variable_of', 'variable_words', 'way_of',
+           'with_turns', 'with_vector']

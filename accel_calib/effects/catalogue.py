@@ -275,10 +275,23 @@ def entry_of(effect: EffectKey) -> Effect:
     return CATALOGUE[effect] if isinstance(effect, str) else effect.entry
 
 
+class ParameterName(str):
+    """The name of a value of an effect, such as ``offset.x``, which keeps the effect."""
+
+    effect: EffectKey
+
+    @classmethod
+    def of(cls, effect: EffectKey, part: str) -> 'ParameterName':
+        made = cls(f'{effect}.{part}')
+        made.effect = effect
+        return made
+
+
 @lru_cache(maxsize=512)
 def parameter_names(effects: tuple[EffectKey, ...]) -> tuple[str, ...]:
-    """Return the names of the values of these effects, such as ``offset.x``, in vector order."""
-    return tuple(f'{effect}.{part}' for effect in effects for part in entry_of(effect).values)
+    """Return the names of the values of these effects, in vector order."""
+    return tuple(ParameterName.of(effect, part)
+                 for effect in effects for part in entry_of(effect).values)
 
 
 def included(effects: Iterable[EffectKey]) -> set[EffectKey]:

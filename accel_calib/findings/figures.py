@@ -32,7 +32,8 @@ from ..calibration import (
     uncertainty_g, Verification)
 from ..comparison import NAMES
 from ..effects import (
-    AXES, effect_named, EffectKey, entry_of, LADDER, Model, MODELS, predict, value_unit)
+    AXES, effect_named, EffectKey, entry_of, LADDER, Model, MODELS, ParameterName, predict,
+    value_unit)
 from ..estimate import pose_noise, sensing_axes, variance_factor
 from ..finding import Rating
 from ..statistics import rms
@@ -117,9 +118,10 @@ def scale_of(name: str) -> tuple[float, float, str]:
         return 1.0 if name in GAINS else 0.0, 100.0, '%'
     effect, _, part = name.rpartition('.')
     try:
-        unit, factor = value_unit(effect_named(effect), part)
-    except KeyError:  # an own effect
-        unit, factor = '', 1.0
+        key = name.effect if isinstance(name, ParameterName) else effect_named(effect)
+    except KeyError:  # an own effect, by its text in a stored row
+        return 0.0, 1.0, ''
+    unit, factor = value_unit(key, part)
     return 0.0, factor, unit
 
 

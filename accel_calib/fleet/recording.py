@@ -436,7 +436,7 @@ def _figures(intake: Intake, outcome: Outcome) -> Row:
         **{figure.key: figure.value for figure in residual_figures(quality)},
         'temperature': warm, 'warnings': list(calibration.warnings),
         'determined': determines(_WHOLE_MODEL, directions_of(poses, intake.units)),
-        'parameters': [{'name': name, 'value': value, 'sd': sd} for name, value, sd in zip(
+        'parameters': [{'name': str(name), 'value': value, 'sd': sd} for name, value, sd in zip(
             calibration.parameters, calibration.model.vector.tolist(), deviation.tolist(),
             strict=True)],
         **{column: float(value) for k, name in enumerate(NAMES) for column, value in (

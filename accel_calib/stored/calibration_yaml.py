@@ -419,7 +419,7 @@ _MOST_SENSORS = 10**9
 
 def write_priors(path: Path, priors: Mapping[str, FleetPrior]) -> None:
     """Write typical values as YAML; OSError if that fails, InputError if the reader refuses it."""
-    models = [{'model': fleet.model, 'sensors': fleet.sensors, 'names': list(_PRIOR_NAMES),
+    models = [{'model': fleet.model, 'sensors': fleet.sensors, 'names': [*map(str, _PRIOR_NAMES)],
                'mean': fleet.prior.mean.tolist(),
                'sd': np.sqrt(np.diag(fleet.prior.covariance)).tolist(),
                'covariance': fleet.prior.covariance.tolist()} for fleet in priors.values()]
