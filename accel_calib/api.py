@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from .calibration import (
     Calibration as Calibration, mounting_of, Verification, verify as verify_calibration)
 from .comparison import compare as compare_calibrations, Comparison
-from .effects import know, model_with, OwnEffect, simulate_poses, simulate_recording
+from .effects import model_with, own_effects, OwnEffect, simulate_poses, simulate_recording
 from .errors import InputError
 from .geometry import spread_directions
 from .logs import (
@@ -64,8 +64,7 @@ def load(path: Source, *, also: Sequence[Effect] = ()) -> Calibration:
         If the file cannot be read.
 
     """
-    know(also)
-    return read_calibration(Path(path))
+    return read_calibration(Path(path), own_effects(also))
 
 
 def read_poses(path: Source) -> Poses:
@@ -212,7 +211,7 @@ def calibrate(log: Source | Poses | Recording | Data, *, units: UnitName | None 
 
     """
     plan = Plan(refined=refined, flat=flat, nose_down=nose_down, frame=frame, sensor=sensor,
-                also=know(also))
+                also=own_effects(also))
     source, options, asked = _asked(log, units, gravity, {'sensor': sensor, **settings})
     found = poses_of(source, options, asked)
     return calibrated_log(source, options, found, plan).calibration
@@ -302,7 +301,6 @@ def refine(poses: Source | Poses | Data, *, base: str | Calibration = 'auto',
         If the readings are clearly in another unit.
 
     """
-    names = know(also)
     start: str | Calibration = base
     if isinstance(base, Calibration):
         start, table = _beside(base, poses, units)
@@ -310,7 +308,8 @@ def refine(poses: Source | Poses | Data, *, base: str | Calibration = 'auto',
     else:
         read = poses_of(*_asked(poses, units, gravity))
         table, known = read.poses, read.units
-    return find_effects(table, known, base=start, sensor=sensor, date=now(), also=names)
+    return find_effects(table, known, base=start, sensor=sensor, date=now(),
+                        also=own_effects(also))
 
 
 def verify(poses: Source | Poses | Data, calibration: Source | Calibration, *,
@@ -437,7 +436,6 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
         out of range, or makes readings beyond any sensor.
 
     """
-    know(also)
     _check_within(poses=(poses, 1, _MOST_ROWS), samples=(samples, 1, _MOST_ROWS),
                   noise=(noise, 0, LARGEST), seed=(seed, 0, math.inf))
     if recording:
@@ -446,7 +444,7 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
     known = units_of(units, gravity)
     # The attitude transforms from sensor to robot axes, ΔR from robot to sensor axes.
     rotation = mounting_of(np.radians(np.asarray(mounting, float)))
-    model = model_with(effects, rotation)
+    model = model_with(effects, rotation, own_effects(also))
     if directions is None:  # in mixed order
         mixed = np.random.default_rng(poses).permutation(spread_directions(poses)[1:])
         up = np.vstack([[[0.0, 0.0, 1.0]], mixed])

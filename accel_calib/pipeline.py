@@ -26,7 +26,7 @@ from .calibration import (
     Calibration, check_sensor, Curve, curve_of, directions_of, fit_partial, fit_poses,
     fit_with_fleet, flat_direction, FleetPrior, level, level_by_rows, lies_in_cone, PRIOR,
     SampleContext, thermal_alone, with_curve, without_curve)
-from .effects import Context, LADDER, Model, PROCESSES
+from .effects import Context, LADDER, Model, OwnEffect, PROCESSES
 from .errors import InputError, RefusedFitError, saying
 from .finding import explained_by, Finding
 from .findings import rate, Rating
@@ -269,8 +269,8 @@ class Plan:
         The levelled frame.
     sensor : str
         Name of the sensor; by default the name in the poses.
-    also : tuple of str
-        Names of own effects of the user, which the search tries beside the catalogue.
+    also : tuple of OwnEffect
+        Own effects of the user, which the search tries beside the catalogue.
     before : Calibration, optional
         The calibration in use. Effects that a refinement has added to it are kept, with new
         values, and the search for effects starts from it. Without a `flat` pose, its levelled
@@ -290,7 +290,7 @@ class Plan:
     nose_down: int | None = None
     frame: FrameName = 'ros'
     sensor: str = ''
-    also: tuple[str, ...] = ()
+    also: tuple[OwnEffect, ...] = ()
     before: Calibration | None = field(default=None, repr=False)
     in_cone: bool = False
 

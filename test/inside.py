@@ -11,6 +11,7 @@ name that is not clear without its file has another one here.
 
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 import os
@@ -35,9 +36,8 @@ from accel_calib.comparison.agreement import (
 from accel_calib.comparison.drift import change, is_over, MEMORY as DRIFT_MEMORY
 from accel_calib.disk import check_regular, previous
 from accel_calib.effects import (
-    acting_temperature, correct, linear_model, Model, model_with, MODELS, parse_effect, predict,
-    sensor_force, simulate_poses, simulate_recording, ThermalStream, with_vector)
-from accel_calib.effects.model import terms_of
+    acting_temperature, correct, linear_model, Model, model_with, MODELS, OwnEffect, parse_effect,
+    predict, sensor_force, simulate_poses, simulate_recording, ThermalStream, with_vector)
 from accel_calib.effects.thermal import Lag, low_passed, rate_of
 from accel_calib.estimate import believable, kinds, originals, unseen_mistakes
 from accel_calib.estimate.closed_form import agreeing
@@ -72,7 +72,7 @@ from accel_calib.refinement import base as refine_base
 from accel_calib.refinement.base import clipped, grid_step, off_grid, sampled, unclipped
 from accel_calib.refinement.beam import accepted, explored, reshaped
 from accel_calib.refinement.curves import (
-    _grown as grown_curve, _rss_beside as rss_beside, best_curve, Curve, Near, probabilities,
+    _grown as grown_curve, _rss_beside as rss_beside, best_curve, FoundCurve, Near, probabilities,
     Process, process_of, SIGNIFICANT, Walk, walk_beside)
 from accel_calib.refinement.linear import (
     _RARE as RARE, Block, LEVEL as REFINE_LEVEL, Linear, outside_of, Set, with_outliers)
@@ -131,9 +131,9 @@ def format_calibration(calibration: Calibration) -> str:
     return calibration_bytes(calibration).decode()
 
 
-def parse_calibration(text: str, name: str) -> Calibration:
-    """Return the calibration in the text of a file."""
-    return calibration_from(text.encode(), name)
+def parse_calibration(text: str, name: str, own: Sequence[OwnEffect] = ()) -> Calibration:
+    """Return the calibration in the text of a file, perhaps with own effects."""
+    return calibration_from(text.encode(), name, own)
 
 
 @dataclass(frozen=True)

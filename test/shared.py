@@ -20,7 +20,7 @@ from typing import Any
 
 from accel_calib import simulate
 from accel_calib.calibration import Calibration, fit_poses
-from accel_calib.effects import effect_named
+from accel_calib.effects import EffectKey, entry_of
 from accel_calib.geometry import unit
 from accel_calib.session import Step
 from accel_calib.table import Floats, Poses
@@ -77,11 +77,10 @@ def known(unit: Any = 'm/s2') -> Calibration:
     return fit_poses(poses, units_of(unit), model='10', date='2026-01-01T00:00:00+00:00')
 
 
-def with_effects(calibration: Calibration, values: Mapping[str, Any], variance: float = 1e-12,
+def with_effects(calibration: Calibration, values: Mapping[Any, Any], variance: float = 1e-12,
                  **columns: Any) -> Calibration:
     """Return a calibration with further effects of this variance, and columns of its poses."""
-    model = Model({**calibration.model.values, **{name: np.array(part, float) for name, part in
-                                                  values.items()}}, calibration.rotation)
+    model = Model({**calibration.model.values, **model_with(values).values}, calibration.rotation)
     covariance, size = variance * np.eye(len(model.vector)), len(calibration.covariance)
     covariance[:size, :size] = calibration.covariance
     return replace(calibration, model=model, covariance=covariance,
@@ -93,9 +92,9 @@ SHAPES = {'start': 1000.0, 'tau': 900.0, 'instant': 4000.0, 'lag': 200.0, 'of_se
 """Values of the shapes of effects, in the context of `context_of`."""
 
 
-def values_of(name: str, parts: Any) -> Floats:
+def values_of(key: EffectKey, parts: Any) -> Floats:
     """Return the values of an effect: parts of twice its typical size, and its shape."""
-    effect = effect_named(name)
+    effect = entry_of(key)
     values = 2.0 * effect.typical * np.asarray(parts)[:len(effect.parameters)]
     return np.array([*values, *(SHAPES[part] for part in effect.shape)])
 

@@ -7,14 +7,14 @@ import re
 
 from accel_calib.calibration import fit_poses
 from accel_calib.effects import (
-    CARRIERS, effect_named, EMPIRICAL, empirical_name, empirical_parts, formula_of, is_effect,
-    kind_of, MODES, modes_of, VARIABLES)
+    CARRIERS, effect_named, EMPIRICAL, EmpiricalCurve, entry_of, formula_of, kind_of, MODES,
+    modes_of, VARIABLES)
 from accel_calib.findings import rate
 from accel_calib.refinement import refine
 from accel_calib.report import calibration_page
 from inside import (
-    beginning, best_curve, export, fitted_state, format_calibration, Model, parse_calibration,
-    predict, simulate_poses)
+    beginning, best_curve, export, fitted_state, format_calibration, Model, model_with,
+    parse_calibration, predict, simulate_poses)
 import numpy as np
 import pytest
 from shared import G, random_directions, sensor
@@ -48,17 +48,20 @@ def base_of(poses):
 
 
 @pytest.mark.parametrize('variable', VARIABLES)
-@pytest.mark.parametrize('carrier', [*CARRIERS, 'gain.z', 'cross_axis.yz'])
-def test_the_name_of_a_curve_is_read_back(carrier, variable):
+@pytest.mark.parametrize(('carrier', 'part'), [
+    *((carrier, '') for carrier in CARRIERS), ('gain', 'z'), ('cross_axis', 'yz')])
+def test_the_text_of_a_curve_is_read_back(carrier, part, variable):
     modes = tuple(modes_of(variable)[k] for k in (0, 2, -1))
-    name = empirical_name(carrier, variable, modes)
+    curve = EmpiricalCurve(carrier, variable, modes, part)
     if carrier != {'force': 'offset', 'direction': 'force'}.get(variable, carrier):
-        assert not is_effect(name)
+        with pytest.raises(KeyError):
+            effect_named(str(curve))
         return
-    assert kind_of(name) == EMPIRICAL
-    assert empirical_parts(name) == (carrier, variable, modes)
-    effect = effect_named(name)
-    parts = 1 if '.' in carrier else len(CARRIERS[carrier])
+    assert str(curve).startswith(f'empirical-{carrier}.{part}'.rstrip('.'))
+    assert effect_named(str(curve)) == curve
+    assert kind_of(curve) == EMPIRICAL
+    effect = entry_of(curve)
+    parts = 1 if part else len(CARRIERS[carrier])
     assert len(effect.parameters) == (7 + 11 + 13 if variable == 'direction' else 3 * parts)
     assert len(set(effect.parameters)) == len(effect.parameters)
     assert effect.needs == (() if variable in ('force', 'direction') else (variable,))
@@ -74,16 +77,17 @@ def test_the_name_of_a_curve_is_read_back(carrier, variable):
     *(f'empirical-force-direction-{degree}' for degree in (2, 7)), 'curve-offset-time-1',
     'offset-time-1'])
 def test_a_name_that_is_no_curve_is_refused(name):
-    assert not is_effect(name)
+    with pytest.raises(KeyError):
+        effect_named(name)
     with pytest.raises(ValueError, match='expected one of'):
         Model({name: np.zeros(3)})
 
 
-@pytest.mark.parametrize('name', [name for name in CURVES if effect_named(name).needs])
+@pytest.mark.parametrize('name', [name for name in CURVES if entry_of(effect_named(name)).needs])
 def test_a_curve_is_constant_outside_of_its_range(name):
-    variable, (low, high) = empirical_parts(name)[1], CURVES[name][-2:]
+    variable, (low, high) = effect_named(name).variable, CURVES[name][-2:]
     at = np.maximum([low - 1.0, low, high, 1e3 * high], 0.0)
-    reading = predict(Model({name: np.array(CURVES[name])}), np.tile([0.6, -0.48, 0.64], (4, 1)),
+    reading = predict(model_with({name: CURVES[name]}), np.tile([0.6, -0.48, 0.64], (4, 1)),
                       {variable: np.column_stack([at] * 3) if variable == 'std' else at})
     np.testing.assert_array_equal(reading[[0, 3]], reading[[1, 2]])
     assert np.max(np.abs(reading[2] - reading[1])) > 1e-3
@@ -91,7 +95,7 @@ def test_a_curve_is_constant_outside_of_its_range(name):
 
 def test_a_curve_over_the_force_is_constant_beyond_1_g():
     force = np.array([[1.0, -1.0, 0.2], [1.7, -3.0, 0.2]])
-    model = Model({'empirical-offset-force-1-3': np.linspace(-3e-3, 4e-3, 6)})
+    model = model_with({'empirical-offset-force-1-3': np.linspace(-3e-3, 4e-3, 6)})
     added = predict(model, force, {}) - force
     np.testing.assert_allclose(added[1], added[0], atol=1e-15)
 
@@ -100,7 +104,7 @@ def test_a_gain_that_depends_on_the_direction_has_the_forms_of_its_degrees():
     rng = np.random.default_rng(3)
     up, oblique = random_directions(200, rng), random_directions(1, rng)[0]
     for degree, factor in ((3, 2.5), (4, 35.0 / 8.0), (5, 63.0 / 8.0), (6, 231.0 / 16.0)):
-        model = Model({f'empirical-force-direction-{degree}': np.zeros(2 * degree + 1)})
+        model = model_with({f'empirical-force-direction-{degree}': np.zeros(2 * degree + 1)})
         basis = model.basis(2.0 * up, {}).full
         gains = np.einsum('ni,nip->np', up, basis) / 2.0
         np.testing.assert_allclose(2.0 * up[:, :, np.newaxis] * gains[:, np.newaxis], basis,
@@ -135,17 +139,17 @@ def test_a_nonlinearity_along_an_oblique_axis_is_described(oblique, form):
 
 def test_a_gain_of_all_degrees_has_each_of_them_once():
     rng = np.random.default_rng(0)
-    name = empirical_name('force', 'direction', modes_of('direction'))
-    values = rng.normal(size=len(effect_named(name).parameters)) * 2e-3
-    model = Model({'offset': np.array([0.01, 0.02, 0.0]), name: values})
+    curve = EmpiricalCurve('force', 'direction', tuple(modes_of('direction')))
+    values = rng.normal(size=len(curve.entry.parameters)) * 2e-3
+    model = Model({'offset': np.array([0.01, 0.02, 0.0]), curve: values})
     poses = simulate_poses(model, random_directions(200, rng), rng, noise_g=3e-4, context={})
-    assert best_curve(base_of(poses), poses, ()).name == name
+    assert best_curve(base_of(poses), poses, ()).name == curve
 
 
 def test_the_values_of_a_curve_are_the_cosines_of_its_definition():
     name = 'empirical-offset.x-temperature-2-3'
     temperature = np.linspace(15.0, 35.0, 9)
-    added = predict(Model({name: np.array(CURVES[name])}), np.zeros((9, 3)),
+    added = predict(model_with({name: CURVES[name]}), np.zeros((9, 3)),
                     {'temperature': temperature})
     share = (temperature - 15.0) / 20.0
     np.testing.assert_allclose(added[:, 0], 4e-3 * np.cos(2.0 * np.pi * share)
@@ -162,11 +166,11 @@ def test_a_curve_is_recovered_within_its_uncertainty():
     low, high = np.min(warm), np.max(warm)
     poses, truth = with_curve(form)
     state = base_of(poses)
-    curve = best_curve(state, poses, ())
-    carrier, variable, modes = empirical_parts(curve.name)
-    assert carrier in ('offset', 'offset.x')
-    assert (variable, {2, 5} <= set(modes), curve.out) == ('temperature', True, ())
-    fit = fitted_state(Model({**state.model.values, curve.name: curve.values}), poses).fit
+    found = best_curve(state, poses, ())
+    curve = found.name
+    assert curve.changed in ('offset', 'offset.x')
+    assert (curve.variable, {2, 5} <= set(curve.modes), found.out) == ('temperature', True, ())
+    fit = fitted_state(Model({**state.model.values, curve: found.values}), poses).fit
     at = {'temperature': np.linspace(low, high, 21)}
     nothing = np.zeros((21, 3))
     error = predict(fit.model, nothing, at)[:, 0] - predict(truth, nothing, at)[:, 0] - form(
@@ -237,7 +241,7 @@ def test_the_formula_of_a_curve_has_its_form_and_its_values(form, curve):
     sizes = np.linalg.lstsq(waves.T, curve(share) - np.mean(curve(share)), rcond=None)[0]
     scales = np.array([0.002, -0.001, 0.003])
     values = np.concatenate([np.outer(sizes, scales).ravel(), [12.0, 40.0]])
-    words = formula_of('empirical-offset-temperature-1-2-3-4-5-6-7-8-9-10', values, {})
+    words = formula_of(EmpiricalCurve('offset', 'temperature', tuple(range(1, 11))), values, {})
     assert words.endswith('t = temperature - 12, from 0 to 28 °C')
     assert {*re.findall(r'[a-z]+(?=\()', words)} == {form} - {''}
     expressions = re.findall(r'[xyz] = (.*?)(?=, [yz] = |; t)', words)

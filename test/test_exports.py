@@ -11,11 +11,12 @@ import shutil
 import subprocess
 
 from accel_calib.calibration import Calibration, GyroBias, Quality
+from accel_calib.effects import effect_named, entry_of
 from accel_calib.errors import InputError
 from accel_calib.units import Units, units_of
 from inside import (
-    export, EXPORT_FORMATS, ExportOptions, format_calibration, identifier, Model, model_with,
-    rotation_from_rpy, simulate_poses, spread_directions, terms_of)
+    export, EXPORT_FORMATS, ExportOptions, format_calibration, identifier, model_with,
+    rotation_from_rpy, simulate_poses, spread_directions)
 import numpy as np
 import pytest
 from shared import KNOWN as AFFINE, refused, rms, run
@@ -41,9 +42,7 @@ NOISE = {'accelerometer_noise_density': 1.1e-3, 'accelerometer_random_walk': 1e-
 def sensor_with(*groups, rotation=None, unit='m/s2', per_g=None, limits=RANGE):
     """Return a calibration with exactly these effects, whose poses cover the temperatures."""
     effects = {name: values for group in groups for name, values in group.items()}
-    model = model_with({name: effects[name] for name in effects if '-' not in name}, rotation)
-    curves = {name: np.array(effects[name]) for name in effects if '-' in name}
-    model = Model({**model.values, **curves}, model.rotation)
+    model = model_with(effects, rotation)
     rng, count = np.random.default_rng(1), 30
     context = {'time': 60.0 * np.arange(count), 'temperature': np.linspace(*limits, count),
                'supply_voltage': rng.uniform(3.2, 3.4, count),
@@ -473,11 +472,10 @@ def test_json_and_npz_hold_everything(name):
     arrays = np.load(io.BytesIO(text_of(made, 'npz')), allow_pickle=False)
     for key in ('matrix', 'offset', 'rotation', 'gain', 'values', 'covariance'):
         np.testing.assert_array_equal(np.reshape(found[key], arrays[key].shape), arrays[key])
-    values = {key: [each[part] for part in terms_of((key,)).effects[0].values if part in each]
+    values = {key: [each[part] for part in entry_of(effect_named(key)).values if part in each]
               for key, each in found['effects'].items()}
     assert json.loads(str(arrays['effects'])) == found['effects']
-    again = replace(made, model=Model({key: np.array(each) for key, each in values.items()},
-                                      np.array(found['rotation'])))
+    again = replace(made, model=model_with(values, np.array(found['rotation'])))
     reading, temperature, wanted = samples(made)
     known = {'temperature': temperature} if 'temperature' in made.model.needs else {}
     np.testing.assert_allclose(again.apply(reading, **known), wanted)

@@ -25,7 +25,7 @@ from threading import Thread
 from typing import Any
 
 from accel_calib import simulate
-from accel_calib.effects import know_file
+from accel_calib.effects import effects_of_file
 from accel_calib.errors import InputError
 from accel_calib.fleet import cluster, Input, run, Store
 from accel_calib.logs import write_table
@@ -641,10 +641,10 @@ band = ac.Effect('band_of_fleet', 'dead band of each axis', typical=0.003, unit=
 def test_own_effects_are_known_to_all_workers_and_needed_later(client: Any, tmp_path: Path
                                                                ) -> None:
     (tmp_path / 'own.py').write_text(OWN, encoding='utf-8')
-    options = replace(QUICK, refined=True, own=know_file(tmp_path / 'own.py'))
+    options = replace(QUICK, refined=True, own=effects_of_file(tmp_path / 'own.py'))
     for seed in range(2):
         poses = simulate({'offset': OFFSET, 'band_of_fleet': (0.01, -0.008, 0.006)}, poses=60,
-                         seed=seed, units='g')
+                         seed=seed, units='g', also=options.own)
         (tmp_path / 'in').mkdir(exist_ok=True)
         write_table(tmp_path / 'in' / f'2026-0{seed + 1}-03.csv', replace(poses, sensor='arm'))
     store = Store(tmp_path / 'out')
@@ -653,7 +653,7 @@ def test_own_effects_are_known_to_all_workers_and_needed_later(client: Any, tmp_
     assert [row['effects'][-1] for row in rows] == ['band_of_fleet'] * 2
     assert run(client, found_in(tmp_path / 'in'), options, store).counts == {'skipped': 2}
     (tmp_path / 'own.py').write_text(OWN.replace('0.05', '0.06'), encoding='utf-8')
-    changed = replace(options, own=know_file(tmp_path / 'own.py'))
+    changed = replace(options, own=effects_of_file(tmp_path / 'own.py'))
     assert run(client, found_in(tmp_path / 'in'), changed, store).counts == {'ok': 2}
     without = python(*COMMAND, 'verify', tmp_path / 'in' / '2026-01-03.csv', '-c',
                      store.folder / rows_of(store.folder)[0]['calibration'])

@@ -6,7 +6,8 @@
 from accel_calib.effects import EFFECTS
 from accel_calib.errors import InputError
 from inside import (
-    correct, linear_model, Model, parse_effect, predict, rotation_from_rpy, with_vector)
+    correct, linear_model, Model, model_with, parse_effect, predict, rotation_from_rpy,
+    with_vector)
 import numpy as np
 import pytest
 from shared import context_of, random_directions, values_of
@@ -64,7 +65,7 @@ def test_a_ratiometric_output_scales_all_gains_and_the_basis_is_its_derivative(r
 
 
 def test_a_covariate_changes_the_offset_from_its_zero_on():
-    model = Model({'offset_covariate-current-2': np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3, 4.0])})
+    model = model_with({'offset_covariate-current-2': [1.0, 2.0, 3.0, 0.1, 0.2, 0.3, 4.0]})
     added = predict(model, np.zeros((2, 3)), {'current': np.array([4.0, 6.0])})
     np.testing.assert_allclose(added, [[0.0, 0.0, 0.0], [2.4, 4.8, 7.2]])
 

@@ -9,11 +9,15 @@ The poses of columns are simulated with numpy alone.
 """
 
 from dataclasses import replace
+import json
+from pathlib import Path
+import pickle
 import re
 
 import accel_calib as ac
-from accel_calib.effects import AXES, by_axis, correct, Effect, EFFECTS, Model, ONE
-from accel_calib.errors import InputError
+from accel_calib.effects import (
+    AXES, by_axis, correct, Effect, EFFECTS, effects_of_file, Model, ONE)
+from accel_calib.errors import InputError, StoredCalibrationError
 from accel_calib.logs import layout_of
 from accel_calib.messages import Rewriter
 from accel_calib.report import refinement_page
@@ -25,6 +29,8 @@ import pandas as pd
 import pytest
 from rosbags.typesys import get_typestore, Stores
 from shared import python, random_directions, refused, run, run_json, run_snippets, SENSOR
+
+DOCS = Path(__file__).parent.parent / 'docs' / 'effects.md'
 
 NEW = Effect('offset that grows with the cube of temperature', 'third-order TCO', AXES, 'g',
              0.005, 0.5, by_axis(ONE),
@@ -168,6 +174,10 @@ def test_an_own_effect_is_simulated_named_stored_and_needed(tmp_path, capsys):
     assert 'needs the effect' in line
     assert '--also FILE.py' in line
     assert verified('--also', own) == (0, [])
+    capsys.readouterr()
+    assert run('compare', stored, stored, '--also', own) == 0
+    shown = next(line for line in capsys.readouterr().out.splitlines() if 'dead_band x' in line)
+    assert ' mg ' in shown  # of the unit g
     own.write_text(OWN.replace('0.05', '0.06'))
     status, (line,) = verified('--also', own)
     assert status == 2
@@ -282,14 +292,57 @@ def test_an_own_effect_is_found_with_its_constants_stored_and_corrected(
     np.testing.assert_allclose(calibration.predict(forces, context), poses.reading, atol=1e-9)
 
 
+def test_effects_of_one_name_do_not_see_each_other(tmp_path):
+    below, above = (ac.Effect('knee', 'offset beyond a temperature', typical=1e-4, unit='g/°C',
+                              function=lambda temperature, sign=sign: np.maximum(
+                                  sign * (temperature - 28.0), 0.0)) for sign in (-1.0, 1.0))
+    up, context = turned(60, 8)
+    stored, at = [], {'temperature': np.array([20.0, 36.0])}
+    for k, own in enumerate((below, above)):
+        poses = ac.simulate({**SENSOR, 'knee': [4e-4, -3e-4, 5e-4]}, directions=up, units='g',
+                            also=[own], **context)
+        ac.refine(poses, also=[own]).calibration.save(tmp_path / f'{k}.yaml')
+        stored.append(ac.load(tmp_path / f'{k}.yaml', also=[own]))
+    readings = np.tile([0.1, 0.2, 0.97], (2, 1))
+    cold, warm = (each.correct(readings, at) for each in stored)
+    assert np.all(np.abs(cold - warm) > 1e-3)  # each has kept its own function
+    for k, other in enumerate((above, below)):
+        with pytest.raises(StoredCalibrationError, match='another definition'):
+            ac.load(tmp_path / f'{k}.yaml', also=[other])
+        with pytest.raises(StoredCalibrationError, match="needs the effect 'knee'"):
+            ac.load(tmp_path / f'{k}.yaml')
+    assert 'knee' not in [step.effect for step in ac.refine(poses).steps]
+    with pytest.raises(InputError, match="'knee' is not in the catalogue"):
+        ac.simulate({'knee': 1e-4})
+
+
+def test_a_calibration_brings_the_file_of_its_effects_into_another_process(tmp_path):
+    (tmp_path / 'own.py').write_text(OWN)
+    own = effects_of_file(tmp_path / 'own.py')
+    up, context = turned(60, 9)
+    poses = ac.simulate({**SENSOR, 'dead_band': [0.01, -0.008, 0.006]}, directions=up, units='g',
+                        also=own, **context)
+    calibration = ac.refine(poses, also=own).calibration
+    assert pickle.loads(pickle.dumps(calibration)) == calibration
+    (tmp_path / 'own.py').unlink()
+    (tmp_path / 'c.pickle').write_bytes(pickle.dumps(calibration))
+    done = python('-c', 'import numpy, pickle, sys; print(pickle.load(open(sys.argv[1], "rb"))'
+                  '.correct(numpy.eye(3), {}).tolist())', tmp_path / 'c.pickle')
+    np.testing.assert_array_equal(json.loads(done.stdout), calibration.correct(np.eye(3), {}))
+
+
 def test_firmware_has_what_depends_on_columns_and_is_refused_for_functions_of_the_force(
-        own_effects, capsys):
+        own_effects, tmp_path, capsys):
+    code = [each for each in re.findall(r'```python\n(.*?)```', DOCS.read_text(), re.S)
+            if 'ac.Effect(' in each]
+    (tmp_path / 'own.py').write_text('\n'.join(code))
     for name, status in (('thermal_knee', 0), ('dead_band', 2)):
         up, context = turned(72, 4)
         poses = ac.simulate({**SENSOR, name: TRUTH[name]}, directions=up, units='g',
                             also=[own_effects[name]], **context)
         ac.refine(poses, also=[own_effects[name]]).calibration.save('own.yaml')
-        assert run('export', 'own.yaml', '--to', 'c', '-o', 'own.h') == status
+        assert run('export', 'own.yaml', '--to', 'c', '-o', 'own.h', '--also',
+                   'own.py') == status
         assert ('of the force (dead_band)' in capsys.readouterr().err) == (status == 2)
 
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 import tracemalloc
 
 from accel_calib.calibration import of_samples, outside, SampleContext
-from accel_calib.effects import empirical_name
 from accel_calib.logs import read_recording, write_blocks, write_table
 from accel_calib.stored import write_calibration
 from accel_calib.table import numbered, Recording
@@ -66,7 +65,7 @@ def test_quantities_outside_are_counted_over_blocks_and_those_inside_are_not():
     ('offset_drift', [1e-3, 0.0, 0.0, 100.0], {'time': np.array([100.0 + 7200.0])},
      'time since the start of the calibration is 2 h, but the range of the calibration is '
      '0 to 0.1583 h'),
-    (empirical_name('offset.x', 'std', [1]), [1e-3, 0.001, 0.02], {'std': np.zeros((1, 3))},
+    ('empirical-offset.x-std-1', [1e-3, 0.001, 0.02], {'std': np.zeros((1, 3))},
      'vibration is 0 mg, but the range of the calibration is 1 to 20 mg')])
 def test_each_quantity_is_described_in_its_unit(name, values, known, words):
     calibration = calibrated({name: np.array(values)})

@@ -6,7 +6,7 @@
 
 import accel_calib as ac
 from accel_calib.calibration import Calibration, fit_poses, outlook
-from accel_calib.effects import EFFECTS, empirical_name, modes_of, VARIABLES
+from accel_calib.effects import EFFECTS, EmpiricalCurve, modes_of, VARIABLES
 from accel_calib.errors import InputError, RefusedFitError
 from accel_calib.finding import has
 from accel_calib.findings import rate
@@ -26,8 +26,8 @@ given = hypothesis.given
 
 OUTPUT = [name for name, effect in EFFECTS.items() if effect.output]
 ADDED = [name for name in EFFECTS if name not in OUTPUT]
-CURVES = [empirical_name({'force': 'offset', 'direction': 'force'}.get(variable, 'gain'), variable,
-                         modes_of(variable)[::2][:2]) for variable in VARIABLES]
+CURVES = [EmpiricalCurve({'force': 'offset', 'direction': 'force'}.get(variable, 'gain'), variable,
+                         tuple(modes_of(variable)[::2][:2])) for variable in VARIABLES]
 
 SEEDS = st.integers(0, 2 ** 32 - 1)
 COUNTS = st.integers(14, 30)
@@ -90,7 +90,7 @@ def assert_equal_forces(found, expected, reading, other_reading):
     assert uncertainty_g(found) == pytest.approx(uncertainty_g(expected), rel=1e-3)
 
 
-@pytest.mark.parametrize('name', [*ADDED, *CURVES])
+@pytest.mark.parametrize('name', [*ADDED, *CURVES], ids=str)
 @tried(15)
 @given(parts=PARTS, seed=SEEDS, angles=ANGLES)
 def test_predict_and_correct_undo_each_other(name, parts, seed, angles):

@@ -164,7 +164,7 @@ def test_a_product_of_two_columns_is_named_and_stored(other, tmp_path):
     taken, fresh = poses.take(slice(60)), poses.take(slice(60, None))
     found = ac.refine(taken, base='10')
     assert f'offset_covariate-{"*".join(sorted(["pressure", other]))}' in {
-        step.name for step in found.steps}
+        str(step.name) for step in found.steps}
     found.calibration.save(tmp_path / 'c.yaml')
     stored = ac.load(tmp_path / 'c.yaml')
     assert stored.parameters == found.calibration.parameters

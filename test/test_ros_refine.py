@@ -7,7 +7,6 @@ from pathlib import Path
 import signal
 from typing import Any
 
-from accel_calib.effects import empirical_name
 from accel_calib.stored import read_calibration, write_calibration
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from inside import spread_directions
@@ -149,7 +148,7 @@ CURVE = [2e-3, -1e-3, 3e-3, 1e-3, 2e-3, -2e-3, 15.0, 35.0]
 @pytest.mark.parametrize(('name', 'values'), [
     ('offset_temperature', [1e-3, -1.5e-3, 2e-3, 30.0, 0.0]),
     ('offset_temperature', [1e-3, -1.5e-3, 2e-3, 30.0, 1.0]),
-    (empirical_name('offset', 'temperature', (1, 2)), CURVE)],
+    ('empirical-offset-temperature-1-2', CURVE)],
     ids=['lag of the die', 'lag of the sensor', 'curve'])
 def test_messages_are_corrected_as_offline(bench: Any, readings: Readings, name: str,
                                            values: list[float], stored: Stored

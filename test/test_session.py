@@ -11,6 +11,7 @@ import shutil
 from typing import Any
 
 from accel_calib.calibration import level, set_heading
+from accel_calib.effects import Covariate
 from accel_calib.errors import InputError, StoredCalibrationError
 from accel_calib.finding import Finding, has, LEVELS
 from accel_calib.logs import open_log, read_poses, write_table
@@ -561,7 +562,7 @@ def test_a_quantity_is_a_column_of_poses_and_its_last_value_holds_when_it_stops(
     poses, around = driver.poses, driver.session.around
     assert np.ptp(poses['motor_current']) > 8.0
     assert 'motor_current' in driver.ask('refine')
-    assert 'offset_covariate-motor_current' in driver.calibration.model.effects
+    assert Covariate('offset', ('motor_current',)) in driver.calibration.model.effects
 
     def force(current: float) -> Any:
         reading = np.array([0.0, 0.0, GRAVITY]) + PER_AMPERE * (current - 6.0) * GRAVITY

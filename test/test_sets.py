@@ -6,9 +6,9 @@
 from dataclasses import replace
 import math
 
-from accel_calib.effects import EFFECTS
+from accel_calib.effects import EFFECTS, EmpiricalCurve
 from inside import (
-    accepted, beginning, Block, candidates, Curve, explored, fitted_state, grown_curve,
+    accepted, beginning, Block, candidates, explored, fitted_state, FoundCurve, grown_curve,
     is_better_than_walk, less, Linear, linearised, Model, Near, outside_of, Process, process_of,
     RARE, REFINE_LEVEL, reshaped, rss_beside, search_effects, Set, SIGNIFICANT, simulate_poses,
     spread_directions, Walk, walk_beside, with_outliers, WORTH)
@@ -375,5 +375,5 @@ def test_a_curve_over_time_must_be_clearly_better_than_a_walk(variable, score, b
     linear = by_hand(rng.normal(size=20), np.eye(20)[:, :1], ['supply_ratio'])
     nothing = Set.of(linear)
     walk = Walk(random_walk(20, 4, 1.0, rng)[0].process, 1.0, nothing.score + 20.0, 50.0)
-    curve = Curve(f'empirical-offset-{variable}-1', np.zeros(5), score, (), 0.0, 1.0)
+    curve = FoundCurve(EmpiricalCurve('offset', variable, (1,)), np.zeros(5), score, (), 0.0, 1.0)
     assert is_better_than_walk(curve, Near(nothing, linear, walk, None)) == better

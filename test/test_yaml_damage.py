@@ -11,7 +11,7 @@ from pathlib import Path
 import re
 
 from accel_calib.calibration import Calibration, fit_poses, Rejected
-from accel_calib.effects import know, OwnEffect
+from accel_calib.effects import OwnEffect
 from accel_calib.errors import (
     AccelCalibError, DamagedCalibrationError, InputError, StoredCalibrationError)
 from accel_calib.finding import has
@@ -225,14 +225,14 @@ def test_damage_is_refused_in_one_line_that_names_it(old: str, new: str, words: 
     ('', 'own_rms is missing'), (', own_rms: much', "own_rms is 'much', expected a finite")])
 def test_an_own_effect_without_the_size_of_its_contribution_is_refused(stated: str, words: str
                                                                        ) -> None:
-    know([OwnEffect('field', 'offset by a field', typical=1e-4, variable='motor_current')])
+    own = OwnEffect('field', 'offset by a field', typical=1e-4, variable='motor_current')
     calibration = parse_calibration(intact()[-1], 'x.yaml')
     text = format_calibration(with_effects(
-        calibration, {'field': [1e-3, 2e-3, 3e-3]},
+        calibration, {own: [1e-3, 2e-3, 3e-3]},
         motor_current=np.linspace(-1.0, 1.0, len(calibration.poses))))
-    assert 'field' in parse_calibration(text, 'x.yaml').model.effects
+    assert own in parse_calibration(text, 'x.yaml', [own]).model.effects
     with pytest.raises(DamagedCalibrationError, match=words):
-        parse_calibration(re.sub(r',\s+own_rms: [-+.e\d]+', stated, text), 'x.yaml')
+        parse_calibration(re.sub(r',\s+own_rms: [-+.e\d]+', stated, text), 'x.yaml', [own])
 
 
 def test_numbers_without_a_point_in_an_edited_file_are_read() -> None:

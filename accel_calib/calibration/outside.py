@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .calibration import Calibration, of_samples, thermal_stream
-from ..effects import Context, effect_named, variable_of
+from ..effects import Context, entry_of, variable_of
 from ..statistics import over_axes
 from ..table import column_of
 from ..text import counted
@@ -91,7 +91,7 @@ class SampleContext:
         context = of_samples(known, count, model, self._thermal)
         self.lacking = ''
         if lacking := [key for key in model.neutral if key not in known]:
-            names = [name for name in model.effects if {*effect_named(name).needs} & {*lacking}]
+            names = [str(each) for each in model.effects if {*entry_of(each).needs} & {*lacking}]
             self.lacking = (f'the samples have no {" and ".join(lacking)}: {" and ".join(names)} '
                             f'{"is" if len(names) == 1 else "are"} not corrected')
         for key, block in outside(self._calibration, context).items():

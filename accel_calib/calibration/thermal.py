@@ -49,7 +49,7 @@ from .calibration import Calibration, PRIOR, Quality, with_history
 from .fit import only_norm
 from .quality import finished, gated, in_g, record_of
 from ..effects import (
-    Context, effect_named, EFFECTS, factors_of, Model, OFFSET_POWERS, REFERENCE_TEMPERATURE,
+    Context, EFFECTS, entry_of, factors_of, Model, OFFSET_POWERS, REFERENCE_TEMPERATURE,
     sensor_force)
 from ..errors import InputError
 from ..estimate import judge
@@ -141,7 +141,7 @@ class Curve:
         """Return the context of a temperature that does not change, at the end of the ramps."""
         time = np.full(len(temperature), np.max(self.stretches['time']))
         return {'temperature': temperature, 'time': time, _RATE: np.zeros_like(temperature),
-                effect_named(_LINEAR).lagged: temperature}
+                entry_of(_LINEAR).lagged: temperature}
 
     def at(self, temperature: Floats) -> Floats:
         """Return the (n, 3) offset at steady temperatures, relative to the reference [g]."""
@@ -181,8 +181,8 @@ class Curve:
             return found, covariance
         here = self._steady(np.array([self.reference_c]))
         to = np.vstack([-_basis(found, [here])[0], np.eye(len(found.vector))])
-        offset = {'offset': -found.at(here).vec_v[0]}
-        return Model({**offset, **found.values}), to @ covariance @ to.T
+        offset = -found.at(here).vec_v[0]
+        return Model({'offset': offset, **found.values}), to @ covariance @ to.T
 
 
 @dataclass(frozen=True)
@@ -303,7 +303,7 @@ class _Board:
         covariance = np.zeros((len(model.vector),) * 2)
         covariance[np.ix_(model.fitted, model.fitted)] = self._covariance(
             np.column_stack([self.levels, self.columns({
-                name: effect_named(name).split(values)[1]
+                str(name): entry_of(name).split(values)[1]
                 for name, values in model.values.items()})]), onto)
         return model, covariance
 
@@ -501,7 +501,7 @@ def thermal_alone(curve: Curve, units: Units, *, sensor: str = '', date: str = '
 
 def _words(curve: Curve) -> str:
     """Return what a calibration has of a curve."""
-    others = [name for name in curve.model.effects if name not in _POWERS]
+    others = [str(name) for name in curve.model.effects if name not in _POWERS]
     return ' and '.join([f'offset over temperature of degree {curve.degree}', *others])
 
 

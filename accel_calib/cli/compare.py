@@ -35,7 +35,7 @@ from ..units import units_of
 
 def run_verify(args: argparse.Namespace) -> Done:
     """Evaluate a calibration on the poses of a log."""
-    stored = stored_calibration(args.calibration)
+    stored = stored_calibration(args.calibration, args.own)
     with intake(args, args.poses, stored) as found:
         calibration = stored.in_units(found.units)
         poses = found.poses.take(rows_between(found.poses, args.rows))
@@ -75,7 +75,8 @@ def several_verify(results: Sequence[dict[str, Any]]) -> Iterator[Any]:
 
 def run_compare(args: argparse.Namespace) -> Done:
     """Test whether calibrations agree."""
-    paths, calibrations = args.calibrations, [read_calibration(path) for path in args.calibrations]
+    paths = args.calibrations
+    calibrations = [read_calibration(path, args.own) for path in paths]
     comparison = compare(calibrations)
     rating = rate_comparison(comparison)
     models = [calibration.name for calibration in calibrations]
@@ -101,7 +102,7 @@ def run_compare(args: argparse.Namespace) -> Done:
 
 def run_history(args: argparse.Namespace) -> Done:
     """Sort calibrations by date, and compare them; in JSON, runs are numbered from 1."""
-    calibrations = [read_calibration(path) for path in args.calibrations]
+    calibrations = [read_calibration(path, args.own) for path in args.calibrations]
     history = history_of(calibrations)
     paths, changes = args.calibrations, []
     for number, change in enumerate(history.changes, 1):
@@ -150,7 +151,7 @@ def _history_lines(history: History) -> Iterator[Any]:
 def run_noise(args: argparse.Namespace) -> Done:
     """Find a long rest, and compute the figures of its noise."""
     check_allantools()
-    calibration = args.calibration and stored_calibration(args.calibration)
+    calibration = args.calibration and stored_calibration(args.calibration, args.own)
     with open_log(args.recording, log_options(args, calibration)) as log:
         if log.poses is None:
             with progress('samples') as moved:

@@ -19,7 +19,7 @@ from .frame import (
     stored_calibration)
 from .output import error_line, progress, short_if_known, table, Verdict, working
 from ..calibration import Calibration, NORM_MODELS, outlook
-from ..effects import AXES, effect_named
+from ..effects import AXES, entry_of
 from ..errors import InputError
 from ..findings import (
     calibration_json, curve_json, effect_figures, linear_figures, rate_refinement, refinement_json)
@@ -233,7 +233,7 @@ def _refined(args: argparse.Namespace) -> tuple[Intake, Refinement]:
     """Refine with one log."""
     from ..refinement import refine  # a fit alone does not load the search
 
-    stored = args.calibration and stored_calibration(args.calibration)
+    stored = args.calibration and stored_calibration(args.calibration, args.own)
     with intake(args, args.poses, stored) as found, working('refining'):
         poses = found.poses.take(rows_between(found.poses, args.rows))
         base = stored.in_units(found.units) if stored else prior(args) or args.base
@@ -264,7 +264,7 @@ def _steps_table(result: Refinement) -> Table:
     for number, step in enumerate(result.steps, 1):
         gap = (f'{short(step.gap_before_mg)} -> {short(step.gap_after_mg)}\n'
                f'({short(step.held_out_before_mg)} -> {short(step.held_out_after_mg)})')
-        lines = [f'{number}. {step.effect}', effect_named(step.name).words,
+        lines = [f'{number}. {step.effect}', entry_of(step.name).words,
                  ', '.join(f'{name} {value}'.lstrip() for name, value in values_of(step)),
                  step.where, f'rivals: {", ".join(step.likely_rivals) or "none"}']
         table.add_row('\n'.join(filter(None, lines)), gap, chance(step.p_value))

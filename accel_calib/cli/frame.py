@@ -33,7 +33,7 @@ from .options import BAD_INPUT, STANDARD_INPUT
 from .output import Output, progress, Verdict, working
 from ..calibration import Calibration, FleetPrior
 from ..disk import replaceable, STANDARD_OUTPUT, write_atomically
-from ..effects import know_file
+from ..effects import effects_of_file, OwnEffect
 from ..errors import AccelCalibError, InputError, known_error, RefusedFitError, saying
 from ..logs import LogOptions, named_topics, OpenLog
 from ..pipeline import Intake, options_for, poses_of
@@ -142,7 +142,7 @@ def _page_of(args: argparse.Namespace) -> Path | None:
 def _done(args: argparse.Namespace) -> Done:
     """Run the command for one input, with the own effects of the user, and draw its page."""
     path, page = getattr(args, 'also', None), _page_of(args)
-    args.own = () if path is None else know_file(path)
+    args.own = () if path is None else effects_of_file(path)
     done: Done = _function('run', args.command)(args)
     if page is not None and done.page is not None:
         from ..report import check_matplotlib, write_page
@@ -378,11 +378,11 @@ def read_lines(log: OpenLog) -> list[str]:
     return said + [f'note: {line}' for line in log.notes]
 
 
-def stored_calibration(path: Path) -> Calibration:
+def stored_calibration(path: Path, own: tuple[OwnEffect, ...]) -> Calibration:
     """Read a stored calibration or standard input; report if it was edited by hand."""
     piped = str(path) == STANDARD_INPUT
-    calibration = (calibration_from(sys.stdin.buffer.read(), 'standard input') if piped else
-                   read_calibration(path))
+    calibration = (calibration_from(sys.stdin.buffer.read(), 'standard input', own) if piped else
+                   read_calibration(path, own))
     for found in calibration.noted:
         if found.kind in OF_FILE:
             Output(stderr=True).print(f'note: {path}: {found.words}')

@@ -46,7 +46,7 @@ def run_capture(args: argparse.Namespace) -> Done:
 
 def run_apply(args: argparse.Namespace) -> Done:
     """Correct a recording."""
-    calibration = stored_calibration(args.calibration)
+    calibration = stored_calibration(args.calibration, args.own)
     if args.no_rotate:
         calibration = calibration.in_sensor_frame
     lines, notes = list[str](), list[str]()
@@ -77,7 +77,8 @@ def run_simulate(args: argparse.Namespace) -> Done:
 
     chosen = {name: getattr(args, name) for name in signature(simulate).parameters
               if hasattr(args, name) and name != 'also'}
-    table = simulate(dict(parse_effect(text) for text in args.effect), **chosen)
+    effects = dict(parse_effect(text, args.own) for text in args.effect)
+    table = simulate(effects, also=args.own, **chosen)
     write_table(args.output, table)
     return Done(shown=[counted(len(table), 'row')], stored=[args.output])
 
@@ -86,7 +87,8 @@ def run_export(args: argparse.Namespace) -> Done:
     """Write the file, and print what it does not hold on standard error."""
     from ..stored.exports import export, identifier, Options, read_noise
 
-    calibration, is_file = stored_calibration(args.calibration), args.output != STANDARD_OUTPUT
+    calibration = stored_calibration(args.calibration, args.own)
+    is_file = args.output != STANDARD_OUTPUT
     named = args.output if is_file and args.output is not None else args.calibration
     chosen = Options(**{**given(Options, args), 'name': args.name or identifier(Path(named).stem)})
     noise = None if args.noise is None else read_noise(args.noise)

@@ -54,7 +54,7 @@ import numpy as np
 import scipy
 
 from ..calibration import Calibration, fit_unknown, in_g, NORM_MODELS, with_history
-from ..effects import Context, effect_named, Model, reading_of
+from ..effects import Context, Model, reading_of
 from ..errors import InputError, RefusedFitError
 from ..estimate import judge, scatter_of
 from ..table import Floats
@@ -120,8 +120,8 @@ def rotation_free(calibration: Calibration, context: Context, per_g: float) -> R
     if units.is_native:
         reading_scale, force_scale = units.per_g / per_g, 1.0
     gain_scale = reading_scale / force_scale
-    own = [k for k, name in enumerate(calibration.parameters)
-           if effect_named(name.rpartition('.')[0]).bends]
+    own = [k for effect, part in zip(model.terms.effects, model.terms.parts, strict=True)
+           if effect.bends for k in range(part.start, part.stop)]
     size = len(model.vector)
     return RotationFree(
         (*NAMES, *(calibration.parameters[k] for k in own)),

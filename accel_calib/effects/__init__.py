@@ -4,11 +4,11 @@
 """
 Effects: what each adds to the reading, and its properties.
 
-`form` defines what an effect is, `catalogue` lists those with a known cause and makes curves
-without one, which `formula` states for a paper or for firmware. `own` adds those of a user, and
-`model` computes with a list of them. `way` finds how each pose was reached, `thermal` how the
-temperature lags and what it is between the steps of a thermometer, and `simulate` makes poses and
-recordings.
+`form` defines what an effect is, and `catalogue` lists those with a known cause. `records` are
+effects beyond the catalogue: curves, which `formula` states for a paper or for firmware, and
+covariates. `own` are those of a user, and `model` computes with a list of them. `way` finds how
+each pose was reached, `thermal` how the temperature lags and what it is between the steps of a
+thermometer, and `simulate` makes poses and recordings.
 
 An effect is one entry in `EFFECTS`. Simulation, fit, correction, search, report and documentation
 read it from there, so an effect that is added here works in all of them. Its contribution to the
@@ -33,35 +33,37 @@ are those of IEEE 1293 (model equation of a linear accelerometer) and of data sh
 """
 
 from .catalogue import (
-    CARRIERS, CHANGES, covariate_names, COVARIATES, curve_pairs, curve_unit, effect_named, EFFECTS,
-    EMPIRICAL, empirical_name, empirical_parts, included, is_effect, kind_of, LADDER, modes_of,
-    NOMINAL_SUPPLY, OFFSET_POWERS, parameter_names, PROCESSES, product_names,
-    REFERENCE_TEMPERATURE, unit_of, value_unit, variable_of, variable_words, VARIABLES, WANDER)
+    CATALOGUE, CHANGES, EFFECTS, entry_of, included, LADDER, NOMINAL_SUPPLY, OFFSET_POWERS,
+    parameter_names, ParameterName, PROCESSES, REFERENCE_TEMPERATURE, WANDER)
 from .form import (
-    AFFINE, AXES, by_axis, Context, CUBE, difference, Effect, fitted_places, FORCE, MODES,
-    MONOMIALS, ODD_SQUARE, ONE, PRODUCT, SIZE, SQUARE, TO_SEPARATE, WAVE, ZONAL, ZONES)
+    AFFINE, AXES, by_axis, Context, CUBE, difference, Effect, EffectKey, EffectRecord,
+    fitted_places, FORCE, MODES, MONOMIALS, ODD_SQUARE, ONE, PRODUCT, SIZE, SQUARE, TO_SEPARATE,
+    WAVE, ZONAL, ZONES)
 from .formula import formula_of
 from .model import (
     AtContext, check_context, CONVERGED_G, correct, EachShape, factors_of, LARGEST_FORCE_G,
     LARGEST_ITERATIONS, length_rows, linear_model, linear_values, Model, ModelForm, MODELS,
     own_slope, predict, reading_of, sensor_force, times, too_large, with_vector)
-from .own import know, know_code, know_file, KNOWN_CODE, OwnEffect
+from .own import effects_of_file, own_effects, OwnEffect
+from .records import (
+    CARRIERS, Covariate, covariates_of, curves_over, effect_named, EMPIRICAL, EmpiricalCurve,
+    kind_of, modes_of, products_of, unit_of, value_unit, variable_of, variable_words, VARIABLES)
 from .simulate import model_with, parse_effect, simulate_poses, simulate_recording, turn_between
 from .thermal import acting_temperature, between_steps, rate_at, ThermalStream
 from .way import way_of, with_turns
 
-__all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CHANGES', 'CONVERGED_G', 'COVARIATES', 'CUBE',
-           'EFFECTS', 'EMPIRICAL', 'FORCE', 'KNOWN_CODE', 'LADDER',
-           'LARGEST_FORCE_G', 'LARGEST_ITERATIONS', 'MODELS', 'MODES', 'MONOMIALS',
-           'NOMINAL_SUPPLY', 'ODD_SQUARE', 'OFFSET_POWERS', 'ONE', 'PROCESSES', 'PRODUCT',
-           'REFERENCE_TEMPERATURE', 'SIZE', 'SQUARE', 'TO_SEPARATE', 'VARIABLES', 'WANDER',
-           'WAVE', 'ZONAL', 'ZONES', 'AtContext', 'Context', 'EachShape', 'Effect', 'Model',
-           'ModelForm', 'OwnEffect', 'ThermalStream', 'acting_temperature', 'between_steps',
-           'by_axis', 'check_context', 'correct', 'covariate_names', 'curve_pairs', 'curve_unit',
-           'difference', 'effect_named', 'empirical_name', 'empirical_parts', 'factors_of',
-           'fitted_places', 'formula_of', 'included', 'is_effect', 'kind_of', 'know', 'know_code',
-           'know_file', 'length_rows', 'linear_model', 'linear_values', 'model_with', 'modes_of',
-           'own_slope', 'parameter_names', 'parse_effect', 'predict', 'product_names', 'rate_at',
-           'reading_of', 'sensor_force', 'simulate_poses', 'simulate_recording', 'times',
-           'too_large', 'turn_between', 'unit_of', 'value_unit', 'variable_of', 'variable_words',
-           'way_of', 'with_turns', 'with_vector']
+__all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CATALOGUE', 'CHANGES', 'CONVERGED_G', 'CUBE', 'EFFECTS',
+           'EMPIRICAL', 'FORCE', 'LADDER', 'LARGEST_FORCE_G', 'LARGEST_ITERATIONS', 'MODELS',
+           'MODES', 'MONOMIALS', 'NOMINAL_SUPPLY', 'ODD_SQUARE', 'OFFSET_POWERS', 'ONE',
+           'PROCESSES', 'PRODUCT', 'REFERENCE_TEMPERATURE', 'SIZE', 'SQUARE', 'TO_SEPARATE',
+           'VARIABLES', 'WANDER', 'WAVE', 'ZONAL', 'ZONES', 'AtContext', 'Context', 'Covariate',
+           'EachShape', 'Effect', 'EffectKey', 'EffectRecord', 'EmpiricalCurve', 'Model',
+           'ModelForm', 'OwnEffect', 'ParameterName', 'ThermalStream', 'acting_temperature',
+           'between_steps', 'by_axis', 'check_context', 'correct', 'covariates_of', 'curves_over',
+           'difference', 'effect_named', 'effects_of_file', 'entry_of', 'factors_of',
+           'fitted_places', 'formula_of', 'included', 'kind_of', 'length_rows', 'linear_model',
+           'linear_values', 'model_with', 'modes_of', 'own_effects', 'own_slope',
+           'parameter_names', 'parse_effect', 'predict', 'products_of', 'rate_at', 'reading_of',
+           'sensor_force', 'simulate_poses', 'simulate_recording', 'times', 'too_large',
+           'turn_between', 'unit_of', 'value_unit', 'variable_of', 'variable_words', 'way_of',
+           'with_turns', 'with_vector']

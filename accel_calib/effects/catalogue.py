@@ -1,31 +1,22 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The catalogue: one entry for each effect with a known cause, and curves without one.
-
-Two kinds of effects are made from their names: an empirical curve, with which a part of the
-reading, the carrier, changes smoothly with a variable (`empirical_name`), and a covariate, which
-is any quantity that the catalogue does not know (`covariate_names`).
-
-"""
+"""The catalogue: one entry for each effect with a known cause."""
 
 from collections import ChainMap
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
-from functools import cache, partial
-from itertools import combinations
-import math
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 
 from .form import (
-    ALL_AXES, AXES, by_axis, Context, CROSS, CUBE, DEGREES, Effect, Factor, FORCE, matrix_terms,
-    MODES, ODD_SQUARE, ONE, PRODUCTS, SIZE, SQUARE, Term, WAVE, ZONAL, ZONES)
+    ALL_AXES, AXES, by_axis, Context, CROSS, CUBE, Effect, EffectKey, Factor, FORCE, matrix_terms,
+    ODD_SQUARE, ONE, PRODUCTS, SIZE, SQUARE, Term)
 from .thermal import acting_temperature, rate_at
-from ..table import column_of, CONTEXT, Floats, is_quantity
-from ..units import MG, STANDARD_GRAVITY
+from ..table import Floats
+from ..units import STANDARD_GRAVITY
 
 REFERENCE_TEMPERATURE = 25.0
 """Temperature at which the temperature effects are zero [°C], as in data sheets."""
@@ -275,256 +266,34 @@ CHANGES: dict[str, Effect] = {
 """Changes of a sensor since its stored calibration; see `accel_calib.refine`. The column ``new``
 is 1 for poses taken since then and 0 for the poses of the calibration."""
 
-EMPIRICAL = 'empirical'
-"""Name of a smooth curve without a physical cause; see `empirical_name`."""
-
-CARRIERS: dict[str, tuple[str, ...]] = {
-    'offset': AXES, 'gain': AXES, 'cross_axis': ('xy', 'xz', 'yz'), 'force': ('all',)}
-"""What an empirical curve can change, with the names of its parts. Each part alone is a carrier,
-too, such as ``gain.z``. The carrier ``force`` is the common gain of all axes."""
-
-VARIABLES: dict[str, str] = {
-    'time': 'time', 'temperature': 'temperature', 'temperature_rate': 'rate of temperature',
-    'supply_voltage': 'supply voltage', 'std': 'vibration', 'force': 'force along the axis',
-    'direction': 'direction of the force'}
-"""Quantities that an empirical curve can be a function of, by column, with their words."""
+CATALOGUE: Mapping[str, Effect] = ChainMap(EFFECTS, PROCESSES, CHANGES)
+"""All effects with a name."""
 
 
-def variable_words(variable: str) -> str:
-    """Return the words of a variable: of `VARIABLES`, a quantity, or a product of two columns."""
-    return ' times '.join(VARIABLES.get(column) or column_of(column).meaning
-                          for column in variable.split(_TIMES))
+def entry_of(effect: EffectKey) -> Effect:
+    """Return the entry of an effect; KeyError for a name that the catalogue lacks."""
+    return CATALOGUE[effect] if isinstance(effect, str) else effect.entry
 
 
-_CARRIED = {'offset': by_axis(ONE), 'gain': by_axis(FORCE), 'cross_axis': CROSS, 'force': ALL_AXES}
+class ParameterName(str):
+    """The name of a value of an effect, such as ``offset.x``, which keeps the effect."""
+
+    effect: EffectKey
+
+    @classmethod
+    def of(cls, effect: EffectKey, part: str) -> 'ParameterName':
+        made = cls(f'{effect}.{part}')
+        made.effect = effect
+        return made
 
 
-def empirical_name(carrier: str, variable: str, modes: Iterable[int]) -> str:
-    """
-    Return the name of an empirical curve: Σ_k c_k cos(k π s) over the modes k, 1 to `MODES`.
-
-    The carrier, one of `CARRIERS` or a part of one, changes with one of `VARIABLES` or a quantity.
-    s runs from 0 to 1 over its range in the poses; outside of it, the curve is constant. The
-    modes of the variable ``direction`` are degrees of spherical harmonics.
-
-    """
-    return '-'.join([EMPIRICAL, carrier, variable, *map(str, modes)])
+@lru_cache(maxsize=512)
+def parameter_names(effects: tuple[EffectKey, ...]) -> tuple[str, ...]:
+    """Return the names of the values of these effects, in vector order."""
+    return tuple(ParameterName.of(effect, part)
+                 for effect in effects for part in entry_of(effect).values)
 
 
-def curve_pairs(quantities: Iterable[str] = ()) -> Iterator[tuple[str, str]]:
-    """Yield the carriers and variables of empirical curves; the quantities are variables, too."""
-    for variable in (*VARIABLES, *quantities):
-        for carrier in CARRIERS:
-            if carrier == {'force': 'offset', 'direction': 'force'}.get(variable, carrier):
-                yield carrier, variable
-
-
-def modes_of(variable: str) -> Sequence[int]:
-    """Return the modes that an empirical curve over a variable can have."""
-    return DEGREES if variable == 'direction' else range(1, MODES + 1)
-
-
-def empirical_parts(name: str) -> tuple[str, str, tuple[int, ...]]:
-    """Return carrier, variable and modes of an empirical curve; `KeyError` for another name."""
-    first, *rest = name.split('-')
-    if first != EMPIRICAL or len(rest) < 3 or not all(part.isdecimal() for part in rest[2:]):
-        raise KeyError(name)
-    modes = tuple(int(part) for part in rest[2:])
-    whole, dot, part = rest[0].partition('.')
-    pairs = curve_pairs(filter(is_quantity, rest[1:2]))
-    if ((whole, rest[1]) not in pairs or (dot and part not in CARRIERS[whole])
-            or list(modes) != sorted(set(modes)) or not set(modes) <= set(modes_of(rest[1]))):
-        raise KeyError(name)
-    return rest[0], rest[1], modes
-
-
-def _empirical(name: str) -> Effect:
-    carrier, variable, modes = empirical_parts(name)
-    if variable == 'direction':  # the gain of all axes as a sum of spherical harmonics
-        zones = [number for number, zone in enumerate(ZONES) if zone.degree in modes]
-        return Effect(
-            f'gain as a smooth function of {VARIABLES["direction"]}', 'empirical curve',
-            tuple(f'{degree}_{k}' for degree in modes for k in range(1, 2 * degree + 2)), 'g/g',
-            0.001, 0.5, tuple(Term(k, axis, ZONAL + 3 * number + axis)
-                              for k, number in enumerate(zones) for axis in range(3)),
-            family='force')
-    whole, _, part = carrier.partition('.')
-    parts, of_force = (part,) if part else CARRIERS[whole], variable == 'force'
-    carried = [term._replace(parameter=parts.index(own)) for term in _CARRIED[whole]
-               if (own := CARRIERS[whole][term.parameter]) in parts]
-    terms = tuple(
-        term._replace(parameter=k * len(parts) + term.parameter,
-                      monomial=WAVE + 3 * (mode - 1) + term.axis if of_force else term.monomial)
-        for k, mode in enumerate(modes) for term in carried)
-    names = tuple(f'{own}_{mode}' for mode in modes for own in parts)
-    words = f'{carrier.replace("_", "-")} as a smooth function of {variable_words(variable)}'
-    curve = partial(Effect, words, 'empirical curve', names, 'g', 0.001, 0.5, terms)
-    if of_force:
-        return curve(family='force')
-    return curve(factor=partial(_cosines, variable, modes, len(carried)), needs=(variable,),
-                 shape=('low', 'high'), shapes=partial(_ends, variable))
-
-
-def _variable(variable: str, context: Mapping[str, Any]) -> Floats:
-    """Return the variable of an empirical curve; for vectors, its RMS over the axes."""
-    values = np.asarray(context[variable], float)
-    return np.sqrt(np.mean(values ** 2, axis=-1)) if variable == 'std' else values
-
-
-def _ends(variable: str, context: Context) -> Iterator[Floats]:
-    """Yield the range of a variable."""
-    values = _variable(variable, context)
-    known = values[np.isfinite(values)]
-    if len(known) and np.ptp(known) > 0.0:
-        yield np.array([np.min(known), np.max(known)])
-
-
-def _cosines(variable: str, modes: tuple[int, ...], terms: int, context: Mapping[str, Any],
-             shape: Floats) -> Any:
-    """Return the cosine of each term, (t, n), with several terms of each mode."""
-    values = _variable(variable, context)
-    share = np.clip((values - shape[0]) / max(shape[1] - shape[0], 1e-300), 0.0, 1.0)
-    return np.repeat(np.cos(np.pi * np.multiply.outer(modes, share)), terms, axis=0)
-
-
-COVARIATES = {'offset_covariate': ('offset', ONE, 'g/unit'),
-              'gain_covariate': ('gain of each axis', FORCE, '1/unit')}
-"""What a covariate changes in proportion to a quantity: words, monomial, unit of its values."""
-
-_CURVED, _TIMES = '2', '*'
-
-
-def covariate_names(quantities: Iterable[str]) -> Iterator[str]:
-    """
-    Yield the names of the covariates of quantities, such as ``offset_covariate-pressure``.
-
-    It adds k (pressure - zero), by axis, with the mean over the poses as zero. With ``-2`` at the
-    end it adds a square, k₂ (pressure - zero)², too.
-
-    """
-    for quantity in quantities:
-        for kind in COVARIATES:
-            yield f'{kind}-{quantity}'
-            yield f'{kind}-{quantity}-{_CURVED}'
-
-
-def product_names(columns: Iterable[str]) -> Iterator[str]:
-    """
-    Yield the names of covariates of a product, such as ``offset_covariate-humidity*pressure``.
-
-    It adds k (humidity - zero) (pressure - zero), by axis: what neither column does alone.
-
-    """
-    for pair in combinations(sorted(columns), 2):
-        yield from (f'{kind}-{_TIMES.join(pair)}' for kind in COVARIATES)
-
-
-def kind_of(name: str) -> str:
-    """Return the name of an effect without the variable, for one made from its name."""
-    return name.partition('-')[0]
-
-
-def variable_of(name: str) -> str:
-    """Return the variable of an effect made from its name; empty for others."""
-    if kind_of(name) == EMPIRICAL:
-        return empirical_parts(name)[1]
-    return name.split('-')[1] if kind_of(name) in COVARIATES else ''
-
-
-def _covariate(name: str) -> Effect:
-    kind, _, rest = name.partition('-')
-    variable, *curved = rest.split('-')
-    columns = tuple(variable.split(_TIMES))
-    is_product = len(columns) == 2 and columns[0] < columns[1] and all(
-        is_quantity(column) or column in CONTEXT for column in columns)
-    if not (is_quantity(variable) and curved in ([], [_CURVED])) and not (
-            is_product and not curved):
-        raise KeyError(name)
-    what, monomial, unit = COVARIATES[kind]
-    terms = by_axis(monomial)
-    names: tuple[str, ...] = AXES
-    if curved:
-        terms += tuple(term._replace(parameter=3 + term.parameter) for term in terms)
-        names += tuple(f'{axis}_square' for axis in AXES)
-    return Effect(
-        f'{what} that changes with {variable_words(variable)}', f'coefficient of {variable}',
-        names, unit, np.inf, 0.5, terms, partial(_departure, columns, bool(curved)), columns,
-        tuple(f'zero_{column}' for column in columns) if is_product else ('zero',),
-        partial(_means, columns, 3 if curved else 2), (0.0,) * len(columns),
-        includes=(f'{kind}-{variable}',) if curved else ())
-
-
-def _departure(columns: Sequence[str], curved: bool, context: Mapping[str, Any], shape: Floats
-               ) -> Any:
-    """Return the product of all column - zero; for a curved covariate its square, too."""
-    away = math.prod(context[column] - zero for column, zero in zip(columns, shape, strict=True))
-    return np.array([away] * 3 + [away ** 2] * 3) if curved else away
-
-
-def _means(columns: Sequence[str], least: int, context: Context) -> Iterator[Floats]:
-    """Yield the means of columns that have at least this number of different values."""
-    known = [context[column][np.isfinite(context[column])] for column in columns]
-    if all(len(np.unique(values)) >= least for values in known):
-        yield np.array([np.mean(values) for values in known])
-
-
-OWN: dict[str, Effect] = {}
-"""Effects of the user that this process knows."""
-
-
-def is_effect(name: str) -> bool:
-    """Return whether an effect has this name."""
-    try:
-        effect_named(name)
-    except KeyError:
-        return False
-    return True
-
-
-@cache
-def effect_named(name: str) -> Effect:
-    """Return the effect with this name: of the catalogue, own, a covariate, or a curve."""
-    known = ChainMap(EFFECTS, PROCESSES, CHANGES, OWN)
-    if name in known:
-        return known[name]
-    return _covariate(name) if kind_of(name) in COVARIATES else _empirical(name)
-
-
-@cache
-def parameter_names(effects: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the names of the values of these effects, such as ``offset.x``, in vector order."""
-    return tuple(f'{name}.{part}' for name in effects for part in effect_named(name).values)
-
-
-def included(names: Iterable[str]) -> set[str]:
-    """Return the names of the effects that these effects contain."""
-    return {each for name in names for each in effect_named(name).includes}
-
-
-_IN_MILLI = ('g', 'g/g', 'g/g²', 'g/g³', 'g/°C', 'g/°C²', 'g/°C³', 'g/h')
-_WITHOUT_UNIT = ('of_sensor', 'form')
-"""Constants of a shape that select one of two forms."""
-
-
-def value_unit(effect_name: str, value_name: str) -> tuple[str, float]:
-    """Return the unit of a value of an effect in reports, and the factor from the model's unit."""
-    if value_name in _WITHOUT_UNIT:
-        return '', 1.0
-    effect, variable = effect_named(effect_name), variable_of(effect_name)
-    if value_name not in effect.parameters:
-        column = value_name.removeprefix('zero_') if _TIMES in variable else variable
-        return unit_of(column) if variable else '' if effect.own else 's', 1.0
-    unit = curve_unit(effect_name) if kind_of(effect_name) == EMPIRICAL else effect.unit
-    if value_name.endswith('_square'):
-        unit = f'{unit}²'
-    return (f'm{unit}', MG) if unit in _IN_MILLI else (unit, 1.0)
-
-
-def curve_unit(name: str) -> str:
-    """Return the unit of an empirical curve."""
-    return 'g' if empirical_parts(name)[0].startswith('offset') else 'g/g'
-
-
-def unit_of(column: str) -> str:
-    """Return the unit of a quantity of the context, with readings in g."""
-    return 'g' if column == 'std' else column_of(column).unit
+def included(effects: Iterable[EffectKey]) -> set[EffectKey]:
+    """Return the effects that these effects contain."""
+    return {each for effect in effects for each in entry_of(effect).includes}

@@ -3,6 +3,7 @@
 
 """The form of an effect: the sum of terms that `accel_calib.effects` describes."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -119,7 +120,7 @@ ZONES = [Zone(degree, towards, leg2poly([0.0] * degree + [1.0]).tolist())
          for degree in DEGREES for towards in _directions(degree)]
 """Harmonics of all `DEGREES`, in their order."""
 
-MONOMIALS: list[Monomial] = [
+MONOMIALS: tuple[Monomial, ...] = (
     Monomial(lambda x, y, z: 1.0, lambda x, y, z: (0.0, 0.0, 0.0)),
     *each_axis(lambda u: u, lambda u: 1.0),
     *each_axis(lambda u: u * u, lambda u: 2.0 * u),
@@ -131,7 +132,7 @@ MONOMIALS: list[Monomial] = [
     Monomial(lambda x, y, z: y * z, lambda x, y, z: (0.0, z, y)),
     *(monomial for mode in range(1, MODES + 1) for monomial in each_axis(*_wave(mode))),
     *(monomial for zone in ZONES for monomial in zone.monomials()),
-]
+)
 """1; u_i; u_i²; u_i³; u_i|u_i|; |u_i|; u_x u_y, u_x u_z, u_y u_z; cos(k π (u_i + 1) / 2) for each
 k, constant beyond ±1 g; u_i P(c) for each of `ZONES`. The first four are affine."""
 
@@ -194,8 +195,8 @@ class Effect:
         Column of the temperature that acts, for the shape ``lag``, ``of_sensor``; else empty.
     family : {'', 'force', 'time'}
         Group of effects that can be confused with this one.
-    includes : tuple of str
-        Names of the effects that this one contains. A model has either this effect or those.
+    includes : tuple of EffectKey
+        The effects that this one contains. A model has either this effect or those.
     base : str
         Name of the effect that changes, for an effect of `CHANGES`; empty for other effects.
     known_orientation : bool
@@ -230,7 +231,7 @@ class Effect:
     over: tuple[str, ...] = ()
     lagged: str = ''
     family: Family = ''
-    includes: tuple[str, ...] = ()
+    includes: 'tuple[EffectKey, ...]' = ()
     base: str = ''
     known_orientation: bool = False
     repeatable_g: float = np.inf
@@ -290,6 +291,28 @@ class Effect:
         """Return the columns that the factor is a function of with this shape."""
         return (self.lagged,) if self.is_lagged(shape) else self.over or self.needs
 
+
+class EffectRecord(ABC):
+    """
+    An effect beyond the catalogue: what defines it, with a text form for files and messages.
+
+    Equal records are the same effect.
+
+    """
+
+    @property
+    @abstractmethod
+    def kind(self) -> str:
+        """Return the name of the effect without what it is a function of."""
+
+    @property
+    @abstractmethod
+    def entry(self) -> Effect:
+        """Return the effect as the catalogue has them."""
+
+
+EffectKey = str | EffectRecord
+"""An effect of a model: its name in the catalogue, or its record."""
 
 AT_POSES = ('since_turn', 'duration')
 """Columns that only poses have."""

@@ -17,10 +17,8 @@ from functools import partial
 
 import numpy as np
 
-from .catalogue import (
-    CARRIERS, curve_unit, effect_named, EMPIRICAL, empirical_parts, kind_of, unit_of, variable_of,
-    variable_words)
-from .form import MODES
+from .form import EffectKey, MODES
+from .records import EmpiricalCurve, unit_of, variable_words
 from ..table import Floats
 from ..units import MG
 
@@ -38,7 +36,7 @@ _Form = tuple[Floats, _Expression]
 """The (k, g) functions of a form, and the expression of their k factors."""
 
 
-def formula_of(name: str, values: Floats, deviations: Mapping[str, float]) -> str:
+def formula_of(effect: EffectKey, values: Floats, deviations: Mapping[str, float]) -> str:
     """
     Return the formula of an empirical curve; empty for others and over directions of the force.
 
@@ -47,13 +45,10 @@ def formula_of(name: str, values: Floats, deviations: Mapping[str, float]) -> st
     in its variable.
 
     """
-    if kind_of(name) != EMPIRICAL or variable_of(name) == 'direction':
+    if not isinstance(effect, EmpiricalCurve) or effect.variable == 'direction':
         return ''
-    carrier, variable, modes = empirical_parts(name)
-    spread = np.array([deviations.get(f'{name}.{part}', 0.0)
-                       for part in effect_named(name).values])
-    whole, _, part = carrier.partition('.')
-    names = (part,) if part else CARRIERS[whole]
+    variable, modes, names = effect.variable, effect.modes, effect.parts
+    spread = np.array([deviations.get(f'{effect}.{part}', 0.0) for part in effect.entry.values])
     low, high = (-1.0, 1.0) if variable == 'force' else values[-2:].tolist()
     share = np.linspace(0.0, 1.0, 201)
     waves = np.cos(np.pi * np.multiply.outer(np.array(modes), share))
@@ -74,7 +69,7 @@ def formula_of(name: str, values: Floats, deviations: Mapping[str, float]) -> st
     unit = 'g' if variable == 'force' else unit_of(variable)
     each = ', '.join(f'{own} = {expression(row)}'
                      for own, row in zip(names, factors.tolist(), strict=True))
-    return (f'{whole.replace("_", "-")} [m{curve_unit(name)}]: {each}; t = '
+    return (f'{effect.carrier.replace("_", "-")} [m{effect.unit}]: {each}; t = '
             f'{variable_words(variable)}{f" {_signed(-low)}" if low else ""}, from 0 to '
             f'{high - low:.6g} {unit}').rstrip()
 

@@ -24,9 +24,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .catalogue import effect_named, EFFECTS, is_effect, PROCESSES
+from .catalogue import CATALOGUE, EFFECTS, entry_of, PROCESSES
 from .form import (
-    AFFINE, AT_POSES, Context, difference, Effect, fitted_places, FORCE, MONOMIALS, ONE)
+    AFFINE, AT_POSES, Context, difference, Effect, EffectKey, fitted_places, FORCE, MONOMIALS, ONE)
 from .thermal import Lag
 from ..errors import InputError
 from ..geometry import unit
@@ -57,11 +57,10 @@ class Terms:
     terms by value, and `bends_to_axis` (3, b) sums by axis the terms `bending` (b,), which bend
     with the force. `scaling` is the index of a term that scales gains, of its value, and (g,) of
     the terms that it scales; None without one. `fixed` is whether all terms are independent of the
-    context, and `of_force` the names of own effects that are functions of the force, too.
+    context, and `of_force` the own effects that are functions of the force, too.
 
     """
 
-    names: tuple[str, ...]
     effects: tuple[Effect, ...]
     parts: tuple[slice, ...]
     rows: tuple[slice, ...]
@@ -77,7 +76,7 @@ class Terms:
     bends_to_axis: Floats
     scaling: tuple[int, int, Indices] | None
     fixed: bool
-    of_force: tuple[str, ...]
+    of_force: tuple[EffectKey, ...]
 
     def monomials_at(self, u: Floats) -> Floats:
         """Return the (m, n) monomials of (n, 3) forces."""
@@ -115,12 +114,12 @@ class Terms:
 
 
 @lru_cache(maxsize=512)
-def terms_of(names: tuple[str, ...]) -> Terms:
-    """Return the terms of the effects of these names; ValueError for other names."""
-    for name in names:
-        if name in PROCESSES or not is_effect(name):
-            raise ValueError(f'effect is {name!r}, expected one of {", ".join(EFFECTS)}')
-    effects = tuple(effect_named(name) for name in names)
+def terms_of(keys: tuple[EffectKey, ...]) -> Terms:
+    """Return the terms of effects; ValueError for a name that is not in the catalogue."""
+    for key in keys:
+        if isinstance(key, str) and (key not in CATALOGUE or key in PROCESSES):
+            raise ValueError(f'effect is {key!r}, expected one of {", ".join(EFFECTS)}')
+    effects = tuple(map(entry_of, keys))
     used = sorted({term.monomial for effect in effects for term in effect.terms} | {ONE})
     ends = [[0, *accumulate(map(len, each))] for each in (
         [effect.values for effect in effects], [effect.terms for effect in effects])]
@@ -140,13 +139,13 @@ def terms_of(names: tuple[str, ...]) -> Terms:
             scaling = own.start, part.start, gains[(gains < own.start) | (gains >= own.stop)]
             break
     return Terms(
-        names, effects, parts, rows, tuple(used), monomial, place, axis, value,
+        effects, parts, rows, tuple(used), monomial, place, axis, value,
         weight=np.array([term.weight for term, _ in terms], float),
         to_affine=_sums(np.where(is_affine, slot, -1), 12),
         to_value=_sums(value, ends[0][-1]), bending=bending,
         bends_to_axis=_sums(axis[bending], 3), scaling=scaling,
         fixed=all(effect.factor is None for effect in effects),
-        of_force=tuple(name for name, effect in zip(names, effects) if effect.of_force))
+        of_force=tuple(key for key, effect in zip(keys, effects) if effect.of_force))
 
 
 def _sums(index: Indices, size: int) -> Floats:
@@ -295,20 +294,20 @@ class Model(Record):
 
     Parameters
     ----------
-    values : mapping of str to (p,) array
-        Values of each effect, by its name in `accel_calib.effects.EFFECTS`. Without a shape that
-        has usual values, these are added.
+    values : mapping of EffectKey to (p,) array
+        Values of each effect, by its name in `accel_calib.effects.EFFECTS` or its record. Without
+        a shape that has usual values, these are added.
     rotation : (3, 3) array
         ΔR, transforms from the levelled frame to the sensor axes.
 
     """
 
-    values: Mapping[str, Floats]
+    values: Mapping[EffectKey, Floats]
     rotation: Floats = field(default_factory=_IDENTITY.copy)
     terms: Terms = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        terms, filled = terms_of(tuple(self.values)), {}
+        terms, filled = terms_of(tuple(self.values)), dict[EffectKey, Floats]()
         for part, effect, (name, values) in zip(terms.parts, terms.effects, self.values.items()):
             expected = (part.stop - part.start,)
             filled[name] = values if np.shape(values) == expected else effect.filled(values)
@@ -323,8 +322,8 @@ class Model(Record):
         return Model, (dict(self.values), self.rotation)
 
     @cached_property
-    def effects(self) -> tuple[str, ...]:
-        """Names of the effects, in order."""
+    def effects(self) -> tuple[EffectKey, ...]:
+        """Effects, in order: names of the catalogue, and records."""
         return tuple(self.values)
 
     @cached_property
@@ -509,12 +508,12 @@ class Model(Record):
 class EachShape:
     """An effect with s shapes, by the (s, t or 1, n) factors of its terms at the poses."""
 
-    name: str
+    effect: EffectKey
     factors: Floats
 
     @property
     def terms(self) -> Terms:
-        return terms_of((self.name,))
+        return terms_of((self.effect,))
 
     def basis_of(self, plain: Floats, context: Context, u: Floats) -> Basis:
         """Return the derivative of the reading by the parameters; see `Model.basis_of`."""
@@ -522,14 +521,14 @@ class EachShape:
         return Basis(plain * self.factors, terms.place, terms.axis, terms.to_value[:parameters])
 
 
-def factors_of(name: str, shapes: Iterable[Floats], context: Context) -> Floats:
+def factors_of(effect: EffectKey, shapes: Iterable[Floats], context: Context) -> Floats:
     """
     Return the (s, t or 1, n) factors of the terms of an effect with s shapes, at poses in g.
 
     Without a column ``force`` [g], the force is that of the readings.
 
     """
-    factor = effect_named(name).factor
+    factor = entry_of(effect).factor
     if factor is None:
         return np.ones((1, 1, 1))
     if 'reading' in context:
@@ -537,7 +536,7 @@ def factors_of(name: str, shapes: Iterable[Floats], context: Context) -> Floats:
     return np.nan_to_num([np.atleast_2d(factor(context, shape)) for shape in shapes])
 
 
-def with_vector(effects: tuple[str, ...], vector: Floats) -> Model:
+def with_vector(effects: tuple[EffectKey, ...], vector: Floats) -> Model:
     """Return the model of these effects with the (p,) vector of all values and ΔR = I."""
     parts = terms_of(effects).parts
     return Model({name: vector[part] for name, part in zip(effects, parts, strict=True)})

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Effects of a user: their definition, the guard around their functions, and how they become known.
+Effects of a user: their definition, the guard around their functions, and the files with them.
 
 A function of a user takes read-only copies of rows that are finite, and returns a finite number
 for each row. It is called again with every other row: another answer shows that it depends on
@@ -11,8 +11,8 @@ something else than its arguments, or on other rows.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property, lru_cache
 from inspect import Parameter, signature
 from itertools import product
 from pathlib import Path
@@ -21,9 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from .catalogue import effect_named, is_effect, OWN, parameter_names
-from .form import AXES, Context, Effect, ONE, Term
-from .model import terms_of
+from .catalogue import CATALOGUE
+from .form import AXES, Context, Effect, EffectRecord, ONE, Term
 from .thermal import rate_at
 from ..disk import check_regular
 from ..errors import AccelCalibError, InputError, OwnEffectError
@@ -55,10 +54,12 @@ _STEPS = (0.618034, 0.414214, 0.732051)
 of the further constants, irrational, so that few starts cover their ranges."""
 
 
-@dataclass(frozen=True)
-class OwnEffect:
+@dataclass(frozen=True, eq=False)
+class OwnEffect(EffectRecord):
     """
     An effect of a user: each axis reads k · function more, or k · form(u) · change(x).
+
+    Two are equal if they come from the same file, or have the same parts.
 
     Parameters
     ----------
@@ -103,8 +104,13 @@ class OwnEffect:
     function: Callable[..., Any] | None = None
     constants: Mapping[str, Sequence[float]] = field(default_factory=dict)
     axes: str = ''.join(AXES)
+    source: tuple[str, bytes] | None = field(default=None, init=False, repr=False)
+    """Name and content of the file that defines the effect, by which it is pickled."""
 
     def __post_init__(self) -> None:
+        if self.name in CATALOGUE:
+            raise InputError(f'the effect {self.name!r} is in the catalogue',
+                             'choose another name')
         simple, taken = self.form is not None or self.variable, (*_COLUMNS, *AXES, _ALL)
         self._check(bool(_NAME.fullmatch(self.name)),
                     'has no usable name, expected small letters, digits and _')
@@ -146,6 +152,29 @@ class OwnEffect:
         if not is_sound:
             raise InputError(f'the effect {self.name!r} {else_}', 'correct its definition')
 
+    def __str__(self) -> str:
+        return self.name
+
+    @property
+    def kind(self) -> str:
+        return self.name
+
+    @property
+    def _parts(self) -> tuple[Any, ...]:
+        return tuple(getattr(self, each.name) for each in fields(self) if each.init)
+
+    def __eq__(self, other: object) -> bool:
+        return (isinstance(other, OwnEffect) and self.name == other.name
+                and self.source == other.source
+                and (self.source is not None or self._parts == other._parts))
+
+    def __hash__(self) -> int:
+        return hash(self.name)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return how to make the effect again: functions of a file cannot be pickled."""
+        return (_of_file, (*self.source, self.name)) if self.source else (OwnEffect, self._parts)
+
     @cached_property
     def _calls(self) -> tuple[tuple[str, Callable[..., Any], tuple[str, ...]], ...]:
         """Return the factors of the effect: kind, function, names of its arguments."""
@@ -173,16 +202,17 @@ class OwnEffect:
     def _places(self) -> list[int]:
         return [k for k, axis in enumerate(AXES) if axis in self.axes or self.axes == _ALL]
 
-    def _entry(self) -> Effect:
-        """Return the effect as the catalogue has them."""
+    @cached_property
+    def entry(self) -> Effect:
         over = tuple(key for key in self._columns if key != 'force')
         return Effect(
-            self.words, 'own effect', (_ALL,) if self.axes == _ALL else tuple(self.axes),
-            self.unit, self.typical, 0.5,
-            tuple(Term(k * (self.axes != _ALL), axis, ONE) for k, axis in enumerate(self._places)),
-            self._factor if self._columns else None,
-            tuple(dict.fromkeys(need for key in over for need in _NEEDS.get(key, (key,)))),
-            tuple(self.constants), self._shapes if self.constants else None, over=over,
+            words=self.words, term='own effect', unit=self.unit, typical=self.typical,
+            parameters=(_ALL,) if self.axes == _ALL else tuple(self.axes), plausible_g=0.5,
+            terms=tuple(Term(k * (self.axes != _ALL), axis, ONE)
+                        for k, axis in enumerate(self._places)),
+            factor=self._factor if self._columns else None, over=over,
+            needs=tuple(dict.fromkeys(need for key in over for need in _NEEDS.get(key, (key,)))),
+            shape=tuple(self.constants), shapes=self._shapes if self.constants else None,
             bounds=tuple((low, high) for low, high, *_ in self.constants.values()),
             of_force='force' in self._columns, own=True)
 
@@ -263,41 +293,26 @@ def _rows(given: Sequence[Any], which: Any) -> list[Any]:
     return [read_only(np.array(each[which])) if np.ndim(each) else each for each in given]
 
 
-def know(effects: Iterable[OwnEffect]) -> tuple[str, ...]:
-    """
-    Make effects of the user known to this process, instead of those of the same names.
-
-    Return their names. Raise InputError for a name that the catalogue has.
-
-    """
-    names = []
-    for own in effects:
-        if is_effect(own.name) and own.name not in OWN:
-            raise InputError(f'the effect {own.name!r} is in the catalogue', 'choose another name')
-        OWN[own.name] = own._entry()
-        names.append(own.name)
-    effect_named.cache_clear()
-    parameter_names.cache_clear()
-    terms_of.cache_clear()
-    return tuple(names)
+def own_effects(effects: Iterable[OwnEffect]) -> tuple[OwnEffect, ...]:
+    """Return effects without those that a later one of the same name replaces."""
+    return tuple({each.name: each for each in effects}.values())
 
 
-def know_file(path: Path) -> tuple[str, ...]:
-    """Execute a Python file as `know_code` does; raise OSError if it cannot be read."""
+def effects_of_file(path: Path) -> tuple[OwnEffect, ...]:
+    """Execute a Python file as `effects_of_code` does; raise OSError if it cannot be read."""
     check_regular(path)
-    return know_code(str(path), path.read_bytes())
+    return effects_of_code(str(path), path.read_bytes())
 
 
-def know_code(name: str, code: bytes) -> tuple[str, ...]:
+@lru_cache(maxsize=16)
+def effects_of_code(name: str, code: bytes) -> tuple[OwnEffect, ...]:
     """
-    Make the own effects that the code of a file defines known, and return their names.
+    Return the own effects that the code of a file defines.
 
-    The code is executed, unless this process has executed it. Raise InputError if it cannot be
-    executed, or defines no effect.
+    The code is executed, unless this process has just executed it. Raise InputError if it cannot
+    be executed, or defines no effect.
 
     """
-    if KNOWN_CODE.get(name) == code:
-        return _DEFINED[name]
     defined: dict[str, Any] = {'__file__': name, '__name__': Path(name).stem}
     try:
         exec(compile(code, name, 'exec'), defined)
@@ -306,17 +321,15 @@ def know_code(name: str, code: bytes) -> tuple[str, ...]:
     except (Exception, SystemExit) as err:
         raise InputError(f'{name} cannot be executed ({reason(err)}), expected '
                          'Python with own effects', 'correct it') from err
-    found = {id(each): each for each in defined.values() if isinstance(each, OwnEffect)}
+    found = [replace(each) for each in defined.values() if isinstance(each, OwnEffect)]
     if not found:
         raise InputError(f'{name} defines no effect, expected at least one accel_calib.Effect',
                          'see docs/effects.md for an example')
-    _DEFINED[name] = know(found.values())
-    KNOWN_CODE[name] = code
-    return _DEFINED[name]
+    for each in found:
+        object.__setattr__(each, 'source', (name, code))
+    return own_effects(found)
 
 
-KNOWN_CODE: dict[str, bytes] = {}
-"""Code of the files with own effects that this process has executed, for another process."""
-
-_DEFINED: dict[str, tuple[str, ...]] = {}
-"""Names of the effects of these files."""
+def _of_file(name: str, code: bytes, effect: str) -> OwnEffect:
+    """Return an effect that is unpickled."""
+    return next(each for each in effects_of_code(name, code) if each.name == effect)

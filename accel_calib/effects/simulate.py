@@ -10,24 +10,26 @@ levelled frame, a unit vector of specific force. Simulated noise is seeded.
 """
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .catalogue import CHANGES, effect_named, EFFECTS, is_effect, PROCESSES
-from .form import Context
+from .catalogue import CHANGES, EFFECTS, entry_of, PROCESSES
+from .form import Context, EffectKey, EffectRecord
 from .model import Model, predict
+from .records import effect_named
 from .way import way_to, with_turns
 from ..errors import InputError
 from ..table import Floats, numbered, Poses, Recording
 from ..units import Indices
 
 
-def parse_effect(text: str) -> tuple[str, Floats]:
+def parse_effect(text: str, own: Sequence[EffectRecord] = ()) -> tuple[str, Floats]:
     """
     Return name and (p,) values from a text such as ``offset=0.01,-0.02,0.03``, as `model_with`.
 
-    Raise `InputError` if the text is not of this form.
+    It may be one of own effects. Raise `InputError` if the text is not of this form.
 
     """
     name, equals, values = text.partition('=')
@@ -38,15 +40,20 @@ def parse_effect(text: str) -> tuple[str, Floats]:
         numbers = np.array([float(part) for part in values.split(',')])
     except ValueError:
         numbers = np.array([np.nan])
-    return name, _values_of(name, numbers, repr(values))
+    return name, _values_of(name, numbers, own, repr(values))[1]
 
 
-def _values_of(name: str, given: ArrayLike, text: str = '') -> Floats:
-    """Return the values of an effect; one value is used for all axes, and the usual shape."""
-    if not is_effect(name) or name in PROCESSES or name in CHANGES:
+def _values_of(name: EffectKey, given: ArrayLike, own: Sequence[EffectRecord], text: str = ''
+               ) -> tuple[EffectKey, Floats]:
+    """Return an effect and its values; one value is used for all axes, and the usual shape."""
+    try:
+        key = effect_named(name, own) if isinstance(name, str) else name
+        if key in PROCESSES or key in CHANGES:
+            raise KeyError(name)
+    except KeyError:
         raise InputError(f'effect {name!r} is not in the catalogue',
-                         f'use one of {", ".join(EFFECTS)}')
-    effect = effect_named(name)
+                         f'use one of {", ".join(EFFECTS)}') from None
+    effect = entry_of(key)
     values, names = np.atleast_1d(np.asarray(given, float)), effect.values
     least = len(effect.parameters) if effect.usual else len(names)
     counts = sorted({least, len(names), 1 if least == len(effect.parameters) else least})
@@ -58,19 +65,21 @@ def _values_of(name: str, given: ArrayLike, text: str = '') -> Floats:
                          f'{",".join(["0.001"] * least)}')
     if len(values) == 1:
         values = np.repeat(values, least)
-    return np.array(effect.filled(values), float)
+    return key, np.array(effect.filled(values), float)
 
 
-def model_with(effects: Mapping[str, ArrayLike], rotation: Floats | None = None) -> Model:
+def model_with(effects: Mapping[Any, ArrayLike], rotation: Floats | None = None,
+               own: Sequence[EffectRecord] = ()) -> Model:
     """
     Return the model with these effects and ΔR, in the order of the catalogue.
 
-    The values are in the units of the catalogue; one value is used for all axes. Raise
+    The effects are keys or text forms, perhaps of own effects. The values are in the units of the
+    catalogue; one value is used for all axes. Raise
     `InputError` for an effect that is not there, or has another number of finite values.
 
     """
-    values = {name: _values_of(name, given) for name, given in effects.items()}
-    ordered = {name: values[name] for name in (*EFFECTS, *values) if name in values}
+    values = dict(_values_of(name, given, own) for name, given in effects.items())
+    ordered = {key: values[key] for key in (*EFFECTS, *values) if key in values}
     return Model(ordered) if rotation is None else Model(ordered, rotation)
 
 

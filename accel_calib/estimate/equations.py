@@ -57,7 +57,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from ..effects import AtContext, Context, EachShape, Model, times
+from ..effects import AtContext, Context, EachShape, EffectKey, Model, times
 from ..geometry import unit
 from ..statistics import NORMAL_95, over_axes
 from ..table import Poses
@@ -265,10 +265,10 @@ class Equations:
         """Return the (m, p) derivative of the prediction by the values of a model, per noise."""
         return np.concatenate([part.columns(model) for part in self.parts])
 
-    def columns_of(self, name: str, factors: Floats) -> Floats:
+    def columns_of(self, effect: EffectKey, factors: Floats) -> Floats:
         """Return the (m, s p) derivative for s shapes; factors as from `effects.factors_of`."""
         return np.concatenate([part.columns(EachShape(
-            name, factors if factors.shape[2] == 1 else factors[:, :, part.which]))
+            effect, factors if factors.shape[2] == 1 else factors[:, :, part.which]))
             for part in self.parts])
 
     def of_poses(self, residual: Floats) -> Floats:

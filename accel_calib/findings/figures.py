@@ -31,7 +31,9 @@ from ..calibration import (
     identifiability, next_pose, NextPose, Outlook, PRIOR, Quality, stated_uncertainty,
     uncertainty_g, Verification)
 from ..comparison import NAMES
-from ..effects import AXES, effect_named, LADDER, Model, MODELS, predict, value_unit
+from ..effects import (
+    AXES, effect_named, EffectKey, entry_of, LADDER, Model, MODELS, ParameterName, predict,
+    value_unit)
 from ..estimate import pose_noise, sensing_axes, variance_factor
 from ..finding import Rating
 from ..statistics import rms
@@ -101,7 +103,7 @@ def effect_figures(calibration: Calibration) -> Iterator[Figure]:
     """Yield the values of the effects beyond V and W; shapes at their usual value are left out."""
     deviations = calibration.deviations
     for effect, values in calibration.model.values.items():
-        shown = {} if effect in LADDER else effect_named(effect).shown(values)
+        shown = {} if effect in LADDER else entry_of(effect).shown(values)
         for name, value in shown.items():
             unit, scale = value_unit(effect, name)
             key = f'{effect}.{name}'
@@ -115,7 +117,11 @@ def scale_of(name: str) -> tuple[float, float, str]:
     if name in (*GAINS, *CROSS):
         return 1.0 if name in GAINS else 0.0, 100.0, '%'
     effect, _, part = name.rpartition('.')
-    unit, factor = value_unit(effect, part)
+    try:
+        key = name.effect if isinstance(name, ParameterName) else effect_named(effect)
+    except KeyError:  # an own effect, by its text in a stored row
+        return 0.0, 1.0, ''
+    unit, factor = value_unit(key, part)
     return 0.0, factor, unit
 
 
@@ -176,7 +182,7 @@ def refinement_json(result: Refinement) -> dict[str, Any]:
         'verdict': result.verdict, 'undecided': result.undecided, 'base': result.calibration.name,
         'poses_used': len(result.poses_g), 'noise_floor_mg': result.noise_floor_mg,
         'gap_mg': result.gap_mg,
-        'steps': [{**asdict(step), 'words': effect_named(step.name).words}
+        'steps': [{**asdict(step), 'name': str(step.name), 'words': entry_of(step.name).words}
                   for step in result.steps],
         'remaining_gap_mg': result.remaining_gap_mg,
         'disturbed_poses': result.disturbed_poses,
@@ -191,7 +197,7 @@ def curve_json(curve: Curve) -> dict[str, Any]:
     """Return the effects of temperature for JSON."""
     return {
         'reference_c': curve.reference_c, 'range_c': curve.range_c, 'degree': curve.degree,
-        'effects': list(curve.model.effects), 'band_mg': curve.band_mg,
+        'effects': [*map(str, curve.model.effects)], 'band_mg': curve.band_mg,
         'change_mg': curve.change_mg, 'residual_mg': curve.residual_mg,
         'held_out_mg': curve.held_out_mg}
 
@@ -398,7 +404,7 @@ class Expected:
         return without_noise(quality.rms_after_mg, quality.noise_floor_mg) * self._per_dof
 
     @cached_property
-    def not_corrected(self) -> tuple[tuple[str, float], ...]:
+    def not_corrected(self) -> tuple[tuple[EffectKey, float], ...]:
         """
         Return effects that the correction of a later sample cannot use, the largest first.
 
@@ -406,7 +412,7 @@ class Expected:
 
         """
         calibration, up = self.calibration, self.directions
-        context, sizes = {**self.poses.columns, 'previous': up}, dict[str, float]()
+        context, sizes = {**self.poses.columns, 'previous': up}, dict[EffectKey, float]()
         if 'std' in self.poses:
             context['std'] = calibration.units.to_g(self.poses['std'])
         for name, values in calibration.model.values.items():
@@ -452,9 +458,9 @@ def without_noise(residual_mg: float, noise_mg: float | None) -> float:
     return math.sqrt(max(residual_mg ** 2 - (noise_mg or 0.0) ** 2, 0.0))
 
 
-def depends_on(name: str) -> set[str]:
+def depends_on(name: EffectKey) -> set[str]:
     """Return the context that an effect is a function of."""
-    effect = effect_named(name)
+    effect = entry_of(name)
     return set(effect.over or effect.needs)
 
 

@@ -23,7 +23,7 @@ from .figures import (
     TOO_EXACT, without_noise, WORST_ERROR)
 from ..calibration import Calibration, directions_in, flat_direction, free_parameters, Verification
 from ..comparison import LEVEL
-from ..effects import EMPIRICAL, kind_of, WANDER
+from ..effects import EmpiricalCurve, WANDER
 from ..errors import TAKE_ALL_SIDES
 from ..finding import Finding, NextStep, ranked, rated, Rating, without
 from ..geometry import coverage, distinct
@@ -216,7 +216,7 @@ def _not_corrected(expected: Expected) -> Iterator[Finding]:
     """Yield the effects of the model that a later sample is not corrected for."""
     for name, size in expected.not_corrected:
         if size > MATTERS.value:
-            short = 'a curve' if kind_of(name) == EMPIRICAL else name
+            short = 'a curve' if isinstance(name, EmpiricalCurve) else name
             if 'time' in depends_on(name) and 'since_turn' not in depends_on(name):
                 yield Finding('settling', f'the readings changed with time by {mg(size)} '
                               f'({short}), and may change again', 'let the sensor settle, and '

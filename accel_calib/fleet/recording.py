@@ -34,7 +34,7 @@ from .. import __version__
 from ..calibration import Calibration, determines, directions_of, fit_poses
 from ..comparison import NAMES, rotation_free
 from ..disk import check_regular
-from ..effects import KNOWN_CODE, MODELS
+from ..effects import MODELS, OwnEffect
 from ..errors import AccelCalibError, InputError, known_error, RefusedFitError
 from ..findings import residual_figures
 from ..logs import LogOptions, SUFFIXES
@@ -343,8 +343,8 @@ class Options:
         Look for effects beyond offset, gain and cross-axis.
     exports : tuple of str
         Formats of `accel_calib.stored.exports.FORMATS` to write beside each calibration.
-    own : tuple of str
-        Names of own effects of the user, which are tried beside the catalogue.
+    own : tuple of OwnEffect
+        Own effects of the user, which are tried beside the catalogue.
 
     """
 
@@ -354,7 +354,7 @@ class Options:
     settings: dict[str, Any] = field(default_factory=dict)
     refined: bool = True
     exports: tuple[str, ...] = ()
-    own: tuple[str, ...] = ()
+    own: tuple[OwnEffect, ...] = ()
 
 
 def key_of(content: str, found: Input, options: Options) -> str:
@@ -363,8 +363,9 @@ def key_of(content: str, found: Input, options: Options) -> str:
         place = sensor_of(found, '', options.sensor_from)
     except AccelCalibError as err:
         place = str(err)
-    stated = asdict(options)
-    own = [code.hex() for code in KNOWN_CODE.values()] if stated.pop('own') else []
+    stated = asdict(replace(options, own=()))
+    del stated['own']
+    own = dict.fromkeys(each.source[1].hex() for each in options.own if each.source)
     about = json.dumps([content, place, __version__, RESULTS, stated, *own], default=str,
                        sort_keys=True)
     return hashlib.blake2b(about.encode(), digest_size=16).hexdigest()
@@ -429,13 +430,13 @@ def _figures(intake: Intake, outcome: Outcome) -> Row:
     variance = np.einsum('tp,pq,tq->t', free.slope, calibration.covariance, free.slope)
     return {
         'status': 'ok', 'rating': outcome.rating.name, 'rating_reason': outcome.rating.reason,
-        'model': calibration.name, 'effects': list(calibration.model.effects),
+        'model': calibration.name, 'effects': [*map(str, calibration.model.effects)],
         'refined': outcome.line, 'units': intake.units.name, 'poses': len(calibration.poses),
         'poses_used': len(poses), 'coverage': quality.coverage,
         **{figure.key: figure.value for figure in residual_figures(quality)},
         'temperature': warm, 'warnings': list(calibration.warnings),
         'determined': determines(_WHOLE_MODEL, directions_of(poses, intake.units)),
-        'parameters': [{'name': name, 'value': value, 'sd': sd} for name, value, sd in zip(
+        'parameters': [{'name': str(name), 'value': value, 'sd': sd} for name, value, sd in zip(
             calibration.parameters, calibration.model.vector.tolist(), deviation.tolist(),
             strict=True)],
         **{column: float(value) for k, name in enumerate(NAMES) for column, value in (

@@ -33,7 +33,7 @@ from .recording import (
 from .sensors import is_damaged, merge_sensor, read_parquet, Store, UNREAD, write_sensors
 from ..calibration import Calibration, FleetPrior
 from ..disk import write_atomically
-from ..effects import know_code, KNOWN_CODE
+from ..effects import OwnEffect
 from ..errors import AccelCalibError, InputError, known_error, needing
 from ..findings import Rating
 from ..logs import Progress
@@ -232,7 +232,7 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
         damaged = tuple(str(store.set_aside(path)) for path, is_so in zip(
             files, _in_order(client, is_damaged, files), strict=True) if is_so)
         store.forget_lost()
-        _merge(client, store)  # what an interrupted run left
+        _merge(client, store, options.own)  # what an interrupted run left
         counts, unread = Counter[str](), list[Row]()
         for item, status in mapped(client, calibrate_recording, found, options, store, limit_s):
             if isinstance(status, Exception):  # not of the recording, unless workers died
@@ -247,7 +247,7 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
             counts[status] += 1
             progress(sum(counts.values()), len(found))
         store.replace_unread(unread)
-        sensors = tuple(_merge(client, store))
+        sensors = tuple(_merge(client, store, options.own))
         known = overview(_in_order(client, digest_of, [*store.sensors(), UNREAD], store))
         priors, path = priors_of(known.typical), store.folder / PRIOR_FILE
         if priors:
@@ -258,14 +258,14 @@ def run(client: Client, found: Sequence[Input], options: Options, store: Store,
         return Summary(counts, sensors, priors, damaged, rating_of(known, sensors))
 
 
-def _merge(client: Client, store: Store) -> list[Row]:
+def _merge(client: Client, store: Store, own: tuple[OwnEffect, ...]) -> list[Row]:
     """Merge all pending rows, and compare the calibrations; return the rows of all sensors."""
     names = store.waiting()
     if not store.sensors_file.exists():
         names = sorted({*names, *store.sensors()})
     if not names:
         return read_parquet(store.sensors_file)
-    found = write_sensors(store, list(_in_order(client, merge_sensor, names, store)))
+    found = write_sensors(store, list(_in_order(client, merge_sensor, names, store, own)))
     for _ in _in_order(client, store.finish, names):
         pass
     return found
@@ -306,7 +306,7 @@ def mapped(client: Client, function: Callable[..., Any], items: Iterable[_Item],
         most = 1 if alone else 0 if suspects else limit
         while len(waiting) < most and (batch := [suspects.pop()] if alone else
                                        list(islice(rest, size))):
-            future = client.submit(_each, KNOWN_CODE, function, batch, *others, pure=False)
+            future = client.submit(_each, function, batch, *others, pure=False)
             waiting[future] = batch
             done.add(future)
         if not waiting:
@@ -371,17 +371,10 @@ def _result_of(client: Client, future: Any, workers: _Workers) -> tuple[list[Any
                          'recordings are skipped') from err
 
 
-def _each(code: Mapping[str, bytes], function: Callable[..., Any], batch: Sequence[Any],
-          *others: Any) -> tuple[list[Any], float]:
-    """
-    Return the result of a function per item, or its exception, and the seconds of them all.
-
-    `code` are the files with own effects of the user.
-
-    """
+def _each(function: Callable[..., Any], batch: Sequence[Any], *others: Any
+          ) -> tuple[list[Any], float]:
+    """Return the result of a function per item, or its exception, and the seconds of them all."""
     begin, results = time.perf_counter(), list[Any]()
-    for each in code.items():
-        know_code(*each)
     for item in batch:
         try:
             results.append(function(item, *others))

@@ -50,7 +50,7 @@ from .recording import as_folder, Row, schema, UNKNOWN
 from ..calibration import Calibration
 from ..comparison import History, history_of, LEVEL, Parameter
 from ..disk import write_atomically
-from ..effects import LADDER
+from ..effects import LADDER, OwnEffect
 from ..errors import InputError, known_error
 from ..stored import read_calibration
 from ..table import Floats
@@ -308,12 +308,12 @@ def model_of(rows: Sequence[Row]) -> str:
     return rows[-1]['sensor_model'] or '' if rows else ''
 
 
-def merge_sensor(name: str, store: Store) -> Row:
+def merge_sensor(name: str, store: Store, own: tuple[OwnEffect, ...] = ()) -> Row:
     """
     Merge the pending rows of a sensor, compare its calibrations, and return the row of the sensor.
 
-    It runs on a worker. `name` is the folder of the sensor. OSError is raised if a file cannot be
-    read or written.
+    It runs on a worker. `name` is the folder of the sensor, and `own` are the effects of the user
+    that its calibrations may have. OSError is raised if a file cannot be read or written.
 
     """
     store.merge(name)
@@ -329,7 +329,7 @@ def merge_sensor(name: str, store: Store) -> Row:
     if len(good) < 2:
         return about
     try:
-        return about | _compared([read_calibration(store.folder / row['calibration'])
+        return about | _compared([read_calibration(store.folder / row['calibration'], own)
                                   for row in good], good)
     except OSError:
         raise

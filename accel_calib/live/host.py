@@ -218,7 +218,7 @@ def _result(calibration: Calibration) -> Message:
         'coverage': quality.coverage,
         'residuals': [(figure.label, figure.value, figure.unit)
                       for figure in residual_figures(quality)],
-        'effects': calibration.model.effects, 'warnings': calibration.warnings,
+        'effects': [*map(str, calibration.model.effects)], 'warnings': calibration.warnings,
         'offset': calibration.offset, 'gain': np.diag(calibration.gain)}
 
 

@@ -17,7 +17,8 @@ that separate effects from their rivals.
 
 from .plan import PlannedPose, PosePlan
 from .refinement import base_words, refine, Refinement, refitted, verdict_words
-from .steps import chance, shown_name, Stage, Step, times_typical, values_of
+from .steps import chance, named_entries, shown_name, Stage, Step, times_typical, values_of
 
 __all__ = ['PlannedPose', 'PosePlan', 'Refinement', 'Stage', 'Step', 'base_words', 'chance',
-           'refine', 'refitted', 'shown_name', 'times_typical', 'values_of', 'verdict_words']
+           'named_entries', 'refine', 'refitted', 'shown_name', 'times_typical', 'values_of',
+           'verdict_words']

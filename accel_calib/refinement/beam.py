@@ -22,7 +22,7 @@ import scipy
 
 from .linear import Block, LEVEL, Linear, Set, with_outliers
 from .state import is_noise
-from ..effects import CHANGES, fitted_places, included
+from ..effects import CHANGES, EffectKey, fitted_places, included
 
 _LEVEL_OF_GAP = 0.05
 """`LEVEL` of an effect that explains all of a gap. A larger one names more of the small effects of
@@ -99,7 +99,7 @@ def reshaped(chosen: Set) -> list[Set]:
     with the best shape beside the others.
 
     """
-    blocks, fitted = chosen.linear.blocks, dict[str, list[int]]()
+    blocks, fitted = chosen.linear.blocks, dict[EffectKey, list[int]]()
     for number, block in enumerate(blocks):
         if block.searched and fitted_places(block.entry, block.shape):
             fitted.setdefault(block.effect, []).append(number)
@@ -146,7 +146,7 @@ def _larger(front: list[Set]) -> list[Set]:
     likely: list[tuple[float, Set, int]] = []  # the largest possible score, a set, a new block
     for before in front:
         linear, scores = before.linear, before.scores_beside
-        tops: dict[str, tuple[float, int]] = {}
+        tops: dict[EffectKey, tuple[float, int]] = {}
         for effect, numbers in linear.numbers_of.items():
             number = int(numbers[np.argmax(scores[numbers])])
             if scores[number] > -np.inf and not _is_barred(linear.blocks[number], before.entries):
@@ -184,8 +184,8 @@ def _with_best_shapes(chosen: Set) -> Set:
 
 
 def _distinct(sets: Iterable[Set]) -> list[Set]:
-    """Return the best set of each list of names and outliers, the best score first."""
-    best: dict[tuple[frozenset[str], tuple[int, ...]], Set] = {}
+    """Return the best set of each list of effects and outliers, the best score first."""
+    best: dict[tuple[frozenset[EffectKey], tuple[int, ...]], Set] = {}
     for chosen in sorted(sets, key=lambda chosen: -round(chosen.score, _DECIMALS)):
         best.setdefault((frozenset(chosen.effects), chosen.out), chosen)
     return list(best.values())

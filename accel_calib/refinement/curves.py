@@ -7,7 +7,7 @@ Gaps without a known form: empirical curves, and an offset that wanders.
 **Curves.** They show where the gap lies, if no known effect has its form. A curve changes a
 carrier (offset, gain, cross-axis, |force|, or one axis of them) with a variable (time,
 temperature, its rate, supply, vibration, the force along the axis, or any quantity). It is a sum
-of a few cosines over the range of the variable (`accel_calib.effects.empirical_name`), or of
+of a few cosines over the range of the variable (`accel_calib.effects.EmpiricalCurve`), or of
 spherical harmonics of a few degrees over the direction of the force, which are the forms of
 nonlinearities along oblique axes. For each carrier and variable, the cosines or degrees are added
 in the order of their gain while the score of `.linear` rises; each costs its values and 2 log k
@@ -39,7 +39,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import combinations, product
 import math
-from typing import NamedTuple
+from typing import cast, NamedTuple
 
 import numpy as np
 
@@ -48,8 +48,8 @@ from .beam import AS_GOOD
 from .linear import Block, LEAST_OWN, LEVEL, Linear, outside_of, Set, with_outliers
 from .state import candidates, left_open, linearised, State
 from ..effects import (
-    AXES, CARRIERS, curve_pairs, Effect, effect_named, EFFECTS, empirical_name, empirical_parts,
-    factors_of, LADDER, Model, modes_of, parameter_names, WANDER)
+    AXES, CATALOGUE, curves_over, EffectKey, EFFECTS, EmpiricalCurve, factors_of, LADDER, Model,
+    parameter_names, WANDER)
 from ..estimate import Fit, judge, left_out
 from ..table import Floats, Poses
 
@@ -74,7 +74,7 @@ _TURNS = np.linspace(0.0, np.pi, 1801)
 """Angles at which a proportion of two effects is looked for; the middle one is a right angle."""
 
 
-class Curve(NamedTuple):
+class FoundCurve(NamedTuple):
     """
     A curve beside a model, and the indices of the outliers beside it.
 
@@ -84,7 +84,7 @@ class Curve(NamedTuple):
 
     """
 
-    name: str
+    name: EmpiricalCurve
     values: Floats
     score: float
     out: tuple[int, ...]
@@ -93,24 +93,21 @@ class Curve(NamedTuple):
 
 
 class _Family(NamedTuple):
-    """The curves of a carrier and its parts over a variable, with all modes in one effect."""
+    """The curves of a carrier and its parts over a variable, with all modes in one curve."""
 
-    carrier: str
-    variable: str
-    effect: Effect
+    curve: EmpiricalCurve
     shape: Floats
 
     @property
     def parts(self) -> list[tuple[str, slice]]:
-        """Return the carrier and each of its parts, with the places of their values."""
-        parts = CARRIERS[self.carrier]
-        alone = [(f'{self.carrier}.{part}', slice(k, None, len(parts)))
-                 for k, part in enumerate(parts)]
-        return [(self.carrier, slice(None)), *(alone if len(parts) > 1 else ())]
+        """Return no part, for the carrier, and each of its parts, with the places of values."""
+        parts = self.curve.parts
+        alone = [(part, slice(k, None, len(parts))) for k, part in enumerate(parts)]
+        return [('', slice(None)), *(alone if len(parts) > 1 else ())]
 
 
 def best_curve(state: State, poses_g: Poses, out: tuple[int, ...], *, least: float = CLEARLY,
-               of_force: bool = False) -> Curve | None:
+               of_force: bool = False) -> FoundCurve | None:
     """
     Return the best curve beside a model, or None if its score is below `least`.
 
@@ -123,15 +120,15 @@ def best_curve(state: State, poses_g: Poses, out: tuple[int, ...], *, least: flo
     if plain.dof < _LEAST_DOF:
         return None
     families, best = list[_Family](), None
-    for carrier, variable in curve_pairs(causes(poses_g)):
-        effect = effect_named(empirical_name(carrier, variable, modes_of(variable)))
-        if set(effect.needs) <= set(poses_g.columns):
-            shapes = [np.zeros(0)] if effect.shapes is None else effect.shapes(poses_g.columns)
-            families += (_Family(carrier, variable, effect, shape) for shape in shapes)
+    for curve in curves_over(causes(poses_g)):
+        entry = curve.entry
+        if set(entry.needs) <= set(poses_g.columns):
+            shapes = [np.zeros(0)] if entry.shapes is None else entry.shapes(poses_g.columns)
+            families += (_Family(curve, shape) for shape in shapes)
     tried = sum(len(family.parts) for family in families)
     most = least + 2.0 * math.log(tried)
     for family in families:
-        if of_force and not family.effect.bends:
+        if of_force and not family.curve.entry.bends:
             continue
         whole = _whole(plain, fit, family)
         kept = _kept(whole, out)
@@ -147,27 +144,25 @@ def best_curve(state: State, poses_g: Poses, out: tuple[int, ...], *, least: flo
 
 def _whole(plain: Linear, fit: Fit, family: _Family) -> Linear:
     """Return the problem with all modes of a carrier as one candidate."""
-    carrier, variable, effect, shape = family
-    modes, count = modes_of(variable), len(effect.parameters)
-    name, one = (empirical_name(carrier, variable, each) for each in (modes, modes[:1]))
-    if effect.factor is None:
-        columns = fit.equations.columns(Model({name: np.zeros(count)}))
+    (curve, shape), entry = family, family.curve.entry
+    count, one = len(entry.parameters), replace(curve, modes=curve.modes[:1])
+    if entry.factor is None:
+        columns = fit.equations.columns(Model({curve: np.zeros(count)}))
     else:
-        factors = factors_of(name, [shape], fit.poses_g.columns)[0]
-        each_mode = factors[::len(effect_named(one).terms), np.newaxis]
+        factors = factors_of(curve, [shape], fit.poses_g.columns)[0]
+        each_mode = factors[::len(one.entry.terms), np.newaxis]
         columns = fit.equations.columns_of(one, each_mode)
     columns, sizes = outside_of(plain.onto, columns)
     return replace(plain, every=np.vstack([columns.T, plain.residual]), sizes=sizes, choice=0.0,
-                   blocks=(Block(name, shape, slice(0, count), effect),))
+                   blocks=(Block(curve, shape, slice(0, count), entry),))
 
 
 def _of_part(whole: Linear, family: _Family, part: str, which: slice) -> Linear:
     """Return the problem with each mode of a carrier, or of its part, as a candidate."""
-    modes = modes_of(family.variable)
-    names = [empirical_name(part, family.variable, (mode,)) for mode in modes]
-    ends = np.cumsum([0, *(len(effect_named(each).parameters) for each in names)]).tolist()
-    blocks = tuple(Block(each, family.shape, slice(*ends[k:k + 2]), family.effect, 0, k + 1.0)
-                   for k, each in enumerate(names))
+    curves = [replace(family.curve, modes=(mode,), part=part) for mode in family.curve.modes]
+    ends = np.cumsum([0, *(len(each.entry.parameters) for each in curves)]).tolist()
+    blocks = tuple(Block(each, family.shape, slice(*ends[k:k + 2]), family.curve.entry, 0, k + 1.0)
+                   for k, each in enumerate(curves))
     return replace(whole, every=np.vstack([whole.every[:-1][which], whole.residual]),
                    sizes=whole.sizes[which], blocks=blocks)
 
@@ -212,7 +207,7 @@ def _grown(problem: Linear, least_rss: float, least: float) -> Set:
     return best
 
 
-def _accepted(score: float, chosen: Set, tried: int) -> Curve | None:
+def _accepted(score: float, chosen: Set, tried: int) -> FoundCurve | None:
     """Return a curve, or None if it is not significant."""
     # The outliers are found again: without the curve, good poses may have looked like outliers.
     chosen = max(with_outliers([chosen]), key=lambda either: either.score)
@@ -222,12 +217,12 @@ def _accepted(score: float, chosen: Set, tried: int) -> Curve | None:
     if p_value > LEVEL:
         return None
     blocks, first = sorted(chosen.blocks), chosen.entries[0]
-    carrier, variable, _ = empirical_parts(first.effect)
-    modes = [empirical_parts(chosen.linear.blocks[block].effect)[2][0] for block in blocks]
-    name = empirical_name(carrier, variable, modes)
+    waves = [cast(EmpiricalCurve, chosen.linear.blocks[block].effect) for block in blocks]
+    curve = replace(waves[0], modes=tuple(wave.modes[0] for wave in waves))
     values = np.concatenate([*(chosen.values[block] for block in blocks), first.shape])
     explained = 1.0 - _held_out(chosen) / max(_held_out(nothing), 1e-300)
-    return Curve(name, values, score, chosen.out, p_value, explained)
+    return FoundCurve(name=curve, values=values, score=score, out=chosen.out, p_value=p_value,
+                      explained=explained)
 
 
 def _held_out(chosen: Set) -> float:
@@ -254,7 +249,7 @@ def nearest_effects(before: State) -> dict[str, float]:
         number = int(np.argmax(gain))
         if rank[number]:
             _, left = Set.of(linear, (number,)).spanned
-            best.append((-gain[number], each.name, before.gap_mg(left)))
+            best.append((-gain[number], str(each.effect), before.gap_mg(left)))
     return {name: left_mg for _, name, left_mg in sorted(best)[:2]}
 
 
@@ -277,15 +272,15 @@ def one_curve(state: State) -> tuple[str, ...]:
             linear.sizes[block.columns] * state.model.values[name])
         gain = (column @ linear.residual) ** 2 / max(float(column @ column), 1e-300)
         score = linear.score(linear.base_rss - gain, 1.0, linear.choice)
-        pairs[name, block.effect] = float(score)
+        pairs[name, str(block.effect)] = float(score)
     best = max(pairs, key=lambda pair: pairs[pair], default=())
     return best if best and pairs[best] > _PROPORTION else ()
 
 
-def _by_axis(names: Iterable[str]) -> list[str]:
+def _by_axis(effects: Iterable[EffectKey]) -> list[str]:
     """Return the nonlinearities of the catalogue with one value for each axis."""
-    return [name for name in names if (effect := effect_named(name)).family == 'force'
-            and effect.parameters == AXES]
+    return [name for name in effects if isinstance(name, str)
+            and CATALOGUE[name].family == 'force' and CATALOGUE[name].parameters == AXES]
 
 
 def _proportion(pair: tuple[str, str], state: State) -> float:
@@ -446,7 +441,7 @@ class Near:
     plain: Linear
     walk: Walk | None
     process: Process | None
-    fitted: Mapping[tuple[str, str], tuple[float, float]] = field(default_factory=dict)
+    fitted: Mapping[tuple[EffectKey, EffectKey], tuple[float, float]] = field(default_factory=dict)
 
     @property
     def beside(self) -> Set:
@@ -454,14 +449,14 @@ class Near:
         return self.chosen.within(self.plain)
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def names(self) -> tuple[EffectKey, ...]:
         return self.chosen.effects
 
-    def block_of(self, name: str) -> int:
+    def block_of(self, name: EffectKey) -> int:
         """Return the index of the block of a chosen effect."""
         return self.chosen.blocks[self.names.index(name)]
 
-    def without(self, name: str) -> Set:
+    def without(self, name: EffectKey) -> Set:
         """Return what was chosen, without an effect."""
         return self.chosen.without(self.block_of(name))
 
@@ -472,12 +467,12 @@ class Near:
             (worth + base_rss + 1e-300) / (worth + self.plain.base_rss + 1e-300))
 
     @property
-    def key(self) -> tuple[frozenset[str], tuple[int, ...], bool]:
+    def key(self) -> tuple[frozenset[EffectKey], tuple[int, ...], bool]:
         """Return what was chosen, apart from values and shapes."""
         return frozenset(self.names), self.chosen.out, self.walk is not None
 
 
-def probabilities(name: str, near: Near, *, usual: bool = True) -> dict[str, float]:
+def probabilities(name: EffectKey, near: Near, *, usual: bool = True) -> dict[EffectKey, float]:
     """
     Return the probabilities of an effect or `WANDER` and those in its place, largest first.
 
@@ -491,7 +486,7 @@ def probabilities(name: str, near: Near, *, usual: bool = True) -> dict[str, flo
     certainty = max((whole - near.chosen.parameters) / whole, LEAST)
     back = 0.0 if usual else 1.0
     others = near.beside if name == WANDER else near.without(name)
-    scores = {name: near.chosen.score + back * near.chosen.unusual}
+    scores: dict[EffectKey, float] = {name: near.chosen.score + back * near.chosen.unusual}
     least = 2.0 * np.log(LEAST) / certainty + scores[name] - back * others.unusual
     for number, likely in enumerate(others.scores_beside):
         effect = others.linear.blocks[number].effect

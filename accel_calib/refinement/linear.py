@@ -51,7 +51,7 @@ import numpy as np
 from numpy.typing import NDArray
 import scipy
 
-from ..effects import Effect, kind_of
+from ..effects import Effect, EffectKey, kind_of
 from ..estimate import by_pose, outliers_among
 from ..table import Floats
 
@@ -77,7 +77,7 @@ LEAST_OWN = 0.02
 class Block(NamedTuple):
     """Columns of an effect with one (s,) shape, its values searched, and the shapes tried."""
 
-    effect: str
+    effect: EffectKey
     shape: Floats
     columns: slice
     entry: Effect
@@ -151,8 +151,8 @@ class Linear:
         return len({kind_of(block.effect) for block in self.blocks})
 
     @cached_property
-    def numbers_of(self) -> dict[str, NDArray[np.intp]]:
-        numbers: dict[str, list[int]] = {}
+    def numbers_of(self) -> dict[EffectKey, NDArray[np.intp]]:
+        numbers: dict[EffectKey, list[int]] = {}
         for number, block in enumerate(self.blocks):
             numbers.setdefault(block.effect, []).append(number)
         return {effect: np.array(each) for effect, each in numbers.items()}
@@ -197,7 +197,7 @@ class Linear:
         return [(np.concatenate(numbers), np.concatenate(index), np.concatenate(products))
                 for numbers, index, products in (zip(*parts) for parts in found.values())]
 
-    def of_effect(self, effect: str) -> Iterator[Group]:
+    def of_effect(self, effect: EffectKey) -> Iterator[Group]:
         """Yield the blocks of an effect, which are consecutive, as `by_width`."""
         numbers = self.numbers_of[effect]
         for own, index, products in self.by_width:
@@ -339,7 +339,7 @@ class Set:
         return [self.linear.blocks[block] for block in self.blocks]
 
     @cached_property
-    def effects(self) -> tuple[str, ...]:
+    def effects(self) -> tuple[EffectKey, ...]:
         return tuple(each.effect for each in self.entries)
 
     @cached_property
@@ -371,12 +371,12 @@ class Set:
             onto += linear.whitened(units) @ (self.root @ self.mix[:count])
         return onto, linear.whitened(linear.residual) - onto @ self.across[:, -1]
 
-    def gains(self, effect: str = '') -> tuple[Floats, Floats]:
+    def gains(self, effect: EffectKey | None = None) -> tuple[Floats, Floats]:
         """Return (b,) gains and ranks of the blocks beside the set; 0 for other effects."""
         linear, across = self.linear, self.across
         along = linear.with_residual[:-1] - across[:, -1] @ across[:, :-1]
         gain, rank = np.zeros(len(linear.blocks)), np.zeros(len(linear.blocks))
-        groups = linear.of_effect(effect) if effect else linear.by_width
+        groups = linear.by_width if effect is None else linear.of_effect(effect)
         for numbers, index, left in self.beside(groups):
             gain[numbers], rank[numbers] = _explained(left, along[index])
         return gain, rank
@@ -387,7 +387,7 @@ class Set:
             parts = np.moveaxis(self.across[:, index], 0, 2)
             yield numbers, index, products - parts @ np.swapaxes(parts, 1, 2)
 
-    def best_of(self, effect: str) -> int:
+    def best_of(self, effect: EffectKey) -> int:
         """Return the block of an effect with the largest gain in addition to the set."""
         own = self.linear.numbers_of[effect]
         return int(own[np.argmax(self.gains(effect)[0][own])])

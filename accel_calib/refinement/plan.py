@@ -38,7 +38,7 @@ from .curves import LEAST, Near, probabilities
 from .search import Found
 from .state import fitted_state, with_effect
 from .steps import percent, shown_name
-from ..effects import effect_named, Model, WANDER
+from ..effects import EffectKey, entry_of, Model, WANDER
 from ..estimate import Fit, judge, kinds
 from ..geometry import attitude_words, ATTITUDES, spread_directions
 from ..statistics import over_axes
@@ -90,7 +90,7 @@ class PlannedPose:
     context : mapping of str to float
         What else to set, by column of `accel_calib.table.COLUMNS`: ``temperature`` [°C],
         ``supply_voltage`` [V], ``std`` [g], and ``time`` as the wait after the last pose [s].
-    separates : tuple of str
+    separates : tuple of EffectKey
         The named effect and its rivals.
     expected : float
         Expected probability of the right one of them after this pose and those before it.
@@ -100,7 +100,7 @@ class PlannedPose:
     up: tuple[float, ...]
     words: str
     context: Mapping[str, float]
-    separates: tuple[str, ...]
+    separates: tuple[EffectKey, ...]
     expected: float
 
     @property
@@ -165,7 +165,7 @@ def plan_poses(found: Found) -> PosePlan:
     rivalries = [fits for name in names if (fits := _fits(name, found))]
     if not rivalries:
         return PosePlan()
-    needs = {key for each in rivalries for name in each for key in effect_named(name).needs}
+    needs = {key for each in rivalries for name in each for key in entry_of(name).needs}
     varied = [key for key in (*VARIED, *sorted(filter(is_quantity, needs))) if key in needs]
     so_far = found.final.poses_g
     directions = np.vstack([ATTITUDES, spread_directions(200)])
@@ -205,14 +205,15 @@ class _Contest:
 
     """
 
-    names: tuple[str, ...]
+    names: tuple[EffectKey, ...]
     weights: Floats
     means: Floats
     rows: tuple[Floats, ...]
     spreads: tuple[Floats, ...]
 
     @classmethod
-    def of(cls, fits: Mapping[str, tuple[float, Fit]], near: Near, candidates: Poses) -> _Contest:
+    def of(cls, fits: Mapping[EffectKey, tuple[float, Fit]], near: Near, candidates: Poses
+           ) -> _Contest:
         """Return a contest from the probability of each model, and its fit to the poses so far."""
         weights = np.array([weight for weight, _ in fits.values()])
         each = [judge(fit.model, candidates) for _, fit in fits.values()]
@@ -263,7 +264,7 @@ class _Contest:
         return expected
 
 
-def _fits(name: str, found: Found) -> dict[str, tuple[float, Fit]]:
+def _fits(name: EffectKey, found: Found) -> dict[EffectKey, tuple[float, Fit]]:
     """
     Return probability and fit of an effect and its rivals; empty if the data are certain enough.
 
@@ -375,7 +376,7 @@ def _held(poses: Sequence[PlannedPose]) -> Iterator[str]:
         yield f'{where + ": " if where else ""}hold {"; ".join(texts)}'
 
 
-def versus(names: Sequence[str]) -> str:
+def versus(names: Sequence[EffectKey]) -> str:
     first, *others = (shown_name(name) for name in names)
     return f'{first} from {", ".join(others)}'
 

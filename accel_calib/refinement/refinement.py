@@ -29,13 +29,15 @@ from .plan import plan_poses, PosePlan
 from .search import Found, search
 from .state import fitted_state, is_noise, State
 from .steps import (
-    advice_for, not_testable, plain_name, Stage, Step, steps_of, untestable, Verdict, verdict_of)
+    advice_for, not_testable, Stage, Step, steps_of, unchanged, untestable, Verdict, verdict_of)
 from ..calibration import (
     Calibration, check_sensor, CLIPPED, fit_findings, fit_poses, fit_with_fleet, FLEET, FleetPrior,
     gated, in_g, LARGEST_DILUTION, OF_A_FIT, only_norm, posterior, quality_of, record_of,
     refuse_if_unfit, Rejected, rejected_by, sound_rows, sure_rows, uncertainty_g, with_history,
     with_rest_noise)
-from ..effects import CHANGES, included, Model, MODELS, parameter_names, PROCESSES, with_vector
+from ..effects import (
+    CHANGES, EffectKey, included, Model, MODELS, OwnEffect, parameter_names, PROCESSES,
+    with_vector)
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import fit_sphere, judge, NotConvergedError, outliers, variance_factor
 from ..finding import explained_by, Finding, without as without_kinds
@@ -117,6 +119,8 @@ class Refinement(Record):
     one_curve : tuple of str
         Two nonlinearities in the same proportion on each axis, as parts of one curve; or empty.
         The second one may not be named, and only show beside the first.
+    also : tuple of OwnEffect
+        Own effects of the user that were tried.
 
     """
 
@@ -124,18 +128,19 @@ class Refinement(Record):
     noise_floor_mg: float | None
     gap_mg: float
     remaining_gap_mg: float
-    steps: tuple[Step, ...]
     disturbed_poses: tuple[int, ...]
     not_testable: tuple[tuple[str, str], ...]
     advice: tuple[str, ...]
     calibration: Calibration
-    refusal: tuple[str, ...]
     poses_g: Poses
     force: Floats
     stages: tuple[Stage, ...]
-    plan: PosePlan
+    steps: tuple[Step, ...] = ()
+    refusal: tuple[str, ...] = ()
+    plan: PosePlan = PosePlan()
     undecided: bool = False
     one_curve: tuple[str, ...] = ()
+    also: tuple[OwnEffect, ...] = ()
 
     def __repr__(self) -> str:
         names = ' + '.join([self.calibration.name, *(step.effect for step in self.steps)])
@@ -187,7 +192,7 @@ def base_words(result: Refinement) -> str:
 
 
 def refine(poses: Poses, units: Units, *, base: str | Calibration | FleetPrior = 'auto',
-           sensor: str = '', date: str = '', also: tuple[str, ...] = ()) -> Refinement:
+           sensor: str = '', date: str = '', also: tuple[OwnEffect, ...] = ()) -> Refinement:
     """
     Find effects that a model lacks, and add them to it.
 
@@ -203,8 +208,8 @@ def refine(poses: Poses, units: Units, *, base: str | Calibration | FleetPrior =
         of the same model are combined with model 10 of these poses.
     sensor, date : str
         Name of the sensor and date for the refined calibration.
-    also : tuple of str
-        Names of own effects of the user, which are tried beside the catalogue.
+    also : tuple of OwnEffect
+        Own effects of the user, which are tried beside the catalogue.
 
     Raises
     ------
@@ -226,18 +231,19 @@ def refine(poses: Poses, units: Units, *, base: str | Calibration | FleetPrior =
         sure, doubts = sure_rows(poses)
         with explained_by(poses.findings):
             try:
-                found = _refine(poses, sure, doubts, units, base, also)
+                found = _refine(poses, sure, doubts, units, base=base, also=also)
             except RefusedFitError:
                 if not doubts:
                     raise
-                found = _refine(poses, poses, (), units, base, also)  # with the doubtful poses
+                # With the doubtful poses.
+                found = _refine(poses, poses, (), units, base=base, also=also)
     made = found.calibration
     return replace(found, calibration=replace(
         made, sensor=sensor or poses.sensor or made.sensor, date=date or made.date))
 
 
-def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Units,
-            base: str | Calibration, also: tuple[str, ...]) -> Refinement:
+def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Units, *,
+            base: str | Calibration, also: tuple[OwnEffect, ...]) -> Refinement:
     """Return the refinement with some of the poses; the others are already rejected."""
     sound, unsound = sound_rows(used, units)
     if len(sound) < _LEAST_POSES:
@@ -272,8 +278,9 @@ def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Un
                      'over the table, to bound its time and memory; it does not look for '
                      'disturbed poses among the others; choose rows to use others')
     note = (*(poses.findings if stored else ()), *((sample,) if len(poses_g) < total else ()))
-    given = Given(poses, poses_g, stored is not None, (*rejected, *unsound), note)
-    return _record(calibration, found, given)
+    given = Given(poses, poses_g, stored=stored is not None, rejected=(*rejected, *unsound),
+                  notes=note)
+    return _conclude(calibration, found, given)
 
 
 def _along_ways(final: State, at: Callable[[Model], Poses]) -> Poses:
@@ -300,7 +307,8 @@ def _is_same_way(model: Model, *ways: Poses) -> bool:
     return bool(np.max(np.abs(one - other), initial=0.0) < 1e-5)
 
 
-def _record(calibration: Calibration, found: Found, given: Given) -> Refinement:
+def _conclude(calibration: Calibration, found: Found, given: Given) -> Refinement:
+    """Return the refinement of a calibration by what a search has found."""
     start, final = found.base, found.final
     if given.stored:  # as stored, without a fit
         kept = calibration.held(start.poses_g)
@@ -311,7 +319,8 @@ def _record(calibration: Calibration, found: Found, given: Given) -> Refinement:
     if verdict == 'no_gap' and calibration.reason != 'ideal' and not given.stored:
         alone = given.poses_g.take(np.isin(given.poses_g.row, calibration.used_poses.row))
         advice = advice_for(found, steps, missing, len(calibration.rejected))
-        return _of_fit(calibration, alone, missing, (*advice, *plan.advice))
+        state = State(judge(Model(calibration.model.values), alone))
+        return _record_of(calibration, state, missing, (*advice, *plan.advice))
     of_search = [*rejected_by(found.final.model, given.poses_g.take(found.outliers))]
     if found.clipped is not None:
         of_search += [Rejected(int(row), CLIPPED, 'clipped')
@@ -325,13 +334,14 @@ def _record(calibration: Calibration, found: Found, given: Given) -> Refinement:
     verdict, undecided = verdict_of(found, steps, refused=bool(refusal))
     advice = advice_for(found, steps, missing, len(outliers),
                         unexplained=verdict == 'unexplained' and not undecided)
-    return Refinement(
-        verdict, final.floor_mg, start.gap_mg(start.fit.residual), final.gap_mg(final.residual),
-        steps, outliers, missing, (*advice, *plan.advice), refined, refusal, final.poses_g,
-        final.fit.equations.force, stages, plan, undecided, found.one_curve)
+    fitted = _record_of(refined, final, missing, (*advice, *plan.advice))
+    return replace(
+        fitted, verdict=verdict, undecided=undecided, steps=steps, stages=stages, plan=plan,
+        gap_mg=start.gap_mg(start.fit.residual), remaining_gap_mg=final.gap_mg(final.residual),
+        disturbed_poses=outliers, refusal=refusal, one_curve=found.one_curve, also=found.also)
 
 
-def _refine_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, also: tuple[str, ...]
+def _refine_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, also: tuple[OwnEffect, ...]
                        ) -> Refinement:
     """
     Find effects beyond model 10, with the typical values of a fleet for model 10.
@@ -373,24 +383,26 @@ def _with(found: Refinement, calibration: Calibration) -> Refinement:
 def _without_search(fitted: Calibration, message: str, advice: str) -> Refinement:
     """Return the fit with the fleet as a refinement, with the reason why nothing was searched."""
     poses_g = in_g(fitted.used_poses, fitted.units)
-    found = _of_fit(
-        fitted, with_history(only_norm(poses_g), fitted.model),
-        not_testable(poses_g, {}, fitted.model.effects),
+    fit = judge(Model(fitted.model.values), with_history(only_norm(poses_g), fitted.model))
+    found = _record_of(
+        fitted, State(fit), not_testable(poses_g, {}, fitted.model.effects),
         (f'no effects were searched: {message}; the result is the fit with the fleet', advice))
-    fit, ratio = judge(Model(fitted.model.values), found.poses_g), fitted.quality.chi2_per_dof
+    ratio = fitted.quality.chi2_per_dof
     quiet = not ratio or is_noise(fit.chi2, fit.chi2 / ratio)
     return replace(found, verdict='no_gap' if quiet else 'unexplained',
                    noise_floor_mg=fitted.quality.noise_floor_mg)
 
 
-def _of_fit(fitted: Calibration, poses_g: Poses, missing: tuple[tuple[str, str], ...],
-            advice: tuple[str, ...]) -> Refinement:
-    """Return a fit as a refinement without steps; `poses_g` are the poses that it used."""
-    fit = judge(Model(fitted.model.values), poses_g)
-    state, out = State(fit), tuple(each.row for each in fitted.rejected)
-    gap_mg, base = state.gap_mg(fit.residual), Stage('base', state.mg_of_poses(fit.residual))
-    return Refinement('no_gap', state.floor_mg, gap_mg, gap_mg, (), out, missing, advice, fitted,
-                      (), poses_g, fit.equations.force, (base,), PosePlan())
+def _record_of(calibration: Calibration, state: State, missing: tuple[tuple[str, str], ...],
+               advice: tuple[str, ...]) -> Refinement:
+    """Return the record of a calibration, by the state of its poses, without a step."""
+    residual = state.fit.residual
+    return Refinement(
+        verdict='no_gap', noise_floor_mg=state.floor_mg, gap_mg=state.gap_mg(residual),
+        remaining_gap_mg=state.gap_mg(residual), not_testable=missing, advice=advice,
+        disturbed_poses=tuple(each.row for each in calibration.rejected), calibration=calibration,
+        poses_g=state.poses_g, force=state.fit.equations.force,
+        stages=(Stage('base', state.mg_of_poses(residual)),))
 
 
 def base_of(poses: Poses, units: Units, name: str) -> Calibration:
@@ -408,7 +420,7 @@ def base_of(poses: Poses, units: Units, name: str) -> Calibration:
         except RefusedFitError:
             if name != 'auto' or 'orientation' not in poses:
                 raise
-    values: dict[str, Floats] = {}
+    values: dict[EffectKey, Floats] = {}
     if units.is_native:
         mat_w, vec_v = fit_sphere(poses.reading)
         units = Units('native', float(mat_w[0, 0]))
@@ -425,9 +437,9 @@ def with_changes(model: Model) -> tuple[Model, Floats]:
     The (q, p) matrix maps the values of `model` to those of the result.
 
     """
-    effects: list[str] = []
+    effects: list[EffectKey] = []
     for name in sorted(model.effects, key=CHANGES.__contains__):  # the changes last
-        own = plain_name(name)
+        own = unchanged(name)
         contained = included((own,)).intersection(effects)
         if contained:
             effects[effects.index(contained.pop())] = own
@@ -435,7 +447,7 @@ def with_changes(model: Model) -> tuple[Model, Floats]:
             effects.append(own)
     names = parameter_names(tuple(effects))
     owners: list[tuple[str, ...]] = []
-    for own in map(plain_name, model.effects):  # of each value, those of the result it adds to
+    for own in map(unchanged, model.effects):  # of each value, those of the result it adds to
         whole = tuple(effect for effect in effects if own in included((effect,)))
         owners += [(value,) if own in effects else parameter_names(whole)
                    for value in parameter_names((own,))]
@@ -505,20 +517,19 @@ def refitted(before: Calibration, poses: Poses, *, sensor: str = '', date: str =
     return replace(calibration, reason=before.reason, sensor=sensor or before.sensor, date=date)
 
 
-def refined_calibration(base: Calibration, final: State, added: tuple[str, ...], given: Given
+def refined_calibration(base: Calibration, final: State, added: tuple[EffectKey, ...], given: Given
                         ) -> tuple[Calibration, tuple[str, ...]]:
     """Return the refined calibration, and the refusal if it must not be used."""
     model, matrix = with_changes(final.model)
     kept, poses = final.poses_g, given.poses
     if 'new' in kept:  # beside the poses of the stored calibration
-        unchanged = final.model.effects == model.effects
-        if unchanged and all(key in base.poses for key in model.needs):
+        if final.model.effects == model.effects and all(key in base.poses for key in model.needs):
             poses = with_stored(given.poses, base)
         else:
             kept = kept.take(kept['new'] > 0.0)
     at_poses = judge(model, kept if base.form.known_orientation
                      else kept.without_columns(*_ORIENTATION))
-    names = ', '.join(plain_name(name) for name in added)
+    names = ', '.join(str(unchanged(name)) for name in added)
     others = without_kinds(base.noted, *OF_A_FIT)
     findings = [each for each in others if not given.stored or each.kind == 'flat_pose']
     refined = replace(

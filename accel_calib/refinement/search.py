@@ -37,15 +37,15 @@ import scipy
 
 from .base import causes, Clipped, off_grid, unclipped
 from .curves import (
-    best_curve, CLEARLY, Curve, Near, one_curve, process_of, SIGNIFICANT, Walk, walk_beside)
+    best_curve, CLEARLY, FoundCurve, Near, one_curve, process_of, SIGNIFICANT, Walk, walk_beside)
 from .linear import LEVEL, Set
 from .settle import fit_without, make_sound, settle
 from .state import beginning, Candidate, fitted_state, linearised, State, without
 from ..effects import (
-    CHANGES, covariate_names, effect_named, EFFECTS, empirical_parts, factors_of, included, LADDER,
-    linear_values, Model, parameter_names, product_names, WANDER)
+    CHANGES, covariates_of, EffectKey, EFFECTS, entry_of, factors_of, included, LADDER,
+    linear_values, Model, OwnEffect, parameter_names, products_of, WANDER)
 from ..estimate import beside_scatter, kinds, scatter_of, stated
-from ..table import CONTEXT, Poses
+from ..table import CONTEXT, Floats, Poses
 
 _TIMED = 30.0
 """A curve over time must have a score better than a walk by this."""
@@ -87,7 +87,7 @@ class Found:
     that were removed because they explain too little, or no more than by chance. Poses at the
     limit of the sensor are left out: they are `clipped`, and `with_clipped` is the base fitted to
     all poses. `grid_g` is the step of the grid of the readings [g], if it is relevant. `also`
-    are the names of own effects that were asked for.
+    are the own effects that were asked for.
 
     """
 
@@ -96,13 +96,13 @@ class Found:
     outliers: NDArray[np.intp]
     near: Near
     walk: Walk | None = None
-    curve: Curve | None = None
-    added: tuple[str, ...] = ()
-    taken_back: tuple[str, ...] = ()
+    curve: FoundCurve | None = None
+    added: tuple[EffectKey, ...] = ()
+    taken_back: tuple[EffectKey, ...] = ()
     clipped: Clipped | None = None
     grid_g: float | None = None
     with_clipped: State | None = None
-    also: tuple[str, ...] = ()
+    also: tuple[OwnEffect, ...] = ()
 
     @cached_property
     def one_curve(self) -> tuple[str, ...]:
@@ -110,11 +110,11 @@ class Found:
         return one_curve(self.final)
 
 
-def search(poses_g: Poses, base: Model, also: tuple[str, ...] = ()) -> Found:
+def search(poses_g: Poses, base: Model, also: tuple[OwnEffect, ...] = ()) -> Found:
     """
     Search for the effects that a base lacks; `NotConvergedError` if its fit fails.
 
-    `also` are the names of own effects of the user, which are tried beside the catalogue.
+    `also` are own effects of the user, which are tried beside the catalogue.
 
     """
     everyone = np.arange(len(poses_g))
@@ -131,7 +131,8 @@ def search(poses_g: Poses, base: Model, also: tuple[str, ...] = ()) -> Found:
                    with_clipped=whole, also=also)
 
 
-def _with_own_noise(found: Found, poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
+def _with_own_noise(found: Found, poses_g: Poses, base: Model, also: tuple[OwnEffect, ...]
+                    ) -> Found:
     """
     Search again if new poses, or those of a stored calibration, are noisier than stated.
 
@@ -155,7 +156,7 @@ def _with_own_noise(found: Found, poses_g: Poses, base: Model, also: tuple[str, 
     return _beside(poses_g.with_columns(own_scatter=scatter), base, also)
 
 
-def _with_scatter(found: Found, poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
+def _with_scatter(found: Found, poses_g: Poses, base: Model, also: tuple[OwnEffect, ...]) -> Found:
     """
     Search again if poses that scatter alike are as good an explanation as what was found.
 
@@ -188,14 +189,14 @@ def _weighted(state: State) -> State:
     return state if found is None else State(stated(found.fit))
 
 
-def _beside(poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
+def _beside(poses_g: Poses, base: Model, also: tuple[OwnEffect, ...]) -> Found:
     """Search in poses with a scatter, and state the result without it."""
     found = _search(poses_g, base, also)
     first, final = (State(stated(state.fit)) for state in (found.base, found.final))
     return replace(found, base=first, final=final, walk=_walk(final, found.near))
 
 
-def _search(poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
+def _search(poses_g: Poses, base: Model, also: tuple[OwnEffect, ...]) -> Found:
     """Search among the effects that are columns of the equations."""
     start = beginning(poses_g, base)
     poses_g = start.poses_g
@@ -203,17 +204,20 @@ def _search(poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
     ladder = near.names
     fixed = (*base.effects, *ladder)
     fixed = tuple(name for name in fixed if name not in included(fixed))
-    names = (*_visible(begun, LADDER), *(name for name in EFFECTS if name not in LADDER),
-             *also, *covariate_names(causes(poses_g)), *_visible(begun, CHANGES))
+    present = {*map(str, fixed)}
+    names: tuple[EffectKey, ...] = (
+        *_visible(begun, LADDER), *(name for name in EFFECTS if name not in LADDER),
+        *(own for own in also if own.name not in present), *covariates_of(causes(poses_g)),
+        *_visible(begun, CHANGES))
     state, near, trial = settle(begun, poses_g, fixed, names)
     varied = {*causes(poses_g), *(column for column in CONTEXT if column in poses_g)}
     if len(varied) <= _MOST_VARIED and (near.walk is not None or not state.is_noise):
-        products = tuple(product_names(varied))
+        products: tuple[EffectKey, ...] = tuple(products_of(varied))
         beside = settle(begun, poses_g, fixed, (*names, *products))
         if not {*products}.isdisjoint(beside[1].names):
             state, near, trial = beside
     begun = fit_without(begun, poses_g, near.chosen.out)
-    taken_back: tuple[str, ...] = ()
+    taken_back: tuple[EffectKey, ...] = ()
     share = 1.0 - (state.rss - state.dof) / max(begun.rss - begun.dof, 1e-300)
     explains = not state.fit.noise_known or state.is_noise or share >= _LEAST_SHARE
     if near.names and near.walk is None and not explains:
@@ -235,7 +239,7 @@ def _search(poses_g: Poses, base: Model, also: tuple[str, ...]) -> Found:
                    added=tuple(name for name in beyond if name in there))
 
 
-def _is_coincidence(found: Found, name: str) -> bool:
+def _is_coincidence(found: Found, name: EffectKey) -> bool:
     """
     Return whether an effect beside a gap or a walk explains less than its quantity, shifted.
 
@@ -244,7 +248,7 @@ def _is_coincidence(found: Found, name: str) -> bool:
     that is hardly correlated with it.
 
     """
-    state, values, entry = found.final, found.final.model.values, effect_named(name)
+    state, values, entry = found.final, found.final.model.values, entry_of(name)
     if not entry.needs or name not in values or (found.walk is None and state.is_noise):
         return False
     shape = entry.split(values[name])[1]
@@ -274,13 +278,13 @@ def _described(found: Found, start: State, poses_g: Poses) -> Found:
     if curve is None:
         return found
     # It may replace the effects of its variable.
-    variable = empirical_parts(curve.name)[1]
-    entries = {name: effect_named(name) for name in found.near.names}
+    variable = curve.name.variable
+    entries = {name: entry_of(name) for name in found.near.names}
     fewer = _less(found, [name for name, entry in entries.items()
                           if (entry.over or entry.needs) == (variable,)])
     if fewer is not None:
         again = best_curve(fewer.final, poses_g, found.near.chosen.out)
-        if again is not None and empirical_parts(again.name)[1] == variable:
+        if again is not None and again.name.variable == variable:
             return _described(fewer, start, poses_g)
     walking = _walking(found)
     if walking is not None and not _is_better(curve, walking.near):
@@ -298,7 +302,7 @@ def _with_one_curve(found: Found, start: State, poses_g: Poses) -> Found | None:
     """
     for what, better in _INSTEAD.items():
         names = [name for name in found.near.names
-                 if (entry := effect_named(name)).family and entry.changes == what]
+                 if (entry := entry_of(name)).family and entry.changes == what]
         if (beside := _less(found, names)) is None:
             continue
         gained = found.near.beside.score - beside.near.beside.score
@@ -311,7 +315,7 @@ def _with_one_curve(found: Found, start: State, poses_g: Poses) -> Found | None:
     return None
 
 
-def _with_curve(found: Found, curve: Curve, start: State, poses_g: Poses) -> Found | None:
+def _with_curve(found: Found, curve: FoundCurve, start: State, poses_g: Poses) -> Found | None:
     """Return what was found, with a curve; None if its fit fails or poses held out disagree."""
     if curve.explained < _HELD_OUT:
         return None
@@ -324,7 +328,7 @@ def _with_curve(found: Found, curve: Curve, start: State, poses_g: Poses) -> Fou
                    walk=None, curve=curve, outliers=np.array(curve.out, np.intp))
 
 
-def _less(found: Found, names: Collection[str]) -> Found | None:
+def _less(found: Found, names: Collection[EffectKey]) -> Found | None:
     """
     Return what was found without some effects, with a walk estimated anew.
 
@@ -355,10 +359,10 @@ def _walking(found: Found) -> Found | None:
     return replace(found, near=near, walk=_walk(found.final, near))
 
 
-def _is_better(curve: Curve, near: Near) -> bool:
+def _is_better(curve: FoundCurve, near: Near) -> bool:
     """Return whether a curve is better than a walk; one over time must be clearly better."""
     walk = 0.0 if near.walk is None else near.walk.score - near.beside.score
-    return curve.score > walk + (_TIMED if empirical_parts(curve.name)[1] == 'time' else 0.0)
+    return curve.score > walk + (_TIMED if curve.name.variable == 'time' else 0.0)
 
 
 def _visible(state: State, names: Iterable[str]) -> tuple[str, ...]:
@@ -366,10 +370,10 @@ def _visible(state: State, names: Iterable[str]) -> tuple[str, ...]:
     present = {*state.model.values, *included(state.model.values)}
     unknown = not len(kinds(state.poses_g)[0])
     return tuple(name for name in names if name not in present
-                 and not (unknown and effect_named(name).known_orientation))
+                 and not (unknown and entry_of(name).known_orientation))
 
 
-def _of_a_turn(state: State) -> set[str]:
+def _of_a_turn(state: State) -> set[EffectKey]:
     """
     Return the changes of gains that a mount that has turned explains.
 
@@ -380,17 +384,18 @@ def _of_a_turn(state: State) -> set[str]:
 
     """
     changes = {name: CHANGES[name] for name in state.model.values if name in CHANGES}
-    values = {change.base: state.model.values[name] for name, change in changes.items()}
+    values: dict[EffectKey, Floats] = {
+        change.base: state.model.values[name] for name, change in changes.items()}
     gains = [name for name, change in changes.items()
-             if not effect_named(change.base).is_offset and not change.known_orientation]
-    if not gains or not any(effect_named(name).known_orientation for name in values):
+             if not entry_of(change.base).is_offset and not change.known_orientation]
+    if not gains or not any(entry_of(name).known_orientation for name in values):
         return set()
     mat_w, mat_c = state.model.linear_part[0], Model(values).linear_part[0] - np.eye(3)
     left, _, right = np.linalg.svd(np.eye(3) + np.linalg.solve(mat_w, mat_c))
     turned = linear_values(np.eye(3) + mat_w @ (left @ right - np.eye(3)), np.zeros(3))
     names = parameter_names(state.model.effects)
     index = [names.index(f'{name}.{part}') for name in gains
-             for part in effect_named(name).parameters]
+             for part in entry_of(name).parameters]
     away = np.concatenate([state.model.values[name] - turned[CHANGES[name].base]
                            for name in gains])
     chi2 = away @ np.linalg.solve(state.fit.covariance[np.ix_(index, index)], away)

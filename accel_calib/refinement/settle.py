@@ -23,7 +23,7 @@ from .linear import Linear, Set
 from .state import (
     Candidate, candidates, fitted_state, left_open, linearised, State, with_effect, without)
 from ..calibration import has_usual_gains
-from ..effects import included, LADDER, Model, WANDER
+from ..effects import EffectKey, included, LADDER, Model, WANDER
 from ..estimate import judge
 from ..table import Poses
 
@@ -51,7 +51,7 @@ class Trial:
     """
 
     poses_g: Poses
-    fixed: tuple[str, ...]
+    fixed: tuple[EffectKey, ...]
     tried: tuple[Candidate, ...]
     beside: Model
     walks: bool
@@ -67,7 +67,7 @@ class Trial:
     def finer(self, chosen: Set) -> Trial | None:
         """Return the trial with further shapes beside those of a set; None if there are none."""
         shapes = {block.effect: block.shape for block in chosen.entries}
-        tried = tuple(each.finer(shapes.get(each.name), self.poses_g.columns)
+        tried = tuple(each.finer(shapes.get(each.effect), self.poses_g.columns)
                       for each in self.tried)
         same = all(new is old for new, old in zip(tried, self.tried, strict=True))
         return None if same else replace(self, tried=tried)
@@ -84,8 +84,8 @@ class Trial:
         return None if after.fit.at_bound or not has_usual_gains(after.model) else after
 
 
-def settle(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterable[str], *,
-           of_ladder: bool = False) -> tuple[State, Near, Trial]:
+def settle(state: State, poses_g: Poses, fixed: tuple[EffectKey, ...],
+           effects: Iterable[EffectKey], *, of_ladder: bool = False) -> tuple[State, Near, Trial]:
     """
     Search and fit in turn until a set is found again.
 
@@ -95,11 +95,11 @@ def settle(state: State, poses_g: Poses, fixed: tuple[str, ...], names: Iterable
 
     """
     trial = Trial(poses_g, fixed,
-                  tuple(candidates((name for name in names if name not in fixed), poses_g)),
+                  tuple(candidates((each for each in effects if each not in fixed), poses_g)),
                   Model({}) if of_ladder else left_open(state), walks=not of_ladder)
-    settled: tuple[tuple[str, ...], tuple[int, ...], Process | None] | None = None
+    settled: tuple[tuple[EffectKey, ...], tuple[int, ...], Process | None] | None = None
     begun = set(state.model.effects) <= set(fixed) and len(state.poses_g) == len(poses_g)
-    refused: set[frozenset[str]] = set()
+    refused: set[frozenset[EffectKey]] = set()
     linear = trial.near(state)
     seen = [Near(Set.of(linear), linear, None, None).key] if begun else []
     for _ in range(_LADDER_ROUNDS if of_ladder else _ROUNDS):
@@ -145,7 +145,7 @@ def _best_fit(near: Near, state: State, trial: Trial) -> tuple[Near, State | Non
     return best, after
 
 
-def _best_near(linear: Linear, trial: Trial, refused: set[frozenset[str]]) -> Near:
+def _best_near(linear: Linear, trial: Trial, refused: set[frozenset[EffectKey]]) -> Near:
     """Return the best set near a model, with or without a walk."""
     def best_of(problem: Linear) -> Set:
         return next((chosen for chosen in accepted(explored(problem))
@@ -175,8 +175,8 @@ def _best_near(linear: Linear, trial: Trial, refused: set[frozenset[str]]) -> Ne
     return best
 
 
-def _at(linear: Linear, names: tuple[str, ...], out: tuple[int, ...], process: Process | None,
-        trial: Trial) -> Near:
+def _at(linear: Linear, names: tuple[EffectKey, ...], out: tuple[int, ...],
+        process: Process | None, trial: Trial) -> Near:
     """Return a set near its fit; its effects are in the order of their contribution."""
     blocks = [int(linear.numbers_of[name][-1]) for name in names]
     plain = Set.of(linear, blocks, out)
@@ -192,8 +192,8 @@ def fit_without(state: State, poses_g: Poses, out: tuple[int, ...]) -> State:
     return fitted_state(state.model, kept) or State(judge(state.model, kept))
 
 
-def make_sound(state: State, near: Near, trial: Trial, base: Model, ladder: tuple[str, ...]
-               ) -> tuple[State, Near]:
+def make_sound(state: State, near: Near, trial: Trial, base: Model,
+               ladder: tuple[EffectKey, ...]) -> tuple[State, Near]:
     """
     Return the final model in which each effect is sound, and the set near it.
 
@@ -228,7 +228,7 @@ def make_sound(state: State, near: Near, trial: Trial, base: Model, ladder: tupl
     return state, near
 
 
-def ladder_set(state: State, name: str) -> tuple[Set, int]:
+def ladder_set(state: State, name: EffectKey) -> tuple[Set, int]:
     """Return the set of an effect of the ladder beside all others of a model, and its block."""
     others = tuple(other for other in state.model.effects if other != name)
     names = [other for other in LADDER if other not in others]
@@ -237,7 +237,7 @@ def ladder_set(state: State, name: str) -> tuple[Set, int]:
     return Set.of(linear, (block,)), block
 
 
-def _doubtful(state: State, near: Near) -> tuple[str, str] | None:
+def _doubtful(state: State, near: Near) -> tuple[EffectKey, EffectKey] | None:
     """Return an effect that is not sound, and the one for its place, or '' to remove it."""
     for name in near.names[::-1]:  # the smallest contribution first
         if (name, '') in near.fitted:
@@ -260,7 +260,7 @@ def _lowers(state: State, fewer: State) -> bool:
     return state.gap_mg(state.held_out) < fewer.gap_mg(fewer.held_out)
 
 
-def _exchanged(state: State, near: Near, name: str, other: str, trial: Trial
+def _exchanged(state: State, near: Near, name: EffectKey, other: EffectKey, trial: Trial
                ) -> tuple[State, Near] | None:
     """Return the fit with another effect, if any, in the place of one, and the set near it."""
     chosen = near.beside.instead(block for block in near.chosen.blocks

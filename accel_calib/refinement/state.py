@@ -24,7 +24,7 @@ import scipy
 from .linear import Block, LEAST_OWN, Linear, orthonormal, outside_of
 from ..calibration import determines, NORM_MODELS, with_history
 from ..effects import (
-    Context, Effect, effect_named, factors_of, included, kind_of, linear_model, Model)
+    Context, Effect, EffectKey, entry_of, factors_of, included, kind_of, linear_model, Model)
 from ..estimate import estimate, Fit, kinds, left_out, NotConvergedError
 from ..geometry import unit
 from ..statistics import rms
@@ -57,18 +57,18 @@ class Candidate:
 
     """
 
-    name: str
+    effect: EffectKey
     every: tuple[Floats, ...]
     places: tuple[int, ...]
     tried: float
     factors: Floats
 
     @classmethod
-    def of(cls, name: str, every: tuple[Floats, ...], places: Iterable[int], context: Context
-           ) -> Candidate:
+    def of(cls, effect: EffectKey, every: tuple[Floats, ...], places: Iterable[int],
+           context: Context) -> Candidate:
         places = tuple(places)
-        return cls(name, every, places, max(len(places) / _SHAPES_ALIKE, 1.0),
-                   factors_of(name, [every[place] for place in places], context))
+        return cls(effect, every, places, max(len(places) / _SHAPES_ALIKE, 1.0),
+                   factors_of(effect, [every[place] for place in places], context))
 
     @property
     def shapes(self) -> tuple[Floats, ...]:
@@ -76,18 +76,18 @@ class Candidate:
 
     @property
     def entry(self) -> Effect:
-        return effect_named(self.name)
+        return entry_of(self.effect)
 
     def beside(self, present: Floats | None, context: Context) -> Candidate:
         """Return the candidate at a force, with the shape of its values in a model, too."""
         if self.entry.of_force:
-            self = Candidate.of(self.name, self.every, self.places, context)
+            self = Candidate.of(self.effect, self.every, self.places, context)
         if present is None or len(self.shapes) < 2:
             return self
         shape = self.entry.split(present)[1]
         return replace(self, every=(*self.every, shape), places=(*self.places, len(self.every)),
                        factors=np.concatenate(
-                           [self.factors, factors_of(self.name, [shape], context)]))
+                           [self.factors, factors_of(self.effect, [shape], context)]))
 
     def finer(self, chosen: Floats | None, context: Context) -> Candidate:
         """Return the candidate with those shapes, too, that lie beside a chosen one."""
@@ -98,7 +98,7 @@ class Candidate:
         around = self.places.index(at)
         first, *_, last = (-1, *self.places, len(self.every))[around:around + 3]
         further = _spread([place for place in range(first + 1, last) if place != at])
-        return Candidate.of(self.name, self.every, sorted((*self.places, *further)), context
+        return Candidate.of(self.effect, self.every, sorted((*self.places, *further)), context
                             ) if further else self
 
     def blocks(self, start: int, alike: int) -> Iterator[Block]:
@@ -106,20 +106,20 @@ class Candidate:
         count, entry, searched = len(self.entry.parameters), self.entry, len(self.shapes) > 1
         for shape in self.shapes:
             new = searched and not np.array_equal(shape, entry.usual)
-            yield Block(self.name, shape, slice(start, start + count), entry, int(new),
+            yield Block(self.effect, shape, slice(start, start + count), entry, int(new),
                         (self.tried if new else 1.0) * alike)
             start += count
 
 
-def candidates(names: Iterable[str], poses_g: Poses) -> Iterator[Candidate]:
-    """Yield the effects of these names that the context of the poses allows."""
+def candidates(effects: Iterable[EffectKey], poses_g: Poses) -> Iterator[Candidate]:
+    """Yield those of effects that the context of the poses allows."""
     context = poses_g.columns
-    for name in names:
-        effect = effect_named(name)
-        if effect.output is None and all(key in context for key in effect.needs):
-            every = (np.zeros(0),) if effect.shapes is None else tuple(effect.shapes(context))
+    for effect in effects:
+        entry = entry_of(effect)
+        if entry.output is None and all(key in context for key in entry.needs):
+            every = (np.zeros(0),) if entry.shapes is None else tuple(entry.shapes(context))
             if every:
-                yield Candidate.of(name, every, _spread(range(len(every))), context)
+                yield Candidate.of(effect, every, _spread(range(len(every))), context)
 
 
 def _spread(places: Sequence[int]) -> Sequence[int]:
@@ -127,10 +127,10 @@ def _spread(places: Sequence[int]) -> Sequence[int]:
     return places[::max(-(-len(places) // _SHAPES_AT_ONCE), 1)]
 
 
-def linearised(fit: Fit, base: tuple[str, ...], tried: Iterable[Candidate] = (),
+def linearised(fit: Fit, base: tuple[EffectKey, ...], tried: Iterable[Candidate] = (),
                beside: Model = _IDEAL) -> Linear:
     """
-    Return the linear problem at a fit, given the names of the base, and the candidates.
+    Return the linear problem at a fit, given the effects of the base, and the candidates.
 
     The columns of the model `beside` are projected out as those of the base.
 
@@ -142,20 +142,22 @@ def linearised(fit: Fit, base: tuple[str, ...], tried: Iterable[Candidate] = (),
     if further.values:
         residual = residual + near.columns(further) @ _amplitudes(further)
     onto = orthonormal(np.hstack([near.columns(held)[:, held.fitted], near.columns(beside)]))
-    tried = [each.beside(further.values.get(each.name), fit.context) for each in tried]
-    alike = Counter(kind_of(each.name) for each in tried)
+    tried = [each.beside(further.values.get(each.effect), fit.context) for each in tried]
+    alike = Counter(kind_of(each.effect) for each in tried)
     widths = [len(each.shapes) * len(each.entry.parameters) for each in tried]
     every, sizes = np.empty((sum(widths) + 1, len(near.pose))), np.empty(sum(widths))
     every[-1] = residual - onto @ (onto.T @ residual)
     blocks: list[Block] = []
     for each, start, width in zip(tried, np.cumsum([0, *widths]).tolist(), widths):
         own = slice(start, start + width)
-        columns, sizes[own] = outside_of(onto, near.columns_of(each.name, each.factors))
+        columns, sizes[own] = outside_of(onto, near.columns_of(each.effect, each.factors))
         every[own] = columns.T
-        blocks += each.blocks(start, alike[kind_of(each.name)])
-    return Linear(onto, near.pose, tuple(blocks), every, sizes, WORTH if near.noise_known else 0.0,
-                  near.count - onto.shape[1], float(every[-1] @ every[-1]),
-                  near.columns(Model({'offset': np.zeros(3)})), 2.0 * math.log(1.0 + len(alike)))
+        blocks += each.blocks(start, alike[kind_of(each.effect)])
+    return Linear(
+        onto=onto, pose=near.pose, blocks=tuple(blocks), every=every, sizes=sizes,
+        worth=WORTH if near.noise_known else 0.0, dof=near.count - onto.shape[1],
+        base_rss=float(every[-1] @ every[-1]), choice=2.0 * math.log(1.0 + len(alike)),
+        offset=near.columns(Model({'offset': np.zeros(3)})))
 
 
 def left_open(state: State) -> Model:
@@ -239,9 +241,9 @@ class State:
         """Return the (n,) residuals of poses from (m,) residuals of the equations [mg]."""
         return self.fit.equations.of_poses(residual) * MG
 
-    def contribution_mg(self, name: str) -> Floats:
+    def contribution_mg(self, effect: EffectKey) -> Floats:
         """Return the (n,) contributions of an effect of the model to the poses [mg]."""
-        alone = Model({name: self.model.values[name]})
+        alone = Model({effect: self.model.values[effect]})
         return self.mg_of_poses(self.fit.equations.columns(alone) @ _amplitudes(alone))
 
     @property
@@ -269,10 +271,11 @@ def fitted_state(model: Model, poses_g: Poses, most: float = np.inf) -> State | 
         return None
 
 
-def with_effect(model: Mapping[str, Floats], name: str, values: Floats) -> dict[str, Floats]:
+def with_effect(model: Mapping[EffectKey, Floats], effect: EffectKey, values: Floats
+                ) -> dict[EffectKey, Floats]:
     """Return the values of a model with one more effect, which replaces those it contains."""
-    contained = included((name,))
-    return {**{key: part for key, part in model.items() if key not in contained}, name: values}
+    contained = included((effect,))
+    return {**{key: part for key, part in model.items() if key not in contained}, effect: values}
 
 
 def without(poses: Poses, out: Sequence[int] | NDArray[np.intp]) -> Poses:

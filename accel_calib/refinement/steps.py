@@ -13,7 +13,7 @@ instant, the ends of the range of a column, or directions of the force.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 import math
 from typing import Literal
@@ -26,9 +26,9 @@ from .search import Found
 from .settle import ladder_set
 from .state import candidates, fitted_state, is_noise, linearised, State, with_effect
 from ..effects import (
-    CHANGES, COVARIATES, effect_named, EFFECTS, EMPIRICAL, empirical_parts, formula_of, included,
-    is_effect, kind_of, Model, parameter_names, PROCESSES, TO_SEPARATE, unit_of, value_unit,
-    variable_of, variable_words, WANDER)
+    CATALOGUE, CHANGES, Covariate, Effect, EffectKey, EFFECTS, EMPIRICAL, EmpiricalCurve, entry_of,
+    formula_of, included, kind_of, Model, OwnEffect, parameter_names, PROCESSES, TO_SEPARATE,
+    unit_of, value_unit, variable_of, variable_words, WANDER)
 from ..estimate import kinds
 from ..geometry import ATTITUDES, axes_of_signs
 from ..statistics import rms
@@ -88,8 +88,8 @@ class Step:
         Probability that noise alone makes one of all candidates this good.
     where : str
         Directions, range or poses of the disagreement.
-    name : str
-        Name in the model, by which `accel_calib.effects.effect_named` finds the effect.
+    name : EffectKey
+        The effect in the model: its name in the catalogue, or its record.
     variable : str
         Quantity that a covariate or a curve is a function of; empty for other effects.
     formula : str
@@ -97,7 +97,7 @@ class Step:
 
     """
 
-    effect: str
+    effect: str = field(init=False)
     rivals: tuple[str, ...]
     probabilities: dict[str, float]
     data_probabilities: dict[str, float]
@@ -109,11 +109,12 @@ class Step:
     held_out_after_mg: float
     p_value: float
     where: str
-    name: str
+    name: EffectKey
     formula: str = ''
     variable: str = field(init=False)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, 'effect', kind_of(self.name))
         object.__setattr__(self, 'variable', variable_of(self.name))
 
     @property
@@ -168,7 +169,7 @@ def values_of(step: Step) -> list[tuple[str, str]]:
     """
     if step.formula:
         return [('', step.formula)]
-    parameters, values = effect_named(step.name).parameters, []
+    parameters, values = entry_of(step.name).parameters, []
     for name, value in step.parameters.items():
         unit_name, scale = value_unit(step.name, name)
         sd = step.parameters_sd.get(name, 0.0)
@@ -178,16 +179,16 @@ def values_of(step: Step) -> list[tuple[str, str]]:
     return values
 
 
-def plain_name(name: str) -> str:
-    """Return the name of an effect, for a change that of the effect that has changed."""
-    return CHANGES[name].base if name in CHANGES else name
+def unchanged(effect: EffectKey) -> EffectKey:
+    """Return an effect, for a change the effect that has changed."""
+    return entry_of(effect).base or effect
 
 
-def shown_name(name: str) -> str:
+def shown_name(effect: EffectKey) -> str:
     """Return the name of an effect among rivals; a covariate keeps its quantity."""
-    if kind_of(name) in COVARIATES:
-        return f'{kind_of(name)}-{variable_of(name)}'
-    return plain_name(kind_of(name))
+    if isinstance(effect, Covariate):
+        return str(replace(effect, power=1))
+    return kind_of(unchanged(effect))
 
 
 def verdict_of(found: Found, steps: Sequence[Step], *, refused: bool) -> tuple[Verdict, bool]:
@@ -216,7 +217,7 @@ def steps_of(found: Found, start: State, date: str
     states, values = [start], dict(found.base.model.values)
     names = [name for name in found.added if name != WANDER]
     for name in names[:-1]:
-        nothing = np.zeros(len(effect_named(name).values))
+        nothing = np.zeros(len(entry_of(name).values))
         values = with_effect(values, name, found.final.model.values.get(name, nothing))
         states.append(fitted_state(Model(values), found.final.poses_g) or states[-1])
     states += [found.final] if names else []
@@ -232,11 +233,11 @@ def steps_of(found: Found, start: State, date: str
         for name, state in zip(titles, at, strict=True))
 
 
-def _step(name: str, before: State, after: State, found: Found, date: str) -> Step:
+def _step(name: EffectKey, before: State, after: State, found: Found, date: str) -> Step:
     """Return the record of one step."""
     chances, by_data = (_chances(name, found, usual=usual) for usual in (True, False))
     rivals = tuple(other for other, part in {**by_data, **chances}.items()
-                   if other != kind_of(shown_name(name))
+                   if other != kind_of(unchanged(name))
                    and max(part, by_data.get(other, 0.0)) > LEAST)
     first, last, held_out = before.fit.residual, after.fit.residual, after.held_out
     is_stored = name == found.added[0] and 'new' in before.poses_g
@@ -244,7 +245,7 @@ def _step(name: str, before: State, after: State, found: Found, date: str) -> St
     if name == WANDER:
         first, first_held_out = before.residual, before.held_out
         last = held_out = beside_walk(found)[1]  # it follows the poses: what it predicts counts
-    effect, words = effect_named(name), _where(name, before, found)
+    effect, words = entry_of(name), _where(name, before, found)
     values = found.final.model.values.get(name, np.zeros(len(effect.values)))
     spread = dict(zip(parameter_names(found.final.model.effects),
                       np.sqrt(np.diag(found.final.fit.covariance)).tolist(), strict=True))
@@ -252,24 +253,26 @@ def _step(name: str, before: State, after: State, found: Found, date: str) -> St
     if name in CHANGES:
         words = f'{_change(name, values, [*deviations.values()], date)}; {words}'
     shown = effect.shown(values)
-    return Step(kind_of(shown_name(name)), rivals, chances, by_data, shown,
-                {part: deviations[part] for part in shown if deviations[part]},
-                before.gap_mg(first), after.gap_mg(last),
-                before.gap_mg(first_held_out), after.gap_mg(held_out),
-                _p_value(name, found), words, plain_name(name),
-                formula_of(name, values, spread))
+    return Step(
+        name=unchanged(name), rivals=rivals, probabilities=chances, data_probabilities=by_data,
+        parameters=shown,
+        parameters_sd={part: deviations[part] for part in shown if deviations[part]},
+        gap_before_mg=before.gap_mg(first), gap_after_mg=after.gap_mg(last),
+        held_out_before_mg=before.gap_mg(first_held_out),
+        held_out_after_mg=after.gap_mg(held_out), p_value=_p_value(name, found), where=words,
+        formula=formula_of(name, values, spread))
 
 
-def _chances(name: str, found: Found, *, usual: bool) -> dict[str, float]:
+def _chances(name: EffectKey, found: Found, *, usual: bool) -> dict[str, float]:
     """Return the probabilities of an effect and of those in its place, by the names shown."""
     own, chances = shown_name(name), dict[str, float]()
     for other, part in probabilities(name, found.near, usual=usual).items():
-        shown = kind_of(own) if shown_name(other) == own else shown_name(other)
+        shown = kind_of(unchanged(name)) if shown_name(other) == own else shown_name(other)
         chances[shown] = chances.get(shown, 0.0) + part
     return chances
 
 
-def _p_value(name: str, found: Found) -> float:
+def _p_value(name: EffectKey, found: Found) -> float:
     near, final = found.near, found.final
     if name == WANDER:
         return math.exp(-found.walk.likelihood_ratio / 2.0) if found.walk else 1.0
@@ -293,10 +296,13 @@ def _output_steps(found: Found) -> list[Step]:
         causes.append(('quantisation', 'step', found.grid_g, after, 'pose means are multiples of '
                        f'{step_mg:.3g} mg, which causes {step_mg / np.sqrt(12.0):.2g} mg RMS per '
                        'axis'))
-    return [Step(name, (), {name: 1.0}, {name: 1.0}, {value_name: value}, {},
-                 before.gap_mg(before.residual), after.gap_mg(after.residual),
-                 before.gap_mg(before.held_out), after.gap_mg(after.held_out), 0.0, where, name)
-            for name, value_name, value, before, where in causes]
+    return [Step(
+        name=name, rivals=(), probabilities={name: 1.0}, data_probabilities={name: 1.0},
+        parameters={value_name: value}, parameters_sd={}, p_value=0.0, where=where,
+        gap_before_mg=before.gap_mg(before.residual), gap_after_mg=after.gap_mg(after.residual),
+        held_out_before_mg=before.gap_mg(before.held_out),
+        held_out_after_mg=after.gap_mg(after.held_out))
+        for name, value_name, value, before, where in causes]
 
 
 def beside_walk(found: Found) -> tuple[Floats, Floats]:
@@ -307,13 +313,12 @@ def beside_walk(found: Found) -> tuple[Floats, Floats]:
     return found.walk.residuals(Set.of(final.linear), final.fit.equations.force)
 
 
-def _curve(name: str, before: State, share_mg: Floats) -> str:
+def _curve(curve: EmpiricalCurve, before: State, share_mg: Floats) -> str:
     """Return what an empirical curve changes, and the known effects that are most similar."""
-    carrier, variable, _ = empirical_parts(name)
-    whole, _, part = carrier.partition('.')
-    what = 'size of the force' if whole == 'force' else whole.replace('_', '-')
-    words = (f'the {what}{f" of {part}" if part else ""} changes with {variable_words(variable)} '
-             f'by up to {np.max(np.abs(share_mg)):.2g} mg')
+    variable = curve.variable
+    what = 'size of the force' if curve.carrier == 'force' else curve.carrier.replace('_', '-')
+    words = (f'the {what}{f" of {curve.part}" if curve.part else ""} changes with '
+             f'{variable_words(variable)} by up to {np.max(np.abs(share_mg)):.2g} mg')
     if variable not in ('force', 'direction', 'std'):  # a variable of one number
         values = before.poses_g[variable]
         parts = np.array_split(np.argsort(values, kind='stable'), 5)
@@ -328,13 +333,13 @@ def _curve(name: str, before: State, share_mg: Floats) -> str:
                     if nearest else '')
 
 
-def _where(name: str, before: State, found: Found) -> str:
+def _where(name: EffectKey, before: State, found: Found) -> str:
     """Return where an effect acts, by its values in the final model."""
-    final, effect = found.final, effect_named(name)
+    final, effect = found.final, entry_of(name)
     poses_g = final.poses_g
     share_mg = (final.contribution_mg(name) if name in final.model.values else
                 final.mg_of_poses(final.residual - beside_walk(found)[0]))
-    if kind_of(name) == EMPIRICAL:
+    if isinstance(name, EmpiricalCurve):
         return _curve(name, before, share_mg)
     if 'instant' in effect.shape:
         time, row = poses_g['time'], poses_g.row
@@ -387,14 +392,14 @@ def untestable(found: Found, steps: Sequence[Step]) -> tuple[tuple[str, str], ..
         seen = is_seen(np.linalg.eigvalsh(left)).any(axis=1)
         for number, square in zip(numbers[seen].tolist(), squares[seen, -1].tolist()):
             block = linear.blocks[number]
-            testable[block.effect] = max(math.sqrt(square) * block.entry.typical,
-                                         testable.get(block.effect, 0.0))
+            name = str(block.effect)
+            testable[name] = max(math.sqrt(square) * block.entry.typical, testable.get(name, 0.0))
     present = (*found.final.model.effects, *(rival for step in steps for rival in step.rivals))
     return not_testable(found.final.poses_g, testable, present, found.also)
 
 
-def not_testable(poses_g: Poses, testable: Mapping[str, float], present: tuple[str, ...],
-                 also: tuple[str, ...] = ()) -> tuple[tuple[str, str], ...]:
+def not_testable(poses_g: Poses, testable: Mapping[str, float], present: tuple[EffectKey, ...],
+                 also: tuple[OwnEffect, ...] = ()) -> tuple[tuple[str, str], ...]:
     """
     Return the effects that these poses cannot show, with the data to record.
 
@@ -404,9 +409,8 @@ def not_testable(poses_g: Poses, testable: Mapping[str, float], present: tuple[s
     """
     missing = []
     unknown = not len(kinds(poses_g)[0])
-    passed = {*present, *included(present)}
-    own = {name: effect_named(name) for name in also}
-    for name, effect in {**EFFECTS, **PROCESSES, **own}.items():
+    passed = {*map(str, present), *included(each for each in present if each in CATALOGUE)}
+    for name, effect in named_entries(also).items():
         if name in passed or effect.output is not None or passed & {*effect.includes}:
             continue
         if name in testable and (effect.needs or testable[name] > _LEAST_VISIBLE):
@@ -426,9 +430,14 @@ def not_testable(poses_g: Poses, testable: Mapping[str, float], present: tuple[s
     return tuple(missing)
 
 
-def _change(name: str, values: Floats, deviations: Sequence[float], date: str) -> str:
+def named_entries(also: tuple[OwnEffect, ...]) -> dict[str, Effect]:
+    """Return the effects that poses can show, by name, with own ones."""
+    return {**EFFECTS, **PROCESSES, **{own.name: own.entry for own in also}}
+
+
+def _change(name: EffectKey, values: Floats, deviations: Sequence[float], date: str) -> str:
     """Return the change of values since a stored calibration of a date, with uncertainties."""
-    effect = effect_named(CHANGES[name].base)
+    effect = entry_of(unchanged(name))
     scale, unit_name = (1e3, 'mg') if effect.is_offset else (100.0, '%')
     shown = ', '.join(f'{"+" if value > 0.0 else ""}{with_sd(value * scale, sd * scale)}'
                       for value, sd in zip(values.tolist(), deviations, strict=True))
@@ -451,15 +460,15 @@ def advice_for(found: Found, steps: tuple[Step, ...], untestable: tuple[tuple[st
                      '1 g is known; take poses of known orientation (ref_x, ref_y, ref_z) with '
                      'both')
     for step in (step for step in steps if step.rivals):
-        families = {effect_named(name).family for name in (step.name, *step.rivals)
-                    if is_effect(name)}
+        families = {entry_of(step.name).family, *(
+            CATALOGUE[name].family if name in CATALOGUE else '' for name in step.rivals)}
         family = families.pop() if len(families) == 1 else ''
         lines.append(f'{step.effect} cannot be distinguished from {", ".join(step.rivals)} here: '
                      f'{TO_SEPARATE[family]}')
-    lines += [line for name in found.also if name not in found.final.model.values
-              for line in _at_bounds(name, found)]
+    lines += [line for own in found.also if own not in found.final.model.values
+              for line in _at_bounds(own, found)]
     for step in steps:
-        times, effect = times_typical(step), effect_named(step.name)
+        times, effect = times_typical(step), entry_of(step.name)
         if times > _FAR:
             lines.append(f'{step.effect} is {times * effect.typical:.2g} {effect.unit}, typical '
                          f'parts have about {effect.typical:.2g}: check that the sensor causes '
@@ -479,22 +488,22 @@ def advice_for(found: Found, steps: tuple[Step, ...], untestable: tuple[tuple[st
     return tuple(lines)
 
 
-def _at_bounds(name: str, found: Found) -> list[str]:
+def _at_bounds(own: OwnEffect, found: Found) -> list[str]:
     """Return a line for each constant of an own effect that would help, but ends at a bound."""
-    effect, final, curve = effect_named(name), found.final, found.curve
+    effect, final, curve = own.entry, found.final, found.curve
     before = final if curve is None else fitted_state(Model({
         each: part for each, part in final.model.values.items() if each != curve.name}),
         final.poses_g)
-    tried = () if before is None else tuple(candidates((name,), final.poses_g))
+    tried = () if before is None else tuple(candidates((own,), final.poses_g))
     if before is None or not tried or not effect.bounds:
         return []
     alone = Set.of(linearised(before.fit, before.model.effects, tried))
-    grown = alone.extended(best := alone.best_of(name))
+    grown = alone.extended(best := alone.best_of(own))
     after = None if grown.score <= 0.0 else fitted_state(Model(with_effect(
-        before.model.values, name, np.concatenate(
+        before.model.values, own, np.concatenate(
             [grown.values[best], alone.linear.blocks[best].shape]))), final.poses_g)
-    shape = () if after is None else effect.split(after.model.values[name])[1].tolist()
-    return [f'{name} is not used, because its constant {constant} ends at its bound {value:.4g}: '
+    shape = () if after is None else effect.split(after.model.values[own])[1].tolist()
+    return [f'{own} is not used, because its constant {constant} ends at its bound {value:.4g}: '
             'widen the bounds in its definition, or use another function'
             for constant, value, bounds in zip(effect.shape, shape, effect.bounds)
             if value in bounds]
@@ -507,10 +516,11 @@ def _unexplained(found: Found, untestable: tuple[tuple[str, str], ...]) -> list[
                 'samples, and the scatter has no structure: clamp the sensor, let it settle '
                 'longer']
     if found.taken_back:
-        nearest = f'; {", ".join(found.taken_back)} would explain only a part'
+        nearest = f'; {", ".join(map(str, found.taken_back))} would explain only a part'
     lines = [f'a gap remains that no effect testable with these data explains{nearest}: check '
              'what differs between the poses, and repeat some of them']
-    columns = sorted({needs for effect, needs in untestable if effect_named(effect).needs})
+    entries = named_entries(found.also)
+    columns = sorted({needs for effect, needs in untestable if entries[effect].needs})
     if columns:
         lines.append(f'record {"; ".join(columns)}: their effects cannot be tested yet')
     return lines
@@ -533,6 +543,6 @@ def times_typical(step: Step) -> float:
     """Return the largest value of an effect relative to that of typical parts; 0: not known."""
     if step.effect == EMPIRICAL:
         return 0.0
-    effect = effect_named(step.name)
+    effect = entry_of(step.name)
     return max((abs(step.parameters.get(name, 0.0)) for name in effect.parameters),
                default=0.0) / effect.typical

@@ -34,8 +34,8 @@ from .sheet import (
     scroll_table, section)
 from ..calibration import Calibration, Curve, mounting_figures, outlook
 from ..effects import (
-    AXES, effect_named, EMPIRICAL, empirical_parts, kind_of, REFERENCE_TEMPERATURE, value_unit,
-    variable_words, with_vector)
+    AXES, EffectKey, EmpiricalCurve, entry_of, REFERENCE_TEMPERATURE, value_unit, variable_words,
+    with_vector)
 from ..findings import effect_figures, rate_refinement, residual_figures
 from ..geometry import coverage
 from ..refinement import verdict_words
@@ -231,7 +231,7 @@ def _key_numbers(calibration: Calibration, residuals: Residuals, checked: Verifi
 def _covered(calibration: Calibration, residuals: Residuals, *, plan: bool) -> str:
     """Return the section about coverage; with the next pose if `plan` is set."""
     direction, words = None, ''
-    linear = all(effect_named(name).linear for name in calibration.model.effects)
+    linear = all(entry_of(name).linear for name in calibration.model.effects)
     if plan and linear and calibration.model.effects:
         asked = outlook(calibration, 'auto').next_pose
         direction, words = asked.direction, f'Next pose: {asked.words}.'.replace('..', '.')
@@ -249,7 +249,7 @@ def values_section(calibration: Calibration) -> str:
                  for name in ('roll', 'pitch', 'yaw')]
     if not rows:
         return ''
-    thermal = any('temperature' in name for name in calibration.model.effects)
+    thermal = any('temperature' in str(effect) for effect in calibration.model.effects)
     note = f'The values hold at {REFERENCE_TEMPERATURE:g} °C.' if thermal else ''
     words = f'{calibration.name}: {calibration.reason}'.replace('ideal: ideal', 'ideal')
     return section('The calibration', paragraph(f'Model {words}'),
@@ -258,7 +258,7 @@ def values_section(calibration: Calibration) -> str:
                    paragraph(note, 'soft'), paragraph(_SOURCE, 'soft'), kind='half tall')
 
 
-def axis_figures(vec: Floats, effects: tuple[str, ...]) -> Floats:
+def axis_figures(vec: Floats, effects: tuple[EffectKey, ...]) -> Floats:
     """Return V [g], the sensitivities of the axes, and their angles [°], (9,), of model values."""
     mat_w, vec_v = with_vector(effects, vec).linear_part
     length = np.linalg.norm(mat_w, axis=1)
@@ -298,21 +298,21 @@ def _linear_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
 
 def _effect_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
     """Yield the values of the other effects; a curve, which has many, is one row."""
-    for name in calibration.model.effects:
-        if kind_of(name) == EMPIRICAL:
-            carrier, variable, modes = empirical_parts(name)
-            mode = 'degree' if variable == 'direction' else 'wave'
-            yield (f'curve of {carrier} over {variable_words(variable)}',
-                   counted(len(modes), mode), '')
+    by_name = {str(effect): effect for effect in calibration.model.effects}
+    for curve in by_name.values():
+        if isinstance(curve, EmpiricalCurve):
+            mode = 'degree' if curve.variable == 'direction' else 'wave'
+            yield (f'curve of {curve.changed} over {variable_words(curve.variable)}',
+                   counted(len(curve.modes), mode), '')
     for figure in effect_figures(calibration):
         name, _, part = figure.key.rpartition('.')
-        if kind_of(name) == EMPIRICAL or not (figure.value or figure.sd):
+        if isinstance(by_name[name], EmpiricalCurve) or not (figure.value or figure.sd):
             continue
-        label, effect = f'{name.replace("_", " ")} {part}', effect_named(name)
+        label, effect = f'{name.replace("_", " ")} {part}', entry_of(by_name[name])
         if part not in effect.parameters:
             yield label, f'{figure.value:.5g} {figure.unit}'.rstrip(), ''
             continue
-        unit, scale = value_unit(name, part)
+        unit, scale = value_unit(by_name[name], part)
         typical, factor = effect.typical * scale, 1.0
         if unit.startswith('g') and 0.0 < typical < _SMALL:
             unit, factor = f'µ{unit}', MG ** 2
@@ -370,7 +370,7 @@ def snippets(calibration: Calibration, stored: str) -> tuple[tuple[str, str], ..
               f'force = calibration.apply(readings{known})  # (n, 3), {units}')
     mat = calibration.rotation.T @ calibration.matrix
     rows = ',\n'.join(f'  {{{_floats(row)}}}' for row in mat)
-    beyond = [name for name in calibration.model.effects if not effect_named(name).linear]
+    beyond = [str(name) for name in calibration.model.effects if not entry_of(name).linear]
     note = '' if not beyond else (
         f'/* Without {", ".join(beyond)}:\n'
         '   accel-calib export --to c writes the terms that C can hold. */\n')

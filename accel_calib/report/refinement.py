@@ -16,7 +16,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any, cast, TYPE_CHECKING
 
 import numpy as np
 
@@ -26,10 +26,8 @@ from .residuals import (
 from .sheet import (
     ACCENT, add_band, AFTER, AXIS_COLOURS, BAND, BEFORE, code, Drawing, drawn, FAINT, figures,
     HEIGHT_INCHES, INK, PAPER, paragraph, save, scroll_table, section)
-from ..effects import (
-    AXES, CARRIERS, curve_unit, effect_named, EMPIRICAL, empirical_parts, parameter_names,
-    variable_words)
-from ..refinement import base_words, chance, values_of, verdict_words
+from ..effects import AXES, EMPIRICAL, EmpiricalCurve, entry_of, parameter_names, variable_words
+from ..refinement import base_words, chance, named_entries, values_of, verdict_words
 from ..statistics import over_axes
 from ..table import Floats
 from ..text import short
@@ -65,14 +63,15 @@ def search_sections(result: Refinement, residuals: Residuals, *, used: bool) -> 
     left = residuals_of_refinement(result)
     if not np.isclose(left.rms_mg, residuals.rms_mg, rtol=0.01):
         yield section('What remains after the refinement', figures(of_remainder(left, 'refined')))
-    rows = [(f'{effect_named(name).words} ({name})', needs) for name, needs in result.not_testable]
+    entries = named_entries(result.also)
+    rows = [(f'{entries[name].words} ({name})', needs) for name, needs in result.not_testable]
     yield section('What these data cannot show', scroll_table(
         'Effects that cannot be tested', ('effect', 'to see it, record'), rows, ''))
 
 
 def _step(result: Refinement, number: int, step: Step) -> str:
     """Return the section of a step, from 1: where it was found, and what it changes."""
-    effect = effect_named(step.name)
+    effect = entry_of(step.name)
     rivals = ', '.join(f'{code(name)} ({step.odds(name)})' for name in step.rivals)
     story = (f'{code(step.effect)} ({escape(effect.term)}). Found '
              f'{escape(step.where)}. With this effect the residual decreases from '
@@ -138,7 +137,7 @@ def of_step(result: Refinement, step: int) -> Iterator[Drawing]:
               for when, words, residuals, _ in stages]
     name, effect = f'step{step + 1}_{after.name}', result.steps[step].name
     values = result.calibration.model.values.get(effect)
-    shape = None if values is None else effect_named(effect).split(values)[1]
+    shape = None if values is None else entry_of(effect).split(values)[1]
     variables = variables_of(effect, result.poses_g, result.force, shape)
     if are_spread(result.force):
         for title, (when, _, residuals, _) in zip(titles, stages, strict=True):
@@ -167,16 +166,14 @@ class CurvePart:
     poses: Floats
 
 
-def curve_parts(result: Refinement, name: str) -> list[CurvePart]:
+def curve_parts(result: Refinement, curve: EmpiricalCurve) -> list[CurvePart]:
     """Return the parts of an empirical curve of the refined model."""
-    carrier, variable, modes = empirical_parts(name)
+    variable, modes, names = curve.variable, curve.modes, curve.parts
     calibration = result.calibration
-    whole, _, part = carrier.partition('.')
-    names = (part,) if part else CARRIERS[whole]
     count = len(names) * len(modes)
     first = parameter_names(calibration.model.effects).index(
-        f'{name}.{effect_named(name).parameters[0]}')
-    values = calibration.model.values[name]
+        f'{curve}.{curve.entry.parameters[0]}')
+    values = calibration.model.values[curve]
     low, high = values[count:] if variable != 'force' else (-1.0, 1.0)
     at = np.linspace(low, high, 201)
     parts = []
@@ -201,13 +198,12 @@ def _waves(modes: Sequence[int], values: Floats, low: float, high: float) -> Flo
 
 def of_curve(result: Refinement, step: int) -> Drawing:
     """Draw the empirical curve of a step with its 95 % band, and ticks at the poses."""
-    name = result.steps[step].name
-    carrier, variable, _ = empirical_parts(name)
-    whole, _, axis = carrier.partition('.')
-    words = 'gain of all axes' if whole == 'force' else whole.replace('_', '-')
-    words += f' of {axis}' if axis else ''
+    curve = cast(EmpiricalCurve, result.steps[step].name)
+    variable = curve.variable
+    words = 'gain of all axes' if curve.carrier == 'force' else curve.carrier.replace('_', '-')
+    words += f' of {curve.part}' if curve.part else ''
     title = f'{words[0].upper()}{words[1:]} over {variable_words(variable)}, with 95 % band'
-    parts = curve_parts(result, name)
+    parts = curve_parts(result, curve)
     with drawn(HEIGHT_INCHES, title) as (figure, (panel,)):
         for part, colour in zip(parts, AXIS_COLOURS):
             both = variable_of(variable, np.concatenate([part.at, part.poses]))
@@ -218,7 +214,7 @@ def of_curve(result: Refinement, step: int) -> Drawing:
             panel.plot(poses, np.full(len(poses), 0.02), '|', color=INK, markersize=7,
                        transform=panel.get_xaxis_transform())
         panel.set_xlabel(both.label)
-        panel.set_ylabel(f'change from the mean [m{curve_unit(name)}]')
+        panel.set_ylabel(f'change from the mean [m{curve.unit}]')
         panel.legend(ncols=len(parts))
     return Drawing(f'step{step + 1}_curve', title, figure)
 

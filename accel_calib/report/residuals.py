@@ -23,7 +23,7 @@ from .sheet import (
     HEIGHT_INCHES, INK, legend_below, Mark, Marks, PAPER, RIM, SEQUENTIAL)
 from ..calibration import (
     Calibration, directions_in, errors_after, errors_before, in_g, with_history)
-from ..effects import acting_temperature, AXES, effect_named, rate_at, sensor_force
+from ..effects import acting_temperature, AXES, EffectKey, entry_of, rate_at, sensor_force
 from ..geometry import uncovered, unit
 from ..statistics import over_axes, rms
 from ..table import column_of, Floats, Poses
@@ -65,7 +65,7 @@ class Variable:
     unit_range: bool = False
 
 
-def variables_of(effect: str, poses_g: Poses, force: Floats, shape: Floats | None = None
+def variables_of(effect: EffectKey, poses_g: Poses, force: Floats, shape: Floats | None = None
                  ) -> list[Variable]:
     """
     Return the variables that an effect depends on: one variable, or one per axis.
@@ -74,7 +74,7 @@ def variables_of(effect: str, poses_g: Poses, force: Floats, shape: Floats | Non
     a lag; by default zeros.
 
     """
-    found = effect_named(effect)
+    found = entry_of(effect)
     shape = np.zeros(len(found.shape)) if shape is None else shape
     known = with_thermal(poses_g, found.lagged, shape)
     key = next((name for name in found.over_of(shape) if name in known), None)

@@ -312,7 +312,7 @@ def _refined(demo: User, report: Callable[[str], None], stored: Path
     report(f'~/set_level: {demo.level()}')
     refined = read_calibration(stored).model
     lag = refined.lags.get('temperature_of_offset')
-    return (tuple(name for name in refined.effects if name not in fitted.effects),
+    return (tuple(str(name) for name in refined.effects if name not in fitted.effects),
             0.0 if lag is None else lag.seconds)
 
 

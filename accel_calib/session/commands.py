@@ -28,7 +28,7 @@ from .store import writing_advice
 from .use import adopt, rate, show_poses
 from .worker import Compute, Files, nothing, Parse, Part, Task
 from ..calibration import angle_words, Calibration, fit_partial, level, mounting_only, set_heading
-from ..effects import Model
+from ..effects import Model, OwnEffect
 from ..errors import AccelCalibError, InputError, RefusedFitError, StoredCalibrationError
 from ..findings import rate_refinement, Rating
 from ..geometry import angle_of, spread_directions
@@ -445,12 +445,12 @@ def fit(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str,
 
 
 def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None, hint: str,
-            own: tuple[str, ...]) -> Fitted:
+            own: tuple[OwnEffect, ...]) -> Fitted:
     """
     Return the refinement of a calibration (None: of a fit).
 
     An effect far beyond those of parts is refused; `hint` says which quantity may be missing. The
-    own effects of these names are tried beside the catalogue.
+    own effects are tried beside the catalogue.
     RefusedFitError if there are too few poses; InputError if the readings are clearly in another
     unit.
 
@@ -490,10 +490,11 @@ def change_words(before: Calibration | None, after: Calibration) -> str:
     offset = after.units.to_g(after.offset - before.offset) * MG
     gain = 100.0 * (np.linalg.solve(before.gain, after.gain) - np.eye(3))
     angle = angle_of(before.rotation.T @ after.rotation)
-    effects = sorted(set(before.model.effects) ^ set(after.model.effects))
+    effects = set(before.model.effects) ^ set(after.model.effects)
     words = [f'offset by ({", ".join(f"{part:+.2f}" for part in offset)}) mg',
              f'gain by up to {np.max(np.abs(gain)):.3f} %', f'mounting by {angle:.2f}°']
-    words += [f'{"with" if name in after.model.effects else "without"} {name}' for name in effects]
+    words += [f'{"with" if name in after.model.effects else "without"} {name}'
+              for name in sorted(effects, key=str)]
     return f'changes {", ".join(words)}'
 
 

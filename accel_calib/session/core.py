@@ -104,7 +104,8 @@ class State:
         self.units = units_of(settings.units, settings.gravity)
         self.sensor = Sensor(settings, self.units)
         self.statistics, self.around = StreamStatistics(clock), Around(clock)
-        self.files = SensorFiles(settings, topic)
+        self.own = own_effects(settings)
+        self.files = SensorFiles(settings, topic, self.own)
         # Messages in ned are those of ros, turned.
         self.frame: FrameName = 'ros' if settings.frame == 'ned' else settings.frame
         self.frame_id: str | None = None
@@ -115,7 +116,6 @@ class State:
         self.enabled, self.still, self.still_since = True, False, math.nan
         self.stillness = math.nan
         self.computing = 0
-        self.own = own_effects(settings)
         self.given: Floats | None = (
             mounting_of(settings.mounting_rpy) if any(settings.mounting_rpy) else None)
         self.events, self.throttle = deque[Event](), Throttle(clock)

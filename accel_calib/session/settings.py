@@ -21,7 +21,7 @@ import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING, TypeVar
 
-from ..effects import know_file, MODELS
+from ..effects import effects_of_file, MODELS, OwnEffect
 from ..errors import InputError
 from ..logs import named_topics
 from ..stillness import CaptureSettings, REPEATED, Repeated, settings_from
@@ -220,10 +220,10 @@ class CalibratorSettings:
         'without encryption')
 
 
-def own_effects(settings: CalibratorSettings) -> tuple[str, ...]:
-    """Make the effects of the file `also` known, and return their names; InputError if bad."""
+def own_effects(settings: CalibratorSettings) -> tuple[OwnEffect, ...]:
+    """Return the effects of the file `also`; InputError if it is bad."""
     try:
-        return know_file(Path(settings.also).expanduser()) if settings.also else ()
+        return effects_of_file(Path(settings.also).expanduser()) if settings.also else ()
     except (OSError, RuntimeError) as error:
         raise InputError(f'also is {settings.also}, which cannot be read: {error}',
                          'correct the parameter') from error

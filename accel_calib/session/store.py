@@ -32,6 +32,7 @@ import numpy as np
 from .settings import CalibratorSettings
 from ..calibration import Calibration, check_sensor
 from ..disk import check_regular, copy_atomically, remove_leftovers, write_atomically
+from ..effects import OwnEffect
 from ..errors import (
     AccelCalibError, crash_words, DamagedCalibrationError, FREE_SPACE, InputError, is_full,
     StoredCalibrationError)
@@ -93,7 +94,7 @@ def ros_home() -> Path:
 @dataclass(frozen=True)
 class Store:
     """
-    The files of a sensor, for readings in one unit.
+    The files of a sensor, for readings in one unit, and the effects of the user.
 
     The poses are in ``<stem of the calibration>_poses.csv`` in the same folder. All methods raise
     OSError if a file cannot be read or written.
@@ -103,6 +104,7 @@ class Store:
     calibration: Path
     identity: Identity
     units: UnitName
+    own: tuple[OwnEffect, ...] = ()
 
     @property
     def poses(self) -> Path:
@@ -121,7 +123,7 @@ class Store:
         a unit that cannot be converted. InputError if it is not a regular file.
 
         """
-        calibration = read_calibration(path)
+        calibration = read_calibration(path, self.own)
         check_sensor(calibration, self.identity.sensor)
         try:
             return calibration.in_units(self.units)
@@ -281,7 +283,8 @@ def _exists(path: Path) -> bool:
     return True
 
 
-def store_of(calibration_file: str, identity: Identity, units: UnitName) -> Store:
+def store_of(calibration_file: str, identity: Identity, units: UnitName,
+             own: tuple[OwnEffect, ...] = ()) -> Store:
     """Return the store at `calibration_file`, by default in `ros_home`; InputError: no home."""
     if calibration_file:
         try:
@@ -289,8 +292,8 @@ def store_of(calibration_file: str, identity: Identity, units: UnitName) -> Stor
         except RuntimeError as error:
             raise InputError(f'calibration_file is {calibration_file}, but this user has no home '
                              'folder', 'state the whole path') from error
-        return Store(path.absolute(), identity, units)
-    return Store(ros_home() / 'accel_calib' / identity.file_name, identity, units)
+        return Store(path.absolute(), identity, units, own)
+    return Store(ros_home() / 'accel_calib' / identity.file_name, identity, units, own)
 
 
 def aside(path: Path, word: str) -> Path:
@@ -364,8 +367,9 @@ def lock(store: Store) -> ExitStack:
 class SensorFiles:
     """The store of a sensor, None until the sensor is known; and why it cannot be used, or ''."""
 
-    def __init__(self, settings: CalibratorSettings, topic: str) -> None:
-        self._settings, self._topic = settings, topic
+    def __init__(self, settings: CalibratorSettings, topic: str, own: tuple[OwnEffect, ...]
+                 ) -> None:
+        self._settings, self._topic, self._own = settings, topic, own
         self._lock: ExitStack | None = None
         self.store: Store | None = None
         self.problem = ''
@@ -385,7 +389,7 @@ class SensorFiles:
         identity = Identity(one_line(sensor).strip()[:LONGEST_NAME], self._topic,
                             bool(self._settings.sensor))
         before, self.store = self.store, store_of(self._settings.calibration_file, identity,
-                                                  self._settings.units)
+                                                  self._settings.units, self._own)
         if before is None or before.calibration != self.store.calibration:
             self.release()
         return self.store if self.locked else self.try_again()

@@ -53,7 +53,6 @@ from typing import Any, BinaryIO, cast, Literal, Protocol, TypeVar
 
 from .store import writing_advice
 from ..calibration import NextPose
-from ..effects import know_code, KNOWN_CODE
 from ..errors import AccelCalibError, InputError
 from ..one_thread import ONE_THREAD
 from ..table import Floats
@@ -162,7 +161,7 @@ class WorkerProcess:
             self._end()
         if process is None or process.stdin is None or process.stdout is None:
             raise EOFError
-        process.stdin.write(pickle.dumps((KNOWN_CODE, pickle.dumps((function, given)))))
+        process.stdin.write(pickle.dumps((function, given)))
         process.stdin.flush()
         if self._idle and not select([process.stdout], [], [], _PATIENCE)[0]:
             self._idle = False  # raising the priority needs privileges, so restart it
@@ -212,10 +211,7 @@ def _read(stream: BinaryIO, calls: SimpleQueue[Any]) -> None:
     """Read calls; end the process when the node ends, even during a computation."""
     try:
         while True:
-            code, call = pickle.load(stream)
-            for each in code.items():  # first, because models in the call may have own effects
-                know_code(*each)
-            calls.put(pickle.loads(call))
+            calls.put(pickle.load(stream))
     finally:
         os._exit(0)
 

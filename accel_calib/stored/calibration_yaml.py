@@ -11,7 +11,7 @@ before it; it reveals a file that was edited by hand.
 
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields, replace
 import hashlib
 from pathlib import Path
@@ -30,7 +30,8 @@ from ..calibration import (
     Rejected, RejectedKind, SampleNoise, STORED_METHODS, with_history)
 from ..disk import FIRST_LINE, FORMAT, write_atomically
 from ..effects import (
-    CHANGES, effect_named, factors_of, is_effect, Model, MODELS, parameter_names, PROCESSES)
+    CHANGES, effect_named, EffectKey, entry_of, factors_of, Model, MODELS, OwnEffect,
+    parameter_names, PROCESSES)
 from ..errors import (
     AccelCalibError, DamagedCalibrationError, InputError, OwnEffectError, RefusedFitError,
     StoredCalibrationError)
@@ -96,7 +97,8 @@ def calibration_bytes(calibration: Calibration) -> bytes:
                           allow_unicode=True, width=99, default_flow_style=None).rstrip()
     data = f'{text}{_CHECKSUM}{_digest(text)}\n'.encode()
     try:
-        calibration_from(data, 'its file')
+        calibration_from(data, 'its file', [
+            each for each in calibration.model.effects if isinstance(each, OwnEffect)])
     except DamagedCalibrationError as err:
         raise InputError(f'the calibration of {counted(len(calibration.poses), "pose")} cannot be '
                          f'stored: {err.message}', 'fit fewer poses, or shorten their texts'
@@ -117,10 +119,10 @@ def _content(calibration: Calibration) -> dict[str, Any]:
         **({} if poses.autopilot is None else {'autopilot': asdict(poses.autopilot)}),
         'units': {'readings': units.name, 'per_g': float(units.per_g)},
         'model': calibration.name, 'method': calibration.method, 'reason': calibration.reason,
-        'effects': {name: {'what': effect.words, 'unit': effect.unit, **effect.shown(values),
-                           **({'own_rms': _own_rms(calibration, name)} if effect.own else {})}
-                    for (name, values), effect in zip(model.values.items(), model.terms.effects,
-                                                      strict=True)},
+        'effects': {str(key): {'what': effect.words, 'unit': effect.unit, **effect.shown(values),
+                               **({'own_rms': _own_rms(calibration, key)} if effect.own else {})}
+                    for (key, values), effect in zip(model.values.items(), model.terms.effects,
+                                                     strict=True)},
         'frame': calibration.frame, 'rotation': model.rotation.tolist(),
         # For users of the file: what follows from the other values.
         **({'mounting': mounting_figures(calibration.rotation, calibration.sensor)}
@@ -141,11 +143,11 @@ def _content(calibration: Calibration) -> dict[str, Any]:
     }
 
 
-def _own_rms(calibration: Calibration, name: str) -> float:
+def _own_rms(calibration: Calibration, own: EffectKey) -> float:
     """Return the RMS over the poses of what the values of an own effect are multiplied by."""
-    shape = effect_named(name).split(calibration.model.values[name])[1]
+    shape = entry_of(own).split(calibration.model.values[own])[1]
     poses_g = with_history(in_g(calibration.poses, calibration.units), calibration.model)
-    return rms(factors_of(name, [shape], poses_g.columns))
+    return rms(factors_of(own, [shape], poses_g.columns))
 
 
 def _rest_noise(gyro: GyroBias | None, noise: SampleNoise | None) -> dict[str, Any]:
@@ -165,10 +167,15 @@ def _rest_noise(gyro: GyroBias | None, noise: SampleNoise | None) -> dict[str, A
     return content
 
 
-def calibration_from(data: bytes, name: str) -> Calibration:
-    """Return the calibration in a file; with ``edited`` if its checksum does not match."""
+def calibration_from(data: bytes, name: str, own: Sequence[OwnEffect] = ()) -> Calibration:
+    """
+    Return the calibration in a file; with ``edited`` if its checksum does not match.
+
+    It may have effects of the user that are among `own`.
+
+    """
     try:
-        return _checked(data, name)
+        return _checked(data, name, own)
     except (StoredCalibrationError, OwnEffectError):
         raise
     except RefusedFitError as err:
@@ -183,7 +190,7 @@ def calibration_from(data: bytes, name: str) -> Calibration:
                                       'fit again, or use the previous file (.before)') from err
 
 
-def _checked(data: bytes, name: str) -> Calibration:
+def _checked(data: bytes, name: str, own: Sequence[OwnEffect]) -> Calibration:
     """Return the calibration in a file after all checks; other errors are those of damage."""
     if not data.strip(b'\0 \t\r\n'):
         raise ValueError('it is empty')
@@ -201,9 +208,9 @@ def _checked(data: bytes, name: str) -> Calibration:
         raise StoredCalibrationError(f'{name} has version {version}, expected {_VERSION}',
                                      'fit the poses again' if version < _VERSION else
                                      'update accel_calib, or fit the poses again')
-    _check_known(content, name)
+    _check_known(content, name, own)
     with np.errstate(all='ignore'):  # the checks refuse what is not finite
-        calibration = gated(_calibration(content))
+        calibration = gated(_calibration(content, own))
     _check_own(calibration, content, name)
     body, found, digest = text.rpartition(_CHECKSUM)
     if not found:
@@ -212,11 +219,11 @@ def _checked(data: bytes, name: str) -> Calibration:
             _edited(calibration, content))
 
 
-def _check_known(content: Mapping[str, Any], name: str) -> None:
-    """Refuse a calibration with an own effect of the user that this process does not know."""
-    stated = content.get('effects')
+def _check_known(content: Mapping[str, Any], name: str, own: Sequence[OwnEffect]) -> None:
+    """Refuse a calibration with an effect of the user that is not among `own`."""
+    stated, known = content.get('effects'), {each.name for each in own}
     for each, values in stated.items() if isinstance(stated, Mapping) else ():
-        if isinstance(values, Mapping) and 'own_rms' in values and not is_effect(each):
+        if isinstance(values, Mapping) and 'own_rms' in values and each not in known:
             raise StoredCalibrationError(
                 f'{name} needs the effect {shown(each)} of the user ({shown(values.get("what"))}),'
                 ' expected its definition', 'use --also FILE.py with the file that defines it, '
@@ -229,9 +236,9 @@ def _check_own(calibration: Calibration, content: Mapping[str, Any], name: str) 
     for each, effect in zip(model.effects, model.terms.effects, strict=True):
         if effect.own and not np.isclose(
                 _own_rms(calibration, each),
-                number_at(content['effects'][each], 'own_rms'), _SAME_OWN, 0.0):
+                number_at(content['effects'][str(each)], 'own_rms'), _SAME_OWN, 0.0):
             raise StoredCalibrationError(
-                f'{name} needs the effect {shown(each)} as it was when it was fitted, found '
+                f'{name} needs the effect {shown(str(each))} as it was when it was fitted, found '
                 'another definition', 'use that definition, or refine again')
 
 
@@ -259,8 +266,8 @@ def _edited(calibration: Calibration, content: Mapping[str, Any]) -> Calibration
     return replace(calibration, noted=tuple(noted))
 
 
-def _calibration(content: Mapping[str, Any]) -> Calibration:
-    model = Model(_effects(value_at(content, 'effects', dict)),
+def _calibration(content: Mapping[str, Any], own: Sequence[OwnEffect]) -> Calibration:
+    model = Model(_effects(value_at(content, 'effects', dict), own),
                   array_at(content, 'rotation', (3, 3)))
     units, size = _units(value_at(content, 'units', dict)), int(np.sum(model.stated))
     rejected = tuple(Rejected(value_at(each, 'row', int), value_at(each, 'reason', str),
@@ -301,21 +308,25 @@ def _units(stated: Mapping[str, Any]) -> Units:
     return Units(name, per_g)
 
 
-def _effects(stated: Mapping[str, Any]) -> dict[str, Floats]:
+def _effects(stated: Mapping[str, Any], own: Sequence[OwnEffect]) -> dict[EffectKey, Floats]:
     """Return the values of effects; shape constants that are not stated are the usual ones."""
+    keys = {}
     for name in stated:
-        if (len(name) > LONGEST_NAME or not is_effect(name) or name in CHANGES
-                or name in PROCESSES):
+        try:
+            keys[name] = effect_named(name[:LONGEST_NAME + 1], own)
+        except KeyError:
+            keys[name] = ''
+        if len(name) > LONGEST_NAME or keys[name] in ('', *CHANGES, *PROCESSES):
             raise ValueError(f'effect {shown(name)} is not in the catalogue')
-    found = {}
-    for name in stated:
-        effect, values = effect_named(name), value_at(stated, name, dict)
-        for key in values:
-            if key not in (*effect.values, 'what', 'unit', *(('own_rms',) if effect.own else ())):
-                raise ValueError(f'the key {shown(key)} of an effect is not known, expected one '
+    found = dict[EffectKey, Floats]()
+    for name, key in keys.items():
+        effect, values = entry_of(key), value_at(stated, name, dict)
+        for part in values:
+            if part not in (*effect.values, 'what', 'unit', *(('own_rms',) if effect.own else ())):
+                raise ValueError(f'the key {shown(part)} of an effect is not known, expected one '
                                  f'of {", ".join(effect.values)}')
         known = {**dict(zip(effect.shape, effect.usual)), **values}
-        found[name] = np.array([number_at(known, part, LARGEST) for part in effect.values])
+        found[key] = np.array([number_at(known, part, LARGEST) for part in effect.values])
     return found
 
 
@@ -364,9 +375,9 @@ def _labels(stated: Mapping[str, Any]) -> NDArray[Any]:
     return np.array(texts, dtype=str)
 
 
-def read_calibration(path: Path) -> Calibration:
+def read_calibration(path: Path, own: Sequence[OwnEffect] = ()) -> Calibration:
     """
-    Read a stored calibration.
+    Read a stored calibration, which may have effects of the user that are among `own`.
 
     Raises
     ------
@@ -378,7 +389,7 @@ def read_calibration(path: Path) -> Calibration:
         If the file cannot be read.
 
     """
-    return calibration_from(beginning_of(path), str(path))
+    return calibration_from(beginning_of(path), str(path), own)
 
 
 def write_calibration(path: Path, calibration: Calibration, *, keep_before: bool = True) -> None:
@@ -408,7 +419,7 @@ _MOST_SENSORS = 10**9
 
 def write_priors(path: Path, priors: Mapping[str, FleetPrior]) -> None:
     """Write typical values as YAML; OSError if that fails, InputError if the reader refuses it."""
-    models = [{'model': fleet.model, 'sensors': fleet.sensors, 'names': list(_PRIOR_NAMES),
+    models = [{'model': fleet.model, 'sensors': fleet.sensors, 'names': [*map(str, _PRIOR_NAMES)],
                'mean': fleet.prior.mean.tolist(),
                'sd': np.sqrt(np.diag(fleet.prior.covariance)).tolist(),
                'covariance': fleet.prior.covariance.tolist()} for fleet in priors.values()]

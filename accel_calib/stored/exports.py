@@ -97,7 +97,7 @@ def _content(calibration: Calibration) -> dict[str, Any]:
         'offset_sd': calibration.offset_sd, 'gain_sd': calibration.gain_sd,
         'parameters': list(calibration.parameters), 'values': model.vector,
         'covariance': calibration.covariance,
-        'effects': {name: {'unit': effect.unit, **effect.shown(values)}
+        'effects': {str(name): {'unit': effect.unit, **effect.shown(values)}
                     for (name, values), effect in zip(model.values.items(), model.terms.effects,
                                                       strict=True)},
         'ranges': {key: list(limits) for key, limits in calibration.ranges.items()},
@@ -288,6 +288,6 @@ def write_plan(path: Path, plan: PosePlan) -> None:
             context = [format(pose.context[key] * scale, '.6g') if key in pose.context else ''
                        for key, (_, scale) in columns.items()]
             writer.writerow([number, *(f'{part:.6f}' for part in pose.up), pose.words, *context,
-                             ' / '.join(pose.separates), f'{pose.expected:.4f}'])
+                             ' / '.join(map(str, pose.separates)), f'{pose.expected:.4f}'])
 
     write_atomically(path, write)

@@ -25,7 +25,8 @@ import numpy as np
 
 from ..calibration import Calibration, in_g, uncertainty_g, with_history
 from ..effects import (
-    AtContext, Context, effect_named, formula_of, Model, NOMINAL_SUPPLY, REFERENCE_TEMPERATURE)
+    AtContext, Context, EffectKey, entry_of, formula_of, Model, NOMINAL_SUPPLY,
+    REFERENCE_TEMPERATURE)
 from ..geometry import angle_of, OVER_THE_SPHERE, spread_directions
 from ..table import Floats, range_of
 from ..text import plain
@@ -248,7 +249,7 @@ def losses_of(calibration: Calibration, label: str, make: Callable[[Calibration]
 def _by_effect(calibration: Calibration, label: str, make: Callable[[Calibration], Made],
                made: Made) -> list[Loss]:
     """Return the losses of the effects, and of the sensitivity, where they matter."""
-    def left(values: dict[str, Floats]) -> float:
+    def left(values: dict[EffectKey, Floats]) -> float:
         kept = Model(values)
         alone = replace(calibration, model=kept, covariance=np.zeros((len(kept.vector),) * 2))
         return difference_mg(alone, make(alone))
@@ -257,15 +258,15 @@ def _by_effect(calibration: Calibration, label: str, make: Callable[[Calibration
     found = [Loss('', f'{label} has no sensitivity: leaves {ideal:.2g} mg', ideal)]
     for name, values in calibration.model.values.items():
         part = float(np.sqrt(max(left({name: values}) ** 2 - ideal ** 2, 0.0)))
-        effect = effect_named(name)
+        effect = entry_of(name)
         parameters, shape = effect.split(values)
         what = effect.words.partition(',')[0]
         words = f'has no {what}'
-        if name in made.rounded:
-            words = f'rounds the {what} to {made.rounded[name]}'
+        if str(name) in made.rounded:
+            words = f'rounds the {what} to {made.rounded[str(name)]}'
         elif effect.is_lagged(shape) and left({name: effect.filled(parameters)}) < LEAST_LOSS_MG:
             words = f'has no lag ({shape[0]:.0f} s) in the {what}'
-        found.append(Loss(name, f'{label} {words}: leaves {part:.2g} mg', part))
+        found.append(Loss(str(name), f'{label} {words}: leaves {part:.2g} mg', part))
     return [loss for loss in found if loss.leaves_mg >= LEAST_LOSS_MG]
 
 
@@ -318,11 +319,12 @@ def unit_in_ascii(units: Units, native: str) -> str:
 def about(calibration: Calibration) -> list[str]:
     """Return lines about a calibration for a comment: sensor, unit, model, curves, quality."""
     quality, poses, units = calibration.quality, calibration.used_poses, calibration.units
+    effects = ', '.join(map(str, calibration.model.effects))
     lines = [f'sensor: {calibration.sensor or "not named"}',
              f'date: {calibration.date or "not known"}',
              f'readings: {unit_in_ascii(units, "native (counts or volts)")}, '
              f'1 g = {units.per_g:.9g}',
-             f'model {calibration.name}: {", ".join(calibration.model.effects) or "no effects"}',
+             f'model {calibration.name}: {effects or "no effects"}',
              f'residual over {len(poses)} poses: before {quality.rms_before_mg:.3g} mg, after '
              f'{quality.rms_after_mg:.3g} mg',
              f'uncertainty of |force|: {uncertainty_g(calibration) * MG:.2g} mg (1 sd, largest '

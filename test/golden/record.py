@@ -24,6 +24,7 @@ import re
 from typing import Any
 
 import accel_calib as ac
+from accel_calib.effects import EffectRecord
 from accel_calib.errors import AccelCalibError
 from accel_calib.table import Table
 import numpy as np
@@ -55,7 +56,7 @@ def plain(value: Any) -> Any:
     """Return any result as JSON can hold it."""
     if value is None or isinstance(value, bool | int):
         return value
-    if isinstance(value, str | Path):
+    if isinstance(value, str | Path | EffectRecord):
         text = _CHANGING.sub('…', str(value).replace(f'{Path.cwd()}/', ''))
         return _SIGN_OF_ZERO.sub('', text)
     if isinstance(value, float):

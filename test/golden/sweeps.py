@@ -13,7 +13,7 @@ from accel_calib.calibration import (
     Calibration, dilution, error_left_in, fit_poses, FleetPrior, gated, gyro_bias_of,
     identifiability, level, lies_in_cone, next_pose, Rejected, set_heading, with_given_mounting)
 from accel_calib.comparison import compare
-from accel_calib.effects import CHANGES, effect_named, EFFECTS, is_effect, MONOMIALS, PROCESSES
+from accel_calib.effects import CHANGES, effect_named, EFFECTS, entry_of, MONOMIALS, PROCESSES
 from accel_calib.estimate import estimate, Prior, variance_factor
 from accel_calib.finding import Finding, LEVELS
 from accel_calib.findings import Expected, LIMITS, rate
@@ -192,11 +192,19 @@ def catalogue() -> Any:
         'offset.y-force-1-4', 'offset-force-2', 'gain-temperature_rate-1-2', 'offset-time',
         'gain.x-time-25', 'gain.x-time-24', 'gain-force-1', 'offset.w-time-1', 'offset-time-2-1',
         'offset-time-0')]
+
+    def is_effect(name: str) -> bool:
+        try:
+            effect_named(name)
+        except KeyError:
+            return False
+        return True
+
     known = {name: is_effect(name) for name in curves}
     names = filter(known.get, curves)
 
     def of(name: str) -> Any:
-        effect = effect_named(name)
+        effect = entry_of(effect_named(name))
         shapes = [] if effect.shapes is None else list(effect.shapes(CONTEXT))
         few = [] if effect.shapes is None else [len(list(effect.shapes({
             key: each[:count] for key, each in CONTEXT.items()}))) for count in (1, 2, 3, 4, 7)]
@@ -205,7 +213,7 @@ def catalogue() -> Any:
                  [] if effect.output is None else effect.output(force[:5], np.array([0.33]))]
         for shape in [*shapes[1:-1:9], *shapes[-1:]] if shapes else [np.zeros(0)]:
             values = np.concatenate([1e-3 * (1.0 + K[:len(effect.parameters)]), shape])
-            model = Model({} if not effect.terms else {name: values})
+            model = Model({} if not effect.terms else {effect_named(name): values})
             found.append([(model.at(CONTEXT).reading(force) - force)[::6], model.lags, np.sum(
                 np.abs(model.basis(force, CONTEXT).full), axis=(0, 1)),
                 model.at(CONTEXT).slope(force)[::9].sum(axis=2)])
@@ -314,7 +322,7 @@ def rated_effects() -> Any:
     poses = made.poses.with_columns(std=CONTEXT['std'])
 
     def of(name: str, values: Any) -> Any:
-        model = Model({**made.model.values, name: np.array(values)})
+        model = Model({**made.model.values, effect_named(name): np.array(values)})
         covariance = np.eye(len(model.vector)) * 1e-8
         covariance[:9, :9] = made.covariance
         whole = replace(made, model=model, covariance=covariance, poses=poses)

@@ -1,0 +1,294 @@
+# Copyright 2026 The accel_calib authors
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Effects beyond the catalogue, as records: curves without a known cause, and covariates.
+
+An empirical curve changes a part of the reading, the carrier, smoothly with a variable. A
+covariate is any quantity that the catalogue does not know. Files, JSON and messages have their
+text form, such as ``empirical-gain.z-temperature-1-2``; `effect_named` reads it.
+
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from itertools import combinations
+import math
+from typing import Any
+
+import numpy as np
+
+from .catalogue import CATALOGUE, entry_of
+from .form import (
+    ALL_AXES, AXES, by_axis, Context, CROSS, DEGREES, Effect, EffectKey, EffectRecord, FORCE,
+    MODES, ONE, Term, WAVE, ZONAL, ZONES)
+from ..table import column_of, CONTEXT, Floats, is_quantity
+from ..units import MG
+
+EMPIRICAL = 'empirical'
+"""Kind of a smooth curve without a physical cause."""
+
+CARRIERS: dict[str, tuple[str, ...]] = {
+    'offset': AXES, 'gain': AXES, 'cross_axis': ('xy', 'xz', 'yz'), 'force': ('all',)}
+"""What an empirical curve can change, with the names of its parts. The carrier ``force`` is the
+common gain of all axes."""
+
+_CARRIED = {'offset': by_axis(ONE), 'gain': by_axis(FORCE), 'cross_axis': CROSS, 'force': ALL_AXES}
+
+VARIABLES: dict[str, str] = {
+    'time': 'time', 'temperature': 'temperature', 'temperature_rate': 'rate of temperature',
+    'supply_voltage': 'supply voltage', 'std': 'vibration', 'force': 'force along the axis',
+    'direction': 'direction of the force'}
+"""Quantities that an empirical curve can be a function of, by column, with their words."""
+
+COVARIATES = {'offset': ('offset', ONE, 'g/unit'), 'gain': ('gain of each axis', FORCE, '1/unit')}
+"""What a covariate changes in proportion to a quantity: words, monomial, unit of its values."""
+
+
+@dataclass(frozen=True)
+class EmpiricalCurve(EffectRecord):
+    """
+    An empirical curve: Σ_k c_k cos(k π s) over the modes k, 1 to `MODES`.
+
+    The carrier, one of `CARRIERS` or a `part` of one, changes with one of `VARIABLES` or a
+    quantity. s runs from 0 to 1 over its range in the poses; outside of it, the curve is constant.
+    The modes of the variable ``direction`` are degrees of spherical harmonics.
+
+    """
+
+    carrier: str
+    variable: str
+    modes: tuple[int, ...]
+    part: str = ''
+
+    @property
+    def kind(self) -> str:
+        return EMPIRICAL
+
+    @property
+    def changed(self) -> str:
+        """Return the carrier with its part, such as ``gain.z``."""
+        return f'{self.carrier}.{self.part}' if self.part else self.carrier
+
+    def __str__(self) -> str:
+        return '-'.join([EMPIRICAL, self.changed, self.variable, *map(str, self.modes)])
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Return the names of the parts of the carrier that change."""
+        return (self.part,) if self.part else CARRIERS[self.carrier]
+
+    @property
+    def unit(self) -> str:
+        return 'g' if self.carrier == 'offset' else 'g/g'
+
+    @property
+    def entry(self) -> Effect:
+        return _entry_of_curve(self)
+
+
+@dataclass(frozen=True)
+class Covariate(EffectRecord):
+    """
+    An offset or a gain that changes by k (x - zero), by axis, with a quantity x.
+
+    The zero is the mean over the poses. With the power 2, a square, k₂ (x - zero)², is added. With
+    two columns it is k (x - zero_x) (y - zero_y): what neither column does alone.
+
+    """
+
+    part: str
+    columns: tuple[str, ...]
+    power: int = 1
+
+    @property
+    def kind(self) -> str:
+        return f'{self.part}_covariate'
+
+    @property
+    def variable(self) -> str:
+        """Return the column, or both, such as ``humidity*pressure``."""
+        return '*'.join(self.columns)
+
+    def __str__(self) -> str:
+        return f'{self.kind}-{self.variable}{"-2" if self.power == 2 else ""}'
+
+    @property
+    def entry(self) -> Effect:
+        return _entry_of_covariate(self)
+
+
+def effect_named(text: str, own: Iterable[EffectRecord] = ()) -> EffectKey:
+    """Return the effect with a name or text form, perhaps an own one; KeyError without one."""
+    if text in CATALOGUE:
+        return text
+    for each in own:
+        if str(each) == text:
+            return each
+    kind, *rest = text.split('-')
+    found: EffectKey | None = None
+    if kind == EMPIRICAL and len(rest) > 2 and all(mode.isdecimal() for mode in rest[2:]):
+        carrier, _, part = rest[0].partition('.')
+        modes = tuple(map(int, rest[2:]))
+        pairs = ((each.carrier, each.variable) for each in curves_over(
+            filter(is_quantity, rest[1:2])))
+        if ((carrier, rest[1]) in pairs and part in ('', *CARRIERS[carrier])
+                and list(modes) == sorted({*modes} & {*modes_of(rest[1])})):
+            found = EmpiricalCurve(carrier, rest[1], modes, part)
+    elif kind.removesuffix('_covariate') in COVARIATES and rest:
+        columns = tuple(rest[0].split('*'))
+        is_product = len(columns) == 2 and columns[0] < columns[1] and all(
+            is_quantity(column) or column in CONTEXT for column in columns)
+        if is_product or is_quantity(rest[0]):
+            power = 2 if rest[1:] and not is_product else 1
+            found = Covariate(kind.removesuffix('_covariate'), columns, power)
+    if found is None or str(found) != text:
+        raise KeyError(text)
+    return found
+
+
+def kind_of(effect: EffectKey) -> str:
+    """Return the name of an effect without what it is a function of."""
+    return effect if isinstance(effect, str) else effect.kind
+
+
+def variable_of(effect: EffectKey) -> str:
+    """Return the variable of a curve or a covariate; empty for others."""
+    return effect.variable if isinstance(effect, EmpiricalCurve | Covariate) else ''
+
+
+def variable_words(column: str) -> str:
+    """Return the words of a variable: of `VARIABLES`, or of a quantity."""
+    return VARIABLES.get(column) or column_of(column).meaning
+
+
+def modes_of(variable: str) -> Sequence[int]:
+    """Return the modes that an empirical curve over a variable can have."""
+    return DEGREES if variable == 'direction' else range(1, MODES + 1)
+
+
+def curves_over(quantities: Iterable[str] = ()) -> Iterator[EmpiricalCurve]:
+    """Yield the curves of all carriers over `VARIABLES` and the quantities, with all modes."""
+    for variable in (*VARIABLES, *quantities):
+        for carrier in CARRIERS:
+            if carrier == {'force': 'offset', 'direction': 'force'}.get(variable, carrier):
+                yield EmpiricalCurve(carrier, variable, tuple(modes_of(variable)))
+
+
+def covariates_of(quantities: Iterable[str]) -> Iterator[Covariate]:
+    """Yield the covariates of quantities, each without and with a square."""
+    for quantity in quantities:
+        for part in COVARIATES:
+            yield from (Covariate(part, (quantity,), power) for power in (1, 2))
+
+
+def products_of(columns: Iterable[str]) -> Iterator[Covariate]:
+    """Yield the covariates of the products of two columns."""
+    for pair in combinations(sorted(columns), 2):
+        yield from (Covariate(part, pair) for part in COVARIATES)
+
+
+@lru_cache(maxsize=2048)
+def _entry_of_curve(curve: EmpiricalCurve) -> Effect:
+    variable, modes = curve.variable, curve.modes
+    if variable == 'direction':  # the gain of all axes as a sum of spherical harmonics
+        zones = [number for number, zone in enumerate(ZONES) if zone.degree in modes]
+        return Effect(
+            f'gain as a smooth function of {VARIABLES["direction"]}', 'empirical curve',
+            tuple(f'{degree}_{k}' for degree in modes for k in range(1, 2 * degree + 2)), 'g/g',
+            0.001, 0.5, tuple(Term(k, axis, ZONAL + 3 * number + axis)
+                              for k, number in enumerate(zones) for axis in range(3)),
+            family='force')
+    parts, of_force = curve.parts, variable == 'force'
+    carried = [term._replace(parameter=parts.index(own)) for term in _CARRIED[curve.carrier]
+               if (own := CARRIERS[curve.carrier][term.parameter]) in parts]
+    terms = tuple(
+        term._replace(parameter=k * len(parts) + term.parameter,
+                      monomial=WAVE + 3 * (mode - 1) + term.axis if of_force else term.monomial)
+        for k, mode in enumerate(modes) for term in carried)
+    names = tuple(f'{own}_{mode}' for mode in modes for own in parts)
+    words = f'{curve.changed.replace("_", "-")} as a smooth function of {variable_words(variable)}'
+    made = partial(Effect, words, 'empirical curve', names, 'g', 0.001, 0.5, terms)
+    if of_force:
+        return made(family='force')
+    return made(factor=partial(_cosines, variable, modes, len(carried)), needs=(variable,),
+                shape=('low', 'high'), shapes=partial(_ends, variable))
+
+
+def _variable(variable: str, context: Mapping[str, Any]) -> Floats:
+    """Return the variable of an empirical curve; for vectors, its RMS over the axes."""
+    values = np.asarray(context[variable], float)
+    return np.sqrt(np.mean(values ** 2, axis=-1)) if variable == 'std' else values
+
+
+def _ends(variable: str, context: Context) -> Iterator[Floats]:
+    """Yield the range of a variable."""
+    values = _variable(variable, context)
+    known = values[np.isfinite(values)]
+    if len(known) and np.ptp(known) > 0.0:
+        yield np.array([np.min(known), np.max(known)])
+
+
+def _cosines(variable: str, modes: tuple[int, ...], terms: int, context: Mapping[str, Any],
+             shape: Floats) -> Any:
+    """Return the cosine of each term, (t, n), with several terms of each mode."""
+    values = _variable(variable, context)
+    share = np.clip((values - shape[0]) / max(shape[1] - shape[0], 1e-300), 0.0, 1.0)
+    return np.repeat(np.cos(np.pi * np.multiply.outer(modes, share)), terms, axis=0)
+
+
+@lru_cache(maxsize=2048)
+def _entry_of_covariate(covariate: Covariate) -> Effect:
+    columns, has_square = covariate.columns, covariate.power == 2
+    what, monomial, unit = COVARIATES[covariate.part]
+    terms = by_axis(monomial)
+    names: tuple[str, ...] = AXES
+    if has_square:
+        terms += tuple(term._replace(parameter=3 + term.parameter) for term in terms)
+        names += tuple(f'{axis}_square' for axis in AXES)
+
+    def departure(context: Mapping[str, Any], shape: Floats) -> Any:
+        """Return the product of all column - zero, and its square."""
+        away = math.prod(context[each] - zero for each, zero in zip(columns, shape, strict=True))
+        return np.array([away] * 3 + [away ** 2] * 3) if has_square else away
+
+    def means(context: Context) -> Iterator[Floats]:
+        """Yield the means of columns with enough different values."""
+        known = [context[column][np.isfinite(context[column])] for column in columns]
+        if all(len(np.unique(values)) > covariate.power for values in known):
+            yield np.array([np.mean(values) for values in known])
+
+    return Effect(
+        words=f'{what} that changes with {" times ".join(map(variable_words, columns))}',
+        term=f'coefficient of {covariate.variable}', parameters=names, unit=unit, typical=np.inf,
+        plausible_g=0.5, terms=terms, factor=departure, needs=columns, shapes=means,
+        shape=('zero',) if len(columns) == 1 else tuple(f'zero_{each}' for each in columns),
+        usual=(0.0,) * len(columns),
+        includes=(replace(covariate, power=1),) if has_square else ())
+
+
+_IN_MILLI = ('g', 'g/g', 'g/g²', 'g/g³', 'g/°C', 'g/°C²', 'g/°C³', 'g/h')
+_WITHOUT_UNIT = ('of_sensor', 'form')
+"""Constants of a shape that select one of two forms."""
+
+
+def value_unit(effect: EffectKey, value_name: str) -> tuple[str, float]:
+    """Return the unit of a value of an effect in reports, and the factor from the model's unit."""
+    if value_name in _WITHOUT_UNIT:
+        return '', 1.0
+    entry = entry_of(effect)
+    if value_name not in entry.parameters:
+        if isinstance(effect, Covariate):
+            return unit_of(effect.columns[entry.shape.index(value_name)]), 1.0
+        return unit_of(effect.variable) if isinstance(effect, EmpiricalCurve) else (
+            '' if entry.own else 's'), 1.0
+    unit = effect.unit if isinstance(effect, EmpiricalCurve) else entry.unit
+    if value_name.endswith('_square'):
+        unit = f'{unit}²'
+    return (f'm{unit}', MG) if unit in _IN_MILLI else (unit, 1.0)
+
+
+def unit_of(column: str) -> str:
+    """Return the unit of a quantity of the context, with readings in g."""
+    return 'g' if column == 'std' else column_of(column).unit
