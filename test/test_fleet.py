@@ -648,7 +648,10 @@ def test_own_effects_are_known_to_all_workers_and_needed_later(client: Any, tmp_
         (tmp_path / 'in').mkdir(exist_ok=True)
         write_table(tmp_path / 'in' / f'2026-0{seed + 1}-03.csv', replace(poses, sensor='arm'))
     store = Store(tmp_path / 'out')
-    assert run(client, found_in(tmp_path / 'in'), options, store).counts == {'ok': 2}
+    summary = run(client, found_in(tmp_path / 'in'), options, store)
+    assert summary.counts == {'ok': 2}
+    arm, = summary.sensors
+    assert (arm['calibrations'], arm['note']) == (2, None)  # compared on a worker, too
     rows = rows_of(tmp_path / 'out')
     assert [row['effects'][-1] for row in rows] == ['band_of_fleet'] * 2
     assert run(client, found_in(tmp_path / 'in'), options, store).counts == {'skipped': 2}
