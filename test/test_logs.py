@@ -206,20 +206,16 @@ def test_a_table_of_100000_columns_is_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(log.table.reading[:, 2], [9.8, 9.81, 9.82])
 
 
-@pytest.mark.parametrize('plot', [False, True])
-def test_the_serial_monitor_and_plotter_of_arduino_are_read(plot: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize(('line', 'before'), [
+    ('ax:{0}\tay:{1}\taz:{2}\n', ''), ('12:00:{when:06.3f} -> {0},{1},{2}\n', ''),
+    ('12:00:{when:06.3f} -> {0} {1} {2}\n', '#\n')])
+def test_the_serial_monitor_and_plotter_of_arduino_are_read(line: str, before: str, tmp_path: Path
+                                                            ) -> None:
     made = samples(poses=8, rest=30, turn=8)
-    text = ''.join(f'ax:{x}\tay:{y}\taz:{z}\n' if plot else f'12:00:{when:06.3f} -> {x},{y},{z}\n'
-                   for when, (x, y, z) in zip(made['time'], rows_of(made['reading'])))
-    log = read_log(write(tmp_path, text), LogOptions(rate=100.0 if plot else None))
+    text = before + ''.join(line.format(*row, when=when) for when, row in zip(
+        made['time'], rows_of(made['reading'])))
+    log = read_log(write(tmp_path, text), LogOptions(rate=None if 'when' in line else 100.0))
     check(log, made['reading'], made['time'], within_s=1e-6)
-
-
-def test_a_comment_without_text_before_the_lines_of_a_monitor_is_ignored(tmp_path: Path) -> None:
-    made = samples(poses=8, rest=30, turn=8)
-    text = ''.join(f'12:00:{when:06.3f} -> {x} {y} {z}\n'
-                   for when, (x, y, z) in zip(made['time'], rows_of(made['reading'])))
-    check(read_log(write(tmp_path, f'#\n{text}')), made['reading'], made['time'], within_s=1e-6)
 
 
 @pytest.mark.parametrize('blank', [',,,', ';;;', '""', '  ', '"","","",""', ' , ,,'])
