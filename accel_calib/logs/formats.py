@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from . import containers, records
+from . import containers
 from .autopilot import FlightLog
 from .bag import open_bag
 from .bag_samples import context_of, imu_samples, rate_words
@@ -356,7 +356,7 @@ FORMATS = (
     Format('an ArduPilot log as text', ('.log',), rb'(?:.*\n)?FMT, *\d+, *\d+, *\w+, *\w+',
            read_dataflash, opened=_flight, plain=True),
     Format('a NumPy file', ('.npy', '.npz'), rb'\x93NUMPY|' + _ZIP + rb'.*\.npyPK',
-           records.of_numpy),
+           containers.of_numpy),
     Format('an Excel file (.xlsx)', ('.xlsx', '.xlsm'), _ZIP + rb'.*xl/workbook\.xml',
            containers.sheets, 'openpyxl'),
     Format('an Excel file (.xls)', ('.xls',), rb'\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1',
@@ -364,21 +364,21 @@ FORMATS = (
     Format('an ActiGraph log', ('.gt3x',), _ZIP + rb'.*log\.bin',
            advice=f'{_EXPORT}ActiLife, or with pygt3x'),
     Format('a ZIP archive', ('.zip',), _ZIP, containers.archived),
-    Format('a MATLAB file', ('.mat',), rb'MATLAB 5\.0 MAT-file', records.matlab,
+    Format('a MATLAB file', ('.mat',), rb'MATLAB 5\.0 MAT-file', containers.matlab,
            module='scipy.io'),
-    Format('an HDF5 file', ('.h5', '.hdf5'), rb'\x89HDF\r\n|MATLAB 7\.3 MAT-file', records.hdf5,
+    Format('an HDF5 file', ('.h5', '.hdf5'), rb'\x89HDF\r\n|MATLAB 7\.3 MAT-file', containers.hdf5,
            'h5py'),
-    Format('a Parquet file', ('.parquet',), b'PAR1', partial(records.columnar, 'parquet'),
+    Format('a Parquet file', ('.parquet',), b'PAR1', partial(containers.columnar, 'parquet'),
            'pyarrow'),
-    Format('a Feather file', ('.feather', '.arrow'), b'ARROW1', partial(records.columnar, 'ipc'),
-           'pyarrow'),
+    Format('a Feather file', ('.feather', '.arrow'), b'ARROW1',
+           partial(containers.columnar, 'ipc'), 'pyarrow'),
     Format('JSON lines', ('.jsonl', '.ndjson'), rb'\s*\{[^\n]*\}\s*\n\s*\{',
-           partial(records.lines, records.json_line), plain=True),
+           partial(containers.lines, containers.json_line), plain=True),
     Format('a JSON file', ('.json',), rb'\s*(?:\{\s*"|\[\s*(?:\{|\[\s*[-"\d]))',
-           records.json_document, plain=True),
+           containers.json_document, plain=True),
     Format('lines of InfluxDB', ('.lp',), rb'(?:#[^\n]*\n)*[^\s,=]+(?:,[^\s=]+=[^\s]+)* '
            rb'[^\s=]+=[-\d.]+[iu]?(?:,[^\s=]+=[^\s]+)* \d{9,19}\s', partial(
-               records.lines, records.influx_line), plain=True),
+               containers.lines, containers.influx_line), plain=True),
     Format('a log of the Betaflight blackbox', ('.bbl', '.bfl'),
            b'H Product:Blackbox flight data recorder', advice='decode it with blackbox_decode {}'),
     Format('a telemetry log of MAVLink', ('.tlog',), b'', advice='use the .bin log of the '
