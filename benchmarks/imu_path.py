@@ -28,10 +28,11 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT)]
 
 from accel_calib.calibration import Calibration, fit_poses, level  # noqa: E402
-from accel_calib.effects import Model, model_with, simulate_poses  # noqa: E402
+from accel_calib.effects import EffectKey, Model, model_with, simulate_poses  # noqa: E402
 from accel_calib.geometry import spread_directions  # noqa: E402
 from accel_calib.logs import write_table  # noqa: E402
 from accel_calib.stored import write_calibration  # noqa: E402
+from accel_calib.table import Floats  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
 from figures import Line, machine, markdown, parser, publish, table  # noqa: E402
 from imu_trial import node, relay, Trial, trial  # noqa: E402
@@ -41,9 +42,9 @@ UNITS = units_of('m/s2')
 SEED = 2030
 EFFECTS = {'offset': np.array([0.03, -0.02, 0.04]), 'axis_gain': np.array([0.012, -0.015, 0.008]),
            'cross_axis': np.array([0.006, -0.004, 0.003])}
-MORE = {'offset_temperature': np.array([1e-3, -5e-4, 8e-4]),
-        'gain_temperature': np.array([3e-4, 2e-4, -1e-4]),
-        'quadratic': np.array([2e-3, -1e-3, 1e-3])}
+MORE: dict[EffectKey, Floats] = {
+    'offset_temperature': np.array([1e-3, -5e-4, 8e-4]),
+    'gain_temperature': np.array([3e-4, 2e-4, -1e-4]), 'quadratic': np.array([2e-3, -1e-3, 1e-3])}
 
 PACES = {'five times a second': 0.2, 'back to back': 0.0}
 """Pauses between calls [s]."""

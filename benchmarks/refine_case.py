@@ -259,7 +259,7 @@ def run(case: Case) -> Outcome:
     try:
         refined = refine(poses, units_of('m/s2'), base=case.base)
         seconds = time.process_time() - started
-        named = tuple((_of_temperature(step.name), tuple(map(_of_temperature, step.rivals)))
+        named = tuple((_of_temperature(str(step.name)), tuple(map(_of_temperature, step.rivals)))
                       for step in refined.steps if step.effect not in (*BASE, EMPIRICAL))
         other = again(np.random.default_rng((*case.seed, 1)), made)
         fresh = _fresh(case, poses, refined, other)
