@@ -166,7 +166,8 @@ def library(poses: Poses, fresh: Poses) -> Library:
                                                   if key not in ('reading', 'count', 'label'))])
         sides.append(Side(near.residual, near.scale, near.columns(model), np.hstack(columns),
                           (recorded - recorded.mean(axis=0)) / (recorded.std(axis=0) + 1e-12)))
-    effects = [(str(each.effect), len(each.entry.parameters)) for each in tried for _ in each.shapes]
+    effects = [(str(each.effect), len(each.entry.parameters))
+               for each in tried for _ in each.shapes]
     ends = np.cumsum([width for _, width in effects]).tolist()
     return Library(sides[0], sides[1], tuple(name for name, _ in effects), tuple(
         slice(end - width, end) for (_, width), end in zip(effects, ends, strict=True)))
