@@ -83,7 +83,7 @@ def run(case: persons.Case, rng: np.random.Generator) -> tuple[bool, float, floa
         ended = person.follow(seconds=400.0 if case.ends in ('done', 'fit') else 40.0)
         seconds = person.times[person.steps.index(ended)]
         named = not case.named or case.named in [
-            each.name for each in conditions(driver.session)]
+            each.name for each in conditions(driver.session.state)]
         held = np.nan
         if driver.calibration is not None:
             reach = case.about.get('can_reach', lambda up: True)

@@ -230,8 +230,8 @@ def _of_session(log: Log, units: str, found: tuple[Finding, ...]) -> Said:
 
 
 def _pushed(log: Log, driver: Driver, found: tuple[Finding, ...]) -> Said:
-    driver.session.found = found
-    context = np.full((len(log.time), len(columns_of(driver.session.settings))), np.nan)
+    driver.session.change(found=found)
+    context = np.full((len(log.time), len(columns_of(driver.session.state.settings))), np.nan)
     rows = np.column_stack([*log[:3], context])
     for block in np.array_split(rows, max(1, len(rows) // 25)):
         driver.now += 25 * float(np.median(np.diff(log.time)))
@@ -246,7 +246,7 @@ def _pushed(log: Log, driver: Driver, found: tuple[Finding, ...]) -> Said:
     rating = driver.sensor.rating
     findings = () if rating is None else rating.findings
     said = ' '.join([answer, *(line.words for line in driver.log), *(
-        each.words for each in findings), *(str(each) for each in checks(driver.session))])
+        each.words for each in findings), *(str(each) for each in checks(driver.session.state))])
     return said, driver.calibration, rating
 
 

@@ -84,9 +84,9 @@ class Driver:
 
     def feed(self, readings: Any, frame_id: str = 'imu_link', **context: float) -> int:
         """Push readings [m/s²] with their context, and return the number of accepted messages."""
-        accepted, columns = 0, columns_of(self.session.settings)
+        accepted, columns = 0, columns_of(self.session.state.settings)
         for column, value in context.items():
-            self.session.around.take(column, value)
+            self.session.state.around.take(column, value)
         for block in np.array_split(np.asarray(readings), max(1, len(readings) // 15)):
             self.now += len(block) / RATE
             if self.session.accepts(frame_id):
@@ -104,7 +104,7 @@ class Driver:
         return '\n'.join(line.words for line in self.log if line.severity == severity)
 
     def finding(self, name: str) -> Any:
-        return next(each for each in checks(self.session) if each.concern == name)
+        return next(each for each in checks(self.session.state) if each.concern == name)
 
 
 class Person:
@@ -156,7 +156,8 @@ class Person:
         for _ in range(most):
             if self.driver.now > end:
                 break
-            now, action = state.progress(self.driver.session), next_action(self.driver.session)
+            present = self.driver.session.state
+            now, action = state.progress(present), next_action(present)
             assert (now.step, now.advice, now.command) == (
                 action.kind, action.words, action.command)
             self.steps.append(action.kind)

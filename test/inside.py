@@ -93,7 +93,7 @@ from accel_calib.session.commands import (
 from accel_calib.session.conditions import next_action, step_of
 from accel_calib.session.live_capture import LiveCapture, PoseBook, with_temperature
 from accel_calib.session.pose_guide import Guide, Plan, plan_for
-from accel_calib.session.sensor import rest_after, Sensor
+from accel_calib.session.sensor import new_sensor, rest_after
 from accel_calib.session.settings import capture_settings, changed, default_of
 from accel_calib.session.state import figures
 from accel_calib.session.store import (

@@ -59,7 +59,7 @@ def test_an_effect_of_temperature_leads_to_refine_and_is_kept_by_a_fit() -> None
     assert 'offset_temperature' in refined.model.effects
     for up in np.eye(3):
         person.rest(up)
-    assert next_action(driver.session).kind == 'poses'  # far above the range of the poses
+    assert next_action(driver.session.state).kind == 'poses'  # far above the range of the poses
     driver.ask('fit')
     again = driver.calibration
     assert again.model.effects == refined.model.effects
@@ -67,17 +67,17 @@ def test_an_effect_of_temperature_leads_to_refine_and_is_kept_by_a_fit() -> None
     assert len(again.poses) == len(driver.poses)
     np.testing.assert_allclose(again.model.values['offset_temperature'][:3], EFFECT, atol=5e-5)
     assert again.is_levelled
-    assert next_action(driver.session).kind == 'done'
+    assert next_action(driver.session.state).kind == 'done'
 
 
 def test_without_messages_or_in_another_unit_the_stream_comes_first() -> None:
     driver = Driver()
-    assert next_action(driver.session).kind == 'connect'
-    driver.session.surroundings = Surroundings(imus=('/camera/imu',))
-    assert next_action(driver.session).words.endswith(' /camera/imu')
+    assert next_action(driver.session.state).kind == 'connect'
+    driver.session.change(surroundings=Surroundings(imus=('/camera/imu',)))
+    assert next_action(driver.session.state).words.endswith(' /camera/imu')
     person = Person(driver, lambda up, temperature: GRAVITY * healthy(up, temperature))
     person.rest(person.flat)
-    assert next_action(driver.session).kind == 'unit'
+    assert next_action(driver.session.state).kind == 'unit'
 
 
 def test_each_fit_refinement_and_levelling_is_reported_as_on_the_command_line(
@@ -86,7 +86,7 @@ def test_each_fit_refinement_and_levelling_is_reported_as_on_the_command_line(
     kinds = [json.loads(text)['next']['kind'] for text in driver.results]
     assert kinds[-1] == 'done'
     assert {'refine', 'level'} <= set(kinds)
-    store = driver.session.files.store
+    store = driver.session.state.files.store
     _, fit = run_json(capsys, 'fit', store.poses)
     _, refined = run_json(capsys, 'refine', store.poses)
     found, calibration = figures(driver), driver.calibration
@@ -94,7 +94,7 @@ def test_each_fit_refinement_and_levelling_is_reported_as_on_the_command_line(
     for result in (found, refined):
         assert 'offset_temperature' in [step['effect'] for step in result['steps']]
     assert (found['rating'], found['in_use'], found['verdict']) == ('GOOD', True, 'explained')
-    assert found['next'] == {'kind': 'done', 'text': next_action(driver.session).words,
+    assert found['next'] == {'kind': 'done', 'text': next_action(driver.session.state).words,
                              'command': ''}
     for key in ('offset', 'gain', 'rotation', 'offset_sd', 'gain_sd'):
         np.testing.assert_allclose(found[key], getattr(calibration, key), atol=1e-12)
@@ -140,7 +140,7 @@ def test_slow_motion_by_hand_is_named_while_a_pose_is_waited_for() -> None:
     up = np.column_stack([np.sin(angle), 0.0 * time, np.cos(angle)])
     noise = 0.0005 * np.random.default_rng(1).normal(size=up.shape)
     driver.feed(GRAVITY * (up @ GAIN + OFFSET + noise))
-    action = next_action(driver.session)
+    action = next_action(driver.session.state)
     assert action.kind == 'poses'
     assert action.words.startswith('turning slowly, ')
     number, unit = action.words.split()[2:4]
@@ -166,7 +166,8 @@ def test_an_upside_down_sensor_is_asked_about_once_unless_its_mounting_is_given(
 
 def test_an_effect_far_beyond_those_of_parts_is_reported_and_not_used() -> None:
     driver = Driver()
-    driver.session.surroundings = Surroundings(thermometers=('/board/temperature', '/cpu'))
+    driver.session.change(surroundings=Surroundings(
+        thermometers=('/board/temperature', '/cpu')))
 
     def unseen(up: Any, temperature: float) -> Any:
         return healthy(up, temperature) + 3.0 * EFFECT * (temperature - 25.0)

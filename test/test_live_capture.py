@@ -14,11 +14,13 @@ from accel_calib.stored import read_calibration
 from accel_calib.table import numbered, Recording
 from accel_calib.units import units_of
 from inside import (
-    LiveCapture, model_with, PoseBook, rest_after, Sensor, simulate_recording, spread_directions,
-    with_temperature)
+    LiveCapture, model_with, new_sensor, PoseBook, rest_after, simulate_recording,
+    spread_directions, with_temperature)
 import numpy as np
 import pytest
 from shared import GRAVITY, MPS2, Readings, Stored
+
+SETTINGS = CalibratorSettings()
 
 FACES = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
 
@@ -36,9 +38,8 @@ def push_all(live: LiveCapture, readings: Any, *, start: float = 0.0, rate: floa
 
 def monitored(stored: Stored) -> tuple[Any, Any]:
     """Return a calibration, and a sensor that uses it."""
-    calibration, sensor = read_calibration(stored()), Sensor(CalibratorSettings(), MPS2)
-    sensor.adopt(calibration)
-    return calibration, sensor
+    calibration = read_calibration(stored())
+    return calibration, new_sensor(SETTINGS, MPS2).adopt(calibration, SETTINGS)
 
 
 def dwell(time: float, direction: Any, count: float = 50.0) -> Dwell:
@@ -176,33 +177,33 @@ def test_change_is_reported_during_the_third_rest_and_survives_a_new_level(store
         return dwell(time, reading / GRAVITY)
 
     for time, off in ((0.0, 0.0), (10.0, 0.05), (20.0, 0.0), (30.0, 0.005), (40.0, 0.005)):
-        sensor.update(rest(time, off), 0.001)
-        sensor.end(rest(time, off), 0.001)
+        sensor = sensor.update(rest(time, off), 0.001)
+        sensor = sensor.end(rest(time, off), 0.001)
         assert sensor.drift.change is None
-    sensor.update(rest(50.0, 0.005), 0.001)
+    sensor = sensor.update(rest(50.0, 0.005), 0.001)
     assert sensor.drift.change is not None
-    sensor.update(rest(50.0, 0.0), 0.001)
+    sensor = sensor.update(rest(50.0, 0.0), 0.001)
     assert sensor.drift.change is not None  # what is reported stays for rests without it
-    sensor.end(rest(50.0, 0.005), 0.001)
+    sensor = sensor.end(rest(50.0, 0.005), 0.001)
     assert sensor.drift.change is not None
     assert sensor.drift.count == 6
     flat = calibration.predict(np.array([[0.0, 0.6, 0.8]]) * GRAVITY)[0]
-    sensor.adopt(level(calibration, flat, 'ros'))
+    sensor = sensor.adopt(level(calibration, flat, 'ros'), SETTINGS)
     assert sensor.drift.change is not None
-    sensor.adopt(None)
+    sensor = sensor.adopt(None, SETTINGS)
     assert sensor.drift is None
 
 
 def test_rest_that_is_reported_late_does_not_hide_the_ongoing_rest(stored: Stored) -> None:
     _, sensor = monitored(stored)
     early, late = dwell(0.0, [0, 0, 1]), dwell(10.0, [0, 0, 1.01])
-    sensor.update(early, 0.001)
-    sensor.update(late, 0.001)
-    sensor.end(early, 0.001)
+    sensor = sensor.update(early, 0.001)
+    sensor = sensor.update(late, 0.001)
+    sensor = sensor.end(early, 0.001)
     assert sensor.drift.count == 2
-    sensor.end(late, 0.001)
+    sensor = sensor.end(late, 0.001)
     assert sensor.drift.count == 2
-    sensor.update(replace(late, end=late.end + 1e3), 0.001)  # by a clock that has jumped
+    sensor = sensor.update(replace(late, end=late.end + 1e3), 0.001)  # by a clock that has jumped
     assert sensor.drift.count == 2
 
 
@@ -235,7 +236,7 @@ def test_robot_that_stands_for_hours_is_monitored_all_the_time(stored: Stored) -
         readings[:, 2] += shift
         for change in push_all(live, readings, start=time[0], rate=4.0, capture=False, block=40):
             if change.rest is not None:
-                sensor.update(change.rest, 0.001)
+                sensor = sensor.update(change.rest, 0.001)
         if sensor.drift.change is not None:
             left_at = left_at or time[0]
         counts.append(sensor.drift.count)

@@ -100,9 +100,9 @@ def test_every_person_ends_in_a_calibration_or_in_one_named_reason(name: str) ->
     person = Person(driver, case.sensor, **case.about)
     assert person.follow(seconds=case.seconds) == case.ends, person.steps
     driver.tick()
-    found = conditions(driver.session)
+    found = conditions(driver.session.state)
     assert case.named in [each.name for each in found]
-    now, words = state.progress(driver.session), dict(state.figures(driver.session))
+    now, words = state.progress(driver.session.state), dict(state.figures(driver.session.state))
     assert (now.advice, now.step) == (found[0].words, found[0].kind)
     assert words['next'] == now.advice
     if case.named:
@@ -123,7 +123,7 @@ def test_axes_of_a_driver_are_named_after_two_rests_and_poses_are_asked_for_as_t
         person = Person(driver, reading(axes))
         person.follow(seconds=25.0)
         assert driver.shown is not None
-        asked = next_action(driver.session).direction
+        asked = next_action(driver.session.state).direction
         np.testing.assert_allclose(driver.shown.asked.direction, asked)
         assert words in driver.logged('warning')
         lines = driver.logged('info').splitlines()
@@ -138,9 +138,9 @@ def test_words_and_direction_come_from_one_pose() -> None:
     person = Person(driver, reading())
     person.rest(person.flat)
     for _ in range(24):
-        if next_action(driver.session).command == 'fit':
+        if next_action(driver.session.state).command == 'fit':
             driver.ask('fit')
-        action = next_action(driver.session)
+        action = next_action(driver.session.state)
         if not action.direction:
             break
         signs = ' '.join(f'{"+" if part > 0 else "-"}{axis}' for axis, part in zip(
@@ -163,9 +163,10 @@ def test_a_calibration_for_another_start_of_the_node_is_not_set_aside_by_the_nex
     assert person.follow(seconds=60.0) == 'restart'
     assert person.called == []
     assert path.read_bytes() == before
-    assert 'restart the node with units of the calibration' in next_action(driver.session).words
+    words = next_action(driver.session.state).words
+    assert 'restart the node with units of the calibration' in words
     driver.ask('reset')
-    assert next_action(driver.session).kind == 'poses'
+    assert next_action(driver.session.state).kind == 'poses'
 
 
 def test_the_correction_and_the_range_of_the_calibration_come_before_done() -> None:
@@ -175,11 +176,11 @@ def test_the_correction_and_the_range_of_the_calibration_come_before_done() -> N
     assert person.follow() == 'done'
     assert 'offset_temperature' in driver.calibration.model.effects
     driver.session.commands.enable(False)
-    assert next_action(driver.session).kind == 'enable'
+    assert next_action(driver.session.state).kind == 'enable'
     driver.session.commands.enable(True)
     person.warming, person.temperature = 0.0, 60.0
     person.rest(person.flat, 4.0)
-    action = next_action(driver.session)
+    action = next_action(driver.session.state)
     assert (action.kind, action.command, action.level) == ('poses', 'refine', 1)
     assert action.words in driver.finding('calibration').words
 
@@ -189,12 +190,12 @@ def test_bursts_of_absurd_readings_are_said_while_they_last_and_only_counted_the
     person = Person(driver, reading())
     person.follow()
     driver.feed(np.full((10, 3), np.nan))
-    assert next_action(driver.session).name == 'not_finite'
+    assert next_action(driver.session.state).name == 'not_finite'
     assert driver.finding('stream').level == 1
     person.rest(person.flat, 8.0)
-    assert next_action(driver.session).kind == 'done'
+    assert next_action(driver.session.state).kind == 'done'
     assert driver.finding('stream').level == 0
-    assert dict(state.figures(driver.session))['readings not finite'] == '10'
+    assert dict(state.figures(driver.session.state))['readings not finite'] == '10'
 
 
 def test_a_calibration_that_cannot_be_stored_leaves_no_file_and_is_asked_for_until_it_is(
@@ -211,13 +212,13 @@ def test_a_calibration_that_cannot_be_stored_leaves_no_file_and_is_asked_for_unt
             driver.ask('fit')
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    folder = driver.session.files.store.calibration.parent
+    folder = driver.session.state.files.store.calibration.parent
     assert [path.name for path in folder.iterdir() if 'before' in path.name] == []
     assert driver.calibration is not None
-    action = next_action(driver.session)
+    action = next_action(driver.session.state)
     assert (action.kind, action.command, action.level) == ('save', 'save', 2)
     driver.ask('save')
-    assert next_action(driver.session).kind == 'level'
+    assert next_action(driver.session.state).kind == 'level'
 
 
 def test_no_step_is_named_while_the_rating_is_being_computed() -> None:
@@ -226,8 +227,9 @@ def test_no_step_is_named_while_the_rating_is_being_computed() -> None:
     for up in spread_directions(16):
         person.rest(up)
     driver.ask('fit')
-    driver.sensor.rating, lines = None, len(driver.log)
+    lines = len(driver.log)
+    driver.session.change_sensor(rating=None)
     person.rest([0.3, 0.3, 0.9])
-    action = next_action(driver.session)
+    action = next_action(driver.session.state)
     assert (action.kind, action.words) == ('', '')
     assert not [line.words for line in driver.log[lines:] if 'next: ' in line.words]

@@ -110,7 +110,7 @@ def test_a_command_that_ends_after_another_sensor_took_over_changes_nothing_of_i
     poses = len(driver.session.sensor.live.book.poses())
     with pytest.raises(AccelCalibError, match=words):
         task.send(found)
-    assert driver.session.name == 'other'
+    assert driver.session.state.name == 'other'
     assert driver.session.sensor.calibration is None
     assert len(driver.session.sensor.live.book.poses()) == poses > 0
 
@@ -127,7 +127,7 @@ def test_files_that_are_read_too_late_are_not_used_for_the_next_sensor(
     driver.feed(rest, 'other')
     for task in late:
         driver.done(task)
-    assert driver.session.name == 'other'
+    assert driver.session.state.name == 'other'
     assert driver.session.sensor.calibration is None
 
 
@@ -135,7 +135,7 @@ def test_an_automatic_fit_of_a_sensor_is_not_one_of_the_next(readings: Readings)
     driver = Driver()
     turned = readings(spread_directions(12))
     driver.feed(turned)
-    driver.session.set_settings(replace(driver.session.settings, auto_fit=True))
+    driver.session.set_settings(replace(driver.session.state.settings, auto_fit=True))
     task, = automatic_fits_due(driver.session)
     driver.now += 3.0
     driver.feed(turned[:200], 'other')
@@ -149,7 +149,7 @@ def test_correction_that_was_switched_off_stays_off_with_the_next_sensor(reading
     driver = Driver()
     driver.session.commands.enable(False)
     driver.feed(readings([[0, 0, 1]])[:30])
-    assert not driver.session.enabled
+    assert not driver.session.state.enabled
     assert 'nothing is published' in driver.session.commands.enable(True)
 
 

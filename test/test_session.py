@@ -70,8 +70,8 @@ def test_second_node_on_the_same_files_is_refused_until_the_first_ends(
     first, second = Driver(calibration_file=str(path)), Driver(calibration_file=str(path))
     for driver in (first, second):
         driver.feed(readings(spread_directions(12)))
-    assert first.session.files.locked
-    assert not second.session.files.locked
+    assert first.session.state.files.locked
+    assert not second.session.state.files.locked
     assert second.finding('calibration').level == Level.ERROR
     assert words in second.finding('calibration').words
     second.refuses(words, 'fit', 'save', 'load')
@@ -79,7 +79,7 @@ def test_second_node_on_the_same_files_is_refused_until_the_first_ends(
     assert len(read_poses(path.with_name('known_poses.csv'))) == 12
     first.session.close()
     second.tick()
-    assert second.session.files.locked
+    assert second.session.state.files.locked
     assert second.calibration is not None
     assert second.finding('calibration').level == Level.OK
 
@@ -130,7 +130,7 @@ def test_messages_of_another_sensor_are_dropped_and_end_the_rest(readings: Readi
     assert not driver.sensor.live.detector.still
     assert "'another', expected 'imu_link'" in driver.logged()
     assert driver.feed(rest[100:]) == len(rest) - 100
-    assert driver.session.statistics.dropped['foreign'] == 1
+    assert driver.session.state.statistics.dropped['foreign'] == 1
     assert driver.finding('stream').level == Level.WARN
 
 
@@ -144,11 +144,11 @@ def test_sensor_that_tumbles_from_the_first_second_is_not_still_until_it_rests(
     up = np.column_stack([np.sin(turn) * np.cos(lean), np.sin(lean), np.cos(turn) * np.cos(lean)])
     for block in np.array_split((up + noise) * per_g, 120):
         driver.feed(block)
-        shown.append(state.progress(driver.session).still)
+        shown.append(state.progress(driver.session.state).still)
     assert not any(shown)
     for direction in (*spread_directions(5), np.array([0.6, 0.0, 0.8])):
         driver.feed((direction + noise[:150]) * per_g)
-    now = state.progress(driver.session)
+    now = state.progress(driver.session.state)
     assert now.still
     np.testing.assert_allclose(now.up, (0.6, 0.0, 0.8), atol=0.1)
 
@@ -161,7 +161,7 @@ def test_silent_sensor_can_be_replaced_by_another_with_its_own_files(
     assert driver.ask('fit')
     driver.now += 3.0
     assert driver.feed(turned[:50], 'another') == 50
-    assert driver.session.name == 'another'
+    assert driver.session.state.name == 'another'
     assert driver.calibration is None
     assert len(driver.poses) < 2
     assert "'another'" in driver.logged('warning')
@@ -295,7 +295,7 @@ def test_context_outside_of_the_ranges_is_limited_with_a_warning(
     for temperature, severity in ((25.0, Level.OK), (30.0, Level.OK), (40.0, Level.WARN)):
         driver.feed(readings([UP])[:50], temperature=temperature)
         assert driver.finding('calibration').level == severity
-        forces.append(driver.sensor.force_of((0.0, 0.0, GRAVITY), driver.session.context)[0])
+        forces.append(driver.sensor.force_of((0.0, 0.0, GRAVITY), driver.session.state.context)[0])
     assert re.findall(r'\d+', driver.finding('calibration').words) == ['40', '20', '30']
     assert forces[0] != forces[1] == forces[2]
 
@@ -307,12 +307,13 @@ def test_advice_changes_with_the_poses_and_with_a_request_that_is_not_followed(
         readings: Readings) -> None:
     driver = Driver()
     driver.feed(readings(spread_directions(5)))
-    before, rest = next_action(driver.session), readings([spread_directions(5)[0]], dwell=20.0)
+    before = next_action(driver.session.state)
+    rest = readings([spread_directions(5)[0]], dwell=20.0)
     driver.feed(rest[:300])
-    after = next_action(driver.session)
+    after = next_action(driver.session.state)
     assert after.direction != before.direction
     driver.feed(rest[300:])
-    assert next_action(driver.session) == after
+    assert next_action(driver.session.state) == after
     assert driver.logged('info').count('repeats') == 1
     driver.feed(readings(spread_directions(30)))
     lines = len(driver.log)
@@ -476,8 +477,9 @@ def test_lag_of_the_temperature_is_followed_while_the_node_runs(
         calibration, with_values(*values[:3])))
     np.testing.assert_allclose(driver.sensor.gravity, expected, atol=0.01)
     assert abs(expected[2] - plain[2]) > 0.15
-    driver.sensor.offered = offered = with_values(*values * [1.0, 1.0, 1.0, 2.0, 1.0])
-    assert state.progress(driver.session).corrected == pytest.approx(
+    offered = with_values(*values * [1.0, 1.0, 1.0, 2.0, 1.0])
+    driver.session.change_sensor(offered=offered)
+    assert state.progress(driver.session.state).corrected == pytest.approx(
         np.linalg.norm(offline(offered)[-1]) / GRAVITY, abs=1e-3)
 
 
@@ -559,7 +561,7 @@ def test_a_quantity_is_a_column_of_poses_and_its_last_value_holds_when_it_stops(
         driver.feed(readings([direction]) + PER_AMPERE * (current - 6.0) * GRAVITY,
                     motor_current=current)
     driver.feed(readings([UP])[:15], motor_current=6.0)
-    poses, around = driver.poses, driver.session.around
+    poses, around = driver.poses, driver.session.state.around
     assert np.ptp(poses['motor_current']) > 8.0
     assert 'motor_current' in driver.ask('refine')
     assert Covariate('offset', ('motor_current',)) in driver.calibration.model.effects
@@ -569,8 +571,8 @@ def test_a_quantity_is_a_column_of_poses_and_its_last_value_holds_when_it_stops(
         return np.array(driver.sensor.force_of(tuple(reading), {'motor_current': current}))
 
     np.testing.assert_allclose(force(2.0), force(10.0), atol=1e-3)
-    driver.session.surroundings = Surroundings(
-        missing={'motor_current': 'nothing comes on /motor/current'})
+    driver.session.change(surroundings=Surroundings(
+        missing={'motor_current': 'nothing comes on /motor/current'}))
     around.take('motor_current', 10.0)
     line = 'no motor_current arrives: nothing comes on /motor/current; the last value holds'
     for seconds, count in ((29.0, 0), (2.0, 1), (20.0, 1)):
@@ -578,7 +580,7 @@ def test_a_quantity_is_a_column_of_poses_and_its_last_value_holds_when_it_stops(
         assert driver.logged('warning').count(line) == count
     assert line in driver.finding('stream').words
     reading = (0.0, 0.0, GRAVITY)
-    assert driver.sensor.force_of(reading, driver.session.context) == pytest.approx(
+    assert driver.sensor.force_of(reading, driver.session.state.context) == pytest.approx(
         driver.sensor.force_of(reading, {'motor_current': 10.0}))
     around.take('motor_current', 3.0)
     driver.tick()
@@ -614,7 +616,7 @@ def test_a_start_without_a_column_leaves_it_in_the_stored_poses(
         assert column not in driver.sensor.live.poses(()) or not lack
         driver.session.close()
         if k == 1:
-            with open_log(driver.session.files.store.poses) as log:  # as a command reads it
+            with open_log(driver.session.state.files.store.poses) as log:  # as a command reads it
                 assert column not in log.poses
                 assert [column in note for note in log.notes] == [True]
 

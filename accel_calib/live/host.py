@@ -80,7 +80,7 @@ class Exchange:
 
     def show_progress(self, reading: Triple | None = None) -> None:
         """Show the progress; the parameter is as in `state.progress`."""
-        now = state.progress(self._session, reading)
+        now = state.progress(self._session.state, reading)
         self.show({'kind': 'progress', 'time': monotonic(), **vars(now)})
 
     def show_event(self, event: Event) -> None:
@@ -148,14 +148,14 @@ class Exchange:
         number, page = self._drawing
         if number != self._number or (page.done() and not page.result()[0]):
             page = Future()
-            self._drawing, store = (self._number, page), self._session.files.store
+            self._drawing, store = (self._number, page), self._session.state.files.store
             self._worker.run(
                 self._drawn(self._shown, store.calibration.name if store else STORED),
                 lambda *found: page.set_result(found))
         page.add_done_callback(lambda done: answer(*done.result()))
 
     def _drawn(self, calibration: Calibration, stored: str) -> Task:
-        return (yield Compute(drawn, calibration, self._session.topic, stored))
+        return (yield Compute(drawn, calibration, self._session.state.topic, stored))
 
     def _exported(self, name: str) -> Task:
         session = self._session
@@ -188,14 +188,14 @@ def _state(session: Session, problem: str, *, busy: str, page: int) -> Message:
     sensor = session.sensor
     in_use, shown, rating = sensor.calibration, sensor.present, sensor.rating
     return {
-        'kind': 'state', 'sensor': session.name, 'source': session.topic,
-        'state': words_of_state(session), 'problem': problem or _problem(session),
+        'kind': 'state', 'sensor': session.state.name, 'source': session.state.topic,
+        'state': words_of_state(session.state), 'problem': problem or _problem(session),
         'calibration': '' if in_use is None else title(in_use),
         'preview': sensor.offered is not None,
         'levelled': shown is not None and shown.is_levelled,
         'mounting': '' if shown is None or not shown.is_levelled else (
             f'the sensor is mounted with {angle_words(shown.rotation)}'),
-        'file': session.files.path, 'busy': busy,
+        'file': session.state.files.path, 'busy': busy,
         'counts_per_g': None if shown is None or not shown.units.is_native else np.mean(
             np.linalg.norm(shown.gain, axis=0)),
         'rating': None if shown is None or rating is None else {
@@ -206,7 +206,7 @@ def _state(session: Session, problem: str, *, busy: str, page: int) -> Message:
 
 def _problem(session: Session) -> str:
     """Return the most severe finding, other than that there is no calibration yet."""
-    found = [each for each in conditions(session) if each.level and (
+    found = [each for each in conditions(session.state) if each.level and (
         each.name or each.level == Level.ERROR)]
     return max(found, key=lambda each: each.level).words if found else ''
 
@@ -253,9 +253,8 @@ class Host:
         self._tasks: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._waiting: list[Floats] = []
         self._due = Throttle()
-        self.session = Session(settings, source.name)
-        self.session.found = source.findings
-        self.session.surroundings = Surroundings(publishers=None)
+        self.session = Session(settings, source.name, found=source.findings,
+                               surroundings=Surroundings(publishers=None))
         self._worker = Worker(self.session, self._tasks.put, self._show, self._flush)
         self.exchange = Exchange(self.session, self._worker, self._tasks.put)
         try:
@@ -297,7 +296,7 @@ class Host:
 
     def _end(self, severity: Severity, words: str) -> None:
         """Show why no more samples come."""
-        self.session.surroundings = Surroundings(publishers=None, ended=True)
+        self.session.change(surroundings=Surroundings(publishers=None, ended=True))
         self._show_problem(words, severity, words)
 
     def _report_source(self) -> None:
@@ -338,7 +337,7 @@ class Host:
             if self.session.accepts(self._source.sensor):
                 known = samples[np.isfinite(samples[:, 7]), 7]
                 if len(known):
-                    self.session.around.take('temperature', float(known[-1]))
+                    self.session.state.around.take('temperature', float(known[-1]))
                 self.session.push(samples, monotonic())
         self._worker.handle_events()
 

@@ -135,7 +135,8 @@ class Calibrator:
                             else None)
         self._context = ContextTopics(node, settings)
         self.session = Session(settings, self._topic)  # last, because it locks the files
-        self._followed = follow(node, lambda: self.session.settings, self.session.set_settings)
+        self._followed = follow(node, lambda: self.session.state.settings,
+                                self.session.set_settings)
         self._call_soon = in_executor(node)
         self._worker = Worker(self.session, self._call_soon, self._show,
                               lambda: self.stream.flush())
@@ -170,15 +171,16 @@ class Calibrator:
         node, overrides = self._node, self._overrides
         node.create_subscription(Imu, 'imu/data_raw', self.stream.on_message, SENSOR, raw=True,
                                  qos_overriding_options=overrides)
-        if 'temperature' not in context_topics(self.session.settings):
+        if 'temperature' not in context_topics(self.session.state.settings):
+            around = self.session.state.around
             node.create_subscription(
                 Temperature, 'temperature',
-                lambda message: self.session.around.take('temperature', message.temperature),
+                lambda message: around.take('temperature', message.temperature),
                 SENSOR, qos_overriding_options=overrides)
         node.create_timer(1.0, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        if self.session.settings.web_port:
+        if self.session.state.settings.web_port:
             try:
-                self._serve_page(self.session.settings)
+                self._serve_page(self.session.state.settings)
             except AccelCalibError as error:
                 self._worker.log('error', str(error))
 
@@ -198,9 +200,10 @@ class Calibrator:
     def _on_transforms(self) -> None:
         """Take the mounting from the static transforms, as soon as they connect the frames."""
         session = self.session
-        if self._transforms is None or not session.frame_id:
+        frame_id, base = session.state.frame_id, session.state.settings.base_frame
+        if self._transforms is None or not frame_id:
             return
-        rotation = self._transforms.rotation(session.settings.base_frame, session.frame_id)
+        rotation = self._transforms.rotation(base, frame_id)
         if rotation is not None:
             session.set_mounting(rotation.T)
 
@@ -208,9 +211,9 @@ class Calibrator:
         node = self._node
         imus, thermometers = published_by_others(
             node, ('sensor_msgs/msg/Imu', 'sensor_msgs/msg/Temperature'))
-        self.session.surroundings = Surroundings(
+        self.session.change(surroundings=Surroundings(
             tuple(map(name_of, node.get_publishers_info_by_topic(self._topic))), imus,
-            thermometers, mismatches(node), self._context.look(self.session))
+            thermometers, mismatches(node), self._context.look(self.session.state.around)))
         self.stream.flush_if_due()
         self.session.tick()
         self._on_transforms()
@@ -221,9 +224,9 @@ class Calibrator:
             self._page.show_state()
 
     def _show_diagnostics(self) -> None:
-        first, *others = diagnostics(self.session)
+        first, *others = diagnostics(self.session.state)
         array = DiagnosticArray(status=[
-            self._status(first, figures(self.session)), *map(self._status, others)])
+            self._status(first, figures(self.session.state)), *map(self._status, others)])
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._diagnostics.publish(array)
 
@@ -231,7 +234,7 @@ class Calibrator:
                 ) -> DiagnosticStatus:
         return DiagnosticStatus(
             level=bytes([check.level]), name=f'{self._name}: {check.concern}', message=check.words,
-            hardware_id=self.session.name,
+            hardware_id=self.session.state.name,
             values=[KeyValue(key=key, value=value) for key, value in values])
 
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> Any:
@@ -240,8 +243,8 @@ class Calibrator:
 
     def _on_self_test(self, request: SelfTest.Request, response: SelfTest.Response) -> Any:
         self.stream.flush()
-        found = checks(self.session)
-        response.id, response.status = self.session.name, list(map(self._status, found))
+        found = checks(self.session.state)
+        response.id, response.status = self.session.state.name, list(map(self._status, found))
         response.passed = bytes([all(each.level == Level.OK for each in found)])
         return response
 
@@ -254,8 +257,8 @@ class Calibrator:
 
     def _show_progress(self) -> None:
         self._progress_at = monotonic()
-        now = state.progress(self.session)
-        step = replace(next_action(self.session), concern='progress')
+        now = state.progress(self.session.state)
+        step = replace(next_action(self.session.state), concern='progress')
         self._progress.publish(self._status(step, now.figures()))
 
     def _show(self, event: Event) -> None:
@@ -278,7 +281,8 @@ class Calibrator:
         calibration = self.session.sensor.calibration
         if self._broadcaster is None or calibration is None or not event.frame_id:
             return
-        child = output_frame(calibration, event.frame_id, self.session.settings.output_frame_id)
+        settings = self.session.state.settings
+        child = output_frame(calibration, event.frame_id, settings.output_frame_id)
         self._broadcaster.publish(self._node.get_clock().now().to_msg(), event.frame_id, child,
                                   event.rotation)
 

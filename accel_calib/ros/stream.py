@@ -36,7 +36,7 @@ from ..logs import (
     THREE, topic_and_field)
 from ..messages.correction import motion_of, output_frame, Rewriter
 from ..messages.one_reading import Triple
-from ..session import BATCH, CalibratorSettings, columns_of, context_topics, Session
+from ..session import Around, BATCH, CalibratorSettings, columns_of, context_topics, Session, State
 from ..table import Floats
 from ..text import some
 
@@ -60,10 +60,10 @@ class Output:
         self.rewriter: Rewriter | None = None
         self._made_for: tuple[object, ...] = ()
 
-    def prepare(self, layout: Layout, calibration: Calibration | None, session: Session) -> None:
+    def prepare(self, layout: Layout, calibration: Calibration | None, state: State) -> None:
         """Count the subscribers, and prepare the correction by this calibration for them."""
         self.listeners = self._publisher.get_subscription_count()
-        settings, sensor = session.settings, session.sensor
+        settings, sensor = state.settings, state.sensor
         fills = settings.fill_covariance and sensor.noise is not None
         made_for = layout, calibration, settings, fills
         if self._made_for and all(map(operator.is_, made_for, self._made_for)):
@@ -130,7 +130,7 @@ class ContextTopics:
                                  f'{str(error).splitlines()[0]}', 'correct the entry') from error
             self._waiting[column] = node.resolve_topic_name(whole) + field
 
-    def look(self, session: Session) -> dict[str, str]:
+    def look(self, around: Around) -> dict[str, str]:
         """Subscribe to the topics that exist by now; return why a column does not arrive."""
         types = dict(self._node.get_topic_names_and_types()) if self._waiting else {}
         for column, asked in list(self._waiting.items()):
@@ -148,7 +148,7 @@ class ContextTopics:
             del self._waiting[column]
             value = operator.attrgetter(fields[0])
             self._node.create_subscription(
-                kind, topic, lambda message, column=column, value=value: session.around.take(
+                kind, topic, lambda message, column=column, value=value: around.take(
                     column, float(value(message))), SENSOR)
             self._missing[column] = f'nothing comes on {topic} ({_short(kinds[0])})'
         return self._missing
@@ -183,7 +183,7 @@ class Stream:
     def __init__(self, session: Session, publishers: Sequence[Any],
                  on_events: Callable[[], None]) -> None:
         self._session, self._on_events = session, on_events
-        self._columns = columns_of(session.settings)
+        self._columns = columns_of(session.state.settings)
         self._outputs = [Output(publisher) for publisher in publishers]
         self._calibrated, self._preview, self._motion = self._outputs
         self._layout = _NO_LAYOUT
@@ -193,9 +193,7 @@ class Stream:
         self._collected: tuple[Floats, float] | None = None  # and when the newest one arrived
         self._due = self._arrived = 0.0
         self._listened = False
-        self._applied: Calibration | None = None
-        self._offered: Calibration | None = None
-        self._settings: CalibratorSettings | None = None
+        self._state = session.state  # for which the outputs are prepared
         self._active = True
 
     def set_active(self, *, active: bool) -> None:
@@ -223,16 +221,13 @@ class Stream:
                 self._on_events()
                 return
             data = usual
-        session = self._session
-        sensor = session.sensor
-        if (due or sensor.applied is not self._applied or sensor.offered is not self._offered
-                or session.settings is not self._settings):
+        if due or self._session.state is not self._state:
             self._prepare()
         if self._listened:
             self._send(data)
         self._newest = data
         self._waiting.append(data)
-        self._contexts.append(session.around.values)
+        self._contexts.append(self._state.around.values)
         self._arrived = now
         if due:
             self._due = now + BATCH
@@ -245,13 +240,12 @@ class Stream:
 
     def _prepare(self) -> None:
         """Prepare the outputs."""
-        session = self._session
-        sensor, self._settings = session.sensor, session.settings
-        self._applied, self._offered = sensor.applied, sensor.offered
-        gyro = sensor.gyro if session.settings.gyro_bias else None
-        bias = _NO_BIAS if gyro is None else gyro.at(session.around.temperature)
+        state = self._state = self._session.state
+        sensor = state.sensor
+        gyro = sensor.gyro if state.settings.gyro_bias else None
+        bias = _NO_BIAS if gyro is None else gyro.at(state.around.temperature)
         for output, calibration in zip(self._outputs, (sensor.applied, sensor.previewed, None)):
-            output.prepare(self._layout, calibration, session)
+            output.prepare(self._layout, calibration, state)
             if output.rewriter is not None:
                 output.rewriter.bias = tuple(bias.tolist())
         self._listened = self._active and any(output.listeners for output in self._outputs)
@@ -269,18 +263,18 @@ class Stream:
             self.flush()
             if not self._session.accepts(layout.frame_id):
                 return None
-            self._layout, self._settings = layout, None  # the corrections are prepared again
+            self._layout = layout
+            self._prepare()
         return data
 
     def _send(self, data: bytes) -> None:
         """Publish the corrected message, or the raw message if so configured."""
-        session = self._session
-        sensor = session.sensor
-        if session.files.problem:
+        state, sensor = self._state, self._state.sensor
+        if state.files.problem:
             return  # another node uses the files
         if sensor.offered is not None and self._preview.listeners:
             self._rewrite(data, self._preview)
-        if not session.enabled or (sensor.calibration is None and session.settings.passthrough):
+        if not state.enabled or (sensor.calibration is None and state.settings.passthrough):
             if math.isfinite(sum(THREE.unpack_from(data, self._layout.place(ACCELERATION)))):
                 self._calibrated.publish(data)
         elif self._calibrated.listeners or self._motion.listeners:
@@ -292,7 +286,7 @@ class Stream:
         if rewriter is None:
             return
         try:
-            corrected = rewriter(data, self._session.around.filled)
+            corrected = rewriter(data, self._state.around.filled)
         except AccelCalibError as error:
             self._session.reports.uncorrected(error)
             return
@@ -300,7 +294,7 @@ class Stream:
             return
         if output.listeners:
             output.publish(corrected)
-        gravity = self._session.sensor.gravity
+        gravity = self._state.sensor.gravity
         if self._motion.listeners and gravity is not None and output is self._calibrated:
             self._motion.publish(motion_of(corrected, rewriter.layout, gravity))
 

@@ -17,7 +17,7 @@ one way.
 from . import state
 from .commands import COMMANDS, Commands
 from .conditions import Condition, conditions, Level, next_action
-from .core import Surroundings
+from .core import State, Surroundings
 from .sensor import title
 from .session import BATCH, Session
 from .settings import (
@@ -25,14 +25,15 @@ from .settings import (
     Settings, WEB_PORT)
 from .state import checks, diagnostics, figures, Progress, words_of_state
 from .store import ros_home
+from .stream import Around
 from .worker import (
     Answer, answered, CallSoon, Compute, Event, Files, Log, Mounting, nothing, Result, Severity,
     ShowPoses, Step, Still, Task, Throttle, Worker, WorkerProcess)
 
-__all__ = ['BATCH', 'COMMANDS', 'WEB_PORT', 'Answer', 'CalibratorSettings', 'CallSoon', 'Commands',
-           'Compute', 'Condition', 'Event', 'Files', 'Level', 'Log', 'Mounting', 'Progress',
-           'Result', 'Session', 'Settings', 'Severity', 'ShowPoses', 'Step', 'Still',
-           'Surroundings', 'Task', 'Throttle', 'Worker', 'WorkerProcess', 'answered', 'changed',
-           'checks', 'columns_of', 'conditions', 'context_topics', 'default_of', 'diagnostics',
-           'expected', 'figures', 'next_action', 'nothing', 'parameter', 'ros_home', 'state',
-           'title', 'words_of_state']
+__all__ = ['BATCH', 'COMMANDS', 'WEB_PORT', 'Answer', 'Around', 'CalibratorSettings', 'CallSoon',
+           'Commands', 'Compute', 'Condition', 'Event', 'Files', 'Level', 'Log', 'Mounting',
+           'Progress', 'Result', 'Session', 'Settings', 'Severity', 'ShowPoses', 'State', 'Step',
+           'Still', 'Surroundings', 'Task', 'Throttle', 'Worker', 'WorkerProcess', 'answered',
+           'changed', 'checks', 'columns_of', 'conditions', 'context_topics', 'default_of',
+           'diagnostics', 'expected', 'figures', 'next_action', 'nothing', 'parameter', 'ros_home',
+           'state', 'title', 'words_of_state']

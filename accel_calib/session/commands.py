@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from .conditions import next_words, thermometer_words
-from .core import State
+from .core import Holder, State
 from .pose_guide import plan_for
 from .sensor import gyro_bias_of_rest, Sensor
 from .settings import CalibratorSettings
@@ -65,7 +65,7 @@ class ChangedError(AccelCalibError):
 class Commands:
     """The commands of a session; those with `offers` only offer a new calibration."""
 
-    session: State
+    session: Holder
     offers: bool = False
 
     def run(self, name: str, **options: bool) -> Task:
@@ -80,27 +80,27 @@ class Commands:
 
     def capture_pose(self) -> Task:
         """Capture the ongoing rest as a pose."""
-        session, sensor, dwell = self.session, self.session.sensor, _rest(self.session)
-        session.files.usable()
+        session, sensor, dwell = self.session, self.session.sensor, _rest(self.session.state)
+        session.state.files.usable()
         sensor.live.capture(dwell)
         sensor.guide.is_new_rest(dwell.start)  # the answer is the line about this pose
         poses_changed(session, ended=False)
         poses = sensor.live.book.poses()
         words = (f'{counted(len(poses), "pose")}: the sensor has been still for '
                  f'{dwell.end - dwell.start:.1f} s')
-        if session.computing:
+        if session.state.computing:
             yield Files(nothing)
             return f'{words}; the next pose is on ~/poses after the computation that is running'
-        plan = yield Compute(plan_for, poses, session.units, session.settings.model)
-        if session.sensor is sensor:
+        plan = yield Compute(plan_for, poses, session.state.units, session.state.settings.model)
+        if session.sensor.live is sensor.live:
             sensor.guide.plan = plan
-        return f'{words}{next_words(session)}'
+        return f'{words}{next_words(session.state)}'
 
     def undo_pose(self) -> Task:
         """Remove the last pose."""
         session = self.session
-        if session.files.store is not None:
-            session.files.usable()
+        if session.state.files.store is not None:
+            session.state.files.usable()
         if not session.sensor.live.undo():
             raise InputError('there are no poses to remove', 'capture a pose first')
         poses_changed(session, ended=False)
@@ -117,9 +117,10 @@ class Commands:
     def refine(self) -> Task:
         """Refine the calibration; use and store the refined calibration, or only offer it."""
         session = self.session
-        hint = '' if 'temperature' in session.around.values else thermometer_words(session)
-        fitted = yield from _sound(session, 'refine', refined, session.units, session.name,
-                                   session.sensor.present, hint, session.own)
+        state = session.state
+        hint = '' if 'temperature' in state.around.values else thermometer_words(state)
+        fitted = yield from _sound(session, 'refine', refined, state.units, state.name,
+                                   state.sensor.present, hint, state.own)
         if fitted.refinement is not None:
             session.sensor.guide.follow(fitted.refinement.plan.poses)
         return (yield from self._use(fitted))
@@ -128,12 +129,12 @@ class Commands:
 
     def set_level(self) -> Task:
         """Level the mounting from the ongoing rest; without a calibration, the mounting alone."""
-        session, rest = self.session, _rest(self.session)
+        session, rest = self.session, _rest(self.session.state)
         calibration = session.sensor.present
         if calibration is None:
-            calibration = session.with_given(mounting_only(
-                poses_from([rest]), session.units, sensor=session.name, date=now()))
-        return (yield from self._use_mounting(_levelled(session, calibration, rest),
+            calibration = session.state.with_given(mounting_only(
+                poses_from([rest]), session.state.units, sensor=session.state.name, date=now()))
+        return (yield from self._use_mounting(_levelled(session.state, calibration, rest),
                                               'the mounting is levelled by this pose'))
 
     def set_heading(self) -> Task:
@@ -142,7 +143,7 @@ class Commands:
         if calibration is None or not calibration.is_levelled:
             raise InputError('the mounting is not levelled', 'place the robot flat and call '
                              '~/set_level first, then tilt its nose down')
-        rest = _rest(session)
+        rest = _rest(session.state)
         headed = set_heading(calibration, rest.mean, session.sensor.context_of(rest, calibration))
         words = 'the heading is set by this pose'
         if headed.rotation[:, 0] @ calibration.rotation[:, 0] < 0.0:
@@ -152,21 +153,22 @@ class Commands:
 
     def calibrate_at_rest(self) -> Task:
         """Take mounting, gyro bias and the offset along gravity from the ongoing level rest."""
-        session, rest = self.session, _rest(self.session)
+        session, rest = self.session, _rest(self.session.state)
         before = session.sensor.present
         if before is not None and not is_partial(before):
             found, words = before, 'offset and gain of the fit are kept'
         else:
-            found = fit_partial(poses_from([rest]), session.units, sensor=session.name, date=now())
+            found = fit_partial(poses_from([rest]), session.state.units,
+                                sensor=session.state.name, date=now())
             rotation = np.eye(3) if before is None else before.rotation
             found = replace(found, model=Model(found.model.values, rotation))
             words = found.reason
-        calibration = session.with_given(replace(
+        calibration = session.state.with_given(replace(
             found, gyro=gyro_bias_of_rest(rest) or found.gyro))
         if calibration.gyro is not None:
             bias = ', '.join(f'{np.degrees(part):+.3f}' for part in calibration.gyro.bias)
             words += f', gyro bias ({bias}) °/s'
-        return (yield from self._use_mounting(_levelled(session, calibration, rest), words))
+        return (yield from self._use_mounting(_levelled(session.state, calibration, rest), words))
 
     def _use_mounting(self, calibration: Calibration, words: str) -> Part[str]:
         """Use or offer a calibration with a new mounting; return the answer."""
@@ -184,20 +186,22 @@ class Commands:
 
     def save(self) -> Task:
         """Use the offered calibration if there is one; store calibration and poses."""
-        session, sensor, store = self.session, self.session.sensor, self.session.files.usable()
+        session, sensor = self.session, self.session.sensor
+        store = session.state.files.usable()
         calibration = sensor.present
         if calibration is None:
             raise InputError('there is no calibration', 'capture poses and call ~/fit first')
         yield Files(store.write, Parse(store.prepared, calibration))
         yield Files(store.save_poses, sensor.live.book.poses())
-        sensor.unsaved = False
-        if sensor.offered is calibration:
-            adopt(session, calibration, sensor.refinement, sensor.rating)
+        if session.sensor.live is sensor.live:
+            session.change_sensor(unsaved=False)
+            if session.sensor.offered is calibration:
+                adopt(session, calibration, session.sensor.refinement, session.sensor.rating)
         return f'stored in {store.calibration} and {store.poses}'
 
     def load(self) -> Task:
         """Read the stored calibration again; if it is refused, the calibration in use is kept."""
-        session, store = self.session, self.session.files.usable()
+        session, store = self.session, self.session.state.files.usable()
         calibration = yield from _alone(session, Parse(store.load_calibration))
         if calibration is None:
             raise StoredCalibrationError(f'{store.calibration} does not exist',
@@ -209,14 +213,14 @@ class Commands:
         """Discard the offered calibration, or return to the one before the last stored one."""
         session = self.session
         if session.sensor.offered is not None:
-            session.sensor.fitted_poses = 0
-            session.sensor.offer(None)
+            session.change(sensor=session.sensor.offer(None, session.state.settings))
+            session.change_sensor(fitted_poses=0)
             rate(session, None)
             return 'the calibration on ~/preview is discarded; the one in use is unchanged'
-        calibration = yield from _alone(session, Files(session.files.usable().step_back))
+        calibration = yield from _alone(session, Files(session.state.files.usable().step_back))
         before = session.sensor.calibration
         adopt(session, calibration)
-        session.sensor.fitted_poses = 0
+        session.change_sensor(fitted_poses=0)
         if calibration is None:
             return 'there is no calibration any more, as before the first fit'
         changes = '' if before is None else f'; {change_words(before, calibration)}'
@@ -224,11 +228,11 @@ class Commands:
 
     def reset(self) -> Task:
         """Remove poses and calibration; the stored files are renamed."""
-        session, store = self.session, self.session.files.usable()
+        session, store = self.session, self.session.state.files.usable()
         kept = yield from _alone(session, Files(store.set_aside, Parse(store.is_good)))
         session.sensor.live.clear()
         adopt(session, None)
-        session.sensor.fitted_poses = 0
+        session.change_sensor(fitted_poses=0)
         poses_changed(session, ended=False)
         return 'poses and calibration are removed' + ''.join(
             f'; the stored file is kept as {path.name}' for path in kept)
@@ -236,11 +240,11 @@ class Commands:
     def enable(self, on: bool) -> str:
         """Switch the correction on or off."""
         session = self.session
-        session.enabled = on
+        session.change(enabled=on)
         if not on:
             return 'the correction is off: raw messages are published unchanged'
         if session.sensor.calibration is None:
-            published = 'raw messages are' if session.settings.passthrough else 'nothing is'
+            published = 'raw messages are' if session.state.settings.passthrough else 'nothing is'
             return (f'the correction is on, but there is no calibration yet: {published} '
                     'published; capture poses and call ~/fit')
         return 'the correction is on: corrected messages are published'
@@ -248,50 +252,50 @@ class Commands:
 
 # ----------------------------------------------------------------------------- parts of commands
 
-def poses_changed(session: State, *, ended: bool, new_rest: Dwell | None = None) -> None:
+def poses_changed(session: Holder, *, ended: bool, new_rest: Dwell | None = None) -> None:
     """Draw and store the poses, and fit if auto_fit is set; `ended`: a rest has ended."""
     sensor = session.sensor
-    show_poses(session, store=session.files.locked, new_rest=new_rest)
+    show_poses(session, store=session.state.files.locked, new_rest=new_rest)
     if ended or len(sensor.live.book.poses()) > sensor.fitted_poses:
-        sensor.auto_fit_waits = True
+        session.change_sensor(auto_fit_waits=True)
     session.events += due(session)
 
 
-def due(session: State) -> list[Task]:
+def due(session: Holder) -> list[Task]:
     """Return an automatic fit if one is due."""
-    sensor, settings = session.sensor, session.settings
-    if (settings.auto_fit and sensor.auto_fit_waits and session.files.locked
+    sensor, settings = session.sensor, session.state.settings
+    if (settings.auto_fit and sensor.auto_fit_waits and session.state.files.locked
             and len(sensor.live.book.poses()) >= settings.auto_fit_poses
             and session.throttle.passes('auto_fit', _AUTO_FIT_EVERY)):
-        sensor.auto_fit_waits = False
+        session.change_sensor(auto_fit_waits=False)
         return [_auto_fit(session, sensor)]
     return []
 
 
-def _auto_fit(session: State, sensor: Sensor) -> Task:
+def _auto_fit(session: Holder, sensor: Sensor) -> Task:
     """Fit the poses of a sensor; use the result if it differs by more than its uncertainty."""
-    if session.sensor is not sensor:
+    if session.sensor.live is not sensor.live:
         return ''
     try:
         fitted = yield from _fit(session)
     except ChangedError:
-        sensor.auto_fit_waits = True
+        session.change_sensor(auto_fit_waits=True)
         return ''
     except RefusedFitError as error:
-        before, sensor.refusal = sensor.refusal, str(error)
-        if sensor.refusal == before:
+        if session.sensor.refusal == str(error):
             return ''
+        session.change_sensor(refusal=str(error))
         raise
-    sensor.refusal = ''
+    session.change_sensor(refusal='')
     return (yield from _use(session, fitted, offers=False)) if fitted.differs else ''
 
 
-def _use(session: State, fitted: Fitted, *, offers: bool) -> Part[str]:
+def _use(session: Holder, fitted: Fitted, *, offers: bool) -> Part[str]:
     """Store and use, or offer, a new calibration; log the details, and return the answer."""
     calibration, words = fitted.calibration, fitted.words
-    store, mounting = session.files.usable(), session.mounting_words(calibration)
-    if offers or session.settings.confirm:
-        session.sensor.offer(calibration)
+    store, mounting = session.state.files.usable(), session.state.mounting_words(calibration)
+    if offers or session.state.settings.confirm:
+        session.change(sensor=session.sensor.offer(calibration, session.state.settings))
         rate(session, fitted.refinement, fitted.rating)
         session.log('info', '; '.join(filter(None, [*fitted.details, mounting])))
         return (f'{words}; published on ~/preview only: call ~/save to use and store it, or '
@@ -300,38 +304,38 @@ def _use(session: State, fitted: Fitted, *, offers: bool) -> Part[str]:
         yield from _alone(session, Files(store.write, Parse(store.prepared, calibration)))
     except OSError as error:
         adopt(session, calibration, fitted.refinement, fitted.rating)
-        session.sensor.unsaved = True
+        session.change_sensor(unsaved=True)
         raise InputError(f'the calibration is in use but could not be stored: {error}',
                          f'{writing_advice(error)}, and call ~/save') from error
     adopt(session, calibration, fitted.refinement, fitted.rating)
     session.log('info', '; '.join(filter(None, [
         *fitted.details, f'stored in {store.calibration}', mounting])))
-    return f'{words}{next_words(session)}'
+    return f'{words}{next_words(session.state)}'
 
 
-def _fit(session: State) -> Part[Fitted]:
+def _fit(session: Holder) -> Part[Fitted]:
     """Return a fit to the poses; the values of a refined calibration are fitted anew."""
-    return (yield from _sound(session, 'fit', fit, session.units, session.settings,
-                              session.name, session.sensor.present))
+    return (yield from _sound(session, 'fit', fit, session.state.units, session.state.settings,
+                              session.state.name, session.sensor.present))
 
 
-def _sound(session: State, name: str, function: Callable[..., Fitted], *given: Any
+def _sound(session: Holder, name: str, function: Callable[..., Fitted], *given: Any
            ) -> Part[Fitted]:
     """Return what a function makes of the poses; fail if it is not fit for use, or outdated."""
-    session.files.usable()
-    sensor, changes = session.sensor, session.sensor.changes
+    session.state.files.usable()
+    sensor = session.sensor
     sensor.live.refresh()
     count = len(sensor.live.book.poses())
-    session.computing += 1
+    session.change(computing=session.state.computing + 1)
     try:
-        poses = sensor.live.poses(session.found)
+        poses = sensor.live.poses(session.state.found)
         found: Fitted = yield Compute(function, poses, *given)
     except RefusedFitError as error:
         session.refuse('poses', error.advice)
         raise
     finally:
-        session.computing -= 1
-    if session.sensor is not sensor or sensor.changes != changes:
+        session.change(computing=session.state.computing - 1)
+    if session.sensor.live is not sensor.live or session.sensor.changes != sensor.changes:
         raise ChangedError(f'another command changed the calibration during ~/{name}; '
                            'the result is discarded', f'call ~/{name} again')
     if found.refusal:
@@ -340,35 +344,35 @@ def _sound(session: State, name: str, function: Callable[..., Fitted], *given: A
         if found.refinement is not None:
             rate(session, found.refinement)
         raise RefusedFitError(f'{found.words}; not used: {why}', advice)
-    sensor.fitted_poses = count
+    session.change_sensor(fitted_poses=count)
     return found
 
 
-def _levelled(session: State, calibration: Calibration, rest: Dwell) -> Calibration:
+def _levelled(state: State, calibration: Calibration, rest: Dwell) -> Calibration:
     """Return a calibration levelled by a rest; check it against the given mounting."""
-    levelled = level(calibration, rest.mean, session.frame,
-                     session.sensor.context_of(rest, calibration))
-    if not np.allclose(session.with_given(levelled).rotation[:, 2], levelled.rotation[:, 2]):
+    levelled = level(calibration, rest.mean, state.frame,
+                     state.sensor.context_of(rest, calibration))
+    if not np.allclose(state.with_given(levelled).rotation[:, 2], levelled.rotation[:, 2]):
         raise InputError('this pose differs by more than 10° of tilt from the mounting in '
                          'mounting_rpy or base_frame', 'place the robot level, or correct the '
                          'given mounting and restart the node')
     return levelled
 
 
-def _alone(session: State, step: Parse) -> Part[Any]:
+def _alone(session: Holder, step: Parse) -> Part[Any]:
     """Use files; fail if another sensor replaces this one meanwhile."""
-    sensor, name = session.sensor, session.name
+    sensor, name = session.sensor, session.state.name
     found = yield step
-    if session.sensor is not sensor:
-        raise InputError(f'the sensor {session.name!r} has replaced {name!r} meanwhile, '
+    if session.sensor.live is not sensor.live:
+        raise InputError(f'the sensor {session.state.name!r} has replaced {name!r} meanwhile, '
                          'expected one sensor: the result is not used',
                          'call the service again')
     return found
 
 
-def _rest(session: State) -> Dwell:
+def _rest(state: State) -> Dwell:
     """Return the ongoing rest; InputError if there is none, or no recent message."""
-    statistics, settings, live = session.statistics, session.settings, session.sensor.live
+    statistics, settings, live = state.statistics, state.settings, state.sensor.live
     if not statistics.messages:
         raise InputError('there is no Imu message yet', 'start the driver')
     if statistics.age > _OLD:
@@ -381,7 +385,7 @@ def _rest(session: State) -> Dwell:
     rest = live.detector.current()
     if rest is not None:
         return rest
-    length = statistics.length_g(session.units)
+    length = statistics.length_g(state.units)
     if abs(length - 1.0) > settings.still_norm_tolerance:
         raise InputError(f'|a| is {length:.3g} g, expected about 1 g at rest',
                          'hold the sensor still; if it is still, restart the node with the '

@@ -90,13 +90,13 @@ _NEEDS_SAMPLES = ('poses', 'level', 'done', '')
 """Kinds of steps that need samples; the others use the poses so far."""
 
 
-def conditions(session: State) -> list[Condition]:
+def conditions(state: State) -> list[Condition]:
     """Return what is the case and what to do about it; the next step is the first entry."""
-    step, files, of_use = _ordinary(session), list(_files(session)), list(_use(session))
-    blocks = bool(session.files.problem) or session.is_refused
+    step, files, of_use = _ordinary(state), list(_files(state)), list(_use(state))
+    blocks = bool(state.files.problem) or state.is_refused
     first, files = (files[:1], files[1:]) if blocks else ([], files)
-    ended = session.surroundings.ended
-    around = [] if ended else [*_stream(session), *_context(session)]
+    ended = state.surroundings.ended
+    around = [] if ended else [*_stream(state), *_context(state)]
     if step.kind == 'level' and ended:  # nothing can be levelled any more
         step = replace(step, kind='done', words='use the calibration', command='')
     if step.kind not in _NEEDS_SAMPLES:
@@ -108,42 +108,42 @@ def conditions(session: State) -> list[Condition]:
         told = '; '.join(filter(None, [*(each.words for each in files), step.words]))
         level = max([step.level, *(each.level for each in files)])
         found = [*around, replace(step, words=told, level=level), *files, *of_use]
-    if axes := session.sensor.guide.axes_words:
+    if axes := state.sensor.guide.axes_words:
         found.append(Condition('poses', axes, level=Level.WARN, concern='stream', name='axes'))
     return [*first, *found]
 
 
-def next_action(session: State) -> Condition:
+def next_action(state: State) -> Condition:
     """Return the next step; without a kind while the poses or the rating are being computed."""
-    return conditions(session)[0]
+    return conditions(state)[0]
 
 
-def next_words(session: State) -> str:
+def next_words(state: State) -> str:
     """Return the next step as the end of an answer."""
-    action = next_action(session)
+    action = next_action(state)
     return f'; next: {action.words}' if action.words else ''
 
 
 # ----------------------------------------------------------------------------- poses and fits
 
-def _ordinary(session: State) -> Condition:
+def _ordinary(state: State) -> Condition:
     """Return the next step of a calibration of which nothing is in the way."""
-    step = _with_sensor(session)
-    refusal = session.refusal_of(step.command)
+    step = _with_sensor(state)
+    refusal = state.refusal_of(step.command)
     if refusal and step.kind != 'poses':
         step = replace(step, words=refusal, command='')
     if step.kind == 'poses' and step.level == Level.OK:
-        step = _within_reach(session, step)
-        held = slow_turn(session)
+        step = _within_reach(state, step)
+        held = slow_turn(state)
         step = replace(step, words=f'{held}; {step.words}') if held else step
-    if session.sensor.calibration is None:
+    if state.sensor.calibration is None:
         step = replace(step, level=max(step.level, Level.WARN))
     return step
 
 
-def _with_sensor(session: State) -> Condition:
+def _with_sensor(state: State) -> Condition:
     """Return the next step with the poses and calibrations of the sensor."""
-    sensor, rating = session.sensor, session.sensor.rating
+    sensor, rating = state.sensor, state.sensor.rating
     if sensor.offered is not None:
         verdict = '' if rating is None else f', {rating.name}: {rating.reason}'
         return Condition('accept', f'a new calibration waits{verdict}; call ~/save to use and '
@@ -161,16 +161,16 @@ def _with_sensor(session: State) -> Condition:
             return _LEVEL
         return Condition('done', rating.next.text if rating.next.kind == 'done' else
                          'use the calibration')
-    return _with_poses(session)
+    return _with_poses(state)
 
 
-def _with_poses(session: State) -> Condition:
+def _with_poses(state: State) -> Condition:
     """Return the next step without a calibration that is good."""
-    sensor, rating, guide = session.sensor, session.sensor.rating, session.sensor.guide
+    sensor, rating, guide = state.sensor, state.sensor.rating, state.sensor.guide
     if rating is not None and rating.findings and rating.findings[0].kind == 'flat_pose':
         return Condition('level', f'{rating.reason}; if it is mounted so, place it level again '
                          'and call ~/set_level once more', 'set_level')
-    if refusal := session.refusal_of('poses'):
+    if refusal := state.refusal_of('poses'):
         return Condition('poses', refusal)
     asked, is_fitted = step_of(guide), 0 < guide.poses == sensor.fitted_poses  # to all poses
     if rating is None or not is_fitted or guide.planned is not None:
@@ -194,17 +194,17 @@ def step_of(guide: Guide) -> Condition:
     return Condition('poses', words, command, tuple(plan.asked.direction.tolist()))
 
 
-def _within_reach(session: State, step: Condition) -> Condition:
+def _within_reach(state: State, step: Condition) -> Condition:
     """Return a step that a robot which cannot be turned further can do, too."""
-    guide, present = session.sensor.guide, session.sensor.present
-    is_refused = bool(session.refusal_of('poses'))
-    if not (is_refused or guide.is_stuck(session.statistics.stamp)):
+    guide, present = state.sensor.guide, state.sensor.present
+    is_refused = bool(state.refusal_of('poses'))
+    if not (is_refused or guide.is_stuck(state.statistics.stamp)):
         return step
     if present is None and not is_refused and guide.poses >= FEWEST_IN_CONE and not (
-            session.refusal_of('fit')):
+            state.refusal_of('fit')):
         return replace(step, words=f'{step.words}; if it cannot be turned further, call ~/fit',
                        command='fit')
-    if present is None and not session.refusal_of('calibrate_at_rest'):
+    if present is None and not state.refusal_of('calibrate_at_rest'):
         return replace(step, words=f'{step.words}; if it cannot be turned over, place the robot '
                        'level, hold it still and call ~/calibrate_at_rest',
                        command='calibrate_at_rest')
@@ -214,34 +214,34 @@ def _within_reach(session: State, step: Condition) -> Condition:
                       f'{step.words}') if present.is_levelled else _LEVEL)
 
 
-def slow_turn(session: State) -> str:
+def slow_turn(state: State) -> str:
     """Return that the sensor turns slowly, and what to do; empty if it is still or shaken."""
-    statistics, live = session.statistics, session.sensor.live
-    if live.still or session.units.is_native or statistics.age > SILENT:
+    statistics, live = state.statistics, state.sensor.live
+    if live.still or state.units.is_native or statistics.age > SILENT:
         return ''
-    rate = statistics.turn_rate(live.detector.threshold, session.units.per_g)
+    rate = statistics.turn_rate(live.detector.threshold, state.units.per_g)
     return f'turning slowly, {rate:.1f} °/s: rest it on something' if rate else ''
 
 
 # ----------------------------------------------------------------------------- files and use
 
-def _files(session: State) -> Iterator[Condition]:
+def _files(state: State) -> Iterator[Condition]:
     """Yield what is wrong with the files."""
-    if session.problem:
-        yield Condition('restart', session.problem, level=Level.ERROR)
-    store = session.files.store
+    if state.problem:
+        yield Condition('restart', state.problem, level=Level.ERROR)
+    store = state.files.store
     if store is not None and not store.is_writable():
         yield Condition(
-            'save', f'{session.files.path} cannot be written: correct the permissions, or restart '
+            'save', f'{state.files.path} cannot be written: correct the permissions, or restart '
             'the node with another calibration_file', level=Level.ERROR, concern='storage')
 
 
-def _use(session: State) -> Iterator[Condition]:
+def _use(state: State) -> Iterator[Condition]:
     """Yield what is wrong with the use of the calibration."""
-    if not session.enabled:
+    if not state.enabled:
         yield Condition('enable', 'correction switched off, raw messages are published: call '
                         '~/enable with true to correct them', level=Level.WARN)
-    for key, each in session.sensor.limits_left(session.context).items():
+    for key, each in state.sensor.limits_left(state.context).items():
         beyond = max(each.low - each.least, each.most - each.high)
         kind = 'poses' if beyond > _FAR * (each.high - each.low) else 'done'
         yield Condition(kind, f'{each.words}: {USES_LIMIT}; capture poses there and call '
@@ -250,11 +250,11 @@ def _use(session: State) -> Iterator[Condition]:
 
 # ----------------------------------------------------------------------------- samples
 
-def _context(session: State) -> Iterator[Condition]:
+def _context(state: State) -> Iterator[Condition]:
     """Yield the columns of the context that are missing, why, and what follows."""
-    calibration, around = session.sensor.calibration, session.around
+    calibration, around = state.sensor.calibration, state.around
     needs = () if calibration is None else calibration.model.needs
-    wanted = [*context_topics(session.settings), *(
+    wanted = [*context_topics(state.settings), *(
         key for key in needs if key in CONTEXT or is_quantity(key))]
     for column in filter(around.is_missing, dict.fromkeys(wanted)):
         follows = ''
@@ -264,21 +264,21 @@ def _context(session: State) -> Iterator[Condition]:
             value = around.assumed.get(column, math.nan)
             follows = f'; {value:.4g} {column_of(column).unit}'.rstrip() + ' is used instead'
         yield Condition(
-            'connect', f'no {column} arrives: {_why_missing(session, column)}{follows}',
+            'connect', f'no {column} arrives: {_why_missing(state, column)}{follows}',
             level=Level.WARN, concern='stream', name=column)
 
 
-def _why_missing(session: State, column: str) -> str:
-    around = session.surroundings
+def _why_missing(state: State, column: str) -> str:
+    around = state.surroundings
     return around.missing.get(column) or (
         'the samples do not have it' if around.publishers is None else
-        thermometer_words(session) if column == 'temperature' else
+        thermometer_words(state) if column == 'temperature' else
         f"start the node with context:=['{column}:=TOPIC'], and its topic")
 
 
-def thermometer_words(session: State) -> str:
+def thermometer_words(state: State) -> str:
     """Return how the node would get a temperature."""
-    around = session.surroundings
+    around = state.surroundings
     topics = ' or '.join(around.thermometers)
     return around.missing.get('temperature') or (
         f'restart the node with temperature:={topics}' if topics else
@@ -304,23 +304,23 @@ _UNITS = (('g', 0.8, 1.2), ('m/s2', 8.0, 12.0))
 """Units with the lowest and highest |reading| of a resting sensor in this unit."""
 
 
-def _stream(session: State) -> Iterator[Condition]:
+def _stream(state: State) -> Iterator[Condition]:
     """Yield what is wrong with the messages, and what to do."""
-    statistics, around = session.statistics, session.surroundings
+    statistics, around = state.statistics, state.surroundings
     names = around.publishers or ()
     told = {'mismatches': '; '.join(around.mismatches),
-            'silence' if names else 'no_publisher': _silence(session)}
+            'silence' if names else 'no_publisher': _silence(state)}
     if len(names) > 1:
         told['publishers'] = (
-            f'{"two" if len(names) == 2 else len(names)} publishers on the topic {session.topic}: '
+            f'{"two" if len(names) == 2 else len(names)} publishers on the topic {state.topic}: '
             f'{", ".join(names)}; expected one sensor: stop the others, or give each sensor its '
             'own topic; a driver that was killed disappears after about 20 s')
     told['stamps'] = statistics.stamp_fault
-    told['unit'] = _wrong_unit(statistics, session.units)
+    told['unit'] = _wrong_unit(statistics, state.units)
     if statistics.dropped_ago < _LASTS:
         told |= {kind: f'dropped {counted(statistics.dropped[kind], what)} {why}'
                  for kind, (what, why) in _DROPPED.items() if statistics.dropped[kind]}
-    told['vibration'] = '' if told['unit'] else _vibration(session)
+    told['vibration'] = '' if told['unit'] else _vibration(state)
     kinds = {'unit': 'unit', 'vibration': 'still'}
     for name, words in told.items():
         if words:
@@ -328,11 +328,11 @@ def _stream(session: State) -> Iterator[Condition]:
                             concern='stream', name=name)
 
 
-def _silence(session: State) -> str:
-    topic, around = session.topic, session.surroundings
+def _silence(state: State) -> str:
+    topic, around = state.topic, state.surroundings
     publishers = around.publishers
     if around.mismatches or (
-            min(session.statistics.age, session.statistics.dropped_ago) <= SILENT):
+            min(state.statistics.age, state.statistics.dropped_ago) <= SILENT):
         return ''
     if publishers is None:
         return (f'{topic} sends no samples: check the board, its cable and its program; the poses '
@@ -357,13 +357,13 @@ def _wrong_unit(statistics: StreamStatistics, units: Units) -> str:
             f'units:={likely}')
 
 
-def _vibration(session: State) -> str:
+def _vibration(state: State) -> str:
     """Return that the sensor stays in one direction without a rest, and which limit takes it."""
-    live, statistics, units = session.sensor.live, session.statistics, session.units
-    limit, spread = live.detector.threshold, statistics.shaken(session.units.per_g)
+    live, statistics, units = state.sensor.live, state.statistics, state.units
+    limit, spread = live.detector.threshold, statistics.shaken(state.units.per_g)
     if not math.isfinite(limit) or spread <= limit or live.still or units.is_native:
         return ''
     return (f'no rest: the readings vary by {spread / units.per_g * MG:.1f} mg, a rest by at most '
             f'{limit / units.per_g * MG:.1f} mg: rest the sensor on something and stop what '
             f'vibrates; if it always does, restart the node with still_std_max:='
-            f'{1.5 * spread / units.per_g * session.settings.gravity:.2g}')
+            f'{1.5 * spread / units.per_g * state.settings.gravity:.2g}')

@@ -1,23 +1,25 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a session knows: the state that its commands, its reports and its pages read."""
+"""What a session knows: its one state, and the holder that goes on to the next one."""
 
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import math
+from typing import Any
 
-from .sensor import Sensor
+from .sensor import new_sensor, Sensor
 from .settings import CalibratorSettings, own_effects
 from .store import SensorFiles
 from .stream import Around, StreamStatistics
 from .worker import Event, Log, Severity, Throttle
 from ..calibration import Calibration, mounting_of, mounting_words, with_given_mounting
+from ..effects import OwnEffect
 from ..errors import InputError
 from ..finding import Finding
 from ..table import Floats
-from ..units import FrameName, units_of
+from ..units import FrameName, Units, units_of
 
 
 @dataclass(frozen=True)
@@ -48,77 +50,74 @@ class Surroundings:
     ended: bool = False
 
 
+@dataclass(frozen=True, eq=False)
 class State:
     """
-    The state of the calibrator of one sensor; InputError if the settings contradict each other.
+    The state of the calibrator of one sensor.
+
+    The stream is counted in `statistics`, `around` and `files`. All else changes only with another
+    state.
 
     Parameters
     ----------
     settings : CalibratorSettings
-        The parameters; they can be replaced later.
+        The parameters.
     topic : str
         Topic of the messages, with namespace.
-    clock : callable
-        Steady clock [s].
-
-    Attributes
-    ----------
-    frame : {'ros', 'android'}
-        Levelled frame of calibrations.
+    units : Units
+        Unit of the readings.
+    sensor : Sensor
+        What belongs to the sensor; another sensor replaces all of it.
+    statistics, around : StreamStatistics, Around
+        The messages, and what is known beside them.
+    files : SensorFiles
+        The files of the sensor.
+    own : tuple of OwnEffect
+        The effects of the user.
+    given : (3, 3) array or None
+        Mounting ΔR that is known from elsewhere.
     frame_id : str or None
         That of the messages; None before the first one.
     problem : str
         Why the stored calibration, or the files, cannot be used.
     is_refused : bool
         Whether the stored calibration is sound, but not for this node as it was started.
+    refusals : mapping of str to (str, tuple)
+        What to do about each refused command, or ``poses`` for a fit, and its situation then.
     found : tuple of Finding
         What was found in the samples before they come here.
     enabled : bool
         Whether messages are corrected.
-    stillness : float
-        Spread of the last samples, relative to the largest of a still sensor.
-    given : (3, 3) array or None
-        Mounting ΔR that is known from elsewhere.
+    still : bool
+        Whether the sensor is still.
+    still_since : float
+        Stamp since when it is [s].
     surroundings : Surroundings
         What is known of the graph of ROS, or of a board.
     computing : int
         Number of fits and refinements that are running.
-    events : deque of Event
-        What the session reports, in order; whoever shows it removes it.
-    throttle : Throttle
-        When log lines and automatic fits are due again.
 
     """
 
-    def __init__(self, settings: CalibratorSettings, topic: str, clock: Callable[[], float]
-                 ) -> None:
-        if any(settings.mounting_rpy) and settings.base_frame:
-            raise InputError('both mounting_rpy and base_frame are set, expected one of them',
-                             'remove one')
-        if settings.publish_tf and settings.output_frame_id and (
-                settings.output_frame_id == settings.base_frame):
-            raise InputError(f'publish_tf would make {settings.base_frame!r}, the frame of the '
-                             'robot, a child of the frame of the sensor',
-                             'set publish_tf to false, or choose another output_frame_id')
-        self.settings, self.topic, self.clock = settings, topic, clock
-        self.units = units_of(settings.units, settings.gravity)
-        self.sensor = Sensor(settings, self.units)
-        self.statistics, self.around = StreamStatistics(clock), Around(clock)
-        self.own = own_effects(settings)
-        self.files = SensorFiles(settings, topic, self.own)
-        # Messages in ned are those of ros, turned.
-        self.frame: FrameName = 'ros' if settings.frame == 'ned' else settings.frame
-        self.frame_id: str | None = None
-        self.problem, self.is_refused = '', False
-        self._refusals: dict[str, tuple[str, tuple[object, ...]]] = {}
-        self.found: tuple[Finding, ...] = ()
-        self.surroundings = Surroundings()
-        self.enabled, self.still, self.still_since = True, False, math.nan
-        self.stillness = math.nan
-        self.computing = 0
-        self.given: Floats | None = (
-            mounting_of(settings.mounting_rpy) if any(settings.mounting_rpy) else None)
-        self.events, self.throttle = deque[Event](), Throttle(clock)
+    settings: CalibratorSettings
+    topic: str
+    units: Units
+    sensor: Sensor
+    statistics: StreamStatistics
+    around: Around
+    files: SensorFiles
+    own: tuple[OwnEffect, ...] = ()
+    given: Floats | None = None
+    frame_id: str | None = None
+    problem: str = ''
+    is_refused: bool = False
+    refusals: Mapping[str, tuple[str, tuple[object, ...]]] = field(default_factory=dict)
+    found: tuple[Finding, ...] = ()
+    enabled: bool = True
+    still: bool = False
+    still_since: float = math.nan
+    surroundings: Surroundings = Surroundings()
+    computing: int = 0
 
     @property
     def name(self) -> str:
@@ -126,30 +125,31 @@ class State:
         return self.settings.sensor or self.frame_id or ''
 
     @property
+    def frame(self) -> FrameName:
+        """Levelled frame of calibrations; messages in ned are those of ros, turned."""
+        return 'ros' if self.settings.frame == 'ned' else self.settings.frame
+
+    @property
+    def stillness(self) -> float:
+        """Spread of the last samples, relative to the largest of a still sensor."""
+        return self.statistics.spread / self.sensor.live.detector.threshold
+
+    @property
     def context(self) -> dict[str, float]:
         """Present time [s], if known, and the context as a calibration uses it."""
         stamp = self.statistics.stamp
         return {**self.around.filled, **({} if math.isnan(stamp) else {'time': stamp})}
 
-    def refuse(self, command: str, words: str) -> None:
-        """Note that a command is refused, or ``poses`` for a fit, and what to do."""
-        self._refusals[command] = words, self._situation(command)
-
     def refusal_of(self, command: str) -> str:
         """Return what to do about a command that would be refused again; empty if it may work."""
-        words, situation = self._refusals.get(command, ('', None))
-        return words if situation and situation == self._situation(command) else ''
+        words, situation = self.refusals.get(command, ('', None))
+        return words if situation and situation == self.situation_of(command) else ''
 
-    def _situation(self, command: str) -> tuple[object, ...]:
+    def situation_of(self, command: str) -> tuple[object, ...]:
         """Return what a refusal of a command depends on."""
-        sensor, rests = self.sensor, command in ('set_level', 'calibrate_at_rest')
-        return (sensor, len(sensor.live.book.poses()), sensor.changes,
-                rests and sensor.live.detector.current() is None)
-
-    def log(self, severity: Severity, words: str, kind: str = '', once_in: float = 0.0) -> None:
-        """Add a log line to the events; of a kind, if it has one, at most one in `once_in` [s]."""
-        if words and (not kind or self.throttle.passes(kind, once_in)):
-            self.events.append(Log(severity, words))
+        live, rests = self.sensor.live, command in ('set_level', 'calibrate_at_rest')
+        return (live, len(live.book.poses()), self.sensor.changes,
+                rests and live.detector.current() is None)
 
     def with_given(self, calibration: Calibration) -> Calibration:
         """Return a calibration with the given mounting, if there is one."""
@@ -160,3 +160,64 @@ class State:
         if calibration is None or not calibration.is_levelled:
             return ''
         return mounting_words(calibration.rotation, self.frame_id or '', self.settings.base_frame)
+
+
+def begin(settings: CalibratorSettings, topic: str, clock: Callable[[], float]) -> State:
+    """Return the first state of a session; InputError if the settings contradict each other."""
+    if any(settings.mounting_rpy) and settings.base_frame:
+        raise InputError('both mounting_rpy and base_frame are set, expected one of them',
+                         'remove one')
+    if settings.publish_tf and settings.output_frame_id and (
+            settings.output_frame_id == settings.base_frame):
+        raise InputError(f'publish_tf would make {settings.base_frame!r}, the frame of the '
+                         'robot, a child of the frame of the sensor',
+                         'set publish_tf to false, or choose another output_frame_id')
+    units, own = units_of(settings.units, settings.gravity), own_effects(settings)
+    return State(
+        settings, topic, units, sensor=new_sensor(settings, units),
+        statistics=StreamStatistics(clock), around=Around(clock),
+        files=SensorFiles(settings, topic, own), own=own,
+        given=mounting_of(settings.mounting_rpy) if any(settings.mounting_rpy) else None)
+
+
+class Holder:
+    """
+    The present state of a session, and what it reports.
+
+    Attributes
+    ----------
+    state : State
+        The present state; another one after each change.
+    events : deque of Event
+        What the session reports, in order; whoever shows it removes it.
+    throttle : Throttle
+        When log lines and automatic fits are due again.
+
+    """
+
+    def __init__(self, state: State, clock: Callable[[], float]) -> None:
+        self.state = state
+        self.events, self.throttle = deque[Event](), Throttle(clock)
+
+    @property
+    def sensor(self) -> Sensor:
+        """Return the present sensor."""
+        return self.state.sensor
+
+    def change(self, **changes: Any) -> None:
+        """Go on with a state in which these fields are changed."""
+        self.state = replace(self.state, **changes)
+
+    def change_sensor(self, **changes: Any) -> None:
+        """Go on with a sensor in which these fields are changed."""
+        self.change(sensor=replace(self.sensor, **changes))
+
+    def refuse(self, command: str, words: str) -> None:
+        """Note that a command is refused, or ``poses`` for a fit, and what to do."""
+        refused = words, self.state.situation_of(command)
+        self.change(refusals={**self.state.refusals, command: refused})
+
+    def log(self, severity: Severity, words: str, kind: str = '', once_in: float = 0.0) -> None:
+        """Add a log line to the events; of a kind, if it has one, at most one in `once_in` [s]."""
+        if words and (not kind or self.throttle.passes(kind, once_in)):
+            self.events.append(Log(severity, words))

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 
 from .conditions import conditions, slow_turn, thermometer_words
-from .core import State
+from .core import Holder
 from .settings import context_topics
 from .stream import AGAIN
 from ..errors import AccelCalibError
@@ -24,15 +24,16 @@ _OFTEN = ('silence', 'no_publisher')
 class Reports:
     """The log lines about the messages of a session, which is the only argument."""
 
-    def __init__(self, session: State) -> None:
+    def __init__(self, session: Holder) -> None:
         self._session = session
         self._told: dict[str, str] = {}
 
     def tick(self) -> None:
         """Report what has changed; to be called about once per second."""
-        session, statistics = self._session, self._session.statistics
-        now = {each.name: each for each in conditions(session) if each.name and each.level}
-        waits = not statistics.messages and not session.surroundings.mismatches
+        session, state = self._session, self._session.state
+        statistics = state.statistics
+        now = {each.name: each for each in conditions(state) if each.name and each.level}
+        waits = not statistics.messages and not state.surroundings.mismatches
         for name, each in now.items():
             if name not in self._told:
                 session.throttle.forget(name)
@@ -41,21 +42,21 @@ class Reports:
                         FAULT_AGAIN if each.concern == 'stream' else math.inf)
         over = [(name, concern) for name, concern in self._told.items() if name not in now]
         for name, concern in over:
-            if concern == 'stream' and name in session.around.values:
+            if concern == 'stream' and name in state.around.values:
                 session.log('info', f'{name} arrives')
         if any(concern == 'stream' for _, concern in over) and statistics.rate and not any(
                 each.concern == 'stream' for each in now.values()):
             session.log('info', f'messages arrive as expected, {statistics.rate:.1f} Hz')
         self._told = {name: each.concern for name, each in now.items()}
-        if (turn := slow_turn(session)) and session.settings.auto_capture:
+        if (turn := slow_turn(state)) and state.settings.auto_capture:
             session.log('info', f'no pose yet: {turn}', 'slow_turn', AGAIN)
-        topics = context_topics(session.settings)
-        if (session.surroundings.thermometers and statistics.messages
-                and 'temperature' not in topics and math.isnan(session.around.temperature)):
-            session.log('warning', f'no temperature arrives; {thermometer_words(session)}',
+        topics = context_topics(state.settings)
+        if (state.surroundings.thermometers and statistics.messages
+                and 'temperature' not in topics and math.isnan(state.around.temperature)):
+            session.log('warning', f'no temperature arrives; {thermometer_words(state)}',
                         'thermometers', 10.0 * FAULT_AGAIN)
         for column in topics:
-            lack, have = session.sensor.live.book.lacking(column)
+            lack, have = state.sensor.live.book.lacking(column)
             if lack and have:
                 session.log('info', f'{lack} of {counted(lack + have, "pose")} have no {column}, '
                             'so that ~/refine cannot use it', f'poses without {column}',
@@ -63,11 +64,11 @@ class Reports:
 
     def unreadable(self, size: int) -> None:
         """Count an unreadable message of this size [bytes]."""
-        self._session.statistics.drop('not_finite')
+        self._session.state.statistics.drop('not_finite')
         self._session.log('warning', f'an Imu message of {size} bytes cannot be read; it is '
                           'dropped: check the driver', 'unreadable', AGAIN)
 
     def uncorrected(self, error: AccelCalibError) -> None:
         """Count a corrected message that is not published because of an error."""
-        self._session.statistics.drop('implausible')
+        self._session.state.statistics.drop('implausible')
         self._session.log('error', f'messages are not corrected: {error}', 'uncorrected', AGAIN)

@@ -13,8 +13,11 @@ final average replaces this first comparison. A robot can stand for weeks, so ea
 
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 import math
 from typing import Any
 
@@ -49,12 +52,25 @@ _LARGEST_BIAS_STEP = 0.02
 """Largest change of a stored bias from rest to rest [rad/s]."""
 
 
+@dataclass(frozen=True, eq=False)
 class Sensor:
     """
     The poses, the plan, the calibration, its drift, and the last rest of one sensor.
 
-    Attributes
+    What streams is followed in `live`, `guide` and `temperatures`. All else changes only with
+    another `Sensor`, which the methods return. Two of them are of the same sensor if they have the
+    same `live`.
+
+    Parameters
     ----------
+    live : LiveCapture
+        The poses.
+    g : float
+        Local gravity [m/s²].
+    guide : Guide
+        The next pose.
+    temperatures : TemperatureHistory
+        What the effects of temperature need.
     calibration, applied : Calibration or None
         The calibration in use, and the same as it corrects messages: in their frame, or without
         the mounting if `rotate` is false.
@@ -76,46 +92,47 @@ class Sensor:
         Sensors that the stored files name.
     drift : Drift or None
         State of the drift monitor; None without a calibration.
+    rest : Dwell or None
+        The last rest.
+    past, counted : Drift, Dwell or None
+        State of the drift monitor without the ongoing rest, and what it has of the last one.
 
     """
 
-    def __init__(self, settings: CalibratorSettings, units: Units) -> None:
-        self.live = LiveCapture(capture_settings(settings), units, columns_of(settings))
-        self.guide, self.temperatures = Guide(), TemperatureHistory()
-        self.calibration: Calibration | None = None
-        self.applied: Calibration | None = None
-        self.offered: Calibration | None = None
-        self.previewed: Calibration | None = None
-        self.rating: Rating | None = None
-        self.refinement: Refinement | None = None
-        self.changes = self.fitted_poses = 0
-        self.auto_fit_waits = self.unsaved = False
-        self.refusal = ''
-        self.owners: set[str] = set()
-        self.drift: Drift | None = None
-        self.rest: Dwell | None = None
-        self._g, self._rotates, self._frame = settings.gravity, settings.rotate, settings.frame
-        self._past: Drift | None = None
-        self._counted: Dwell | None = None
-        self._prepared: tuple[Calibration, OneReading] | None = None
-        self._held: tuple[Dwell | None, Calibration | None, Floats | None] = None, None, None
+    live: LiveCapture
+    g: float
+    guide: Guide = field(default_factory=Guide)
+    temperatures: TemperatureHistory = field(default_factory=TemperatureHistory)
+    calibration: Calibration | None = None
+    applied: Calibration | None = None
+    offered: Calibration | None = None
+    previewed: Calibration | None = None
+    rating: Rating | None = None
+    refinement: Refinement | None = None
+    unsaved: bool = False
+    changes: int = 0
+    fitted_poses: int = 0
+    auto_fit_waits: bool = False
+    refusal: str = ''
+    owners: frozenset[str] = frozenset()
+    drift: Drift | None = None
+    rest: Dwell | None = None
+    past: Drift | None = None
+    counted: Dwell | None = None
 
     @property
     def present(self) -> Calibration | None:
         """Return the calibration that a command starts from: the offered one, or that in use."""
         return self.offered or self.calibration
 
-    def offer(self, calibration: Calibration | None) -> None:
+    def offer(self, calibration: Calibration | None, settings: CalibratorSettings) -> Sensor:
         """Publish this calibration on ~/preview only; None: discard the offered one."""
-        self.offered = calibration
-        self.previewed = calibration and on_topics(calibration, self._frame)
-        self.changes += 1
+        return replace(self, offered=calibration, changes=self.changes + 1,
+                       previewed=calibration and on_topics(calibration, settings.frame))
 
-    def adopt(self, calibration: Calibration | None) -> None:
+    def adopt(self, calibration: Calibration | None, settings: CalibratorSettings) -> Sensor:
         """Use this calibration; the drift monitor restarts unless only the mounting differs."""
-        self.offer(None)
-        self.unsaved = False
-        before = self.calibration
+        before, past, counted = self.calibration, self.past, self.counted
         only_levelled = (
             before is not None and calibration is not None
             and before.model.effects == calibration.model.effects
@@ -123,18 +140,18 @@ class Sensor:
             and np.array_equal(before.covariance, calibration.covariance)
             and not np.array_equal(before.model.rotation, calibration.model.rotation))
         if not only_levelled:
-            self._past = None if calibration is None else Drift(calibration)
-            self._counted = self.rest
-        self.calibration, self.drift = calibration, self._past
+            past, counted = None if calibration is None else Drift(calibration), self.rest
         self.temperatures.forget()
-        self.set_rotates(self._rotates)
+        return replace(self.offer(None, settings), calibration=calibration, unsaved=False,
+                       drift=past, past=past, counted=counted).turn(settings)
 
-    def set_rotates(self, rotates: bool) -> None:
+    def turn(self, settings: CalibratorSettings) -> Sensor:
         """Turn corrected messages into the levelled frame, or leave them in that of the sensor."""
-        self._rotates, self.applied = rotates, self.calibration
-        if self.calibration is not None:
-            self.applied = (on_topics(self.calibration, self._frame) if rotates
-                            else self.calibration.in_sensor_frame)
+        applied = self.calibration
+        if applied is not None:
+            applied = (on_topics(applied, settings.frame) if settings.rotate
+                       else applied.in_sensor_frame)
+        return replace(self, applied=applied)
 
     @property
     def gyro(self) -> GyroBias | None:
@@ -166,29 +183,27 @@ class Sensor:
         """Whether the sensor has changed since the calibration."""
         return self.drift is not None and self.drift.change is not None
 
-    def update(self, rest: Dwell, least: float) -> None:
+    def update(self, rest: Dwell, least: float) -> Sensor:
         """Compare an ongoing rest with 1 g; `least` is the smallest change to report [g]."""
-        self.rest = rest
-        part = self._uncounted(rest)
+        past, counted, part = self.past, self.counted, self._uncounted(rest)
         if part is not None and part.end - part.start >= LONG_REST:
-            self._past, self._counted = self._with(rest, least), _as_noisy_as(part, rest)
-        self._compare(least)
+            past, counted = self._with(rest, least), _as_noisy_as(part, rest)
+        return replace(self, rest=rest, past=past, counted=counted)._compare(least)
 
-    def end(self, rest: Dwell, least: float) -> None:
+    def end(self, rest: Dwell, least: float) -> Sensor:
         """Compare a rest that ended with 1 g; `least` is as in `update`."""
-        self._past, self._counted = self._with(rest, least), rest
-        self._compare(least)
+        return replace(self, past=self._with(rest, least), counted=rest)._compare(least)
 
-    def _compare(self, least: float) -> None:
-        self.drift = self._past if self.rest is None else self._with(self.rest, least)
-        found, past = self.drift, self._past
+    def _compare(self, least: float) -> Sensor:
+        found, past = self.past if self.rest is None else self._with(self.rest, least), self.past
         if found is not None and past is not None and found.change and not past.change:
             # What was reported during a rest ends by the rule of `drift`, not with the rest.
-            self._past = replace(past, change=found.change, since=found.since)
+            past = replace(past, change=found.change, since=found.since)
+        return replace(self, drift=found, past=past)
 
     def _uncounted(self, rest: Dwell) -> Dwell | None:
         """Return the part of a rest that was not counted yet, or None if it is too short."""
-        before = self._counted
+        before = self.counted
         if before is None or not overlap(before, rest) or rest.samples < before.samples:
             return rest
         is_longer = rest.end - before.end >= _SHORT_REST and rest.samples > before.samples
@@ -198,24 +213,20 @@ class Sensor:
         """Return the state of the monitor after what was not counted yet of a rest."""
         part = self._uncounted(rest)
         context = None if part is None else self._context(part)
-        if self._past is None or self.calibration is None or part is None or context is None:
-            return self._past
+        if self.past is None or self.calibration is None or part is None or context is None:
+            return self.past
         noise = part.std[np.newaxis] / math.sqrt(part.count)
         found = rest_errors(self.calibration, part.mean[np.newaxis], noise, context)
-        return compared(self._past, found[0], least)
+        return compared(self.past, found[0], least)
 
-    @property
+    @cached_property
     def gravity(self) -> Floats | None:
         """Corrected force of the last rest, (3,) [m/s²]; None if it cannot be corrected."""
-        rest, applied, gravity = self._held
-        if rest is not self.rest or applied is not self.applied:
-            rest, applied, gravity = self.rest, self.applied, None
-            context = None if rest is None else self._context(rest)
-            if rest is not None and applied is not None and context is not None:
-                force = applied.correct(rest.mean[np.newaxis], context)[0]
-                gravity = force * output_scale(applied, self._g)
-            self._held = rest, applied, gravity
-        return gravity
+        context = None if self.rest is None else self._context(self.rest)
+        if self.rest is None or self.applied is None or context is None:
+            return None
+        force = self.applied.correct(self.rest.mean[np.newaxis], context)[0]
+        return force * output_scale(self.applied, self.g)
 
     def _context(self, rest: Dwell) -> Context | None:
         """Return the context of a rest, or None if the calibration needs more context."""
@@ -250,17 +261,29 @@ class Sensor:
 
     def force_of(self, reading: Triple, known: Known) -> Triple | None:
         """Return the force of a reading by the `present` calibration [g]; None: not known."""
-        calibration = self.present
-        if calibration is None:
+        calibration, corrected = self.present, self._corrected
+        if calibration is None or corrected is None:
             return None
-        if self._prepared is None or self._prepared[0] is not calibration:
-            self._prepared = calibration, OneReading(calibration, 1.0 / calibration.force_per_g)
         context = {**calibration.model.neutral, 'std': _AT_REST, 'previous': _AT_REST,
                    'rate': _AT_REST, **self.temperatures.columns_of(calibration.model), **known}
         try:
-            return self._prepared[1].at(context).correct(*reading)
+            return corrected.at(context).correct(*reading)
         except InputError:
             return None  # a quantity is not known yet, or the reading is out of range
+
+    @cached_property
+    def _corrected(self) -> OneReading | None:
+        """Return what corrects one reading by the `present` calibration."""
+        calibration = self.present
+        if calibration is None:
+            return None
+        return OneReading(calibration, 1.0 / calibration.force_per_g)
+
+
+def new_sensor(settings: CalibratorSettings, units: Units) -> Sensor:
+    """Return a sensor without poses and calibration."""
+    return Sensor(LiveCapture(capture_settings(settings), units, columns_of(settings)),
+                  settings.gravity)
 
 
 def gyro_bias_of_rest(rest: Dwell) -> GyroBias | None:

@@ -12,16 +12,18 @@ uses a steady clock.
 """
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from time import monotonic
+from typing import Any
 
 import numpy as np
 
 from .commands import Commands, due, poses_changed
 from .conditions import next_action
-from .core import State
+from .core import begin, Holder
 from .live_capture import Change
 from .reports import FAULT_AGAIN, Reports
-from .sensor import Sensor
+from .sensor import new_sensor
 from .settings import CalibratorSettings
 from .stream import AGAIN, SILENT
 from .use import adopt, load, show_mounting, show_poses
@@ -44,9 +46,20 @@ _LARGEST_G, _LARGEST_NATIVE = 1e4, 2.0 ** 32
 """Larger readings are not of a sensor, and would cost the detector its digits [g, native]."""
 
 
-class Session(State):
+class Session(Holder):
     """
-    The calibrator of one sensor; parameters, attributes and errors as of `State`.
+    The calibrator of one sensor; InputError if the settings contradict each other.
+
+    Parameters
+    ----------
+    settings : CalibratorSettings
+        The parameters; some can be replaced later.
+    topic : str
+        Topic of the messages, with namespace.
+    clock : callable
+        Steady clock [s].
+    known : mapping of str to object
+        Fields of the first state that are not those of a new one, such as `found`.
 
     Attributes
     ----------
@@ -58,27 +71,28 @@ class Session(State):
     """
 
     def __init__(self, settings: CalibratorSettings, topic: str,
-                 clock: Callable[[], float] = monotonic) -> None:
-        super().__init__(settings, topic, clock)
+                 clock: Callable[[], float] = monotonic, **known: Any) -> None:
+        super().__init__(replace(begin(settings, topic, clock), **known), clock)
         self.commands, self.reports = Commands(self), Reports(self)
-        self._largest = (_LARGEST_NATIVE if self.units.is_native
-                         else _LARGEST_G * self.units.per_g)
-        known = settings.sensor or settings.calibration_file
-        if not known or not self._open(answered):
+        units = self.state.units
+        self._largest = _LARGEST_NATIVE if units.is_native else _LARGEST_G * units.per_g
+        is_named = settings.sensor or settings.calibration_file
+        if not is_named or not self._open(answered):
             show_poses(self, store=False)
 
     def set_settings(self, settings: CalibratorSettings) -> None:
         """Replace the settings that can change while the node runs."""
-        before, self.settings = self.settings, settings
+        before = self.state.settings
+        self.change(settings=settings)
         if settings.rotate != before.rotate:
-            self.sensor.set_rotates(settings.rotate)
+            self.change(sensor=self.sensor.turn(settings))
         if settings.model != before.model:
             self.sensor.guide.plan = None
             show_poses(self, store=False)
 
     def tick(self) -> None:
         """Check the stream, and try to lock the files; to be called about once per second."""
-        store = self.files.try_again()
+        store = self.state.files.try_again()
         if store is not None:
             self.events.append(load(self, store, self.sensor))
         self._report_still()
@@ -87,7 +101,7 @@ class Session(State):
 
     def close(self) -> None:
         """Unlock the files."""
-        self.files.release()
+        self.state.files.release()
 
     # Samples
 
@@ -98,32 +112,33 @@ class Session(State):
         A message of another sensor ends the ongoing rest. After `SILENT`, it replaces the sensor.
 
         """
-        if frame_id == self.frame_id:
+        if frame_id == self.state.frame_id:
             return True
-        if self.frame_id is None:
-            self.log('info', f'Imu messages arrive on {self.topic}, frame_id {frame_id!r}'
-                     if frame_id else f'samples arrive from {self.topic}')
-            self.frame_id = frame_id
+        if self.state.frame_id is None:
+            self.log('info', f'Imu messages arrive on {self.state.topic}, frame_id {frame_id!r}'
+                     if frame_id else f'samples arrive from {self.state.topic}')
+            self.change(frame_id=frame_id)
             self._show_frame()
-            if self.files.store is None or self.sensor.owners - {self.name}:
+            if self.state.files.store is None or self.sensor.owners - {self.state.name}:
                 self._begin_again()
-            elif not self.settings.sensor:
-                self.files.take(self.name)
+            elif not self.state.settings.sensor:
+                self.state.files.take(self.state.name)
             return True
-        is_replaced = self.statistics.age > SILENT
+        is_replaced = self.state.statistics.age > SILENT
         if is_replaced:
             self.log('warning', f'the messages now have frame_id {frame_id!r} instead of '
-                     f'{self.frame_id!r}: switching to this sensor')
-        self._change(self.sensor.live.interrupt(self.settings.auto_capture))
+                     f'{self.state.frame_id!r}: switching to this sensor')
+        self._change(self.sensor.live.interrupt(self.state.settings.auto_capture))
         if is_replaced:
-            self.frame_id = frame_id
-            if not self.settings.sensor:  # otherwise the user has set the sensor
+            self.change(frame_id=frame_id)
+            if not self.state.settings.sensor:  # otherwise the user has set the sensor
                 self._begin_again()
             self._show_frame()
             return True
-        self.statistics.drop('foreign')
-        self.log('error', f'an Imu message has frame_id {frame_id!r}, expected {self.frame_id!r}; '
-                 'it is dropped: use a separate topic for each sensor', 'foreign', AGAIN)
+        self.state.statistics.drop('foreign')
+        self.log('error', f'an Imu message has frame_id {frame_id!r}, expected '
+                 f'{self.state.frame_id!r}; it is dropped: use a separate topic for each sensor',
+                 'foreign', AGAIN)
         return False
 
     def push(self, samples: Floats, arrived: float) -> None:
@@ -140,20 +155,19 @@ class Session(State):
         """
         good = (np.abs(samples[:, 1:4]) <= self._largest).all(axis=1)  # and no NaN
         if not np.all(good):
-            self.statistics.drop('not_finite', int(np.sum(~good)))
+            self.state.statistics.drop('not_finite', int(np.sum(~good)))
             reading = tuple(samples[~good, 1:4][0].tolist())
             self.log('warning', f'an Imu message has the linear_acceleration {reading}, expected '
                      f'three finite numbers up to {self._largest:.3g}; it is dropped: check the '
                      'driver', 'absurd', AGAIN)
             samples = samples[good]
         if len(samples):
-            since = arrived - self.statistics.arrived
-            self.statistics.add(samples, arrived)
+            since = arrived - self.state.statistics.arrived
+            self.state.statistics.add(samples, arrived)
             self.sensor.temperatures.add(samples[:, 0], samples[:, 7])
             live = self.sensor.live
             before = live.detector.interruptions[-1:]
-            self._change(live.push(samples, self.settings.auto_capture))
-            self.stillness = self.statistics.spread / live.detector.threshold
+            self._change(live.push(samples, self.state.settings.auto_capture))
             last = live.detector.interruptions[-1:]
             if last != before and abs(last[0].seconds - since) > SILENT:
                 where = 'back' if last[0].seconds < 0.0 else 'ahead'
@@ -163,14 +177,15 @@ class Session(State):
                          f'jump {where}', FAULT_AGAIN)
 
     def _change(self, changes: Iterable[Change]) -> None:
-        sensor, least = self.sensor, self.settings.drift_warn / self.settings.gravity
+        least = self.state.settings.drift_warn / self.state.settings.gravity
         for change in changes:
             self._report_still()
-            had_changed = sensor.has_changed
+            sensor, had_changed = self.sensor, self.sensor.has_changed
             if change.rest is not None:
-                sensor.update(change.rest, least)
+                sensor = sensor.update(change.rest, least)
             for dwell in change.ended:
-                sensor.end(dwell, least)
+                sensor = sensor.end(dwell, least)
+            self.change(sensor=sensor)
             if sensor.drift is not None and sensor.has_changed is not had_changed:
                 self.log('warning' if sensor.has_changed else 'info', status(sensor.drift))
             if change.doubted:
@@ -178,8 +193,8 @@ class Session(State):
                          'moved or vibrated, as by motors: later rests are quieter; a fit leaves '
                          'out such poses if the others are sufficient')
             for rest in change.refused:
-                if 2.0 * (rest.end - rest.start) > self.settings.min_dwell and (
-                        next_action(self).kind == 'poses'):
+                if 2.0 * (rest.end - rest.start) > self.state.settings.min_dwell and (
+                        next_action(self.state).kind == 'poses'):
                     self.log('info', f'this rest gave no pose: {rest.words}', rest.reason, AGAIN)
             if change.poses:
                 new = change.rest is not None and sensor.guide.is_new_rest(change.rest.start)
@@ -189,18 +204,18 @@ class Session(State):
 
     def _report_still(self) -> None:
         # Without messages, or without a clock, nobody knows whether the sensor rests.
-        blind = max(self.statistics.age, self.statistics.stopped) > SILENT
-        if (self.sensor.live.still and not blind) is not self.still:
-            self.still = not self.still
-            self.still_since = self.statistics.stamp - self.settings.still_window
-            self.events.append(Still(self.still))
+        blind = max(self.state.statistics.age, self.state.statistics.stopped) > SILENT
+        if (self.sensor.live.still and not blind) is not self.state.still:
+            since = self.state.statistics.stamp - self.state.settings.still_window
+            self.change(still=not self.state.still, still_since=since)
+            self.events.append(Still(self.state.still))
 
     # The sensor and its files
 
     def _show_frame(self) -> None:
         """Show poses and mounting in the frame of the sensor, which was not known before."""
-        frame_id = self.frame_id
-        if frame_id and frame_id == self.settings.output_frame_id:
+        frame_id = self.state.frame_id
+        if frame_id and frame_id == self.state.settings.output_frame_id:
             self.log('warning', f'output_frame_id is {frame_id!r}, the frame of the sensor: TF '
                      'turns levelled messages twice; choose another output_frame_id, or set '
                      'rotate to false')
@@ -211,23 +226,24 @@ class Session(State):
 
     def _begin_again(self) -> None:
         """Discard poses and calibration of another sensor, and load those of this sensor."""
-        self.sensor = Sensor(self.settings, self.units)
+        self.change(sensor=new_sensor(self.state.settings, self.state.units))
         self._open(self.events.append)
 
     def _open(self, run: Callable[[Task], object]) -> bool:
         """Lock and load the files of the sensor; return whether no other node uses them."""
-        store = self.files.take(self.name)
-        self.problem = self.files.problem
-        self.log('error', self.problem)
+        store = self.state.files.take(self.state.name)
+        self.change(problem=self.state.files.problem)
+        self.log('error', self.state.problem)
         if store is not None:
             run(load(self, store, self.sensor))
         return store is not None
 
     def set_mounting(self, rotation: Floats) -> None:
         """Use a mounting ΔR that is known from elsewhere, (3, 3)."""
-        if self.given is not None and np.allclose(self.given, rotation):
+        if self.state.given is not None and np.allclose(self.state.given, rotation):
             return
-        self.given = rotation
-        self.log('info', mounting_words(rotation, self.frame_id or '', self.settings.base_frame))
+        self.change(given=rotation)
+        self.log('info', mounting_words(rotation, self.state.frame_id or '',
+                                        self.state.settings.base_frame))
         if self.sensor.calibration is not None:
             adopt(self, self.sensor.calibration, self.sensor.refinement)

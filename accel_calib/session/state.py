@@ -134,40 +134,40 @@ Newest = tuple[tuple[float, ...], float, float]
 _NOT_KNOWN: Newest = (), math.nan, math.nan
 
 
-def progress(session: State, reading: Triple | None = None) -> Progress:
+def progress(state: State, reading: Triple | None = None) -> Progress:
     """Return the progress; `reading` is the newest one, by default the last that was pushed."""
-    sensor, statistics = session.sensor, session.statistics
+    sensor, statistics = state.sensor, state.statistics
     plan, silent = sensor.guide.plan, statistics.age > SILENT
-    up, length, corrected = _NOT_KNOWN if silent else _newest(session, reading)
-    action, rating = next_action(session), sensor.rating
+    up, length, corrected = _NOT_KNOWN if silent else _newest(state, reading)
+    action, rating = next_action(state), sensor.rating
     # NaN if it is not known, or not the noise alone.
     noisy = rating is not None and has(rating.findings, 'beyond_noise')
     accuracy = math.nan if plan is None or noisy else plan.asked.error * plan.noise_g
     return Progress(
-        still=session.still and not silent,
-        stillness=math.nan if silent else session.stillness,
-        dwell=statistics.stamp - session.still_since if session.still else 0.0,
-        min_dwell=session.settings.min_dwell, poses=sensor.guide.poses,
+        still=state.still and not silent,
+        stillness=math.nan if silent else state.stillness,
+        dwell=statistics.stamp - state.still_since if state.still else 0.0,
+        min_dwell=state.settings.min_dwell, poses=sensor.guide.poses,
         total=0 if plan is None else plan.asked.total,
         coverage=0.0 if plan is None else plan.coverage,
         accuracy=accuracy, step=action.kind, advice=action.words,
         command=action.command,
         direction=action.direction,
-        up=up, length=length, corrected=corrected, temperature=session.around.temperature)
+        up=up, length=length, corrected=corrected, temperature=state.around.temperature)
 
 
-def _newest(session: State, reading: Triple | None) -> Newest:
+def _newest(state: State, reading: Triple | None) -> Newest:
     """Describe the newest reading; a native one has a direction only if its zero is known."""
-    sensor, newest = session.sensor, session.statistics.newest
+    sensor, newest = state.sensor, state.statistics.newest
     if reading is None:
         if newest is None:
             return _NOT_KNOWN
         reading = tuple(newest.tolist())
-    force = sensor.force_of(reading, session.context)
+    force = sensor.force_of(reading, state.context)
     corrected = math.nan if force is None else math.hypot(*force)
-    if not session.units.is_native:
+    if not state.units.is_native:
         length = math.hypot(*reading)
-        return _unit(reading, length), length / session.units.per_g, corrected
+        return _unit(reading, length), length / state.units.per_g, corrected
     if sensor.present is None or force is None:
         zero = () if sensor.guide.plan is None else sensor.guide.plan.zero
         parts = [part - at for part, at in zip(reading, zero, strict=False)]
@@ -179,27 +179,27 @@ def _unit(vector: Sequence[float], length: float) -> tuple[float, ...]:
     return tuple(part / length for part in vector) if 0.0 < length < math.inf else ()
 
 
-def diagnostics(session: State) -> list[Condition]:
+def diagnostics(state: State) -> list[Condition]:
     """Return the state, which is the first of the most severe conditions, and all `checks`."""
-    found = conditions(session)
-    by_concern = {each.concern: each for each in _checked(session, found)}
+    found = conditions(state)
+    by_concern = {each.concern: each for each in _checked(state, found)}
     first = max(found, key=lambda each: each.level)
-    words = by_concern[first.concern].words if first.level else words_of_state(session)
+    words = by_concern[first.concern].words if first.level else words_of_state(state)
     return [Condition('', words, level=first.level, concern='state'), *by_concern.values()]
 
 
-def checks(session: State) -> list[Condition]:
+def checks(state: State) -> list[Condition]:
     """Return the results of all checks, one for each concern."""
-    return diagnostics(session)[1:]
+    return diagnostics(state)[1:]
 
 
-def _checked(session: State, found: Sequence[Condition]) -> Iterator[Condition]:
+def _checked(state: State, found: Sequence[Condition]) -> Iterator[Condition]:
     """Yield for each concern the conditions that are wrong, or that all is fine."""
-    sensor, drift = session.sensor, session.sensor.drift
-    fine = {'stream': f'{session.statistics.rate:.1f} Hz on {session.topic}',
+    sensor, drift = state.sensor, state.sensor.drift
+    fine = {'stream': f'{state.statistics.rate:.1f} Hz on {state.topic}',
             'calibration': '' if sensor.calibration is None else title(sensor.calibration),
             'drift': 'no calibration yet' if drift is None else status(drift),
-            'storage': session.files.path}
+            'storage': state.files.path}
     if sensor.calibration is None and sensor.offered is None:
         count = counted(len(sensor.live.book.poses()), 'pose')
         fine['calibration'] = f'no calibration yet, captured {count}'
@@ -212,36 +212,36 @@ def _checked(session: State, found: Sequence[Condition]) -> Iterator[Condition]:
                         level=max([Level.OK, *(each.level for each in wrong)]))
 
 
-def words_of_state(session: State) -> str:
+def words_of_state(state: State) -> str:
     """Return whether messages are corrected, and why not."""
-    calibration = session.sensor.calibration
+    calibration = state.sensor.calibration
     return next(words for holds, words in (
-        (session.files.problem, 'another node uses the files, nothing is published'),
-        (not session.enabled, 'correction switched off, raw messages are published'),
-        (session.sensor.offered is not None, 'a new calibration waits for ~/save or ~/undo'),
+        (state.files.problem, 'another node uses the files, nothing is published'),
+        (not state.enabled, 'correction switched off, raw messages are published'),
+        (state.sensor.offered is not None, 'a new calibration waits for ~/save or ~/undo'),
         (calibration is not None and is_partial(calibration),
          'correcting, with a calibration of a part of the orientations'),
         (calibration is not None, 'correcting'),
-        (not session.statistics.messages, 'waiting for the first message'),
-        (session.settings.passthrough, 'no calibration, raw messages are published'),
+        (not state.statistics.messages, 'waiting for the first message'),
+        (state.settings.passthrough, 'no calibration, raw messages are published'),
         (True, 'no calibration, nothing is published')) if holds)
 
 
-def figures(session: State) -> Iterator[tuple[str, str]]:
+def figures(state: State) -> Iterator[tuple[str, str]]:
     """Yield names and values for the diagnostics."""
-    sensor, counts, warm = session.sensor, session.statistics, session.around.temperature
+    sensor, counts, warm = state.sensor, state.statistics, state.around.temperature
     gravity, rest, drift, live = sensor.gravity, sensor.rest, sensor.drift, sensor.live
-    yield 'state', words_of_state(session)
-    yield 'sensor', session.name
+    yield 'state', words_of_state(state)
+    yield 'sensor', state.name
     yield 'calibration', 'none' if sensor.calibration is None else title(sensor.calibration)
-    yield 'calibration file', session.files.path
+    yield 'calibration file', state.files.path
     yield 'rate [Hz]', f'{counts.rate:.1f}'
     yield 'messages', str(counts.messages)
     yield 'readings not finite', str(counts.dropped['not_finite'])
     yield 'messages of another sensor', str(counts.dropped['foreign'])
     yield 'corrected messages not plausible', str(counts.dropped['implausible'])
     yield 'residual |a| - 1 g at last rest [mg]', _number(math.nan if gravity is None else (
-        float(np.linalg.norm(gravity)) / session.settings.gravity - 1.0) * MG)
+        float(np.linalg.norm(gravity)) / state.settings.gravity - 1.0) * MG)
     if drift is not None:
         yield 'drift since calibration [mg]', _number(drift.error * MG)
         yield 'stated uncertainty at last rest [mg]', _number(drift.stated * MG)
@@ -254,9 +254,9 @@ def figures(session: State) -> Iterator[tuple[str, str]]:
             yield 'temperature when calibrated [°C]', f'{low:.1f} to {high:.1f}'
     yield 'since last rest [s]', _number(math.nan if rest is None else (
         0.0 if live.still else max(0.0, counts.stamp - rest.end)))
-    yield from _figures_of_capture(session)
+    yield from _figures_of_capture(state)
     yield 'still below [m/s² or native]', f'{live.detector.threshold:.4g}'
-    yield 'mounting', session.mounting_words(sensor.calibration) or 'not known'
+    yield 'mounting', state.mounting_words(sensor.calibration) or 'not known'
     gyro, noise = sensor.gyro, sensor.noise
     if gyro is not None:
         yield 'gyro bias [rad/s]', _vector(gyro.at(warm))
@@ -266,24 +266,24 @@ def figures(session: State) -> Iterator[tuple[str, str]]:
         yield 'noise of angular velocity [rad/s]', _vector(noise.rate)
 
 
-def _figures_of_capture(session: State) -> Iterator[tuple[str, str]]:
-    live, warm = session.sensor.live, session.around.temperature
+def _figures_of_capture(state: State) -> Iterator[tuple[str, str]]:
+    live, warm = state.sensor.live, state.around.temperature
     poses, breaks = live.book.poses(), live.detector.interruptions
     yield 'poses captured', str(len(poses))
     yield 'poses doubtful', str(int(np.sum(poses['doubtful'])) if 'doubtful' in poses else 0)
-    yield 'next', next_action(session).words or 'turn the sensor'
+    yield 'next', next_action(state).words or 'turn the sensor'
     yield 'interruptions of the clock', str(len(breaks))
     yield 'last interruption', (
         f'{breaks[-1].kind}, {breaks[-1].seconds:.2f} s' if breaks else 'none')
     yield 'zeros or frozen readings [s]', (
         f'{sum(each.end - each.start for each in live.detector.missing):.1f}')
     yield 'temperature [°C]', (_number(warm) if math.isfinite(warm)
-                               else f'not known: {thermometer_words(session)}')
-    for column in context_topics(session.settings):
+                               else f'not known: {thermometer_words(state)}')
+    for column in context_topics(state.settings):
         unit = column_of(column).unit
         if column != 'temperature':
             yield f'{column} [{unit}]' if unit else column, _number(
-                session.around.values.get(column, math.nan))
+                state.around.values.get(column, math.nan))
 
 
 def _vector(values: Iterable[float]) -> str:

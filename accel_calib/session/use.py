@@ -15,7 +15,7 @@ from typing import Any, cast
 import numpy as np
 
 from .conditions import next_action
-from .core import State
+from .core import Holder
 from .pose_guide import plan_for
 from .sensor import Sensor, title
 from .store import Store, tidied, unusable, writing_advice
@@ -33,69 +33,71 @@ _SEVERITY: dict[str, Severity] = {'GOOD': 'info', 'USABLE': 'warning', 'BAD': 'e
 """Severity of the log line about a finding, by its level."""
 
 
-def adopt(session: State, calibration: Calibration | None, refinement: Refinement | None = None,
+def adopt(session: Holder, calibration: Calibration | None, refinement: Refinement | None = None,
           rating: Rating | None = None) -> None:
     """Correct with this calibration, and with the given mounting if there is one."""
-    session.problem, session.is_refused = '', False
+    session.change(problem='', is_refused=False)
     if calibration is None:
-        session.sensor.adopt(None)
-        session.around.assume({})
+        session.change(sensor=session.sensor.adopt(None, session.state.settings))
+        session.state.around.assume({})
         rate(session, None)
         return
     levelled = calibration.is_levelled
-    if levelled and calibration.frame != session.frame:
+    if levelled and calibration.frame != session.state.frame:
         session.log('warning', f'the stored mounting is for the frame {calibration.frame}, but '
-                    f'frame is {session.settings.frame}: it is turned, and a measured heading is '
-                    'kept')
-        calibration = in_frame(calibration, session.frame)
-    stored, calibration = calibration, session.with_given(calibration)
+                    f'frame is {session.state.settings.frame}: it is turned, and a measured '
+                    'heading is kept')
+        calibration = in_frame(calibration, session.state.frame)
+    stored, calibration = calibration, session.state.with_given(calibration)
     if levelled and not np.allclose(stored.rotation[:, 2], calibration.rotation[:, 2]):
         session.log('warning', 'the stored mounting differs from the given one by more than 10° '
                     'of tilt: the given mounting is used; call ~/set_level with the robot level')
-    session.sensor.adopt(calibration)
-    session.around.assume({key: value for key, value in calibration.typical.items()
-                           if key in CONTEXT or is_quantity(key)})
+    session.change(sensor=session.sensor.adopt(calibration, session.state.settings))
+    session.state.around.assume({
+        key: value for key, value in calibration.typical.items()
+        if key in CONTEXT or is_quantity(key)})
     rate(session, refinement, rating)
-    turned = calibration.is_levelled and session.settings.rotate
+    turned = calibration.is_levelled and session.state.settings.rotate
     session.log('info', f'correcting with {title(calibration)}; messages are in the frame '
-                f'{session.settings.frame if turned else "of the sensor"}')
+                f'{session.state.settings.frame if turned else "of the sensor"}')
     for finding in calibration.noted:
         session.log(_SEVERITY[finding.level], finding.words)
     show_mounting(session)
 
 
-def show_mounting(session: State) -> None:
+def show_mounting(session: Holder) -> None:
     """Show the mounting of the calibration in use, if it is levelled."""
     calibration = session.sensor.calibration
-    if session.frame_id and calibration is not None and calibration.is_levelled:
-        levelled = on_topics(calibration, session.settings.frame)
-        session.events.append(Mounting(levelled.rotation, session.frame_id))
+    if session.state.frame_id and calibration is not None and calibration.is_levelled:
+        levelled = on_topics(calibration, session.state.settings.frame)
+        session.events.append(Mounting(levelled.rotation, session.state.frame_id))
 
 
-def rate(session: State, refinement: Refinement | None, rating: Rating | None = None) -> None:
+def rate(session: Holder, refinement: Refinement | None, rating: Rating | None = None) -> None:
     """Add a task that rates the present calibration, if need be, and reports it as JSON."""
-    sensor = session.sensor
-    sensor.refinement = refinement
-    if rating is not None or sensor.present is None:
-        sensor.rating = rating
-    if sensor.present is not None:
-        session.events.append(_report_rating(session, sensor, sensor.present, rating))
+    calibration = session.sensor.present
+    session.change_sensor(refinement=refinement)
+    if rating is not None or calibration is None:
+        session.change_sensor(rating=rating)
+    if calibration is not None:
+        session.events.append(_report_rating(session, calibration, refinement, rating))
 
 
-def _report_rating(session: State, sensor: Sensor, calibration: Calibration,
+def _report_rating(session: Holder, calibration: Calibration, refinement: Refinement | None,
                    rating: Rating | None) -> Task:
     """Rate a calibration, and report it, unless another one has replaced it."""
-    rating, found = yield Compute(rated, calibration, sensor.refinement, rating,
-                                  session.settings.model)
-    if sensor.present is not calibration:
+    rating, found = yield Compute(rated, calibration, refinement, rating,
+                                  session.state.settings.model)
+    if session.sensor.present is not calibration:
         return ''
-    sensor.rating = rating
-    action = next_action(session)
+    session.change_sensor(rating=rating)
+    action = next_action(session.state)
     if action.kind:
-        found['in_use'] = sensor.offered is not calibration
+        found['in_use'] = session.sensor.offered is not calibration
         if calibration.is_levelled:
             found['mounting'] = mounting_figures(
-                calibration.rotation, session.frame_id or '', session.settings.base_frame)
+                calibration.rotation, session.state.frame_id or '',
+                session.state.settings.base_frame)
         command = action.command and f'~/{action.command}'
         session.events.append(Result(json.dumps({
             **found, **rating_json(rating, action.kind, action.words, command)})))
@@ -111,22 +113,22 @@ def rated(calibration: Calibration, refinement: Refinement | None, rating: Ratin
             cast('dict[str, Any]', plain(whole)))
 
 
-def show_poses(session: State, *, store: bool, new_rest: Dwell | None = None) -> None:
+def show_poses(session: Holder, *, store: bool, new_rest: Dwell | None = None) -> None:
     """Add a task that stores the poses, and draws them with the next pose."""
     sensor = session.sensor
     poses = sensor.live.book.poses()
-    added = sensor.guide.added(len(poses), session.statistics.stamp)
+    added = sensor.guide.added(len(poses), session.state.statistics.stamp)
     session.events.append(_draw_poses(
-        session, sensor, poses, added, new_rest, session.files.store if store else None))
+        session, sensor, poses, added, new_rest, session.state.files.store if store else None))
 
 
-def _draw_poses(session: State, sensor: Sensor, poses: Poses, added: int,
+def _draw_poses(session: Holder, sensor: Sensor, poses: Poses, added: int,
                 new_rest: Dwell | None, store: Store | None) -> Task:
     """Store and draw poses, this number more than before; return the line of a new rest."""
     guide = sensor.guide
-    missed = '' if new_rest is None else guide.rested(new_rest.mean, session.units)
+    missed = '' if new_rest is None else guide.rested(new_rest.mean, session.state.units)
     due, given = added != 0 or guide.plan is None or guide.is_stale, (
-        poses, session.units, session.settings.model, tuple(guide.skipped))
+        poses, session.state.units, session.state.settings.model, tuple(guide.skipped))
     try:
         yield Files(nothing) if store is None else Files(store.save_poses, poses)
     except OSError as error:
@@ -136,21 +138,23 @@ def _draw_poses(session: State, sensor: Sensor, poses: Poses, added: int,
     plan = yield Compute(plan_for, *given) if due and len(poses) else Compute(nothing)
     if due and not len(poses):  # without the start of the worker process
         plan = plan_for(*given)
-    if plan is not None and sensor is session.sensor:
+    is_same = session.sensor.live is sensor.live
+    if plan is not None and is_same:
         guide.plan = plan
         asked = plan.asked if guide.plan is None else guide.plan.asked  # as the next step asks
-        session.events.append(ShowPoses(plan.up, asked, session.frame_id or ''))
-    if new_rest is None or sensor is not session.sensor:
+        session.events.append(ShowPoses(plan.up, asked, session.state.frame_id or ''))
+    if new_rest is None or not is_same:
         return ''
     session.log('warning', guide.axes_words, f'axes {guide.axes.tolist()}', math.inf)
-    action, line = next_action(session), ''
+    action, line = next_action(session.state), ''
     if action.kind:
-        line = guide.line(poses, session.units, '' if action.kind == 'done' else action.words,
+        line = guide.line(poses, session.state.units,
+                          '' if action.kind == 'done' else action.words,
                           asks=action.kind == 'poses', added=added > 0)
     return '; '.join(filter(None, (missed, line)))
 
 
-def load(session: State, store: Store, sensor: Sensor) -> Task:
+def load(session: Holder, store: Store, sensor: Sensor) -> Task:
     """Read the files of a sensor, and use them unless another one has replaced it."""
     calibration: Calibration | None = None
     poses: Poses | None = None
@@ -159,8 +163,8 @@ def load(session: State, store: Store, sensor: Sensor) -> Task:
     try:
         calibration = yield Parse(store.load_calibration)
     except Exception as error:  # the node starts in any case
-        session.is_refused = isinstance(error, StoredCalibrationError) and not isinstance(
-            error, DamagedCalibrationError)
+        session.change(is_refused=isinstance(error, StoredCalibrationError) and not isinstance(
+            error, DamagedCalibrationError))
         problem = yield Files(unusable, store.calibration, error)
     if calibration is not None and calibration.stream not in ('', store.identity.topic):
         notes.append(f'{store.calibration} was made for {calibration.stream}, but it is used '
@@ -169,17 +173,17 @@ def load(session: State, store: Store, sensor: Sensor) -> Task:
         poses = yield Files(store.load_poses)
     except Exception as error:
         notes.append((yield Files(unusable, store.poses, error, True)))
-    if session.sensor is not sensor:
+    if session.sensor.live is not sensor.live:
         return ''
-    sensor.owners = {each.sensor for each in (calibration, poses)
-                     if each is not None and each.sensor}
+    session.change_sensor(owners=frozenset(
+        each.sensor for each in (calibration, poses) if each is not None and each.sensor))
     if poses is not None:
         sensor.live.book.add_stored(poses)
         session.log('info', f'read {counted(len(poses), "pose")} from the store')
     if calibration is not None:
         adopt(session, calibration)
-        sensor.fitted_poses = len(calibration.poses)
-    session.problem = problem
+        session.change_sensor(fitted_poses=len(calibration.poses))
+    session.change(problem=problem)
     for line in filter(None, (problem, *notes)):
         session.log('error', line)
     show_poses(session, store=False)

@@ -54,7 +54,7 @@ class _Driver(Driver):
             if self.session.accepts(frame_id):
                 rows = np.full((len(block), 9), np.nan)
                 rows[:, :7], rows[:, 7], rows[:, 0] = block, t, block[:, 0] + at
-                self.session.around.take('temperature', t)
+                self.session.state.around.take('temperature', t)
                 self.session.push(rows, self.now)
             self.handle()
         self.session.tick()
@@ -63,8 +63,8 @@ class _Driver(Driver):
     def state(self) -> Any:
         """Return progress, diagnostics, checks and poses."""
         drift = self.session.sensor.drift
-        return [state.progress(self.session), dict(health_figures(self.session)),
-                checks(self.session), self.shown, self.session.sensor.live.book.poses(),
+        return [state.progress(self.session.state), dict(health_figures(self.session.state)),
+                checks(self.session.state), self.shown, self.session.sensor.live.book.poses(),
                 drift and {'covariance': drift.calibration.covariance, **those(
                     drift, 'repeats temperatures rests count scatter change since without')}]
 
