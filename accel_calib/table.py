@@ -6,7 +6,7 @@ Tables of readings with their context: poses and recordings.
 
 `COLUMNS` is the only list of columns. Files, simulation, effects and documentation read names,
 units and meanings there. Any other column of numbers is a quantity, such as ``pressure``: a cause
-that `accel_calib.refine` tries. Its key is its name, with one ``_`` for other characters than
+that `accel_calib.refinement` tries. Its key is its name, with one ``_`` for other characters than
 letters and digits.
 
 """

@@ -28,7 +28,7 @@ Rests are then left out by their distance from a robust line: its slope is the m
 of all pairs, weighted by their difference of temperature [3]_.
 
 **Noise.** The noise of a sample is the median over the rests, by axis, so that disturbed rests do
-not affect it. For the rate, `accel_calib.capture` measures it in windows of 0.5 s, without slow
+not affect it. For the rate, `accel_calib.stillness` measures it in windows of 0.5 s, without slow
 drift. For the reading it is ``std``, over the whole rest, because all pose tables have it. On real
 recordings with rests of some seconds, both agree within 4 %.
 

@@ -252,7 +252,7 @@ WANDER = 'offset_wander'
 PROCESSES: dict[str, Effect] = {
     WANDER: _in_time('offset that changes slowly without a known form', 'bias random walk', (),
                      'g', 0.001, terms=(), needs=('time',))}
-"""Random processes. `accel_calib.refine` names them; a model cannot contain them."""
+"""Random processes. `accel_calib.refinement` names them; a model cannot contain them."""
 
 LADDER = ('offset', 'gain', 'axis_gain', 'cross_axis', 'misalignment')
 """The effects that make up V and W. Every sensor has them; models 4 to 12 consist of them."""
@@ -263,7 +263,7 @@ CHANGES: dict[str, Effect] = {
                               includes=tuple(f'{each}_change' for each in EFFECTS[name].includes),
                               base=name)
     for name in LADDER}
-"""Changes of a sensor since its stored calibration; see `accel_calib.refine`. The column ``new``
+"""Changes of a sensor since its stored calibration; see `accel_calib.refinement`. The column ``new``
 is 1 for poses taken since then and 0 for the poses of the calibration."""
 
 CATALOGUE: Mapping[str, Effect] = ChainMap(EFFECTS, PROCESSES, CHANGES)

@@ -17,8 +17,8 @@ effects are therefore compared, those with the most frequent effects of the sens
 
 **Changes.** A sensor has many steps from one calibration to the next, and a fleet many sensors. A
 step counts as a change only if its probability, times the number of steps, is below the level of
-`accel_calib.compare`. The change is for good if the calibration after the next one differs, too;
-otherwise the calibration after the step is the odd one.
+`accel_calib.comparison`. The change is for good if the calibration after the next one differs,
+too; otherwise the calibration after the step is the odd one.
 
 **Drift.** A sensor that drifts steadily differs at every step. A step is therefore a change only
 if it remains significant when the drift is subtracted. The drift of a value is here the median of
@@ -273,7 +273,7 @@ def alike(rows: Iterable[Row]) -> list[Row]:
 
     Left out are recordings without a calibration, those whose poses do not determine offset, gain
     and cross-axis gain, and those without the most frequent effects. Models 4, 7 and 10 are alike,
-    because `accel_calib.compare` compares them with the uncertainty of the largest one.
+    because `accel_calib.comparison` compares them with the uncertainty of the largest one.
 
     """
     good = [row for row in rows if row['calibration'] and row['determined']]
@@ -353,7 +353,7 @@ def _compared(calibrations: Sequence[Calibration], rows: Sequence[Row]) -> Row:
         if back or most is None or change.comparison.p_value >= limit:
             back = False  # no change, or from the odd one back to the others
             continue
-        for_good = None  # not known of the newest calibration
+        for_good = None  # the calibration after the newest one is not there yet
         if k + 2 < len(history.moments):
             for_good = (steady.changed(k, k + 2, limit) is not None
                         and history.between(k, k + 2).p_value < limit)

@@ -4,7 +4,7 @@
 """
 The longest rest of a recording, its Allan deviation, and the covariance of the estimates.
 
-**Rest.** The detector of `accel_calib.capture` finds the rests, which end at an interruption of
+**Rest.** The detector of `accel_calib.stillness` finds the rests, which end at an interruption of
 the stamps. A few missing samples are replaced by the sample before, because a recording that loses
 one sample in a thousand would otherwise have no long rest. Stamps with jitter are not used one by
 one: samples come from a regular clock, and their order is right.
