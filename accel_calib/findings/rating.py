@@ -123,7 +123,7 @@ def _outliers(expected: Expected) -> tuple[int, ...]:
 
 
 def _limited(expected: Expected) -> Iterator[Finding]:
-    """Yield what the calibration is not for, and findings if poses at a limit, or many, are left out."""
+    """Yield what the calibration is not for, and findings about poses that are left out."""
     if not expected.calibration.model.effects:
         yield Finding('mounting_alone', 'it is a mounting alone: offset and gain are not '
                       'calibrated', _more_poses(expected), 'USABLE')
