@@ -9,9 +9,9 @@ all of a calibration: its residuals [mg], V and W in the unit of the readings, a
 the other effects in the units of the catalogue. The functions with ``json`` in their names make
 the JSON of results, for the command line and the topic ``~/result``.
 
-The parameters of `accel_calib.comparison` do not depend on the axes of the model. `scale_of` states
-how they are shown: offsets in mg, gains minus 1 and cross-axis gains in %. For native units, 1 g
-is the mean of the sensitivities.
+The parameters of `accel_calib.comparison` do not depend on the axes of the model. `scale_of`
+states how they are shown: offsets in mg, gains minus 1 and cross-axis gains in %. For native
+units, 1 g is the mean of the sensitivities.
 
 """
 
