@@ -263,8 +263,8 @@ CHANGES: dict[str, Effect] = {
                               includes=tuple(f'{each}_change' for each in EFFECTS[name].includes),
                               base=name)
     for name in LADDER}
-"""Changes of a sensor since its stored calibration; see `accel_calib.refinement`. The column ``new``
-is 1 for poses taken since then and 0 for the poses of the calibration."""
+"""Changes of a sensor since its stored calibration; see `accel_calib.refinement`. The column
+``new`` is 1 for poses taken since then and 0 for the poses of the calibration."""
 
 CATALOGUE: Mapping[str, Effect] = ChainMap(EFFECTS, PROCESSES, CHANGES)
 """All effects with a name."""
