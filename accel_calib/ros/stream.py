@@ -257,7 +257,8 @@ class Stream:
             data = _usual(data)
             layout = layout_of(data)
         if layout is None:
-            self._session.reports.unreadable(len(data))
+            self._session.drop('not_finite', 'warning', f'an Imu message of {len(data)} bytes '
+                               'cannot be read; it is dropped: check the driver')
             return None
         if layout != self._layout:
             self.flush()
@@ -288,7 +289,7 @@ class Stream:
         try:
             corrected = rewriter(data, self._state.around.filled)
         except AccelCalibError as error:
-            self._session.reports.uncorrected(error)
+            self._session.drop('implausible', 'error', f'messages are not corrected: {error}')
             return
         if corrected is None:
             return

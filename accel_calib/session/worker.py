@@ -49,7 +49,7 @@ import sys
 from threading import Lock, Thread
 from time import monotonic
 from traceback import format_exc
-from typing import Any, BinaryIO, cast, Literal, Protocol, TypeVar
+from typing import Any, BinaryIO, cast, Literal, TypeVar
 
 from .store import writing_advice
 from ..calibration import NextPose
@@ -358,23 +358,13 @@ class Throttle:
 Answer = Callable[[bool, Any], object]
 """Function of the success of a task, and of its answer or the words of its error."""
 
-CallSoon = Callable[[Callable[[], None]], None]
+CallSoon = Callable[[Callable[[], object]], None]
 """Function that lets the thread of the session call a function, one after the other."""
-
-
-class Reporting(Protocol):
-    """What a worker needs of a session."""
-
-    events: deque[Event]
-
-    def log(self, severity: Severity, words: str) -> None: ...
-
-    def close(self) -> None: ...
 
 
 class Worker:
     """
-    The threads for the tasks of a session.
+    The threads for the tasks of a session, which come with its `events`.
 
     `running` names the commands that are not answered, the oldest first. `call_soon` lets the
     thread of the session call a function. `show` is called with each event that is no task, in
@@ -383,9 +373,9 @@ class Worker:
 
     """
 
-    def __init__(self, session: Reporting, call_soon: CallSoon, show: Callable[[Any], object],
+    def __init__(self, events: deque[Event], call_soon: CallSoon, show: Callable[[Any], object],
                  flush: Callable[[], object] = lambda: None) -> None:
-        self._session, self._call_soon, self._show = session, call_soon, show
+        self._events, self._call_soon, self._show = events, call_soon, show
         self._flush = flush
         self._files = ThreadPoolExecutor(1, 'accel_calib_files')
         self._computation = ThreadPoolExecutor(1, 'accel_calib')
@@ -398,9 +388,8 @@ class Worker:
 
     def handle_events(self) -> None:
         """Show the events of the session, run its tasks, and log their answers."""
-        events = self._session.events
-        while events:
-            event = events.popleft()
+        while self._events:
+            event = self._events.popleft()
             if isinstance(event, Generator):
                 self.run(event, self._log_answer)
             else:
@@ -408,7 +397,7 @@ class Worker:
 
     def log(self, severity: Severity, words: str) -> None:
         """Log a line, and show it at once."""
-        self._session.log(severity, words)
+        self._events.append(Log(severity, words))
         self.handle_events()
 
     def _log_answer(self, success: bool, words: str) -> None:
@@ -504,11 +493,10 @@ class Worker:
                            'the log')
 
     def close(self) -> None:
-        """Stop the computation, finish writing, and unlock the files."""
+        """Stop the computation, and finish writing."""
         self._closed = True
         self._process.close()
         self._computation.shutdown(wait=True)
         for step, _, _ in self._steps:
             self._files.submit(step.run, self._process.call_if_free)
         self._files.shutdown(wait=True)
-        self._session.close()
