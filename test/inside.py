@@ -22,7 +22,7 @@ from accel_calib.calibration import (
     Calibration, determines, mounting_figures, posterior, refuse_if_unfit, sound_rows)
 from accel_calib.calibration.mounting import (
     axes_of, doubts_about_flat, fault_of, mounting, with_heading, with_heading_of)
-from accel_calib.calibration.partial import carried, common_sensors, without_knocked
+from accel_calib.calibration.partial import common_sensors, without_knocked
 from accel_calib.calibration.pose_planning import (
     missing_poses, poses_needed, rows_of, shape_words, unseen)
 from accel_calib.cli.commands import COMMANDS, HIDDEN as DEMO_CHOICES, parser

@@ -24,8 +24,8 @@ from .outside import Outside, outside, SampleContext, USES_LIMIT
 from .partial import fit_partial, fit_with_fleet, FleetPrior, mounting_only, posterior
 from .pose_planning import (
     determines, dilution, directions_in, error_left_in, free_parameters, identifiability,
-    LARGEST_DILUTION, lies_in_cone, next_pose, NextPose, NORM_MODELS, Outlook, outlook,
-    refuse_if_unfit, request_for, stated_uncertainty)
+    LARGEST_DILUTION, lies_in_cone, lies_in_plane, next_pose, NextPose, NORM_MODELS, Outlook,
+    outlook, refuse_if_unfit, request_for, stated_uncertainty)
 from .quality import (
     deviations_g, errors_after, errors_before, fit_findings, gated, has_usual_gains, in_g,
     LARGEST_OFFSET_G, OF_A_FIT, quality_of, record_of, uncertainty_g, Verification, verify,
@@ -41,10 +41,10 @@ __all__ = ['CLIPPED', 'FLEET', 'LARGEST_DILUTION', 'LARGEST_OFFSET_G', 'NORM_MOD
            'error_left_in', 'errors_after', 'errors_before', 'fit_findings', 'fit_partial',
            'fit_poses', 'fit_unknown', 'fit_with_fleet', 'flat_direction', 'free_parameters',
            'gated', 'gyro_bias_of', 'has_usual_gains', 'identifiability', 'in_frame', 'in_g',
-           'level', 'level_by_rows', 'lies_in_cone', 'mounting_figures', 'mounting_of',
-           'mounting_only', 'mounting_words', 'next_pose', 'of_samples', 'on_topics', 'only_norm',
-           'outlook', 'outside', 'posterior', 'quality_of', 'record_of', 'refuse_if_unfit',
-           'rejected_by', 'sample_noise_of', 'set_heading', 'sound_rows', 'stated_uncertainty',
-           'sure_rows', 'thermal_alone', 'thermal_stream', 'request_for',
-           'uncertainty_g', 'verify', 'with_curve',
-           'with_given_mounting', 'with_history', 'with_rest_noise', 'without_curve']
+           'level', 'level_by_rows', 'lies_in_cone', 'lies_in_plane', 'mounting_figures',
+           'mounting_of', 'mounting_only', 'mounting_words', 'next_pose', 'of_samples',
+           'on_topics', 'only_norm', 'outlook', 'outside', 'posterior', 'quality_of',
+           'record_of', 'refuse_if_unfit', 'rejected_by', 'request_for', 'sample_noise_of',
+           'set_heading', 'sound_rows', 'stated_uncertainty', 'sure_rows', 'thermal_alone',
+           'thermal_stream', 'uncertainty_g', 'verify', 'with_curve', 'with_given_mounting',
+           'with_history', 'with_rest_noise', 'without_curve']

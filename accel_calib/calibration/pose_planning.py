@@ -98,10 +98,13 @@ _CONE = 30.0
 Largest angle between poses and their mean direction of a robot that cannot be turned over [°].
 
 Robots with wheels or tracks tilt by 10° to 25°. No number of poses within 30° determines model 10:
-the dilution is above 300 for 60 poses. Poses further apart, such as those in a ring, in a plane or
-at right angles, come from a sensor that can be turned.
+the dilution is above 300 for 60 poses. Poses further apart, such as those in a ring or at right
+angles, come from a sensor that can be turned.
 
 """
+
+_OUT_OF_PLANE = 0.1
+"""Smallest RMS distance of unit vectors from the nearest plane that is not a plane."""
 
 _WIDE = 75.0
 """Angle above which poses are no longer described as near one direction [°]."""
@@ -463,6 +466,13 @@ def lies_in_cone(directions: Floats) -> bool:
     return bool(len(directions) and cone_of(directions).degrees <= _CONE)
 
 
+def lies_in_plane(directions: Floats) -> bool:
+    """Return whether 4 or more (n, 3) unit vectors are those of a robot that turns on one axis."""
+    count, centred = len(directions), directions - directions.mean(axis=0)
+    return count > 3 and not lies_in_cone(directions) and bool(
+        np.linalg.svd(centred, compute_uv=False)[-1] < _OUT_OF_PLANE * np.sqrt(count))
+
+
 def determines(name: str, directions: Floats, noise: Floats | None = None) -> bool:
     """Return whether poses determine a model; parameters as in `refuse_if_unfit`."""
     return (len(directions) >= poses_needed(name)
@@ -534,8 +544,7 @@ def shape_words(name: str, directions: Floats) -> str:
     cone = cone_of(directions)
     if cone.degrees < _WIDE:
         return f'the {count} poses lie within {cone.degrees:.0f}° of one direction'
-    centred = directions - directions.mean(axis=0)
-    if np.linalg.svd(centred, compute_uv=False)[-1] < 0.1 * np.sqrt(count):
+    if lies_in_plane(directions):
         return f'the {count} poses lie in a plane'
     return (f'the {count} poses have {distinct(directions)} directions that leave a region of '
             'the sphere uncovered')

@@ -228,7 +228,7 @@ class User(Node):
         self.turn('flat')
         count = _SETTLED
         while True:
-            self._spin(lambda: len(self._rest('raw')) >= count, 'a longer rest')
+            self._spin(lambda count=count: len(self._rest('raw')) >= count, 'a longer rest')
             try:
                 return self.call('calibrator/set_level')
             except AccelCalibError:

@@ -62,7 +62,7 @@ def fit(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str,
     """
     found = calibrated(poses, units, Plan(
         settings.model, settings.method, refined=False, sensor=sensor, before=before,
-        in_cone=True))
+        partial=True))
     calibration, rating, quality = found.calibration, found.rating, found.calibration.quality
     about = calibration.reason if is_partial(calibration) else (
         f'model {calibration.name} from {len(calibration.used_poses)} of '

@@ -111,8 +111,8 @@ class WorkerProcess:
 
         Arguments and result are pickled. An error of the function is raised here, too; InputError
         if the node is ending. Other threads wait for their turn. If the process dies, the function
-        is called here. With `limit_s` [s] it is not, but EOFError is raised, and TimeoutError after
-        this time, when the process is ended.
+        is called here. With `limit_s` [s] it is not, but EOFError is raised; after this time the
+        process is ended, and TimeoutError is raised.
 
         """
         with self._turn:

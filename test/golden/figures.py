@@ -17,8 +17,8 @@ from accel_calib.refinement import refine
 from accel_calib.table import Poses
 from accel_calib.units import Units
 from inside import (
-    carried, kinds, Linear, Model, probabilities, repeatability_of, rotation_free, search_effects,
-    Set, spread_directions, unseen_mistakes)
+    kinds, Linear, Model, probabilities, repeatability_of, rotation_free, search_effects, Set,
+    spread_directions, unseen_mistakes)
 import numpy as np
 
 UP = spread_directions(4)
@@ -74,8 +74,7 @@ def of_calibration(calibration: Calibration) -> dict[str, Any]:
             **those(free, 'values axes'), 'slope': np.linalg.norm(free.slope, axis=1)},
         'repeatability': (those(repeatability_of(calibration), 'chi2 dof stated belief')
                           if effects else ''),
-        'repeats': Drift(calibration).repeats ** 0.5, 'outside': outside(calibration, wide),
-        'partial': carried(calibration) if calibration.method == 'prior' and effects else ''}
+        'repeats': Drift(calibration).repeats ** 0.5, 'outside': outside(calibration, wide)}
 
 
 def of_expected(expected: Expected) -> dict[str, Any]:
