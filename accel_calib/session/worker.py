@@ -331,10 +331,6 @@ class Throttle:
         self._last[kind] = now
         return True
 
-    def forget(self, kind: str) -> None:
-        """Let the next one of this kind be due."""
-        self._last.pop(kind, None)
-
 
 Answer = Callable[[bool, Any], object]
 """Function of the success of a task, and of its answer or the words of its error."""
