@@ -22,6 +22,7 @@ from __future__ import annotations
 import asyncio
 from collections import Counter
 from concurrent.futures import Future
+from contextlib import suppress
 import errno
 from functools import partial
 import hmac
@@ -184,7 +185,7 @@ class PageServer:
         self._exchange, self._host, self._port = exchange, host, port
         self.token = secrets.token_urlsafe(16)
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._over: asyncio.Event | None = None
+        self._over = asyncio.Event()
         self._thread: Thread | None = None
         self._link_file: Path | None = None
         self.board = Board()
@@ -207,18 +208,19 @@ class PageServer:
             started.result()
         except OSError as error:
             self._thread.join()
-            is_used = error.errno == errno.EADDRINUSE
-            raise (InputError(f'the port {self._port} of {self._host} is in use, so there is no '
-                              'live page', 'stop the other program, or choose another port')
-                   if is_used else
-                   InputError(f'the live page cannot be served at {self._host}, port '
-                              f'{self._port}: {error.strerror or error}', 'choose an address of '
-                              'this machine, and a port above 1023')) from error
+            if error.errno == errno.EADDRINUSE:
+                raise InputError(
+                    f'the port {self._port} of {self._host} is in use, so there is no live page',
+                    'stop the other program, or choose another port') from error
+            raise InputError(
+                f'the live page cannot be served at {self._host}, port {self._port}: '
+                f'{error.strerror or error}', 'choose an address of this machine, and a port '
+                'above 1023') from error
         self._exchange.show = self.show
 
     def close(self) -> None:
         """Close all viewers, and stop serving."""
-        if self._thread is not None and self._loop is not None and self._over is not None:
+        if self._thread is not None:
             self._call(self._over.set)
             self._thread.join()
             self._thread = None
@@ -268,10 +270,9 @@ class PageServer:
             return
         self._address = Address(listener.sockets)
         self._port = self._address.port
-        self._over = asyncio.Event()
         started.set_result(None)
-        self._look()
-        await self._over.wait()
+        while not self._over.is_set():
+            await self._look()
         listener.close()
         for connection in list(self.connections):
             if connection.stage > 1:
@@ -304,18 +305,16 @@ class PageServer:
             words = f'the live page {what} ({self._reported[what]} so far)'
             self._exchange.call_soon(lambda: self._exchange.log('warning', words))
 
-    def _look(self) -> None:
-        """Show the newest progress, close stuck viewers, and look again."""
-        loop = asyncio.get_running_loop()
-        wait = _RARELY_S
-        if self.viewers:
-            wait = PERIOD
-            if self.board.history:
-                self._take(self.board.history[-1])
-            for viewer in list(self.viewers):
-                if loop.time() - viewer.sending_since > STUCK_S:
-                    viewer.abort()
-        loop.call_later(wait, self._look)
+    async def _look(self) -> None:
+        """Show the newest progress, close stuck viewers, and wait."""
+        if self.viewers and self.board.history:
+            self._take(self.board.history[-1])
+        now = asyncio.get_running_loop().time()
+        for viewer in list(self.viewers):
+            if now - viewer.sending_since > STUCK_S:
+                viewer.abort()
+        with suppress(asyncio.TimeoutError):
+            await asyncio.wait_for(self._over.wait(), PERIOD if self.viewers else _RARELY_S)
 
     def _take(self, message: Message) -> None:
         if self.board.take(message):

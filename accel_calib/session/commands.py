@@ -68,7 +68,7 @@ def capture_pose(session: Holder) -> Task:
     sensor, dwell = session.sensor, _rest(session.state)
     session.state.files.usable()
     sensor.live.capture(dwell)
-    sensor.guide.is_new_rest(dwell.start)  # the answer is the line about this pose
+    session.change_sensor(guide=replace(sensor.guide, rest=dwell.start))  # the answer is its line
     poses_changed(session, ended=False)
     poses = sensor.live.book.poses()
     words = (f'{counted(len(poses), "pose")}: the sensor has been still for '
@@ -78,7 +78,7 @@ def capture_pose(session: Holder) -> Task:
         return f'{words}; the next pose is on ~/poses after the computation that is running'
     plan = yield Compute(plan_for, poses, session.state.units, session.state.settings.model)
     if session.sensor.live is sensor.live:
-        sensor.guide.plan = plan
+        session.change_sensor(guide=session.sensor.guide.choose(plan))
     return f'{words}{next_words(session.state)}'
 
 
@@ -149,7 +149,7 @@ def refine(session: Holder) -> Part[Fitted]:
     hint = '' if 'temperature' in state.around.values else thermometer_words(state)
     fitted = yield from _compute(session, fitting.refine, state.units, state.name,
                                  state.sensor.present, hint, state.own)
-    session.sensor.guide.follow(fitted.refinement.plan.poses)
+    session.change_sensor(guide=session.sensor.guide.follow(fitted.refinement.plan.poses))
     return fitted
 
 

@@ -87,7 +87,7 @@ class Session(Holder):
         if settings.rotate != before.rotate:
             self.change(sensor=self.sensor.turn(settings))
         if settings.model != before.model:
-            self.sensor.guide.plan = None
+            self.change_sensor(guide=self.sensor.guide.choose(None))
             show_poses(self, store=False)
 
     def tick(self) -> None:
@@ -232,9 +232,11 @@ class Session(Holder):
                         next_step(self.state).kind == 'poses'):
                     self.log('info', f'this rest gave no pose: {rest.words}', rest.reason, AGAIN)
             if change.poses:
-                new = change.rest is not None and sensor.guide.is_new_rest(change.rest.start)
-                poses_changed(self, ended=bool(change.ended),
-                              new_rest=change.rest if new else None)
+                new, guide = change.rest, self.sensor.guide
+                new = new if new is not None and new.start > guide.rest else None
+                if new is not None:
+                    self.change_sensor(guide=replace(guide, rest=new.start))
+                poses_changed(self, ended=bool(change.ended), new_rest=new)
         self._report_still()
 
     def _report_still(self) -> None:

@@ -106,20 +106,23 @@ def _report_rating(session: Holder, calibration: Calibration, refinement: Refine
 
 def show_poses(session: Holder, *, store: bool, new_rest: Dwell | None = None) -> None:
     """Add a task that stores the poses, and draws them with the next pose."""
-    sensor = session.sensor
+    sensor, guide = session.sensor, session.sensor.guide
     poses = sensor.live.book.poses()
-    added = sensor.guide.added(len(poses), session.state.statistics.stamp)
+    session.change_sensor(guide=guide.note(len(poses), session.state.statistics.stamp))
     session.events.append(_draw_poses(
-        session, sensor, poses, added, new_rest, session.state.files.store if store else None))
+        session, sensor, poses, len(poses) - guide.count, new_rest,
+        session.state.files.store if store else None))
 
 
 def _draw_poses(session: Holder, sensor: Sensor, poses: Poses, added: int,
                 new_rest: Dwell | None, store: Store | None) -> Task:
     """Store and draw poses, this number more than before; return the line of a new rest."""
-    guide = sensor.guide
-    missed = '' if new_rest is None else guide.rested(new_rest.mean, session.state.units)
-    due, given = added != 0 or guide.plan is None or guide.is_stale, (
-        poses, session.state.units, session.state.settings.model, tuple(guide.skipped))
+    state, guide, missed = session.state, session.sensor.guide, ''
+    if new_rest is not None and state.sensor.live is sensor.live:
+        guide, missed = guide.answer(new_rest.mean, state.units)
+        session.change_sensor(guide=guide)
+    due = added != 0 or guide.chosen is None or guide.is_stale
+    given = poses, state.units, state.settings.model, guide.skipped
     try:
         yield Files(nothing) if store is None else Files(store.save_poses, poses)
     except OSError as error:
@@ -129,19 +132,19 @@ def _draw_poses(session: Holder, sensor: Sensor, poses: Poses, added: int,
     plan = yield Compute(plan_for, *given) if due and len(poses) else Compute(nothing)
     if due and not len(poses):  # without the start of the worker process
         plan = plan_for(*given)
-    is_same = session.sensor.live is sensor.live
-    if plan is not None and is_same:
-        guide.plan = plan
-        asked = plan.asked if guide.plan is None else guide.plan.asked  # as the next step asks
-        session.events.append(ShowPoses(plan.up, asked, session.state.frame_id or ''))
-    if new_rest is None or not is_same:
+    if session.sensor.live is not sensor.live:
         return ''
+    if plan is not None:
+        session.change_sensor(guide=session.sensor.guide.choose(plan))
+        asked = session.sensor.guide.plan or plan  # as the next step asks
+        session.events.append(ShowPoses(plan.up, asked.asked, session.state.frame_id or ''))
+    if new_rest is None:
+        return ''
+    guide, step = session.sensor.guide, next_step(session.state)
     session.log('warning', guide.axes_words, f'axes {guide.axes.tolist()}', math.inf)
-    action, line = next_step(session.state), ''
-    if action.kind:
-        line = guide.line(poses, session.state.units,
-                          '' if action.kind == 'done' else action.text,
-                          asks=action.kind == 'poses', added=added > 0)
+    line = '' if not step.kind else guide.line(
+        poses, session.state.units, '' if step.kind == 'done' else step.text,
+        asks=step.kind == 'poses', added=added > 0)
     return '; '.join(filter(None, (missed, line)))
 
 
