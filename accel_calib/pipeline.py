@@ -276,8 +276,8 @@ class Plan:
         values, and the search for effects starts from it. Without a `flat` pose, its levelled
         frame and its mounting are kept.
     partial : bool
-        Fit poses that are all near one direction, or in a plane, with typical values of
-        sensors, unless `before` is a full fit.
+        Fit poses that are all near one direction, too, with typical values of sensors, unless
+        `before` is a full fit. Poses in a plane are always fitted so by ``auto``.
 
     """
 
@@ -365,10 +365,12 @@ def _fit(poses: Poses, units: Units, plan: Plan, date: str) -> Calibration:
     if before is not None and is_refined(before):
         from .refinement import refitted
         return refitted(before, poses, sensor=plan.sensor, date=date)
-    if (plan.partial and (before is None or is_partial(before)) and not units.is_native
+    if ((before is None or is_partial(before)) and not units.is_native
             and len(poses) >= FEWEST_IN_CONE):
         up = directions_of(poses, units)
-        if lies_in_cone(up) or lies_in_plane(up):
+        in_plane = (plan.model, plan.method) == ('auto', 'ml') and 'reference' not in poses and (
+            lies_in_plane(up))
+        if in_plane or plan.partial and lies_in_cone(up):
             return fit_partial(poses, units, sensor=plan.sensor, date=date)
     return fit_poses(poses, units, model=plan.model, method=plan.method, sensor=plan.sensor,
                      date=date)

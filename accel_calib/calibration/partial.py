@@ -357,12 +357,12 @@ def _words_of_part(calibration: Calibration) -> tuple[str, Finding]:
         degrees = np.degrees(_largest_across(moved @ covariance @ moved.T, axis))
         along, across = 'along gravity', 'across it'
         tilt = f' ({degrees:.1f}° of tilt until it is levelled)'
-    gains = enumerated([f'±{100.0 * gain:.1f} % on {axis_name}' for axis_name, gain in zip(
+    gains = enumerated([f'±{100.0 * gain:.2g} % on {axis_name}' for axis_name, gain in zip(
         AXES, deviation[place['axis_gain']], strict=True)])
     return reason, Finding(
         'open', f'open: offset {along} ±{_mg(float(np.sqrt(axis @ offset @ axis)))}, {across} '
         f'±{_mg(_largest_across(offset, axis))}{tilt}, gain {gains}, cross-axis '
-        f'±{100.0 * np.max(deviation[place["cross_axis"]]):.1f} %; elsewhere on the sphere |a| is '
+        f'±{100.0 * np.max(deviation[place["cross_axis"]]):.2g} %; elsewhere on the sphere |a| is '
         f'known to {_mg(uncertainty_g(calibration))}',
         f'to determine them, {turn_words(missing_poses(NAME, shown))}')
 
