@@ -8,7 +8,8 @@ import json
 import re
 
 import accel_calib as ac
-from accel_calib.calibration import fit_poses, verify, with_history
+from accel_calib.calibration import fit_poses, verify
+from accel_calib.effects import add_history
 from accel_calib.errors import RefusedFitError
 from accel_calib.logs import read_recording, write_table
 from accel_calib.refinement import refine, verdict_words
@@ -151,7 +152,7 @@ def test_structure_that_is_not_understood_remains_a_gap(structure):
     rng = np.random.default_rng(1)
     poses = poses_of(with_effects(rng), rng, 60)
     scattered = plus(poses, 0.002 * rng.normal(size=(60, 3)))
-    found = search_effects(with_history(scattered, Model({})),
+    found = search_effects(add_history(scattered, Model({})),
                            fit_poses(poses, G, model='10').model)
     lines = advice_for(replace(found, **structure), (), (), 0, unexplained=True)
     assert any('gap remains' in line for line in lines)

@@ -13,8 +13,7 @@ determine, and plans the next pose. `thermal` is for a still board whose tempera
 """
 
 from .calibration import (
-    Calibration, check_sensor, FLEET, of_samples, PRIOR, Quality, Rejected, RejectedKind,
-    STORED_METHODS, thermal_stream, with_history)
+    Calibration, check_sensor, FLEET, PRIOR, Quality, Rejected, RejectedKind, STORED_METHODS)
 from .fit import (
     CLIPPED, directions_of, fit_poses, fit_unknown, only_norm, rejected_by, sound_rows, sure_rows)
 from .mounting import (
@@ -42,9 +41,8 @@ __all__ = ['CLIPPED', 'FLEET', 'LARGEST_DILUTION', 'LARGEST_OFFSET_G', 'NORM_MOD
            'fit_poses', 'fit_unknown', 'fit_with_fleet', 'flat_direction', 'free_parameters',
            'gated', 'gyro_bias_of', 'has_usual_gains', 'identifiability', 'in_frame', 'in_g',
            'level', 'level_by_rows', 'lies_in_cone', 'mounting_figures', 'mounting_of',
-           'mounting_only', 'mounting_words', 'next_pose', 'of_samples', 'on_topics', 'only_norm',
-           'outlook', 'outside', 'posterior', 'quality_of', 'record_of', 'refuse_if_unfit',
-           'rejected_by', 'sample_noise_of', 'set_heading', 'sound_rows', 'stated_uncertainty',
-           'sure_rows', 'thermal_alone', 'thermal_stream', 'request_for',
-           'uncertainty_g', 'verify', 'with_curve',
-           'with_given_mounting', 'with_history', 'with_rest_noise', 'without_curve']
+           'mounting_only', 'mounting_words', 'next_pose', 'on_topics', 'only_norm', 'outlook',
+           'outside', 'posterior', 'quality_of', 'record_of', 'refuse_if_unfit', 'rejected_by',
+           'request_for', 'sample_noise_of', 'set_heading', 'sound_rows', 'stated_uncertainty',
+           'sure_rows', 'thermal_alone', 'uncertainty_g', 'verify', 'with_curve',
+           'with_given_mounting', 'with_rest_noise', 'without_curve']

@@ -26,10 +26,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .calibration import Calibration, check_sensor, PRIOR, Quality, Rejected, with_history
+from .calibration import Calibration, check_sensor, PRIOR, Quality, Rejected
 from .pose_planning import WEAK_DILUTION
 from .rest_noise import gyro_bias_of, sample_noise_of
-from ..effects import correct, LADDER, length_rows, Model, sensor_force
+from ..effects import add_history, correct, LADDER, length_rows, Model, sensor_force
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import believable, Fit, judge, left_out, Rival, unseen_mistakes
 from ..finding import Finding, without
@@ -105,7 +105,7 @@ def verify(calibration: Calibration, poses: Poses) -> Verification:
     """
     model, units = calibration.model, calibration.units
     check_sensor(calibration, poses.sensor)
-    poses_g = calibration.held(with_history(in_g(poses, units), model))
+    poses_g = calibration.held(add_history(in_g(poses, units), model))
     vectors = calibration.form.known_orientation and 'reference' in poses
     floor = None
     if believable(poses_g.noise) is not None:

@@ -33,11 +33,10 @@ from .steps import (
 from ..calibration import (
     Calibration, check_sensor, CLIPPED, fit_findings, fit_poses, fit_with_fleet, FLEET, FleetPrior,
     gated, in_g, LARGEST_DILUTION, OF_A_FIT, only_norm, posterior, quality_of, record_of,
-    refuse_if_unfit, Rejected, rejected_by, sound_rows, sure_rows, uncertainty_g, with_history,
-    with_rest_noise)
+    refuse_if_unfit, Rejected, rejected_by, sound_rows, sure_rows, uncertainty_g, with_rest_noise)
 from ..effects import (
-    CHANGES, EffectKey, included, Model, MODELS, OwnEffect, parameter_names, PROCESSES,
-    with_vector)
+    add_history, CHANGES, EffectKey, included, Model, MODELS, OwnEffect, parameter_names,
+    PROCESSES, with_vector)
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import fit_sphere, judge, NotConvergedError, outliers, variance_factor
 from ..finding import explained_by, Finding, without as without_kinds
@@ -253,7 +252,7 @@ def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Un
     calibration = stored or base_of(poses, units, str(base))
 
     def at(model: Model) -> Poses:
-        known = with_history(in_g(sound, calibration.units), model)
+        known = add_history(in_g(sound, calibration.units), model)
         return known if stored is None else beside_stored(known, stored, model)
 
     every, model = at(calibration.model), Model(calibration.model.values)
@@ -383,7 +382,7 @@ def _with(found: Refinement, calibration: Calibration) -> Refinement:
 def _without_search(fitted: Calibration, message: str, advice: str) -> Refinement:
     """Return the fit with the fleet as a refinement, with the reason why nothing was searched."""
     poses_g = in_g(fitted.used_poses, fitted.units)
-    fit = judge(Model(fitted.model.values), with_history(only_norm(poses_g), fitted.model))
+    fit = judge(Model(fitted.model.values), add_history(only_norm(poses_g), fitted.model))
     found = _record_of(
         fitted, State(fit), not_testable(poses_g, {}, fitted.model.effects),
         (f'no effects were searched: {message}; the result is the fit with the fleet', advice))
@@ -493,7 +492,7 @@ def refitted(before: Calibration, poses: Poses, *, sensor: str = '', date: str =
     check_units(poses, before.units)
     sure, doubts = sure_rows(poses)
     sound, unsound = sound_rows(sure, before.units)
-    poses_g = with_history(in_g(sound, before.units), before.model)
+    poses_g = add_history(in_g(sound, before.units), before.model)
     lacking = [key for key in before.model.needs if key not in poses_g]
     if lacking:
         raise RefusedFitError(f'the poses have no {" or ".join(lacking)}, which the calibration '

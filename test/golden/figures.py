@@ -7,9 +7,9 @@ from collections.abc import Callable
 from typing import Any
 
 from accel_calib.calibration import (
-    Calibration, fit_partial, fit_poses, in_g, mounting_only, outlook, outside, verify,
-    with_history)
+    Calibration, fit_partial, fit_poses, in_g, mounting_only, outlook, outside, verify)
 from accel_calib.comparison import Drift
+from accel_calib.effects import add_history
 from accel_calib.errors import AccelCalibError
 from accel_calib.estimate import estimate, Fit, judge
 from accel_calib.findings import Expected, rate
@@ -117,7 +117,7 @@ def searched(poses: Poses, units: Units, base: str) -> dict[str, Any]:
     """Return what a search found near its final model, with the table of candidates."""
     calibration = fit_poses(poses, units, model=base)
     model = Model(calibration.model.values)
-    found = search_effects(with_history(in_g(poses, calibration.units), model), model)
+    found = search_effects(add_history(in_g(poses, calibration.units), model), model)
     near, linear, chosen = found.near, found.near.chosen.linear, found.near.chosen
     gain, rank = chosen.gains()
     walk = linear.choice * (linear.penalty > 0.0)
@@ -165,7 +165,7 @@ def _visible(linear: Linear) -> dict[str, float]:
 
 def solved(poses: Poses, units: Units, *effects: str) -> dict[str, Any]:
     """Return the fit of any effects to the poses, and their equations before it."""
-    poses_g = with_history(in_g(poses, units), Model({}))
+    poses_g = add_history(in_g(poses, units), Model({}))
     start = Model({name: np.zeros(1 if name == 'gain' else 3) for name in effects})
     return {'kinds': kinds(poses_g), 'start': of_fit(judge(start, poses_g)),
             'fit': of_fit(estimate(start, poses_g))}
