@@ -48,7 +48,8 @@ from .model import (
 from .own import effects_of_file, own_effects, OwnEffect
 from .records import (
     CARRIERS, Covariate, covariates_of, curves_over, effect_named, EMPIRICAL, EmpiricalCurve,
-    kind_of, modes_of, products_of, unit_of, value_unit, variable_of, variable_words, VARIABLES)
+    kind_of, modes_of, products_of, shown_name, unchanged, unit_of, value_unit, variable_of,
+    variable_words, VARIABLES)
 from .simulate import model_with, parse_effect, simulate_poses, simulate_recording, turn_between
 from .thermal import acting_temperature, between_steps, rate_at, ThermalStream
 from .way import add_acting, add_history, context_of_samples, FROM_TEMPERATURE, thermal_stream
@@ -66,6 +67,6 @@ __all__ = ['AFFINE', 'AXES', 'CARRIERS', 'CATALOGUE', 'CHANGES', 'CONVERGED_G', 
            'fitted_places', 'formula_of', 'included', 'kind_of', 'length_rows', 'linear_model',
            'linear_values', 'model_with', 'modes_of', 'own_effects', 'own_slope',
            'parameter_names', 'parse_effect', 'predict', 'products_of', 'rate_at', 'reading_of',
-           'sensor_force', 'simulate_poses', 'simulate_recording', 'thermal_stream', 'times',
-           'too_large', 'turn_between', 'unit_of', 'value_unit', 'variable_of', 'variable_words',
-           'with_vector']
+           'sensor_force', 'shown_name', 'simulate_poses', 'simulate_recording', 'thermal_stream',
+           'times', 'too_large', 'turn_between', 'unchanged', 'unit_of', 'value_unit',
+           'variable_of', 'variable_words', 'with_vector']

@@ -7,12 +7,14 @@ from collections.abc import Callable
 from typing import Any
 
 from accel_calib.calibration import (
-    Calibration, fit_partial, fit_poses, in_g, mounting_only, outlook, outside, verify)
+    Calibration, fit_partial, fit_poses, in_g, mounting_only, NextPose, Outlook, outlook, outside,
+    verify)
 from accel_calib.comparison import Drift
 from accel_calib.effects import add_history
 from accel_calib.errors import AccelCalibError
 from accel_calib.estimate import estimate, Fit, judge
-from accel_calib.findings import Expected, rate
+from accel_calib.findings import Expected, plan_lines, rate, request_words
+from accel_calib.geometry import attitude_words
 from accel_calib.refinement import refine
 from accel_calib.table import Poses
 from accel_calib.units import Units
@@ -22,6 +24,10 @@ from inside import (
 import numpy as np
 
 UP = spread_directions(4)
+
+_OF_A_STEP = ('effect rivals probabilities data_probabilities parameters parameters_sd '
+              'gap_before_mg gap_after_mg held_out_before_mg held_out_after_mg p_value name '
+              'formula variable')
 
 
 def attempt(function: Callable[..., Any], *given: Any, **options: Any) -> Any:
@@ -65,7 +71,7 @@ def of_calibration(calibration: Calibration) -> dict[str, Any]:
         **those(calibration, 'name method units sensor frame rotation offset gain offset_sd '
                 'gain_sd ranges quality rejected reason warnings gyro noise'),
         'values': by_effect(calibration.model, calibration.covariance),
-        'rating': rate(calibration), 'outlook': outlook(calibration),
+        'rating': rate(calibration), 'outlook': _ahead(outlook(calibration)),
         'expected': of_expected(Expected(calibration)),
         'reading': attempt(calibration.predict, force, known),
         'force': attempt(calibration.correct, units.from_g(UP), wide),
@@ -76,6 +82,17 @@ def of_calibration(calibration: Calibration) -> dict[str, Any]:
                           if effects else ''),
         'repeats': Drift(calibration).repeats ** 0.5, 'outside': outside(calibration, wide),
         'partial': carried(calibration) if calibration.method == 'prior' and effects else ''}
+
+
+def _ahead(ahead: Outlook) -> dict[str, Any]:
+    """Return what the poses of a calibration determine, and the next pose in words."""
+    return {**those(ahead, 'identifiability uncertainty_mg'),
+            'next_pose': of_next_pose(ahead.next_pose)}
+
+
+def of_next_pose(asked: NextPose) -> dict[str, Any]:
+    """Return the next pose, and what is asked for."""
+    return {**those(asked, 'direction error total fits'), 'words': request_words(asked)}
 
 
 def of_expected(expected: Expected) -> dict[str, Any]:
@@ -109,8 +126,12 @@ def fits(poses: Poses, units: Units, *asked: str) -> dict[str, Any]:
 def refined(poses: Poses, units: Units, base: str) -> dict[str, Any]:
     """Return the figures of a refinement."""
     found = refine(poses, units, base=base)
-    return {**those(found, 'verdict gap_mg remaining_gap_mg steps advice refusal '
-                    'stages plan force'), 'calibration': of_calibration(found.calibration)}
+    return {**those(found, 'verdict gap_mg remaining_gap_mg advice refusal stages force'),
+            'steps': [{**those(step, _OF_A_STEP), 'where': step.where} for step in found.steps],
+            'plan': {'lines': plan_lines(found.plan), 'poses': [
+                {**those(each, 'up context separates expected'),
+                 'words': attitude_words(np.array(each.up))} for each in found.plan.poses]},
+            'calibration': of_calibration(found.calibration)}
 
 
 def searched(poses: Poses, units: Units, base: str) -> dict[str, Any]:
