@@ -370,7 +370,7 @@ def _fit(poses: Poses, units: Units, plan: Plan, date: str) -> Calibration:
         up = directions_of(poses, units)
         in_plane = (plan.model, plan.method) == ('auto', 'ml') and 'reference' not in poses and (
             lies_in_plane(up))
-        if in_plane or plan.partial and lies_in_cone(up):
+        if in_plane or (plan.partial and lies_in_cone(up)):
             return fit_partial(poses, units, sensor=plan.sensor, date=date)
     return fit_poses(poses, units, model=plan.model, method=plan.method, sensor=plan.sensor,
                      date=date)

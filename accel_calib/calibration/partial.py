@@ -52,8 +52,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .calibration import Calibration, FLEET, PRIOR, Rejected
+from .directions import determines, lies_in_plane
 from .fit import copies, only_norm, rejected_by, sound_rows, sure_rows
-from .pose_planning import determines, enumerated, lies_in_plane, missing_poses, turn_words
+from .planning import missing_poses, turn_words
 from .quality import deviations_g, finished, fit_findings, in_g, record_of, uncertainty_g
 from ..effects import AXES, EFFECTS, Model, MODELS, sensor_force, with_vector
 from ..errors import InputError, RefusedFitError
@@ -62,7 +63,7 @@ from ..estimate import (
 from ..finding import Finding, without
 from ..geometry import cone_of, unit
 from ..table import check_units, Poses
-from ..text import counted
+from ..text import counted, enumerated
 from ..units import Floats, Indices, MG, Units
 
 NAME = '10'
