@@ -87,9 +87,9 @@ from accel_calib.report.sheet import page as page_of
 from accel_calib.report.stability import comparison_page, history_page
 from accel_calib.ros.run import own_domain
 from accel_calib.session import store as session_store, worker
-from accel_calib.session.commands import (
-    due as automatic_fits_due, fit as fit_in_node, poses_changed)
-from accel_calib.session.conditions import next_action, step_of
+from accel_calib.session.commands import poses_changed
+from accel_calib.session.conditions import step_of
+from accel_calib.session.fitting import fit as fit_in_node
 from accel_calib.session.live_capture import LiveCapture, PoseBook, with_temperature
 from accel_calib.session.pose_guide import Guide
 from accel_calib.session.sensor import new_sensor, rest_after
@@ -186,12 +186,14 @@ PATIENCE_WITH_A_CHILD = child, '_PATIENCE_S'
 
 if find_spec('aiohttp'):  # what the live page needs is not installed everywhere
     from accel_calib.live import server, viewer
-    from accel_calib.live.host import Host, log_line as live_log
-    from accel_calib.live.server import PageServer, PERIOD as LIVE_PERIOD
+    from accel_calib.live.exchange import log_line as live_log
+    from accel_calib.live.host import Host
+    from accel_calib.live.server import PageServer
     from accel_calib.live.viewer import (
-        announce, COMMANDS as LIVE_COMMANDS, LARGEST as LARGEST_LIVE_MESSAGE, qr_code, reachable)
+        announce, COMMANDS as LIVE_COMMANDS, LARGEST as LARGEST_LIVE_MESSAGE,
+        PERIOD as LIVE_PERIOD, qr_code, reachable)
 
     PATIENCE_FOR_A_HELLO = viewer, '_HELLO_S'
-    PATIENCE_FOR_A_REQUEST = viewer, '_REQUEST_S'
+    PATIENCE_FOR_A_REQUEST = server, '_REQUEST_S'
     PERIOD_OF_A_COMPLAINT = server, '_QUIET_S'
-    STUCK = viewer, 'STUCK_S'
+    STUCK = server, 'STUCK_S'
