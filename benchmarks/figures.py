@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -89,6 +90,8 @@ class Frame:
         How the page was called.
     machine : str
         The machine, with its load before.
+    path : Path or None
+        File of the page; None if it is only printed.
     pool : multiprocessing.Pool or None
         Processes for the sets; None for none beside this one.
 
@@ -96,6 +99,7 @@ class Frame:
 
     command: str
     machine: str
+    path: Path | None
     pool: Any = None
 
     def run(self, work: Callable[..., Any], tasks: Iterable[tuple[Any, ...]]) -> list[Any]:
@@ -105,6 +109,39 @@ class Frame:
                  else [work(*task) for task in tasks])
         tell(f'{work.__name__}: {len(tasks)} sets in {time.monotonic() - began:.0f} s')
         return found
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The result of a function in a process of its own, and what it took."""
+
+    result: Any
+    seconds: float
+    cpu: float  # [s]
+    before: float  # resident memory with all imports and what was prepared [MB]
+    megabytes: float  # largest resident memory of the process [MB]
+
+
+def measure_alone(prepare: Callable[..., Callable[[], Any]], *given: Any) -> Measured:
+    """Return what the function takes that `prepare` returns, both called in a fresh process."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context('spawn')) as alone:
+        found: Measured = alone.submit(_measure, prepare, *given).result()
+    tell(prepare.__name__, *given, found)
+    return found
+
+
+def _measure(prepare: Callable[..., Callable[[], Any]], *given: Any) -> Measured:
+    work = prepare(*given)
+    before, began, cpu = largest_mb(), time.perf_counter(), time.process_time()
+    result = work()
+    return Measured(result, time.perf_counter() - began, time.process_time() - cpu, before,
+                    largest_mb())
+
+
+def largest_mb() -> float:
+    """Return the largest resident memory of this process so far [MB]; not that of its parent."""
+    text = Path('/proc/self/status').read_text(encoding='ascii')
+    return int(text.partition('VmHWM:')[2].split()[0]) / 1024.0
 
 
 def tell(*words: object) -> None:
@@ -149,7 +186,7 @@ def main(*pages: Callable[..., Iterable[str]]) -> None:
     with ExitStack() as stack:
         pool = (stack.enter_context(multiprocessing.get_context('spawn').Pool(jobs)) if jobs > 1
                 else None)
-        frame = Frame(command, machine(), pool)
+        frame = Frame(command, machine(), path, pool)
         text = '\n\n'.join(filter(None, page(frame, **given)))
     text = f'{text}\n\nMeasured at the commit {commit()}.\n'
     print(text)

@@ -16,8 +16,9 @@ from dataclasses import dataclass, replace
 from accel_calib.effects import Model, model_with
 from accel_calib.geometry import spread_directions, unit
 from accel_calib.statistics import rms
-from accel_calib.table import concatenated, Floats, numbered, Poses
+from accel_calib.table import COLUMNS, concatenated, Floats, numbered, Poses
 from accel_calib.units import MG
+from generator import Simulated
 import numpy as np
 
 NOISE = 3e-4
@@ -54,6 +55,16 @@ def draw_model(rng: np.random.Generator, offset: float = 0.03) -> Model:
 def join(poses: Poses, more: Poses) -> Poses:
     """Return poses followed by others."""
     columns = concatenated([poses, more]).columns
+    return Poses(columns, numbered(columns))
+
+
+def poses_of(made: Simulated) -> Poses:
+    """Return poses of the independent simulator of the tests, as the reader of tables does."""
+    columns = {}
+    for key, column in COLUMNS.items():
+        parts = [made.columns[name] for name in column.names if name in made.columns]
+        if len(parts) == len(column.names):
+            columns[key] = np.column_stack(parts) if len(parts) > 1 else parts[0]
     return Poses(columns, numbered(columns))
 
 
