@@ -19,6 +19,8 @@ import re
 import sys
 from typing import Any
 
+from docutils import nodes
+
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
 
 project = 'accel_calib'
@@ -84,8 +86,20 @@ def escape_bars(app: Any, kind: str, name: str, obj: Any, options: Any, lines: l
     lines[:] = [re.sub(r'\|(\w+)\|', r'\\|\1\\|', line) for line in lines]
 
 
+def name_cells(app: Any, tree: nodes.document, page: str) -> None:
+    """Repeat the head of its column in each cell: narrow screens show rows one below the other."""
+    for table in tree.findall(nodes.tgroup):
+        heads = [entry.astext() for head in table.findall(nodes.thead)
+                 for entry in head.findall(nodes.entry)]
+        for row in [row for body in table.findall(nodes.tbody) for row in body.findall(nodes.row)]:
+            for head, entry in list(zip(heads, row.children))[1:]:
+                if head and len(heads) > 2 and entry.astext():
+                    entry.children[0].insert(0, nodes.inline('', f'{head}: ', classes=['of-column']))
+
+
 def setup(app: Any) -> None:
     """Connect the functions of this file."""
+    app.connect('doctree-resolved', name_cells)
     app.connect('autodoc-process-docstring', escape_bars)
     app.connect('source-read', insert_tables)
     app.connect('source-read', link_to_repository)
