@@ -13,13 +13,14 @@ import re
 import shlex
 from typing import Any
 
+from accel_calib.errors import AccelCalibError
 from accel_calib.logs import LogOptions
 from golden import inputs
 from golden.driven import session
 from golden.figures import attempt, LOOKS
 from golden.record import parted, plain
 from golden.sweeps import SWEEPS
-from inside import main, poses_of
+from inside import main, meaning, poses_of, read_log
 import numpy as np
 import yaml
 
@@ -27,6 +28,8 @@ CASES: dict[str, Any] = yaml.safe_load(
     Path(__file__).with_name('cases.yaml').read_text(encoding='utf-8'))
 _WITHOUT_JSON = ('apply', 'report', 'simulate')
 _SETTINGS = ('run', 'look', 'units', 'session')
+CORPUS = Path(__file__).parents[1] / 'corpus' / 'logs'
+"""Small logs of all dialects, by what they show, and the options with which they are read."""
 
 
 def result_of(name: str, folder: Path) -> Any:
@@ -40,6 +43,10 @@ def result_of(name: str, folder: Path) -> Any:
 
 
 def _of_case(case: dict[str, Any]) -> Any:
+    if 'names' in case:
+        return {name: attempt(meaning, name) for name in case['names']}
+    if 'read' in case:
+        return _read(case['read'])
     files = {file: made for file, made in case.items() if file not in _SETTINGS}
     for file, made in files.items():
         (kind, options), = made.items()
@@ -52,6 +59,20 @@ def _of_case(case: dict[str, Any]) -> Any:
             kind, *given = look.split()
             found[look] = plain(attempt(LOOKS[kind], intake.poses, intake.units, *given))
     return {**found, 'session': session(case['session'])} if 'session' in case else found
+
+
+def _read(folder: str) -> Any:
+    """Return what each log of a folder of the corpus holds, or its refusal."""
+    Path(folder).symlink_to(CORPUS / folder)
+    given = yaml.safe_load((CORPUS / 'options.yaml').read_text(encoding='utf-8'))
+    found = {}
+    for path in sorted(Path(folder).iterdir()):
+        for options in given.get(str(path), [{}]):
+            log = attempt(read_log, path, LogOptions(**options))
+            found[f'{path.stem} {options or ""}'.strip()] = (
+                [log, log.read_as] if isinstance(log, AccelCalibError) else
+                [type(log.table).__name__, log.table.row, log])
+    return found
 
 
 def _ran(command: str) -> Any:
