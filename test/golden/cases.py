@@ -78,17 +78,20 @@ def _read(folder: str) -> Any:
 def _ran(command: str) -> Any:
     """Return what a command writes."""
     arguments = shlex.split(command)
-    if arguments[0] not in _WITHOUT_JSON:
+    if arguments[0] not in _WITHOUT_JSON and '--json' not in arguments:
         arguments += ['--json', 'result.json']
-    before = {path: path.stat().st_mtime_ns for path in Path().iterdir()}
+    before = {path: path.lstat().st_mtime_ns for path in Path().rglob('*')}
     errors = io.StringIO()
     with redirect_stdout(io.StringIO()), redirect_stderr(errors):
-        status = main(arguments)
+        try:
+            status = main(arguments)
+        except SystemExit as ended:
+            status = ended.code
     assert 'internal error' not in errors.getvalue(), errors.getvalue()
-    written = sorted(path for path in Path().iterdir()
-                     if before.get(path) != path.stat().st_mtime_ns)
+    written = sorted(path for path in Path().rglob('*') if not path.is_dir()
+                     and before.get(path) != path.lstat().st_mtime_ns)
     return {'status': status, 'errors': errors.getvalue() if status == 2 else '',
-            **{path.name: _content(path) for path in written}}
+            **{str(path): _content(path) for path in written}}
 
 
 def _content(path: Path) -> Any:
