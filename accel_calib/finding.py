@@ -35,7 +35,7 @@ KINDS: Mapping[str, str] = MappingProxyType({
     'edited': 'the file was edited by hand',
     'mounting_alone': 'offset and gain are not calibrated',
     'thermal_alone': 'the offset over temperature is known, but not the offset and the gain',
-    'partial': 'the poses lie near one direction',
+    'partial': 'the poses lie near one direction or in a plane',
     'outlier_not_certain': 'other poses may be wrong instead of those left out',
     'no_check': 'there are only as many poses as values',
     'held_out': 'orientations that the fit has not seen are wrong',
@@ -72,7 +72,7 @@ KINDS: Mapping[str, str] = MappingProxyType({
     'not_calibrated': 'recordings of a fleet have no usable calibration',
     'noisy': 'the white noise at rest is larger than that of common parts',
     'not_seen': 'a rest does not show all figures of the noise',
-    'open': 'what poses near one direction leave open',
+    'open': 'what poses near one direction or in a plane leave open',
     'correction_in_file': 'an edited file states another correction than its effects',
     'note': 'a note'})
 """Kinds of findings and their meaning, the most informative reason for a rating first."""

@@ -20,11 +20,11 @@ from pathlib import Path
 from accel_calib.api import in_units_of
 from accel_calib.calibration import (
     Calibration, determines, mounting_figures, posterior, refuse_if_unfit, sound_rows)
+from accel_calib.calibration.directions import poses_needed, rows_of, shape_words
 from accel_calib.calibration.mounting import (
     axes_of, doubts_about_flat, fault_of, mounting, with_heading, with_heading_of)
-from accel_calib.calibration.partial import carried, common_sensors, without_knocked
-from accel_calib.calibration.pose_planning import (
-    missing_poses, poses_needed, rows_of, shape_words, unseen)
+from accel_calib.calibration.partial import common_sensors, without_knocked
+from accel_calib.calibration.planning import choose_levels, find_undetermined, missing_poses
 from accel_calib.cli.commands import COMMANDS, HIDDEN as DEMO_CHOICES, parser
 from accel_calib.cli.main import main
 from accel_calib.cli.nodes import changes, screen, state
@@ -76,11 +76,10 @@ from accel_calib.refinement.curves import (
     Process, process_of, SIGNIFICANT, Walk, walk_beside)
 from accel_calib.refinement.linear import (
     _RARE as RARE, Block, LEVEL as REFINE_LEVEL, Linear, outside_of, Set, with_outliers)
-from accel_calib.refinement.plan import _levels as levels_of, NOTHING as NOTHING_TO_PLAN
 from accel_calib.refinement.search import (
     _is_better as is_better_than_walk, _less as less, search as search_effects)
 from accel_calib.refinement.state import beginning, candidates, fitted_state, linearised, WORTH
-from accel_calib.refinement.steps import advice_for
+from accel_calib.refinement.steps import remarks_on
 from accel_calib.report.page import axis_figures, snippets
 from accel_calib.report.refinement import all_drawings, curve_parts
 from accel_calib.report.residuals import residuals_of, residuals_of_refinement
@@ -92,7 +91,7 @@ from accel_calib.session.commands import (
     due as automatic_fits_due, fit as fit_in_node, poses_changed)
 from accel_calib.session.conditions import next_action, step_of
 from accel_calib.session.live_capture import LiveCapture, PoseBook, with_temperature
-from accel_calib.session.pose_guide import Guide, Plan, plan_for
+from accel_calib.session.pose_guide import Guide
 from accel_calib.session.sensor import new_sensor, rest_after
 from accel_calib.session.settings import capture_settings, changed, default_of
 from accel_calib.session.state import figures

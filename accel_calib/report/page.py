@@ -36,9 +36,9 @@ from ..calibration import Calibration, Curve, mounting_figures, outlook
 from ..effects import (
     AXES, EffectKey, EmpiricalCurve, entry_of, REFERENCE_TEMPERATURE, value_unit, variable_words,
     with_vector)
-from ..findings import effect_figures, rate_refinement, residual_figures
+from ..findings import (
+    effect_figures, rate_refinement, request_words, residual_figures, verdict_words)
 from ..geometry import coverage
-from ..refinement import verdict_words
 from ..table import Floats
 from ..text import counted, milli, percentage, short, signed, with_minus
 from ..units import MG
@@ -234,7 +234,8 @@ def _covered(calibration: Calibration, residuals: Residuals, *, plan: bool) -> s
     linear = all(entry_of(name).linear for name in calibration.model.effects)
     if plan and linear and calibration.model.effects:
         asked = outlook(calibration, 'auto').next_pose
-        direction, words = asked.direction, f'Next pose: {asked.words}.'.replace('..', '.')
+        direction = asked.direction
+        words = f'Next pose: {request_words(asked)}.'.replace('..', '.')
     return section('Coverage of the sphere', figures(
         [of_coverage(residuals, coverage(residuals.force), direction)], 'wide'),
         paragraph(words), HINT, kind='half')

@@ -27,7 +27,8 @@ from .sheet import (
     ACCENT, add_band, AFTER, AXIS_COLOURS, BAND, BEFORE, code, Drawing, drawn, FAINT, figures,
     HEIGHT_INCHES, INK, PAPER, paragraph, save, scroll_table, section)
 from ..effects import AXES, EMPIRICAL, EmpiricalCurve, entry_of, parameter_names, variable_words
-from ..refinement import base_words, chance, named_entries, values_of, verdict_words
+from ..findings import base_words, chance_words, odds_words, value_words, verdict_words
+from ..refinement import named_entries
 from ..statistics import over_axes
 from ..table import Floats
 from ..text import short
@@ -57,7 +58,8 @@ def search_sections(result: Refinement, residuals: Residuals, *, used: bool) -> 
             [(str(number), step.effect,
               f'{short(step.gap_before_mg)} → {short(step.gap_after_mg)}',
               f'{short(step.held_out_before_mg)} → {short(step.held_out_after_mg)}',
-              chance(step.p_value)) for number, step in enumerate(result.steps, 1)]), kind='half')
+              chance_words(step.p_value)) for number, step in enumerate(result.steps, 1)]),
+            kind='half')
     for number, step in enumerate(result.steps, 1):
         yield _step(result, number, step)
     left = residuals_of_refinement(result)
@@ -72,15 +74,15 @@ def search_sections(result: Refinement, residuals: Residuals, *, used: bool) -> 
 def _step(result: Refinement, number: int, step: Step) -> str:
     """Return the section of a step, from 1: where it was found, and what it changes."""
     effect = entry_of(step.name)
-    rivals = ', '.join(f'{code(name)} ({step.odds(name)})' for name in step.rivals)
+    rivals = ', '.join(f'{code(name)} ({odds})' for name, odds in odds_words(step).items())
     story = (f'{code(step.effect)} ({escape(effect.term)}). Found '
              f'{escape(step.where)}. With this effect the residual decreases from '
              f'{short(step.gap_before_mg)} to <strong>{short(step.gap_after_mg)} mg</strong>, '
              f'and the held-out residual from {short(step.held_out_before_mg)} to '
              f'{short(step.held_out_after_mg)} mg; '
-             f'<span class="whole">{escape(chance(step.p_value))}</span>.'
+             f'<span class="whole">{escape(chance_words(step.p_value))}</span>.'
              + (f' These poses cannot distinguish it from {rivals}.' if rivals else ''))
-    shown = values_of(step)
+    shown = value_words(step)
     table = paragraph(step.formula) if step.formula else scroll_table(
         f'Values of step {number}', [name for name, _ in shown],
         [[value for _, value in shown]] if shown else [])

@@ -44,6 +44,7 @@ from .declare import (
 from .stream import ContextTopics, Stream
 from ..calibration import NextPose
 from ..errors import AccelCalibError
+from ..findings import request_words
 from ..live import check_installed
 from ..messages.correction import output_frame
 from ..session import (
@@ -84,11 +85,12 @@ def pose_markers(directions: Floats, asked: NextPose, frame_id: str) -> MarkerAr
         markers += [_marker('poses', k, Marker.SPHERE, _CAPTURED, _DOT, direction),
                     _text('numbers', k, str(k + 1), direction * _NUMBER_AT)]
     if asked.direction is None:
-        markers.append(_text('next', 1, asked.words, _ABOVE))
+        markers.append(_text('next', 1, request_words(asked), _ABOVE))
     else:
         arrow = _marker('next', 0, Marker.ARROW, _ASKED_FOR, _SHAFT)
         arrow.points = [Point(), _point(asked.direction)]
-        markers += [arrow, _text('next', 1, asked.words, asked.direction * _WORDS_AT)]
+        markers += [arrow, _text('next', 1, request_words(asked),
+                                 asked.direction * _WORDS_AT)]
     for marker in markers:
         marker.header.frame_id = frame_id
     return MarkerArray(markers=markers)

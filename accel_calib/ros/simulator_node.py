@@ -27,8 +27,9 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from .declare import declared, STREAM
-from ..calibration import mounting_of, of_samples, thermal_stream
-from ..effects import model_with, parse_effect, predict, turn_between
+from ..calibration import mounting_of
+from ..effects import (
+    context_of_samples, model_with, parse_effect, predict, thermal_stream, turn_between)
 from ..geometry import spread_directions
 from ..session import parameter
 from ..table import Floats, numbered, Recording
@@ -143,7 +144,7 @@ class SimulatedImu:
         self._sent += len(path)
         noise_g = self._settings.noise / self._settings.gravity
         known = {'time': time, 'temperature': self._temperatures(time)}
-        context = {**of_samples(known, len(path), self._model, self._thermal),
+        context = {**context_of_samples(known, len(path), self._model, self._thermal),
                    'std': np.full_like(force, noise_g)}
         rng, rotation = self._rng, self._model.rotation
         columns = {

@@ -21,19 +21,19 @@ import numpy as np
 
 from .conditions import next_words, thermometer_words
 from .core import Holder, State
-from .pose_guide import plan_for
 from .sensor import gyro_bias_of_rest, Sensor
 from .settings import CalibratorSettings
 from .store import writing_advice
 from .use import adopt, rate, show_poses
 from .worker import Compute, Files, nothing, Parse, Part, Task
-from ..calibration import angle_words, Calibration, fit_partial, level, mounting_only, set_heading
-from ..effects import Model, OwnEffect
+from ..calibration import (
+    angle_words, Calibration, fit_partial, level, mounting_only, plan_session, set_heading)
+from ..effects import Model, OwnEffect, shown_name
 from ..errors import AccelCalibError, InputError, RefusedFitError, StoredCalibrationError
-from ..findings import rate_refinement, Rating
+from ..findings import rate_refinement, Rating, rival_words, verdict_words
 from ..geometry import angle_of, spread_directions
 from ..pipeline import calibrated, is_partial, is_refined, Plan
-from ..refinement import refine, Refinement, shown_name, times_typical, verdict_words
+from ..refinement import refine, Refinement
 from ..stillness import Dwell, poses_from
 from ..table import Poses
 from ..text import counted, listed, now
@@ -91,7 +91,8 @@ class Commands:
         if session.state.computing:
             yield Files(nothing)
             return f'{words}; the next pose is on ~/poses after the computation that is running'
-        plan = yield Compute(plan_for, poses, session.state.units, session.state.settings.model)
+        plan = yield Compute(plan_session, poses, session.state.units,
+                             session.state.settings.model)
         if session.sensor.live is sensor.live:
             sensor.guide.plan = plan
         return f'{words}{next_words(session.state)}'
@@ -433,7 +434,7 @@ def fit(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str,
     """
     found = calibrated(poses, units, Plan(
         settings.model, settings.method, refined=False, sensor=sensor, before=before,
-        in_cone=True))
+        partial=True))
     calibration, rating, quality = found.calibration, found.rating, found.calibration.quality
     about = calibration.reason if is_partial(calibration) else (
         f'model {calibration.name} from {len(calibration.used_poses)} of '
@@ -461,10 +462,10 @@ def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None,
     """
     refinement = refine(poses, units, base='auto' if before is None else before, sensor=sensor,
                         date=now(), also=own)
-    beyond = [step for step in refinement.steps if times_typical(step) > _BEYOND]
+    beyond = [step for step in refinement.steps if step.times_typical > _BEYOND]
     if beyond and not refinement.refusal:
         refinement = replace(refinement, refusal=(
-            f'{beyond[0].effect} is {times_typical(beyond[0]):.0f} times that of typical parts',
+            f'{beyond[0].effect} is {beyond[0].times_typical:.0f} times that of typical parts',
             f'find what else changed with it; {hint}' if hint else 'find what else changed with '
             'it: check the mounting and the setup, and take the poses again'))
     rating, calibration = rate_refinement(refinement), refinement.calibration
@@ -476,7 +477,7 @@ def refined(poses: Poses, units: Units, sensor: str, before: Calibration | None,
     details += [*calibration.warnings, *refinement.advice]
     if not refinement.refusal:
         details.append(change_words(before, calibration))
-    names = [shown_name(step.name) + (f' (or {", ".join(step.likely_rivals)})' if step.rivals
+    names = [shown_name(step.name) + (f' (or {", ".join(rival_words(step))})' if step.rivals
                                       else '') for step in refinement.steps]
     found, verb = ' and '.join(names), 's' if len(names) == 1 else ''
     verdict = {'no_gap': 'no gap beyond the noise', 'explained': f'{found} explain{verb} the gap',

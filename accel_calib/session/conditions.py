@@ -23,6 +23,7 @@ from .settings import context_topics
 from .stream import SILENT, StreamStatistics
 from ..calibration import USES_LIMIT
 from ..comparison import status
+from ..findings import request_words
 from ..pipeline import FEWEST_IN_CONE, is_partial
 from ..table import column_of, CONTEXT, is_quantity
 from ..text import counted
@@ -187,10 +188,12 @@ def step_of(guide: Guide) -> Condition:
         return calling('refine', 'all poses of the plan are taken')
     if plan is None:
         return Condition('', '')
+    words = request_words(plan.asked)
     if plan.asked.direction is None:
-        return calling('fit', plan.asked.words)
-    words, command = (f'{plan.asked.words}, or call ~/fit', 'fit') if plan.asked.fits else (
-        plan.asked.words, '')
+        return calling('fit', words)
+    command = ''
+    if plan.asked.fits:
+        words, command = f'{words}, or call ~/fit', 'fit'
     return Condition('poses', words, command, tuple(plan.asked.direction.tolist()))
 
 
