@@ -189,7 +189,7 @@ def inside_rows(poses: Poses, units: Units
         Rejected(row, CLIPPED, 'clipped') for row in rows), (Finding(
             'limited', f'{len(rows)} of {len(poses)} poses are left out, because the readings end '
             f'at {short(limit)} {units.name}, the limit of the sensor', 'choose a larger range of '
-            'the sensor, and record again', 'USABLE', rows, 'record'),)
+            'the sensor, and record again', 'USABLE', rows, step='record'),)
 
 
 def sure_rows(poses: Poses) -> tuple[Poses, tuple[Rejected, ...]]:
@@ -245,7 +245,8 @@ def _by_norm(poses: Poses, units: Units, model: str, method: Method) -> tuple[Ca
     if model == 'auto':
         noted += find_undetermined(list(dilutions)[-1], used, noise)
     return record_of(
-        fit, poses, units, used, name, method, covariance=covariance_with(fit, unlike),
+        fit, poses, units, used, name=name, method=method,
+        covariance=covariance_with(fit, unlike),
         rejected=rejected_by(fit.model, poses_g.take(~inside[original])), reason=reason,
         noted=tuple(noted)), fit
 
@@ -386,7 +387,7 @@ def fit_known(poses: Poses, units: Units, method: Method) -> Calibration:
     unlike = rivals(fit, kept, out, poses_g, lambda others: estimate(fit.model, others))
     fit = stated(fit)
     return record_of(
-        fit, poses, units, unit(fit.poses_g['reference']), ORIENTED, method,
+        fit, poses, units, unit(fit.poses_g['reference']), name=ORIENTED, method=method,
         covariance=covariance_with(fit, unlike), rejected=_rejected_known(fit, poses_g.take(out)),
         reason=reason,
         noted=(*rival_findings(unlike, poses.row), *fit_findings(fit, 0.0), *_placement(fit)))

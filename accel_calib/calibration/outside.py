@@ -71,8 +71,8 @@ def outside(calibration: Calibration, known: Context) -> dict[str, Outside]:
         values = values[np.isfinite(values)]
         if len(values):
             count = int(np.sum((values < low) | (values > high)))
-            found[key] = Outside(key, count, len(values), low, high, float(np.min(values)),
-                                 float(np.max(values)))
+            found[key] = Outside(key, count, len(values), low=low, high=high,
+                                 least=float(np.min(values)), most=float(np.max(values)))
     return found
 
 

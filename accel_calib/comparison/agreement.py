@@ -128,7 +128,8 @@ def rotation_free(calibration: Calibration, context: Context, per_g: float) -> R
         np.concatenate([vec_v * reading_scale, mat_s[_ENTRIES] * gain_scale, model.vector[own]]),
         np.concatenate([slope_v * reading_scale, slope_s[_ENTRIES] * gain_scale,
                         np.eye(size)[own]]),
-        np.linalg.solve(mat_s, mat_w) @ model.rotation, reading_scale, force_scale)
+        axes=np.linalg.solve(mat_s, mat_w) @ model.rotation, reading_scale=reading_scale,
+        force_scale=force_scale)
 
 
 def _polar(mat_w: Floats, slope_w: Floats) -> tuple[Floats, Floats]:

@@ -30,9 +30,9 @@ import numpy as np
 
 from .server import PAGE, PageServer, PERIOD
 from .viewer import Message
-from ..calibration import angle_words, Calibration
+from ..calibration import Calibration
 from ..errors import AccelCalibError, InputError, system_error
-from ..findings import rate, residual_figures
+from ..findings import angle_words, rate, residual_figures
 from ..messages.one_reading import Triple
 from ..report import calibration_page, STORED
 from ..session import (

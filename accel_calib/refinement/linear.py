@@ -273,7 +273,7 @@ class Set:
             root = turn / np.sqrt(np.maximum(size, 1e-12))  # against division by zero
             linear.without_poses[out] = root, root.T @ across
         root, across = linear.without_poses[out]
-        found = cls(linear, (), out, root, across, np.eye(len(across)))
+        found = cls(linear, (), out, root, across, mix=np.eye(len(across)))
         for block in blocks:
             found = found.extended(block)
         return found
@@ -290,7 +290,7 @@ class Set:
         mix[:rows, :count], mix[:rows, count:] = self.mix, -self.mix @ (along @ new)
         mix[rows:, count:] = new
         return Set(self.linear, (*self.blocks, block), self.out, self.root,
-                   np.concatenate([self.across, new.T @ left]), mix)
+                   np.concatenate([self.across, new.T @ left]), mix=mix)
 
     def instead(self, blocks: Iterable[int]) -> Set:
         """Return the set of other blocks, with the same poses left out."""

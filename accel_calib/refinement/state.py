@@ -108,7 +108,7 @@ class Candidate:
         for shape in self.shapes:
             new = searched and not np.array_equal(shape, entry.usual)
             yield Block(self.effect, shape, slice(start, start + count), entry, int(new),
-                        (self.tried if new else 1.0) * alike)
+                        tried=(self.tried if new else 1.0) * alike)
             start += count
 
 

@@ -26,11 +26,10 @@ from .settings import CalibratorSettings
 from .store import writing_advice
 from .use import adopt, rate, show_poses
 from .worker import Compute, Files, nothing, Parse, Part, Task
-from ..calibration import (
-    angle_words, Calibration, fit_partial, level, mounting_only, plan_session, set_heading)
+from ..calibration import Calibration, fit_partial, level, mounting_only, plan_session, set_heading
 from ..effects import Model, OwnEffect, shown_name
 from ..errors import AccelCalibError, InputError, RefusedFitError, StoredCalibrationError
-from ..findings import rate_refinement, Rating, rival_words, verdict_words
+from ..findings import angle_words, rate_refinement, Rating, rival_words, verdict_words
 from ..geometry import angle_of, spread_directions
 from ..pipeline import calibrated, is_partial, is_refined, Plan
 from ..refinement import refine, Refinement

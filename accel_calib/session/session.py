@@ -28,8 +28,8 @@ from .settings import CalibratorSettings
 from .stream import AGAIN, SILENT
 from .use import adopt, load, show_mounting, show_poses
 from .worker import answered, ShowPoses, Still, Task
-from ..calibration import mounting_words
 from ..comparison import status
+from ..findings import mounting_words
 from ..table import Floats
 from ..text import counted
 
