@@ -197,6 +197,8 @@ def _grown(problem: Linear, least_rss: float, least: float) -> Set:
             break
         scores = now.scores_beside
         scores[list(now.blocks)] = -np.inf
+        if not np.max(scores) > -np.inf:  # all are there, or none is outside of the others
+            break
         now = now.extended(int(np.argmax(scores)))
         if now.parameters > _LARGEST_SHARE * problem.dof:
             break
