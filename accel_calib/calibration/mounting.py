@@ -42,7 +42,6 @@ rotation by another angle. A rotation can be intended, a mirror image cannot.
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from itertools import permutations, product
 import math
 
 import numpy as np
@@ -54,7 +53,7 @@ from ..effects import add_history, AXES, Context, Model, sensor_force
 from ..errors import InputError
 from ..estimate import fit_12
 from ..finding import Finding, Level, without
-from ..geometry import angle_of, axes_of_signs, rotation_from_rpy
+from ..geometry import angle_of, axes_of_signs, rotation_from_rpy, SIGNED_AXES
 from ..table import Floats, Poses
 from ..units import FrameName
 
@@ -344,7 +343,7 @@ def fault_of(mat_q: Floats) -> str | None:
     """Return the wiring fault of a matrix as from `axes_of`; None if there is none."""
     if angle_of(mat_q) <= _NEAR:  # the angle of a mirror image is 90° or more
         return None
-    nearest = max(_PERMUTATIONS, key=lambda one: float(np.sum(one * mat_q)))
+    nearest = max(SIGNED_AXES, key=lambda one: float(np.sum(one * mat_q)))
     if angle_of(mat_q @ nearest.T) > _NEAR:
         if np.linalg.det(mat_q) > 0.0:
             return f'the sensor is rotated by {_turn(mat_q.T)}'
@@ -364,12 +363,6 @@ def fault_of(mat_q: Floats) -> str | None:
         swapped = [axis for axis, own in zip(AXES, diagonal, strict=True) if own == 0.0]
         return f'{" and ".join(swapped)} are swapped'
     return f'the axes are permuted to a mirror image: {reads}'
-
-
-_PERMUTATIONS: list[Floats] = [
-    np.diag(signs) @ np.eye(3)[list(order)]
-    for order in permutations(range(3)) for signs in product((1.0, -1.0), repeat=3)]
-"""The 48 signed permutations of the axes, including mirror images."""
 
 
 def _turn(rotation: Floats) -> str:

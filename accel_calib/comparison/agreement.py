@@ -262,7 +262,7 @@ def comparable(calibrations: Sequence[Calibration]) -> tuple[Comparable, ...]:
         larger = NORM_MODELS[NORM_MODELS.index(run.name) + 1:] if run.name in NORM_MODELS else ()
         if largest in larger and run.model.effects == run.form.effects:
             with suppress(RefusedFitError):  # its poses do not determine the larger model
-                sure = fit_unknown(run.used_poses, run.units, largest, 'ml')
+                sure = fit_unknown(run.used_poses, run.units, largest, 'ml')[0]
         found.append(Comparable(run, sure, repeatability_of(sure)))
     return tuple(found)
 
