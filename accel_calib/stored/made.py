@@ -366,7 +366,8 @@ def _environment() -> 'Environment':
     made = Environment(loader=PackageLoader('accel_calib.stored'), undefined=StrictUndefined,
                        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)
     made.policies['json.dumps_kwargs'] = {'allow_nan': False}
-    made.filters |= {'yaml': _yaml, 'single': _single, 'literal': literal,
+    made.filters |= {'yaml': _yaml, 'single': _single, 'literal': literal, 'signed': signed,
+                     'horner': horner,
                      'lines': lambda lines, mark: '\n'.join(
                          f'{mark} {line}'.rstrip() for line in lines),
                      'flat': lambda rows: np.ravel(rows).tolist(),
@@ -396,3 +397,17 @@ def literal(value: Any) -> str:
         return f'{{{", ".join(map(literal, value))}}}'
     text = str(np.float32(value))
     return f'{text}f' if set('.e') & set(text) else f'{text}.0f'
+
+
+def signed(value: float) -> str:
+    """Return a literal, in brackets if it is negative."""
+    return f'({literal(value)})' if value < 0 else literal(value)
+
+
+def horner(polynomial: Sequence[float]) -> str:
+    """Return the C expression of a polynomial in s, in brackets if it has more than one part."""
+    kept = np.trim_zeros(np.array(polynomial), 'b')
+    text = signed(kept[-1]) if len(kept) else '0.0f'
+    for value in kept[-2::-1]:
+        text = f'({signed(value)} + s * {text})' if value else f's * {text}'
+    return text
