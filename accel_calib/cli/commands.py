@@ -68,8 +68,7 @@ def command_line(name: str, args: argparse.Namespace, **changed: object) -> str:
     """Return the line of a command with the options of another one, where it has them."""
     made = Parser(add_help=False)
     COMMANDS[name].add_to(made)
-    values = (
-        *vars(args), *changed)
+    values = {**vars(args), **changed}
     words = ['accel-calib', name]
     for action in made._actions:
         value = values.get(action.dest)
@@ -188,8 +187,8 @@ COMMANDS = {
         'find the still stretches of a recording and write the pose table', 'recordings',
         'recording.mcap -o poses.csv', (
             source('recording', any_log()),
-            option('-o', '--output', metavar='FILE', help='pose table to write; - for standard output',
-                   **_OUTPUT),
+            option('-o', '--output', metavar='FILE', help='pose table to write; - for standard '
+                   'output', **_OUTPUT),
             *CAPTURE, *LOG, *shared('--json')), writes='table'),
     'fit': Command(
         'fit a calibration to still poses', 'fit', 'poses.csv -o calibration.yaml --flat 1', (

@@ -201,25 +201,6 @@ def single(values: Floats) -> Floats:
     return np.asarray(np.asarray(values, np.float32), float)
 
 
-def affine_fit(calibration: Calibration) -> tuple[Floats, Floats]:
-    """
-    Return M (3, 3) and c (3,) with levelled force = M reading - c [g].
-
-    For a model of offset and gain they are exact; for others they are the least-squares fit over
-    the sphere and the range of the temperature.
-
-    """
-    if all(effect.linear for effect in calibration.model.terms.effects):
-        matrix = np.linalg.inv(calibration.model.linear_part[0]) / calibration.units.per_g
-        offset = matrix @ calibration.offset
-    else:
-        grid, scale = steady_grid(calibration), calibration.units.per_g
-        columns = np.column_stack([grid.reading / scale, np.ones(len(grid.reading))])
-        found = np.linalg.lstsq(columns, grid.force, rcond=None)[0]
-        matrix, offset = found[:3].T / scale, -found[3]
-    return calibration.rotation.T @ matrix, calibration.rotation.T @ offset
-
-
 # The losses
 
 
