@@ -18,12 +18,13 @@ import os
 from pathlib import Path
 import sys
 from tempfile import TemporaryDirectory
+from unittest.mock import patch
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 
 from accel_calib.geometry import ATTITUDES, spread_directions, unit  # noqa: E402
-from accel_calib.session import conditions  # noqa: E402
+from accel_calib.session import COMMANDS, conditions  # noqa: E402
 from driven import Driver, GRAVITY, Person  # noqa: E402
 from figures import machine, markdown, parser, publish  # noqa: E402
 import numpy as np  # noqa: E402
@@ -80,10 +81,11 @@ def run(case: persons.Case, rng: np.random.Generator) -> tuple[bool, float, floa
         case.change(driver)
         person = Person(driver, case.sensor, **case.about)
         person._rng = rng
-        ended = person.follow(seconds=400.0 if case.ends in ('done', 'fit') else 40.0)
+        with patch.dict(COMMANDS, dict.fromkeys(case.refuses, persons.refused)):
+            ended = person.follow(seconds=400.0 if case.ends in ('done', 'fit') else 40.0)
         seconds = person.times[person.steps.index(ended)]
         named = not case.named or case.named in [
-            each.name for each in conditions(driver.session.state)]
+            each.kind for each in conditions(driver.session.state)]
         held = np.nan
         if driver.calibration is not None:
             reach = case.about.get('can_reach', lambda up: True)

@@ -32,7 +32,8 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')  # each process has one core
 
-from accel_calib.refinement import PlannedPose, refine, Refinement, Step  # noqa: E402
+from accel_calib.calibration import PlannedPose  # noqa: E402
+from accel_calib.refinement import refine, Refinement, Step  # noqa: E402
 from accel_calib.units import units_of  # noqa: E402
 from figures import Line, parser, publish, table  # noqa: E402
 from generator import Around, basis_of, plain_reading, Setup, simulate, Simulated  # noqa: E402

@@ -31,8 +31,8 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / 'test'), str(ROOT / 'docs')]
 os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')  # each process has one core
 
-from accel_calib.calibration import fit_poses, in_g, with_history  # noqa: E402
-from accel_calib.effects import EFFECTS, factors_of  # noqa: E402
+from accel_calib.calibration import fit_poses, in_g  # noqa: E402
+from accel_calib.effects import add_history, EFFECTS, factors_of  # noqa: E402
 from accel_calib.estimate import judge  # noqa: E402
 from accel_calib.refinement.linear import orthonormal, SEEN  # noqa: E402
 from accel_calib.refinement.state import candidates  # noqa: E402
@@ -155,7 +155,7 @@ def library(poses: Poses, fresh: Poses) -> Library:
     """Return the equations of poses and of others near model 10 of the first ones."""
     units = units_of('m/s2')
     model = fit_poses(poses, units, model='10').model
-    tables = [with_history(in_g(each, units), model) for each in (poses, fresh)]
+    tables = [add_history(in_g(each, units), model) for each in (poses, fresh)]
     tried = [*candidates(_CATALOGUE, tables[0])]
     sides = []
     for table in tables:

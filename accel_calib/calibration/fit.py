@@ -30,10 +30,11 @@ import numpy as np
 import scipy
 
 from .calibration import Calibration, ORIENTED, Rejected
+from .directions import (
+    determines, dilution, directions_of, free_parameters, LARGEST_DILUTION, NORM_MODELS,
+    poses_needed)
 from .mounting import wiring
-from .pose_planning import (
-    determines, dilution, free_parameters, LARGEST_DILUTION, NORM_MODELS, poses_needed,
-    refuse_if_unfit, unseen, WEAK_DILUTION)
+from .planning import find_undetermined, refuse_if_unfit
 from .quality import finished, fit_findings, in_g, LARGEST_OFFSET_G, record_of, rival_findings
 from ..effects import EFFECTS, length_rows, linear_model, Model, MODELS, sensor_force, with_vector
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
@@ -201,19 +202,6 @@ def sure_rows(poses: Poses) -> tuple[Poses, tuple[Rejected, ...]]:
         for row in poses.row[doubtful])
 
 
-def directions_of(poses: Poses, units: Units) -> Floats:
-    """
-    Return approximate directions of up before a fit, (n, 3) unit vectors in the sensor axes.
-
-    They start from the centre of the readings if the poses determine it, or the unit is native.
-
-    """
-    raw = unit(poses.reading)
-    if not units.is_native and dilution('4', raw) > WEAK_DILUTION:
-        return raw
-    return unit(poses.reading - fit_sphere(poses.reading)[1])
-
-
 def fit_unknown(poses: Poses, units: Units, model: str, method: Method) -> Calibration:
     """Fit poses of unknown orientation; parameters and errors as in `fit_poses`."""
     return _by_norm(poses, units, model, method)[0]
@@ -252,12 +240,14 @@ def _by_norm(poses: Poses, units: Units, model: str, method: Method) -> tuple[Ca
     fit, out = fits[name], first[~inside[first]]
     unlike = rivals(fit, kept, out, poses_g, lambda others: _estimated(name, others))
     fit = stated(fit)
+    noted = [*copies(original, poses_g), *rival_findings(unlike, poses_g.row),
+             *fit_findings(fit, dilutions[name])]
+    if model == 'auto':
+        noted += find_undetermined(list(dilutions)[-1], used, noise)
     return record_of(
         fit, poses, units, used, name, method, covariance=covariance_with(fit, unlike),
         rejected=rejected_by(fit.model, poses_g.take(~inside[original])), reason=reason,
-        noted=(*copies(original, poses_g), *rival_findings(unlike, poses_g.row),
-               *fit_findings(fit, dilutions[name]),
-               *(unseen(list(dilutions)[-1], used, noise) if model == 'auto' else ()))), fit
+        noted=tuple(noted)), fit
 
 
 def copies(original: Indices, poses: Poses) -> Iterator[Finding]:

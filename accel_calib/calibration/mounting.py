@@ -49,9 +49,9 @@ from typing import Any
 import numpy as np
 import scipy
 
-from .calibration import Calibration, with_history
+from .calibration import Calibration
 from .quality import in_g
-from ..effects import AXES, Context, Model, sensor_force
+from ..effects import add_history, AXES, Context, Model, sensor_force
 from ..errors import InputError
 from ..estimate import fit_12
 from ..finding import Finding, Level, without
@@ -238,7 +238,7 @@ def _pose_in(poses: Poses, row: int, calibration: Calibration) -> tuple[Floats, 
     if not 1 <= row <= len(poses):
         raise InputError(f'row {row} is not in the table, expected 1 to {len(poses)}',
                          'correct the row number')
-    known = with_history(in_g(poses, calibration.units), calibration.model)
+    known = add_history(in_g(poses, calibration.units), calibration.model)
     return poses.reading[row - 1], known.take(slice(row - 1, row)).columns
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .calibration import Calibration, of_samples, thermal_stream
-from ..effects import Context, entry_of, variable_of
+from .calibration import Calibration
+from ..effects import Context, context_of_samples, entry_of, thermal_stream, variable_of
 from ..statistics import over_axes
 from ..table import column_of
 from ..text import counted
@@ -86,9 +86,9 @@ class SampleContext:
         self.lacking = ''
 
     def of(self, known: Context, count: int) -> Context:
-        """Return the context of the next block as `of_samples` does."""
+        """Return the context of the next block as `context_of_samples` does."""
         model = self._calibration.model
-        context = of_samples(known, count, model, self._thermal)
+        context = context_of_samples(known, count, model, self._thermal)
         self.lacking = ''
         if lacking := [key for key in model.neutral if key not in known]:
             names = [str(each) for each in model.effects if {*entry_of(each).needs} & {*lacking}]

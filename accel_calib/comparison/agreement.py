@@ -53,8 +53,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from ..calibration import Calibration, fit_unknown, in_g, NORM_MODELS, with_history
-from ..effects import Context, Model, reading_of
+from ..calibration import Calibration, fit_unknown, in_g, NORM_MODELS
+from ..effects import add_history, Context, Model, reading_of
 from ..errors import InputError, RefusedFitError
 from ..estimate import judge, scatter_of
 from ..table import Floats
@@ -222,7 +222,7 @@ def _scale(pool: Sequence[Repeatability]) -> tuple[float, float]:
 def repeatability_of(calibration: Calibration) -> Repeatability:
     """Return how well the poses of a calibration repeat."""
     model = Model(calibration.model.values)
-    poses_g = with_history(in_g(calibration.poses, calibration.units), model)
+    poses_g = add_history(in_g(calibration.poses, calibration.units), model)
     poses_g = poses_g.take(np.isin(poses_g.row, calibration.used_poses.row))
     if not calibration.form.known_orientation:
         poses_g = poses_g.without_columns('reference')

@@ -153,6 +153,18 @@ def kind_of(effect: EffectKey) -> str:
     return effect if isinstance(effect, str) else effect.kind
 
 
+def unchanged(effect: EffectKey) -> EffectKey:
+    """Return an effect, for a change the effect that has changed."""
+    return entry_of(effect).base or effect
+
+
+def shown_name(effect: EffectKey) -> str:
+    """Return the name of an effect among rivals; a covariate keeps its quantity."""
+    if isinstance(effect, Covariate):
+        return str(replace(effect, power=1))
+    return kind_of(unchanged(effect))
+
+
 def variable_of(effect: EffectKey) -> str:
     """Return the variable of a curve or a covariate; empty for others."""
     return effect.variable if isinstance(effect, EmpiricalCurve | Covariate) else ''

@@ -22,9 +22,10 @@ from numpy.typing import NDArray
 import scipy
 
 from .linear import Block, LEAST_OWN, Linear, orthonormal, outside_of
-from ..calibration import determines, NORM_MODELS, with_history
+from ..calibration import determines, NORM_MODELS
 from ..effects import (
-    Context, Effect, EffectKey, entry_of, factors_of, included, kind_of, linear_model, Model)
+    add_history, Context, Effect, EffectKey, entry_of, factors_of, included, kind_of, linear_model,
+    Model)
 from ..estimate import estimate, Fit, kinds, left_out, NotConvergedError
 from ..geometry import unit
 from ..statistics import rms
@@ -260,7 +261,7 @@ def is_noise(rss: float, dof: float) -> bool:
 
 def beginning(poses_g: Poses, model: Model) -> State:
     """Return the state of a base model, fitted to all poses; `NotConvergedError` if that fails."""
-    return State(estimate(model, with_history(poses_g, model)))
+    return State(estimate(model, add_history(poses_g, model)))
 
 
 def fitted_state(model: Model, poses_g: Poses, most: float = np.inf) -> State | None:

@@ -18,7 +18,6 @@ succeeds on a slow machine.
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from itertools import takewhile
 import json
 import os
@@ -148,7 +147,9 @@ class User(Node):
         self._messages: dict[str, dict[int, tuple[float, float, float]]] = {
             name: {} for name in _KINDS}
         self.create_subscription(MarkerArray, 'calibrator/poses', self._on_poses, LATCHED)
-        self.create_subscription(Temperature, 'temperature', self._on_temperature, SENSOR)
+        self.create_subscription(
+            Temperature, 'temperature',
+            lambda message: setattr(self, '_temperature', message.temperature), SENSOR)
         for name, topic, kind in (('raw', 'imu/data_raw', Imu),
                                   ('corrected', 'imu/data_calibrated', Imu),
                                   ('truth', 'simulator/truth', Vector3Stamped)):
@@ -159,9 +160,6 @@ class User(Node):
     def _on_poses(self, markers: MarkerArray) -> None:
         at = [marker.pose.position for marker in markers.markers if marker.ns == 'poses']
         self._poses = np.array([[point.x, point.y, point.z] for point in at]).reshape(-1, 3)
-
-    def _on_temperature(self, message: Temperature) -> None:
-        self._temperature = message.temperature
 
     def _keeper(self, name: str) -> Callable[[Any], None]:
         kept = self._messages[name]
@@ -193,9 +191,6 @@ class User(Node):
         up = self._rest('raw').sum(axis=(0, 1))
         return bool(np.any(self._poses @ up > _SAME_POSE * np.linalg.norm(up)))
 
-    def _has_rested(self, count: int, *names: str) -> bool:
-        return len(self._rest(*names)) >= count
-
     def turn(self, service: str = 'next') -> None:
         """Turn the sensor, and wait until it rests."""
         self._spin(lambda: bool(self._up), 'a message of the simulator')
@@ -204,7 +199,7 @@ class User(Node):
         for kept in self._messages.values():
             kept.clear()
         self._spin(lambda: self._up not in ((), before)
-                   and self._has_rested(_SETTLED, 'truth'), 'rest of the simulated sensor')
+                   and len(self._rest('truth')) >= _SETTLED, 'rest of the simulated sensor')
 
     def capture(self, count: int) -> None:
         """Let the calibrator capture this number of poses."""
@@ -220,7 +215,7 @@ class User(Node):
         rests = []
         for done in range(1, count + 1):
             self.turn()
-            self._spin(lambda: self._has_rested(_SAMPLES, *_KINDS) and self._has_captured(),
+            self._spin(lambda: len(self._rest(*_KINDS)) >= _SAMPLES and self._has_captured(),
                        f'rest {done}')
             rests.append(dict(zip(_KINDS, self._rest(*_KINDS).mean(axis=0))))
             error = np.linalg.norm(rests[-1]['corrected'] - rests[-1]['truth']) * MG
@@ -231,26 +226,27 @@ class User(Node):
     def level(self) -> str:
         """Put the robot flat, and call ``~/set_level`` as soon as the rest is long enough."""
         self.turn('flat')
-        for count in range(_SETTLED, _LONGEST_REST, _SETTLED):
-            self._spin(partial(self._has_rested, count, 'raw'), 'a longer rest')
-            answer = self._request('calibrator/set_level')
-            if answer.success:
-                return str(answer.message)
-        raise _refused('calibrator/set_level', answer)
+        count = _SETTLED
+        while True:
+            self._spin(lambda count=count: len(self._rest('raw')) >= count, 'a longer rest')
+            try:
+                return self.call('calibrator/set_level')
+            except AccelCalibError:
+                count += _SETTLED
+                if count >= _LONGEST_REST:
+                    raise
 
     def call(self, service: str) -> str:
         """Call a service, and return its answer; AccelCalibError if it fails."""
-        answer = self._request(service)
-        if not answer.success:
-            raise _refused(service, answer)
-        return str(answer.message)
-
-    def _request(self, service: str) -> Trigger.Response:
         client = self._triggers[service]
         self._spin(client.service_is_ready, f'the service {service}')
         future = client.call_async(Trigger.Request())
         self._spin(future.done, f'the answer of {service}')
-        return future.result()
+        answer = future.result()
+        if not answer.success:
+            raise AccelCalibError(f'{service} answered: {answer.message}',
+                                  'run the demonstration again')
+        return str(answer.message)
 
     def _spin(self, until: Callable[[], bool], what: str) -> None:
         """Spin until a condition is true; the text names the condition in errors."""
@@ -269,10 +265,6 @@ class User(Node):
         """Leave DDS."""
         self._executor.shutdown()
         self.destroy_node()
-
-
-def _refused(service: str, answer: Trigger.Response) -> AccelCalibError:
-    return AccelCalibError(f'{service} answered: {answer.message}', 'run the demonstration again')
 
 
 def demonstrate(report: Callable[[str], None], hidden: str = '') -> Outcome:
@@ -298,21 +290,16 @@ def demonstrate(report: Callable[[str], None], hidden: str = '') -> Outcome:
         raw, calibrated = (_errors(rests, name) for name in ('raw', 'corrected'))
         if not hidden:
             return Outcome(len(rests), raw, calibrated, time.monotonic() - began)
-        found, lag_s = _refined(demo, report, folder / 'accel_calib' / 'demo.yaml')
+        stored = folder / 'accel_calib' / 'demo.yaml'
+        fitted = read_calibration(stored).model
+        report(f'~/refine: {demo.call("calibrator/refine")}')
+        report(f'~/set_level: {demo.level()}')
+        refined = read_calibration(stored).model
+        lag = refined.lags.get('temperature_of_offset')
         again = _errors(demo.measure(_CHECKED_HIDDEN), 'corrected')
-        return Outcome(len(rests), calibrated, again, time.monotonic() - began,
-                       parse_effect(hidden)[0], found, lag_s)
-
-
-def _refined(demo: User, report: Callable[[str], None], stored: Path
-             ) -> tuple[tuple[str, ...], float]:
-    """Refine and level; return the effects that are new in the stored model, and their lag [s]."""
-    fitted = read_calibration(stored).model
-    report(f'~/refine: {demo.call("calibrator/refine")}')
-    report(f'~/set_level: {demo.level()}')
-    refined = read_calibration(stored).model
-    lag = refined.lags.get('temperature_of_offset')
-    return (tuple(str(name) for name in refined.effects if name not in fitted.effects),
+        return Outcome(
+            len(rests), calibrated, again, time.monotonic() - began, parse_effect(hidden)[0],
+            tuple(str(name) for name in refined.effects if name not in fitted.effects),
             0.0 if lag is None else lag.seconds)
 
 

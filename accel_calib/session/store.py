@@ -15,6 +15,8 @@ It is held until it is released or the process ends.
 
 """
 
+from __future__ import annotations
+
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 import errno
@@ -29,7 +31,6 @@ import stat
 
 import numpy as np
 
-from .settings import CalibratorSettings
 from ..calibration import Calibration, check_sensor
 from ..disk import check_regular, copy_atomically, remove_leftovers, write_atomically
 from ..effects import OwnEffect
@@ -39,7 +40,6 @@ from ..errors import (
 from ..logs import read_poses, write_table
 from ..stored import calibration_bytes, read_calibration
 from ..table import LARGEST, Poses
-from ..text import LONGEST_NAME, one_line
 from ..units import UnitName
 
 _UNSAFE = re.compile(r'[^A-Za-z0-9_-]+')
@@ -364,61 +364,46 @@ def lock(store: Store) -> ExitStack:
         return held.pop_all()
 
 
+@dataclass(frozen=True)
 class SensorFiles:
-    """The store of a sensor, None until the sensor is known; and why it cannot be used, or ''."""
+    """
+    The store of a sensor, None until the sensor is known, and its `lock`, None without it.
 
-    def __init__(self, settings: CalibratorSettings, topic: str, own: tuple[OwnEffect, ...]
-                 ) -> None:
-        self._settings, self._topic, self._own = settings, topic, own
-        self._lock: ExitStack | None = None
-        self.store: Store | None = None
-        self.problem = ''
+    `problem` is why another node has the lock; empty if none has it.
+
+    """
+
+    store: Store | None = None
+    lock: ExitStack | None = None
+    problem: str = ''
 
     @property
     def path(self) -> str:
         """Path of the calibration; empty until the sensor is known."""
         return '' if self.store is None else str(self.store.calibration)
 
-    @property
-    def locked(self) -> bool:
-        """Whether this node has locked the files."""
-        return self._lock is not None
-
-    def take(self, sensor: str) -> Store | None:
-        """Lock the files of a sensor and return the store; None if another node uses them."""
-        identity = Identity(one_line(sensor).strip()[:LONGEST_NAME], self._topic,
-                            bool(self._settings.sensor))
-        before, self.store = self.store, store_of(self._settings.calibration_file, identity,
-                                                  self._settings.units, self._own)
-        if before is None or before.calibration != self.store.calibration:
-            self.release()
-        return self.store if self.locked else self.try_again()
-
-    def try_again(self) -> Store | None:
-        """Lock the files if they have become free; return the store, or otherwise None."""
-        if self.store is None or self.locked:
-            return None
+    def take(self) -> SensorFiles:
+        """Return the files, locked unless another node uses them."""
+        if self.store is None or self.lock is not None:
+            return self
         try:
-            self._lock, self.problem = lock(self.store), ''
+            return replace(self, lock=lock(self.store), problem='')
         except StoreInUseError as error:
-            self.problem = str(error)
-            return None
-        return self.store
+            return replace(self, problem=str(error))
 
     def usable(self) -> Store:
         """Return the locked store; InputError if the sensor is not known, or it is not locked."""
         if self.store is None:
             raise InputError('the name of the sensor is not known, because there is no Imu '
                              'message yet', 'start the driver, or set the parameter sensor')
-        if not self.locked:
+        if self.lock is None:
             raise InputError(self.problem, 'this node stores nothing')
         return self.store
 
     def release(self) -> None:
         """Unlock the files."""
-        if self._lock is not None:
-            self._lock.close()
-        self._lock = None
+        if self.lock is not None:
+            self.lock.close()
 
 
 def tidied(store: Store) -> list[str]:

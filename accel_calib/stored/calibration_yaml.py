@@ -27,10 +27,10 @@ from .plain_yaml import (
 from .. import __version__
 from ..calibration import (
     Calibration, FleetPrior, gated, GyroBias, in_g, LARGEST_OFFSET_G, mounting_figures, Quality,
-    Rejected, RejectedKind, SampleNoise, STORED_METHODS, with_history)
+    Rejected, RejectedKind, SampleNoise, STORED_METHODS)
 from ..disk import FIRST_LINE, FORMAT, write_atomically
 from ..effects import (
-    CHANGES, effect_named, EffectKey, entry_of, factors_of, Model, MODELS, OwnEffect,
+    add_history, CHANGES, effect_named, EffectKey, entry_of, factors_of, Model, MODELS, OwnEffect,
     parameter_names, PROCESSES)
 from ..errors import (
     AccelCalibError, DamagedCalibrationError, InputError, OwnEffectError, RefusedFitError,
@@ -146,7 +146,7 @@ def _content(calibration: Calibration) -> dict[str, Any]:
 def _own_rms(calibration: Calibration, own: EffectKey) -> float:
     """Return the RMS over the poses of what the values of an own effect are multiplied by."""
     shape = entry_of(own).split(calibration.model.values[own])[1]
-    poses_g = with_history(in_g(calibration.poses, calibration.units), calibration.model)
+    poses_g = add_history(in_g(calibration.poses, calibration.units), calibration.model)
     return rms(factors_of(own, [shape], poses_g.columns))
 
 

@@ -34,11 +34,13 @@ from .. import __version__
 from ..calibration import Calibration
 from ..disk import write_atomically
 from ..errors import InputError
+from ..findings import plan_lines
+from ..geometry import attitude_words
 from ..text import one_line
 from ..units import STANDARD_GRAVITY
 
 if TYPE_CHECKING:
-    from ..refinement import PosePlan
+    from ..calibration import PosePlan
 
 __all__ = ['CALIBRATION_ALONE', 'FORMATS', 'Exported', 'Format', 'Loss', 'Noise', 'Options',
            'export', 'identifier', 'read_noise', 'write_plan']
@@ -279,7 +281,7 @@ def write_plan(path: Path, plan: PosePlan) -> None:
     columns = {**{key: (key, 1.0) for pose in plan.poses for key in pose.context}, **_CONTEXT}
 
     def write(file: TextIO) -> None:
-        file.writelines(f'# {one_line(line)}\n' for line in plan.lines)
+        file.writelines(f'# {one_line(line)}\n' for line in plan_lines(plan))
         writer = csv.writer(file, lineterminator='\n')
         writer.writerow(['pose', 'up_x', 'up_y', 'up_z', 'attitude',
                          *(name for name, _ in columns.values()), 'separates',
@@ -287,7 +289,8 @@ def write_plan(path: Path, plan: PosePlan) -> None:
         for number, pose in enumerate(plan.poses, 1):
             context = [format(pose.context[key] * scale, '.6g') if key in pose.context else ''
                        for key, (_, scale) in columns.items()]
-            writer.writerow([number, *(f'{part:.6f}' for part in pose.up), pose.words, *context,
+            writer.writerow([number, *(f'{part:.6f}' for part in pose.up),
+                             attitude_words(np.array(pose.up)), *context,
                              ' / '.join(map(str, pose.separates)), f'{pose.expected:.4f}'])
 
     write_atomically(path, write)

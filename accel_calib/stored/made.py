@@ -23,9 +23,9 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from ..calibration import Calibration, in_g, uncertainty_g, with_history
+from ..calibration import Calibration, in_g, uncertainty_g
 from ..effects import (
-    AtContext, Context, EffectKey, entry_of, formula_of, Model, NOMINAL_SUPPLY,
+    add_history, AtContext, Context, EffectKey, entry_of, formula_of, Model, NOMINAL_SUPPLY,
     REFERENCE_TEMPERATURE)
 from ..geometry import angle_of, OVER_THE_SPHERE, spread_directions
 from ..table import Floats, range_of
@@ -285,7 +285,7 @@ def _full_grid(calibration: Calibration) -> Grid:
     model = calibration.model
     if not set(model.needs) - {'temperature'}:
         return steady_grid(calibration)
-    poses = with_history(in_g(calibration.poses, calibration.units), model)
+    poses = add_history(in_g(calibration.poses, calibration.units), model)
     known = calibration.held_context(poses.columns)
     rows = np.flatnonzero(np.isin(calibration.poses.row, calibration.used_poses.row))
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, 60).astype(int))]
