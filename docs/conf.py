@@ -86,20 +86,31 @@ def escape_bars(app: Any, kind: str, name: str, obj: Any, options: Any, lines: l
     lines[:] = [re.sub(r'\|(\w+)\|', r'\\|\1\\|', line) for line in lines]
 
 
-def name_cells(app: Any, tree: nodes.document, page: str) -> None:
-    """Repeat the head of its column in each cell: narrow screens show rows one below the other."""
+def prepare_tables(app: Any, tree: nodes.document, page: str) -> None:
+    """
+    Make tables fit narrow screens, which show the cells of a row one below the other.
+
+    Each cell of three or more columns begins with the head of its column, which wide screens hide.
+    Words that no column holds may break after a sign.
+
+    """
     for table in tree.findall(nodes.tgroup):
-        heads = [entry.astext() for head in table.findall(nodes.thead)
-                 for entry in head.findall(nodes.entry)]
-        for row in [row for body in table.findall(nodes.tbody) for row in body.findall(nodes.row)]:
-            for head, entry in list(zip(heads, row.children))[1:]:
-                if head and len(heads) > 2 and entry.astext():
-                    entry.children[0].insert(0, nodes.inline('', f'{head}: ', classes=['of-column']))
+        heads, body = ([*part.findall(nodes.row)] for part in table.children[-2:])
+        for row in body if heads else ():
+            for head, entry in zip(heads[0].children[1:], row.children[1:]):
+                if len(row.children) > 2 and head.astext() and entry.astext():
+                    label = nodes.inline('', f'{head.astext()}: ', classes=['of-column'])
+                    entry.children[0].insert(0, label)
+        for text in [*table.findall(nodes.Text)]:
+            parted = re.sub(r'\S{40,}', lambda word: re.sub(
+                r'(?<=[,=_/*@])', '\N{ZERO WIDTH SPACE}', word[0]), text)
+            if not isinstance(text.parent, nodes.literal):
+                text.parent.replace(text, nodes.Text(parted))
 
 
 def setup(app: Any) -> None:
     """Connect the functions of this file."""
-    app.connect('doctree-resolved', name_cells)
+    app.connect('doctree-resolved', prepare_tables)
     app.connect('autodoc-process-docstring', escape_bars)
     app.connect('source-read', insert_tables)
     app.connect('source-read', link_to_repository)

@@ -92,6 +92,12 @@ def test_links_lead_somewhere(page):
             assert anchor[1:] in anchors_of(target), anchor
 
 
+@pytest.mark.parametrize('page', OWN_PAGES)
+def test_named_files_exist(page):
+    for path in re.findall(r'`((?:\w+/)+\w+\.(?:py|xml))`', text_of(page)):
+        assert (ROOT / path).exists() or (ROOT / 'accel_calib' / path).exists(), path
+
+
 def anchors_of(path):
     """Return the anchors that GitHub makes of the headings of a page."""
     headings = re.findall(r'^#+ (.+)$', path.read_text(encoding='utf-8'), re.MULTILINE)
