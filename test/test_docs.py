@@ -7,6 +7,7 @@ import ast
 from dataclasses import fields
 import importlib
 import inspect
+from pydoc import locate
 import re
 import shlex
 from xml.etree import ElementTree
@@ -69,6 +70,16 @@ def test_api_reference_has_all_public_names_and_their_docstrings_every_parameter
             for each in head.split(',')]
         assert listed == list(inspect.signature(getattr(ac, name)).parameters), name
         assert {'Returns', 'Raises'} <= set(sections), name
+
+
+def test_api_reference_names_records_where_they_are():
+    module = ''
+    page = text_of('docs/api.md')
+    for kind, name in re.findall(r'^\.\. (currentmodule|autoclass):: (\S+)$', page, re.M):
+        if kind == 'currentmodule':
+            module = name
+        else:
+            assert locate(f'{module}.{name}') or locate(name), name
 
 
 @pytest.mark.parametrize('page', OWN_PAGES)
