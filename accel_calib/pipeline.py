@@ -29,7 +29,7 @@ from .calibration import (
 from .effects import Context, LADDER, Model, OwnEffect, PROCESSES
 from .errors import InputError, RefusedFitError, saying
 from .finding import explained_by, Finding
-from .findings import rate, Rating
+from .findings import outside_line, rate, Rating
 from .logs import Frame, LogOptions, open_log, OpenLog, Piped, Progress
 from .stillness import (
     account_of, capture, Captured, CaptureSettings, cells_of, check_measured, is_one_direction,
@@ -276,8 +276,8 @@ class Plan:
         values, and the search for effects starts from it. Without a `flat` pose, its levelled
         frame and its mounting are kept.
     partial : bool
-        Fit poses that are all near one direction, or in a plane, with typical values of
-        sensors, unless `before` is a full fit.
+        Fit poses that are all near one direction, too, with typical values of sensors, unless
+        `before` is a full fit. Poses in a plane are always fitted so by ``auto``.
 
     """
 
@@ -365,10 +365,12 @@ def _fit(poses: Poses, units: Units, plan: Plan, date: str) -> Calibration:
     if before is not None and is_refined(before):
         from .refinement import refitted
         return refitted(before, poses, sensor=plan.sensor, date=date)
-    if (plan.partial and (before is None or is_partial(before)) and not units.is_native
+    if ((before is None or is_partial(before)) and not units.is_native
             and len(poses) >= FEWEST_IN_CONE):
         up = directions_of(poses, units)
-        if lies_in_cone(up) or lies_in_plane(up):
+        in_plane = (plan.model, plan.method) == ('auto', 'ml') and 'reference' not in poses and (
+            lies_in_plane(up))
+        if in_plane or (plan.partial and lies_in_cone(up)):
             return fit_partial(poses, units, sensor=plan.sensor, date=date)
     return fit_poses(poses, units, model=plan.model, method=plan.method, sensor=plan.sensor,
                      date=date)
@@ -558,4 +560,4 @@ class Correction:
     def notes(self) -> list[str]:
         """Return what the samples lack, and what left the range of the calibration, so far."""
         return [*filter(None, [self._context.lacking]),
-                *(each.line for each in self._context.left)]
+                *map(outside_line, self._context.left)]

@@ -18,13 +18,12 @@ import os
 from pathlib import Path
 
 from accel_calib.api import in_units_of
-from accel_calib.calibration import (
-    Calibration, determines, mounting_figures, posterior, refuse_if_unfit, sound_rows)
+from accel_calib.calibration import Calibration, determines, posterior, refuse_if_unfit, sound_rows
+from accel_calib.calibration.directions import poses_needed, rows_of, shape_words
 from accel_calib.calibration.mounting import (
     axes_of, doubts_about_flat, fault_of, mounting, with_heading, with_heading_of)
 from accel_calib.calibration.partial import common_sensors, without_knocked
-from accel_calib.calibration.pose_planning import (
-    missing_poses, poses_needed, rows_of, shape_words, unseen)
+from accel_calib.calibration.planning import choose_levels, find_undetermined, missing_poses
 from accel_calib.cli.commands import COMMANDS, HIDDEN as DEMO_CHOICES, parser
 from accel_calib.cli.main import main
 from accel_calib.cli.nodes import changes, screen, state
@@ -43,6 +42,7 @@ from accel_calib.estimate import believable, kinds, originals, unseen_mistakes
 from accel_calib.estimate.closed_form import agreeing
 from accel_calib.estimate.equations import equations, measured
 from accel_calib.estimate.outliers import _look_alikes as look_alikes
+from accel_calib.findings import mounting_figures
 from accel_calib.findings.figures import number
 from accel_calib.fleet.overview import (
     digest, digest_of, estimated, Months, not_agreeing, odd_sensors, overview, priors_of,
@@ -59,7 +59,7 @@ from accel_calib.live import sources
 from accel_calib.live.sources import _interval as interval_of_lines, is_port, open_source, Source
 from accel_calib.logs import bag_samples, child, layout_with, LogOptions, open_bag, open_log, text
 from accel_calib.logs.flight import read_dataflash, read_ulg
-from accel_calib.logs.names import format_named, meaning, NAMES as LOG_FORMATS, unit_of
+from accel_calib.logs.names import format_named, meaning, NAMES as LOG_FORMATS
 from accel_calib.logs.quantities import are_samples
 from accel_calib.logs.serialized import frame_ids, stamps_of
 from accel_calib.messages.one_reading import OneReading
@@ -76,15 +76,14 @@ from accel_calib.refinement.curves import (
     Process, process_of, SIGNIFICANT, Walk, walk_beside)
 from accel_calib.refinement.linear import (
     _RARE as RARE, Block, LEVEL as REFINE_LEVEL, Linear, outside_of, Set, with_outliers)
-from accel_calib.refinement.plan import _levels as levels_of, NOTHING as NOTHING_TO_PLAN
 from accel_calib.refinement.search import (
     _is_better as is_better_than_walk, _less as less, search as search_effects)
 from accel_calib.refinement.state import beginning, candidates, fitted_state, linearised, WORTH
-from accel_calib.refinement.steps import advice_for
-from accel_calib.report.page import axis_figures, snippets
+from accel_calib.refinement.steps import remarks_on
+from accel_calib.report.page import axis_figures
 from accel_calib.report.refinement import all_drawings, curve_parts
 from accel_calib.report.residuals import residuals_of, residuals_of_refinement
-from accel_calib.report.sheet import sheet
+from accel_calib.report.sheet import page as page_of
 from accel_calib.report.stability import comparison_page, history_page
 from accel_calib.ros.run import own_domain
 from accel_calib.session import store as session_store, worker
@@ -92,7 +91,7 @@ from accel_calib.session.commands import poses_changed
 from accel_calib.session.conditions import step_of
 from accel_calib.session.fitting import fit as fit_in_node
 from accel_calib.session.live_capture import LiveCapture, PoseBook, with_temperature
-from accel_calib.session.pose_guide import Guide, Plan, plan_for
+from accel_calib.session.pose_guide import Guide
 from accel_calib.session.sensor import new_sensor, rest_after
 from accel_calib.session.settings import capture_settings, changed, default_of
 from accel_calib.session.state import figures

@@ -22,7 +22,9 @@ from ..calibration import Calibration, NORM_MODELS, outlook
 from ..effects import AXES, entry_of
 from ..errors import InputError
 from ..findings import (
-    calibration_json, curve_json, effect_figures, linear_figures, rate_refinement, refinement_json)
+    base_words, calibration_json, chance_words, curve_json, effect_figures, linear_figures,
+    plan_lines, rate_refinement, refinement_json, request_words, rival_words, value_words,
+    verdict_words)
 from ..pipeline import (
     calibrated, calibrated_log, Intake, Outcome, Plan, ramp_or_poses, RampIntake,
     thermally_calibrated, ThermalOutcome)
@@ -46,7 +48,7 @@ def run_fit(args: argparse.Namespace) -> Done:
                         'read_as': found.read_as, 'read_lines': found.lines},
         shown=_tables(calibration), page=partial(_page, args, args.poses, found, outcome),
         notes=[f'model {calibration.name}: {calibration.reason}',
-               f'next pose: {ahead.next_pose.words}', *found.lines])
+               f'next pose: {request_words(ahead.next_pose)}', *found.lines])
 
 
 def run_calibrate(args: argparse.Namespace) -> Done:
@@ -191,7 +193,6 @@ def _tables(calibration: Calibration) -> Iterator[Any]:
 
 def run_refine(args: argparse.Namespace) -> Done:
     """Refine a calibration, and store it unless it is refused."""
-    from ..refinement import verdict_words
     from ..report import refinement_page
 
     found, result = _refined(args)
@@ -207,7 +208,7 @@ def run_refine(args: argparse.Namespace) -> Done:
     rows, missing = result.disturbed_poses, [name for name, _ in result.not_testable]
     return Done({'file': args.poses, **refinement_json(result), 'read_as': found.read_as},
                 [*([_steps_table(result)] if result.steps else ()),
-                 *(f'plan: {line}' for line in result.plan.lines if args.plan is not None)],
+                 *(f'plan: {line}' for line in plan_lines(result.plan) if args.plan is not None)],
                 rate_refinement(result), stored=stored,
                 page=partial(refinement_page, result, str(args.poses)),
                 refusal=result.refusal if args.output else (),
@@ -254,8 +255,6 @@ def several_refine(results: Sequence[dict[str, Any]]) -> Iterator[str]:
 
 def _steps_table(result: Refinement) -> Table:
     """Return a table of the steps."""
-    from ..refinement import base_words, chance, values_of
-
     table = Table(title=f'From {base_words(result)}: residuals in mg, held out in brackets',
                   show_lines=True)
     table.add_column('effect, and where it was found', overflow='fold')
@@ -265,9 +264,9 @@ def _steps_table(result: Refinement) -> Table:
         gap = (f'{short(step.gap_before_mg)} -> {short(step.gap_after_mg)}\n'
                f'({short(step.held_out_before_mg)} -> {short(step.held_out_after_mg)})')
         lines = [f'{number}. {step.effect}', entry_of(step.name).words,
-                 ', '.join(f'{name} {value}'.lstrip() for name, value in values_of(step)),
-                 step.where, f'rivals: {", ".join(step.likely_rivals) or "none"}']
-        table.add_row('\n'.join(filter(None, lines)), gap, chance(step.p_value))
+                 ', '.join(f'{name} {value}'.lstrip() for name, value in value_words(step)),
+                 step.where, f'rivals: {", ".join(rival_words(step)) or "none"}']
+        table.add_row('\n'.join(filter(None, lines)), gap, chance_words(step.p_value))
     return table
 
 

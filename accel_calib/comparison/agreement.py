@@ -53,8 +53,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from ..calibration import Calibration, fit_unknown, in_g, NORM_MODELS, with_history
-from ..effects import Context, Model, reading_of
+from ..calibration import Calibration, fit_unknown, in_g, NORM_MODELS
+from ..effects import add_history, Context, Model, reading_of
 from ..errors import InputError, RefusedFitError
 from ..estimate import judge, scatter_of
 from ..table import Floats
@@ -128,7 +128,8 @@ def rotation_free(calibration: Calibration, context: Context, per_g: float) -> R
         np.concatenate([vec_v * reading_scale, mat_s[_ENTRIES] * gain_scale, model.vector[own]]),
         np.concatenate([slope_v * reading_scale, slope_s[_ENTRIES] * gain_scale,
                         np.eye(size)[own]]),
-        np.linalg.solve(mat_s, mat_w) @ model.rotation, reading_scale, force_scale)
+        axes=np.linalg.solve(mat_s, mat_w) @ model.rotation, reading_scale=reading_scale,
+        force_scale=force_scale)
 
 
 def _polar(mat_w: Floats, slope_w: Floats) -> tuple[Floats, Floats]:
@@ -222,7 +223,7 @@ def _scale(pool: Sequence[Repeatability]) -> tuple[float, float]:
 def repeatability_of(calibration: Calibration) -> Repeatability:
     """Return how well the poses of a calibration repeat."""
     model = Model(calibration.model.values)
-    poses_g = with_history(in_g(calibration.poses, calibration.units), model)
+    poses_g = add_history(in_g(calibration.poses, calibration.units), model)
     poses_g = poses_g.take(np.isin(poses_g.row, calibration.used_poses.row))
     if not calibration.form.known_orientation:
         poses_g = poses_g.without_columns('reference')
@@ -261,7 +262,7 @@ def comparable(calibrations: Sequence[Calibration]) -> tuple[Comparable, ...]:
         larger = NORM_MODELS[NORM_MODELS.index(run.name) + 1:] if run.name in NORM_MODELS else ()
         if largest in larger and run.model.effects == run.form.effects:
             with suppress(RefusedFitError):  # its poses do not determine the larger model
-                sure = fit_unknown(run.used_poses, run.units, largest, 'ml')
+                sure = fit_unknown(run.used_poses, run.units, largest, 'ml')[0]
         found.append(Comparable(run, sure, repeatability_of(sure)))
     return tuple(found)
 

@@ -26,6 +26,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 import scipy
 
+from .poses import combination_words, plan_lines, request_words
 from ..calibration import (
     Calibration, Curve, deviations_g, directions_in, error_left_in, free_parameters,
     identifiability, next_pose, NextPose, Outlook, PRIOR, Quality, stated_uncertainty,
@@ -42,7 +43,7 @@ from ..text import signed
 from ..units import MG
 
 if TYPE_CHECKING:
-    from ..refinement import Refinement
+    from ..refinement import Refinement, Step
 
 OFFSETS, GAINS, CROSS = NAMES[:3], NAMES[3:6], NAMES[6:]
 
@@ -167,10 +168,10 @@ def calibration_json(calibration: Calibration, ahead: Outlook) -> dict[str, Any]
             'model': seen.model, 'dilution': seen.dilution, 'mean_dilution': seen.mean_dilution,
             'parameters': {name: {'determined': name not in unseen, 'dilution': deviation}
                            for name, deviation in seen.deviations.items()},
-            'undetermined': [{'weights': dict(open_.weights), 'words': open_.words}
+            'undetermined': [{'weights': dict(open_.weights), 'words': combination_words(open_)}
                              for open_ in seen.undetermined]},
         'next_pose': None if asked.direction is None else {
-            'direction': asked.direction, 'words': asked.words}}
+            'direction': asked.direction, 'words': request_words(asked)}}
 
 
 def _known(values: Floats) -> Floats | None:
@@ -182,15 +183,20 @@ def refinement_json(result: Refinement) -> dict[str, Any]:
         'verdict': result.verdict, 'undecided': result.undecided, 'base': result.calibration.name,
         'poses_used': len(result.poses_g), 'noise_floor_mg': result.noise_floor_mg,
         'gap_mg': result.gap_mg,
-        'steps': [{**asdict(step), 'name': str(step.name), 'words': entry_of(step.name).words}
-                  for step in result.steps],
+        'steps': [_step_json(step) for step in result.steps],
         'remaining_gap_mg': result.remaining_gap_mg,
         'disturbed_poses': result.disturbed_poses,
         'not_testable': [{'effect': effect, 'needs': needs}
                          for effect, needs in result.not_testable],
-        'advice': result.advice, 'plan': result.plan.lines,
+        'advice': result.advice, 'plan': plan_lines(result.plan),
         'warnings': result.calibration.warnings,
         'refusal': result.refusal[0] if result.refusal else None}
+
+
+def _step_json(step: Step) -> dict[str, Any]:
+    found = {'where' if key == 'place' else key: value for key, value in asdict(step).items()}
+    return {**found, 'where': step.where, 'name': str(step.name),
+            'words': entry_of(step.name).words}
 
 
 def curve_json(curve: Curve) -> dict[str, Any]:

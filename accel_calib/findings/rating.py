@@ -21,6 +21,7 @@ from .figures import (
     BAD_ERROR, BOUND, CHANGED, COVERED, degrees, depends_on, Expected, FAR_OFF, GOOD_ERROR, HIDDEN,
     LEFT_OUT, MANY_OUT, MATTERS, mg, NEAR_FLAT, number, PER_OUTLIER, SPAN, TILT, TO_CHECK,
     TOO_EXACT, without_noise, WORST_ERROR)
+from .poses import request_words
 from ..calibration import (
     Calibration, directions_in, flat_direction, free_parameters, lies_in_plane, Verification)
 from ..comparison import LEVEL
@@ -255,7 +256,8 @@ def _more_poses(expected: Expected) -> str:
     if asked.direction is None:
         return 'take more poses, and hold the sensor longer in each'
     more = asked.total - len(expected.poses)
-    return f'take {counted(more, "more pose") if more > 0 else "more poses"}: {asked.words}'
+    poses = counted(more, 'more pose') if more > 0 else 'more poses'
+    return f'take {poses}: {request_words(asked)}'
 
 
 def _remedy(expected: Expected, refinement: Refinement | None) -> NextStep:

@@ -44,6 +44,7 @@ from .stream import ContextTopics, Stream
 from ..calibration import NextPose
 from ..errors import AccelCalibError
 from ..finding import LEVELS
+from ..findings import request_words
 from ..live import check_installed
 from ..messages.correction import output_frame
 from ..session import (
@@ -91,7 +92,7 @@ def pose_markers(directions: Floats, asked: NextPose, frame_id: str) -> MarkerAr
         markers.append(_marker('next', 0, Marker.ARROW, _ASKED_FOR, _SHAFT))
         markers[-1].points = [Point(), _point(asked.direction)]
         markers[-1].scale.y = markers[-1].scale.z = 2.0 * _SHAFT
-    markers.append(_marker('next', 1, _TEXT, _WORDS, _LETTER, words_at, text=asked.words))
+    markers.append(_marker('next', 1, _TEXT, _WORDS, _LETTER, words_at, text=request_words(asked)))
     for marker in markers:
         marker.header.frame_id = frame_id
     return MarkerArray(markers=markers)

@@ -27,8 +27,9 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from .declare import declared, STREAM
-from ..calibration import mounting_of, of_samples, thermal_stream
-from ..effects import model_with, parse_effect, predict, turn_between
+from ..calibration import mounting_of
+from ..effects import (
+    context_of_samples, model_with, parse_effect, predict, thermal_stream, turn_between)
 from ..geometry import spread_directions
 from ..session import parameter
 from ..table import Floats, numbered, Recording
@@ -160,7 +161,7 @@ class SimulatedImu:
         known = {'time': time, 'temperature': first + (last - first) * (
             swing if settings.temperature_period else np.interp(time, [0.0, self.duration], [
                 0.0, 1.0]))}
-        context = {**of_samples(known, len(path), self._model, self._thermal),
+        context = {**context_of_samples(known, len(path), self._model, self._thermal),
                    'std': np.full_like(force, noise_g)}
         rng, rotation = self._rng, self._model.rotation
         columns = {

@@ -23,15 +23,15 @@ from . import fitting
 from .conditions import next_words, thermometer_words
 from .core import Holder, State
 from .fitting import change_words, Fitted
-from .pose_guide import plan_for
 from .sensor import gyro_bias_of_rest, Sensor
 from .store import writing_advice
 from .use import adopt, rate, show_poses
 from .worker import Compute, Files, nothing, Parse, Part, Task
 from ..calibration import (
-    angle_words, Calibration, fit_partial, level, mounting_only, set_heading as with_heading)
+    Calibration, fit_partial, level, mounting_only, plan_session, set_heading as with_heading)
 from ..effects import Model
 from ..errors import AccelCalibError, InputError, RefusedFitError, StoredCalibrationError
+from ..findings import angle_words
 from ..pipeline import is_partial
 from ..stillness import Dwell, poses_from
 from ..text import counted, now
@@ -76,7 +76,7 @@ def capture_pose(session: Holder) -> Task:
     if session.state.computing:
         yield Files(nothing)
         return f'{words}; the next pose is on ~/poses after the computation that is running'
-    plan = yield Compute(plan_for, poses, session.state.units, session.state.settings.model)
+    plan = yield Compute(plan_session, poses, session.state.units, session.state.settings.model)
     if session.sensor.live is sensor.live:
         session.change_sensor(guide=session.sensor.guide.choose(plan))
     return f'{words}{next_words(session.state)}'

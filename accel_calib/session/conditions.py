@@ -22,9 +22,9 @@ from .core import State
 from .pose_guide import Guide, NOT_FOLLOWED
 from .settings import context_topics
 from .stream import SILENT, StreamStatistics
-from ..calibration import USES_LIMIT
 from ..comparison import status
 from ..finding import Finding, NextStep
+from ..findings import outside_words, request_words, USES_LIMIT
 from ..pipeline import FEWEST_IN_CONE, is_partial
 from ..table import column_of, CONTEXT, is_quantity
 from ..text import counted
@@ -159,9 +159,10 @@ def step_of(guide: Guide) -> Finding:
     if plan is None:
         return _step('', '')
     asked = plan.asked
+    words = request_words(asked)
     if asked.direction is None:
-        return _calling('fit', asked.words)
-    return _step('poses', f'{asked.words}, or call ~/fit' if asked.fits else asked.words,
+        return _calling('fit', words)
+    return _step('poses', f'{words}, or call ~/fit' if asked.fits else words,
                  'fit' if asked.fits else '', direction=tuple(asked.direction.tolist()))
 
 
@@ -202,8 +203,8 @@ def _use(state: State) -> Iterator[Finding]:
     for key, each in state.sensor.limits_left(state.context).items():
         beyond = max(each.low - each.least, each.most - each.high)
         step = 'poses' if beyond > _FAR * (each.high - each.low) else 'done'
-        yield Finding('outside', f'{each.words}: {USES_LIMIT}; capture poses there and call '
-                      '~/refine', level='USABLE', step=step, about=key, command='refine')
+        yield Finding('outside', f'{outside_words(each)}: {USES_LIMIT}; capture poses there and '
+                      'call ~/refine', level='USABLE', step=step, about=key, command='refine')
 
 
 # ----------------------------------------------------------------------------- samples

@@ -10,12 +10,12 @@ import numpy as np
 
 from .settings import CalibratorSettings
 from ..calibration import Calibration, outlook
-from ..effects import OwnEffect
-from ..findings import calibration_json, rate, rate_refinement, Rating, refinement_json
+from ..effects import OwnEffect, shown_name
+from ..findings import (
+    calibration_json, rate, rate_refinement, Rating, refinement_json, rival_words, verdict_words)
 from ..geometry import angle_of, spread_directions
 from ..pipeline import calibrated, is_partial, is_refined, Plan
-from ..refinement import (
-    refine as refine_poses, Refinement, shown_name, times_typical, verdict_words)
+from ..refinement import refine as refine_poses, Refinement
 from ..table import Poses
 from ..text import counted, listed, now, plain
 from ..units import MG, Units
@@ -89,10 +89,10 @@ def refine(poses: Poses, units: Units, sensor: str, before: Calibration | None, 
     """
     refinement = refine_poses(poses, units, base='auto' if before is None else before,
                               sensor=sensor, date=now(), also=own)
-    beyond = [step for step in refinement.steps if times_typical(step) > _BEYOND]
+    beyond = [step for step in refinement.steps if step.times_typical > _BEYOND]
     if beyond and not refinement.refusal:
         refinement = replace(refinement, refusal=(
-            f'{beyond[0].effect} is {times_typical(beyond[0]):.0f} times that of typical parts',
+            f'{beyond[0].effect} is {beyond[0].times_typical:.0f} times that of typical parts',
             f'find what else changed with it; {hint}' if hint else 'find what else changed with '
             'it: check the mounting and the setup, and take the poses again'))
     rating, calibration = rate_refinement(refinement), refinement.calibration
@@ -104,7 +104,7 @@ def refine(poses: Poses, units: Units, sensor: str, before: Calibration | None, 
     details += [*calibration.warnings, *refinement.advice]
     if not refinement.refusal:
         details.append(change_words(before, calibration))
-    names = [shown_name(step.name) + (f' (or {", ".join(step.likely_rivals)})' if step.rivals
+    names = [shown_name(step.name) + (f' (or {", ".join(rival_words(step))})' if step.rivals
                                       else '') for step in refinement.steps]
     found, verb = ' and '.join(names), 's' if len(names) == 1 else ''
     verdict = {'no_gap': 'no gap beyond the noise', 'explained': f'{found} explain{verb} the gap',

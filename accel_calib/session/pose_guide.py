@@ -17,18 +17,13 @@ request is not repeated.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import permutations, product
 import math
 
 import numpy as np
 
-from ..calibration import directions_of, lies_in_cone, next_pose, NextPose, request_for
-from ..errors import RefusedFitError
-from ..estimate import fit_sphere, pose_noise
-from ..geometry import attitude_words, ATTITUDES, axes_of_signs, coverage, TAKEN, unit
-from ..refinement import PlannedPose
+from ..calibration import lies_in_cone, NextPose, PlannedPose, SessionPlan
+from ..geometry import ATTITUDES, axes_of_signs, SIGNED_AXES, TAKEN, unit
 from ..table import Floats, Poses
 from ..units import MG, Units
 
@@ -37,9 +32,6 @@ _FOLLOWED = math.cos(math.radians(30.0))
 
 _APART = math.cos(math.radians(50.0))
 """Requests 50° to 130° apart show two axes."""
-
-_FEWEST_NATIVE = 4
-"""Smallest number of poses to estimate the centre of native readings."""
 
 _WITHOUT_NEW = 30.0
 """Time without a new pose after which the robot probably cannot be turned further [s]."""
@@ -58,62 +50,9 @@ _AGREES = math.cos(math.radians(25.0))
 seldom agrees by chance (`benchmarks/persons.py`)."""
 
 
-@dataclass(frozen=True)
-class Plan:
-    """
-    The next pose, or that more poses no longer help, and the poses for which it was chosen.
-
-    `up` are the (n, 3) approximate directions of up in the sensor axes, unit vectors; n = 0 if
-    they are not known. `noise_g` is the median noise of the poses [g], NaN if not known.
-    `coverage` is the share of the sphere within 45° of a pose. `zero` is the approximate zero of
-    native readings before a fit; empty if it is not known.
-
-    """
-
-    asked: NextPose
-    poses: int
-    up: Floats
-    noise_g: float
-    coverage: float
-    zero: tuple[float, ...] = ()
-
-
-def plan_for(poses: Poses, units: Units, model: str, skipped: Sequence[Floats] = ()) -> Plan:
-    """
-    Return the next pose for a fit of this model, or that more poses no longer help.
-
-    As long as the directions of native readings are not known, the poses are taken for those that
-    were asked for. Otherwise the same pose would be asked for again. The directions `skipped` are
-    not asked for, unless no others are left.
-
-    """
-    up: Floats = np.zeros((0, 3))
-    if not units.is_native or len(poses) >= _FEWEST_NATIVE:
-        with suppress(RefusedFitError):
-            up = directions_of(poses, units)
-    noise, noise_g = pose_noise(poses.noise, up), None
-    if noise is not None and len(noise) and not units.is_native:
-        noise_g = float(np.median(units.to_g(noise)))
-    fitted_model = '10' if model == 'auto' else model
-    asked = next_pose(up, fitted_model, noise, noise_g=noise_g)
-    supposed = up
-    while len(supposed) < len(poses) and asked.direction is not None:
-        supposed = np.vstack([supposed, asked.direction])
-        asked = next_pose(supposed, fitted_model)
-    if asked.direction is not None and len(skipped):
-        other = next_pose(np.vstack([supposed, *skipped]), fitted_model)
-        if other.direction is not None:
-            asked = replace(asked, direction=other.direction, words=other.words)
-    # The zero of readings in other units than native ones is known.
-    zero = fit_sphere(poses.reading)[1].tolist() if units.is_native and len(up) else ()
-    return Plan(asked, len(poses), up, math.nan if noise_g is None else noise_g,
-                coverage(up) if len(up) else 0.0, tuple(zero))
-
-
-_AXES = sorted((np.eye(3)[list(order)] * signs for order in permutations(range(3))
-                for signs in product((1.0, -1.0), repeat=3)),
+_AXES = sorted(SIGNED_AXES,
                key=lambda axes: np.sum(np.diag(axes) != 1.0) + 0.1 * np.sum(axes < 0.0))
-"""The 48 ways in which axes can be swapped and inverted, the most likely first: reading = A up."""
+"""The ways in which axes can be swapped and inverted, the most likely first: reading = A up."""
 
 _SIMPLE = 7
 """Number of them with no, or with one axis inverted, or two swapped."""
@@ -126,7 +65,7 @@ class Guide:
 
     Parameters
     ----------
-    chosen : Plan or None
+    chosen : SessionPlan or None
         The next pose for a fit; None before the first choice.
     planned : tuple of PlannedPose or None
         The poses of a refinement that are still asked for, () once all are taken; None: the poses
@@ -150,7 +89,7 @@ class Guide:
 
     """
 
-    chosen: Plan | None = None
+    chosen: SessionPlan | None = None
     planned: tuple[PlannedPose, ...] | None = None
     begun: int = 0
     axes: Floats = field(default_factory=lambda: _AXES[0])
@@ -163,25 +102,21 @@ class Guide:
     rest: float = -math.inf
 
     @property
-    def plan(self) -> Plan | None:
+    def plan(self) -> SessionPlan | None:
         """Return the next pose, or that of a followed refinement; None before the first choice."""
         plan = self.chosen
         if plan is None:
             return None
-        asked, is_usual = plan.asked, np.array_equal(self.axes, _AXES[0])
+        asked = plan.asked
         if self.planned:
             first = self.planned[0]
-            up = self.axes.T @ first.up
-            words = first.words if is_usual else attitude_words(up)
-            where = f' {first.conditions}' if first.conditions else ''
-            asked = NextPose(up, f'hold {words}{where}, {first.purpose}', asked.error,
-                             plan.poses + len(self.planned), fits=False)
-        elif asked.direction is not None and not is_usual:
-            up = self.axes.T @ asked.direction
-            asked = replace(asked, direction=up, words=request_for(up))
+            asked = NextPose(self.axes.T @ first.up, asked.error, plan.poses + len(self.planned),
+                             fits=False, planned=first)
+        elif asked.direction is not None:
+            asked = replace(asked, direction=self.axes.T @ asked.direction)
         return replace(plan, asked=asked)
 
-    def choose(self, plan: Plan | None) -> Guide:
+    def choose(self, plan: SessionPlan | None) -> Guide:
         """Ask for another pose; those of a refinement that are taken now are not asked for."""
         planned = self.planned
         if plan is None or plan.poses < self.begun:

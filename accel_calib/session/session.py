@@ -29,8 +29,8 @@ from .store import Identity, SensorFiles, store_of
 from .stream import AGAIN, SILENT
 from .use import adopt, open_files, show_mounting, show_poses
 from .worker import answered, ShowPoses, Still, Task
-from ..calibration import mounting_words
 from ..comparison import status
+from ..findings import mounting_words
 from ..table import Floats
 from ..text import counted, LONGEST_NAME, one_line
 

@@ -20,8 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .live_capture import LONG_REST
-from ..calibration import thermal_stream
-from ..effects import Context, Model, ThermalStream
+from ..effects import Context, Model, thermal_stream, ThermalStream
 from ..table import Floats
 from ..units import Units
 

@@ -16,14 +16,13 @@ import numpy as np
 from .conditions import next_step
 from .core import Holder
 from .fitting import rated
-from .pose_guide import plan_for
 from .sensor import Sensor, title
 from .store import Store, tidied, unusable, writing_advice
 from .stream import AGAIN
 from .worker import Compute, Files, Mounting, nothing, Parse, Result, Severity, ShowPoses, Task
-from ..calibration import Calibration, in_frame, mounting_figures, on_topics
+from ..calibration import Calibration, in_frame, on_topics, plan_session
 from ..errors import DamagedCalibrationError, StoredCalibrationError
-from ..findings import Rating, rating_json
+from ..findings import mounting_figures, Rating, rating_json
 from ..refinement import Refinement
 from ..stillness import Dwell
 from ..table import CONTEXT, is_quantity, Poses
@@ -129,9 +128,9 @@ def _draw_poses(session: Holder, sensor: Sensor, poses: Poses, added: int,
         session.log('error', f'the poses could not be stored: {error}; {writing_advice(error)}',
                     'not_stored', AGAIN)
     # Computed even where only an average has changed, so that the lines keep their order.
-    plan = yield Compute(plan_for, *given) if due and len(poses) else Compute(nothing)
+    plan = yield Compute(plan_session, *given) if due and len(poses) else Compute(nothing)
     if due and not len(poses):  # without the start of the worker process
-        plan = plan_for(*given)
+        plan = plan_session(*given)
     if session.sensor.live is not sensor.live:
         return ''
     if plan is not None:

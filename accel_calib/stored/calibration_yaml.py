@@ -26,17 +26,18 @@ from .plain_yaml import (
     values_at)
 from .. import __version__
 from ..calibration import (
-    Calibration, FleetPrior, gated, GyroBias, in_g, LARGEST_OFFSET_G, mounting_figures, Quality,
-    Rejected, RejectedKind, SampleNoise, STORED_METHODS, with_history)
+    Calibration, FleetPrior, gated, GyroBias, in_g, LARGEST_OFFSET_G, Quality, Rejected,
+    RejectedKind, SampleNoise, STORED_METHODS)
 from ..disk import FIRST_LINE, FORMAT, write_atomically
 from ..effects import (
-    CHANGES, effect_named, EffectKey, entry_of, factors_of, Model, MODELS, OwnEffect,
+    add_history, CHANGES, effect_named, EffectKey, entry_of, factors_of, Model, MODELS, OwnEffect,
     parameter_names, PROCESSES)
 from ..errors import (
     AccelCalibError, DamagedCalibrationError, InputError, OwnEffectError, RefusedFitError,
     StoredCalibrationError)
 from ..estimate import Prior
 from ..finding import Finding, KINDS, LEVELS, without
+from ..findings import mounting_figures
 from ..statistics import rms
 from ..table import Autopilot, check_values, COLUMNS, Floats, is_quantity, LARGEST, Poses
 from ..text import counted, LONGEST_NAME, plain, some
@@ -146,7 +147,7 @@ def _content(calibration: Calibration) -> dict[str, Any]:
 def _own_rms(calibration: Calibration, own: EffectKey) -> float:
     """Return the RMS over the poses of what the values of an own effect are multiplied by."""
     shape = entry_of(own).split(calibration.model.values[own])[1]
-    poses_g = with_history(in_g(calibration.poses, calibration.units), calibration.model)
+    poses_g = add_history(in_g(calibration.poses, calibration.units), calibration.model)
     return rms(factors_of(own, [shape], poses_g.columns))
 
 

@@ -61,8 +61,9 @@ def plain(value: Any) -> Any:
     if value is None or isinstance(value, bool | int):
         return value
     if isinstance(value, str | Path | EffectRecord):
-        text = _CHANGING.sub('…', str(value).replace(f'{Path.cwd()}/', ''))
-        return _SIGN_OF_ZERO.sub('', text)
+        here = str(Path.cwd())
+        text = str(value).replace(f'{here}/', '').replace(here, '.')
+        return _SIGN_OF_ZERO.sub('', _CHANGING.sub('…', text))
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else str(float(value))
     if isinstance(value, bytes):
