@@ -76,19 +76,6 @@ CASES = {
     'calibrator': Case('the calibrator is killed, and started again', 'calibrator'),
     'calibrator-udp': Case('the same without shared memory', 'calibrator', udp=True)}
 
-ABOUT = """\
-# Figures of processes that are killed
-
-Made by `{command}`. A driver at
-{rate:g} Hz, a calibrator and a listener are processes of their own. In each trial one of them is
-started, and killed by SIGKILL up to {latest:g} s after the listener has received messages. The
-others must live. After the kill of a driver, the self-test of the calibrator must answer. "Silent"
-are the trials in which no messages arrived, or no answer, for {patience:g} s; then all processes
-are started anew.
-
-The transport is the default one, shared memory; without it, it is UDP with
-`config/fast_dds_udp.xml`. Load of the machine after each case: {loads}. Machine: {machine}."""
-
 
 def begin(folder: Path, environment: dict[str, str], name: str) -> Any:
     """Work in a folder, where a crash leaves a core and the Python stack; return a ROS node."""
@@ -303,20 +290,19 @@ def row_of(case: Case, found: list[Trial]) -> tuple[object, ...]:
             f'{lost:,} of {sent:,}' if case.victim == 'driver' and not case.ends else '', start)
 
 
-def page(frame: Frame, kills: int = 200, seed: int = 1, cases: tuple[str, ...] = tuple(CASES)
-         ) -> Iterator[str]:
+def driver_kills(frame: Frame, kills: int = 200, seed: int = 1,
+                 cases: tuple[str, ...] = tuple(CASES)) -> Iterator[str]:
     """Yield the parts of the page; `kills` is the number of each case."""
     os.environ.update(ROS_DOMAIN_ID=str(os.getpid() % 101 + 1))
     rows, loads = [], []
     for name in cases:
         rows.append(row_of(CASES[name], list(run_case(CASES[name], kills, seed))))
         loads.append(f'{os.getloadavg()[0]:.0f}')
-    yield ABOUT.format(command=frame.command, rate=RATE, latest=LATEST, patience=PATIENCE,
-                       loads=', '.join(loads), machine=frame.machine)
     yield markdown(('', 'kills', 'ends of the calibrator', 'ends of the others', 'silent',
                     'messages lost', 'from the start to the first message, s: median, longest'),
                    rows)
+    yield f'Load of the machine after each case: {", ".join(loads)}.'
 
 
 if __name__ == '__main__':
-    main(page)
+    main(driver_kills)

@@ -29,7 +29,7 @@ the poses determine.
 and 8 corners of the sensor. It is the orientation that increases the determinant of M plus the
 information of one pose spread over the whole sphere most (D-optimal design, Fedorov 1972). The
 latter represents the poses to come; without it the first poses would be chosen as if they were the
-last. `benchmarks/next_pose.py` compares this order with others.
+last. `benchmarks/poses.py` compares this order with others.
 
 With n well spread poses, the error of |force| is the noise of a pose times √(p / n), RMS over the
 sphere. Another pose reduces it by the factor 1 / 2n. More poses no longer help if the next pose
@@ -63,7 +63,7 @@ The dilution is 400 for 12 poses in a 45° cone, 100 for poses in five direction
 2°, and 25 for the worst 1 % of 12 poses in random directions. With a noise of 0.3 mg per pose, 25
 corresponds to an error of 8 mg in some direction. All fits that are wrong by 10 mg over the whole
 sphere have a larger dilution; with a limit of 40, some of them would pass
-(`benchmarks/geometry.py`).
+(`benchmarks/poses.py`).
 
 """
 
