@@ -106,7 +106,6 @@ def compare_set(index: int, seed: int, number: int) -> tuple[Comparison, Compari
 
 
 def lines_of(case: Case, found: Sequence[tuple[Comparison, Comparison, int]]) -> Iterator[Line]:
-    """Yield the lines of a case."""
     def share(part: int) -> str:
         return f'{100.0 * part / count:.1f} % ({part}/{count})'
 

@@ -4,13 +4,9 @@
 """
 Drivers and calibrators that are killed: whether the other processes notice.
 
-A driver publishes at 1 kHz, a calibrator corrects the messages, and a listener receives them and
-calls the self-test. All are processes of their own. In each trial the driver, or the calibrator,
-is started and killed by SIGKILL at a random time. The benchmark itself does not use ROS.
-
-Driver and listener count in memory that they share with the benchmark, because a killed process
-cannot write its records. Each message has the number of its trial, and its own number in it, where
-the orientation would be; the sensor has no orientation.
+The benchmark itself does not use ROS. Driver and listener count in memory that they share with it,
+because a killed process cannot write its records. Each message has the number of its trial, and
+its own number in it, where the orientation would be; the sensor has no orientation.
 
 """
 
@@ -274,7 +270,6 @@ def status_words(status: int) -> str:
 
 
 def row_of(case: Case, found: list[Trial]) -> tuple[object, ...]:
-    """Return the row of the table."""
     def ends_of(*names: str) -> str:
         every = [status_words(status) for each in found for name, status in each.died.items()
                  if name in names]

@@ -115,7 +115,6 @@ def cpu_us(each: Trial) -> float:
 
 
 def lines_at_1_khz(trials: Trials) -> Iterator[Line]:
-    """Yield the lines of the trials at 1 kHz."""
     turns, medians = len(trials['node']), {
         name: np.median([each.cpu_us for each in found]) for name, found in trials.items()}
     saved = medians['node'] - medians['unheard']

@@ -4,13 +4,8 @@
 """
 An hour of the node at 1 kHz: messages lost, memory, CPU time and latency, minute by minute.
 
-A sensor is turned and rests, so that the node captures poses. A caller uses the services all the
-time. At the end of each round it resets the node, and the next round begins without poses and
-without a calibration. A bare relay of the same messages shows what other programs on the machine
-do to the latency.
-
-A trend compares each minute with the same minute of the other rounds, because a round has a
-pattern of its own: memory and CPU time depend on the number of poses and on the calibration.
+A caller uses the services all the time. At the end of each round it resets the node, and the next
+round begins without poses and without a calibration.
 
 """
 
@@ -213,7 +208,6 @@ def trend_words(slope: float, error: float, unit: str) -> str:
 
 
 def lines_of(run: LongRun) -> Iterator[Line]:
-    """Yield the lines of the table."""
     lost, bare = run.lost(run.ours).sum(), run.lost(run.bare).sum()
     answered = [each for each in run.answers if each.words]
     refused = sum(not each.success for each in answered)
@@ -266,7 +260,6 @@ def intervals_of(run: LongRun) -> str:
 
 
 def long_run(frame: Frame, minutes: float = 60.0, rate: float = 1000.0) -> Iterator[str]:
-    """Yield the parts of the page."""
     rounds, seconds, interval = round(minutes / 5.0), 300.0, 60.0
     if minutes < 10.0:
         rounds = max(round(minutes), 1)

@@ -65,7 +65,6 @@ def is_told(kind: int, seed: int, number: int) -> bool:
 
 
 def persons(frame: Frame, sets: int = 40, seed: int = 1) -> Iterator[str]:
-    """Yield the parts of the page."""
     rows = []
     for name, case in test_persons.PERSONS.items():
         ended, seconds, held = np.array(frame.run(

@@ -148,7 +148,6 @@ def run_set(index: int, seed: int, number: int) -> Outcome | None:
 
 
 def lines_of(name: str, outcomes: Sequence[Outcome]) -> Iterator[Line]:
-    """Yield the lines of one pair of twins."""
     sets = len(outcomes)
     planned, random = (float(np.median(each)) for each in zip(*(
         (o.planned, o.random) for o in outcomes)))

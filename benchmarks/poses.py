@@ -153,7 +153,6 @@ def median(values: Sequence[float]) -> str:
 
 
 def row_of(name: str, outcomes: Sequence[Outcome]) -> list[str]:
-    """Return a row of the table by case."""
     out = [each for each in outcomes if each.refused]
     offers = [f'{np.mean([each.offered == model for each in out]):.0%} {model}'
               for model in ('7', '4') if any(each.offered == model for each in out)]
@@ -182,7 +181,6 @@ def lines_of(found: dict[str, list[Outcome]]) -> Iterator[Line]:
 
 
 def geometry(frame: Frame, sets: int = 200, seed: int = 1) -> Iterator[str]:
-    """Yield the parts of the page."""
     outcomes = frame.run(fit_set, [(name, seed, number) for name in CASES
                                    for number in range(sets)])
     found = {name: outcomes[k * sets:(k + 1) * sets] for k, name in enumerate(CASES)}
@@ -252,7 +250,6 @@ def take(name: str, seed: int, number: int) -> tuple[list[float], float]:
 
 
 def next_pose(frame: Frame, sets: int = 200, seed: int = 1) -> Iterator[str]:
-    """Yield the parts of the page."""
     lines, needed, rows = [], {}, []
     for name, (order, _) in ORDERS.items():
         found = frame.run(take, [(name, seed, number) for number in range(sets)])

@@ -234,19 +234,14 @@ Check = tuple[str, Callable[[Outcome], bool], float | None, float | None]
 """What is counted, the condition, and the smallest and the largest share that are asked."""
 
 
-def is_right(outcome: Outcome) -> bool:
-    """Return whether all hidden effects are named, or named as rivals, and nothing else is."""
-    return outcome.judgement in ('exact', 'rival')
+def judge(*words: str) -> Callable[[Outcome], bool]:
+    """Return the condition that the judgement is one of these."""
+    return lambda outcome: outcome.judgement in words
 
 
-def is_wrong(outcome: Outcome) -> bool:
-    """Return whether an effect is named that is not hidden."""
-    return outcome.judgement == 'wrong'
-
-
-def is_exact(outcome: Outcome) -> bool:
-    """Return whether exactly the hidden effects are named."""
-    return outcome.judgement == 'exact'
+is_right, is_exact, is_wrong = judge('exact', 'rival'), judge('exact'), judge('wrong')
+"""Whether all hidden effects are named, perhaps as rivals, and nothing else; an effect that is
+not hidden is named."""
 
 
 def is_described(outcome: Outcome) -> bool:
@@ -370,7 +365,6 @@ def share_line(what: str, outcomes: Outcomes, good: Callable[[Outcome], bool],
 
 
 def lines_of(row: str, outcomes: Outcomes) -> Iterator[Line]:
-    """Yield the lines of a row."""
     if row in ALONE:
         yield from lines_of_one('one effect, {} poses, size {:g}'.format(*ALONE[row]), outcomes)
         return
@@ -418,7 +412,6 @@ def lines_of_fresh(what: str, outcomes: Outcomes, most: float | None = None, *,
 
 
 def seconds_line(what: str, outcomes: Outcomes, most: float | None = None) -> Line:
-    """Return the line of the duration."""
     seconds = np.array([o.seconds for o in outcomes] or [np.nan])
     middle = float(np.median(seconds))
     return Line(f'{what}: CPU seconds per set', f'{middle:.2f}, longest {np.max(seconds):.2f}',
@@ -436,7 +429,7 @@ def lines_of_one(what: str, outcomes: Outcomes) -> Iterator[Line]:
     yield share_line(f'{what}: look-alikes right or rival', alike, is_right, least=0.98)
     yield share_line(f'{what}: look-alikes exact', alike, is_exact)
     yield share_line(f'{what}: wrong and no rival', outcomes, is_wrong, most=0.01)
-    yield share_line(f'{what}: missed', outcomes, lambda o: o.judgement == 'missed')
+    yield share_line(f'{what}: missed', outcomes, judge('missed'))
     yield share_line(f'{what}: right and verdict explained', outcomes,
                      lambda o: is_right(o) and o.verdict == 'explained')
     fitted = [o for o in outcomes if o.true_mg is not None]

@@ -118,7 +118,6 @@ def knocks(frame: Frame, sets: int, seed: int) -> Iterator[Line]:
 
 
 def share(what: str, good: Sequence[bool] | Floats, least: float) -> Line:
-    """Return the line of a share that is at least to be reached."""
     part = float(np.mean(good))
     return Line(what, f'{100.0 * part:.1f} %', len(good), f'≥ {100.0 * least:g} %', part >= least)
 
@@ -303,7 +302,6 @@ ROWS = {'knocks': knocks, 'bounds': bounds, 'placements': placements, 'intervals
 
 def robustness(frame: Frame, sets: int = 200, seed: int = 1, only: tuple[str, ...] = tuple(ROWS)
                ) -> Iterator[str]:
-    """Yield the table."""
     yield table(line for name in only for line in ROWS[name](frame, sets, 100_000 * seed))
 
 

@@ -286,7 +286,6 @@ def counted(name: str, surface: str, sets: int, seed: int, folder: Path) -> Coun
 
 
 def row_of(name: str, surface: str, sets: int, seed: int) -> tuple[object, ...]:
-    """Return a row of the table."""
     with TemporaryDirectory() as folder:
         found = counted(name, surface, sets, seed, Path(folder))
     return (name, surface, sets, found['named'] if FAULTS[name].words else '',

@@ -331,7 +331,6 @@ def measure(frame: Frame, sets: int, seed: int, noisy: bool) -> Sums:
 
 
 def compare_rules(found: Sums) -> str:
-    """Return the table of all rules on all kinds, as Markdown."""
     heads = ('recordings', 'rule', 'moving samples in poses', 'rest used', 'rests missed',
              'false poses', 'median error of a mean, mg', 'largest, mg',
              'RMS error of its norm, mg', 'normalised error', 'the same of false poses')
@@ -409,7 +408,6 @@ def lines_of_first(frame: Frame, sets: int, seed: int) -> Iterator[Line]:
 # -------------------------------------------------------------------------------- real recordings
 
 def rows_of_real() -> Iterator[tuple[object, ...]]:
-    """Yield the rows of all rules on the real recordings."""
     for name, unit_name, wanted in RECORDINGS:
         recording = read_recording(DATA / f'{name}.csv')
         units = units_of(unit_name)
@@ -442,7 +440,6 @@ def fit_words(poses: Sequence[Pose], unit_name: Literal['g', 'native']) -> tuple
 
 
 def stillness(frame: Frame, sets: int = 60, seed: int = 1) -> Iterator[str]:
-    """Yield the parts of the page."""
     usual, noisy = (measure(frame, sets, seed, each) for each in (False, True))
     yield table([*lines_of(usual, 'noise 0.3 to 5 mg', sets),
                  *lines_of(noisy, 'noise 50 mg', sets)])
