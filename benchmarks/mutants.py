@@ -30,12 +30,12 @@ import sys
 from tempfile import TemporaryDirectory
 from xml.etree import ElementTree
 
+from figures import markdown, parser, publish
 from cosmic_ray.ast import ast_nodes, get_ast
 from cosmic_ray.mutating import mutate_code
 from cosmic_ray.operators.operator import Operator
 from cosmic_ray.plugins import get_operator, operator_names
 import coverage
-from figures import markdown, parser, publish
 
 ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = ('calibration', 'comparison', 'effects', 'estimate', 'findings', 'logs',

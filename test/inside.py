@@ -18,8 +18,7 @@ import os
 from pathlib import Path
 
 from accel_calib.api import in_units_of
-from accel_calib.calibration import (
-    Calibration, determines, mounting_figures, posterior, refuse_if_unfit, sound_rows)
+from accel_calib.calibration import Calibration, determines, posterior, refuse_if_unfit, sound_rows
 from accel_calib.calibration.directions import poses_needed, rows_of, shape_words
 from accel_calib.calibration.mounting import (
     axes_of, doubts_about_flat, fault_of, mounting, with_heading, with_heading_of)
@@ -43,6 +42,7 @@ from accel_calib.estimate import believable, kinds, originals, unseen_mistakes
 from accel_calib.estimate.closed_form import agreeing
 from accel_calib.estimate.equations import equations, measured
 from accel_calib.estimate.outliers import _look_alikes as look_alikes
+from accel_calib.findings import mounting_figures
 from accel_calib.findings.figures import number
 from accel_calib.fleet.overview import (
     digest, digest_of, estimated, Months, not_agreeing, odd_sensors, overview, priors_of,

@@ -323,7 +323,7 @@ def plan_session(poses: Poses, units: Units, model: str, skipped: Sequence[Float
     # The zero of readings in other units than native ones is known.
     zero = fit_sphere(poses.reading)[1].tolist() if units.is_native and len(up) else ()
     return SessionPlan(asked, len(poses), up, math.nan if noise_g is None else noise_g,
-                       coverage(up) if len(up) else 0.0, tuple(zero))
+                       coverage(up) if len(up) else 0.0, zero=tuple(zero))
 
 
 # ----------------------------------------------------------------------------- refusals

@@ -206,10 +206,10 @@ def gyro_bias_of(poses: Poses) -> GyroBias | None:
     if np.any(np.abs(bias) >= LARGEST_BIAS) or np.any(sd >= _LARGEST_SD):
         return None
     if 'temperature' not in rests:
-        return GyroBias(bias, sd, len(rests), math.nan, slope, ())
+        return GyroBias(bias, sd, len(rests), math.nan, slope, temperatures=())
     limits = range_of(rests, 'temperature')
     mean = float(np.clip(rests['temperature'].mean(), *limits))
-    return GyroBias(bias, sd, len(rests), mean, slope, limits)
+    return GyroBias(bias, sd, len(rests), mean, slope, temperatures=limits)
 
 
 def _noise_of(rests: Poses) -> Floats:

@@ -128,7 +128,8 @@ def rotation_free(calibration: Calibration, context: Context, per_g: float) -> R
         np.concatenate([vec_v * reading_scale, mat_s[_ENTRIES] * gain_scale, model.vector[own]]),
         np.concatenate([slope_v * reading_scale, slope_s[_ENTRIES] * gain_scale,
                         np.eye(size)[own]]),
-        np.linalg.solve(mat_s, mat_w) @ model.rotation, reading_scale, force_scale)
+        axes=np.linalg.solve(mat_s, mat_w) @ model.rotation, reading_scale=reading_scale,
+        force_scale=force_scale)
 
 
 def _polar(mat_w: Floats, slope_w: Floats) -> tuple[Floats, Floats]:
@@ -261,7 +262,7 @@ def comparable(calibrations: Sequence[Calibration]) -> tuple[Comparable, ...]:
         larger = NORM_MODELS[NORM_MODELS.index(run.name) + 1:] if run.name in NORM_MODELS else ()
         if largest in larger and run.model.effects == run.form.effects:
             with suppress(RefusedFitError):  # its poses do not determine the larger model
-                sure = fit_unknown(run.used_poses, run.units, largest, 'ml')
+                sure = fit_unknown(run.used_poses, run.units, largest, 'ml')[0]
         found.append(Comparable(run, sure, repeatability_of(sure)))
     return tuple(found)
 

@@ -96,7 +96,7 @@ def _distribution(values: Mapping[str, Values]) -> list[tuple[str, ...]]:
 def _typical(fleet: FleetPrior) -> list[tuple[str, ...]]:
     """Return the typical values and spreads."""
     spread = np.sqrt(np.diag(fleet.prior.covariance))
-    rows = []
+    rows = list[tuple[str, ...]]()
     for name, mean, sd in zip(parameter_names(MODELS['10'].effects), fleet.prior.mean, spread,
                               strict=True):
         _, factor, unit = scale_of(name)
@@ -107,7 +107,7 @@ def _typical(fleet: FleetPrior) -> list[tuple[str, ...]]:
 
 def _changes(sensors: Sequence[Row]) -> list[tuple[str, ...]]:
     """Return lines about the sensors whose calibrations differ."""
-    rows = []
+    rows = list[tuple[str, ...]]()
     for row in sensors:
         sensor, drift = row['sensor'], row.get('drift')
         for change in row['changes']:

@@ -17,10 +17,10 @@ from time import monotonic, time
 import numpy as np
 
 from .viewer import Message
-from ..calibration import angle_words, Calibration
+from ..calibration import Calibration
 from ..errors import InputError
 from ..finding import LEVELS
-from ..findings import rate, residual_figures
+from ..findings import angle_words, rate, residual_figures
 from ..messages.one_reading import Triple
 from ..report import calibration_page, STORED
 from ..session import (

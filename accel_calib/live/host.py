@@ -74,7 +74,11 @@ class Host:
                 return
             if len(block):
                 self._waiting.append(block)
-            self._report_source()
+            problem, before = self._source.problem(), self.exchange.problem
+            if bool(problem) != bool(before):
+                self._show_problem(problem, 'warning' if problem else 'info', problem or (
+                    f'{self._source.name} is back; continue with the next pose'))
+            self.exchange.problem = problem
             self._work()
         self._flush()
         while not is_over():
@@ -96,14 +100,6 @@ class Host:
             severity, words = 'error', str(known_error(error))
         self.session.change(surroundings=Surroundings(publishers=None, ended=True))
         self._show_problem(words, severity, words)
-
-    def _report_source(self) -> None:
-        """Show and log that the source is interrupted, or is back."""
-        problem = self._source.problem()
-        if bool(problem) != bool(self.exchange.problem):
-            self._show_problem(problem, 'warning' if problem else 'info', problem or (
-                f'{self._source.name} is back; continue with the next pose'))
-        self.exchange.problem = problem
 
     def _show_problem(self, problem: str, severity: Severity, words: str) -> None:
         """Show what is wrong, or that nothing is, and log it."""

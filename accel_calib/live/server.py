@@ -22,6 +22,7 @@ from __future__ import annotations
 import asyncio
 from collections import Counter
 from concurrent.futures import Future
+import errno
 from functools import partial
 import hmac
 from http import HTTPStatus
@@ -37,8 +38,8 @@ from aiohttp import web
 
 from .exchange import Exchange
 from .viewer import (
-    announce, Board, LARGEST, Message, not_bound, PERIOD, reachable, secured, STUCK_S,
-    TooManyError, Viewer)
+    announce, Board, LARGEST, Message, PERIOD, reachable, secured, STUCK_S, TooManyError, Viewer)
+from ..errors import InputError
 from ..report import policy
 from ..session import Answer, Throttle
 from ..stored.exports import FORMATS
@@ -206,7 +207,13 @@ class PageServer:
             started.result()
         except OSError as error:
             self._thread.join()
-            raise not_bound(error, self._host, self._port) from error
+            is_used = error.errno == errno.EADDRINUSE
+            raise (InputError(f'the port {self._port} of {self._host} is in use, so there is no '
+                              'live page', 'stop the other program, or choose another port')
+                   if is_used else
+                   InputError(f'the live page cannot be served at {self._host}, port '
+                              f'{self._port}: {error.strerror or error}', 'choose an address of '
+                              'this machine, and a port above 1023')) from error
         self._exchange.show = self.show
 
     def close(self) -> None:

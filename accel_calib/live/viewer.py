@@ -19,10 +19,8 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import Callable, Mapping
-import errno
 import io
 from ipaddress import ip_address
-from itertools import takewhile
 import json
 import math
 import os
@@ -120,16 +118,6 @@ def announce(link: str, name: str) -> tuple[str, Path | None]:
     return f'{words}; its link with the token is in {file}', file
 
 
-def not_bound(error: OSError, host: str, port: int) -> InputError:
-    """Return the error for an address that cannot be used."""
-    if error.errno == errno.EADDRINUSE:
-        return InputError(f'the port {port} of {host} is in use, so there is no live page',
-                          'stop the other program, or choose another port')
-    return InputError(f'the live page cannot be served at {host}, port {port}: '
-                      f'{error.strerror or error}', 'choose an address of this machine, and a '
-                      'port above 1023')
-
-
 def reachable(host: str) -> str:
     """Return an address for a link: that of the network if the server listens everywhere."""
     try:
@@ -162,21 +150,17 @@ class Board:
     def __init__(self) -> None:
         self.newest: dict[str, Message] = {}
         self.history: deque[Message] = deque(maxlen=int(_HISTORY_S / PERIOD))
-        self._lines: deque[Message] = deque(maxlen=_LINES)
+        self.lines: deque[Message] = deque(maxlen=_LINES)
 
     def take(self, message: Message) -> bool:
         """Keep a message; return whether it is new."""
         if message['kind'] == 'log':
-            self._lines.append(message)
+            self.lines.append(message)
         elif message == self.newest.get(message['kind']):
             return False
         else:
             self.newest[message['kind']] = message
         return True
-
-    def lines_after(self, number: int) -> list[Message]:
-        """Return the log lines with larger numbers, the newest first."""
-        return list(takewhile(lambda line: line['number'] > number, reversed(self._lines)))
 
     def welcome(self, why: str) -> Message:
         """Return the answer to ``hello``; `why` commands are not accepted is empty if they are."""
@@ -271,7 +255,7 @@ class Viewer:
             while True:
                 self.news.clear()
                 answers = len(self._answers)  # later ones may be about a state that is not sent
-                for line in reversed(self._board.lines_after(self._seen)):
+                for line in [each for each in self._board.lines if each['number'] > self._seen]:
                     await self._send(line)
                     self._seen = line['number']
                 for kind in ('state', 'poses', 'progress'):

@@ -126,8 +126,9 @@ def search(poses_g: Poses, base: Model, also: tuple[OwnEffect, ...] = ()) -> Fou
     found = _search(poses_g, base, also)
     for again in (_with_own_noise, _with_scatter):
         found = again(found, poses_g, base, also)
-    found = replace(found, base=_weighted(found.base), final=_weighted(found.final))
-    return replace(found, outliers=everyone[found.outliers], clipped=clip, grid_g=grid,
+    base_state, final = _weighted(found.base), _weighted(found.final)
+    return replace(found, base=base_state, final=final, walk=_walk(final, found.near),
+                   outliers=everyone[found.outliers], clipped=clip, grid_g=grid,
                    with_clipped=whole, also=also)
 
 
@@ -387,7 +388,7 @@ def _of_a_turn(state: State) -> set[EffectKey]:
     values: dict[EffectKey, Floats] = {
         change.base: state.model.values[name] for name, change in changes.items()}
     gains = [name for name, change in changes.items()
-             if not entry_of(change.base).is_offset and not change.known_orientation]
+             if entry_of(change.base).changes != 'offset' and not change.known_orientation]
     if not gains or not any(entry_of(name).known_orientation for name in values):
         return set()
     mat_w, mat_c = state.model.linear_part[0], Model(values).linear_part[0] - np.eye(3)

@@ -18,7 +18,7 @@ EventsExecutor.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import partial, partialmethod
 from queue import SimpleQueue
 from time import monotonic
 from traceback import format_exc
@@ -354,17 +354,9 @@ class ManagedCalibrator(LifecycleNode):
             self.get_logger().error(str(error))
             self._destroy_entities()
             return TransitionCallbackReturn.FAILURE
-        self._set_active(active=False)
+        self._calibrator.stream.set_active(active=False)
         self._calibrator.start()
         return TransitionCallbackReturn.SUCCESS
-
-    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Publish corrected messages."""
-        return self._set_active(active=True)
-
-    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop publishing corrected messages."""
-        return self._set_active(active=False)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Close the files and remove all topics and services."""
@@ -374,10 +366,14 @@ class ManagedCalibrator(LifecycleNode):
 
     on_shutdown = on_cleanup
 
-    def _set_active(self, *, active: bool) -> TransitionCallbackReturn:
+    def _set_active(self, state: LifecycleState, *, active: bool) -> TransitionCallbackReturn:
+        """Publish corrected messages, or stop it."""
         if self._calibrator is not None:
             self._calibrator.stream.set_active(active=active)
         return TransitionCallbackReturn.SUCCESS
+
+    on_activate = partialmethod(_set_active, active=True)
+    on_deactivate = partialmethod(_set_active, active=False)
 
     def close(self) -> None:
         """Finish writing, and release the files."""

@@ -18,6 +18,7 @@ succeeds on a slow machine.
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from itertools import takewhile
 import json
 import os
@@ -191,6 +192,9 @@ class User(Node):
         up = self._rest('raw').sum(axis=(0, 1))
         return bool(np.any(self._poses @ up > _SAME_POSE * np.linalg.norm(up)))
 
+    def _has_rested(self, count: int, *names: str) -> bool:
+        return len(self._rest(*names)) >= count
+
     def turn(self, service: str = 'next') -> None:
         """Turn the sensor, and wait until it rests."""
         self._spin(lambda: bool(self._up), 'a message of the simulator')
@@ -199,7 +203,7 @@ class User(Node):
         for kept in self._messages.values():
             kept.clear()
         self._spin(lambda: self._up not in ((), before)
-                   and len(self._rest('truth')) >= _SETTLED, 'rest of the simulated sensor')
+                   and self._has_rested(_SETTLED, 'truth'), 'rest of the simulated sensor')
 
     def capture(self, count: int) -> None:
         """Let the calibrator capture this number of poses."""
@@ -215,7 +219,7 @@ class User(Node):
         rests = []
         for done in range(1, count + 1):
             self.turn()
-            self._spin(lambda: len(self._rest(*_KINDS)) >= _SAMPLES and self._has_captured(),
+            self._spin(lambda: self._has_rested(_SAMPLES, *_KINDS) and self._has_captured(),
                        f'rest {done}')
             rests.append(dict(zip(_KINDS, self._rest(*_KINDS).mean(axis=0))))
             error = np.linalg.norm(rests[-1]['corrected'] - rests[-1]['truth']) * MG
@@ -228,7 +232,7 @@ class User(Node):
         self.turn('flat')
         count = _SETTLED
         while True:
-            self._spin(lambda count=count: len(self._rest('raw')) >= count, 'a longer rest')
+            self._spin(partial(self._has_rested, count, 'raw'), 'a longer rest')
             try:
                 return self.call('calibrator/set_level')
             except AccelCalibError:

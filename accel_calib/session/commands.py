@@ -28,10 +28,10 @@ from .store import writing_advice
 from .use import adopt, rate, show_poses
 from .worker import Compute, Files, nothing, Parse, Part, Task
 from ..calibration import (
-    angle_words, Calibration, fit_partial, level, mounting_only, plan_session,
-    set_heading as with_heading)
+    Calibration, fit_partial, level, mounting_only, plan_session, set_heading as with_heading)
 from ..effects import Model
 from ..errors import AccelCalibError, InputError, RefusedFitError, StoredCalibrationError
+from ..findings import angle_words
 from ..pipeline import is_partial
 from ..stillness import Dwell, poses_from
 from ..text import counted, now

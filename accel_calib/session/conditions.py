@@ -22,10 +22,9 @@ from .core import State
 from .pose_guide import Guide, NOT_FOLLOWED
 from .settings import context_topics
 from .stream import SILENT, StreamStatistics
-from ..calibration import USES_LIMIT
 from ..comparison import status
 from ..finding import Finding, NextStep
-from ..findings import request_words
+from ..findings import outside_words, request_words, USES_LIMIT
 from ..pipeline import FEWEST_IN_CONE, is_partial
 from ..table import column_of, CONTEXT, is_quantity
 from ..text import counted
@@ -204,8 +203,8 @@ def _use(state: State) -> Iterator[Finding]:
     for key, each in state.sensor.limits_left(state.context).items():
         beyond = max(each.low - each.least, each.most - each.high)
         step = 'poses' if beyond > _FAR * (each.high - each.low) else 'done'
-        yield Finding('outside', f'{each.words}: {USES_LIMIT}; capture poses there and call '
-                      '~/refine', level='USABLE', step=step, about=key, command='refine')
+        yield Finding('outside', f'{outside_words(each)}: {USES_LIMIT}; capture poses there and '
+                      'call ~/refine', level='USABLE', step=step, about=key, command='refine')
 
 
 # ----------------------------------------------------------------------------- samples

@@ -14,10 +14,11 @@ from .settings import CalibratorSettings, own_effects
 from .store import SensorFiles
 from .stream import AGAIN, Around, StreamStatistics
 from .worker import Event, Log, Severity, Throttle
-from ..calibration import Calibration, mounting_of, mounting_words, with_given_mounting
+from ..calibration import Calibration, mounting_of, with_given_mounting
 from ..effects import OwnEffect
 from ..errors import InputError
 from ..finding import Finding
+from ..findings import mounting_words
 from ..table import Floats
 from ..units import FrameName, Units, units_of
 

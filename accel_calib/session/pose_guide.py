@@ -19,13 +19,12 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import permutations, product
 import math
 
 import numpy as np
 
 from ..calibration import lies_in_cone, NextPose, PlannedPose, SessionPlan
-from ..geometry import ATTITUDES, axes_of_signs, TAKEN, unit
+from ..geometry import ATTITUDES, axes_of_signs, SIGNED_AXES, TAKEN, unit
 from ..table import Floats, Poses
 from ..units import MG, Units
 
@@ -49,10 +48,9 @@ _AGREES = math.cos(math.radians(25.0))
 seldom agrees by chance (`benchmarks/persons.py`)."""
 
 
-_AXES = sorted((np.eye(3)[list(order)] * signs for order in permutations(range(3))
-                for signs in product((1.0, -1.0), repeat=3)),
+_AXES = sorted(SIGNED_AXES,
                key=lambda axes: np.sum(np.diag(axes) != 1.0) + 0.1 * np.sum(axes < 0.0))
-"""The 48 ways in which axes can be swapped and inverted, the most likely first: reading = A up."""
+"""The ways in which axes can be swapped and inverted, the most likely first: reading = A up."""
 
 _SIMPLE = 7
 """Number of them with no, or with one axis inverted, or two swapped."""

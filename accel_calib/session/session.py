@@ -29,8 +29,8 @@ from .store import Identity, SensorFiles, store_of
 from .stream import AGAIN, SILENT
 from .use import adopt, open_files, show_mounting, show_poses
 from .worker import answered, ShowPoses, Still, Task
-from ..calibration import mounting_words
 from ..comparison import status
+from ..findings import mounting_words
 from ..table import Floats
 from ..text import counted, LONGEST_NAME, one_line
 
@@ -110,10 +110,9 @@ class Session(Holder):
         waits = not statistics.messages and not state.surroundings.mismatches
         for (kind, about), text in now.items():
             name, is_stream = f'{kind} {about}', kind not in CONCERNS
-            if (kind, about) not in self._told:
-                self.throttle.forget(name)
+            again = AGAIN if kind in _OFTEN else _FAULT_AGAIN if is_stream else math.inf
             self.log('info' if waits else 'warning', f'waiting: {text}' if waits else text, name,
-                     AGAIN if kind in _OFTEN else _FAULT_AGAIN if is_stream else math.inf)
+                     again if (kind, about) in self._told else 0.0)
         over = [key for key in self._told if key not in now and key[0] not in CONCERNS]
         for _, about in over:
             if about in state.around.values:

@@ -194,28 +194,27 @@ class Store:
         """Return a copy of a good file for `step_back`, or an empty step if there is none."""
         if not is_good:
             aside(self.calibration, 'other')
-        steps = self.steps()
-        step = self._step(1 + max(self._numbers(), default=0))
+        kept, used = [*self.steps().values()], [number for number, _ in self._named_as_steps()]
+        step = self.calibration.with_name(
+            f'{self.calibration.name}.before{1 + max(used, default=0)}')
         if _exists(self.calibration):
             copy_atomically(self.calibration, step)
         else:
             step.touch()
-        for old in steps[:max(len(steps) + 1 - MOST_STEPS, 0)]:
-            self._step(old).unlink(missing_ok=True)
+        for old in kept[:max(len(kept) + 1 - MOST_STEPS, 0)]:
+            old.unlink(missing_ok=True)
         return step
 
-    def steps(self) -> list[int]:
-        """Return the numbers of the kept steps, oldest first."""
-        return [number for number in self._numbers() if self._step(number).is_file()]
+    def steps(self) -> dict[int, Path]:
+        """Return the kept steps by number, the oldest first."""
+        return {number: path for number, path in self._named_as_steps() if path.is_file()}
 
-    def _numbers(self) -> list[int]:
-        """Return the numbers that are in use, also by what is not a file, in order."""
-        names = self.calibration.parent.glob(f'{glob.escape(self.calibration.name)}.before*')
-        numbers = (path.name.removeprefix(f'{self.calibration.name}.before') for path in names)
-        return sorted(int(number) for number in numbers if _NUMBER.fullmatch(number))
-
-    def _step(self, number: int) -> Path:
-        return self.calibration.with_name(f'{self.calibration.name}.before{number}')
+    def _named_as_steps(self) -> list[tuple[int, Path]]:
+        """Return what has the name of a step, also what is not a file, with its number."""
+        start = f'{self.calibration.name}.before'
+        found = ((path.name.removeprefix(start), path)
+                 for path in self.calibration.parent.glob(f'{glob.escape(start)}*'))
+        return sorted((int(number), path) for number, path in found if _NUMBER.fullmatch(number))
 
     def step_back(self) -> Calibration | None:
         """
@@ -230,7 +229,7 @@ class Store:
             check_regular(self.calibration)
             now = self.calibration.read_bytes()
         # The last step that differs from the file; equal ones come from failed writes.
-        for step in map(self._step, reversed(self.steps())):
+        for step in reversed(self.steps().values()):
             if step.read_bytes() != now:
                 break
             step.unlink()

@@ -20,9 +20,9 @@ from .sensor import Sensor, title
 from .store import Store, tidied, unusable, writing_advice
 from .stream import AGAIN
 from .worker import Compute, Files, Mounting, nothing, Parse, Result, Severity, ShowPoses, Task
-from ..calibration import Calibration, in_frame, mounting_figures, on_topics, plan_session
+from ..calibration import Calibration, in_frame, on_topics, plan_session
 from ..errors import DamagedCalibrationError, StoredCalibrationError
-from ..findings import Rating, rating_json
+from ..findings import mounting_figures, Rating, rating_json
 from ..refinement import Refinement
 from ..stillness import Dwell
 from ..table import CONTEXT, is_quantity, Poses

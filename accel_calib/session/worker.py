@@ -331,10 +331,6 @@ class Throttle:
         self._last[kind] = now
         return True
 
-    def forget(self, kind: str) -> None:
-        """Let the next one of this kind be due."""
-        self._last.pop(kind, None)
-
 
 Answer = Callable[[bool, Any], object]
 """Function of the success of a task, and of its answer or the words of its error."""
@@ -416,9 +412,12 @@ class Worker:
     def _submit(self, pool: ThreadPoolExecutor, step: Step, call: Callable[..., Any],
                 then: Callable[[Future[Any]], object]) -> None:
         """Run a step in a pool; what is `then` to be done, and what waits, is done here."""
+        def finish(done: Future[Any]) -> None:
+            then(done)
+            self._advance()
+
         future = pool.submit(step.run, call)
-        future.add_done_callback(
-            lambda done: self._call_soon(lambda: (then(done), self._advance())))
+        future.add_done_callback(lambda done: self._call_soon(partial(finish, done)))
 
     def _resume(self, task: Task, answer: Answer, done: Future[Any] | None) -> None:
         """Continue a task with the result of its step; nothing else begins meanwhile."""

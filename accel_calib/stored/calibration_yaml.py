@@ -26,8 +26,8 @@ from .plain_yaml import (
     values_at)
 from .. import __version__
 from ..calibration import (
-    Calibration, FleetPrior, gated, GyroBias, in_g, LARGEST_OFFSET_G, mounting_figures, Quality,
-    Rejected, RejectedKind, SampleNoise, STORED_METHODS)
+    Calibration, FleetPrior, gated, GyroBias, in_g, LARGEST_OFFSET_G, Quality, Rejected,
+    RejectedKind, SampleNoise, STORED_METHODS)
 from ..disk import FIRST_LINE, FORMAT, write_atomically
 from ..effects import (
     add_history, CHANGES, effect_named, EffectKey, entry_of, factors_of, Model, MODELS, OwnEffect,
@@ -37,6 +37,7 @@ from ..errors import (
     StoredCalibrationError)
 from ..estimate import Prior
 from ..finding import Finding, KINDS, LEVELS, without
+from ..findings import mounting_figures
 from ..statistics import rms
 from ..table import Autopilot, check_values, COLUMNS, Floats, is_quantity, LARGEST, Poses
 from ..text import counted, LONGEST_NAME, plain, some
