@@ -28,38 +28,6 @@ from sensors import draw_model, FACES, random_directions
 
 G = units_of('g')
 
-COMPARE = """\
-# Figures of compare
-
-Made by `{command}`.
-
-Repeat runs of one simulated sensor, with 0.3 mg of noise per pose mean and axis, compared as they
-are and with 1 mg of offset added on one axis in one run. Two runs of 12 poses leave six residuals
-to estimate the noise from, and 1 mg is four to five standard deviations of an offset there.
-Measured noise is not fully believed.
-
-12 poses determine a cross-axis gain to about 0.3 mg/g. Where a sensor has so little, `auto`
-chooses model 10 if the noise makes it look larger, and otherwise model 7, which sets it to zero.
-The comparison of 20 runs detects this difference; with `--model 10` there is none. Where the noise
-is really twice that of the samples, 1 mg is half as large beside it."""
-
-WATCHING = """\
-# Figures of drift monitoring
-
-Made by `{command}`.
-The noise is that of a pose mean, by axis; {before} rests precede the change. A change of length by
-5 mg is fully visible at each rest. An offset of 5 mg is visible by the cosine of its angle to up,
-2.9 mg RMS over all attitudes. Changes below 1 mg are ignored."""
-
-LIMITS = """\
-Limits: with 0.5 mg of noise a change sometimes needs a fourth rest. 12 such poses state 1 mg or
-more for some rests, and ten rests show only roughly how well the sensor repeats. With 1 mg of
-noise a change of 5 mg is hardly larger than the stated uncertainty. Rests in which an offset is
-perpendicular to up do not show it. In random attitudes any three errors look like some offset, so
-that knocks are ruled out only if three rests show it clearly. Alarms occur where the sensor
-repeats ten times worse than its samples state and 12 poses cannot show it, and where one rest in
-twelve is knocked."""
-
 
 # ------------------------------------------------------------------------------------ repeat runs
 
@@ -138,7 +106,6 @@ def compare_set(index: int, seed: int, number: int) -> tuple[Comparison, Compari
 
 
 def lines_of(case: Case, found: Sequence[tuple[Comparison, Comparison, int]]) -> Iterator[Line]:
-    """Yield the lines of a case."""
     def share(part: int) -> str:
         return f'{100.0 * part / count:.1f} % ({part}/{count})'
 
@@ -164,7 +131,6 @@ def compare(frame: Frame, sets: int = 200, seed: int = 1) -> Iterator[str]:
     for index, case in enumerate(CASES):
         count = max(sets // 2 if case.runs > 5 else sets, 1)
         lines += lines_of(case, frame.run(compare_set, [(index, seed, k) for k in range(count)]))
-    yield COMPARE.format(command=frame.command)
     yield table(lines)
 
 
@@ -313,9 +279,7 @@ def watching(frame: Frame, sets: int = 200, long: int = 20, rests: int = 10_000,
     `rests` each.
 
     """
-    yield WATCHING.format(command=frame.command, before=BEFORE)
     yield table(lines_of_monitoring(sets, long, rests, seed))
-    yield LIMITS
 
 
 if __name__ == '__main__':

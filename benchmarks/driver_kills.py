@@ -4,13 +4,9 @@
 """
 Drivers and calibrators that are killed: whether the other processes notice.
 
-A driver publishes at 1 kHz, a calibrator corrects the messages, and a listener receives them and
-calls the self-test. All are processes of their own. In each trial the driver, or the calibrator,
-is started and killed by SIGKILL at a random time. The benchmark itself does not use ROS.
-
-Driver and listener count in memory that they share with the benchmark, because a killed process
-cannot write its records. Each message has the number of its trial, and its own number in it, where
-the orientation would be; the sensor has no orientation.
+The benchmark itself does not use ROS. Driver and listener count in memory that they share with it,
+because a killed process cannot write its records. Each message has the number of its trial, and
+its own number in it, where the orientation would be; the sensor has no orientation.
 
 """
 
@@ -75,19 +71,6 @@ CASES = {
     'end-udp': Case('the same without shared memory', ends=True, udp=True),
     'calibrator': Case('the calibrator is killed, and started again', 'calibrator'),
     'calibrator-udp': Case('the same without shared memory', 'calibrator', udp=True)}
-
-ABOUT = """\
-# Figures of processes that are killed
-
-Made by `{command}`. A driver at
-{rate:g} Hz, a calibrator and a listener are processes of their own. In each trial one of them is
-started, and killed by SIGKILL up to {latest:g} s after the listener has received messages. The
-others must live. After the kill of a driver, the self-test of the calibrator must answer. "Silent"
-are the trials in which no messages arrived, or no answer, for {patience:g} s; then all processes
-are started anew.
-
-The transport is the default one, shared memory; without it, it is UDP with
-`config/fast_dds_udp.xml`. Load of the machine after each case: {loads}. Machine: {machine}."""
 
 
 def begin(folder: Path, environment: dict[str, str], name: str) -> Any:
@@ -287,7 +270,6 @@ def status_words(status: int) -> str:
 
 
 def row_of(case: Case, found: list[Trial]) -> tuple[object, ...]:
-    """Return the row of the table."""
     def ends_of(*names: str) -> str:
         every = [status_words(status) for each in found for name, status in each.died.items()
                  if name in names]
@@ -303,20 +285,19 @@ def row_of(case: Case, found: list[Trial]) -> tuple[object, ...]:
             f'{lost:,} of {sent:,}' if case.victim == 'driver' and not case.ends else '', start)
 
 
-def page(frame: Frame, kills: int = 200, seed: int = 1, cases: tuple[str, ...] = tuple(CASES)
-         ) -> Iterator[str]:
+def driver_kills(frame: Frame, kills: int = 200, seed: int = 1,
+                 cases: tuple[str, ...] = tuple(CASES)) -> Iterator[str]:
     """Yield the parts of the page; `kills` is the number of each case."""
     os.environ.update(ROS_DOMAIN_ID=str(os.getpid() % 101 + 1))
     rows, loads = [], []
     for name in cases:
         rows.append(row_of(CASES[name], list(run_case(CASES[name], kills, seed))))
         loads.append(f'{os.getloadavg()[0]:.0f}')
-    yield ABOUT.format(command=frame.command, rate=RATE, latest=LATEST, patience=PATIENCE,
-                       loads=', '.join(loads), machine=frame.machine)
     yield markdown(('', 'kills', 'ends of the calibrator', 'ends of the others', 'silent',
                     'messages lost', 'from the start to the first message, s: median, longest'),
                    rows)
+    yield f'Load of the machine after each case: {", ".join(loads)}.'
 
 
 if __name__ == '__main__':
-    main(page)
+    main(driver_kills)

@@ -23,6 +23,7 @@ import multiprocessing
 import os
 from pathlib import Path
 import platform
+import re
 import subprocess
 import sys
 import time
@@ -81,24 +82,8 @@ def markdown(heads: Sequence[object], rows: Iterable[Iterable[object]]) -> str:
 
 @dataclass(frozen=True)
 class Frame:
-    """
-    What a page knows about the run.
+    """The file of a page, None if it is only printed, and a pool of processes for its sets."""
 
-    Parameters
-    ----------
-    command : str
-        How the page was called.
-    machine : str
-        The machine, with its load before.
-    path : Path or None
-        File of the page; None if it is only printed.
-    pool : multiprocessing.Pool or None
-        Processes for the sets; None for none beside this one.
-
-    """
-
-    command: str
-    machine: str
     path: Path | None
     pool: Any = None
 
@@ -153,10 +138,11 @@ def main(*pages: Callable[..., Iterable[str]]) -> None:
     """
     Make a page: parse its arguments, print it, and write it if asked to.
 
-    A page is a function that takes a `Frame` and options, and yields paragraphs. The options of
-    the command line are its own, with their defaults: a number, False for a switch, None for a
-    path, or a tuple of words or numbers. `sets` brings `--jobs` along. If there are several
-    pages, the first argument names one.
+    A page is a function with the name of its file in ``docs/figures``. It takes a `Frame` and
+    options, and yields what it finds: tables, and phrases. The words beside them stand in the
+    file. The options of the command line are those of the function, with their defaults: a
+    number, False for a switch, None for a path, or a tuple of words or numbers. `sets` brings
+    `--jobs` along. If there are several pages, the first argument names one.
 
     """
     parser = argparse.ArgumentParser(
@@ -170,8 +156,8 @@ def main(*pages: Callable[..., Iterable[str]]) -> None:
             if usual is False:
                 kind = {'action': 'store_true'}
             elif isinstance(usual, tuple):
-                words = usual if isinstance(usual[0], str) else None
-                kind = {'nargs': '+', 'choices': words, 'type': type(usual[0])}
+                known = usual if isinstance(usual[0], str) else None
+                kind = {'nargs': '+', 'choices': known, 'type': type(usual[0])}
             options.add_argument(f'--{name.replace("_", "-")}', default=usual, **kind)
             if name == 'sets':
                 options.add_argument('--jobs', type=int, default=2, help='number of processes')
@@ -183,15 +169,46 @@ def main(*pages: Callable[..., Iterable[str]]) -> None:
     command = ' '.join(['python', f'benchmarks/{Path(sys.argv[0]).name}', *words,
                         '--markdown FILE'])
     os.environ['PYTHONPATH'] = os.pathsep.join([str(ROOT), str(ROOT / 'test')])
+    about = machine()
     with ExitStack() as stack:
         pool = (stack.enter_context(multiprocessing.get_context('spawn').Pool(jobs)) if jobs > 1
                 else None)
-        frame = Frame(command, machine(), path, pool)
-        text = '\n\n'.join(filter(None, page(frame, **given)))
-    text = f'{text}\n\nMeasured at the commit {commit()}.\n'
+        parts = list(page(Frame(path, pool), **given))
+    file = ROOT / 'docs' / 'figures' / f'{page.__name__}.md'
+    text = update(file.read_text(encoding='utf-8'), parts) if file.exists() else '\n\n'.join(
+        [*parts, 'Measured at the commit .'])
+    text = re.sub(r'(Made by\s)`[^`]*`', lambda found: f'{found[1]}`{command}`', text)
+    text = re.sub(r'(Machine: |` on |^)[^,\n]+, \d+ cores, load .*?numpy [\d.]*\d',
+                  lambda found: found[1] + about, text, flags=re.MULTILINE)
+    text = re.sub(r'(Measured at the commit )[^\n]*\s*$', rf'\g<1>{commit()}.\n', text)
     print(text)
     if path is not None:
         path.write_text(text, encoding='utf-8')
+
+
+def update(page: str, parts: Iterable[str]) -> str:
+    """
+    Return a page with what was found.
+
+    A table takes the place of that with the same number in the page. A phrase gives its numbers
+    to the same words in the page, with other white space; new words are the last paragraph.
+
+    """
+    number = r'[-+]?\d[\d,.]*\d|\d'
+    tables = [part for part in parts if part.startswith('|')]
+    for phrase in (part for part in parts if not part.startswith('|')):
+        values = iter(re.findall(number, phrase))
+        words = (re.escape(each) for each in re.sub(number, '#', phrase).split())
+        pattern = r'\s+'.join(words).replace(re.escape('#'), f'(?:{number})')
+        found = re.search(pattern, page)
+        if found:
+            new = re.sub(number, lambda _: next(values), found[0])  # noqa: B023
+            page = page[:found.start()] + new + page[found.end():]
+        else:
+            page = page.replace('\n\nMeasured at', f'\n\n{phrase}\n\nMeasured at')
+    table = re.compile(r'^\| .*\n\|---.*\n(?:\|.*\n)*', re.MULTILINE)
+    assert len(tables) == len(table.findall(page)), 'expected as many tables as the page has'
+    return table.sub(lambda _: tables.pop(0) + '\n', page)
 
 
 def commit() -> str:

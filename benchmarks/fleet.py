@@ -98,26 +98,6 @@ STAGED = 10
 MILLION = 1_000_000
 HOUR_S = 3600.0
 
-ABOUT = """# Speed and memory of a fleet
-
-Made by `{command}`.
-
-{sensors:,} simulated sensors with {calibrations} pose tables of {poses} poses each, on a cluster
-of this machine; {damaged:.0f} % of the files are damaged. The offset of every second sensor
-depends on the temperature, which rises in each of its tables (model B). Every process has one
-thread. Speed with one and two workers is the median of {turns} turns of some recordings, without
-the first and last tenth of each. The workers share the processors with the program and the
-scheduler. Memory is the resident memory of the largest worker, and of the program with the
-scheduler.
-
-Machine: {machine}."""
-
-AFTER = """\
-A stage is timed in one process on {staged} recordings of whole sensors, in milliseconds of the
-processor, without waiting for the disk. The rest of a recording on a worker is the work of Dask. A
-million robots with {calibrations} recordings each need the core hours of the last lines:
-recordings, merge and comparison, from the whole run; the search from its stage."""
-
 
 # ----------------------------------------------------------------------------------------- sensors
 
@@ -397,8 +377,8 @@ def lines_of_costs(costs: Mapping[str, float], done: Whole, calibrations: int, w
                    f'{hours:,.0f}')
 
 
-def page(frame: Frame, sensors: int = 10_000, calibrations: int = 20, workers: int = 2,
-         seed: int = 1, no_refine: bool = False, folder: Path | None = None) -> Iterator[str]:
+def fleet(frame: Frame, sensors: int = 10_000, calibrations: int = 20, workers: int = 2,
+          seed: int = 1, no_refine: bool = False, folder: Path | None = None) -> Iterator[str]:
     """
     Yield the parts of the page.
 
@@ -427,12 +407,11 @@ def page(frame: Frame, sensors: int = 10_000, calibrations: int = 20, workers: i
                       [draw_sensor(k, calibrations, seed) for k in range(sensors)],
                       done.summary.sensors),
                   *lines_of_costs(costs, done, calibrations, workers, refined=not no_refine)]
-    yield ABOUT.format(command=frame.command, machine=frame.machine, sensors=sensors,
-                       calibrations=calibrations, poses=POSES, damaged=100.0 * DAMAGED,
-                       turns=TURNS)
     yield table(lines)
-    yield AFTER.format(staged=len(staged), calibrations=calibrations)
+    yield f'{sensors:,} simulated sensors with {calibrations} pose tables of {POSES} poses each'
+    yield f'in one process on {len(staged)} recordings of whole sensors'
+    yield f'million robots with {calibrations} recordings each need the core hours'
 
 
 if __name__ == '__main__':
-    main(page)
+    main(fleet)

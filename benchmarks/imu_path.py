@@ -38,18 +38,6 @@ PACES = {'five times a second': 0.2, 'back to back': 0.0}
 OFTEN = ROOT / 'config' / 'fast_dds.xml'
 """Profile that makes DDS announce a process more often than every 3 s."""
 
-ABOUT = """\
-# Figures of the Imu path
-
-Made by `{command}`. The node has a
-levelled 10-parameter calibration, and the messages have covariances, which makes the most work.
-Driver and user are rclpy processes too and share the cores with the node. A set is a turn of all
-trials. The CPU time of the node excludes its worker process, which fits and refines. A start waits
-until DDS finds the other processes, sometimes for an announcement that comes every 3 s. The caller
-of `~/fit` and `~/refine` is an rclpy process too, and calls that are back to back load it much.
-
-Machine: {machine}."""
-
 Trials = dict[str, list[Trial]]
 Phases = dict[str, tuple[int, int, int]]
 """Begin and end of parts of a trial [ns], and the number of calls answered in each."""
@@ -127,7 +115,6 @@ def cpu_us(each: Trial) -> float:
 
 
 def lines_at_1_khz(trials: Trials) -> Iterator[Line]:
-    """Yield the lines of the trials at 1 kHz."""
     turns, medians = len(trials['node']), {
         name: np.median([each.cpu_us for each in found]) for name, found in trials.items()}
     saved = medians['node'] - medians['unheard']
@@ -200,7 +187,7 @@ def plain_figures(trials: Trials) -> str:
                      'p99, µs'), rows)
 
 
-def page(frame: Frame, turns: int = 5, quick: bool = False) -> Iterator[str]:
+def imu_path(frame: Frame, turns: int = 5, quick: bool = False) -> Iterator[str]:
     """Yield the parts of the page; quick: one short turn."""
     turns, seconds, long = (1, 2.0, 5.0) if quick else (turns, 6.0, 60.0)
     rng = np.random.default_rng(SEED)
@@ -232,11 +219,10 @@ def page(frame: Frame, turns: int = 5, quick: bool = False) -> Iterator[str]:
                 runs.append(run_calls(node(own, 'auto_capture:=false'), seconds))
             tell(f'turn {turn + 1} of {turns}')
         many = {name: [between(commands[name], 8000.0, long)] for name in flood}
-    yield ABOUT.format(command=frame.command, machine=frame.machine)
     yield table([*lines_at_1_khz(steady), *lines_of_starts(starts),
                  *lines_under_load(flood, many, long), *lines_of_calls(runs)])
     yield plain_figures(steady)
 
 
 if __name__ == '__main__':
-    main(page)
+    main(imu_path)

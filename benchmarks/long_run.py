@@ -4,13 +4,8 @@
 """
 An hour of the node at 1 kHz: messages lost, memory, CPU time and latency, minute by minute.
 
-A sensor is turned and rests, so that the node captures poses. A caller uses the services all the
-time. At the end of each round it resets the node, and the next round begins without poses and
-without a calibration. A bare relay of the same messages shows what other programs on the machine
-do to the latency.
-
-A trend compares each minute with the same minute of the other rounds, because a round has a
-pattern of its own: memory and CPU time depend on the number of poses and on the calibration.
+A caller uses the services all the time. At the end of each round it resets the node, and the next
+round begins without poses and without a calibration.
 
 """
 
@@ -43,22 +38,6 @@ HOUR = 3600.0
 KILOBYTE = 1.024e-3
 """Unit of the memory in /proc [MB]."""
 
-ABOUT = """\
-# Figures of a long run
-
-Made by `{command}`. A sensor is turned
-through poses at {rate:g} Hz, and the node captures each of them. Every {every:g} s one of these
-services is called: {calls}. `~/reset` is called
-at the end of each round of {round:g} s. Raw messages are published while there is no calibration
-(`passthrough`).
-
-Medians and trends are of the time after a warm-up of {warm:g} min. A trend compares each minute
-with the same minute of the other rounds, and ± is its standard error. Resident memory contains
-pages that processes share. The worker is the process that fits and refines. A bare relay of the
-same messages runs beside the node: its figures show what other programs on the machine do.
-
-Machine: {machine}."""
-
 
 @dataclass(frozen=True)
 class Answer:
@@ -72,38 +51,19 @@ class Answer:
 
 @dataclass(frozen=True)
 class LongRun:
-    """
-    The measurements of a run.
+    """The measurements of a run."""
 
-    Parameters
-    ----------
-    edges : (n + 1,) array
-        Times of the samples [ns].
-    per_round : int
-        Number of intervals of a round.
-    samples : mapping of str to (n + 1,) array
-        Resident memory of the node, the part of it that no other process shares (`own`), resident
-        memory of its worker process and of the bare relay [MB]; CPU time of the node without its
-        worker process (`cpu`), and of the bare relay (`bare`) [s].
-    sent : (m,) array
-        Stamps of the messages of the driver [ns].
-    ours, bare : (k, 2) array
-        Stamp and arrival of the messages of the node and of the bare relay [ns].
-    answers : list of Answer
-        The answers of the services.
-    log : str
-        What the node printed.
-
-    """
-
-    edges: Stamps
-    per_round: int
+    edges: Stamps  # (n + 1,) times of the samples [ns]
+    per_round: int  # number of intervals of a round
+    # (n + 1,) each: resident memory of the node, the part of it that no other process shares
+    # (own), resident memory of its worker and of the bare relay [MB]; CPU time of the node
+    # without its worker (cpu), and of the bare relay (bare) [s].
     samples: dict[str, Floats]
-    sent: Stamps
-    ours: Stamps
-    bare: Stamps
-    answers: list[Answer]
-    log: str
+    sent: Stamps  # (m,) stamps of the messages of the driver [ns]
+    ours: Stamps  # (k, 2) stamp and arrival of the messages of the node [ns],
+    bare: Stamps  # and of the bare relay
+    answers: list[Answer]  # of the services
+    log: str  # what the node printed
 
     def count(self, stamps: Stamps) -> NDArray[np.int64]:
         """Return the number of different stamps in each interval."""
@@ -179,8 +139,8 @@ def take_sample(node: int, relay: int) -> dict[str, float]:
     return found
 
 
-def long_run(rounds: int, seconds: float, interval: float, rate: float = 1000.0, *,
-             domain: int | None = None) -> LongRun:
+def run_rounds(rounds: int, seconds: float, interval: float, rate: float = 1000.0, *,
+               domain: int | None = None) -> LongRun:
     """
     Run the node for some rounds.
 
@@ -238,7 +198,8 @@ def long_run(rounds: int, seconds: float, interval: float, rate: float = 1000.0,
         rate, during, domain=domain)
     columns = {name: np.array([each[name] for each in samples[:rounds * per_round + 1]])
                for name in samples[0]}
-    return LongRun(columns['at'], per_round, columns, trial.sent, *trial.heard, answers, trial.log)
+    ours, bare = trial.heard
+    return LongRun(columns['at'], per_round, columns, trial.sent, ours, bare, answers, trial.log)
 
 
 def trend_words(slope: float, error: float, unit: str) -> str:
@@ -247,7 +208,6 @@ def trend_words(slope: float, error: float, unit: str) -> str:
 
 
 def lines_of(run: LongRun) -> Iterator[Line]:
-    """Yield the lines of the table."""
     lost, bare = run.lost(run.ours).sum(), run.lost(run.bare).sum()
     answered = [each for each in run.answers if each.words]
     refused = sum(not each.success for each in answered)
@@ -299,26 +259,25 @@ def intervals_of(run: LongRun) -> str:
                             for row in zip(*columns, strict=True)))
 
 
-def page(frame: Frame, minutes: float = 60.0, rate: float = 1000.0) -> Iterator[str]:
-    """Yield the parts of the page."""
+def long_run(frame: Frame, minutes: float = 60.0, rate: float = 1000.0) -> Iterator[str]:
     rounds, seconds, interval = round(minutes / 5.0), 300.0, 60.0
     if minutes < 10.0:
         rounds = max(round(minutes), 1)
         seconds, interval = 60.0 * minutes / rounds, 6.0 * minutes / rounds
-    run = long_run(rounds, seconds, interval, rate)
+    run = run_rounds(rounds, seconds, interval, rate)
     for each in run.answers:
         if not each.success:
             tell(f'{each.name}: {each.words or "no answer"}')
-    yield ABOUT.format(command=frame.command, rate=rate, every=CALL_EVERY, round=seconds,
-                       calls=', '.join(f'`~/{name}`' for name in CALLS),
-                       warm=run.warm * interval / 60.0, machine=frame.machine)
     yield table(lines_of(run))
     called = {name: found for name in (*CALLS, 'reset') if (found := run.called(name))}
     yield markdown(('service', 'calls', 'failed', 'longest answer, s'), (
         (f'`~/{name}`', len(found), sum(not each.success for each in found),
          f'{max(each.seconds for each in found):.2f}') for name, found in called.items()))
     yield intervals_of(run)
+    yield f'through poses at {rate:g} Hz'
+    yield f'at the end of each round of {seconds:g} s'
+    yield f'after a warm-up of {run.warm * interval / 60.0:g} min'
 
 
 if __name__ == '__main__':
-    main(page)
+    main(long_run)

@@ -1,14 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Persons who do what the guide says, as far as they can: how each of them ends, and when.
-
-The persons are those of ``test/test_persons.py``, in each set with another sensor and hand. A
-calibration must hold in the directions that the person can reach: the error of |a| there is
-compared with its stated uncertainty.
-
-"""
+"""Persons who do what the guide says, as far as they can: how each of them ends, and when."""
 
 from __future__ import annotations
 
@@ -23,28 +16,14 @@ from accel_calib.session import COMMANDS, conditions
 from accel_calib.statistics import rms
 from driven import Driver, GRAVITY, Person
 import numpy as np
-import test_persons as persons
-
-ABOUT = """\
-# Persons who cannot follow the guide
-
-Made by `{command}` on
-{machine}.
-Each set is another sensor (offsets of 30 mg, gains of 1.5 %) and another hand, which does what the
-next step says as far as this person can, with 2 to 4 s for each rest. *In time*: the end is
-reached, or what is in the way is named, within the limit. *Held*: the RMS error of |a| over the
-directions within reach is at most 1.96 times the stated one."""
-
-ORDERS = """\
-Of {orders} who turn a sound sensor in an own order of sides, of sides and edges, or of any
-directions, {told} were told that its axes are swapped or inverted."""
+import test_persons
 
 
 def run_person(name: str, seed: int, number: int) -> tuple[bool, float, float]:
     """Return whether a person ends as expected, when [s], and whether the error holds."""
-    case, rng = persons.PERSONS[name], np.random.default_rng([seed, number, len(name)])
-    persons.OFFSET = 0.03 * rng.uniform(-1.0, 1.0, 3)
-    persons.GAIN = np.eye(3) + 0.015 * np.diag(rng.uniform(-1.0, 1.0, 3))
+    case, rng = test_persons.PERSONS[name], np.random.default_rng([seed, number, len(name)])
+    test_persons.OFFSET = 0.03 * rng.uniform(-1.0, 1.0, 3)
+    test_persons.GAIN = np.eye(3) + 0.015 * np.diag(rng.uniform(-1.0, 1.0, 3))
     with TemporaryDirectory() as home:
         os.environ['ROS_HOME'] = home
         driver = Driver()
@@ -78,7 +57,7 @@ def is_told(kind: int, seed: int, number: int) -> bool:
     with TemporaryDirectory() as home:
         os.environ['ROS_HOME'] = home
         driver, told = Driver(), False
-        person = Person(driver, persons.reading())
+        person = Person(driver, test_persons.reading())
         person._rng = rng
         for up in order:
             person.rest(up, 1.4)
@@ -87,10 +66,9 @@ def is_told(kind: int, seed: int, number: int) -> bool:
     return told
 
 
-def page(frame: Frame, sets: int = 40, seed: int = 1) -> Iterator[str]:
-    """Yield the parts of the page."""
+def persons(frame: Frame, sets: int = 40, seed: int = 1) -> Iterator[str]:
     rows = []
-    for name, case in persons.PERSONS.items():
+    for name, case in test_persons.PERSONS.items():
         ended, seconds, held = np.array(frame.run(
             run_person, [(name, seed, number) for number in range(sets)]), float).T
         known = held[np.isfinite(held)]
@@ -100,11 +78,11 @@ def page(frame: Frame, sets: int = 40, seed: int = 1) -> Iterator[str]:
                      f'{np.sum(known):.0f} of {len(known)}' if len(known) else ''))
     told = frame.run(is_told, [(kind, seed, number) for kind in range(3)
                                for number in range(3 * sets)])
-    yield ABOUT.format(command=frame.command, machine=frame.machine)
     yield markdown(('person', 'ends', 'as expected', 'limit [s]', 'in time', 'median [s]', 'held'),
                    rows)
-    yield ORDERS.format(orders=len(told), told=sum(told))
+    yield (f'Of {len(told)} who turn a sound sensor in an own order of sides, of sides and edges, '
+           f'or of any directions, {sum(told)} were told')
 
 
 if __name__ == '__main__':
-    main(page)
+    main(persons)

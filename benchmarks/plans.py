@@ -4,17 +4,8 @@
 """
 Number of poses until an effect is named beside its twin: planned poses against random ones.
 
-Twins are effects that 24 poses often cannot separate: quadratic and gain_asymmetry; cubic and
-odd_quadratic; offset_temperature and offset_drift with a temperature that rises with time. The
-sets are those of an independent generator (`test/generator.py`) in which one of the twins is
-hidden, one is named with the other as its rival, and none has a probability of 95 %.
-
-More poses of the same sensor are then taken. By the plan: its first pose, and then the first pose
-of the next plan. At random: a random direction, at a random temperature within the range of the
-first poses. A set ends when one twin has a probability of 95 %, or after 40 poses.
-
-The expected probability is compared with the outcome of the whole first plan: the probability that
-`refine` then gives to the hidden effect.
+More poses of the same sensor are taken by the plan: its first pose, and then the first pose of the
+next plan; or at random. A set ends when one twin is certain, or after `MOST` poses.
 
 """
 
@@ -158,7 +149,6 @@ def run_set(index: int, seed: int, number: int) -> Outcome | None:
 
 
 def lines_of(name: str, outcomes: Sequence[Outcome]) -> Iterator[Line]:
-    """Yield the lines of one pair of twins."""
     sets = len(outcomes)
     planned, random = (float(np.median(each)) for each in zip(*(
         (o.planned, o.random) for o in outcomes)))
@@ -177,8 +167,8 @@ def lines_of(name: str, outcomes: Sequence[Outcome]) -> Iterator[Line]:
                f'{before:.2f}; {expected:.2f}; {after:.2f} ± {error:.2f}', sets)
 
 
-def page(frame: Frame, sets: int = 12, seed: int = 1) -> Iterator[str]:
-    """Yield the parts of the page; `sets` is the number for each pair of twins."""
+def plans(frame: Frame, sets: int = 12, seed: int = 1) -> Iterator[str]:
+    """Yield the table; `sets` is the number for each pair of twins."""
     lines: list[Line] = []
     for index, (first, second, *_) in enumerate(TWINS):
         outcomes: list[Outcome] = []
@@ -188,9 +178,8 @@ def page(frame: Frame, sets: int = 12, seed: int = 1) -> Iterator[str]:
             if len(outcomes) >= sets:
                 break
         lines += lines_of(f'{first} and {second}', outcomes[:sets]) if outcomes else []
-    yield f'# Figures of the plans\n\n{str(__doc__).strip()}\n\nMade by `{frame.command}`.'
     yield table(lines)
 
 
 if __name__ == '__main__':
-    main(page)
+    main(plans)

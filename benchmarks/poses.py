@@ -53,9 +53,12 @@ class Outcome:
     with_added: float = np.nan  # of model 10 with these poses
 
 
-def repeat(directions: Floats) -> Floats:
-    """Repeat directions up to 12."""
-    return directions[np.arange(COUNT) % len(directions)]
+def draw_few(degrees: float, directions: Floats | None = None) -> Draw:
+    """Return a function that repeats few directions up to 12; by default five random ones."""
+    def draw(rng: np.random.Generator) -> Floats:
+        few = random_directions(5, rng) if directions is None else directions
+        return tilt(few[np.arange(COUNT) % len(few)], degrees, rng)
+    return draw
 
 
 def draw_plane(degrees: float) -> Draw:
@@ -79,15 +82,13 @@ def draw_cone(degrees: float) -> Draw:
 
 
 CASES: dict[str, tuple[Draw, float | None]] = {
-    **{f'5 directions, held {off:g}° off': (
-        lambda rng, off=off: tilt(repeat(random_directions(5, rng)), off, rng),
-        1.0 if off < 1 else None) for off in (0.0, 0.5, 1.0, 2.0, 3.0, 5.0, 10.0)},
+    **{f'5 directions, held {off:g}° off': (draw_few(off), 1.0 if off < 1 else None)
+       for off in (0.0, 0.5, 1.0, 2.0, 3.0, 5.0, 10.0)},
     **{f'in a {angle:g}° cone': (draw_cone(angle), 1.0 if angle <= 45 else None)
        for angle in (30.0, 45.0, 60.0, 75.0)},
     **{f'in a plane, held {off:g}° off': (draw_plane(off), 1.0 if off < 2 else None)
        for off in (0.0, 1.0, 2.0, 5.0, 10.0)},
-    **{f'six faces twice, held {off:g}° off': (
-        lambda rng, off=off: tilt(repeat(FACES), off, rng), 1.0 if off < 0.5 else None)
+    **{f'six faces twice, held {off:g}° off': (draw_few(off, FACES), 1.0 if off < 0.5 else None)
        for off in (0.0, 0.5, 1.0, 2.0, 5.0)},
     'random directions': (lambda rng: random_directions(COUNT, rng), 0.0),
     'spread, held 10° off': (lambda rng: tilt(spread_directions(COUNT), 10.0, rng), 0.0)}
@@ -152,7 +153,6 @@ def median(values: Sequence[float]) -> str:
 
 
 def row_of(name: str, outcomes: Sequence[Outcome]) -> list[str]:
-    """Return a row of the table by case."""
     out = [each for each in outcomes if each.refused]
     offers = [f'{np.mean([each.offered == model for each in out]):.0%} {model}'
               for model in ('7', '4') if any(each.offered == model for each in out)]
@@ -180,27 +180,10 @@ def lines_of(found: dict[str, list[Outcome]]) -> Iterator[Line]:
                f'{np.mean(out):.1%}', len(out))
 
 
-GEOMETRY = """\
-# Figures of poor geometry
-
-Poses that do not determine model 10: whether they are refused, and whether the advice helps.
-
-12 poses of a sensor with offset, gains and cross-axis gains, 0.3 mg of noise per pose mean and
-axis, in good directions and in directions that are poor in some way. Each set is fitted. The
-tables have the share that is refused; the RMS error of |a| on fresh directions where it is fitted,
-and where it is fitted although it is refused; the smaller model that the refusal offers; and the
-error with the poses added that the refusal names, each held 5° off. "Held 1° off" means 1° in each
-of two axes. Some sets of 12 random directions leave a region of the sphere uncovered.
-
-Made by `{command}`."""
-
-
 def geometry(frame: Frame, sets: int = 200, seed: int = 1) -> Iterator[str]:
-    """Yield the parts of the page."""
     outcomes = frame.run(fit_set, [(name, seed, number) for name in CASES
                                    for number in range(sets)])
     found = {name: outcomes[k * sets:(k + 1) * sets] for k, name in enumerate(CASES)}
-    yield GEOMETRY.format(command=frame.command)
     yield table(lines_of(found))
     yield markdown(HEADS, [row_of(*each) for each in found.items()])
     yield markdown(('refused for model', *MODELS), (
@@ -266,22 +249,7 @@ def take(name: str, seed: int, number: int) -> tuple[list[float], float]:
     return errors, enough
 
 
-NEXT_POSE = """\
-# Figures of the next pose
-
-Number of poses until |a| is known, by the order in which they are taken.
-
-A sensor with offset, gains and cross-axis gains, 0.3 mg of noise per pose mean and axis, is turned
-pose by pose: as the node asks, in the order faces, edges, corners, or at random. After each pose
-model 10 is fitted, and the RMS error of |a| is measured on fresh directions. A person holds an
-attitude 10° off in each of two axes. The result is the number of poses from which on the median
-over the sets stays below 0.3 mg.
-
-Made by `{command}`."""
-
-
 def next_pose(frame: Frame, sets: int = 200, seed: int = 1) -> Iterator[str]:
-    """Yield the parts of the page."""
     lines, needed, rows = [], {}, []
     for name, (order, _) in ORDERS.items():
         found = frame.run(take, [(name, seed, number) for number in range(sets)])
@@ -302,9 +270,8 @@ def next_pose(frame: Frame, sets: int = 200, seed: int = 1) -> Iterator[str]:
         lines.append(Line(f'poses to {AIM} mg: as asked, held 10° off, instead of {name}',
                           f'{words_of(ours)} instead of {words_of(needed[name])}', sets,
                           'fewer', ours < needed[name]))
-    yield NEXT_POSE.format(command=frame.command)
     yield table(lines)
-    yield f'Median error of |a| [mg]:\n\n{markdown(("poses", *SHOWN), rows)}'
+    yield markdown(('poses', *SHOWN), rows)
 
 
 def words_of(count: int) -> str:

@@ -4,15 +4,8 @@
 """
 The rating of calibrations, compared with their true error.
 
-Each set is a random sensor with poses of one kind. It is fitted, or fitted and refined as
-``calibrate`` does, and rated. The true error is the RMS of |corrected| - 1 g over 2,000 new
-readings without noise, in random orientations and at temperatures in the range of the poses. The
-sensors, their effects and the true error are computed here, without the models and the simulation
-of the package. A rating is wrong if GOOD has a true error above the limit of a good calibration,
-or if BAD has one below it. The limits were chosen with other seeds. A wrong value of gravity is
-not among the sets, because still poses cannot show it::
-
-    python benchmarks/rating.py --markdown docs/figures/rating.md
+The sensors, their effects and the true error are computed here, without the models and the
+simulation of the package.
 
 """
 
@@ -170,17 +163,17 @@ def rate_set(index: int, number: int, seed: int) -> Result:
     units = units_of('native' if kind.native else 'g')
     try:
         calibration: Calibration = fit_poses(poses, units)
-        rating: Rating = rate(calibration)
+        rated: Rating = rate(calibration)
         if kind.refined:
             found = refine(poses, units)
-            calibration, rating = found.calibration, rate_refinement(found)
+            calibration, rated = found.calibration, rate_refinement(found)
     except AccelCalibError:
         return Result(kind, 'refused')
     force, at = random_directions(NEW, rng), rng.choice(temperature, NEW)
     known = {'temperature': at, 'time': np.full(NEW, 20.0 * len(poses))}
     corrected = calibration.apply(reading(force, at), **{
         key: values for key, values in known.items() if key in calibration.poses})
-    return Result(kind, rating.name, length_error_mg(corrected), Expected(calibration).error_mg)
+    return Result(kind, rated.name, length_error_mg(corrected), Expected(calibration).error_mg)
 
 
 def lines_of(results: Sequence[Result]) -> Iterator[Line]:
@@ -213,9 +206,9 @@ def rows_of(results: Sequence[Result]) -> Iterator[tuple[object, ...]]:
                f'{np.median(errors):.2g}' if errors else '', f'{max(good):.2g}' if good else '')
 
 
-def page(frame: Frame, sets: int = 100, seed: int = 4051) -> Iterator[str]:
+def rating(frame: Frame, sets: int = 100, seed: int = 4051) -> Iterator[str]:
     """
-    Yield the parts of the page; `sets` of each kind, and a fourth of those that are refined.
+    Yield the tables; `sets` of each kind, and a fourth of those that are refined.
 
     The seed is that of the published figures; the limits were chosen with the seeds 77 to 79.
 
@@ -223,11 +216,9 @@ def page(frame: Frame, sets: int = 100, seed: int = 4051) -> Iterator[str]:
     results = frame.run(rate_set, [
         (index, number, seed) for index, kind in enumerate(KINDS)
         for number in range(max(sets // (4 if kind.refined else 1), 1))])
-    yield f'# Figures of the rating\n\n{str(__doc__).strip()}'
     yield table(lines_of(results))
-    yield 'Without a hidden effect the noise of a pose is 0.05 to 3 mg unless the name says more.'
     yield markdown(('set', *NAMES, 'median true error [mg]', 'largest of GOOD'), rows_of(results))
 
 
 if __name__ == '__main__':
-    main(page)
+    main(rating)

@@ -45,26 +45,6 @@ XSENS = DATA / 'xsens_mti_counts.csv'
 EFFECTS = {'offset': np.array([0.02, -0.03, 0.01]), 'axis_gain': np.array([0.01, -0.02, 0.015]),
            'cross_axis': np.array([0.004, -0.002, 0.003])}
 
-RECORDINGS = """\
-# Figures of recordings
-
-Made by `{command}`. Figures are medians over the repeats
-(sets); processes that are compared take turns. A rate is that of the whole work: opening the bag,
-reading it, and finding poses or writing the corrected copy. The rate of rosbags excludes the
-opening. Memory is bounded if ten times the messages take less than 3 % of their bytes more.
-
-Machine: {machine}, rosbags {rosbags}."""
-
-MEMORY = """\
-# Memory over the length of a recording
-
-Made by `{command}`. The largest resident memory of the
-whole process, with Python, numpy and scipy, on CSV recordings at 100 samples per second. The
-sensor rests for 4 s and turns for 1 s, so that a million samples have 2,000 poses. `noise` runs on
-a recording without turns.
-
-Machine: {machine}."""
-
 
 # --------------------------------------------------------- work of a process: of the parts of bags
 
@@ -225,8 +205,7 @@ def recordings(frame: Frame, messages: int = FULL, repeats: int = 3, temporary: 
         lines = list(lines_of_commands(folder, table_, 11 * repeats))
         for storage in ('mcap', 'sqlite3'):
             lines += lines_of_bag(folder, storage, messages, repeats, calibration)
-    yield RECORDINGS.format(command=frame.command, machine=frame.machine,
-                            rosbags=version('rosbags'))
+    yield f'rosbags {version("rosbags")}'
     yield table(lines)
 
 
@@ -302,7 +281,6 @@ def memory(frame: Frame, millions: tuple[float, ...] = (1.0, 3.0, 10.0), seed: i
                 f'{(after - before) / (long - short) * MILLION:.1f}', 1,
                 f'{MOST_RISE_MB:.0f} MB in all' if flat else '',
                 after - before < MOST_RISE_MB if flat else None))
-    yield MEMORY.format(command=frame.command, machine=frame.machine)
     yield table(lines)
 
 

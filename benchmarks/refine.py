@@ -26,7 +26,7 @@ from typing import Any
 
 from figures import Frame, Line, main, markdown, table, tell
 from accel_calib.calibration import fit_poses, verify
-from accel_calib.refinement import refine
+from accel_calib.refinement import refine as refine_poses
 from accel_calib.statistics import rms
 from accel_calib.table import Poses
 from accel_calib.units import MG, units_of
@@ -91,70 +91,30 @@ unit sphere, the same change of |a| is that of an offset, of a gain or of the si
 Effects without a pair have no such form.
 """
 
-ABOUT = """\
-# Figures of refine
-
-Made by `{command}`, on sets of an independent generator
-(`test/generator.py`). The size of an effect is the RMS of its part in |a| that the base cannot
-absorb, over the noise of a pose mean. Look-alikes are quadratic, gain_asymmetry and
-cross_coupling; also cubic and odd_quadratic. Fresh errors are those of other poses of the same
-sensor. Shares have their exact interval for 95 % (Clopper and Pearson)."""
-
 
 # ------------------------------------------------------------------------------------------- sets
 
 @dataclass(frozen=True)
 class Outcome:
-    """
-    The result of a case.
-
-    Parameters
-    ----------
-    case : Case
-        The case.
-    verdict : str
-        Of the refinement; ``error`` if it raised an exception.
-    seconds : float
-        CPU time of the refinement [s].
-    knocked : mapping of int to float
-        Rows that were knocked, and the change of |a| over the noise.
-    named : tuple of (str, tuple of str)
-        Each named effect with its rivals.
-    disturbed : frozenset of int
-        Rows that were left out.
-    deviations : tuple of float
-        Errors of the values of the hidden effects over their standard deviations; empty if the
-        refinement is refused.
-    fresh : tuple of float
-        RMS residual of fresh poses with the base and with the refined calibration, and RMS of
-        their noise [mg]; empty after an exception.
-    true_mg : float or None
-        Residual of fresh poses with the true form [mg]; None if it was not fitted.
-    where : tuple of str
-        Words of each empirical term.
-    lag : float or None
-        The lag of `offset_temperature` [s]; None if it has none.
-    said : tuple of (bool, bool, bool)
-        Of each step: whether the named effect is the most probable of its list, whether the
-        held-out residual falls, and whether the instant in its words is that of its values.
-    error : str
-        The traceback of the exception.
-
-    """
+    """The result of a case."""
 
     case: Case
-    verdict: str
-    seconds: float
-    knocked: Mapping[int, float]
-    named: tuple[tuple[str, tuple[str, ...]], ...] = ()
-    disturbed: frozenset[int] = frozenset()
-    deviations: tuple[float, ...] = ()
+    verdict: str  # of the refinement; error if it raised an exception
+    seconds: float  # CPU time of the refinement [s]
+    knocked: Mapping[int, float]  # rows that were knocked, and the change of |a| over the noise
+    named: tuple[tuple[str, tuple[str, ...]], ...] = ()  # each named effect with its rivals
+    disturbed: frozenset[int] = frozenset()  # rows that were left out
+    deviations: tuple[float, ...] = ()  # errors of the hidden values over their deviations
+    # RMS residual of fresh poses with the base and with the refined calibration, and RMS of their
+    # noise [mg]; empty after an exception.
     fresh: tuple[float, ...] = ()
-    true_mg: float | None = None
-    where: tuple[str, ...] = ()
-    lag: float | None = None
+    true_mg: float | None = None  # residual of fresh poses with the true form, if it was fitted
+    where: tuple[str, ...] = ()  # words of each empirical term
+    lag: float | None = None  # of `offset_temperature`, if it has one [s]
+    # Of each step: whether the named effect is the most probable of its list, whether the held-out
+    # residual falls, and whether the instant in its words is that of its values.
     said: tuple[tuple[bool, bool, bool], ...] = ()
-    error: str = ''
+    error: str = ''  # the traceback of the exception
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -199,7 +159,7 @@ def run_case(case: Case) -> Outcome:
     poses = with_columns(poses_of(made), case, 2)
     started = time.process_time()
     try:
-        refined: Any = refine(poses, MS2, base=case.group.base)
+        refined: Any = refine_poses(poses, MS2, base=case.group.base)
         seconds = time.process_time() - started
         other = again(np.random.default_rng((*case.seed, 1)), made)
         base = fit_poses(poses, MS2, model=case.group.base)
@@ -274,19 +234,14 @@ Check = tuple[str, Callable[[Outcome], bool], float | None, float | None]
 """What is counted, the condition, and the smallest and the largest share that are asked."""
 
 
-def is_right(outcome: Outcome) -> bool:
-    """Return whether all hidden effects are named, or named as rivals, and nothing else is."""
-    return outcome.judgement in ('exact', 'rival')
+def judge(*words: str) -> Callable[[Outcome], bool]:
+    """Return the condition that the judgement is one of these."""
+    return lambda outcome: outcome.judgement in words
 
 
-def is_wrong(outcome: Outcome) -> bool:
-    """Return whether an effect is named that is not hidden."""
-    return outcome.judgement == 'wrong'
-
-
-def is_exact(outcome: Outcome) -> bool:
-    """Return whether exactly the hidden effects are named."""
-    return outcome.judgement == 'exact'
+is_right, is_exact, is_wrong = judge('exact', 'rival'), judge('exact'), judge('wrong')
+"""Whether all hidden effects are named, perhaps as rivals, and nothing else; an effect that is
+not hidden is named."""
 
 
 def is_described(outcome: Outcome) -> bool:
@@ -410,7 +365,6 @@ def share_line(what: str, outcomes: Outcomes, good: Callable[[Outcome], bool],
 
 
 def lines_of(row: str, outcomes: Outcomes) -> Iterator[Line]:
-    """Yield the lines of a row."""
     if row in ALONE:
         yield from lines_of_one('one effect, {} poses, size {:g}'.format(*ALONE[row]), outcomes)
         return
@@ -458,7 +412,6 @@ def lines_of_fresh(what: str, outcomes: Outcomes, most: float | None = None, *,
 
 
 def seconds_line(what: str, outcomes: Outcomes, most: float | None = None) -> Line:
-    """Return the line of the duration."""
     seconds = np.array([o.seconds for o in outcomes] or [np.nan])
     middle = float(np.median(seconds))
     return Line(f'{what}: CPU seconds per set', f'{middle:.2f}, longest {np.max(seconds):.2f}',
@@ -476,7 +429,7 @@ def lines_of_one(what: str, outcomes: Outcomes) -> Iterator[Line]:
     yield share_line(f'{what}: look-alikes right or rival', alike, is_right, least=0.98)
     yield share_line(f'{what}: look-alikes exact', alike, is_exact)
     yield share_line(f'{what}: wrong and no rival', outcomes, is_wrong, most=0.01)
-    yield share_line(f'{what}: missed', outcomes, lambda o: o.judgement == 'missed')
+    yield share_line(f'{what}: missed', outcomes, judge('missed'))
     yield share_line(f'{what}: right and verdict explained', outcomes,
                      lambda o: is_right(o) and o.verdict == 'explained')
     fitted = [o for o in outcomes if o.true_mg is not None]
@@ -552,10 +505,11 @@ def other_results(outcomes: Outcomes) -> str:
     return ', '.join(f'{count} {word}' for word, count in Counter(words).most_common(5))
 
 
-def page(frame: Frame, sets: int = 20, seed: int = 1, only: tuple[str, ...] = ROWS
-         ) -> Iterator[str]:
+def refine(frame: Frame, sets: int = 20, seed: int = 1, only: tuple[str, ...] = ROWS
+           ) -> Iterator[str]:
     """Yield the parts of the page; `sets` is the number of each kind in each row."""
-    lines, everything = [], []
+    lines: list[Line] = []
+    everything: list[Outcome] = []
     for row in only:
         outcomes = frame.run(run_case, [(case,) for case in cases_of(row, sets, seed)])
         everything += outcomes
@@ -564,7 +518,6 @@ def page(frame: Frame, sets: int = 20, seed: int = 1, only: tuple[str, ...] = RO
     for error, count in Counter(o.error for o in everything if o.error).most_common(5):
         tell(f'{count} times:\n{error}')
     lines += lines_of_all(everything)
-    yield ABOUT.format(command=frame.command)
     yield table(line for line in lines if line.sets)
     yield markdown(('row', 'hidden', 'sets', 'exact', 'rival', 'wrong', 'missed', 'error',
                     'clean poses left out', 'parameters inside 3 sd',
@@ -573,4 +526,4 @@ def page(frame: Frame, sets: int = 20, seed: int = 1, only: tuple[str, ...] = RO
 
 
 if __name__ == '__main__':
-    main(page)
+    main(refine)

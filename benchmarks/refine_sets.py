@@ -53,29 +53,15 @@ Kind = tuple[dict[str, float], Setup]
 
 @dataclass(frozen=True)
 class Group:
-    """
-    Sets of a row that are counted together.
+    """Sets of a row that are counted together."""
 
-    Parameters
-    ----------
-    what : str
-        Description; empty if the row has only one group.
-    draw : callable
-        Random generator -> hidden effects and settings of one set of each kind.
-    drawn : bool
-        Whether the hidden effects are random, and the kinds are therefore counted together.
-    base : str
-        Base of the refinement.
-    columns : int
-        Number of columns that the catalogue does not know. The first one is the temperature under
-        another name, so that an effect of it is one of a column; the others are noise.
-
-    """
-
-    what: str
+    what: str  # empty if the row has only one group
+    # Random generator -> hidden effects and settings of one set of each kind.
     draw: Callable[[np.random.Generator], list[Kind]]
-    drawn: bool = False
-    base: str = '10'
+    drawn: bool = False  # whether the effects are random, and the kinds counted together
+    base: str = '10'  # of the refinement
+    # Columns that the catalogue does not know. The first one is the temperature under another
+    # name, so that an effect of it is one of a column; the others are noise.
     columns: int = 0
 
 
@@ -214,7 +200,7 @@ def true_form_error_mg(made: Simulated, fresh: Simulated) -> float | None:
     ends = np.cumsum([len(value) for value in made.values.values()])
 
     def errors(free: Floats, poses: Simulated) -> Floats:
-        """Return |u| - 1 of each pose, with u found from the reading by iteration."""
+        """Return |u| - 1 of each pose over its noise; u is found from the reading by iteration."""
         gain = np.zeros((3, 3))
         for value, (i, j) in zip(free[3:9], SYMMETRIC, strict=True):
             gain[i, j] = gain[j, i] = value
@@ -228,10 +214,10 @@ def true_form_error_mg(made: Simulated, fresh: Simulated) -> float | None:
             added = sum(basis_of(name, around, traits) @ (part * scale)
                         for name, part, scale in zip(poses.values, parts, scales, strict=True))
             u = linear - added @ inverse
-        return np.linalg.norm(u, axis=1) - 1.0
+        return (np.linalg.norm(u, axis=1) - 1.0) / poses.noise
 
     free = np.concatenate([
         made.traits.offset, [made.traits.gain[i, j] for i, j in SYMMETRIC], [1.0],
         *(value / scale for value, scale in zip(made.values.values(), scales, strict=True))])
-    found = least_squares(lambda x: errors(x, made) / made.noise, free, x_scale='jac')
-    return rms(errors(found.x, fresh)) * MG
+    found = least_squares(errors, free, x_scale='jac', args=(made,))
+    return rms(errors(found.x, fresh) * fresh.noise) * MG

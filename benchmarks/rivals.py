@@ -255,7 +255,7 @@ def judge_ways(case: Case) -> Judged:
     return found
 
 
-def page(frame: Frame, sets: int = 1, seed: int = 1) -> Iterator[str]:
+def rivals(frame: Frame, sets: int = 1, seed: int = 1) -> Iterator[str]:
     """Yield the table: how often each way is exact, and its errors of other poses."""
     heads, rows = [''], dict[str, list[str]]()
     for name, chosen in ROWS.items():
@@ -275,4 +275,4 @@ def page(frame: Frame, sets: int = 1, seed: int = 1) -> Iterator[str]:
 
 
 if __name__ == '__main__':
-    main(page)
+    main(rivals)

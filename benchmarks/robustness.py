@@ -1,20 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Trust in a fit: outliers, bad placement, stated uncertainty, choice of the model.
-
-Poses are spread over the sphere with 8° of jitter unless a row says otherwise. The noise of a pose
-mean is 0.3 mg by axis; its standard deviation is measured from 100 samples. Errors are RMS errors
-of |a| on fresh directions, the median over the sets. Poor geometry has its own page,
-[geometry](geometry.md).
-
-Limits: 12 poses leave three residuals. Without a stated noise these must show the noise and a
-knocked pose at once. Poses that scatter have a variance in common, but so few do not show it, and
-those with little noise have too much weight. Model 7 fits 6 poses of a sensor of 10 parameters
-exactly, so that nothing shows the cross-axis gains that it lacks.
-
-"""
+"""Trust in a fit: outliers, bad placement, stated uncertainty, choice of the model."""
 
 from __future__ import annotations
 
@@ -131,7 +118,6 @@ def knocks(frame: Frame, sets: int, seed: int) -> Iterator[Line]:
 
 
 def share(what: str, good: Sequence[bool] | Floats, least: float) -> Line:
-    """Return the line of a share that is at least to be reached."""
     part = float(np.mean(good))
     return Line(what, f'{100.0 * part:.1f} %', len(good), f'≥ {100.0 * least:g} %', part >= least)
 
@@ -314,12 +300,10 @@ ROWS = {'knocks': knocks, 'bounds': bounds, 'placements': placements, 'intervals
         'recordings': recordings, 'wiring': wiring, 'choices': choices}
 
 
-def page(frame: Frame, sets: int = 200, seed: int = 1, only: tuple[str, ...] = tuple(ROWS)
-         ) -> Iterator[str]:
-    """Yield the parts of the page."""
-    yield f'# Figures of trust\n\n{__doc__.strip()}\n\nMade by `{frame.command}`.'
+def robustness(frame: Frame, sets: int = 200, seed: int = 1, only: tuple[str, ...] = tuple(ROWS)
+               ) -> Iterator[str]:
     yield table(line for name in only for line in ROWS[name](frame, sets, 100_000 * seed))
 
 
 if __name__ == '__main__':
-    main(page)
+    main(robustness)

@@ -5,8 +5,7 @@
 Faults of a sensor, its driver and its clock: whether they are named, and never calibrated.
 
 A simulated recording is given a fault, and calibrated as a user does it. A recording without a
-fault must have no finding about the samples. Faults of the text and of the order of rows are no
-faults of messages.
+fault must have no finding about the samples.
 
 """
 
@@ -45,18 +44,6 @@ OF_TEXT = ('whole seconds', 'newest first')
 """Faults of files that are no faults of messages."""
 
 Said = tuple[str, Calibration | None, Rating | None]
-
-ABOUT = """\
-# Faults of sensors
-
-Made by `{command}`. Each set is a
-recording of 14 poses with other errors of the sensor, noise, rate and orientations, and with one
-fault. It comes as a CSV file, as a bag, as messages to the session of a node, and as a recording
-that the live page plays. *Named*: a finding, a note, a line of the log or the refusal is about the
-fault. *Wrong*: a calibration that is not BAD leaves an error of |a| above 10 mg in new
-orientations.
-
-Machine: {machine}."""
 
 
 # ------------------------------------------------------------------------------------------ faults
@@ -299,23 +286,21 @@ def counted(name: str, surface: str, sets: int, seed: int, folder: Path) -> Coun
 
 
 def row_of(name: str, surface: str, sets: int, seed: int) -> tuple[object, ...]:
-    """Return a row of the table."""
     with TemporaryDirectory() as folder:
         found = counted(name, surface, sets, seed, Path(folder))
     return (name, surface, sets, found['named'] if FAULTS[name].words else '',
             found['calibrated'], found['wrong'], found['false'] if name == 'none' else '')
 
 
-def page(frame: Frame, sets: int = 50, clean: int = 125, seed: int = 2030,
-         only: tuple[str, ...] = tuple(FAULTS)) -> Iterator[str]:
+def sensor_faults(frame: Frame, sets: int = 50, clean: int = 125, seed: int = 2030,
+                  only: tuple[str, ...] = tuple(FAULTS)) -> Iterator[str]:
     """Yield the parts of the page; `clean` is the number of sets without a fault."""
     rows = frame.run(row_of, [
         (name, surface, clean if name == 'none' else sets, seed)
         for name in only for surface in SURFACES
         if not (name in OF_TEXT and surface in ('bag', 'node'))])
-    yield ABOUT.format(command=frame.command, machine=frame.machine)
     yield markdown(('fault', 'as', 'sets', 'named', 'calibrated', 'wrong', 'false findings'), rows)
 
 
 if __name__ == '__main__':
-    main(page)
+    main(sensor_faults)

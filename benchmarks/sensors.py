@@ -119,29 +119,13 @@ class Sensor:
 
 @dataclass(frozen=True)
 class Case:
-    """
-    A sensor and its n poses.
-
-    Parameters
-    ----------
-    sensor : Sensor
-        The sensor.
-    poses : Poses
-        Its poses, in g.
-    force : (n, 3) array
-        True specific force of each pose [g].
-    noise : (n,) array
-        True standard deviation of each pose, by axis, with its scatter [g].
-    shows_mg : (n,) array
-        Change of |force| by a knock; 0 if the pose was not knocked.
-
-    """
+    """A sensor and its n poses."""
 
     sensor: Sensor
-    poses: Poses
-    force: Floats
-    noise: Floats
-    shows_mg: Floats
+    poses: Poses  # in g
+    force: Floats  # (n, 3) true specific force of each pose [g]
+    noise: Floats  # (n,) true standard deviation of each pose, by axis, with its scatter [g]
+    shows_mg: Floats  # (n,) change of |force| by a knock; 0 if the pose was not knocked
 
 
 def draw_sensor(rng: np.random.Generator, kind: str = '10') -> Sensor:

@@ -26,37 +26,6 @@ from sensors import draw_case, draw_sensor, NOISE, poses_of, spread
 G, MS2 = units_of('g'), units_of('m/s2')
 SEED = 2031
 
-FITS = """\
-# Figures of fits
-
-Time of fits: one sensor, and up to a million poses.
-
-Everything runs on one core. The closed form is compared with the ellipsoid by numpy's least
-squares, the likelihood with scipy's `least_squares` and its numerical derivatives; both are what
-people commonly write by hand. Times of fits are CPU time, the least of several runs.
-
-Made by `{command}` on {machine}."""
-
-REFINE_COST = """\
-# Cost of refine with many poses
-
-Made by `{command}` on {machine}."""
-
-STILLNESS_SPEED = """\
-# Speed of the stillness detector
-
-Made by `{command}`.
-Times are CPU time of one core over arrays in memory, the least of several repeats. The sensor
-rests for 4 s and is shaken for 1 s.
-
-Machine: {machine}."""
-
-COSTS = """\
-A sample costs {fast:.0f} ns at 1000 Hz and {slow:.0f} ns at 100 Hz, where a chunk has ten samples
-and a rest 400. A sensor that always rests gives {long:.0f} million samples/s at 100 Hz. The
-difference is {rest:.0f} µs per rest: some calls of numpy join its chunks, and a record is made of
-it."""
-
 
 def least_time(work: Callable[[], object], seconds: float = 1.0, runs: int = 3) -> float:
     """Return the least CPU time of work [s], in some seconds and runs, but not in 5 s of them."""
@@ -140,9 +109,7 @@ def fits(frame: Frame, largest: int = 1_000_000) -> Iterator[str]:
     axes.legend(frameon=False)
     if frame.path:
         figure.savefig(frame.path.with_suffix('.svg'), metadata={'Date': None})
-    yield FITS.format(command=frame.command, machine=frame.machine)
     yield table(lines)
-    yield '![time over poses](fits.svg)'
 
 
 # ----------------------------------------------------------------------------------- refinements
@@ -183,7 +150,6 @@ def refine_cost(frame: Frame, seed: int = 2028, poses: tuple[int, ...] = tuple(L
                      f'≤ {LONGEST[count]:g}', found.seconds <= LONGEST[count]),
                 Line(f'{what}: largest memory [MB] ({found.before:.0f} before)',
                      f'{found.megabytes:.0f}', 1, f'≤ {MOST_MB:g}', found.megabytes <= MOST_MB)]
-    yield REFINE_COST.format(command=frame.command, machine=frame.machine)
     yield table(lines)
 
 
@@ -251,10 +217,10 @@ def stillness_speed(frame: Frame, largest: int = 3 * 10**7, seed: int = 1) -> It
     resting = recording_of(10**6, 100.0, seed, rest=1e5)
     still = least_time(partial(capture, resting, G), 0.0) / 10**6
     slow, fast = each[100.0], each[1000.0]
-    yield STILLNESS_SPEED.format(command=frame.command, machine=frame.machine)
     yield table(lines)
-    yield COSTS.format(fast=1e9 * fast, slow=1e9 * slow, long=1e-6 / still,
-                       rest=1e6 * (slow - still) * 100.0 * (REST + SHAKEN))
+    yield f'A sample costs {1e9 * fast:.0f} ns at 1000 Hz and {1e9 * slow:.0f} ns at 100 Hz'
+    yield f'always rests gives {1e-6 / still:.0f} million samples/s at 100 Hz'
+    yield f'difference is {1e6 * (slow - still) * 100.0 * (REST + SHAKEN):.0f} µs per rest'
 
 
 if __name__ == '__main__':

@@ -8,17 +8,10 @@ A simulated recording is a sequence of stretches: the sensor rests, is carried b
 orientation, and so on. By its kind it is also held in the hand, turned slowly, beside a person who
 walks by, or beside a motor. Forces are in g, all else is SI.
 
-A rule takes a recording and returns poses. Ours is the detector of the package. The two others are
-simple, and get what ours has to find out: that the sensor rests in the first two seconds.
-**variance**: the standard deviation over a sliding second, by axis, is below three times that of
-the first two seconds, or 0.33 mg (imu_tk and others use a multiple of the variance in a first
-rest). **gyro**: the mean rate over half a second is within 0.5 °/s of that of the first two
-seconds. A pose is a stretch of a second or more; both treat the samples as independent.
-
-A pose belongs to the rest that it overlaps most, if that is more than half of the pose; otherwise
-it is false. Its error is its mean less the true specific force of that rest; the error of its norm
-is |mean| - 1. The normalised error is error / stated noise; its standard deviation is 1 if the
-statement is right.
+A rule takes a recording and returns poses. A pose belongs to the rest that it overlaps most, if
+that is more than half of the pose; otherwise it is false. Its error is its mean less the true
+specific force of that rest; the error of its norm is |mean| - 1. The normalised error is error /
+stated noise; its standard deviation is 1 if the statement is right.
 
 """
 
@@ -49,53 +42,18 @@ NOISES_MG = (0.3, 1.0, 3.0, 5.0)
 NOISY_MG = 50.0
 RATES_HZ = (50.0, 100.0, 200.0, 1000.0)
 CORRELATION_S = (0.0, 0.0, 0.02, 0.2)
+Unit = Literal['m/s2', 'g', 'native']
+
 REST, CARRY, OTHER = 0, 1, 2
 """Phases of a recording."""
 
 GYRO_NOISE, GYRO_BIAS = 2e-3, 1.5e-2
 """Standard deviations of the gyro, of a sample and of its bias by axis [rad/s]."""
 
-RECORDINGS = (('mpu9150_imu0', 'm/s2', 21), ('mpu9150_imu1', 'm/s2', 21),
-              ('xsens_mti_counts', 'native', 38))
+RECORDINGS: tuple[tuple[str, Unit, int], ...] = (
+    ('mpu9150_imu0', 'm/s2', 21), ('mpu9150_imu1', 'm/s2', 21),
+    ('xsens_mti_counts', 'native', 38))
 """Name, unit, and the number of poses that the person took."""
-
-ABOUT = """# Figures of the stillness detector
-
-Made by `{command}`.
-Each recording has ten rests of 2.5 to 8 s at 50 to 1000 Hz, noise that is white or has a
-correlation time of 20 or 200 ms, and a gyro with 2 mrad/s of noise and a bias. Two rules beside
-ours know that the recording begins with a rest: *variance* uses three times the standard deviation
-of the first two seconds, as imu_tk and others do; *gyro* requires a mean rate within 0.5 °/s of
-that of the first two seconds. In most of a false pose the sensor moves. The normalised error is
-the error of a pose mean over its stated noise std/√count, without the largest 1 %, which show
-under *largest*; its standard deviation should be 1. For false poses it is the error against the
-true force in their middle: a tremor below the noise of the sensor does no harm to a mean. Rests
-beside footsteps and a motor count as rests, because their means are right."""
-
-ABOUT_FIRST = """\
-## Disturbed from the first second on
-
-Each recording lasts 12 s, at 100, 200 or 1000 Hz, in one orientation, with 2 mg of white noise
-unless another noise is named. The sensor has not rested before. The frequency wanders by 5 %, at
-most by 0.5 Hz. *captured* is the share of recordings with a pose. A tremor faster than 5 Hz
-averages out over a chunk like vibration and counts as rest; its effect on a mean is small.
-Vibration within about 5 Hz of a multiple of the sample rate looks like shaking in the samples, and
-is refused. This costs rests beside a motor at 50 Hz below."""
-
-LIMITS = """\
-Limits: beside a motor the stated noise is too large, because vibration averages out faster than
-the noise it resembles. With 50 mg of noise, a turn that lasts longer than the correlation time of
-200 ms is not always distinguished from noise. Most rests of a few seconds are refused there
-without a gyro, because their samples cannot show that the sensor was not turned. Steps that are
-clearly larger than the noise of a quiet sensor cost rests that a threshold learned from the steps
-keeps. A tremor below about twice the noise counts as rest; against the true force such poses are
-as good as their stated noise."""
-
-ABOUT_REAL = """\
-## Real recordings
-
-A fit of 10 parameters to all poses. The truth of these recordings is not known. The gyro of the
-Xsens recording is in counts, so that a threshold in °/s does not apply."""
 
 
 # --------------------------------------------------------------------------- simulated recordings
@@ -373,7 +331,6 @@ def measure(frame: Frame, sets: int, seed: int, noisy: bool) -> Sums:
 
 
 def compare_rules(found: Sums) -> str:
-    """Return the table of all rules on all kinds, as Markdown."""
     heads = ('recordings', 'rule', 'moving samples in poses', 'rest used', 'rests missed',
              'false poses', 'median error of a mean, mg', 'largest, mg',
              'RMS error of its norm, mg', 'normalised error', 'the same of false poses')
@@ -451,10 +408,9 @@ def lines_of_first(frame: Frame, sets: int, seed: int) -> Iterator[Line]:
 # -------------------------------------------------------------------------------- real recordings
 
 def rows_of_real() -> Iterator[tuple[object, ...]]:
-    """Yield the rows of all rules on the real recordings."""
     for name, unit_name, wanted in RECORDINGS:
         recording = read_recording(DATA / f'{name}.csv')
-        units: Any = units_of(unit_name)
+        units = units_of(unit_name)
         native = units.name == 'native'
         reading = recording.reading if native else units.to_g(recording.reading)
         time = recording['time']
@@ -483,21 +439,16 @@ def fit_words(poses: Sequence[Pose], unit_name: Literal['g', 'native']) -> tuple
     return f'{quality.rms_after_mg:.3f}', '' if chi2 is None else f'{chi2:.1f}'
 
 
-def page(frame: Frame, sets: int = 60, seed: int = 1) -> Iterator[str]:
-    """Yield the parts of the page."""
+def stillness(frame: Frame, sets: int = 60, seed: int = 1) -> Iterator[str]:
     usual, noisy = (measure(frame, sets, seed, each) for each in (False, True))
-    yield ABOUT.format(command=frame.command)
     yield table([*lines_of(usual, 'noise 0.3 to 5 mg', sets),
                  *lines_of(noisy, 'noise 50 mg', sets)])
-    yield LIMITS
-    yield ABOUT_FIRST
     yield table(lines_of_first(frame, sets, seed))
-    yield f'## Noise 0.3 to 5 mg\n\n{compare_rules(usual)}'
-    yield f'## Noise 50 mg\n\n{compare_rules(noisy)}'
-    yield ABOUT_REAL
+    yield compare_rules(usual)
+    yield compare_rules(noisy)
     yield markdown(('recording', 'rule', 'poses', 'taken by hand', 'samples used', 'residual, mg',
                     'chi² per degree of freedom'), rows_of_real())
 
 
 if __name__ == '__main__':
-    main(page)
+    main(stillness)

@@ -12,7 +12,7 @@ models that the poses determine.
 and 8 corners of the sensor. It is the orientation that increases the determinant of M plus the
 information of one pose spread over the whole sphere most (D-optimal design, Fedorov 1972). The
 latter represents the poses to come; without it the first poses would be chosen as if they were the
-last. `benchmarks/next_pose.py` compares this order with others.
+last. `benchmarks/poses.py` compares this order with others.
 
 With n well spread poses, the error of |force| is the noise of a pose times √(p / n), RMS over the
 sphere. Another pose reduces it by the factor 1 / 2n. More poses no longer help if the next pose

@@ -184,7 +184,7 @@ COMMANDS = {
                    metavar='LOG'),
             *_calibration_of_logs()), writes='calibration', about='logs'),
     'capture': Command(
-        'find the still stretches of a recording and write the pose table', 'recordings',
+        'find the still stretches of a recording and write the pose table', 'fit',
         'recording.mcap -o poses.csv', (
             source('recording', any_log()),
             option('-o', '--output', metavar='FILE', help='pose table to write; - for standard '
@@ -255,7 +255,7 @@ COMMANDS = {
                                 f'repeated: {", ".join(_ALONE())}')),
             *LOG, *CAPTURE, *shared('--no-refine', '--json'))),
     'apply': Command(
-        'correct a recording with a calibration', 'recordings',
+        'correct a recording with a calibration', 'fit',
         'recording.mcap -c calibration.yaml -o corrected', (
             source('recording', any_log()), stored(required=True),
             option('-o', '--output', metavar='OUT', help='CSV table or bag to write, of the same '
@@ -266,7 +266,7 @@ COMMANDS = {
             *LOG), writes='table'),
     'export': Command(
         'write a calibration in the format of a firmware, an autopilot or another tool',
-        'recordings', 'calibration.yaml --to c -o imu.h', (
+        'fit', 'calibration.yaml --to c -o imu.h', (
             option('calibration', type=Path, metavar='CALIBRATION', help='stored calibration; - '
                    'for standard input'),
             option('--to', required=True, choices=late('stored.exports', 'FORMATS'),
@@ -297,7 +297,7 @@ COMMANDS = {
             report('page to write with the Allan deviation and the figures (HTML)'), *LOG,
             *shared('--json'))),
     'simulate': Command(
-        'simulate poses or a recording of a sensor with known effects', 'recordings',
+        'simulate poses or a recording of a sensor with known effects', 'fit',
         '-o poses.csv --effect offset=0.02,-0.01,0.03 --effect axis_gain=0.01', (
             option('-o', '--output', metavar='OUT', help='CSV table to write; - for standard '
                    'output', **_OUTPUT),

@@ -114,7 +114,14 @@ def rotation_free(calibration: Calibration, context: Context, per_g: float) -> R
     slope_v = model.basis(origin, context).full[0]
     here = {key: np.repeat(column, 3, 0) for key, column in context.items()}
     slope_w = model.basis(np.zeros((3, 3)), here, np.eye(3)).full  # (column, row, p)
-    mat_s, slope_s = _polar(mat_w, np.swapaxes(slope_w, 0, 1))
+    # S and its (3, 3, p) derivative, from the eigenvectors of W Wᵀ.
+    squared, vectors = np.linalg.eigh(mat_w @ mat_w.T)
+    roots = np.sqrt(squared)
+    half = np.einsum('ijp,kj->ikp', np.swapaxes(slope_w, 0, 1), mat_w)
+    turned = np.einsum('ia,ijp,jb->abp', vectors, half + np.swapaxes(half, 0, 1), vectors)
+    turned = turned / np.add.outer(roots, roots)[:, :, np.newaxis]
+    mat_s = (vectors * roots) @ vectors.T
+    slope_s = np.einsum('ia,abp,jb->ijp', vectors, turned, vectors)
     units = calibration.units  # the common unit is the standard g, or native
     reading_scale = force_scale = (units.per_g / STANDARD_GRAVITY if units.is_si else units.per_g)
     if units.is_native:
@@ -130,16 +137,6 @@ def rotation_free(calibration: Calibration, context: Context, per_g: float) -> R
                         np.eye(size)[own]]),
         axes=np.linalg.solve(mat_s, mat_w) @ model.rotation, reading_scale=reading_scale,
         force_scale=force_scale)
-
-
-def _polar(mat_w: Floats, slope_w: Floats) -> tuple[Floats, Floats]:
-    """Return S (3, 3) and its (3, 3, p) derivative from W and the (3, 3, p) derivative of W."""
-    squared, vectors = np.linalg.eigh(mat_w @ mat_w.T)
-    roots = np.sqrt(squared)
-    half = np.einsum('ijp,kj->ikp', slope_w, mat_w)
-    turned = np.einsum('ia,ijp,jb->abp', vectors, half + np.swapaxes(half, 0, 1), vectors)
-    turned = turned / np.add.outer(roots, roots)[:, :, np.newaxis]
-    return (vectors * roots) @ vectors.T, np.einsum('ia,abp,jb->ijp', vectors, turned, vectors)
 
 
 _WORSE = 0.001

@@ -257,6 +257,10 @@ class Effect:
             return 'force'
         return 'offset' if all(term.monomial == ONE for term in self.terms) else 'gain'
 
+    @property
+    def is_offset(self) -> bool:
+        return self.changes == 'offset'
+
     @cached_property
     def bends(self) -> bool:
         """Whether the effect is not affine in the force."""

@@ -7,7 +7,7 @@ The maximum likelihood fit of any list of effects to poses of any kind, by least
 `.equations` sets up the equations of the poses. Damped least squares (Levenberg 1944, Marquardt
 1963) within bounds minimises the sum of their squared residuals; for a dozen poses,
 `scipy.optimize.least_squares` takes several times as long, mostly because of overhead
-(`benchmarks/fits.py`). The covariance is (JᵀJ)⁻¹ times the variance factor of `.equations`.
+(`benchmarks/speed.py`). The covariance is (JᵀJ)⁻¹ times the variance factor of `.equations`.
 
 The bounds of each parameter limit its contribution to a reading to `Effect.plausible_g`. A fitted
 shape constant stays near the values that the search tries. The effects of V and W have no bounds

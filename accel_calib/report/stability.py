@@ -26,7 +26,7 @@ from .sheet import (
 from ..comparison import Comparison, History, Parameter
 from ..findings import (
     change_in_words, CROSS, GAINS, in_words, OFFSETS, rate_comparison, rate_noise, scale_of)
-from ..noise import AxisNoise, duration, FIGURES, Kind, NoiseFigures, shown_unit, TYPICAL, WORDS
+from ..noise import FIGURES, AxisNoise, duration, Kind, NoiseFigures, shown_unit, TYPICAL, WORDS
 from ..statistics import rms
 from ..table import Floats
 from ..text import power_of_ten, short, with_minus, with_sd

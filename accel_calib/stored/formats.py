@@ -33,7 +33,7 @@ ArduPilot [2]_, and the parameter file of QGroundControl [3]_.
 A has columns of length 1, which is the rotation of the axes where the gains are those of each axis
 (Fusion). K is diagonal, and R has rows of length 1 (imucal). Q is a rotation, and L is lower
 triangular with a positive diagonal (OpenVINS, as Kalibr has it). For a model with more than offset
-and gain, M and c are the least-squares fit (`affine_fit`).
+and gain, M and c are the least-squares fit to it.
 
 **Noise.** The figures are those of ``accel-calib noise --json``, per square root of hertz.
 VINS-Fusion takes the noise of one sample, which is the density times the square root of the rate.
@@ -239,25 +239,6 @@ def _three(start: str, end: str, values: Floats) -> Parameters:
 # A matrix and an offset
 
 
-def affine_fit(calibration: Calibration) -> tuple[Floats, Floats]:
-    """
-    Return M (3, 3) and c (3,) with levelled force = M reading - c [g].
-
-    For a model of offset and gain they are exact; for others they are the least-squares fit over
-    the sphere and the range of the temperature.
-
-    """
-    if all(effect.linear for effect in calibration.model.terms.effects):
-        matrix = np.linalg.inv(calibration.model.linear_part[0]) / calibration.units.per_g
-        offset = matrix @ calibration.offset
-    else:
-        grid, scale = steady_grid(calibration), calibration.units.per_g
-        columns = np.column_stack([grid.reading / scale, np.ones(len(grid.reading))])
-        found = np.linalg.lstsq(columns, grid.force, rcond=None)[0]
-        matrix, offset = found[:3].T / scale, -found[3]
-    return calibration.rotation.T @ matrix, calibration.rotation.T @ offset
-
-
 def affine(calibration: Calibration, force_per_g: float | None = None, levelled: bool = True,
            notes: tuple[str, ...] = ()) -> Made:
     """
@@ -271,7 +252,15 @@ def affine(calibration: Calibration, force_per_g: float | None = None, levelled:
     unit, gyro = force_per_g or calibration.force_per_g, calibration.gyro
     bias = np.zeros(3) if gyro is None else gyro.bias
     unknown = [] if gyro else ['the bias of the gyro is not known: it is 0']
-    matrix, constant = (each * unit for each in affine_fit(calibration))
+    if all(effect.linear for effect in calibration.model.terms.effects):
+        sensor = np.linalg.inv(calibration.model.linear_part[0]) / calibration.units.per_g
+        constant = sensor @ calibration.offset
+    else:
+        grid, scale = steady_grid(calibration), calibration.units.per_g
+        columns = np.column_stack([grid.reading / scale, np.ones(len(grid.reading))])
+        found = np.linalg.lstsq(columns, grid.force, rcond=None)[0]
+        sensor, constant = found[:3].T / scale, -found[3]
+    matrix, constant = ((calibration.rotation.T @ each) * unit for each in (sensor, constant))
     sensitivity, inverse = np.linalg.norm(matrix, axis=0), np.linalg.inv(matrix)
     gain = np.linalg.norm(inverse, axis=1)
     orthogonal, triangular = (part[..., ::-1] for part in np.linalg.qr(matrix[:, ::-1]))
