@@ -9,11 +9,11 @@ from collections.abc import Iterator
 import os
 from tempfile import TemporaryDirectory
 
-from figures import Frame, main, markdown
 from accel_calib.geometry import ATTITUDES, spread_directions, unit
 from accel_calib.session import conditions
 from accel_calib.statistics import rms
 from driven import Driver, GRAVITY, Person
+from figures import Frame, markdown
 import numpy as np
 import test_persons
 
@@ -80,7 +80,3 @@ def persons(frame: Frame, sets: int = 40, seed: int = 1) -> Iterator[str]:
                    rows)
     yield (f'Of {len(told)} who turn a sound sensor in an own order of sides, of sides and edges, '
            f'or of any directions, {sum(told)} were told')
-
-
-if __name__ == '__main__':
-    main(persons)
