@@ -191,12 +191,12 @@ def main() -> None:
         path.write_text(text, encoding='utf-8')
 
 
-def update(page: str, parts: Iterable[str]) -> str:
+def update(page: str, parts: Sequence[str]) -> str:
     """
     Return a page with what was found.
 
-    A table takes the place of that with the same number in the page. A phrase gives its numbers
-    to the same words in the page, with other white space; new words are the last paragraph.
+    Tables take the place of those in the page, in their order. A phrase is found in the page by
+    its words, and its numbers take the place of those there. What has no place comes last.
 
     """
     number = r'[-+]?\d[\d,.]*\d|\d'
@@ -210,10 +210,11 @@ def update(page: str, parts: Iterable[str]) -> str:
             new = re.sub(number, lambda _: next(values), found[0])  # noqa: B023
             page = page[:found.start()] + new + page[found.end():]
         else:
-            page = page.replace('\n\nMeasured at', f'\n\n{phrase}\n\nMeasured at')
-    table = re.compile(r'^\| .*\n\|---.*\n(?:\|.*\n)*', re.MULTILINE)
-    assert len(tables) == len(table.findall(page)), 'expected as many tables as the page has'
-    return table.sub(lambda _: tables.pop(0) + '\n', page)
+            tables.append(phrase)
+    page = re.sub(r'^\| .*\n\|---.*\n(?:\|.*\n)*', lambda old: (
+        f'{tables.pop(0)}\n' if tables else old[0]), page, flags=re.MULTILINE)
+    words, last, commit_words = page.rpartition('Measured at the commit ')
+    return ''.join([words, *(f'{each}\n\n' for each in tables), last, commit_words])
 
 
 def commit() -> str:
