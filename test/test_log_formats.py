@@ -7,7 +7,7 @@ from pathlib import Path
 import re
 from typing import Any
 
-from accel_calib.calibration import Calibration, fit_poses, level_by_rows
+from accel_calib.calibration import Calibration, fit_poses
 from accel_calib.errors import InputError
 from accel_calib.logs import LogOptions
 from accel_calib.stillness import capture
@@ -100,16 +100,6 @@ def test_the_csv_of_an_older_ardupilot_log_has_no_number_of_the_sensor(tmp_path:
     check(log.table, log.units, 'ardupilot/two_imus.csv')
 
 
-def test_a_flat_pose_makes_a_level_vehicle_read_up() -> None:
-    log = read_log(LOGS / 'px4/log_sensor_accel_0.csv')
-    poses = capture(log.table, log.units).poses  # type: ignore[arg-type]
-    fitted = fit_poses(poses, log.units, model='10')
-    calibration = level_by_rows(fitted, poses, 'ros', 1, None)
-    up = calibration.apply(poses.reading[:1])[0] / log.units.per_g
-    np.testing.assert_allclose(up, [0.0, 0.0, 1.0], atol=2e-3)
-    np.testing.assert_allclose(calibration.rotation, make.FRD, atol=2e-2)
-
-
 # ---------------------------------------------------------------------------------- PX4 logs
 
 def test_a_log_of_the_default_profile_gives_the_selected_sensor_with_its_temperature() -> None:
@@ -186,13 +176,6 @@ def test_of_two_sensors_the_lowest_or_the_one_that_is_named_is_read(name: str) -
         assert any('IMU 1' in note for note in lowest.notes)
 
 
-def test_the_text_log_has_the_numbers_of_the_binary_log() -> None:
-    binary, text = ardupilot('two_imus.bin'), ardupilot('one_imu.log')
-    assert set(binary.recording.columns) == set(text.recording.columns)
-    for key, values in binary.recording.columns.items():
-        np.testing.assert_allclose(text.recording[key], values, rtol=1e-6, atol=1e-9)
-
-
 def test_garbage_within_an_ardupilot_log_is_passed_over_and_noted(tmp_path: Path) -> None:
     whole = (LOGS / 'ardupilot/raw_acc.bin').read_bytes()
     start = whole.index(b'\xa3\x95\x65', 20_000)
@@ -218,13 +201,6 @@ def test_the_messages_of_older_ardupilot_logs_are_read(tmp_path: Path) -> None:
     assert any('1 line of' in note for note in log.notes)
     other = read_dataflash(path, sensor='1').recording
     np.testing.assert_allclose(other.reading[:, 0], [1.5, 1.6])
-
-
-def test_the_calibration_that_an_ardupilot_log_holds_already_is_named(tmp_path: Path) -> None:
-    rows = [*make.dataflash_forms(), ('PARM', (1, 'INS_ACCOFFS_X', 0.25, 0.0)),
-            *make.imu_rows(make.recording(1), 0)]
-    log = ardupilot(write(tmp_path, make.dataflash_bytes(rows)))
-    assert any('INS_ACCOFFS_X 0.25' in note for note in log.notes)
 
 
 @pytest.mark.parametrize(('suffix', 'content'), [
