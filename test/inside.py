@@ -81,9 +81,9 @@ from accel_calib.refinement.state import beginning, candidates, fitted_state, li
 from accel_calib.refinement.steps import remarks_on
 from accel_calib.report.page import axis_figures, snippets
 from accel_calib.report.refinement import all_drawings, curve_parts
-from accel_calib.report.residuals import residuals_of, residuals_of_refinement
+from accel_calib.report.residuals import residuals_of
 from accel_calib.report.sheet import sheet
-from accel_calib.report.stability import comparison_page, history_page
+from accel_calib.report.stability import comparison_page
 from accel_calib.ros.run import own_domain
 from accel_calib.session import store as session_store, worker
 from accel_calib.session.commands import (

@@ -203,6 +203,13 @@ def test_the_messages_of_older_ardupilot_logs_are_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(other.reading[:, 0], [1.5, 1.6])
 
 
+def test_the_calibration_that_an_ardupilot_log_holds_already_is_named(tmp_path: Path) -> None:
+    rows = [*make.dataflash_forms(), ('PARM', (1, 'INS_ACCOFFS_X', 0.25, 0.0)),
+            *make.imu_rows(make.recording(1), 0)]
+    log = ardupilot(write(tmp_path, make.dataflash_bytes(rows)))
+    assert any('INS_ACCOFFS_X 0.25' in note for note in log.notes)
+
+
 @pytest.mark.parametrize(('suffix', 'content'), [
     *(('.ulg', each) for each in (b'', b'ULog\x01\x12\x35\x01', b'\0\0',
                                   b'ULog\x01\x12\x35\x01' + b'\xff' * 500)),

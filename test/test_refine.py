@@ -238,6 +238,15 @@ def test_a_step_is_found_among_more_instants_than_are_tried(count, place):
     assert not found.calibration.rejected
 
 
+def test_the_effects_of_the_ladder_are_added_to_an_ideal_sensor(taken):
+    found = refine(taken(6, poses=60)[0], MPS2, base='ideal')
+    steps = [step.effect for step in found.steps]
+    assert sorted(steps) == ['axis_gain', 'cross_axis', 'offset']
+    gaps = [found.gap_mg, *(step.gap_after_mg for step in found.steps)]
+    assert gaps == sorted(gaps, reverse=True)
+    assert found.verdict == 'explained'
+
+
 def test_a_long_table_is_refined_from_a_sample_and_says_so(monkeypatch):
     monkeypatch.setattr(*LARGEST_SAMPLE, 400)
     rng = np.random.default_rng(4)

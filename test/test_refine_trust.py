@@ -22,6 +22,7 @@ import pandas as pd
 import pytest
 from shared import data, G, random_directions, run, run_json, sensor
 
+OFFSET = np.array([0.02, -0.01, 0.03])
 WARM = np.array([6e-4, -4e-4, 5e-4])
 TCO = {'offset_temperature': WARM}
 
@@ -338,6 +339,18 @@ def test_the_change_of_each_axis_is_stated_with_its_own_uncertainty_and_date(cou
                  for axis, change in zip('xyz', moved)]
     assert 0.7 < np.sqrt(np.mean(np.square(away))) < 1.4  # chi² of 24 values: 0.72 to 1.28 at 95 %
     assert np.max(np.abs(away)) < 4.0
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_effects_of_twelve_poses_are_named_and_not_used(seed):
+    rng = np.random.default_rng(seed)
+    poses = simulate_poses(model_with({'offset': OFFSET, 'offset_temperature': 4.0 * WARM}),
+                           spread_directions(12), rng, noise_g=0.001,
+                           context={'temperature': rng.uniform(15.0, 35.0, 12)})
+    found = refine(poses, G, base='7')
+    assert (len(names(found)), found.verdict) == (1, 'unexplained')
+    assert (bool(found.refusal), found.undecided) == (True, True)
+    assert not found.steps[0].parameters_sd
 
 
 def test_samples_of_a_board_that_hardly_turns_give_it_no_absurd_gain():

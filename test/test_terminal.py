@@ -321,6 +321,8 @@ def test_screen_shows_all_figures() -> None:
                   'direction in sensor axes: +0.58 +0.58 -0.58'):
         assert words in shown
     assert f'{ENOUGH.accuracy * 1e3:.2g} mg expected' in drawn(screen(NODE, ENOUGH))
+    for words in ('1.0213 g, corrected 1.0002 g', '-3.5 °C'):
+        assert words in drawn(screen(NODE, SEEN))
 
 
 def pose_step(*signs: float) -> Progress:

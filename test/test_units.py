@@ -109,6 +109,20 @@ def test_verify_takes_the_unit_that_the_caller_states() -> None:
         ac.verify(poses('m/s2'), calibration, units='g')
 
 
+def test_refine_starts_from_a_calibration_in_the_other_unit() -> None:
+    rng = np.random.default_rng(5)
+    hidden = {**SENSOR, 'offset_temperature': (0.002, -0.001, 0.0015)}
+    base = ac.fit(poses('g'))
+    warm = rng.uniform(10.0, 50.0, 40)
+    found = [ac.refine(ac.simulate(hidden, poses=40, units=each, seed=6, noise=0.001,
+                                   temperature=warm), base=base) for each in METRIC]
+    assert [each.calibration.units.name for each in found] == list(METRIC)
+    assert [[step.effect for step in each.steps] for each in found] == [['offset_temperature']] * 2
+    np.testing.assert_allclose(found[0].gap_mg, found[1].gap_mg, rtol=1e-6)
+    np.testing.assert_allclose(found[0].calibration.model.vector,
+                               found[1].calibration.model.vector, rtol=1e-4, atol=1e-7)
+
+
 @pytest.mark.parametrize('stated', [True, False])
 @pytest.mark.parametrize('units', METRIC)
 def test_apply_corrects_a_table_in_the_other_unit(units: str, stated: bool, tmp_path: Path
