@@ -16,7 +16,9 @@ from accel_calib.logs import read_recording, write_table
 from accel_calib.refinement import refine
 from accel_calib.stored import write_calibration
 import generator
-from inside import Model, model_with, remarks_on, rotation_from_rpy, search_effects, simulate_poses
+from inside import (
+    Model, model_with, remarks_on, rotation_from_rpy, search_effects, simulate_poses,
+    spread_directions)
 import numpy as np
 import pandas as pd
 import pytest
