@@ -7,8 +7,8 @@ import re
 
 from accel_calib.calibration import fit_poses
 from accel_calib.effects import (
-    CARRIERS, effect_named, EMPIRICAL, EmpiricalCurve, entry_of, formula_of, kind_of, MODES,
-    modes_of, VARIABLES)
+    CARRIERS, effect_named, EMPIRICAL, EmpiricalCurve, entry_of, formula_of, kind_of, modes_of,
+    VARIABLES)
 from accel_calib.findings import rate
 from accel_calib.refinement import refine
 from accel_calib.report import calibration_page
@@ -16,7 +16,7 @@ from inside import (
     export, format_calibration, Model, model_with, parse_calibration, predict, simulate_poses)
 import numpy as np
 import pytest
-from shared import G, random_directions, sensor
+from shared import G, random_directions, sensor, table
 
 COUNT = 100
 CURVES = {
@@ -61,15 +61,7 @@ def test_the_text_of_a_curve_is_read_back(carrier, part, variable):
     assert effect.needs == (() if variable in ('force', 'direction') else (variable,))
 
 
-@pytest.mark.parametrize('name', [
-    'empirical', 'empirical-', 'empirical-offset', 'empirical-offset-time',
-    *(f'empirical-offset-time-{modes}' for modes in (
-        '', '0', f'{MODES + 1}', 'one', '-1', '1.5', '\u00b2', '1-1', '2-1')),
-    *(f'empirical-{parts}-1' for parts in (
-        'offset-count', 'offset-ax', 'mood-time', 'offset.q-time', 'offset.-time',
-        'offset.x.y-time', 'gain-force', 'gain-direction')),
-    *(f'empirical-force-direction-{degree}' for degree in (2, 7)), 'curve-offset-time-1',
-    'offset-time-1'])
+@pytest.mark.parametrize('name', table('no_curves'))
 def test_a_name_that_is_no_curve_is_refused(name):
     with pytest.raises(KeyError):
         effect_named(name)

@@ -19,7 +19,7 @@ from inside import (
     rotation_from_rpy, simulate_poses, spread_directions)
 import numpy as np
 import pytest
-from shared import KNOWN as AFFINE, rms, run
+from shared import KNOWN as AFFINE, rms, run, table
 import yaml
 
 BY_AXIS = {name: AFFINE[name] for name in ('offset', 'axis_gain')}
@@ -147,27 +147,12 @@ def test_a_header_holds_the_temperature_in_the_range_of_the_poses(compiled):
                                    atol=3e-6 * 9.8)
 
 
-@pytest.mark.parametrize(('text', 'name'), [
-    ('calibration', 'calibration'), ('IMU left/2', 'imu_left_2'), ('9dof', 'accel_9dof'),
-    ('', 'accel'), ('*/', 'accel'), ('\u00fc', 'accel'), ('__a__', 'a'), ('x' * 99, 'x' * 40)])
+@pytest.mark.parametrize(('text', 'name'), table('identifiers'))
 def test_any_text_becomes_an_identifier(text, name):
     assert identifier(text) == name
 
 
-@pytest.mark.parametrize(('name', 'to', 'options', 'message'), [
-    *(('affine', 'c', {'name': name}, 'expected a letter')
-      for name in ('9', 'a b', 'a;', '_a', '\u00fc', 'a' * 42)),
-    ('counts', 'px4', {}, 'native readings, but .* m/s2'),
-    *(('counts', to, {}, 'native readings, but .* m/s2')
-      for to in ('ardupilot', 'realsense', 'openvins', 'dlio')),
-    ('affine', 'inav', {'counts_per_g': 1e6}, 'counts, expected at most 32767'),
-    ('affine', 'mpu6050', {'name': '*/'}, 'expected a letter'),
-    ('vast', 'mpu6050', {}, 'counts, expected at most 32767'),
-    ('counts', 'inav', {'counts_per_g': 65536.0}, 'iNav takes 1 to 8192'),
-    ('counts', 'inav', {'counts_per_g': 0.5}, 'iNav takes 1 to 8192'),
-    ('affine', 'px4', {'instance': 9}, '--instance is 9'),
-    ('affine', 'ardupilot', {'instance': 9}, '--instance is 9'),
-    ('affine', 'betaflight', {'counts_per_g': 1e6}, 'counts, expected at most 32767')])
+@pytest.mark.parametrize(('name', 'to', 'options', 'message'), table('export_refused'))
 def test_what_a_format_cannot_hold_is_refused(name, to, options, message):
     made = sensor_with({'offset': [20.0, 0.0, 0.0]}) if name == 'vast' else HEADERS[name]
     with pytest.raises(InputError, match=message):
@@ -493,15 +478,7 @@ def test_the_loss_is_the_difference_that_the_written_values_leave(to, tmp_path):
     assert f' leaves {left:.2g} mg' in found.losses[-1]
 
 
-@pytest.mark.parametrize(('effects', 'to', 'words'), [
-    ({'gain_temperature': [0.0005] * 3}, 'px4', 'PX4 has no gain that changes with temperature'),
-    ({'offset_temperature': [0.001] * 3}, 'imucal', 'imucal has no offset that changes with'),
-    ({'offset_temperature': [1e-3, 1e-3, 1e-3, 900.0, 0.0]}, 'c', 'C header has no lag (900 s)'),
-    ({'offset_drift': [0.01, 0.02, 0.01, 0.0]}, 'c', 'C header has no offset that drifts'),
-    ({'supply_ratio': [1.0, 0.1, 0.1, 0.1]}, 'c', 'C header has no offset and gain in proportion'),
-    ({'temperature_rate': [1.0] * 3}, 'c', 'C header has no offset in proportion to the rate'),
-    ({'hysteresis': [0.002] * 3}, 'c', 'C header has no offset that depends on the previous'),
-    ({'quadratic': [0.003] * 3}, 'imu_calib', 'imu_calib has no square of the force')])
+@pytest.mark.parametrize(('effects', 'to', 'words'), table('export_losses'))
 def test_effects_that_a_format_lacks_are_losses_in_numbers(effects, to, words):
     made = export(sensor_with(AFFINE if to != 'px4' else BY_AXIS, effects), to)
     assert len(made.losses) == 1

@@ -28,7 +28,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from rosbags.typesys import get_typestore, Stores
-from shared import python, random_directions, refused, run, run_json, run_snippets, SENSOR
+from shared import python, random_directions, refused, run, run_json, run_snippets, SENSOR, table
 
 DOCS = Path(__file__).parent.parent / 'docs' / 'effects.md'
 
@@ -180,12 +180,7 @@ def test_an_own_effect_that_cannot_work_is_refused_when_it_is_made(wrong, messag
         ac.Effect(**{'name': 'own', 'words': 'own effect', 'typical': 0.001, **wrong})
 
 
-BAD = {'1 / 0': 'fails .division by zero', 'None': 'returns NoneType', '"text"': 'returns str',
-       'x[1:]': 'of shape', 'np.log(x - 25)': r'returns \[nan', 'x + 1j': 'complex128',
-       'np.multiply(x, 2, out=x)': 'read-only',
-       'x * np.random.rand()': 'other numbers', 'x - np.mean(x)': 'other numbers',
-       'calls.append(1) or x * len(calls)': 'other numbers', 'sys.exit(0)': 'fails .SystemExit 0.',
-       'exec("raise ValueError(chr(10) + chr(27))")': 'fails .ValueError.', '[x, 1]': 'fails'}
+BAD = table('bad_functions')
 
 
 @pytest.mark.parametrize('bad', BAD)
@@ -353,10 +348,7 @@ def test_an_own_effect_does_not_hide_one_of_the_catalogue():
         ac.load('calibration.yaml', also=[ac.Effect('quadratic', 'mine', typical=0.001)])
 
 
-@pytest.mark.parametrize(('text', 'message'), [
-    ('import accel_calib\n', 'defines no effect'), ('1 / 0\n', 'division by zero'),
-    ('def\n', 'invalid syntax'),
-    ('import sys\nsys.exit(0)\n', 'SystemExit 0')])
+@pytest.mark.parametrize(('text', 'message'), table('bad_effect_files'))
 def test_a_file_without_own_effects_is_refused(text, message, tmp_path, capsys):
     (tmp_path / 'own.py').write_text(text)
     assert message in refused(capsys, 'refine', 'poses.csv', '--also', tmp_path / 'own.py')

@@ -13,23 +13,11 @@ from xml.etree import ElementTree
 import accel_calib
 from accel_calib.logs import FORMATS
 import pytest
-from shared import ROOT
+from shared import ROOT, table
 
 EXECUTABLES = ('accel-calib', 'calibrator', 'calibrator_lifecycle', 'simulator')
 
-ROSDEP_KEYS = {
-    'Jinja2': 'python3-jinja2',
-    'PyYAML': 'python3-yaml',
-    'aiohttp': 'python3-aiohttp',
-    'matplotlib': 'python3-matplotlib',
-    'numpy': 'python3-numpy',
-    'pyserial': 'python3-serial',
-    'pytest': 'python3-pytest',
-    'rich': 'python3-rich',
-    'rosbags': '',  # not in Ubuntu; the nodes do not import it, and who reads bags is told
-    'scipy': 'python3-scipy',
-    'segno': '',  # has no key; without it there is no QR code
-}
+ROSDEP_KEYS = table('rosdep_keys')
 
 
 @pytest.fixture

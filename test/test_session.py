@@ -24,7 +24,7 @@ from inside import (
     spread_directions, store_of, StreamStatistics, use_calibration, writing_advice)
 import numpy as np
 import pytest
-from shared import GRAVITY, python, Readings, ROOT, Stored, with_effects
+from shared import GRAVITY, python, Readings, ROOT, Stored, table, with_effects
 
 UP, LEFT, FORWARD = [0, 0, 1], [0, 1, 0], [1, 0, 0]
 NOSE_DOWN = [-0.6, 0.0, 0.8]
@@ -344,15 +344,7 @@ def test_rate_and_faults_of_the_stamps_follow_the_last_seconds() -> None:
     assert statistics_of(*times[:1]).rate == 0.0
 
 
-@pytest.mark.parametrize(('settings', 'words'), [
-    ({'mounting_rpy': [0.0, 0.0, 1.0], 'base_frame': 'base_link'},
-     'both mounting_rpy and base_frame'),
-    ({'publish_tf': True, 'base_frame': 'base_link', 'output_frame_id': 'base_link'},
-     'publish_tf would make'),
-    *(({'context': [entry]}, f'entry {entry!r}, expected column:=topic') for entry in (
-        'motor_current', ':=/motor/current', 'time:=/clock', 'ax:=/x', 'two words:=/x',
-        'a__b:=/x')),
-    ({'context': ['a:=/x', 'a:=/y']}, 'each column once')])
+@pytest.mark.parametrize(('settings', 'words'), table('contradicting_settings'))
 def test_settings_that_contradict_each_other_are_refused(settings: Any, words: str) -> None:
     with pytest.raises(InputError, match=words):
         Driver(**settings)

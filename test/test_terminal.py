@@ -25,7 +25,7 @@ from inside import (
 import numpy as np
 import pytest
 from rich.console import Console
-from shared import forked, python, random_directions, ROOT, run, run_json
+from shared import forked, python, random_directions, ROOT, run, run_json, table
 
 SIMULATE = ('simulate', '--recording', '--poses', '14', '--effect', 'offset=0.02,-0.01,0.03', '-o')
 
@@ -117,13 +117,7 @@ def test_control_characters_are_escaped():
     assert shown('a ± \udc80', 'ascii') == 'a +- \\udc80'
 
 
-@pytest.mark.parametrize(('line', 'said'), [
-    ('calibrte x', '(did you mean calibrate?); see accel-calib --help\n'),
-    ('fit x.csv --modle 4', '(did you mean --model?)'),
-    ('refine x.csv --bsae 4', '(did you mean --base?)'),
-    ('fit x --units m/s', '(did you mean m/s2?)'),
-    ('fit x.csv --gravity -3', 'expected a positive number; see accel-calib fit --help'),
-    ('fit', 'the following arguments are required: '), ('fit x\0', 'has the character NUL')])
+@pytest.mark.parametrize(('line', 'said'), table('misspelt'))
 def test_a_misspelt_name_gets_a_suggestion_in_one_line_and_a_wrong_value_none(line, said, capsys):
     with pytest.raises(SystemExit, match='2'):
         main(line.split())
@@ -240,11 +234,7 @@ def test_a_reader_that_leaves_early_gets_no_error(tmp_path):
     assert 'Broken' not in done.stderr
 
 
-@pytest.mark.parametrize(('line', 'message'), [
-    ('simulate -o - --json -', 'unrecognized arguments: --json'),
-    ('capture r.csv -o - --json -', '-o and --json are both -'),
-    ('fit r.csv r.csv -o -', '-o is -, expected a folder'),
-    ('fit -', 'standard input is empty'), ('fleet r.csv -o -', '-o is -, expected a folder')])
+@pytest.mark.parametrize(('line', 'message'), table('not_piped'))
 def test_what_cannot_go_through_a_pipe_is_refused(line, message, tmp_path):
     (tmp_path / 'r.csv').write_text('time,ax,ay,az\n0,0,0,9.8\n', encoding='utf-8')
     done = forked(*line.split(), folder=tmp_path)
