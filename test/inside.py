@@ -30,7 +30,7 @@ from accel_calib.cli.main import main
 from accel_calib.cli.nodes import changes, screen, state
 from accel_calib.cli.options import in_one_line
 from accel_calib.cli.output import Output, shown
-from accel_calib.comparison import NAMES as PARAMETER_NAMES, rotation_free
+from accel_calib.comparison import rotation_free
 from accel_calib.comparison.agreement import (
     on_one_scale, outlier, p_values, Repeatability, repeatability_of, Runs)
 from accel_calib.comparison.drift import change, is_over, MEMORY as DRIFT_MEMORY

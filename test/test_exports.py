@@ -236,19 +236,6 @@ def test_autopilots_correct_as_apply_does_if_there_is_no_cross_axis_gain(
     np.testing.assert_allclose(force, wanted * factor, atol=2e-5)
 
 
-@pytest.mark.parametrize(('to', 'instance', 'names'), [
-    ('px4', 2, ('CAL_ACC2_ID', 'TC_A2_ID')), ('ardupilot', 1, ('INS_ACC_ID',)),
-    ('ardupilot', 2, ('INS_ACC2_ID',)), ('ardupilot', 3, ('INS_ACC3_ID',))])
-def test_the_parameters_of_an_autopilot_have_its_instance_and_device(to, instance, names,
-                                                                     tmp_path):
-    made = sensor_with(BY_AXIS, THERMAL)
-    reading, temperature, wanted = samples(made)
-    text = text_of(made, to, instance=instance, device_id=2490378)
-    found, force = by_autopilot(to, text, reading, temperature, tmp_path, instance)
-    assert {found[name] for name in names} == {2490378}
-    np.testing.assert_allclose(force, wanted, atol=2e-5)
-
-
 @pytest.mark.parametrize('to', ['px4', 'ardupilot', 'betaflight'])
 def test_readings_from_ros_are_turned_to_the_axes_of_the_autopilot(to, tmp_path):
     turn = np.array([1.0, -1.0, -1.0])

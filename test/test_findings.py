@@ -18,7 +18,7 @@ from inside import (
     format_calibration, main, Model, model_with, number, parse_calibration, spread_directions)
 import numpy as np
 import pytest
-from shared import error_mg, G, MPS2, random_directions
+from shared import error_mg, G, random_directions
 
 TIME = 20.0 * np.arange(30)
 WARM = 27.0 + 3.5 * np.sin(TIME / 60.0)
@@ -112,23 +112,6 @@ def test_findings_and_steps_have_a_listed_kind_and_a_finding_has_the_step_of_its
         Finding('surprise', 'what')
     with pytest.raises(ValueError, match="'wait'"):
         NextStep('wait', 'what')
-
-
-def test_the_figures_of_a_calibration_are_those_of_its_fields():
-    effects = {**COMMON, 'quadratic': [0.004, -0.003, 0.005]}
-    poses = simulated(effects, directions=random_directions(40, np.random.default_rng(4)),
-                      noise=1e-4)
-    calibration = refine(poses, MPS2).calibration
-    found = {figure.key: figure for figure in figures_of(calibration)}
-    assert found['rms_after_mg'].value == calibration.quality.rms_after_mg
-    assert found['max_before_mg'].value == 10.0 * calibration.quality.max_before_percent
-    assert found['offset.x'].value == calibration.offset[0]
-    assert found['offset.x'].unit == 'm/s²'
-    assert found['gain.xy'].sd == calibration.gain_sd[0, 1]
-    assert 'gain.yx' not in found  # the same value as gain.xy
-    row = calibration.parameters.index('quadratic.z')
-    assert found['quadratic.z'].value == 1000.0 * calibration.model.vector[row]
-    assert found['quadratic.z'].unit == 'mg/g²'
 
 
 def test_figures_that_are_not_known_are_left_out_and_a_gain_not_fitted_has_no_deviation():

@@ -91,15 +91,6 @@ def test_another_and_an_unknown_format_are_refused_with_what_is_lacking_or_meant
         format_named('phypox', ['Time (s)'], 'log.csv')
 
 
-def test_the_csv_of_an_older_ardupilot_log_has_no_number_of_the_sensor(tmp_path: Path) -> None:
-    lines = (LOGS / 'ardupilot/two_imus.csv').read_text(encoding='utf-8').splitlines()
-    rows = [line.split(',') for line in lines]
-    kept = [','.join(row[:2] + row[3:]) for row in rows if row[2] in ('I', '0')]
-    log = read_log(write(tmp_path, '\n'.join([*kept, '']).encode()))
-    assert isinstance(log.table, Recording)
-    check(log.table, log.units, 'ardupilot/two_imus.csv')
-
-
 # ---------------------------------------------------------------------------------- PX4 logs
 
 def test_a_log_of_the_default_profile_gives_the_selected_sensor_with_its_temperature() -> None:

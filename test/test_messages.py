@@ -12,7 +12,6 @@ the variable IMU_MESSAGES, 800 by default.
 from dataclasses import replace
 import math
 import os
-import pickle
 import struct
 
 from accel_calib.effects import EFFECTS
@@ -26,7 +25,7 @@ from accel_calib.units import STANDARD_GRAVITY
 from inside import Model, OneReading, rotation_from_rpy
 import numpy as np
 import pytest
-from shared import known, python, random_directions, values_of, with_effects
+from shared import known, random_directions, values_of, with_effects
 
 COUNT = int(os.environ.get('IMU_MESSAGES', '800'))
 COVARIANCES = ORIENTATION_COVARIANCE, ANGULAR_VELOCITY_COVARIANCE, ACCELERATION_COVARIANCE
@@ -234,23 +233,6 @@ def test_acting_temperature_is_limited_to_its_range_at_the_poses():
                             temperature=np.full(200, each))[-1] for each in (high, 90.0, 25.0)]
     np.testing.assert_allclose(at[0], at[1], atol=1e-6)
     assert np.max(np.abs(at[0] - at[2])) > 1e-3
-
-
-def test_what_the_worker_has_computed_is_not_computed_again_after_levelling(tmp_path):
-    calibration = lagging()
-    assert calibration.ranges
-    stored = tmp_path / 'calibration.pickle'
-    stored.write_bytes(pickle.dumps(calibration))
-    code = ('import pickle, sys; from pathlib import Path; import numpy as np; '
-            'from accel_calib.calibration import level; '
-            'given = pickle.loads(Path(sys.argv[1]).read_bytes()); '
-            'context = dict.fromkeys(("time", "temperature", "temperature_of_offset"), '
-            'np.array([25.0])); '
-            'flat = np.array([0.1, 0.2, 9.8]); '
-            'levelled = level(given, flat, "ros", context); '
-            'print(levelled.correct(flat[np.newaxis], context), "scipy.linalg" in sys.modules)')
-    found = python('-c', code, stored)
-    assert found.stdout.endswith('False\n'), found.stderr
 
 
 def test_context_of_one_reading_is_limited_to_the_ranges():

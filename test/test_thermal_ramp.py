@@ -170,18 +170,6 @@ def test_rests_with_times_in_another_unit_are_read_right_or_refused_with_the_uni
 
 
 @pytest.mark.usefixtures('without_pages')
-def test_the_cycle_of_a_real_board_leaves_two_mg_and_autopilots_state_what_they_lose(tmp_path,
-                                                                                     capsys):
-    path, out = data('poses/thermal_cycle_poses.csv'), tmp_path / 'c.yaml'
-    status, result = run_json(capsys, 'thermal', path, '-o', out)
-    assert status == 0
-    assert result['rms_after_mg'] == result['thermal']['residual_mg'] < 2.2
-    calibration = read_calibration(out)
-    for vendor in ('px4', 'ardupilot'):
-        assert any('lag' in each for each in export(calibration, vendor).losses)
-
-
-@pytest.mark.usefixtures('without_pages')
 def test_a_real_sensor_that_steps_when_it_is_heated_has_the_step_and_the_slope(tmp_path, capsys):
     path = data('poses/icm42652_rest_poses.csv')
     assert run('thermal', path, '-o', tmp_path / 'c.yaml') == 0
@@ -267,19 +255,6 @@ def test_a_shaken_part_and_a_fast_begin_are_left_out_with_a_note():
     values, deviations = coefficients(curve(log))
     assert np.all(np.abs(values - BENT) < 5.0 * deviations)
     assert '5 °C/min' in stretches(ramp(8, minutes=20.0)).notes[0]
-
-
-@pytest.mark.usefixtures('without_pages')
-def test_the_sense_hat_has_the_curve_that_others_found(tmp_path, capsys):
-    path = data('sensehat_lsm9ds1_temperature.csv')
-    lines = path.read_text().splitlines()
-    still = [line for line in lines[3:] if float(line.partition(',')[0]) > 82180.0]
-    cut = tmp_path / 'still.csv'
-    cut.write_text('\n'.join([*lines[:3], *still]))
-    assert run('thermal', cut, '-o', tmp_path / 'c.yaml') == 0
-    slopes = read_calibration(tmp_path / 'c.yaml').model.values['offset_temperature'][:3]
-    np.testing.assert_allclose(slopes * MG, [0.57, 0.41, -0.41], atol=0.02)
-    assert 'the board moved' in refused(capsys, 'thermal', path, '-o', tmp_path / 'd.yaml')
 
 
 def test_calibrate_recognises_a_still_board_in_a_file_and_in_memory(tmp_path):

@@ -38,19 +38,6 @@ def unstated(table: Table) -> Table:
 
 
 @pytest.mark.parametrize('units', METRIC)
-def test_a_converted_calibration_equals_a_fit_in_that_unit(units: str) -> None:
-    here, there = (ac.fit(poses(each), model='10') for each in (units, other(units)))
-    found = here.in_units(other(units))
-    assert found.units == there.units
-    assert isinstance(found, ac.Calibration)
-    for name in ('offset', 'gain', 'matrix', 'offset_sd', 'gain_sd'):
-        np.testing.assert_allclose(getattr(found, name), getattr(there, name), rtol=1e-6,
-                                   atol=1e-9, err_msg=name)
-    np.testing.assert_allclose(found.poses['std'], there.poses['std'], rtol=1e-12)
-    np.testing.assert_allclose(found.noise.force, there.noise.force, rtol=1e-9)
-
-
-@pytest.mark.parametrize('units', METRIC)
 def test_conversion_is_exact_and_goes_back(units: str) -> None:
     calibration = ac.fit(poses(units), model='10')
     there = calibration.in_units(other(units))
