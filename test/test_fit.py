@@ -8,12 +8,13 @@ from dataclasses import astuple, replace
 from itertools import product
 
 import accel_calib as ac
-from accel_calib.calibration import fit_poses, in_g, outlook, verify
+from accel_calib.calibration import fit_poses, in_g, verify
 from accel_calib.errors import RefusedFitError
 from accel_calib.estimate import (
     estimate, fit_norm, judge, lower_triangular, NotConvergedError, originals, outliers_among,
     Point, scatter_of, sensing_axes, solve, start_of, variance_factor)
 from accel_calib.finding import has
+from accel_calib.findings import outlook
 from accel_calib.geometry import ATTITUDES
 from accel_calib.table import numbered, Poses
 from accel_calib.units import units_of

@@ -5,11 +5,11 @@
 
 
 import accel_calib as ac
-from accel_calib.calibration import Calibration, fit_poses, outlook
+from accel_calib.calibration import Calibration, fit_poses
 from accel_calib.effects import EFFECTS, EmpiricalCurve, modes_of, VARIABLES
 from accel_calib.errors import InputError, RefusedFitError
 from accel_calib.finding import has
-from accel_calib.findings import rate
+from accel_calib.findings import outlook, rate
 from accel_calib.table import Poses
 from accel_calib.units import MG, units_of
 from inside import (

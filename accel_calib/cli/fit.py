@@ -18,12 +18,12 @@ from .frame import (
     console, Done, FAILED, given, intake, log_options, prior, rows_between, settings,
     stored_calibration)
 from .output import error_line, progress, short_if_known, table, Verdict, working
-from ..calibration import Calibration, NORM_MODELS, outlook
+from ..calibration import Calibration, NORM_MODELS
 from ..effects import AXES, entry_of
 from ..errors import InputError
 from ..findings import (
     base_words, calibration_json, chance_words, curve_json, effect_figures, linear_figures,
-    plan_lines, rate_refinement, refinement_json, request_words, rival_words, value_words,
+    outlook, plan_lines, rate_refinement, refinement_json, request_words, rival_words, value_words,
     verdict_words)
 from ..pipeline import (
     calibrated, calibrated_log, Intake, Outcome, Plan, ramp_or_poses, RampIntake,

@@ -32,12 +32,12 @@ from .sheet import (
     ACCENT, add_band, AFTER, BAND, block, Drawing, drawn, EDGE, figures, HEIGHT_INCHES, HINT,
     how_to_read, INK, legend_below, listing, Mark, Marks, numbers, paragraph, rated_sheet,
     scroll_table, section)
-from ..calibration import Calibration, Curve, outlook
+from ..calibration import Calibration, Curve
 from ..effects import (
     AXES, EffectKey, EmpiricalCurve, entry_of, REFERENCE_TEMPERATURE, value_unit, variable_words,
     with_vector)
 from ..findings import (
-    effect_figures, mounting_figures, rate_refinement, request_words, residual_figures,
+    effect_figures, mounting_figures, outlook, rate_refinement, request_words, residual_figures,
     verdict_words)
 from ..geometry import coverage
 from ..table import Floats

@@ -20,10 +20,11 @@ from .sensor import Sensor, title
 from .store import Store, tidied, unusable, writing_advice
 from .stream import AGAIN
 from .worker import Compute, Files, Mounting, nothing, Parse, Result, Severity, ShowPoses, Task
-from ..calibration import Calibration, in_frame, on_topics, outlook, plan_session
+from ..calibration import Calibration, in_frame, on_topics, plan_session
 from ..errors import DamagedCalibrationError, StoredCalibrationError
 from ..findings import (
-    calibration_json, mounting_figures, rate as rating_of, Rating, rating_json, refinement_json)
+    calibration_json, mounting_figures, outlook, rate as rating_of, Rating, rating_json,
+    refinement_json)
 from ..refinement import Refinement
 from ..stillness import Dwell
 from ..table import CONTEXT, is_quantity, Poses
