@@ -30,12 +30,12 @@ from .residuals import of_before_after, of_coverage, of_remainder, Residuals, re
 from .sheet import (
     ACCENT, add_band, AFTER, BAND, Drawing, drawn, EDGE, HEIGHT_INCHES, INK, legend_below, Mark,
     Marks, page)
-from ..calibration import Calibration, Curve, outlook
+from ..calibration import Calibration, Curve
 from ..effects import (
     AXES, EffectKey, EmpiricalCurve, entry_of, REFERENCE_TEMPERATURE, value_unit, variable_words,
     with_vector)
 from ..findings import (
-    effect_figures, mounting_figures, rate_refinement, request_words, residual_figures,
+    effect_figures, mounting_figures, outlook, rate_refinement, request_words, residual_figures,
     verdict_words)
 from ..geometry import coverage
 from ..table import Floats
