@@ -22,7 +22,7 @@ from .figures import (
     LEFT_OUT, MANY_OUT, MATTERS, mg, NEAR_FLAT, number, PER_OUTLIER, SPAN, TILT, TO_CHECK,
     TOO_EXACT, without_noise, WORST_ERROR)
 from ..calibration import Calibration, directions_in, flat_direction, free_parameters, Verification
-from ..comparison import LEVEL
+from ..comparison import Comparison, LEVEL
 from ..effects import EmpiricalCurve, WANDER
 from ..errors import TAKE_ALL_SIDES
 from ..finding import Finding, NextStep, ranked, rated, Rating, without
@@ -32,7 +32,6 @@ from ..text import counted, listed
 from ..units import MG
 
 if TYPE_CHECKING:
-    from ..comparison import Comparison
     from ..noise import NoiseFigures
     from ..refinement import Refinement
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast, TYPE_CHECKING
+from typing import Any, cast
 
 import numpy as np
 
@@ -26,14 +26,12 @@ from .sheet import (
     ACCENT, add_band, AFTER, AXIS_COLOURS, BAND, BEFORE, Drawing, drawn, FAINT, HEIGHT_INCHES, INK,
     PAPER, save)
 from ..effects import AXES, EMPIRICAL, EmpiricalCurve, entry_of, parameter_names, variable_words
-from ..refinement import base_words, chance, named_entries, values_of, verdict_words
+from ..refinement import (
+    base_words, chance, named_entries, Refinement, Step, values_of, verdict_words)
 from ..statistics import over_axes
 from ..table import Floats
 from ..text import short
 from ..units import MG
-
-if TYPE_CHECKING:
-    from ..refinement import Refinement, Step
 
 
 def search_values(result: Refinement, residuals: Residuals) -> dict[str, Any]:
