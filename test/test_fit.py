@@ -14,7 +14,6 @@ from accel_calib.estimate import (
     estimate, judge, NotConvergedError, originals, outliers_among, Point, scatter_of, solve,
     start_of, variance_factor)
 from accel_calib.finding import has
-from accel_calib.findings import outlook
 from accel_calib.geometry import ATTITUDES
 from accel_calib.table import numbered, Poses
 from accel_calib.units import units_of

@@ -45,8 +45,8 @@ __all__ = ['CLIPPED', 'ENOUGH', 'FLEET', 'LARGEST_DILUTION', 'LARGEST_OFFSET_G',
            'fit_unknown', 'fit_with_fleet', 'flat_direction', 'free_parameters', 'gated',
            'gyro_bias_of', 'has_usual_gains', 'identifiability', 'in_frame', 'in_g', 'level',
            'level_by_rows', 'lies_in_cone', 'lies_in_plane', 'mounting_of', 'mounting_only',
-           'next_pose', 'on_topics', 'only_norm', 'outside', 'plan_refinement',
-           'plan_session', 'posterior', 'quality_of', 'record_of', 'refuse_if_unfit', 'rejected_by', 'sample_noise_of',
-           'set_heading', 'sound_rows', 'stated_uncertainty', 'sure_rows', 'thermal_alone',
-           'uncertainty_g', 'verify', 'with_curve', 'with_given_mounting', 'with_rest_noise',
-           'without_curve']
+           'next_pose', 'on_topics', 'only_norm', 'outside', 'plan_refinement', 'plan_session',
+           'posterior', 'quality_of', 'record_of', 'refuse_if_unfit', 'rejected_by',
+           'sample_noise_of', 'set_heading', 'sound_rows', 'stated_uncertainty', 'sure_rows',
+           'thermal_alone', 'uncertainty_g', 'verify', 'with_curve', 'with_given_mounting',
+           'with_rest_noise', 'without_curve']
