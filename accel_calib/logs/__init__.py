@@ -12,7 +12,7 @@ process with limits. `serialized` defines the places of the fields in serialized
 
 from .autopilot import ARDUPILOT_REFERENCE, ByAxis, DEGREE, PER_MILLION
 from .bag import imus_of, open_bag
-from .bag_samples import messages_of, Track
+from .bag_samples import field_of, messages_of, Track
 from .child import parts_of
 from .columns import LogOptions, named_topics, topic_and_field
 from .containers import Frame, Piped
@@ -31,7 +31,7 @@ __all__ = ['ACCELERATION', 'ACCELERATION_COVARIANCE', 'ANGULAR_VELOCITY',
            'IMU_DOUBLES', 'LITTLE_ENDIAN', 'NAMES', 'NAME_AT', 'NINE', 'ORIENTATION',
            'ORIENTATION_COVARIANCE', 'PER_MILLION', 'STAMP', 'STAMP_AT', 'SUFFIXES', 'THREE',
            'ByAxis', 'Frame', 'Layout', 'LineReader', 'LogOptions', 'Messages', 'OpenLog', 'Piped',
-           'Progress', 'Track', 'are_untimed_samples', 'doubles_at', 'imus_of', 'is_bag', 'joined',
-           'layout_of', 'layout_with', 'messages_of', 'named_topics', 'open_bag', 'open_log',
-           'parts_of', 'put_doubles', 'read_poses', 'read_recording', 'renamed', 'samples_of',
-           'topic_and_field', 'write_blocks', 'write_table']
+           'Progress', 'Track', 'are_untimed_samples', 'doubles_at', 'field_of', 'imus_of',
+           'is_bag', 'joined', 'layout_of', 'layout_with', 'messages_of', 'named_topics',
+           'open_bag', 'open_log', 'parts_of', 'put_doubles', 'read_poses', 'read_recording',
+           'renamed', 'samples_of', 'topic_and_field', 'write_blocks', 'write_table']

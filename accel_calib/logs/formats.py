@@ -426,23 +426,6 @@ def is_bag(path: Path) -> bool:
     return path.is_dir() or path.suffix.lower() in BAG.suffixes
 
 
-def _format_of(path: Path) -> Format:
-    """Return the format of a file; InputError if it is none that is read."""
-    known = BAG
-    if not is_bag(path):
-        with path.open('rb') as file:
-            head = file.read(_HEAD)
-            file.seek(max(file.tell(), path.stat().st_size - _TAIL))
-            known = recognised(path, head + file.read())
-    if known.advice:
-        raise InputError(f'{path} is {known.name}, expected a log or a table that is read',
-                         known.advice.format(path.name))
-    if known.needs and find_spec(known.needs) is None:
-        with needing(known.needs, known.name):
-            raise ImportError(f'no module {known.needs}')
-    return known
-
-
 @contextmanager
 def open_log(path: Path | Piped | Frame, options: LogOptions = LogOptions()) -> Iterator[OpenLog]:
     """
@@ -465,9 +448,20 @@ def open_log(path: Path | Piped | Frame, options: LogOptions = LogOptions()) -> 
 
     """
     if isinstance(path, Path):
+        known = BAG
         if not path.is_dir():
             check_regular(path)
-        known = _format_of(path)
+        if not is_bag(path):
+            with path.open('rb') as file:
+                head = file.read(_HEAD)
+                file.seek(max(file.tell(), path.stat().st_size - _TAIL))
+                known = recognised(path, head + file.read())
+        if known.advice:
+            raise InputError(f'{path} is {known.name}, expected a log or a table that is read',
+                             known.advice.format(path.name))
+        if known.needs and find_spec(known.needs) is None:
+            with needing(known.needs, known.name):
+                raise ImportError(f'no module {known.needs}')
         opened = (known.opened if known.plain else _binary)(known, path, options)
     else:
         opened = _tables(TEXT, Path(str(path)), options, [path.table])

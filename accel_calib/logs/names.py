@@ -88,7 +88,7 @@ COUNTERS = frozenset(('counter', 'packetcounter', 'packetnumber', 'packet', 'fra
 TICKS = {'sampletimefine': {'ticks of 100 µs': 1e-4, 'µs': 1e-6}}
 """Units of clocks with a name of their own: of Xsens, by the model."""
 
-MICRO, MILLI, DEGREE = 1e-6, 1e-3, math.pi / 180.0
+MICRO, MILLI, DEGREE_RAD = 1e-6, 1e-3, math.pi / 180.0
 _UNITS = {
     'reading': {
         ('m/s2', 1.0): 'ms2 m/s2 m/s/s ms-2 mps2 mss mpss mpsps m/sec2 m/ss meter/s2 meters/s2',
@@ -101,9 +101,9 @@ _UNITS = {
         ('native', 1.0): 'lsb lsbs count counts digit digits v volt volts mv'},
     'rate': {
         ('rad/s', 1.0): 'rad/s rads radps rad/sec rads-1 rad radsec radians/s',
-        ('°/s', DEGREE): 'deg/s degs dps degps deg/sec degs-1 deg degrees/s degree/s degsec '
-                         'degrees/sec',
-        ('m°/s', 1e-3 * DEGREE): 'mdps mdeg/s',
+        ('°/s', DEGREE_RAD): 'deg/s degs dps degps deg/sec degs-1 deg degrees/s degree/s degsec '
+                             'degrees/sec',
+        ('m°/s', 1e-3 * DEGREE_RAD): 'mdps mdeg/s',
         ('rpm', math.pi / 30.0): 'rpm'},
     'time': {
         ('s', 1.0): 's sec secs second seconds',
@@ -439,7 +439,7 @@ _ARDUPILOT_FORMATS = tuple(
 
 _BLACKBOX_TIMES = {'time (us)': MICRO, 'time (ms)': MILLI, 'time (s)': 1.0, 'time': MICRO}
 _BLACKBOX_UNITS: dict[str, UnitName] = {'': 'native', ' (g)': 'g', ' (m/s/s)': 'm/s2'}
-_BLACKBOX_RATES = {' (deg/s)': DEGREE, ' (rad/s)': 1.0, '': 0.0}
+_BLACKBOX_RATES = {' (deg/s)': DEGREE_RAD, ' (rad/s)': 1.0, '': 0.0}
 
 
 def _betaflight(time: str, unit: str, rate: str) -> LogFormat:

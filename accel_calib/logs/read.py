@@ -16,10 +16,9 @@ import csv
 from dataclasses import replace
 import json
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .columns import LogOptions
 from .dialect import Cells
@@ -81,21 +80,17 @@ def write_blocks(path: Path, blocks: Iterable[Table]) -> int:
                 file.writelines(f'# {name}: {one_line(json.dumps(value, ensure_ascii=False))}\n'
                                 for name, value in block.about.items())
                 writer.writerow([name for key in keys for name in column_of(key).names])
-            parts = [_as_text(block[key]) for key in keys]
-            writer.writerows(zip(*(column for part in parts for column in part), strict=True))
+            columns: list[list[str]] = []
+            for values in (block[key] for key in keys):
+                digits = '.16g' if values.ndim == 1 else '.12g'  # stamps need all digits
+                columns += [values.tolist()] if values.dtype.kind in 'US' else [
+                    ['' if value != value else format(value, digits) for value in column.tolist()]
+                    for column in np.atleast_2d(values.T)]
+            writer.writerows(zip(*columns, strict=True))
             rows += len(block)
 
     write_atomically(path, write)
     return rows
-
-
-def _as_text(values: NDArray[Any]) -> list[list[str]]:
-    """Return the columns of an array as text, with enough digits for all sensors."""
-    if values.dtype.kind in 'US':
-        return [values.tolist()]
-    digits = '.16g' if values.ndim == 1 else '.12g'  # stamps need all digits
-    return [['' if value != value else format(value, digits) for value in column.tolist()]
-            for column in np.atleast_2d(values.T)]
 
 
 # ----------------------------------------------------------------------------- serial ports

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .columns import chosen, is_log_header, LogOptions
-from .dialect import Cells, first_label, is_clock, is_comment, is_number, layout_of, short, split
+from .dialect import Cells, COMMENTS, is_clock, is_number, layout_of, short
 from ..errors import InputError
 from ..table import Floats
 from ..text import counted
@@ -43,6 +43,8 @@ PEEKED = 1 << 16
 _BLANK = ' \t\r\n,;|'
 """Characters of a row without any value, as spreadsheets write at the end of a table."""
 
+_ONE_LABEL = re.compile(r'\s*([A-Za-z]\w*)(?:\s*[:=]\s*|\s+)[-+]?\d*\.?\d+(?:\s*\D{0,6})?')
+
 
 def text_table(path: Path, options: LogOptions, raw: io.BufferedReader[Any], size: int
                ) -> TextTable:
@@ -50,8 +52,11 @@ def text_table(path: Path, options: LogOptions, raw: io.BufferedReader[Any], siz
     encoding = _encoding(raw.peek())
     text = io.TextIOWrapper(raw, encoding, errors='replace', newline=None)
     head, rows = _head(path, text), iter(text)
-    if label := first_label(head):
-        rows = _readings(chain(head, text), label)
+    names = [match[1] for match in map(_ONE_LABEL.fullmatch, head) if match]
+    cycle = list(dict.fromkeys(names))  # of numbers that stand one per line
+    repeats = len(cycle) >= 3 and names[:3 * len(cycle)] == 3 * cycle
+    if repeats and 4 * len(names) > len(head):
+        rows = _readings(chain(head, text), cycle[0])
         head = list(islice(rows, _HEAD_LINES))
     return TextTable(path, head, rows, options, encoding, size)
 
@@ -179,10 +184,8 @@ class TextTable:
         layout, columns = self.layout, self.columns.numeric
         dialect, delimiter = layout.dialect, layout.dialect.delimiter
         texts, breaks = lines, layout.width - 1
-        if dialect.monitor or dialect.labelled or dialect.prefix:
-            texts = list(map(dialect.plain, lines))
-        if '"' in ''.join(texts):  # lines without quotes, parted by tabs
-            rows = [split(line, delimiter) for line in texts]
+        if dialect.monitor or dialect.labelled or dialect.prefix or '"' in ''.join(lines):
+            rows = list(map(dialect.cells, lines))  # without quotes, parted by tabs
             if any(len(row) != layout.width for row in rows):
                 return None
             texts = ['\t'.join([row[k] for k in columns]) for row in rows]
@@ -208,7 +211,8 @@ class TextTable:
             fault = self._fault(line)
             if fault is None:
                 good.append(k)
-            elif is_comment(line.lstrip()) or not line.replace('""', '').strip(_BLANK):
+            elif (line.lstrip().startswith(COMMENTS)
+                  or not line.replace('""', '').strip(_BLANK)):
                 continue
             elif not self._skip_bad or not self._bad:
                 self._bad = f'{f"line {place[k]}: " if place else ""}row {rows[k]}{fault}'
