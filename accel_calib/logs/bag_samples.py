@@ -114,20 +114,6 @@ def field_of(column: str, numbers: Sequence[str], asked: str = '') -> str:
 
 
 @dataclass(frozen=True)
-class Track:
-    """Finite values of a quantity, in order of time [s]."""
-
-    time: Floats
-    value: Floats
-
-    def at(self, time: Floats) -> Floats:
-        """Return the (n,) interpolated values; NaN if the track is empty."""
-        if not len(self.time):
-            return np.full(len(time), np.nan)
-        return np.interp(time, self.time, self.value)
-
-
-@dataclass(frozen=True)
 class ContextTopic:
     """
     A topic with a quantity in a field such as ``status.temperature``.
@@ -166,14 +152,14 @@ class ContextTopic:
         time = stamps if self.late is None else _received(block) + self.late
         return time, values * self.factor + self.summand
 
-    def track(self) -> Track:
-        """Return the values of the whole bag."""
+    def track(self) -> Floats:
+        """Return the times [s] and finite values of the whole bag, (2, n); one NaN if none is."""
         connections = self.bag.connections(self.topic, self.msgtype)
         blocks = [self.values(block) for block in self.bag.blocks(connections)]
         time, value = np.hstack([np.zeros((2, 0)), *map(np.array, blocks)])
         known = np.flatnonzero(np.isfinite(value))
         order = known[np.argsort(time[known], kind='stable')]
-        return Track(time[order], value[order])
+        return np.array([time[order], value[order]] if len(order) else [[0.0], [np.nan]])
 
 
 def _received(block: Sequence[Received]) -> Floats:
@@ -332,7 +318,7 @@ def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool,
     for block in bag.blocks(bag.connections(topic), BLOCK):
         messages = bag.joined(block, topic, before=before)
         columns, which = imus_of(messages, f'{bag.path}, {topic}', before, sensor, chosen=chosen)
-        columns |= {key: track.at(columns['time']) for key, track in tracks.items()}
+        columns |= {key: np.interp(columns['time'], *track) for key, track in tracks.items()}
         samples = Recording(columns, before + np.arange(len(block)) + 1, 'm/s2', sensor)
         parts.append(samples if np.all(which) else samples.take(which))
         before += len(block)
@@ -347,8 +333,8 @@ def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool,
 # ---------------------------------------------------------------------------------- messages
 
 def _needed(bag: Bag, needs: Collection[str], used: Sequence[ContextTopic], notes: Sequence[str]
-            ) -> dict[str, Track]:
-    """Return all values of the quantities that a calibration needs; InputError without one."""
+            ) -> dict[str, Floats]:
+    """Return the tracks of the quantities that a calibration needs; InputError without one."""
     topics, tracks = {source.quantity: source for source in used}, {}
     for quantity in dict.fromkeys([*QUANTITIES, *topics]):
         if quantity.key not in needs:
@@ -359,7 +345,7 @@ def _needed(bag: Bag, needs: Collection[str], used: Sequence[ContextTopic], note
                              f'depends on the {quantity.words}', 'name the topic with --context '
                              f'{quantity.key}:=TOPIC, or use a calibration without it')
         track = tracks[quantity.key] = topics[quantity].track()
-        if not len(track.time):
+        if np.isnan(track[1, 0]):
             raise InputError(f'{bag.path}: {topics[quantity].topic} has no finite number, '
                              f'expected the {quantity.words}', 'name another topic')
     return tracks
@@ -385,7 +371,7 @@ def messages_of(path: Path, options: LogOptions, needs: Collection[str]) -> Gene
         number = {id(each): k for k, each in enumerate(connections)}
         imu = [number[id(each)] for each in bag.connections(topic)]
         yield {'topic': topic, 'sensor': sensor, 'count': bag.count(topic), 'imu': imu,
-               'tracks': {key: vars(track) for key, track in tracks.items()},
+               'tracks': tracks,
                'compression': getattr(bag.reader, 'compression_mode', None),
                'connections': [{
                    'topic': each.topic, 'msgtype': each.msgtype, 'msgdef': each.msgdef.data,

@@ -41,7 +41,7 @@ from ..disk import check_regular, FIRST_LINE
 from ..errors import DamagedLogError, InputError, needing, saying
 from ..finding import Finding
 from ..table import check_units, check_values, concatenated, CONTEXT, Poses, Recording
-from ..text import some
+from ..text import counted, some
 from ..units import Units, units_of
 
 _HEAD, _TAIL = 8192, 65536
@@ -467,3 +467,24 @@ def open_log(path: Path | Piped | Frame, options: LogOptions = LogOptions()) -> 
         opened = _tables(TEXT, Path(str(path)), options, [path.table])
     with opened as log, saying(log.read_as):
         yield log
+
+
+def read_poses(path: Path, *, partial: bool = False) -> Poses:
+    """
+    Return the poses of a pose table; a recording is an InputError, as others in `open_log`.
+
+    `partial`: columns of the context with empty cells, which are NaN, are kept.
+
+    """
+    with open_log(path, LogOptions(partial=partial)) as log:
+        if log.poses is not None:
+            return log.poses
+        raise InputError(f'{path} is a recording of {counted(sum(map(len, log.blocks)), "sample")}'
+                         ', expected a pose table', 'use capture')
+
+
+def read_recording(path: Path, topic: str = '', sensor: str = '', *, in_child: bool = True
+                   ) -> Recording:
+    """Return all samples of a recording; options as in `LogOptions`, errors as in `open_log`."""
+    with open_log(path, LogOptions(topic=topic, sensor=sensor, in_child=in_child)) as log:
+        return concatenated(list(log.blocks))
