@@ -210,10 +210,10 @@ def chosen(layout: Layout, options: LogOptions) -> Chosen:
             found['time'] = counted
     else:
         check_sensor(header[:MOST], layout.path)
-        found = _sources(layout, {**maker.present(header), **given})
-        found |= {f'{key}/': column(layout, name) for key, name in maker.divisors.items()}
-        if maker.instance:
-            found['instance'] = column(layout, maker.instance)
+        theirs = maker.present(header)
+        ours = {key: theirs.pop(key) for key in OURS if key in theirs}
+        found = _sources(layout, {**ours, **given})
+        found |= {key: column(layout, name) for key, name in theirs.items()}
     sources = {key: tuple(found[name] for name in own.names) for key, own in COLUMNS.items()
                if found.keys() >= {*own.names}}
     sources |= {key: (source,) for key, source in found.items() if key not in OURS}
