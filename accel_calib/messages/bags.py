@@ -32,7 +32,7 @@ from ..disk import check_regular
 from ..errors import InputError
 from ..logs import (
     BAG, doubles_at, IMU_DOUBLES, imus_of, joined, LogOptions, Messages, messages_of, open_bag,
-    parts_of, Progress, put_doubles, renamed, Track)
+    parts_of, Progress, put_doubles, renamed)
 from ..pipeline import Correction
 from ..table import check_units, Recording
 from ..units import Units, units_of
@@ -144,7 +144,7 @@ class _Imus:
         if not self.done:
             check_units(samples, self.units, str(self.path))
         known = self.correction.context(samples.with_columns(**{
-            key: Track(**track).at(columns['time'])
+            key: np.interp(columns['time'], *track)
             for key, track in self.known['tracks'].items()}))
         doubles = doubles_at(messages, slice(0, IMU_DOUBLES))
         with np.errstate(over='ignore', invalid='ignore'):  # damaged numbers become infinite
