@@ -217,42 +217,20 @@ _DIGITS = 1e-14
 """Rounding error of differences of sums, relative to the squared reading."""
 
 
-@dataclass(frozen=True)
-class Columns:
+def windows_of(sums: Records, axes: int, origin: Floats) -> tuple[Floats, Floats]:
     """
-    Sums of n chunks as contiguous arrays, and the windows that end with them.
+    Return means and variances, (axes, m), of the m windows of n chunks.
 
-    `first` (axes, n) are those of reading and rate. `repeats` (n,) are the samples that repeat the
-    one before; `zeros` is 1 for chunks with zeros. `mean` and `level`, (axes, m), are the means
-    and variances of the m windows.
-
-    """
-
-    count: Floats
-    first: Floats
-    at_limit: Floats
-    repeats: Floats
-    zeros: Floats
-    mean: Floats
-    level: Floats
-
-
-def columns_of(sums: Records, axes: int, origin: Floats) -> Columns:
-    """
-    Return the sums of n chunks for the reading (3 axes), or reading and rate (6).
-
-    They are relative to the `origin` (6,), which is added to the means.
+    The sums are relative to the `origin` (6,), which is added to the means; `axes` is 3 for the
+    reading alone, or 6 with the rate.
 
     """
     first, second = (np.ascontiguousarray(sums[name].T[:axes]) for name in ('first', 'second'))
-    count = sums['count'].copy()
     inside, total, power = (sliding(np.add, each, CHUNKS_PER_WINDOW)
-                            for each in (count, first, second))
+                            for each in (sums['count'], first, second))
     mean = total / inside
     power = np.maximum(power - total * mean, 0.0)
-    return Columns(count, first, np.ascontiguousarray(sums['at_limit'].T), sums['repeats'].copy(),
-                   (sums['zeros'] > 0.0).astype(float), mean + origin[:axes, np.newaxis],
-                   power / (inside - 1.0))
+    return mean + origin[:axes, np.newaxis], power / (inside - 1.0)
 
 
 @dataclass(frozen=True)
@@ -282,16 +260,22 @@ class Stretch:
     white: Floats
 
 
-def stretch(sums: Columns, length: int, size: int, spacing: float) -> Stretch:
-    """Return the figures over `length` chunks that end at each of the last `size` chunks."""
-    start = len(sums.count) - size - length + 1
-    counts, first = sums.count[start:], sums.first[:, start:]
+def stretch(sums: Records, level: Floats, length: int, size: int, spacing: float) -> Stretch:
+    """
+    Return the figures over `length` chunks that end at each of the last `size` chunks.
+
+    `sums` are those of at least as many chunks, `level` the (axes, m) variances of the windows
+    that end with the last of them, and `spacing` is the length of a chunk [s].
+
+    """
+    sums = sums[len(sums) - size - length + 1:]
     inner = length - CHUNKS_PER_WINDOW + 1
-    level = sums.level[:, sums.level.shape[1] - size - inner + 1:]
+    level = level[:, level.shape[1] - size - inner + 1:]
     variance = sliding(np.add, level, inner) / inner
-    count = sliding(np.add, counts, length)
+    count = sliding(np.add, sums['count'], length)
     # Reading and rate are (3, groups, …).
-    cells = (first / counts).reshape(-1, 3, size + length - 1).swapaxes(0, 1)
+    cells = sums['first'].T[:len(level)] / sums['count']
+    cells = cells.reshape(-1, 3, cells.shape[1]).swapaxes(0, 1)
     white = (variance * (length / count)).reshape(-1, 3, size).swapaxes(0, 1)
     white = white + _DIGITS * np.sum(np.square(cells[..., length - 1:]), axis=0)
     line = lines(cells, length)
@@ -299,6 +283,6 @@ def stretch(sums: Columns, length: int, size: int, spacing: float) -> Stretch:
     reading = Trend(found.slope[:, 0], *(part[0] for part in found[1:]))
     return Stretch(
         reading, found.excess, variance, sliding(np.maximum, level[:3], inner), count,
-        sliding(np.add, sums.at_limit[:, start:], length) / count,
-        sliding(np.add, sums.repeats[start:], length) / np.maximum(count - length, 1.0),
+        sliding(np.add, sums['at_limit'].T, length) / count,
+        sliding(np.add, sums['repeats'], length) / np.maximum(count - length, 1.0),
         cells[:, 0], np.sum(line.square, axis=(0, 1)) / length, np.sum(white, axis=(0, 1)))
