@@ -21,7 +21,7 @@ from accel_calib.api import in_units_of
 from accel_calib.calibration import Calibration, determines, posterior, refuse_if_unfit, sound_rows
 from accel_calib.calibration.directions import poses_needed, rows_of, shape_words
 from accel_calib.calibration.mounting import (
-    axes_of, doubts_about_flat, fault_of, mounting, with_heading)
+    axes_of, doubts_about_flat, fault_of, mounting, with_heading, with_heading_of)
 from accel_calib.calibration.partial import common_sensors, without_knocked
 from accel_calib.calibration.planning import choose_levels, find_undetermined, missing_poses
 from accel_calib.cli.commands import COMMANDS, HIDDEN as DEMO_CHOICES, parser
@@ -53,7 +53,8 @@ from accel_calib.fleet.recording import (
 from accel_calib.fleet.run import mapped
 from accel_calib.fleet.sensors import alike, drift_of, merge_sensor, write_parquet
 from accel_calib.geometry import (
-    distinct, OVER_THE_SPHERE, quaternion_of, rotation_from_rpy, spread_directions, unit, words_of)
+    attitude_words, distinct, OVER_THE_SPHERE, quaternion_of, rotation_from_rpy, spread_directions,
+    unit, words_of)
 from accel_calib.live import sources
 from accel_calib.live.sources import _interval as interval_of_lines, is_port, open_source, Source
 from accel_calib.logs import bag_samples, child, layout_with, LogOptions, open_bag, open_log, text
@@ -71,10 +72,10 @@ from accel_calib.refinement import base as refine_base
 from accel_calib.refinement.base import clipped, grid_step, off_grid, sampled, unclipped
 from accel_calib.refinement.beam import accepted, explored, reshaped
 from accel_calib.refinement.curves import (
-    _grown as grown_curve, _rss_beside as rss_beside, FoundCurve, Near, probabilities, Process,
-    process_of, SIGNIFICANT, Walk, walk_beside)
+    _grown as grown_curve, _rss_beside as rss_beside, best_curve, FoundCurve, Near, probabilities,
+    Process, process_of, SIGNIFICANT, Walk, walk_beside)
 from accel_calib.refinement.linear import (
-    _RARE as RARE, Block, LEVEL as REFINE_LEVEL, Linear, outside_of, Set)
+    _RARE as RARE, Block, LEVEL as REFINE_LEVEL, Linear, outside_of, Set, with_outliers)
 from accel_calib.refinement.search import (
     _is_better as is_better_than_walk, _less as less, search as search_effects)
 from accel_calib.refinement.state import beginning, candidates, fitted_state, linearised, WORTH

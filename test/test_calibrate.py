@@ -45,6 +45,21 @@ def test_a_recording_becomes_a_calibration_a_page_and_a_verdict(recording, tmp_p
     assert 'GOOD' in (tmp_path / 'c.html').read_text(encoding='utf-8')
 
 
+@pytest.mark.usefixtures('without_pages')
+def test_a_hidden_effect_is_added_unless_it_is_not_wanted(tmp_path, capsys):
+    path = tmp_path / 'poses.csv'
+    run('simulate', '-o', path, '--poses', 60, *OPTIONS, '--effect',
+        'quadratic=0.004,0.003,-0.004')
+    _, found, lines = calibrated(capsys, path, '-o', tmp_path / 'c.yaml')
+    assert found['refined'].startswith('refined with quadratic')
+    assert 'quadratic' in read_calibration(tmp_path / 'c.yaml').model.effects
+    assert [step['effect'] for step in found['refinement']['steps']] == ['quadratic']
+    _, plain, _ = calibrated(capsys, path, '-o', tmp_path / 'd.yaml', '--no-refine')
+    assert plain['refinement'] is None
+    assert 'quadratic' not in read_calibration(tmp_path / 'd.yaml').model.effects
+    assert any(found['refined'][:20] in line for line in lines)
+
+
 def bent(path, *, bend_mg):
     """Write poses of a sensor whose readings are far from an ellipsoid, without their noise."""
     up = random_directions(40, np.random.default_rng(5))

@@ -454,6 +454,16 @@ def test_json_and_npz_hold_everything(name):
     assert export(made, 'json').losses == ()
 
 
+def test_json_states_what_matrix_and_offset_leave_alone():
+    made = export(HEADERS['bending'], 'json')
+    found = json.loads(made.text_or_bytes)
+    reading = HEADERS['bending'].predict(spread_directions(300) * 9.80665)
+    forces = (reading - found['offset']) @ np.transpose(found['matrix'])
+    left = rms_mg(forces / 9.80665 - spread_directions(300))
+    assert f'leave {left:.2g} mg' in made.notes[0]
+    assert export(HEADERS['affine'], 'json').notes == ()
+
+
 @pytest.mark.parametrize('to', ['px4', 'ardupilot'])
 def test_the_loss_is_the_difference_that_the_written_values_leave(to, tmp_path):
     made, force = HEADERS['bending'], spread_directions(300)
@@ -472,6 +482,14 @@ def test_effects_that_a_format_lacks_are_losses_in_numbers(effects, to, words):
     assert made.losses[0].startswith(words)
     assert made.details[0].leaves_mg == pytest.approx(made.leaves_mg, rel=0.02)
     assert made.leaves_mg > 0.1
+
+
+def test_a_drift_is_exported_as_it_was_at_the_last_pose(compiled):
+    made = sensor_with(AFFINE, {'offset_drift': [0.01, 0.02, 0.01, 0.0]})
+    reading = samples(HEADERS['affine'])[0]
+    text = {'later': text_of(made, 'c', name='later')}
+    for found in compiled(text, [reading], [np.zeros(len(reading))]):
+        np.testing.assert_allclose(found[0], made.apply(reading, time=1e9), atol=3e-6 * 9.8)
 
 
 def test_the_mounting_is_a_loss_where_a_format_does_not_hold_it():
@@ -511,3 +529,10 @@ def test_the_command_writes_beside_the_calibration(to, stored, tmp_path, capsys)
     for line in wanted.losses:
         assert line in ' '.join(printed.err.split())
     assert f'stored in {path}' in ' '.join(printed.err.split())
+
+
+def test_the_command_writes_to_standard_output_and_its_losses_to_standard_error(stored, capfd):
+    assert run('export', stored, '--to', 'px4', '-o', '-') == 0
+    printed = capfd.readouterr()
+    assert printed.out == text_of(HEADERS['affine'], 'px4')
+    assert ' leaves 6.4 mg' in printed.err

@@ -137,6 +137,19 @@ def test_poses_that_carry_no_search_are_refined_to_the_fit_with_the_fleet(
     assert 'directions' in dict(result.not_testable)['quadratic']
 
 
+def test_a_refinement_with_the_fleet_finds_an_effect_beyond_it(fleet: FleetPrior) -> None:
+    rng = np.random.default_rng(8)
+    sensor = bent(a_sensor(rng))
+    poses = poses_of(sensor, 16, rng)
+    result = refine(poses, IN_G, base=fleet)
+    assert [step.effect for step in result.steps] == ['quadratic']
+    refined = result.calibration
+    assert refined.method == 'fleet'
+    assert error_mg(refined, sensor) < 0.2 * error_mg(fit_poses(poses, IN_G, model='10'), sensor)
+    deviation = np.sqrt(np.diag(refined.covariance))
+    assert rms((refined.model.vector - sensor.vector) / deviation) < 2.0
+
+
 @pytest.mark.usefixtures('without_pages')
 def test_the_command_line_refines_with_the_file_of_the_fleet(
         fleet: FleetPrior, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

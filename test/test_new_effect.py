@@ -123,6 +123,25 @@ def test_any_column_that_varies_is_a_cause_without_which_a_log_is_not_corrected_
     assert f' motor_current: {name}-motor_current' in shown
 
 
+def test_a_hump_over_any_column_is_a_curve_of_it():
+    rng = np.random.default_rng(8)
+    pressure = rng.uniform(950.0, 1050.0, 60)
+    hump = np.exp(-0.5 * ((pressure - 1003.0) / 12.0) ** 2)
+    found = ac.refine(still(rng, 60, np.outer(hump, [0.006, -0.004, 0.005]), pressure=pressure),
+                      units='g')
+    assert [(step.effect, step.variable) for step in found.steps] == [('empirical', 'pressure')]
+    assert found.verdict == 'described'
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_columns_of_noise_are_not_named(seed):
+    rng = np.random.default_rng([9, seed])
+    noise = {f'noise_{k}': np.cumsum(rng.normal(size=40)) if k % 2 else rng.normal(size=40)
+             for k in range(25)}
+    found = ac.refine(still(rng, 40, **noise), units='g')
+    assert not any(step.variable for step in found.steps)
+
+
 def test_text_and_columns_with_holes_are_no_cause(tmp_path):
     rng = np.random.default_rng(10)
     poses = still(rng, 30, room=['lab'] * 30, pressure=rng.uniform(950.0, 1050.0, 30))
@@ -198,6 +217,11 @@ def test_a_function_that_is_none_of_its_arguments_is_refused_in_one_line(
     assert "of the effect 'own'" in line
     assert re.search(BAD[bad], line), line
     assert line.strip().isprintable()
+
+
+def test_poses_are_read_only():
+    with pytest.raises(ValueError, match='read-only'):
+        ac.simulate().reading[0] = 0.0
 
 
 def turned(count, seed):

@@ -281,6 +281,10 @@ def drawn(view: Any, width: int = 80, height: int = 24, encoding: str = 'utf-8')
     return raw.getvalue().decode(encoding)
 
 
+def row(shown: str, label: str) -> str:
+    return next(line for line in shown.splitlines() if label in line)
+
+
 @pytest.mark.parametrize('progress', [START, ENOUGH, FITTED, replace(
     START, still=False, stillness=math.nan, accuracy=math.nan, step='', advice='')])
 def test_figures_are_read_as_they_are_written(progress: Progress) -> None:
@@ -336,6 +340,20 @@ def test_every_step_is_shown_in_the_largest_words_that_fit(progress: Progress, w
     for width in (80, 40):
         lines = drawn(screen(NODE, progress), width=width).splitlines()
         assert {len(line) for line in lines} == {width}
+
+
+def test_lengths_and_temperature_are_shown_if_they_are_known() -> None:
+    before, fitted = (drawn(screen(NODE, progress)) for progress in (START, SEEN))
+    assert 'not known' in row(before, '|a|')
+    assert 'temperature' not in before
+    assert '1.0213 g, corrected 1.0002 g' in row(fitted, '|a|')
+    assert '-3.5 °C' in row(fitted, 'temperature')
+
+
+def test_terminal_without_unicode_gets_ascii() -> None:
+    shown = drawn(screen(NODE, replace(MIDDLE, stillness=1.5)), encoding='ascii')
+    assert 'FRONT LEFT BOTTOM' in shown
+    assert '#|#' in row(shown, 'stillness')
 
 
 def test_end_of_the_poses_is_clear() -> None:
