@@ -287,8 +287,8 @@ def time_stages(spent: dict[str, float], stages: Mapping[str, tuple[Any, str]],
 def costs_by_stage(found: Sequence[Input], options: Options, folder: Path) -> dict[str, float]:
     """Return the cost by stage in one process [ms of processor per recording]."""
     spent: dict[str, float] = defaultdict(float)
-    here = mock.patch.object(RUN.WorkerProcess, 'call_within',
-                             lambda self, limit_s, function, *given: function(*given))
+    here = mock.patch.object(RUN.WorkerProcess, 'call',
+                             lambda self, function, *given, limit_s=None: function(*given))
     with TemporaryDirectory(dir=folder) as out, here:
         store = Store(Path(out))
         first = Store(store.folder / 'first')

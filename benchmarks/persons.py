@@ -30,7 +30,7 @@ def run_person(name: str, seed: int, number: int) -> tuple[bool, float, float]:
         case.change(driver)
         person = Person(driver, case.sensor, **case.about)
         person._rng = rng
-        with patch.dict(COMMANDS, dict.fromkeys(case.refuses, persons.refused)):
+        with patch.dict(COMMANDS, dict.fromkeys(case.refuses, test_persons.refused)):
             ended = person.follow(seconds=400.0 if case.ends in ('done', 'fit') else 40.0)
         seconds = person.times[person.steps.index(ended)]
         named = not case.named or case.named in [

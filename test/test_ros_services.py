@@ -38,7 +38,7 @@ def test_log_and_markers_report_that_more_poses_no_longer_help() -> None:
     few = plan_session(poses.take(slice(0, 8)), units_of('g'), 'auto').asked
     arrow, text = [m for m in pose_markers(np.zeros((0, 3)), few, 'imu').markers if m.ns == 'next']
     np.testing.assert_allclose([getattr(arrow.points[1], axis) for axis in 'xyz'], few.direction)
-    assert text.text == few.words
+    assert text.text == request_words(few)
 
 
 def test_poses_are_captured_and_removed_on_request(bench: Any, readings: Readings) -> None:
