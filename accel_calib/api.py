@@ -18,7 +18,7 @@ from .calibration import (
 from .comparison import compare as compare_calibrations, Comparison
 from .effects import model_with, own_effects, OwnEffect, simulate_poses, simulate_recording
 from .errors import InputError
-from .geometry import spread_directions
+from .geometry import spread_directions, unit
 from .logs import (
     are_untimed_samples, Frame, LogOptions, read_poses as read_pose_table,
     read_recording as read_whole_recording)
@@ -400,7 +400,7 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
         Number of poses, spread evenly over the sphere; the first pose is flat. The others are in
         mixed order, so that direction is not correlated with time or temperature.
     directions : (n, 3) array, optional
-        Directions of up in the levelled frame; they replace `poses`.
+        Directions of up in the levelled frame, of any length; they replace `poses`.
     noise : float
         Standard deviation of a sample [g].
     samples : int
@@ -450,6 +450,10 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
         up = np.vstack([[[0.0, 0.0, 1.0]], mixed])
     else:
         up = np.asarray(directions, float)
+        if up.ndim != 2 or up.shape[1] != 3 or not np.all(np.linalg.norm(up, axis=1) > 0.0):
+            raise InputError(f'directions has shape {up.shape}, expected (n, 3) vectors',
+                             'give a vector other than zero for each pose')
+        up = unit(up)
     rng, warm = np.random.default_rng(seed), np.asarray(temperature, float)
     if recording:
         found: Table = simulate_recording(model, up, rng, noise_g=noise, rate_hz=rate, dwell=dwell,

@@ -24,12 +24,12 @@ import numpy as np
 
 from .calibration import (
     Calibration, check_sensor, Curve, curve_of, directions_of, fit_partial, fit_poses,
-    fit_with_fleet, flat_direction, FleetPrior, level, level_by_rows, lies_in_cone, PRIOR,
-    SampleContext, thermal_alone, with_curve, without_curve)
+    fit_with_fleet, flat_direction, FleetPrior, level, level_by_rows, lies_in_cone, lies_in_plane,
+    PRIOR, SampleContext, thermal_alone, with_curve, without_curve)
 from .effects import Context, LADDER, Model, OwnEffect, PROCESSES
 from .errors import InputError, RefusedFitError, saying
 from .finding import explained_by, Finding
-from .findings import rate, Rating
+from .findings import outside_line, rate, Rating
 from .logs import Frame, LogOptions, open_log, OpenLog, Piped, Progress
 from .stillness import (
     account_of, capture, Captured, CaptureSettings, cells_of, check_measured, is_one_direction,
@@ -275,9 +275,9 @@ class Plan:
         The calibration in use. Effects that a refinement has added to it are kept, with new
         values, and the search for effects starts from it. Without a `flat` pose, its levelled
         frame and its mounting are kept.
-    in_cone : bool
+    partial : bool
         Fit poses that are all near one direction, too, with typical values of sensors, unless
-        `before` is a full fit.
+        `before` is a full fit. Poses in a plane are always fitted so by ``auto``.
 
     """
 
@@ -292,7 +292,7 @@ class Plan:
     sensor: str = ''
     also: tuple[OwnEffect, ...] = ()
     before: Calibration | None = field(default=None, repr=False)
-    in_cone: bool = False
+    partial: bool = False
 
 
 @dataclass(frozen=True)
@@ -365,9 +365,13 @@ def _fit(poses: Poses, units: Units, plan: Plan, date: str) -> Calibration:
     if before is not None and is_refined(before):
         from .refinement import refitted
         return refitted(before, poses, sensor=plan.sensor, date=date)
-    if (plan.in_cone and (before is None or is_partial(before)) and not units.is_native
-            and len(poses) >= FEWEST_IN_CONE and lies_in_cone(directions_of(poses, units))):
-        return fit_partial(poses, units, sensor=plan.sensor, date=date)
+    if ((before is None or is_partial(before)) and not units.is_native
+            and len(poses) >= FEWEST_IN_CONE):
+        up = directions_of(poses, units)
+        in_plane = (plan.model, plan.method) == ('auto', 'ml') and 'reference' not in poses and (
+            lies_in_plane(up))
+        if in_plane or (plan.partial and lies_in_cone(up)):
+            return fit_partial(poses, units, sensor=plan.sensor, date=date)
     return fit_poses(poses, units, model=plan.model, method=plan.method, sensor=plan.sensor,
                      date=date)
 
@@ -556,4 +560,4 @@ class Correction:
     def notes(self) -> list[str]:
         """Return what the samples lack, and what left the range of the calibration, so far."""
         return [*filter(None, [self._context.lacking]),
-                *(each.line for each in self._context.left)]
+                *map(outside_line, self._context.left)]

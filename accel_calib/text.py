@@ -96,6 +96,11 @@ def counted(count: int, noun: str) -> str:
     return f'{count} {noun}' if count == 1 else f'{count} {noun}s'
 
 
+def enumerated(words: Sequence[str]) -> str:
+    """Join words by commas and 'and'."""
+    return ' and '.join(filter(None, [', '.join(words[:-1]), words[-1]]))
+
+
 def some(items: Iterable[object], most: int = 12) -> str:
     """Return the first items of a list, each shortened, and how many more there are."""
     words = [word if len(word) <= _LONGEST_ITEM else f'{word[:_LONGEST_ITEM]}…'

@@ -8,9 +8,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 import os
 from tempfile import TemporaryDirectory
+from unittest.mock import patch
 
 from accel_calib.geometry import ATTITUDES, spread_directions, unit
-from accel_calib.session import conditions
+from accel_calib.session import COMMANDS, conditions
 from accel_calib.statistics import rms
 from driven import Driver, GRAVITY, Person
 from figures import Frame, markdown
@@ -29,10 +30,11 @@ def run_person(name: str, seed: int, number: int) -> tuple[bool, float, float]:
         case.change(driver)
         person = Person(driver, case.sensor, **case.about)
         person._rng = rng
-        ended = person.follow(seconds=400.0 if case.ends in ('done', 'fit') else 40.0)
+        with patch.dict(COMMANDS, dict.fromkeys(case.refuses, test_persons.refused)):
+            ended = person.follow(seconds=400.0 if case.ends in ('done', 'fit') else 40.0)
         seconds = person.times[person.steps.index(ended)]
         named = not case.named or case.named in [
-            each.name for each in conditions(driver.session.state)]
+            each.kind for each in conditions(driver.session.state)]
         held = np.nan
         if driver.calibration is not None:
             reach = case.about.get('can_reach', lambda up: True)

@@ -14,7 +14,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from accel_calib.refinement import PlannedPose, refine, Refinement, Step
+from accel_calib.calibration import PlannedPose
+from accel_calib.refinement import refine, Refinement, Step
 from accel_calib.table import Floats
 from accel_calib.units import units_of
 from figures import Frame, Line, table

@@ -8,10 +8,7 @@ All ways get the same columns: each effect of the catalogue with each shape, nea
 10, in units of the noise. They differ only in what they choose. The Gaussian process and the
 oracle need no columns: the first one predicts the residual from all that is recorded, the second
 one fits the true form. The sets are those of `refine_sets`, which nothing was tuned with for seeds
-from 2028 on. The output is the table of ``docs/compare.md``::
-
-    pip install scikit-learn pysindy
-    python benchmarks/figures.py rivals --sets 2 --seed 2029 --jobs 2
+from 2028 on. ``pip install scikit-learn pysindy`` installs what they need.
 
 """
 
@@ -23,8 +20,8 @@ from functools import cached_property
 from typing import Any
 import warnings
 
-from accel_calib.calibration import fit_poses, in_g, with_history
-from accel_calib.effects import EFFECTS, factors_of
+from accel_calib.calibration import fit_poses, in_g
+from accel_calib.effects import add_history, EFFECTS, factors_of
 from accel_calib.estimate import judge
 from accel_calib.refinement.linear import orthonormal, SEEN
 from accel_calib.refinement.state import candidates
@@ -129,7 +126,7 @@ def library_of(poses: Poses, fresh: Poses) -> Library:
     """Return the equations of poses and of others near model 10 of the first ones."""
     units = units_of('m/s2')
     model = fit_poses(poses, units, model='10').model
-    tables = [with_history(in_g(each, units), model) for each in (poses, fresh)]
+    tables = [add_history(in_g(each, units), model) for each in (poses, fresh)]
     tried = [*candidates(CATALOGUE, tables[0])]
     sides = []
     for table in tables:

@@ -27,8 +27,7 @@ HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parent), str(HERE)]
 
 import accel_calib as ac  # noqa: E402
-from accel_calib.findings import effect_figures  # noqa: E402
-from accel_calib.refinement import chance  # noqa: E402
+from accel_calib.findings import chance_words, effect_figures  # noqa: E402
 from accel_calib.report.sheet import AFTER, BEFORE, drawn, EDGE  # noqa: E402
 from accel_calib.table import Floats  # noqa: E402
 from accel_calib.text import short, with_minus, with_sd  # noqa: E402
@@ -115,7 +114,7 @@ def _effects(case: Case) -> Iterator[str]:
 
 
 def _odds(step: Mapping[str, Any]) -> str:
-    return ' or '.join((chance(step['p_value']), *(f'`{name}`' for name in step['rivals'])))
+    return ' or '.join((chance_words(step['p_value']), *(f'`{name}`' for name in step['rivals'])))
 
 
 def errors(case: Case) -> tuple[Floats, Floats]:

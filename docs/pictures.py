@@ -32,6 +32,7 @@ sys.path[:0] = [str(HERE.parent)]
 
 from accel_calib.api import simulate  # noqa: E402
 from accel_calib.calibration import next_pose  # noqa: E402
+from accel_calib.findings import request_words  # noqa: E402
 from accel_calib.logs import write_table  # noqa: E402
 from accel_calib.table import Floats  # noqa: E402
 import numpy as np  # noqa: E402
@@ -104,7 +105,8 @@ def asked_poses(count: int = POSES) -> Iterator[tuple[Floats, str]]:
         asked = next_pose(taken)
         if asked.direction is None:
             return
-        words = asked.words.removeprefix('turn the sensor so that the ').replace(' points up', '')
+        words = request_words(asked).removeprefix('turn the sensor so that the ')
+        words = words.replace(' points up', '')
         yield asked.direction, words
         taken = np.vstack([taken, asked.direction])
 

@@ -20,6 +20,7 @@ from pathlib import Path
 import re
 import sys
 from textwrap import wrap
+from typing import Any
 
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parent)]
@@ -53,7 +54,8 @@ def effects() -> Iterator[str]:
     for name, effect in EFFECTS.items():
         needs = ', '.join(part for key in effect.needs for part in COLUMNS[key].names)
         values = ', '.join(effect.values)
-        yield (f'| `{name}` | {effect.words} | {effect.term} | {values} | {effect.unit} | '
+        unit = effect.unit.replace('/', '/\N{WORD JOINER}')  # a narrow column does not break it
+        yield (f'| `{name}` | {effect.words} | {effect.term} | {values} | {unit} | '
                f'{effect.typical:g} | {needs} |')
 
 
@@ -111,12 +113,27 @@ def formats() -> Iterator[str]:
     yield f'| refused with what converts it | {refused} | |'
 
 
+def stated(value: Any) -> str:
+    """Return a value as YAML has it."""
+    return str(value).lower() if isinstance(value, bool) else repr(value)
+
+
+def settings() -> Iterator[str]:
+    """Yield the parameters of the calibrator."""
+    yield '| parameter | default | meaning | live |'
+    yield '|---|---|---|---|'
+    for each in fields(CalibratorSettings):
+        words = re.sub(r'([|<*])', r'\\\1', f"{each.metadata['words']} ({expected(each)})")
+        live = 'yes' if each.metadata['live'] else ''
+        yield f'| `{each.name}` | `{stated(default_of(each))}` | {words} | {live} |'
+
+
 Tables = Mapping[str, Callable[[], Iterator[str]]]
 
 TABLES: Tables = {
     'columns': columns, 'effects': effects, 'exports': exports,
     'findings': partial(kinds, KINDS), 'formats': formats, 'names': names, 'rating': rating,
-    'steps': partial(kinds, STEPS)}
+    'settings': settings, 'steps': partial(kinds, STEPS)}
 PARAMETERS = HERE.parent / 'config' / 'calibrator.yaml'
 COMMENT = '    # '
 
@@ -131,8 +148,7 @@ def parameters() -> Iterator[str]:
         live = ' *' if each.metadata['live'] else ''
         words = f"{each.metadata['words']} ({expected(each)}){live}"
         yield from wrap(words, 99, initial_indent=COMMENT, subsequent_indent=COMMENT)
-        value = default_of(each)
-        yield f'    {each.name}: {str(value).lower() if isinstance(value, bool) else repr(value)}'
+        yield f'    {each.name}: {stated(default_of(each))}'
 
 
 def with_tables(text: str, made: Tables = TABLES) -> str:

@@ -243,6 +243,8 @@ def test_a_record_is_pickled_with_cached_values_while_another_thread_adds_one(po
     (lambda poses: ac.fit(poses, flat=1, nose_down=1), 'within 10° of the flat pose'),
     (lambda poses: ac.simulate({'offest': 1.0}), "'offest' is not in the catalogue"),
     (lambda poses: ac.simulate({}, time=[0.0, 1.0]), r'time has shape \(2,\), expected 24 rows'),
+    (lambda poses: ac.simulate({}, directions=np.ones(3)), r'shape \(3,\), expected \(n, 3\)'),
+    (lambda poses: ac.simulate({}, directions=[[0, 0, 0]]), 'other than zero'),
     (lambda poses: ac.compare([ac.fit(poses)]), 'found 1 calibration, expected at least 2'),
     (lambda poses: ac.capture(ac.simulate({}, recording=True, poses=2), min_dwel=3), 'min_dwel'),
     (lambda poses: ac.fit(poses).apply(poses.to_dataframe()), r'shape \(24, 7\), expected \(n, 3'),

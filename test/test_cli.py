@@ -106,66 +106,6 @@ def test_a_refusal_says_how_the_log_was_read(command, kind, calibration, tmp_pat
     refused(capsys, *arguments)
 
 
-@pytest.mark.parametrize(('text', 'message'), [
-    ('', 'is empty'), ('ax,ay,az\n1,2,x\n', "'x', expected a finite number"),
-    ('ax,ay,az\n' + '9000,100,16000\n' * 12, 'lie in a plane'),
-    ('ax,ay,az\n' + '0,0,9.8\n' * 12, 'all have the same orientation'),
-])
-def test_a_bad_table_does_not_change_a_stored_calibration(text, message, calibration, tmp_path,
-                                                          capsys):
-    stored, bad = calibration.read_text(), tmp_path / 'bad.csv'
-    bad.write_text(text)
-    assert message in refused(capsys, 'fit', bad, '-o', calibration)
-    assert calibration.read_text() == stored
-
-
-MISSING_FILES = [
-    ('fit', 'missing.csv'), ('capture', 'missing.csv', '-o', 'x.csv'),
-    ('capture', 'missing.mcap', '-o', 'x.csv'), ('verify', 'poses.csv', '-c', 'missing.yaml'),
-    ('calibrate', 'missing.csv'), ('noise', 'missing.csv'), ('compare', 'missing.yaml'),
-    ('history', 'missing.yaml'), ('export', 'missing.yaml', '--to', 'c'),
-    ('refine', 'missing.mcap'), ('refine', 'poses.csv', '-c', 'missing.yaml')]
-
-
-@pytest.mark.parametrize('arguments', [
-    *((*arguments, '--json', '../error.json') for arguments in MISSING_FILES),
-    ('apply', 'missing.csv', '-c', 'calibration.yaml', '-o', 'x.csv'),
-    ('fit', 'poses.csv', '-o', 'no_folder/c.yaml'), ('fit', 'poses.csv', '--rows', '3:2'),
-    ('fit', 'poses.csv', '--rows', '0:5'), ('fit', 'poses.csv', '--rows', 'a:b'),
-    ('fit', 'poses.csv', '--rows', '1:99'), ('fit', 'poses.csv', '--flat', '99'),
-    ('fit', 'poses.csv', 'poses.csv', '-o', 'calibration.yaml'),
-    ('fit', 'poses.csv', '--units', 'g'), ('simulate', '-o', 'x.csv', '--effect', 'wobble=1'),
-    *(('simulate', '-o', 'x.csv', *words.split()) for words in (
-        '--poses 0', '--seed -1', '--poses 99999999999999999999999', '--poses 100000000',
-        '--samples 99999999999999999999999', '--noise nan', '--noise 1e308',
-        '--effect offset=1e308', '--mounting nan 0 0', '--recording --rate 1e300',
-        '--recording --dwell 1e300', '--gravity 1e308',
-        '--temperature 1e308 1e308 --effect offset_temperature=1')),
-    *(('fit', 'poses.csv', option, 'circle') for option in ('-o', '--json', '--report')),
-    ('fit', 'poses.csv', '-o', 'new.yaml', '--json', '.'), ('calibrate', 'poses.csv', '-o', ''),
-    ('capture', 'poses.csv', '-o', 'circle'), ('calibrate', 'poses.csv', '-o', 'circle'),
-    ('apply', 'poses.csv', '-c', 'calibration.yaml', '-o', 'circle'), ('fit', 'circle'),
-    ('capture', 'poses.csv', '-o', 'x.csv'), ('verify', 'poses.csv', '-c', 'poses.csv'),
-    ('noise', 'poses.csv'), ('fit', 'poses.csv', '--model', '12'), ('fit', '.'),
-    ('refine', 'poses.csv', '--rows', '1:3'), ('refine', 'poses.csv', '--report', 'none/r.html'),
-    ('refine', 'poses.csv', '--base', '12'), ('report', 'missing.csv', '-o', 'r.html'),
-    ('report', 'poses.csv', '-o', 'no_folder/r.html'),
-])
-def test_bad_input_is_one_line_and_status_2_and_an_error_in_the_json(
-        arguments, calibration, tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    error = tmp_path.parent / 'error.json'
-    error.unlink(missing_ok=True)
-    (tmp_path / 'circle').symlink_to('circle')
-    there = sorted(tmp_path.iterdir())
-    refused(capsys, *arguments)
-    assert sorted(tmp_path.iterdir()) == there
-    if arguments[-1] == '../error.json':
-        result = json.loads(error.read_text())
-        assert {'error', 'advice'} <= set(result) <= {'error', 'advice', 'file'}
-        assert result['advice']
-
-
 @pytest.mark.parametrize('closed', [(1,), (2,), (0,), (0, 1, 2)])
 @pytest.mark.parametrize('command', ['fit poses.csv -o new.yaml', 'fit missing.csv'])
 def test_closed_streams_change_no_exit_status_and_no_file(closed, command, poses, tmp_path):
@@ -187,6 +127,8 @@ def test_a_name_that_is_not_utf_8_is_refused_in_one_line(poses, tmp_path):
 INTERRUPTED = """
 import atexit, runpy, signal, sys
 signal.signal(signal.SIGINT, signal.{handler})  # a shell lets background commands ignore it
+
+
 def interrupt(event, about):
     if event == 'import' and about[0] == {name!r}:
         signal.raise_signal(signal.SIGINT)
@@ -313,6 +255,7 @@ def test_a_missing_library_is_named_in_one_line_with_how_to_install_it(module, l
 
 
 # --------------------------------------------------------------------- settings of the capture
+
 
 def shaky(path, quiet=3, shaken=9, std_g=0.012):
     """Write a recording whose first rests are quiet, and whose other rests are shaken."""

@@ -19,7 +19,7 @@ from inside import (
     rotation_from_rpy, simulate_poses, spread_directions)
 import numpy as np
 import pytest
-from shared import KNOWN as AFFINE, refused, rms, run
+from shared import KNOWN as AFFINE, rms, run
 import yaml
 
 BY_AXIS = {name: AFFINE[name] for name in ('offset', 'axis_gain')}
@@ -567,38 +567,8 @@ def test_the_command_writes_beside_the_calibration(to, stored, tmp_path, capsys)
     assert f'stored in {path}' in ' '.join(printed.err.split())
 
 
-@pytest.mark.parametrize('to', ['json', 'npz', 'realsense', 'c'])
-def test_only_an_export_is_replaced(to, stored, tmp_path, capsys):
-    foreign, path = io.BytesIO(), tmp_path / f'calibration{EXPORT_FORMATS[to].suffix}'
-    np.savez(foreign, a=np.arange(3))
-    for content in (b'{"mine": 1}', foreign.getvalue(), b'accel_calib: my notes\n',
-                    stored.read_bytes(), b'run accel-calib export calibration.yaml\n'):
-        path.write_bytes(content)
-        assert 'exists and is no export' in refused(capsys, 'export', stored, '--to', to)
-        assert path.read_bytes() == content
-
-
 def test_the_command_writes_to_standard_output_and_its_losses_to_standard_error(stored, capfd):
     assert run('export', stored, '--to', 'px4', '-o', '-') == 0
     printed = capfd.readouterr()
     assert printed.out == text_of(HEADERS['affine'], 'px4')
     assert ' leaves 6.4 mg' in printed.err
-
-
-@pytest.mark.parametrize(('arguments', 'message'), [
-    (['--to', 'c', '-o', 'calibration.yaml'], 'is an input'),
-    (['--to', 'c', '-o', 'none/imu.h'], 'is not a folder'),
-    (['--to', 'json', '-o', '-', '--json', '-'], 'are both -'),
-    (['--to', 'kalibr'], '--noise is not given'),
-    (['--to', 'kalibr', '--noise', 'calibration.yaml'], 'is not a JSON file'),
-    (['--to', 'kalibr', '--noise', 'list.json'], 'contains no JSON object'),
-    (['--to', 'kalibr', '--noise', 'none.json'], 'none.json'),
-    (['--to', 'c', '--name', '*/'], 'expected a letter')])
-def test_the_command_refuses_in_one_line_and_writes_nothing(arguments, message, stored, tmp_path,
-                                                            monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / 'list.json').write_text('[1]', encoding='utf-8')
-    before = stored.read_bytes()
-    assert message in refused(capsys, 'export', 'calibration.yaml', *arguments)
-    assert stored.read_bytes() == before
-    assert sorted(each.name for each in tmp_path.iterdir()) == ['calibration.yaml', 'list.json']

@@ -5,7 +5,6 @@
 
 from dataclasses import replace
 import os
-import shutil
 import stat
 
 from accel_calib.calibration import fit_poses
@@ -19,7 +18,7 @@ from inside import (
     format_calibration, Model, parse_calibration, previous, simulate_poses, spread_directions)
 import numpy as np
 import pytest
-from shared import refused, run, sensor
+from shared import sensor
 
 
 def write(folder, text):
@@ -47,26 +46,6 @@ def test_every_column_is_read_as_it_was_written(tmp_path):
     for key in table.columns.keys() - {'label'}:
         np.testing.assert_allclose(found[key], table[key], rtol=1e-11)
     np.testing.assert_allclose(np.diff(found['time']), 0.0025, atol=5e-7)
-
-
-@pytest.mark.parametrize(('text', 'message'), [
-    ('', 'is empty'), ('# only a comment\n\n', 'is empty'),
-    ('ax,ay,az\n', 'a header line but no rows'),
-    ('ax,ay\n1,2\n', 'lacks az'),
-    ('ax,ay,az,ax\n1,2,3,4\n', '2 columns ax'),
-    ('ax,ay,az\n1,2,three\n', "row 1, column az is 'three', expected a finite number"),
-    ('ax,ay,az\n1,2,3\n1,nan,3\n', "row 2, column ay is 'nan'"),
-    ('ax,ay,az\n1,2,3\n1,2,inf\n', "row 2, column az is 'inf'"),
-    ('ax,ay,az\n1,2,3\n1,,3\n', "row 2, column ay is ''"),
-    ('ax,ay,az\n1,2,3\n1,2\n4,5,6\n', 'row 2 has 2 values, expected 3'),
-    ('ax,ay,az,count\n1,2,3,0\n', 'not above 0'),
-    ('ax,ay,az,std_x,std_y,std_z\n1,2,3,1,1,-1\n', 'negative'),
-    (b'\x80\x04\x95\xff\xfe', 'is not a text file'),
-])
-def test_a_bad_pose_table_is_refused_in_one_line(text, message, tmp_path):
-    with pytest.raises(InputError, match=message) as refusal:
-        read_poses(write(tmp_path, text))
-    assert '\n' not in str(refusal.value)
 
 
 def test_a_recording_needs_times_and_a_missing_file_is_an_error_of_the_system(tmp_path):
@@ -115,76 +94,6 @@ def test_shape_at_its_usual_value_is_not_stored(values, text, calibration):
     np.testing.assert_array_equal(found.covariance, given.covariance)
     again = format_calibration(found)
     assert format_calibration(parse_calibration(again, 'calibration.yaml')) == again
-
-
-@pytest.fixture(scope='module')
-def made(tmp_path_factory):
-    folder = tmp_path_factory.mktemp('made')
-    assert run('simulate', '-o', folder / 'rec.csv', '--recording', '--poses', 14, '--dwell', 2,
-               '--rate', 50) == 0
-    assert run('simulate', '-o', folder / 'poses.csv', '--poses', 14) == 0
-    assert run('fit', folder / 'poses.csv', '-o', folder / 'cal.yaml') == 0
-    (folder / 'notes.txt').write_text('my notes\n')
-    (folder / 'old.json').write_text('{}')
-    (folder / 'out').mkdir()
-    (folder / 'more').mkdir()
-    (folder / 'more' / 'poses.csv').write_bytes((folder / 'poses.csv').read_bytes())
-    return folder
-
-
-@pytest.fixture
-def here(made, tmp_path, monkeypatch):
-    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-@pytest.mark.usefixtures('here')
-@pytest.mark.parametrize('command', ['calibrate', 'fit', 'refine', 'verify', 'capture', 'apply'])
-def test_a_calibration_in_place_of_a_log_is_named(command, capsys):
-    used = ['-c', 'cal.yaml'] if command in ('verify', 'apply') else []
-    stored = [] if command == 'verify' else ['-o', 'other']
-    assert 'is a calibration' in refused(capsys, command, 'cal.yaml', *used, *stored)
-
-
-def contents(folder):
-    return {path: path.read_bytes() for path in folder.rglob('*') if path.is_file()}
-
-
-@pytest.mark.parametrize('arguments', [
-    ('capture', 'rec.csv', '-o', 'rec.csv'), ('capture', 'rec.csv', '-o', 'notes.txt'),
-    ('apply', 'rec.csv', '-c', 'cal.yaml', '-o', 'cal.yaml'),
-    ('apply', 'rec.csv', '-c', 'cal.yaml', '-o', 'rec.csv'),
-    ('fit', 'poses.csv', '-o', 'poses.csv'), ('fit', 'poses.csv', '--json', 'cal.yaml'),
-    ('fit', 'poses.csv', '--report', 'cal.yaml'),
-    ('fit', 'poses.csv', '-o', 'new.yaml', '--json', 'new.yaml'),
-    ('fit', 'poses.csv', '-o', 'new.yaml', '--json', 'nowhere/x.json'),
-    ('verify', 'poses.csv', '-c', 'cal.yaml', '--json', 'cal.yaml'),
-    ('refine', 'poses.csv', '-o', 'poses.csv'), ('refine', 'poses.csv', '--plan', 'cal.yaml'),
-    ('simulate', '-o', 'cal.yaml'), ('simulate', '-o', 'notes.txt'),
-    ('export', 'cal.yaml', '--to', 'c', '-o', 'cal.yaml'),
-    ('export', 'cal.yaml', '--to', 'c', '-o', 'notes.txt'),
-    ('calibrate', 'rec.csv', '-o', 'rec.csv'), ('calibrate', 'rec.csv', '-o', 'notes.txt'),
-    ('fit', 'poses.csv', 'more/poses.csv', '-o', 'out'),
-    ('fit', 'poses.csv', 'rec.csv', '-o', 'cal.yaml'),
-    ('compare', 'cal.yaml', 'cal.yaml', '--json', 'cal.yaml'),
-    *((command, *read, '--json', 'old.json', '--force') for command, *read in (
-        ('fit', 'poses.csv', '--prior', 'old.json'), ('refine', 'poses.csv', '--also', 'old.json'),
-        ('fleet', 'rec.csv', '@old.json', '-o', 'out'))),
-], ids=' '.join)
-def test_nothing_else_is_overwritten(arguments, here, capsys):
-    before = contents(here)
-    refused(capsys, *arguments)
-    assert contents(here) == before
-
-
-@pytest.mark.parametrize('arguments', [
-    ('fit', 'poses.csv', '-o', 'cal.yaml'), ('capture', 'rec.csv', '-o', 'poses.csv'),
-    ('simulate', '-o', 'poses.csv'), ('simulate', '-o', 'notes.txt', '--force'),
-    ('fit', 'poses.csv', 'rec.csv', '-o', 'out')], ids=' '.join)
-def test_a_file_of_the_same_kind_is_replaced(arguments, here):
-    assert run(*arguments) == 0
-    assert run(*arguments) == 0
 
 
 def put(path, text='new\n'):

@@ -6,6 +6,7 @@ import re
 
 from accel_calib.calibration import dilution, error_left_in, fit_poses, identifiability, next_pose
 from accel_calib.errors import RefusedFitError
+from accel_calib.findings import request_words
 from accel_calib.geometry import sphere_through
 from accel_calib.table import Poses
 from inside import (
@@ -121,11 +122,11 @@ def test_error_of_a_smaller_model_is_that_of_fits_to_common_sensors(smaller, dir
 
 def test_next_poses_have_words_and_are_far_fewer_than_random_poses():
     asked = next_pose(np.delete(FACES, 1, axis=0), '7')
-    assert 'left side' in asked.words
+    assert 'left side' in request_words(asked)
     directions = np.zeros((0, 3))
     while len(directions) < 12:
         asked = next_pose(directions)
-        np.testing.assert_allclose([asked.direction], named(asked.words))
+        np.testing.assert_allclose([asked.direction], named(request_words(asked)))
         directions = np.vstack([directions, asked.direction])
     assert identifiability('10', directions).mean_dilution < 0.95
     at_random = [identifiability('10', random_directions(12, np.random.default_rng(seed)))

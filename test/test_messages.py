@@ -16,8 +16,7 @@ import os
 import pickle
 import struct
 
-from accel_calib.calibration import of_samples, thermal_stream
-from accel_calib.effects import EFFECTS
+from accel_calib.effects import context_of_samples, EFFECTS, thermal_stream
 from accel_calib.errors import AccelCalibError, InputError
 from accel_calib.logs import (
     ACCELERATION, ACCELERATION_COVARIANCE, ANGULAR_VELOCITY, ANGULAR_VELOCITY_COVARIANCE,
@@ -183,7 +182,7 @@ def test_lag_carries_over_from_block_to_block(calibration):
     def part(rows, *stream):
         own = {key: values[rows] for key, values in context.items()}
         return corrected(calibration, doubles[rows],
-                         of_samples(own, len(doubles[rows]), calibration.model, *stream))
+                         context_of_samples(own, len(doubles[rows]), calibration.model, *stream))
 
     expected, stream = part(slice(None)), thermal_stream(calibration.model)
     parts = [part(slice(0, 77), stream), part(slice(77, 300), stream)]

@@ -6,7 +6,9 @@
 from dataclasses import replace
 import tracemalloc
 
-from accel_calib.calibration import of_samples, outside, SampleContext
+from accel_calib.calibration import outside, SampleContext
+from accel_calib.effects import context_of_samples
+from accel_calib.findings import outside_words
 from accel_calib.logs import read_recording, write_blocks, write_table
 from accel_calib.stored import write_calibration
 from accel_calib.table import numbered, Recording
@@ -69,7 +71,7 @@ def test_quantities_outside_are_counted_over_blocks_and_those_inside_are_not():
      'vibration is 0 mg, but the range of the calibration is 1 to 20 mg')])
 def test_each_quantity_is_described_in_its_unit(name, values, known, words):
     calibration = calibrated({name: np.array(values)})
-    found = [each.words for each in outside(calibration, known).values() if each.count]
+    found = [outside_words(each) for each in outside(calibration, known).values() if each.count]
     assert len(found) == 1
     assert words in found[0]
 
@@ -152,14 +154,14 @@ def test_blocks_give_the_same_as_the_whole(calibration, stored, tmp_path, monkey
     monkeypatch.setattr(*ROWS_OF_A_TEXT, rows)
     blocks = read_recording(applied(path, stored, tmp_path / 'blocks.csv'))
     assert capsys.readouterr().out.replace('blocks.csv', '') == printed
-    expected = calibration.correct(samples.reading, of_samples(
+    expected = calibration.correct(samples.reading, context_of_samples(
         samples.columns, len(samples), calibration.model))
     for found in (whole, blocks):
         np.testing.assert_allclose(found.reading, expected, rtol=0.0, atol=1e-9)
         for key in ('time', 'temperature', 'rate'):
             np.testing.assert_allclose(found[key], samples[key], rtol=1e-10)
     parts = [samples.take(slice(k, k + rows)) for k in range(0, len(samples), rows)]
-    alone = np.concatenate([calibration.correct(part.reading, of_samples(
+    alone = np.concatenate([calibration.correct(part.reading, context_of_samples(
         part.columns, len(part), calibration.model)) for part in parts])
     assert np.max(np.abs(alone - expected)) > 1e-3  # the state at the start of a block matters
 

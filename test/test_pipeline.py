@@ -31,10 +31,10 @@ def test_poses_near_one_direction_are_fitted_if_planned_and_replace_no_full_fit(
     cone = ac.simulate(SENSOR, directions=np.column_stack([tilts, np.ones(len(tilts))]))
     with pytest.raises(RefusedFitError):
         calibrated_by(cone, MPS2, PLAN)
-    partial = calibrated_by(cone, MPS2, replace(PLAN, in_cone=True)).calibration
+    partial = calibrated_by(cone, MPS2, replace(PLAN, partial=True)).calibration
     assert is_partial(partial)
-    again = calibrated_by(cone, MPS2, replace(PLAN, in_cone=True, before=partial)).calibration
+    again = calibrated_by(cone, MPS2, replace(PLAN, partial=True, before=partial)).calibration
     assert is_partial(again)
     full = calibrated_by(ac.simulate(SENSOR, poses=16), MPS2, PLAN).calibration
     with pytest.raises(RefusedFitError):
-        calibrated_by(cone, MPS2, replace(PLAN, in_cone=True, before=full))
+        calibrated_by(cone, MPS2, replace(PLAN, partial=True, before=full))

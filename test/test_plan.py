@@ -7,12 +7,12 @@ import csv
 from dataclasses import replace
 import json
 
-from accel_calib.calibration import NextPose
-from accel_calib.refinement import PlannedPose, refine
+from accel_calib.calibration import NextPose, PlannedPose, SessionPlan
+from accel_calib.findings import NOTHING_TO_PLAN, rival_words
+from accel_calib.refinement import refine
 from accel_calib.table import Poses
 from generator import Setup, simulate, write_csv
-from inside import (
-    attitude_words, Guide, levels_of, model_with, NOTHING_TO_PLAN, Plan, simulate_poses, step_of)
+from inside import attitude_words, choose_levels, Guide, model_with, simulate_poses, step_of
 import numpy as np
 import pytest
 from shared import G, random_directions, run, run_json
@@ -115,7 +115,7 @@ def test_voltages_of_a_plan_are_the_ends_and_the_middle_of_those_of_the_poses():
 def test_temperatures_of_a_plan_are_those_of_the_poses_and_some_beyond(taken, expected):
     poses = Poses({'reading': np.eye(3)[:len(taken)], 'temperature': np.array(taken)},
                   np.arange(len(taken)))
-    assert levels_of('temperature', poses) == expected
+    assert choose_levels('temperature', poses) == expected
 
 
 def test_the_poses_of_the_plan_name_the_hidden_effect():
@@ -147,29 +147,29 @@ def test_what_is_usual_does_not_replace_a_pose_that_would_show_it(seed):
                       for chances in (step.probabilities, step.data_probabilities))
     assert usual[0] > 5.0 * usual[1]  # the drift is a hundred usual ones
     assert by_data[0] == pytest.approx(by_data[1], abs=0.1)
-    assert any(words.count('%') == 2 for words in step.likely_rivals)
+    assert any(words.count('%') == 2 for words in rival_words(step))
     assert found.plan.poses
 
 
 def planned(up, **context):
-    return PlannedPose(up, attitude_words(np.array(up)), context, ('cubic', 'odd_quadratic'), 0.9)
+    return PlannedPose(up, context, ('cubic', 'odd_quadratic'), 0.9)
 
 
 def guide_at(guide, up):
-    asked = NextPose(np.array([1.0, 0.0, 0.0]), 'turn the sensor', 0.5, 12, True)
-    guide.plan = Plan(asked, len(up), np.array(up, float).reshape(-1, 3), 1e-4, 0.5)
+    asked = NextPose(np.array([1.0, 0.0, 0.0]), 0.5, 12, True)
+    return guide.choose(
+        SessionPlan(asked, len(up), np.array(up, float).reshape(-1, 3), 1e-4, 0.5))
 
 
 def test_the_node_asks_for_the_poses_of_the_plan_and_then_for_refine():
-    guide = Guide()
-    guide_at(guide, [(0, 0, -1)])
-    guide.follow([planned((0.0, 0.0, 1.0)), planned((0.0, 1.0, 0.0), temperature=40.0)])
+    guide = guide_at(Guide(), [(0, 0, -1)]).follow([
+        planned((0.0, 0.0, 1.0)), planned((0.0, 1.0, 0.0), temperature=40.0)])
     assert guide.plan.asked.direction.tolist() == [0.0, 0.0, 1.0]
-    assert step_of(guide).words.endswith(' cubic from odd_quadratic')
-    guide_at(guide, [(0, 0, -1), (0, 0.1, 1)])
-    assert ' at 40 °C' in step_of(guide).words
+    assert step_of(guide).text.endswith(' cubic from odd_quadratic')
+    guide = guide_at(guide, [(0, 0, -1), (0, 0.1, 1)])
+    assert ' at 40 °C' in step_of(guide).text
     assert guide.plan.asked.direction.tolist() == [0.0, 1.0, 0.0]
-    guide_at(guide, [(0, 0, -1), (0, 0.1, 1), (0, 1, 0)])
-    assert (step_of(guide).kind, step_of(guide).command) == ('refine', 'refine')
-    guide_at(guide, [])
-    assert (step_of(guide).kind, step_of(guide).command) == ('poses', 'fit')
+    guide = guide_at(guide, [(0, 0, -1), (0, 0.1, 1), (0, 1, 0)])
+    assert (step_of(guide).step, step_of(guide).command) == ('refine', 'refine')
+    guide = guide_at(guide, [])
+    assert (step_of(guide).step, step_of(guide).command) == ('poses', 'fit')

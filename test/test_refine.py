@@ -7,8 +7,9 @@ import re
 
 import accel_calib as ac
 from accel_calib.effects import between_steps
+from accel_calib.findings import value_words, verdict_words
 from accel_calib.logs import read_poses
-from accel_calib.refinement import refine, values_of, verdict_words
+from accel_calib.refinement import refine
 import generator
 from inside import LARGEST_SAMPLE, model_with, simulate_poses, spread_directions
 import numpy as np
@@ -89,7 +90,7 @@ def test_steps_state_the_values_and_deviations_of_the_final_model(taken):
         assert [step.parameters[axis] for axis in 'xyz'] == values.tolist()
         assert [step.parameters_sd[axis] for axis in 'xyz'] == pytest.approx(
             [deviations[f'{step.effect}.{axis}'] for axis in 'xyz'])
-        shown = dict(values_of(step))
+        shown = dict(value_words(step))
         assert all('±' in shown[axis] for axis in 'xyz')
 
 

@@ -8,14 +8,16 @@ import json
 import re
 
 import accel_calib as ac
-from accel_calib.calibration import fit_poses, verify, with_history
+from accel_calib.calibration import fit_poses, verify
+from accel_calib.effects import add_history
 from accel_calib.errors import RefusedFitError
+from accel_calib.findings import verdict_words
 from accel_calib.logs import read_recording, write_table
-from accel_calib.refinement import refine, verdict_words
+from accel_calib.refinement import refine
 from accel_calib.stored import write_calibration
 import generator
 from inside import (
-    advice_for, Model, model_with, rotation_from_rpy, search_effects, simulate_poses,
+    Model, model_with, remarks_on, rotation_from_rpy, search_effects, simulate_poses,
     spread_directions)
 import numpy as np
 import pandas as pd
@@ -151,12 +153,11 @@ def test_structure_that_is_not_understood_remains_a_gap(structure):
     rng = np.random.default_rng(1)
     poses = poses_of(with_effects(rng), rng, 60)
     scattered = plus(poses, 0.002 * rng.normal(size=(60, 3)))
-    found = search_effects(with_history(scattered, Model({})),
+    found = search_effects(add_history(scattered, Model({})),
                            fit_poses(poses, G, model='10').model)
-    lines = advice_for(replace(found, **structure), (), (), 0, unexplained=True)
-    assert any('gap remains' in line for line in lines)
-    assert not any('no structure' in line for line in lines)
-    assert any('no structure' in line for line in advice_for(found, (), (), 0, unexplained=True))
+    kinds = [{each.kind for each in remarks_on(what, (), (), 0, unexplained=True)}
+             for what in (replace(found, **structure), found)]
+    assert ['gap' in kinds[0], 'scatter' in kinds[0], 'scatter' in kinds[1]] == [True, False, True]
 
 
 def test_poses_that_scatter_alike_hide_nothing_though_their_noise_differs():

@@ -7,12 +7,14 @@ from dataclasses import fields
 import re
 from typing import Any
 
+from accel_calib.calibration import plan_session
 from accel_calib.errors import InputError
+from accel_calib.findings import request_words
 from accel_calib.logs import read_poses
 from accel_calib.session import CalibratorSettings
 from accel_calib.units import units_of
 from diagnostic_msgs.msg import DiagnosticArray
-from inside import capture_settings, changed, Model, plan_for, simulate_poses, spread_directions
+from inside import capture_settings, changed, Model, simulate_poses, spread_directions
 from inside_ros import pose_markers, SimulatorSettings
 import numpy as np
 import pytest
@@ -29,11 +31,11 @@ def count(markers: list[Any], namespace: str = 'poses') -> int:
 
 def test_log_and_markers_report_that_more_poses_no_longer_help() -> None:
     poses = simulate_poses(Model({}), spread_directions(24), np.random.default_rng(1))
-    asked = plan_for(poses, units_of('g'), 'auto').asked
-    assert (asked.direction, re.findall(r'\d\S*', asked.words)) == (None, ['24', '0.18'])
+    asked = plan_session(poses, units_of('g'), 'auto').asked
+    assert (asked.direction, re.findall(r'\d\S*', request_words(asked))) == (None, ['24', '0.18'])
     markers = pose_markers(np.zeros((0, 3)), asked, 'imu').markers
-    assert [m.text for m in markers if m.ns == 'next'] == [asked.words]
-    few = plan_for(poses.take(slice(0, 8)), units_of('g'), 'auto').asked
+    assert [m.text for m in markers if m.ns == 'next'] == [request_words(asked)]
+    few = plan_session(poses.take(slice(0, 8)), units_of('g'), 'auto').asked
     arrow, text = [m for m in pose_markers(np.zeros((0, 3)), few, 'imu').markers if m.ns == 'next']
     np.testing.assert_allclose([getattr(arrow.points[1], axis) for axis in 'xyz'], few.direction)
     assert text.text == few.words

@@ -3,7 +3,7 @@
 
 """Lag and rate of the temperature: known solutions, wavy temperatures, streams."""
 
-from accel_calib.calibration import with_history
+from accel_calib.effects import add_history
 from accel_calib.errors import InputError
 from accel_calib.estimate import estimate
 from inside import (
@@ -138,7 +138,7 @@ def test_fit_recovers_the_lag_within_its_uncertainty(effect, of_sensor, lag):
     poses = simulate_poses(true, random_directions(count, rng), rng, context=context)
     start = Model({**{name: np.zeros(3) for name in SENSOR},
                    effect: np.array([5e-4, -5e-4, 5e-4, 1.5 * lag, of_sensor])})
-    fit = estimate(start, with_history(poses, start))
+    fit = estimate(start, add_history(poses, start))
     assert fit.model.needs == ('temperature', 'time')
     found, sd = fit.model.values[effect], np.sqrt(np.diag(fit.covariance))[-5:]
     assert sd[3] < 0.15 * lag

@@ -7,44 +7,44 @@ From poses to a calibration.
 `fit` is the entry point, and `partial` that for few poses, with the typical values of sensors.
 `calibration` is the record. `quality` makes it, computes its figures, and has the gate, which
 rejects implausible results. `rest_noise` adds the figures of the gyro and of the samples.
-`mounting` computes the mounting and detects wiring faults. `pose_planning` computes what poses
-determine, and plans the next pose. `thermal` is for a still board whose temperature changes.
+`mounting` computes the mounting and detects wiring faults. `directions` computes what poses
+determine, and `planning` the next pose. `thermal` is for a still board whose temperature changes.
 
 """
 
 from .calibration import (
-    Calibration, check_sensor, FLEET, of_samples, PRIOR, Quality, Rejected, RejectedKind,
-    STORED_METHODS, thermal_stream, with_history)
-from .fit import (
-    CLIPPED, directions_of, fit_poses, fit_unknown, only_norm, rejected_by, sound_rows, sure_rows)
+    Calibration, check_sensor, FLEET, PRIOR, Quality, Rejected, RejectedKind, STORED_METHODS)
+from .directions import (
+    Combination, determines, dilution, directions_in, directions_of, error_left_in,
+    free_parameters, identifiability, LARGEST_DILUTION, lies_in_cone, lies_in_plane, NORM_MODELS)
+from .fit import CLIPPED, fit_poses, fit_unknown, only_norm, rejected_by, sound_rows, sure_rows
 from .mounting import (
-    angle_words, flat_direction, in_frame, level, level_by_rows, mounting_figures, mounting_of,
-    mounting_words, on_topics, set_heading, with_given_mounting)
-from .outside import Outside, outside, SampleContext, USES_LIMIT
+    flat_direction, in_frame, level, level_by_rows, mounting_of, on_topics, set_heading,
+    with_given_mounting)
+from .outside import Outside, outside, SampleContext
 from .partial import fit_partial, fit_with_fleet, FleetPrior, mounting_only, posterior
-from .pose_planning import (
-    determines, dilution, directions_in, error_left_in, free_parameters, identifiability,
-    LARGEST_DILUTION, lies_in_cone, next_pose, NextPose, NORM_MODELS, Outlook, outlook,
-    refuse_if_unfit, request_for, stated_uncertainty)
+from .planning import (
+    ENOUGH, next_pose, NextPose, Outlook, outlook, plan_refinement, plan_session, PlannedPose,
+    PosePlan, refuse_if_unfit, SessionPlan)
 from .quality import (
     deviations_g, errors_after, errors_before, fit_findings, gated, has_usual_gains, in_g,
-    LARGEST_OFFSET_G, OF_A_FIT, quality_of, record_of, uncertainty_g, Verification, verify,
-    with_rest_noise)
+    LARGEST_OFFSET_G, OF_A_FIT, quality_of, record_of, stated_uncertainty, uncertainty_g,
+    Verification, verify, with_rest_noise)
 from .rest_noise import gyro_bias_of, GyroBias, sample_noise_of, SampleNoise
 from .thermal import Curve, curve_of, thermal_alone, with_curve, without_curve
 
-__all__ = ['CLIPPED', 'FLEET', 'LARGEST_DILUTION', 'LARGEST_OFFSET_G', 'NORM_MODELS', 'OF_A_FIT',
-           'PRIOR', 'STORED_METHODS', 'USES_LIMIT', 'Calibration', 'Curve', 'FleetPrior',
-           'GyroBias', 'NextPose', 'Outlook', 'Outside', 'Quality', 'Rejected', 'RejectedKind',
-           'SampleContext', 'SampleNoise', 'Verification', 'angle_words', 'check_sensor',
-           'curve_of', 'determines', 'deviations_g', 'dilution', 'directions_in', 'directions_of',
-           'error_left_in', 'errors_after', 'errors_before', 'fit_findings', 'fit_partial',
-           'fit_poses', 'fit_unknown', 'fit_with_fleet', 'flat_direction', 'free_parameters',
-           'gated', 'gyro_bias_of', 'has_usual_gains', 'identifiability', 'in_frame', 'in_g',
-           'level', 'level_by_rows', 'lies_in_cone', 'mounting_figures', 'mounting_of',
-           'mounting_only', 'mounting_words', 'next_pose', 'of_samples', 'on_topics', 'only_norm',
-           'outlook', 'outside', 'posterior', 'quality_of', 'record_of', 'refuse_if_unfit',
-           'rejected_by', 'sample_noise_of', 'set_heading', 'sound_rows', 'stated_uncertainty',
-           'sure_rows', 'thermal_alone', 'thermal_stream', 'request_for',
-           'uncertainty_g', 'verify', 'with_curve',
-           'with_given_mounting', 'with_history', 'with_rest_noise', 'without_curve']
+__all__ = ['CLIPPED', 'ENOUGH', 'FLEET', 'LARGEST_DILUTION', 'LARGEST_OFFSET_G', 'NORM_MODELS',
+           'OF_A_FIT', 'PRIOR', 'STORED_METHODS', 'Calibration', 'Combination', 'Curve',
+           'FleetPrior', 'GyroBias', 'NextPose', 'Outlook', 'Outside', 'PlannedPose', 'PosePlan',
+           'Quality', 'Rejected', 'RejectedKind', 'SampleContext', 'SampleNoise', 'SessionPlan',
+           'Verification', 'check_sensor', 'curve_of', 'determines', 'deviations_g', 'dilution',
+           'directions_in', 'directions_of', 'error_left_in', 'errors_after', 'errors_before',
+           'fit_findings', 'fit_partial', 'fit_poses', 'fit_unknown', 'fit_with_fleet',
+           'flat_direction', 'free_parameters', 'gated', 'gyro_bias_of', 'has_usual_gains',
+           'identifiability', 'in_frame', 'in_g', 'level', 'level_by_rows', 'lies_in_cone',
+           'lies_in_plane', 'mounting_of', 'mounting_only', 'next_pose', 'on_topics', 'only_norm',
+           'outlook',
+           'outside', 'plan_refinement', 'plan_session', 'posterior', 'quality_of', 'record_of',
+           'refuse_if_unfit', 'rejected_by', 'sample_noise_of', 'set_heading', 'sound_rows',
+           'stated_uncertainty', 'sure_rows', 'thermal_alone', 'uncertainty_g', 'verify',
+           'with_curve', 'with_given_mounting', 'with_rest_noise', 'without_curve']

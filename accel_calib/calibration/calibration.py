@@ -7,8 +7,7 @@ The record of a calibration, and the context in which it corrects readings.
 Effects are not extrapolated: beyond the range of the poses, the correction uses the limit of the
 range (`Calibration.ranges`), and `.outside` says how far beyond it was. A curve over the vibration
 has a range, too. A single sample does not show its vibration, so that the correction uses the
-lower limit. The order of the poses determines the previous pose of each, for `hysteresis`, and the
-rate of the temperature, for `temperature_rate` and lags.
+lower limit.
 
 """
 
@@ -28,8 +27,8 @@ from numpy.typing import ArrayLike
 
 from .rest_noise import GyroBias, SampleNoise
 from ..effects import (
-    acting_temperature, AXES, between_steps, Context, correct, Model, ModelForm, MODELS,
-    parameter_names, predict, rate_at, ThermalStream, way_of, with_turns)
+    add_acting, AXES, Context, context_of_samples, correct, FROM_TEMPERATURE, Model, ModelForm,
+    MODELS, parameter_names, predict)
 from ..errors import InputError, RefusedFitError, StoredCalibrationError
 from ..finding import Finding, Rating
 from ..table import data_frame, Floats, in_unit, name_from, Poses, Record, Table
@@ -48,10 +47,7 @@ FLEET = 'fleet'
 STORED_METHODS = (*METHODS, PRIOR, FLEET)
 """Methods of stored calibrations; the user selects one of `METHODS`."""
 
-_THERMAL = ('temperature_rate', 'temperature_of_offset', 'temperature_of_gain')
-"""Context that is computed from time and temperature."""
-
-_HELD = ('time', 'temperature', *_THERMAL, 'supply_voltage')
+_HELD = ('time', 'temperature', *FROM_TEMPERATURE, 'supply_voltage')
 """Context that is limited to the range of the poses, as quantities are."""
 
 _Known = TypeVar('_Known', bound=Table)
@@ -314,7 +310,7 @@ class Calibration(Record):
     @cached_property
     def ranges(self) -> Mapping[str, tuple[float, float]]:
         """Range over the poses of what the effects depend on; of a lag, the acting temperature."""
-        known = _with_acting(self.model, self.poses.columns)
+        known = add_acting(self.poses.columns, self.model)
         used = np.isin(self.poses.row, self.used_poses.row)
         wanted = {*self.model.over, *({'temperature'} & {*self.model.needs})}
         return {key: (float(np.min(known[key][used])), float(np.max(known[key][used])))
@@ -394,8 +390,9 @@ class Calibration(Record):
         context = {key: np.broadcast_to(np.asarray(values, float),
                                         (len(rows), 3) if key == 'rate' else (len(rows),))
                    for key, values in known.items()}
-        found = {key: values for key, values in of_samples(context, len(rows), self.model).items()
-                 if key in context or key not in self.model.neutral}  # `correct` names the missing
+        found = context_of_samples(context, len(rows), self.model)
+        lacking = {*self.model.neutral} - {*context}  # `correct` names them
+        found = {key: values for key, values in found.items() if key not in lacking}
         return self.correct(rows, found).reshape(given.shape)
 
     def predict(self, force: Floats, context: Context | None = None) -> Floats:
@@ -431,7 +428,7 @@ class Calibration(Record):
         """Return a context limited to `ranges`."""
         if not context or not self.ranges:
             return context or {}
-        known = _with_acting(self.model, context)
+        known = add_acting(context, self.model)
         return {**known, **{key: np.clip(known[key], *limits)
                             for key, limits in self.ranges.items() if key in known}}
 
@@ -525,64 +522,6 @@ class Calibration(Record):
 def _later(part: str) -> Any:
     """Import a part of the package that takes calibrations, when it is given one."""
     return import_module(f'accel_calib.{part}')
-
-
-def of_samples(known: Context, count: int, model: Model,
-               stream: ThermalStream | None = None) -> Context:
-    """
-    Return the context of single samples that a model needs, ``count`` rows each.
-
-    A single sample does not show the vibration or the previous pose; both are zero, and so is a
-    rate that is NaN. A quantity that is not recorded has the value of no change. Lag and rate of
-    the temperature come from earlier samples, unless they are known already. A `stream` has the
-    temperature before these samples; they are added to it.
-
-    """
-    none = np.zeros((count, 3))
-    found = {**{key: np.full(count, value) for key, value in model.neutral.items()}, **known,
-             'std': none, 'previous': none,
-             'rate': np.nan_to_num(known['rate']) if 'rate' in known else none}
-    lacking = not all(key in known for key in model.over if key in _THERMAL)
-    stream = thermal_stream(model) if stream is None and lacking else stream
-    if stream is not None and 'time' in known and 'temperature' in known:
-        found.update(stream.add_all(known['time'], known['temperature']))
-    return found
-
-
-def thermal_stream(model: Model) -> ThermalStream | None:
-    """Return the lag and rate of the temperature that a model needs; None if it needs none."""
-    rate = 'temperature_rate' in model.over
-    return ThermalStream(model.lags, rate=rate) if model.lags or rate else None
-
-
-def _with_acting(model: Model, known: Context) -> Context:
-    """Return a context with rate and lag of the temperature, from its rows as history."""
-    wanted = [key for key in model.over if key in _THERMAL and key not in known]
-    if not wanted or 'time' not in known or 'temperature' not in known:
-        return known
-    known = {**known, 'temperature_rate': rate_at(known)}
-    return {**known, **{key: acting_temperature(known, key, *lag)
-                        for key, lag in model.lags.items()}}
-
-
-def with_history(poses_g: Poses, model: Model) -> Poses:
-    """
-    Return poses in g with the context that comes from the poses before and after.
-
-    That is ``temperature_rate``, ``since_turn``, and ``previous``, the unit vector towards the
-    previous pose in order of time, or of rows; columns of the table are kept. A temperature in
-    steps is estimated between them. The directions are
-    those that the model corrects. If it needs ``previous`` for that, both are iterated; for a
-    model that depends on its signs alone, all signs are compared.
-
-    """
-    if 'time' in poses_g and 'temperature' in poses_g and 'temperature_rate' not in poses_g:
-        poses_g = poses_g.with_columns(
-            temperature=between_steps(poses_g['time'], poses_g['temperature']))
-        poses_g = poses_g.with_columns(temperature_rate=rate_at(poses_g.columns))
-    if 'previous' not in poses_g:
-        poses_g = poses_g.with_columns(previous=way_of(poses_g, model))
-    return replace(poses_g, columns=with_turns(poses_g.columns))
 
 
 def check_sensor(calibration: Calibration, sensor: str) -> None:

@@ -2,20 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Calibrations from few poses, with the typical values of sensors.
+Calibrations from poses of a part of the sphere, with the typical values of sensors.
 
-A robot with wheels tilts by 10° or 20°. Its poses do not determine offset and gain, and a fit is
-refused. Still possible are `mounting_only`, without values; `fit_partial`, with the values of
-model 10 that are most probable for a common sensor with these readings (maximum a posteriori); and
-`fit_with_fleet`, for a sensor of a fleet whose values are known. There, poses are left out as
-knocked only if the poses determine the values without the fleet.
+A robot with wheels tilts by 10° or 20°, and other ones turn on one axis. Their poses do not
+determine offset and gain. Still possible are `mounting_only`, without values; `fit_partial`, with
+the values of model 10 that are most probable for a common sensor with these readings (maximum a
+posteriori); and `fit_with_fleet`, for a sensor of a fleet whose values are known. There, poses are
+left out as knocked only if the poses determine the values without the fleet.
 
 **Common sensors.** Before any pose, each value of model 10 is normally distributed about zero with
 the typical size of its effect (`accel_calib.effects`). The poses reduce this uncertainty only in
 the combinations that they carry: poses near one direction determine the sum of offset and gain
-along it, and, by their tilt, some combinations across it. The covariance of the result is the
-posterior one. It is small for |force| in the directions of the poses, and elsewhere nearly that of
-a sensor without calibration.
+along it, and, by their tilt, some combinations across it; poses in a plane determine what acts in
+the plane. The covariance of the result is the posterior one. It is small for |force| in the
+directions of the poses, and elsewhere nearly that of a sensor without calibration.
 
 **Fleet** (empirical Bayes). The sensors of one model have the values of model 10 with the mean m
 and the covariance P. A few sensors are unlike the others. The values of a sensor are therefore
@@ -34,7 +34,7 @@ previous one. The evidence of a factor is the probability of the readings r, giv
     r ~ N(0, factor · noise² + J P Jᵀ)
 
 with P the covariance of the prior, linearised at the fit. The stated noise, a factor of 1, has the
-prior probability `_STATED`. The variance factor is that of a full fit, computed at the most
+prior probability `STATED_NOISE`. The variance factor is that of a full fit, computed at the most
 probable one, but at least as large. The readings of a sensor that is unlike its fleet could also
 come from a usual sensor with very large noise: with a fleet, the noise is limited to
 `FLEET_NOISE_G`, and the probability of a noise decreases with its factor on the stated noise.
@@ -52,17 +52,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .calibration import Calibration, FLEET, PRIOR, Rejected
+from .directions import determines, lies_in_plane
 from .fit import copies, only_norm, rejected_by, sound_rows, sure_rows
-from .pose_planning import determines, enumerated, missing_poses, turn_words
+from .planning import missing_poses, turn_words
 from .quality import deviations_g, finished, fit_findings, in_g, record_of, uncertainty_g
 from ..effects import AXES, EFFECTS, Model, MODELS, sensor_force, with_vector
 from ..errors import InputError, RefusedFitError
 from ..estimate import (
     estimate, Fit, judge, LARGEST_SHARE, NotConvergedError, originals, Prior, variance_factor)
 from ..finding import Finding, without
-from ..geometry import Cone, cone_of, unit
+from ..geometry import cone_of, unit
+from ..statistics import STATED_NOISE
 from ..table import check_units, Poses
-from ..text import counted
+from ..text import counted, enumerated
 from ..units import Floats, Indices, MG, Units
 
 NAME = '10'
@@ -102,11 +104,9 @@ FIRST_NOISE_G = 0.1
 _NOISE_STEP = 3.0
 """Noise of the first fit [g], and the factor by which it is reduced."""
 
-_STATED = 0.7
-"""Prior probability that the stated noise is right, as in `accel_calib.estimate.equations`."""
-
-_AS_STATED = float(np.log(_STATED / (1.0 - _STATED) * 10.0))
-"""Its logarithm relative to that of each of about ten other factors."""
+_AS_STATED = float(np.log(STATED_NOISE / (1.0 - STATED_NOISE) * 10.0))
+"""Logarithm of the prior probability that the stated noise is right, relative to that of each of
+about ten other factors."""
 
 _LEAST_FACTOR = 1e-6
 """Smallest variance factor; with 0, values that the poses do not see would have no prior."""
@@ -285,7 +285,7 @@ def mounting_only(poses: Poses, units: Units, *, sensor: str = '', date: str = '
     sound, rejected = usable(poses, units, 'a mounting')
     fit, offset = judge(Model({}), only_norm(in_g(sound, units))), EFFECTS['offset'].typical
     return finished(record_of(
-        fit, poses, units, unit(sound.reading), 'ideal', PRIOR, rejected=rejected,
+        fit, poses, units, unit(sound.reading), name='ideal', method=PRIOR, rejected=rejected,
         reason='mounting alone: offset and gain are not calibrated',
         noted=(Finding(
             'open', 'offset and gain are not calibrated: a common sensor has an offset of '
@@ -296,12 +296,13 @@ def mounting_only(poses: Poses, units: Units, *, sensor: str = '', date: str = '
 
 def fit_partial(poses: Poses, units: Units, *, sensor: str = '', date: str = '') -> Calibration:
     """
-    Fit model 10 to poses near one direction, with the spread of common sensors as the prior.
+    Fit model 10 to poses near one direction or in a plane, with common sensors as the prior.
 
-    It is for directions that `lies_in_cone`, for which a fit is refused. Only |force| = 1 g is
-    used, even if the orientations are known. The calibration has ΔR = I and the method `PRIOR`.
-    Its covariance includes the prior. The reason states what the poses determine, and a finding
-    what they leave open.
+    It is for directions that `lies_in_cone`, for which a fit is refused, and those that
+    `lies_in_plane`, where a smaller model would assume what they do not show. Only |force| = 1 g
+    is used, even if the orientations are known. The calibration has ΔR = I and the method
+    `PRIOR`. Its covariance includes the prior. The reason states what the poses determine, and a
+    finding what they leave open.
 
     Parameters
     ----------
@@ -325,25 +326,45 @@ def fit_partial(poses: Poses, units: Units, *, sensor: str = '', date: str = '')
     sound, rejected = usable(poses, units, 'a partial fit')
     if determines(NAME, unit(sound.reading)):
         raise ValueError(f'the {len(sound)} poses determine model {NAME}, expected poses near '
-                         'one direction: use fit_poses')
+                         'one direction or in a plane: use fit_poses')
     found = most_probable(only_norm(in_g(sound, units)), priors_of(), FIRST_NOISE_G, LARGEST_SHARE)
-    calibration = _recorded(found, poses, sound, units, PRIOR, rejected)
-    about = carried(calibration)
-    along = ('along gravity the sum of offset and gain, and so |a|, is known to '
-             f'{_mg(about.along_g)}')
-    reason = f'1 pose: {along}' if about.count == 1 else (
-        f'the {about.count} poses lie within {about.cone.degrees:.0f}° of one direction: {along}, '
-        f'and at each pose |a| to {_mg(about.among_g)}')
-    gains = enumerated([f'±{100.0 * gain:.1f} % on {axis}'
-                        for axis, gain in zip(AXES, about.gain, strict=True)])
-    missing = turn_words(missing_poses(NAME, about.cone.axis[np.newaxis]))
-    left_open = Finding(
-        'open', f'open: offset along gravity ±{_mg(about.offset_along_g)}, across it '
-        f'±{_mg(about.offset_across_g)} ({about.tilt_deg:.1f}° of tilt until it is levelled), '
-        f'gain {gains}, cross-axis ±{100.0 * about.cross_axis:.1f} %; elsewhere on the sphere '
-        f'|a| is known to {_mg(about.elsewhere_g)}', f'to determine them, {missing}')
+    calibration = _record_of(found, poses, sound, units, method=PRIOR, rejected=rejected)
+    reason, left_open = _words_of_part(calibration)
     return finished(replace(calibration, reason=reason, noted=(left_open, *calibration.noted)),
                     sensor, date)
+
+
+def _words_of_part(calibration: Calibration) -> tuple[str, Finding]:
+    """Return what the poses of a part of the sphere determine, and what they leave open."""
+    model, covariance = calibration.model, calibration.covariance
+    up = unit(sensor_force(model, calibration.units.to_g(calibration.used_poses.reading), {}))
+    count, cone, deviation = len(up), cone_of(up), np.sqrt(np.diag(covariance))
+    place = dict(zip(model.effects, model.terms.parts, strict=True))
+    offset = covariance[place['offset'], place['offset']]
+    at_each = _mg(float(np.max(deviations_g(calibration, up))))
+    if lies_in_plane(up):
+        axis, shown = np.linalg.svd(up - up.mean(axis=0))[2][2], up
+        reason = f'the {count} poses lie in a plane: at each pose |a| is known to {at_each}'
+        along, across, tilt = 'across the plane', 'in it', ''
+    else:
+        axis, shown = cone.axis, cone.axis[np.newaxis]
+        reason = ('along gravity the sum of offset and gain, and so |a|, is known to '
+                  f'{_mg(float(deviations_g(calibration, shown)[0]))}')
+        reason = f'1 pose: {reason}' if count == 1 else (
+            f'the {count} poses lie within {cone.degrees:.0f}° of one direction: {reason}, and at '
+            f'each pose |a| to {at_each}')
+        moved = np.linalg.solve(model.linear_part[0], model.basis(shown, {}).full[0])
+        degrees = np.degrees(_largest_across(moved @ covariance @ moved.T, axis))
+        along, across = 'along gravity', 'across it'
+        tilt = f' ({degrees:.1f}° of tilt until it is levelled)'
+    gains = enumerated([f'±{100.0 * gain:.2g} % on {axis_name}' for axis_name, gain in zip(
+        AXES, deviation[place['axis_gain']], strict=True)])
+    return reason, Finding(
+        'open', f'open: offset {along} ±{_mg(float(np.sqrt(axis @ offset @ axis)))}, {across} '
+        f'±{_mg(_largest_across(offset, axis))}{tilt}, gain {gains}, cross-axis '
+        f'±{100.0 * np.max(deviation[place["cross_axis"]]):.2g} %; elsewhere on the sphere |a| is '
+        f'known to {_mg(uncertainty_g(calibration))}',
+        f'to determine them, {turn_words(missing_poses(NAME, shown))}')
 
 
 def fit_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, *, sensor: str = '',
@@ -364,14 +385,14 @@ def fit_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, *, sensor: str
         raise RefusedFitError('the readings contradict the values of the fleet, expected a sensor '
                               'of the same model', 'check the unit and the poses, or fit without '
                               '--prior') from None
-    calibration = _recorded(found, poses, sound, units, FLEET, rejected)
+    calibration = _record_of(found, poses, sound, units, method=FLEET, rejected=rejected)
     reason = f'{counted(len(found.kept), "pose")} with {fleet.words}'
     return finished(replace(calibration, reason=reason, noted=(
         *(UNLIKE_FLEET,) * found.is_unlike, *calibration.noted)), sensor, date)
 
 
-def _recorded(found: PriorFit, poses: Poses, sound: Poses, units: Units, method: str,
-              rejected: tuple[Rejected, ...]) -> Calibration:
+def _record_of(found: PriorFit, poses: Poses, sound: Poses, units: Units, *, method: str,
+               rejected: tuple[Rejected, ...]) -> Calibration:
     """Return a fit to the sound poses as a calibration."""
     fit, out = found.fit, sound.take(~np.isin(found.original, found.kept))
     noted = fit_findings(fit, 0.0)
@@ -380,7 +401,7 @@ def _recorded(found: PriorFit, poses: Poses, sound: Poses, units: Units, method:
                          'poses repeat as well as the noise of their samples predicts',
                          'take more poses'), *without(noted, 'no_check'))
     return record_of(
-        fit, poses, units, unit(sound.reading)[found.kept], NAME, method,
+        fit, poses, units, unit(sound.reading)[found.kept], name=NAME, method=method,
         rejected=(*rejected, *rejected_by(fit.model, in_g(out, units))),
         noted=(*copies(found.original, sound), *noted))
 
@@ -408,50 +429,7 @@ def usable(poses: Poses, units: Units, what: str) -> tuple[Poses, tuple[Rejected
     return sound, rejected
 
 
-@dataclass(frozen=True)
-class Carried:
-    """
-    What the poses of a partial fit determine, and what they leave open.
-
-    All fields but `count` and `cone` are standard deviations. Those of |force| are along the mean
-    direction of the poses, and the largest among the poses and over the sphere [g]. Those of the
-    offset are along this direction, and the largest across it [g]. `tilt_deg` is that of up before
-    the mounting is levelled [°], `gain` is (3,), and `cross_axis` is the largest.
-
-    """
-
-    count: int
-    cone: Cone
-    along_g: float
-    among_g: float
-    elsewhere_g: float
-    offset_along_g: float
-    offset_across_g: float
-    tilt_deg: float
-    gain: Floats
-    cross_axis: float
-
-
-def carried(calibration: Calibration) -> Carried:
-    """Return what the poses of a calibration from `fit_partial` determine."""
-    model, covariance = calibration.model, calibration.covariance
-    reading = calibration.units.to_g(calibration.used_poses.reading)
-    up = unit(sensor_force(model, reading, {}))
-    cone = cone_of(up)
-    axis = cone.axis[np.newaxis]
-    moved = np.linalg.solve(model.linear_part[0], model.basis(axis, {}).full[0])
-    deviation = np.sqrt(np.diag(covariance))
-    place = dict(zip(model.effects, model.terms.parts, strict=True))
-    offset = covariance[place['offset'], place['offset']]
-    return Carried(
-        len(up), cone, float(deviations_g(calibration, axis)[0]),
-        float(np.max(deviations_g(calibration, up))), uncertainty_g(calibration),
-        float(np.sqrt(cone.axis @ offset @ cone.axis)), _across(offset, cone.axis),
-        float(np.degrees(_across(moved @ covariance @ moved.T, cone.axis))),
-        deviation[place['axis_gain']], float(np.max(deviation[place['cross_axis']])))
-
-
-def _across(covariance: Floats, axis: Floats) -> float:
+def _largest_across(covariance: Floats, axis: Floats) -> float:
     """Return the largest standard deviation at right angles to an axis."""
     across = np.eye(3) - np.outer(axis, axis)
     return float(np.sqrt(np.max(np.linalg.eigvalsh(across @ covariance @ across))))

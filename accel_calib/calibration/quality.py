@@ -8,7 +8,7 @@ The error of a pose is |force| - 1 g. For model 12 and poses of known orientatio
 of the vector error. The residual of a calibration is the RMS of the errors over the poses.
 
 The gate checks every calibration before it is stored, loaded or used. A fit has already converged
-(`accel_calib.estimate.fit`), and its poses determine the model (`.pose_planning`). The gate checks
+(`accel_calib.estimate.fit`), and its poses determine the model (`.directions`). The gate checks
 the calibration itself: finite values, a proper rotation, a valid covariance, plausible offset,
 gain and effects, and a useful uncertainty. The limits are far beyond the values of working
 sensors; only useless calibrations exceed them.
@@ -26,10 +26,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .calibration import Calibration, check_sensor, PRIOR, Quality, Rejected, with_history
-from .pose_planning import WEAK_DILUTION
+from .calibration import Calibration, check_sensor, PRIOR, Quality, Rejected
+from .directions import WEAK_DILUTION
 from .rest_noise import gyro_bias_of, sample_noise_of
-from ..effects import correct, LADDER, length_rows, Model, sensor_force
+from ..effects import add_history, correct, LADDER, length_rows, Model, sensor_force
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import believable, Fit, judge, left_out, Rival, unseen_mistakes
 from ..finding import Finding, without
@@ -105,7 +105,7 @@ def verify(calibration: Calibration, poses: Poses) -> Verification:
     """
     model, units = calibration.model, calibration.units
     check_sensor(calibration, poses.sensor)
-    poses_g = calibration.held(with_history(in_g(poses, units), model))
+    poses_g = calibration.held(add_history(in_g(poses, units), model))
     vectors = calibration.form.known_orientation and 'reference' in poses
     floor = None
     if believable(poses_g.noise) is not None:
@@ -135,8 +135,8 @@ def quality_of(fit: Fit, units: Units, directions: Floats) -> Quality:
                    coverage(directions))
 
 
-def record_of(fit: Fit, poses: Poses, units: Units, directions: Floats, name: str, method: str, *,
-              covariance: Floats | None = None, rejected: tuple[Rejected, ...] = (),
+def record_of(fit: Fit, poses: Poses, units: Units, directions: Floats, *, name: str,
+              method: str, covariance: Floats | None = None, rejected: tuple[Rejected, ...] = (),
               reason: str = '', noted: tuple[Finding, ...] = ()) -> Calibration:
     """
     Return a fit to the poses that are not rejected as a calibration, with the ΔR of its model.
@@ -148,9 +148,10 @@ def record_of(fit: Fit, poses: Poses, units: Units, directions: Floats, name: st
 
     """
     return Calibration(
-        name, method, fit.model, units, poses.sensor, 'ros', '',
-        fit.covariance if covariance is None else covariance, quality_of(fit, units, directions),
-        poses, tuple(sorted(rejected, key=lambda pose: pose.row)), reason, noted)
+        name=name, method=method, model=fit.model, units=units, sensor=poses.sensor, frame='ros',
+        date='', covariance=fit.covariance if covariance is None else covariance,
+        quality=quality_of(fit, units, directions), poses=poses,
+        rejected=tuple(sorted(rejected, key=lambda pose: pose.row)), reason=reason, noted=noted)
 
 
 def with_rest_noise(calibration: Calibration, poses: Poses) -> Calibration:
@@ -399,3 +400,15 @@ def deviations_g(calibration: Calibration, up: Floats) -> Floats:
         return np.zeros(len(up))
     rows = model.basis(up, known).along(length_rows(model, up, known))
     return np.sqrt(np.maximum(np.sum(rows @ calibration.covariance * rows, axis=1), 0.0))
+
+
+def stated_uncertainty(calibration: Calibration) -> float | None:
+    """Return the stated uncertainty of the corrected force, RMS over the sphere [g]."""
+    up, alone = OVER_THE_SPHERE, calibration.method == PRIOR and not calibration.form.effects
+    per_g, known = calibration.force_per_g, calibration.typical_context(len(up))
+    if alone or not calibration.model.effects or not known.keys() >= {*calibration.model.needs}:
+        return None
+    covariance = calibration.force_covariance(up * per_g, known) / per_g ** 2
+    errors = (np.trace(covariance, axis1=1, axis2=2) if calibration.form.known_orientation
+              else np.einsum('ni,nij,nj->n', up, covariance, up))
+    return float(np.sqrt(np.mean(errors)))

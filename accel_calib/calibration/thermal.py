@@ -45,12 +45,12 @@ import numpy as np
 from numpy.typing import NDArray
 import scipy
 
-from .calibration import Calibration, PRIOR, Quality, with_history
+from .calibration import Calibration, PRIOR, Quality
 from .fit import only_norm
 from .quality import finished, gated, in_g, record_of
 from ..effects import (
-    Context, EFFECTS, entry_of, factors_of, Model, OFFSET_POWERS, REFERENCE_TEMPERATURE,
-    sensor_force)
+    add_history, Context, EFFECTS, entry_of, factors_of, Model, OFFSET_POWERS,
+    REFERENCE_TEMPERATURE, sensor_force)
 from ..errors import InputError
 from ..estimate import judge
 from ..finding import Finding
@@ -535,7 +535,7 @@ def _of_poses(curve: Curve) -> Model:
 def _added(curve: Curve, poses: Poses) -> Floats:
     """Return what the temperature adds to each pose, relative to 25 °C [g]."""
     model = _of_poses(curve)
-    known = with_history(poses, model).columns
+    known = add_history(poses, model).columns
     return np.zeros((len(poses), 3)) + model.at(known).vec_v
 
 
@@ -552,7 +552,7 @@ def with_curve(fitted: Calibration, curve: Curve, poses: Poses) -> Calibration:
     if not thermal.effects:
         thermal = _UNCHANGED
     model, own = Model({**fitted.model.values, **thermal.values}), len(fitted.model.vector)
-    used_g = with_history(in_g(fitted.used_poses, fitted.units), model)
+    used_g = add_history(in_g(fitted.used_poses, fitted.units), model)
     moved = only_norm(used_g.with_columns(reading=used_g.reading + _added(curve, used_g)))
     known = {key: used_g[key] for key in ('time', 'temperature', _RATE) if key in used_g}
     judged = judge(model, moved.with_columns(**known))
@@ -570,10 +570,10 @@ def with_curve(fitted: Calibration, curve: Curve, poses: Poses) -> Calibration:
         columns={key: np.concatenate([own_rows[key], values])
                  for key, values in rows.columns.items() if key in own_rows})
     rejected = [each.row for each in fitted.rejected]
-    kept_g = with_history(in_g(every.take(~np.isin(every.row, rejected)), fitted.units), model)
+    kept_g = add_history(in_g(every.take(~np.isin(every.row, rejected)), fitted.units), model)
     made = record_of(
         judge(model, kept_g), every, fitted.units, unit(sensor_force(
-            model, kept_g.reading, kept_g.columns)), fitted.name, fitted.method,
+            model, kept_g.reading, kept_g.columns)), name=fitted.name, method=fitted.method,
         covariance=covariance, rejected=fitted.rejected,
         reason=f'{fitted.reason}; {_words(curve)}',
         noted=(*fitted.noted, *findings_of_curve(curve)))

@@ -5,7 +5,7 @@
 
 from collections import ChainMap
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
 
@@ -26,8 +26,8 @@ NOMINAL_SUPPLY = 3.3
 
 HOUR = 3600.0
 
-_ROTATION = matrix_terms((0, 2, 1, 1.0), (0, 1, 2, -1.0), (1, 0, 2, 1.0), (1, 2, 0, -1.0),
-                         (2, 1, 0, 1.0), (2, 0, 1, -1.0))
+_ROTATION = matrix_terms(((0, 2, 1, 1.0), (0, 1, 2, -1.0), (1, 0, 2, 1.0), (1, 2, 0, -1.0),
+                          (2, 1, 0, 1.0), (2, 0, 1, -1.0)))
 _COUPLED = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
 _SUPPLY = (*ALL_AXES, *(Term(1 + axis, axis, ONE) for axis in range(3)))
 _LEVER = tuple(Term(parameter, axis, ONE) for axis in range(3) for parameter in range(3))
@@ -89,10 +89,6 @@ def _lags(context: Context) -> Iterator[Floats]:
                 yield np.array([lag, of_sensor])
 
 
-def _warming_to(power: int) -> Factor:
-    return lambda context, shape: (context['temperature'] - REFERENCE_TEMPERATURE) ** power
-
-
 def _lagged_warming(key: str) -> Factor:
     """Return the factor of an effect whose acting temperature is the column `key`."""
     def factor(context: Mapping[str, Any], shape: Floats) -> Any:
@@ -151,21 +147,25 @@ def _centripetal(context: Mapping[str, Any], shape: Floats) -> Floats:
     return np.array(entries) / STANDARD_GRAVITY
 
 
+_effect = partial(Effect, plausible_g=0.5)
 _bending = partial(Effect, plausible_g=0.5, family='force')
 _in_time = partial(Effect, plausible_g=0.5, family='time')
 _LAG = ('lag', 'of_sensor')
 
 EFFECTS: dict[str, Effect] = {
-    'offset': Effect('zero-g offset', 'bias K0, zero-g offset', AXES, 'g', 0.1, 1.0,
-                     by_axis(ONE), repeatable_g=0.03),
-    'gain': Effect('one gain for all axes', 'scale factor K1, sensitivity', ('all',), 'g/g', 0.03,
-                   0.5, ALL_AXES, repeatable_g=0.015),
-    'axis_gain': Effect('gain of each axis', 'scale factor K1, sensitivity', AXES, 'g/g', 0.03,
-                        0.5, by_axis(FORCE), includes=('gain',), repeatable_g=0.015),
-    'cross_axis': Effect('cross-axis gain, symmetric', 'cross-axis sensitivity',
-                         ('xy', 'xz', 'yz'), 'g/g', 0.02, 0.5, CROSS, repeatable_g=0.015),
-    'misalignment': Effect('rotation of the sensing axes', 'input-axis misalignment', AXES, 'g/g',
-                           0.02, np.inf, _ROTATION, known_orientation=True),
+    'offset': Effect('zero-g offset', 'bias K0, zero-g offset', AXES, 'g', 0.1, plausible_g=1.0,
+                     terms=by_axis(ONE), repeatable_g=0.03),
+    'gain': _effect('one gain for all axes', 'scale factor K1, sensitivity', ('all',), 'g/g', 0.03,
+                    terms=ALL_AXES, repeatable_g=0.015),
+    'axis_gain': _effect(
+        'gain of each axis', 'scale factor K1, sensitivity', AXES, 'g/g', 0.03,
+        terms=by_axis(FORCE), includes=('gain',), repeatable_g=0.015),
+    'cross_axis': _effect(
+        'cross-axis gain, symmetric', 'cross-axis sensitivity', ('xy', 'xz', 'yz'), 'g/g', 0.02,
+        terms=CROSS, repeatable_g=0.015),
+    'misalignment': Effect(
+        'rotation of the sensing axes', 'input-axis misalignment', AXES, 'g/g', 0.02,
+        plausible_g=np.inf, terms=_ROTATION, known_orientation=True),
     'quadratic': _bending('square of the force', 'second-order coefficient K2', AXES, 'g/g²',
                           0.001, terms=by_axis(SQUARE)),
     'cubic': _bending('cube of the force', 'third-order coefficient K3', AXES, 'g/g³', 0.001,
@@ -186,10 +186,12 @@ EFFECTS: dict[str, Effect] = {
         lagged='temperature_of_offset'),
     'offset_temperature_quadratic': _in_time(
         'offset that changes with the square of temperature', 'second-order TCO', AXES, 'g/°C²',
-        1e-5, terms=by_axis(ONE), factor=_warming_to(2), needs=('temperature',)),
+        1e-5, terms=by_axis(ONE), needs=('temperature',),
+        factor=lambda context, shape: (context['temperature'] - REFERENCE_TEMPERATURE) ** 2),
     'offset_temperature_cubic': _in_time(
         'offset that changes with the cube of temperature', 'third-order TCO', AXES, 'g/°C³',
-        1e-7, terms=by_axis(ONE), factor=_warming_to(3), needs=('temperature',)),
+        1e-7, terms=by_axis(ONE), needs=('temperature',),
+        factor=lambda context, shape: (context['temperature'] - REFERENCE_TEMPERATURE) ** 3),
     'gain_temperature': _in_time(
         'gain that changes with temperature', 'sensitivity temperature coefficient TCS', AXES,
         '1/°C', 0.0003, terms=by_axis(FORCE), factor=_lagged_warming('temperature_of_gain'),
@@ -201,9 +203,8 @@ EFFECTS: dict[str, Effect] = {
         needs=('time', 'temperature'), over=('temperature_rate',)),
     'supply_ratio': Effect(
         'offset and gain in proportion to the supply', 'ratiometric output', ('gain', *AXES),
-        'g/g', 1.0, 1.0, _SUPPLY,
-        lambda context, shape: context['supply_voltage'] / NOMINAL_SUPPLY - 1.0,
-        ('supply_voltage',), scales=True),
+        'g/g', 1.0, plausible_g=1.0, terms=_SUPPLY, needs=('supply_voltage',), scales=True,
+        factor=lambda context, shape: context['supply_voltage'] / NOMINAL_SUPPLY - 1.0),
     'offset_drift': _in_time(
         'offset that drifts with time', 'bias drift', AXES, 'g/h', 0.0005, terms=by_axis(ONE),
         factor=_since, needs=('time',), shape=('start',), shapes=_from_start),
@@ -223,23 +224,27 @@ EFFECTS: dict[str, Effect] = {
         'gain that jumps at an instant', 'scale-factor shift after shock', AXES, 'g/g', 0.005,
         terms=by_axis(FORCE), factor=_after, needs=('time',), shape=('instant',),
         shapes=_instants),
-    'vibration_rectification': Effect(
+    'vibration_rectification': _effect(
         'offset that grows with vibration', 'vibration rectification coefficient VRC', AXES,
-        'g/g²', 0.002, 0.5, by_axis(ONE),
-        lambda context, shape: np.asarray(context['std'], float).T ** 2, ('std',)),
-    'hysteresis': Effect('offset that depends on the previous pose', 'hysteresis', AXES, 'g',
-                         0.001, 0.5, by_axis(ONE), _motion, ('previous',), ('form',),
-                         lambda context: iter(np.array([[0.0], [1.0]])), usual=(0.0,)),
-    'creep': Effect('offset that relaxes after a turn', 'creep', AXES, 'g', 0.001, 0.5,
-                    by_axis(ONE), _creep, ('time', 'previous'), ('tau',), _relaxations,
-                    over=('since_turn',)),
-    'lever_arm': Effect('centripetal force away from the axis of rotation', 'size effect', AXES,
-                        'm', 0.1, 5.0, _LEVER, _centripetal, ('rate',)),
+        'g/g²', 0.002, terms=by_axis(ONE), needs=('std',),
+        factor=lambda context, shape: np.asarray(context['std'], float).T ** 2),
+    'hysteresis': _effect(
+        'offset that depends on the previous pose', 'hysteresis', AXES, 'g', 0.001,
+        terms=by_axis(ONE), factor=_motion, needs=('previous',), shape=('form',),
+        shapes=lambda context: iter(np.array([[0.0], [1.0]])), usual=(0.0,)),
+    'creep': _effect(
+        'offset that relaxes after a turn', 'creep', AXES, 'g', 0.001, terms=by_axis(ONE),
+        factor=_creep, needs=('time', 'previous'), shape=('tau',), shapes=_relaxations,
+        over=('since_turn',)),
+    'lever_arm': Effect(
+        'centripetal force away from the axis of rotation', 'size effect', AXES, 'm', 0.1,
+        plausible_g=5.0, terms=_LEVER, factor=_centripetal, needs=('rate',)),
     'saturation': Effect(
-        'readings clipped at a limit', 'full-scale range', ('limit',), 'g', 2.0, np.inf, (),
+        'readings clipped at a limit', 'full-scale range', ('limit',), 'g', 2.0,
+        plausible_g=np.inf, terms=(),
         output=lambda reading, limit: np.clip(reading, -limit[0], limit[0])),
     'quantisation': Effect(
-        'readings on a grid', 'resolution', ('step',), 'g', 0.001, np.inf, (),
+        'readings on a grid', 'resolution', ('step',), 'g', 0.001, plausible_g=np.inf, terms=(),
         output=lambda reading, step: np.round(reading / step[0]) * step[0]),
 }
 """All effects that are functions of the force and the context."""
@@ -297,3 +302,48 @@ def parameter_names(effects: tuple[EffectKey, ...]) -> tuple[str, ...]:
 def included(effects: Iterable[EffectKey]) -> set[EffectKey]:
     """Return the effects that these effects contain."""
     return {each for effect in effects for each in entry_of(effect).includes}
+
+
+@dataclass(frozen=True)
+class ModelForm:
+    """
+    One of the models that consist of offset and gains.
+
+    W has `gains` parameters, apart from a rotation. `norm` is the model with the same ellipsoid
+    that |force| = 1 g alone determines. Poses of `known_orientation` determine the axes of W; with
+    `sensing_axes`, they are fixed to the sensing axes.
+
+    """
+
+    effects: tuple[str, ...]
+    gains: int
+    norm: str
+    known_orientation: bool = False
+    sensing_axes: bool = False
+
+    @property
+    def largest(self) -> str:
+        """Name of the largest model for poses of the same kind."""
+        return '12' if self.known_orientation else '10'
+
+
+_WHOLE = ('offset', 'axis_gain', 'cross_axis', 'misalignment')
+
+MODELS: dict[str, ModelForm] = {
+    'ideal': ModelForm((), 0, 'ideal'),
+    '4': ModelForm(('offset', 'gain'), 1, '4'),
+    '7': ModelForm(('offset', 'axis_gain'), 3, '7'),
+    '9': ModelForm(_WHOLE, 6, '10', sensing_axes=True),
+    '10': ModelForm(('offset', 'axis_gain', 'cross_axis'), 6, '10'),
+    '12': ModelForm(_WHOLE, 6, '10', known_orientation=True),
+}
+"""The models by name. Models 9 and 10 differ only in their axes: model 9 fixes the axes to the
+sensing axes (ESGI'95 report), model 10 makes W symmetric (AN5286)."""
+
+
+def linear_values(mat_w: Floats, vec_v: Floats) -> dict[str, Floats]:
+    """Return the values of the effects of `LADDER` from W (3, 3) and V (3,) [g]."""
+    symmetric, skew = (mat_w + mat_w.T) / 2, (mat_w - mat_w.T) / 2
+    return {'offset': np.array(vec_v, float), 'gain': np.array([np.trace(mat_w) / 3.0 - 1.0]),
+            'axis_gain': np.diag(mat_w) - 1.0, 'cross_axis': symmetric[[0, 0, 1], [1, 2, 2]],
+            'misalignment': skew[[2, 0, 1], [1, 2, 0]]}

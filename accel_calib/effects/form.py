@@ -4,7 +4,7 @@
 """The form of an effect: the sum of terms that `accel_calib.effects` describes."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any, Literal, NamedTuple
@@ -257,10 +257,9 @@ class Effect:
             return 'force'
         return 'offset' if all(term.monomial == ONE for term in self.terms) else 'gain'
 
-    @cached_property
+    @property
     def is_offset(self) -> bool:
-        """Whether the effect is a part of V in every context."""
-        return self.linear and all(term.monomial == ONE for term in self.terms)
+        return self.changes == 'offset'
 
     @cached_property
     def bends(self) -> bool:
@@ -347,12 +346,12 @@ def by_axis(first: int) -> tuple[Term, ...]:
     return tuple(Term(axis, axis, first + step * axis) for axis in range(3))
 
 
-def matrix_terms(*entries: tuple[int, int, int, float]) -> tuple[Term, ...]:
+def matrix_terms(entries: Iterable[tuple[int, int, int, float]]) -> tuple[Term, ...]:
     """Return the terms of a matrix times the force, from (parameter, row, column, weight)."""
     return tuple(Term(parameter, row, FORCE + column, weight)
                  for parameter, row, column, weight in entries)
 
 
-CROSS = matrix_terms((0, 0, 1, 1.0), (0, 1, 0, 1.0), (1, 0, 2, 1.0), (1, 2, 0, 1.0),
-                     (2, 1, 2, 1.0), (2, 2, 1, 1.0))
+CROSS = matrix_terms(((0, 0, 1, 1.0), (0, 1, 0, 1.0), (1, 0, 2, 1.0), (1, 2, 0, 1.0),
+                      (2, 1, 2, 1.0), (2, 2, 1, 1.0)))
 ALL_AXES = tuple(Term(0, axis, FORCE + axis) for axis in range(3))

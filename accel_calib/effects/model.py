@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .catalogue import CATALOGUE, EFFECTS, entry_of, PROCESSES
+from .catalogue import CATALOGUE, EFFECTS, entry_of, linear_values, MODELS, PROCESSES
 from .form import (
     AFFINE, AT_POSES, Context, difference, Effect, EffectKey, fitted_places, FORCE, MONOMIALS, ONE)
 from .thermal import Lag
@@ -139,7 +139,8 @@ def terms_of(keys: tuple[EffectKey, ...]) -> Terms:
             scaling = own.start, part.start, gains[(gains < own.start) | (gains >= own.stop)]
             break
     return Terms(
-        effects, parts, rows, tuple(used), monomial, place, axis, value,
+        effects=effects, parts=parts, rows=rows, monomials=tuple(used), monomial=monomial,
+        place=place, axis=axis, value=value,
         weight=np.array([term.weight for term, _ in terms], float),
         to_affine=_sums(np.where(is_affine, slot, -1), 12),
         to_value=_sums(value, ends[0][-1]), bending=bending,
@@ -273,18 +274,13 @@ def times(matrix: Floats, vectors: Floats) -> Floats:
 
 
 class _Change(NamedTuple):
-    """
-    A value that changes the factors of the terms `rows`: at a `place` of the shape of an effect.
-
-    Without an `effect`, it scales them by the term at `place`.
-
-    """
+    """A value that changes the factors of the terms `rows`: a shape constant, or a scale."""
 
     rows: slice | Indices
     value: int
-    effect: Effect | None
+    effect: Effect | None  # None: it scales them
     shape: Floats
-    place: int
+    place: int  # in the shape, or of the term that scales
 
 
 @dataclass(frozen=True, eq=False)
@@ -406,27 +402,19 @@ class Model(Record):
         """Return the model at columns of n rows; raise InputError if a needed one is missing."""
         if self.terms.fixed:
             return self._without_context
-        alone = self._alone(context, None)
-        found = self._at(alone * self._scales(alone))
+        alone, scales = self._factors(context, None)
+        found = self._at(alone * scales)
         if not self.terms.of_force:
             return found
         own = Model({name: self.values[name] for name in self.terms.of_force})
-        return replace(found, own=lambda u: own._at(own._alone(context, u)).vec_v)
+        return replace(found, own=lambda u: own._at(own._factors(context, u)[0]).vec_v)
 
-    def _scales(self, alone: Floats) -> Floats:
-        """Return by what another effect scales the terms, (t, n), or (t, 1) if none does."""
-        if self.terms.scaling is None:
-            return np.ones((len(alone), 1))
-        term, value, scaled = self.terms.scaling
-        found = np.ones_like(alone)
-        found[scaled] += self.vector[value] * alone[term]
-        return found
-
-    def _alone(self, context: Context, u: Floats | None) -> Floats:
+    def _factors(self, context: Context, u: Floats | None) -> tuple[Floats, Floats]:
         """
-        Return the (t, n) factors of each effect alone; 0 where its context is NaN.
+        Return the (t, n) factors of each effect alone, and by what another effect scales them.
 
-        Without (n, 3) forces u, those of own effects of the force are 0, too.
+        A factor is 0 where its context is NaN. Without (n, 3) forces u, those of own effects of
+        the force are 0, too. The scales are (t, 1) if no effect scales others.
 
         """
         check_context(self, context)
@@ -438,18 +426,23 @@ class Model(Record):
             if effect.factor is not None:
                 skipped = effect.of_force and u is None
                 found[rows] = 0.0 if skipped else effect.factor(known, shape)
-        return np.nan_to_num(found, copy=False)
+        np.nan_to_num(found, copy=False)
+        scales = np.ones((len(found), 1))
+        if self.terms.scaling is not None:
+            term, value, scaled = self.terms.scaling
+            scales = np.ones_like(found)
+            scales[scaled] += self.vector[value] * found[term]
+        return found, scales
 
     def _at(self, factors: Floats) -> AtContext:
         """Sum the affine terms, given the (t, n) factors."""
         terms = self.terms
         sized = factors * (terms.weight * self.vector[terms.value])[:, np.newaxis]
         affine = (terms.to_affine @ sized).T
-        mat_w = _IDENTITY + affine[:, 3:].reshape(-1, 3, 3)
-        bend = sized[terms.bending]
+        mat_w, vec_v = _IDENTITY + affine[:, 3:].reshape(-1, 3, 3), affine[:, :3]
         if terms.fixed:
-            return AtContext(mat_w[0], affine[0, :3], terms, bend)
-        return AtContext(mat_w, affine[:, :3], terms, bend)
+            mat_w, vec_v = mat_w[0], vec_v[0]
+        return AtContext(mat_w, vec_v, terms, sized[terms.bending])
 
     def basis(self, u: Floats, context: Context, direction: Floats | None = None) -> Basis:
         """
@@ -466,8 +459,8 @@ class Model(Record):
         """Return the same from the (t, n) terms for values and factors of 1."""
         if self.terms.fixed:
             return replace(self.rows, terms=plain)
-        alone, context = self._alone(context, u), {**context, 'force': u}
-        scales = self._scales(alone)
+        alone, scales = self._factors(context, u)
+        context = {**context, 'force': u}
         found = [plain * (alone * scales)]
         for each in self._changes:
             if each.effect is None or each.effect.factor is None:
@@ -550,55 +543,10 @@ def check_context(model: Model, context: Mapping[str, Any]) -> None:
                          'does not have', 'record these columns together with the readings')
 
 
-@dataclass(frozen=True)
-class ModelForm:
-    """
-    One of the models that consist of offset and gains.
-
-    W has `gains` parameters, apart from a rotation. `norm` is the model with the same ellipsoid
-    that |force| = 1 g alone determines. Poses of `known_orientation` determine the axes of W; with
-    `sensing_axes`, they are fixed to the sensing axes.
-
-    """
-
-    effects: tuple[str, ...]
-    gains: int
-    norm: str
-    known_orientation: bool = False
-    sensing_axes: bool = False
-
-    @property
-    def largest(self) -> str:
-        """Name of the largest model for poses of the same kind."""
-        return '12' if self.known_orientation else '10'
-
-
-_WHOLE = ('offset', 'axis_gain', 'cross_axis', 'misalignment')
-
-MODELS: dict[str, ModelForm] = {
-    'ideal': ModelForm((), 0, 'ideal'),
-    '4': ModelForm(('offset', 'gain'), 1, '4'),
-    '7': ModelForm(('offset', 'axis_gain'), 3, '7'),
-    '9': ModelForm(_WHOLE, 6, '10', sensing_axes=True),
-    '10': ModelForm(('offset', 'axis_gain', 'cross_axis'), 6, '10'),
-    '12': ModelForm(_WHOLE, 6, '10', known_orientation=True),
-}
-"""The models by name. Models 9 and 10 differ only in their axes: model 9 fixes the axes to the
-sensing axes (ESGI'95 report), model 10 makes W symmetric (AN5286)."""
-
-
 def linear_model(name: str, mat_w: Floats, vec_v: Floats) -> Model:
     """Return one of the models with gain W (3, 3), offset V (3,) [g] and ΔR = I."""
     values = linear_values(mat_w, vec_v)
     return Model({effect: values[effect] for effect in MODELS[name].effects})
-
-
-def linear_values(mat_w: Floats, vec_v: Floats) -> dict[str, Floats]:
-    """Return the values of the effects of `LADDER` from W (3, 3) and V (3,) [g]."""
-    symmetric, skew = (mat_w + mat_w.T) / 2, (mat_w - mat_w.T) / 2
-    return {'offset': np.array(vec_v, float), 'gain': np.array([np.trace(mat_w) / 3.0 - 1.0]),
-            'axis_gain': np.diag(mat_w) - 1.0, 'cross_axis': symmetric[[0, 0, 1], [1, 2, 2]],
-            'misalignment': skew[[2, 0, 1], [1, 2, 0]]}
 
 
 def predict(model: Model, force: Floats, context: Context) -> Floats:

@@ -19,7 +19,7 @@ from .catalogue import CHANGES, EFFECTS, entry_of, PROCESSES
 from .form import Context, EffectKey, EffectRecord
 from .model import Model, predict
 from .records import effect_named
-from .way import way_to, with_turns
+from .way import add_turns, way_to
 from ..errors import InputError
 from ..table import Floats, numbered, Poses, Recording
 from ..units import Indices
@@ -95,7 +95,7 @@ def simulate_poses(model: Model, directions: Floats, rng: np.random.Generator, *
     """
     known = {'std': np.full_like(directions, noise_g), **(context or {})}
     way = way_to((directions @ model.rotation.T)[np.newaxis], known)
-    reading = predict(model, directions, with_turns({'previous': way, **known}))
+    reading = predict(model, directions, add_turns({'previous': way, **known}))
     reading = reading + rng.normal(size=reading.shape) * noise_g / np.sqrt(samples)
     columns = {**known, 'reading': reading, 'count': np.full(len(directions), float(samples))}
     return Poses(columns, numbered(columns))

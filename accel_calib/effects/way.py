@@ -2,22 +2,30 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The way on which each pose was reached, and when, from the forces of successive poses.
+The context of poses and samples that follows from those before them.
 
+**Temperature.** Its rate, and the temperature that acts with a lag (`.thermal`).
+
+**Way.** A pose has the way on which it was reached, and when, from the forces of successive poses.
 A table states the mean time of a pose. With its duration, the turn before it ends where the pose
 begins. Otherwise the time since the turn counts from the last pose before it: between a turn and
 the poses on both sides are unknown times, which only change the size of an exponential.
 
 """
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 
 from .form import Context
 from .model import Model
+from .thermal import acting_temperature, between_steps, rate_at, ThermalStream
 from ..geometry import unit
 from ..table import Floats, Poses
+
+FROM_TEMPERATURE = ('temperature_rate', 'temperature_of_offset', 'temperature_of_gain')
+"""Context that is computed from time and temperature."""
 
 _MOVED = np.radians(3.0)
 """Smallest change of direction of a move [rad]; less may be noise or settling."""
@@ -58,7 +66,7 @@ def way_to(force: Floats, known: Context, signs: Floats = np.zeros((1, 3))) -> F
     return previous
 
 
-def way_of(poses_g: Poses, model: Model) -> Floats:
+def _find_way(poses_g: Poses, model: Model) -> Floats:
     """Return the (n, 3) unit vectors towards the previous pose, by the forces of a model."""
     mat_w, vec_v = model.linear_part
     force = (poses_g.reading - vec_v) @ np.linalg.inv(mat_w).T
@@ -68,7 +76,7 @@ def way_of(poses_g: Poses, model: Model) -> Floats:
         return way
 
     def forces(previous: Floats) -> Floats:
-        turns = with_turns({**known, 'previous': way})
+        turns = add_turns({**known, 'previous': way})
         return model.at({**turns, 'previous': previous}).force(poses_g.reading)
 
     if np.array_equal(forces(way), forces(np.sign(way))):
@@ -82,7 +90,7 @@ def way_of(poses_g: Poses, model: Model) -> Floats:
     return way
 
 
-def with_turns(known: Context) -> Context:
+def add_turns(known: Context) -> Context:
     """Return context with the time from the last turn to the start of each pose [s], if known."""
     if 'time' not in known or 'since_turn' in known:
         return known
@@ -93,3 +101,61 @@ def with_turns(known: Context) -> Context:
     if 'duration' not in known:
         first = np.maximum(first - 1, 0)
     return {**known, 'since_turn': (start - start[first])[np.argsort(order)]}
+
+
+def add_history(poses_g: Poses, model: Model) -> Poses:
+    """
+    Return poses in g with the context that comes from the poses before and after.
+
+    That is ``temperature_rate``, ``since_turn``, and ``previous``, the unit vector towards the
+    previous pose in order of time, or of rows; columns of the table are kept. A temperature in
+    steps is estimated between them. The directions are those that the model corrects. If it needs
+    ``previous`` for that, both are iterated; for a model that depends on its signs alone, all
+    signs are compared.
+
+    """
+    if 'time' in poses_g and 'temperature' in poses_g and 'temperature_rate' not in poses_g:
+        poses_g = poses_g.with_columns(
+            temperature=between_steps(poses_g['time'], poses_g['temperature']))
+        poses_g = poses_g.with_columns(temperature_rate=rate_at(poses_g.columns))
+    if 'previous' not in poses_g:
+        poses_g = poses_g.with_columns(previous=_find_way(poses_g, model))
+    return replace(poses_g, columns=add_turns(poses_g.columns))
+
+
+def add_acting(known: Context, model: Model) -> Context:
+    """Return a context with rate and lag of the temperature, from its rows as history."""
+    wanted = [key for key in model.over if key in FROM_TEMPERATURE and key not in known]
+    if not wanted or 'time' not in known or 'temperature' not in known:
+        return known
+    known = {**known, 'temperature_rate': rate_at(known)}
+    return {**known, **{key: acting_temperature(known, key, *lag)
+                        for key, lag in model.lags.items()}}
+
+
+def thermal_stream(model: Model) -> ThermalStream | None:
+    """Return the lag and rate of the temperature that a model needs; None if it needs none."""
+    rate = 'temperature_rate' in model.over
+    return ThermalStream(model.lags, rate=rate) if model.lags or rate else None
+
+
+def context_of_samples(known: Context, count: int, model: Model,
+                       stream: ThermalStream | None = None) -> Context:
+    """
+    Return the context of single samples that a model needs, ``count`` rows each.
+
+    A single sample does not show the vibration or the previous pose; both are zero, and so is a
+    rate that is NaN. A quantity that is not recorded has the value of no change. Lag and rate of
+    the temperature come from earlier samples, unless they are known already. A `stream` has the
+    temperature before these samples; they are added to it.
+
+    """
+    none = np.zeros((count, 3))
+    found = {**{key: np.full(count, value) for key, value in model.neutral.items()}, **known,
+             'std': none, 'previous': none,
+             'rate': np.nan_to_num(known['rate']) if 'rate' in known else none}
+    lacking = not all(key in known for key in model.over if key in FROM_TEMPERATURE)
+    stream = thermal_stream(model) if stream is None and lacking else stream
+    if stream is not None and 'time' in known and 'temperature' in known:
+        found.update(stream.add_all(known['time'], known['temperature']))
+    return found

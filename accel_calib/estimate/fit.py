@@ -499,12 +499,12 @@ def estimate(start: Model, poses_g: Poses, prior: Prior | None = None,
     lower, upper = _bounds(start, poses_g)
     lower, upper = lower[fitted], upper[fitted]
     values, found = solve(point_at, start.vector[fitted], lower, upper,
-                          np.add if prior is None else along_quadrics, most)
+                          move=np.add if prior is None else along_quadrics, most=most)
     at_bound = bool(np.any((values <= lower) | (values >= upper)))
     count = len(found.source.residual)
     own = None if prior is None else Point(found.residual[count:], found.columns[count:])
-    return Fit(model_at(values), poses_g, found.source, found.columns[:count],
-               free_of(start), at_bound, own, factor)
+    return Fit(model_at(values), poses_g, found.source, found.columns[:count], free_of(start),
+               at_bound=at_bound, prior=own, factor=factor)
 
 
 def _bounds(start: Model, poses_g: Poses) -> tuple[Floats, Floats]:

@@ -21,7 +21,9 @@ from .figures import (
     BAD_ERROR, BOUND, CHANGED, COVERED, degrees, depends_on, Expected, FAR_OFF, GOOD_ERROR, HIDDEN,
     LEFT_OUT, MANY_OUT, MATTERS, mg, NEAR_FLAT, number, PER_OUTLIER, SPAN, TILT, TO_CHECK,
     TOO_EXACT, without_noise, WORST_ERROR)
-from ..calibration import Calibration, directions_in, flat_direction, free_parameters, Verification
+from .poses import request_words
+from ..calibration import (
+    Calibration, directions_in, flat_direction, free_parameters, lies_in_plane, Verification)
 from ..comparison import LEVEL
 from ..effects import EmpiricalCurve, WANDER
 from ..errors import TAKE_ALL_SIDES
@@ -132,8 +134,9 @@ def _limited(expected: Expected) -> Iterator[Finding]:
                       'are not calibrated', 'run thermal with a log of twelve poses, too, or '
                       'calibrate in the autopilot after this', 'USABLE')
     elif expected.is_partial:
-        yield Finding('partial', 'the poses lie near one direction: in other orientations the '
-                      f'error is up to {mg(expected.worst_mg)}', _more_poses(expected), 'USABLE')
+        where = 'in a plane' if lies_in_plane(expected.directions) else 'near one direction'
+        yield Finding('partial', f'the poses lie {where}: in other orientations the error is '
+                      f'up to {mg(expected.worst_mg)}', _more_poses(expected), 'USABLE')
     for each in expected.calibration.noted:
         if each.kind == 'limited' and expected.error_mg > BAD_ERROR.value:
             yield replace(each, text=f'{each.text}; by the others alone the error may be '
@@ -253,7 +256,8 @@ def _more_poses(expected: Expected) -> str:
     if asked.direction is None:
         return 'take more poses, and hold the sensor longer in each'
     more = asked.total - len(expected.poses)
-    return f'take {counted(more, "more pose") if more > 0 else "more poses"}: {asked.words}'
+    poses = counted(more, 'more pose') if more > 0 else 'more poses'
+    return f'take {poses}: {request_words(asked)}'
 
 
 def _remedy(expected: Expected, refinement: Refinement | None) -> NextStep:

@@ -42,8 +42,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .one_reading import AtReading, OneReading, Triple
-from ..calibration import Calibration, of_samples, thermal_stream
-from ..effects import ThermalStream
+from ..calibration import Calibration
+from ..effects import context_of_samples, thermal_stream, ThermalStream
 from ..errors import InputError
 from ..geometry import quaternion_of
 from ..logs import (
@@ -78,7 +78,7 @@ def corrected(calibration: Calibration, doubles: Floats, context: Mapping[str, N
         Factor on the corrected force.
 
     """
-    known = of_samples(context, len(doubles), calibration.model)
+    known = context_of_samples(context, len(doubles), calibration.model)
     rotation = calibration.model.rotation
     result = doubles.copy()
     force = calibration.correct(doubles[:, ACCELERATION], known)

@@ -10,15 +10,12 @@ the catalogue as columns of its equations. `linear` scores sets of these columns
 `beam` searches for the best sets near a model, `settle` repeats this and the fit in turn until
 each effect is sound, and `search` is the whole method. `curves` contains causes without a known
 form: a random walk of the offset, and an empirical curve; beside them it computes the probability
-of each effect and of its rivals. `steps` describes what was found, and `plan` chooses the poses
-that separate effects from their rivals.
+of each effect and of its rivals. `steps` states what was found; `accel_calib.findings` has the
+words for it.
 
 """
 
-from .plan import PlannedPose, PosePlan
-from .refinement import base_words, refine, Refinement, refitted, verdict_words
-from .steps import chance, named_entries, shown_name, Stage, Step, times_typical, values_of
+from .refinement import refine, Refinement, refitted
+from .steps import named_entries, Remark, Stage, Step
 
-__all__ = ['PlannedPose', 'PosePlan', 'Refinement', 'Stage', 'Step', 'base_words', 'chance',
-           'named_entries', 'refine', 'refitted', 'shown_name', 'times_typical', 'values_of',
-           'verdict_words']
+__all__ = ['Refinement', 'Remark', 'Stage', 'Step', 'named_entries', 'refine', 'refitted']

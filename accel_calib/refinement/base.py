@@ -41,8 +41,8 @@ from numpy.typing import NDArray
 import scipy
 
 from .state import beginning, fitted_state, State, without
-from ..calibration import Calibration, in_g, with_history
-from ..effects import included, Model, MODELS
+from ..calibration import Calibration, in_g
+from ..effects import add_history, included, Model, MODELS
 from ..estimate import estimate, judge
 from ..finding import has
 from ..geometry import unit
@@ -300,19 +300,19 @@ def unclipped(poses_g: Poses, base: Model) -> tuple[State | None, Clipped | None
     values = {name: part for name, part in base.values.items() if name not in included(linear)}
     values |= {name: np.zeros(3) for name in linear if name not in values}
     for model in (base, Model(values)):
-        fewer = fitted_state(model, with_history(kept, model))
+        fewer = fitted_state(model, add_history(kept, model))
         if fewer is None or fewer.dof < 1:
             continue
-        whole = fitted_state(model, with_history(plain, model))
+        whole = fitted_state(model, add_history(plain, model))
         if whole is None or whole.linear.score(
                 fewer.rss, float(len(plain) - len(kept)), 0.0) > _CLEARLY:
             break
     else:
         return None, None
-    whole = fitted_state(base, with_history(plain, base))
+    whole = fitted_state(base, add_history(plain, base))
     if whole is None:  # it converges only without the poses at the limit
         model = beginning(kept, base).model
-        whole = State(judge(model, with_history(plain, model)))
+        whole = State(judge(model, add_history(plain, model)))
     return whole, clip
 
 
@@ -343,7 +343,7 @@ def beside_stored(poses_g: Poses, calibration: Calibration, model: Model) -> Pos
     or was fitted to some of the new poses and still agrees with them.
 
     """
-    stored = with_history(in_g(calibration.poses, calibration.units), model)
+    stored = add_history(in_g(calibration.poses, calibration.units), model)
     stored = stored.take(np.isin(stored.row, calibration.used_poses.row))
     if not len(stored) or not calibration.model.effects:
         return poses_g

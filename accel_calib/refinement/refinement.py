@@ -20,24 +20,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from html import escape
+from importlib import import_module
 
 import numpy as np
 
 from .base import beside_stored, sampled, with_stored
-from .plan import plan_poses, PosePlan
 from .search import Found, search
 from .state import fitted_state, is_noise, State
 from .steps import (
-    advice_for, not_testable, Stage, Step, steps_of, unchanged, untestable, Verdict, verdict_of)
+    find_rivals, not_testable, Remark, remarks_on, Stage, Step, steps_of, untestable, Verdict,
+    verdict_of)
 from ..calibration import (
     Calibration, check_sensor, CLIPPED, fit_findings, fit_poses, fit_with_fleet, FLEET, FleetPrior,
-    gated, in_g, LARGEST_DILUTION, OF_A_FIT, only_norm, posterior, quality_of, record_of,
-    refuse_if_unfit, Rejected, rejected_by, sound_rows, sure_rows, uncertainty_g, with_history,
-    with_rest_noise)
+    gated, in_g, LARGEST_DILUTION, OF_A_FIT, only_norm, plan_refinement, PosePlan, posterior,
+    quality_of, record_of, refuse_if_unfit, Rejected, rejected_by, sound_rows, sure_rows,
+    uncertainty_g, with_rest_noise)
 from ..effects import (
-    CHANGES, EffectKey, included, Model, MODELS, OwnEffect, parameter_names, PROCESSES,
-    with_vector)
+    add_history, CHANGES, EffectKey, included, Model, MODELS, OwnEffect, parameter_names,
+    PROCESSES, unchanged, with_vector)
 from ..errors import RefusedFitError, TAKE_ALL_SIDES
 from ..estimate import fit_sphere, judge, NotConvergedError, outliers, variance_factor
 from ..finding import explained_by, Finding, without as without_kinds
@@ -65,16 +67,6 @@ simulated poses, a wrong effect explains as much as the true one, and new poses 
 _BASE = '10'
 _ORIENTATION = ('reference', 'orientation')
 
-_VERDICTS = {
-    'no_gap': 'No gap beyond the noise: these poses support no further effect.',
-    'explained': 'The gap is explained: only noise remains beyond the named effects.',
-    'described': 'The gap is described, not explained: only noise remains beyond an empirical '
-                 'curve, but its cause is not known.',
-    'drifts': 'The offset drifts: only noise remains beside a slow change of the offset, which no '
-              'calibration corrects.',
-    'unexplained': 'A gap remains that no effect of the catalogue explains.',
-}
-
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Refinement(Record):
@@ -98,8 +90,8 @@ class Refinement(Record):
         Rows of the poses left out.
     not_testable : tuple of (str, str)
         Effects that these data cannot show, and the data to record for them.
-    advice : tuple of str
-        Advice for the user.
+    remarks : tuple of Remark
+        What there is to say for advice; `advice` in words.
     calibration : Calibration
         The refined calibration.
     refusal : tuple of str
@@ -130,7 +122,7 @@ class Refinement(Record):
     remaining_gap_mg: float
     disturbed_poses: tuple[int, ...]
     not_testable: tuple[tuple[str, str], ...]
-    advice: tuple[str, ...]
+    remarks: tuple[Remark, ...]
     calibration: Calibration
     poses_g: Poses
     force: Floats
@@ -147,48 +139,21 @@ class Refinement(Record):
         return (f'Refinement({self.verdict}: {names}; residual {self.gap_mg:.3g} -> '
                 f'{self.remaining_gap_mg:.3g} mg)')
 
+    @cached_property
+    def advice(self) -> tuple[str, ...]:
+        """Return advice for the user, one line each."""
+        return tuple(import_module('accel_calib.findings').advice_lines(self))
+
     def _repr_html_(self) -> str:
         """Return the steps as a table, for notebooks."""
+        rival_words = import_module('accel_calib.findings').rival_words
         rows = [[step.effect, f'{step.gap_before_mg:.3g} → {step.gap_after_mg:.3g}',
                  f'{step.held_out_before_mg:.3g} → {step.held_out_after_mg:.3g}',
-                 f'{step.p_value:.1g}', ', '.join(step.likely_rivals), step.where]
+                 f'{step.p_value:.1g}', ', '.join(rival_words(step)), step.where]
                 for step in self.steps]
         head = ['effect', 'residual [mg]', 'held out [mg]', 'p', 'rivals', 'where']
         lines = ''.join(f'<p>{escape(line)}</p>\n' for line in (repr(self), *self.advice))
         return (table(head, rows) if rows else '') + lines
-
-
-def verdict_words(result: Refinement) -> str:
-    words = _VERDICTS[result.verdict]
-    if result.undecided:
-        words = ('Not enough poses: they cannot tell what explains the gap, because '
-                 f'{_why_undecided(result)}.')
-    elif result.verdict == 'unexplained' and result.steps:
-        words = ('A gap remains beyond the named effects, and no effect of the catalogue explains '
-                 'it.')
-    if result.noise_floor_mg is None:
-        words += (' The noise of the poses is not known (no std and count), so their scatter is '
-                  'taken as the noise.')
-    return words
-
-
-def _why_undecided(result: Refinement) -> str:
-    if result.refusal:
-        return result.refusal[0]
-    if result.one_curve:
-        one, other = result.one_curve
-        if other not in {step.effect for step in result.steps}:
-            return (f'beside {one}, {other} shows in the same proportion on each axis, as parts '
-                    'of one curve do')
-        return (f'{one} and {other} are in the same proportion on each axis, as parts of one '
-                'curve are')
-    most = max(result.steps, key=lambda step: len(step.rivals))
-    return f'{len(most.rivals)} others explain it about as well as {most.effect}'
-
-
-def base_words(result: Refinement) -> str:
-    name = result.calibration.name
-    return 'ideal sensor' if name == 'ideal' else f'model {name}'
 
 
 def refine(poses: Poses, units: Units, *, base: str | Calibration | FleetPrior = 'auto',
@@ -253,7 +218,7 @@ def _refine(poses: Poses, used: Poses, rejected: tuple[Rejected, ...], units: Un
     calibration = stored or base_of(poses, units, str(base))
 
     def at(model: Model) -> Poses:
-        known = with_history(in_g(sound, calibration.units), model)
+        known = add_history(in_g(sound, calibration.units), model)
         return known if stored is None else beside_stored(known, stored, model)
 
     every, model = at(calibration.model), Model(calibration.model.values)
@@ -314,13 +279,14 @@ def _conclude(calibration: Calibration, found: Found, given: Given) -> Refinemen
         kept = calibration.held(start.poses_g)
         start = State(judge(Model(calibration.model.values), kept))
     steps, stages = steps_of(found, start, calibration.date)
-    missing, plan = untestable(found, steps), plan_poses(found)
+    missing, plan = untestable(found, steps), plan_refinement(
+        find_rivals(found), final.model, final.poses_g, found.near.chosen.variance)
     verdict, _ = verdict_of(found, steps, refused=False)
     if verdict == 'no_gap' and calibration.reason != 'ideal' and not given.stored:
         alone = given.poses_g.take(np.isin(given.poses_g.row, calibration.used_poses.row))
-        advice = advice_for(found, steps, missing, len(calibration.rejected))
+        remarks = remarks_on(found, steps, missing, len(calibration.rejected))
         state = State(judge(Model(calibration.model.values), alone))
-        return _record_of(calibration, state, missing, (*advice, *plan.advice))
+        return _record_of(calibration, state, missing, remarks)
     of_search = [*rejected_by(found.final.model, given.poses_g.take(found.outliers))]
     if found.clipped is not None:
         of_search += [Rejected(int(row), CLIPPED, 'clipped')
@@ -332,9 +298,9 @@ def _conclude(calibration: Calibration, found: Found, given: Given) -> Refinemen
     if refusal:
         steps = tuple(replace(step, parameters_sd={}) for step in steps)
     verdict, undecided = verdict_of(found, steps, refused=bool(refusal))
-    advice = advice_for(found, steps, missing, len(outliers),
-                        unexplained=verdict == 'unexplained' and not undecided)
-    fitted = _record_of(refined, final, missing, (*advice, *plan.advice))
+    remarks = remarks_on(found, steps, missing, len(outliers),
+                         unexplained=verdict == 'unexplained' and not undecided)
+    fitted = _record_of(refined, final, missing, remarks)
     return replace(
         fitted, verdict=verdict, undecided=undecided, steps=steps, stages=stages, plan=plan,
         gap_mg=start.gap_mg(start.fit.residual), remaining_gap_mg=final.gap_mg(final.residual),
@@ -383,10 +349,10 @@ def _with(found: Refinement, calibration: Calibration) -> Refinement:
 def _without_search(fitted: Calibration, message: str, advice: str) -> Refinement:
     """Return the fit with the fleet as a refinement, with the reason why nothing was searched."""
     poses_g = in_g(fitted.used_poses, fitted.units)
-    fit = judge(Model(fitted.model.values), with_history(only_norm(poses_g), fitted.model))
+    fit = judge(Model(fitted.model.values), add_history(only_norm(poses_g), fitted.model))
     found = _record_of(
         fitted, State(fit), not_testable(poses_g, {}, fitted.model.effects),
-        (f'no effects were searched: {message}; the result is the fit with the fleet', advice))
+        (Remark('not_searched', {'message': message}), Remark('refusal', {'advice': advice})))
     ratio = fitted.quality.chi2_per_dof
     quiet = not ratio or is_noise(fit.chi2, fit.chi2 / ratio)
     return replace(found, verdict='no_gap' if quiet else 'unexplained',
@@ -394,12 +360,12 @@ def _without_search(fitted: Calibration, message: str, advice: str) -> Refinemen
 
 
 def _record_of(calibration: Calibration, state: State, missing: tuple[tuple[str, str], ...],
-               advice: tuple[str, ...]) -> Refinement:
+               remarks: tuple[Remark, ...]) -> Refinement:
     """Return the record of a calibration, by the state of its poses, without a step."""
     residual = state.fit.residual
     return Refinement(
         verdict='no_gap', noise_floor_mg=state.floor_mg, gap_mg=state.gap_mg(residual),
-        remaining_gap_mg=state.gap_mg(residual), not_testable=missing, advice=advice,
+        remaining_gap_mg=state.gap_mg(residual), not_testable=missing, remarks=remarks,
         disturbed_poses=tuple(each.row for each in calibration.rejected), calibration=calibration,
         poses_g=state.poses_g, force=state.fit.equations.force,
         stages=(Stage('base', state.mg_of_poses(residual)),))
@@ -427,7 +393,8 @@ def base_of(poses: Poses, units: Units, name: str) -> Calibration:
         values = {'offset': vec_v / units.per_g}
     poses_g = in_g(poses, units)
     fit = judge(Model(values), poses_g)
-    return record_of(fit, poses, units, unit(poses_g.reading), 'ideal', 'ml', reason='ideal')
+    return record_of(fit, poses, units, unit(poses_g.reading), name='ideal', method='ml',
+                     reason='ideal')
 
 
 def with_changes(model: Model) -> tuple[Model, Floats]:
@@ -493,7 +460,7 @@ def refitted(before: Calibration, poses: Poses, *, sensor: str = '', date: str =
     check_units(poses, before.units)
     sure, doubts = sure_rows(poses)
     sound, unsound = sound_rows(sure, before.units)
-    poses_g = with_history(in_g(sound, before.units), before.model)
+    poses_g = add_history(in_g(sound, before.units), before.model)
     lacking = [key for key in before.model.needs if key not in poses_g]
     if lacking:
         raise RefusedFitError(f'the poses have no {" or ".join(lacking)}, which the calibration '

@@ -22,9 +22,10 @@ from numpy.typing import NDArray
 import scipy
 
 from .linear import Block, LEAST_OWN, Linear, orthonormal, outside_of
-from ..calibration import determines, NORM_MODELS, with_history
+from ..calibration import determines, NORM_MODELS
 from ..effects import (
-    Context, Effect, EffectKey, entry_of, factors_of, included, kind_of, linear_model, Model)
+    add_history, Context, Effect, EffectKey, entry_of, factors_of, included, kind_of, linear_model,
+    Model)
 from ..estimate import estimate, Fit, kinds, left_out, NotConvergedError
 from ..geometry import unit
 from ..statistics import rms
@@ -107,7 +108,7 @@ class Candidate:
         for shape in self.shapes:
             new = searched and not np.array_equal(shape, entry.usual)
             yield Block(self.effect, shape, slice(start, start + count), entry, int(new),
-                        (self.tried if new else 1.0) * alike)
+                        tried=(self.tried if new else 1.0) * alike)
             start += count
 
 
@@ -140,7 +141,7 @@ def linearised(fit: Fit, base: tuple[EffectKey, ...], tried: Iterable[Candidate]
     further = Model({name: values for name, values in model.values.items() if name not in base})
     residual = near.residual
     if further.values:
-        residual = residual + near.columns(further) @ _amplitudes(further)
+        residual = residual + near.columns(further) @ amplitudes_of(further)
     onto = orthonormal(np.hstack([near.columns(held)[:, held.fitted], near.columns(beside)]))
     tried = [each.beside(further.values.get(each.effect), fit.context) for each in tried]
     alike = Counter(kind_of(each.effect) for each in tried)
@@ -174,7 +175,7 @@ def left_open(state: State) -> Model:
     return linear_model(largest, np.eye(3), np.zeros(3))
 
 
-def _amplitudes(model: Model) -> Floats:
+def amplitudes_of(model: Model) -> Floats:
     """Return the (p,) values of a model with those of its shapes set to zero."""
     parts = [np.concatenate([values[:len(effect.parameters)], np.zeros(len(effect.shape))])
              for effect, values in zip(model.terms.effects, model.values.values(), strict=True)]
@@ -241,11 +242,6 @@ class State:
         """Return the (n,) residuals of poses from (m,) residuals of the equations [mg]."""
         return self.fit.equations.of_poses(residual) * MG
 
-    def contribution_mg(self, effect: EffectKey) -> Floats:
-        """Return the (n,) contributions of an effect of the model to the poses [mg]."""
-        alone = Model({effect: self.model.values[effect]})
-        return self.mg_of_poses(self.fit.equations.columns(alone) @ _amplitudes(alone))
-
     @property
     def floor_mg(self) -> float | None:
         """Return the residual expected of a correct model [mg]; None if the noise is unknown."""
@@ -260,7 +256,7 @@ def is_noise(rss: float, dof: float) -> bool:
 
 def beginning(poses_g: Poses, model: Model) -> State:
     """Return the state of a base model, fitted to all poses; `NotConvergedError` if that fails."""
-    return State(estimate(model, with_history(poses_g, model)))
+    return State(estimate(model, add_history(poses_g, model)))
 
 
 def fitted_state(model: Model, poses_g: Poses, most: float = np.inf) -> State | None:

@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The steps of a refinement from what a search found, and advice.
+The steps of a refinement from what a search found, and remarks for advice.
+
+Places and remarks are kinds with figures; `accel_calib.findings` has their words.
 
 **One model.** A step has the residuals without and with its effect. All else that is stated of it
 is of the final model: values, deviations, rivals, probabilities, and where it acts, which is an
@@ -12,11 +14,12 @@ instant, the ends of the range of a column, or directions of the force.
 
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from itertools import pairwise
 import math
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -24,16 +27,17 @@ from .curves import LEAST, nearest_effects, probabilities
 from .linear import is_seen, Set
 from .search import Found
 from .settle import ladder_set
-from .state import candidates, fitted_state, is_noise, linearised, State, with_effect
+from .state import (
+    amplitudes_of, candidates, fitted_state, is_noise, linearised, State, with_effect)
+from ..calibration import ENOUGH
 from ..effects import (
-    CATALOGUE, CHANGES, Covariate, Effect, EffectKey, EFFECTS, EMPIRICAL, EmpiricalCurve, entry_of,
-    formula_of, included, kind_of, Model, OwnEffect, parameter_names, PROCESSES, TO_SEPARATE,
-    unit_of, value_unit, variable_of, variable_words, WANDER)
-from ..estimate import kinds
-from ..geometry import ATTITUDES, axes_of_signs
+    CATALOGUE, CHANGES, Effect, EffectKey, EFFECTS, EMPIRICAL, EmpiricalCurve, entry_of,
+    formula_of, included, kind_of, Model, OwnEffect, parameter_names, PROCESSES, shown_name,
+    unchanged, variable_of, WANDER)
+from ..estimate import Fit, kinds
+from ..geometry import ATTITUDES
 from ..statistics import rms
 from ..table import column_of, Floats, Poses
-from ..text import counted, listed, with_minus, with_sd
 from ..units import MG
 
 MOST_RIVALS = 3
@@ -51,12 +55,15 @@ _FAR = 10.0
 _FEW = 10
 """Degrees of freedom below which most effects cannot be detected."""
 
-_APART = 0.05
-"""Difference of two probabilities above which both are stated."""
-
-_LEAST_P = 1e-16
-
 Verdict = Literal['no_gap', 'explained', 'described', 'drifts', 'unexplained']
+
+
+@dataclass(frozen=True)
+class Remark:
+    """Something to say: its kind, and the figures of the sentence by name."""
+
+    kind: str
+    figures: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -86,8 +93,8 @@ class Step:
         Held-out residual without and with the effect [mg].
     p_value : float
         Probability that noise alone makes one of all candidates this good.
-    where : str
-        Directions, range or poses of the disagreement.
+    place : Remark
+        Directions, range or poses of the disagreement; `where` in words.
     name : EffectKey
         The effect in the model: its name in the catalogue, or its record.
     variable : str
@@ -108,7 +115,7 @@ class Step:
     held_out_before_mg: float
     held_out_after_mg: float
     p_value: float
-    where: str
+    place: Remark
     name: EffectKey
     formula: str = ''
     variable: str = field(init=False)
@@ -118,16 +125,24 @@ class Step:
         object.__setattr__(self, 'variable', variable_of(self.name))
 
     @property
-    def likely_rivals(self) -> tuple[str, ...]:
-        """Return the rivals with their probabilities, such as ``quadratic (11 %)``."""
-        return tuple(f'{name} ({self.odds(name)})' for name in self.rivals)
+    def where(self) -> str:
+        """Return the place of the disagreement in words."""
+        return str(import_module('accel_calib.findings').place_words(self))
 
-    def odds(self, rival: str) -> str:
-        """Return the probability of a rival, and that by the data alone if it differs much."""
+    def odds(self, rival: str) -> tuple[float, float]:
+        """Return the probability of a rival, and that by the data alone."""
         whole, alone = (each.get(rival, LEAST / 10.0) for each in (  # those left out are small
             self.probabilities, self.data_probabilities))
-        by_data = f', by the data alone {percent(alone)}' if abs(alone - whole) > _APART else ''
-        return f'{percent(whole)}{by_data}'
+        return whole, alone
+
+    @property
+    def times_typical(self) -> float:
+        """Return the largest value relative to that of typical parts; 0: not known."""
+        if self.effect == EMPIRICAL:
+            return 0.0
+        effect = entry_of(self.name)
+        return max((abs(self.parameters.get(name, 0.0)) for name in effect.parameters),
+                   default=0.0) / effect.typical
 
 
 @dataclass(frozen=True)
@@ -146,49 +161,6 @@ class Stage:
 
     name: str
     residual_mg: Floats
-
-
-def chance(p_value: float) -> str:
-    """Return the probability that noise alone explains a step."""
-    return f'p < {_LEAST_P:.0e}' if p_value < _LEAST_P else f'p = {p_value:.1g}'
-
-
-def percent(probability: float) -> str:
-    """Return a probability as text; only certainty is 0 or 100 %."""
-    if 0.0 < probability < 0.005:
-        return '< 1 %'
-    return '> 99 %' if 0.995 <= probability < 1.0 else f'{100.0 * probability:.0f} %'
-
-
-def values_of(step: Step) -> list[tuple[str, str]]:
-    """
-    Return name and text of each value of a step, ± its deviation; values in g are in mg.
-
-    A curve that has a formula is stated by that.
-
-    """
-    if step.formula:
-        return [('', step.formula)]
-    parameters, values = entry_of(step.name).parameters, []
-    for name, value in step.parameters.items():
-        unit_name, scale = value_unit(step.name, name)
-        sd = step.parameters_sd.get(name, 0.0)
-        words = with_sd(value * scale, sd * scale) if sd else f'{value * scale:.5g}'
-        sign = '+' if name in parameters and value >= 0.0 else ''
-        values.append((name, with_minus(f'{sign}{words} {unit_name}'.rstrip())))
-    return values
-
-
-def unchanged(effect: EffectKey) -> EffectKey:
-    """Return an effect, for a change the effect that has changed."""
-    return entry_of(effect).base or effect
-
-
-def shown_name(effect: EffectKey) -> str:
-    """Return the name of an effect among rivals; a covariate keeps its quantity."""
-    if isinstance(effect, Covariate):
-        return str(replace(effect, power=1))
-    return kind_of(unchanged(effect))
 
 
 def verdict_of(found: Found, steps: Sequence[Step], *, refused: bool) -> tuple[Verdict, bool]:
@@ -245,13 +217,14 @@ def _step(name: EffectKey, before: State, after: State, found: Found, date: str)
     if name == WANDER:
         first, first_held_out = before.residual, before.held_out
         last = held_out = beside_walk(found)[1]  # it follows the poses: what it predicts counts
-    effect, words = entry_of(name), _where(name, before, found)
+    effect, place = entry_of(name), _place(name, before, found)
     values = found.final.model.values.get(name, np.zeros(len(effect.values)))
     spread = dict(zip(parameter_names(found.final.model.effects),
                       np.sqrt(np.diag(found.final.fit.covariance)).tolist(), strict=True))
     deviations = {part: spread.get(f'{name}.{part}', 0.0) for part in effect.values}
     if name in CHANGES:
-        words = f'{_change(name, values, [*deviations.values()], date)}; {words}'
+        change = zip(values.tolist(), deviations.values(), strict=True)
+        place = replace(place, figures={**place.figures, 'change': [*change], 'date': date})
     shown = effect.shown(values)
     return Step(
         name=unchanged(name), rivals=rivals, probabilities=chances, data_probabilities=by_data,
@@ -259,7 +232,7 @@ def _step(name: EffectKey, before: State, after: State, found: Found, date: str)
         parameters_sd={part: deviations[part] for part in shown if deviations[part]},
         gap_before_mg=before.gap_mg(first), gap_after_mg=after.gap_mg(last),
         held_out_before_mg=before.gap_mg(first_held_out),
-        held_out_after_mg=after.gap_mg(held_out), p_value=_p_value(name, found), where=words,
+        held_out_after_mg=after.gap_mg(held_out), p_value=_p_value(name, found), place=place,
         formula=formula_of(name, values, spread))
 
 
@@ -285,24 +258,22 @@ def _p_value(name: EffectKey, found: Found) -> float:
 
 
 def _output_steps(found: Found) -> list[Step]:
-    after, causes = found.base, list[tuple[str, str, float, State, str]]()
+    after, causes = found.base, list[tuple[str, str, float, State, Remark]]()
     if found.clipped is not None and found.with_clipped is not None:
         whole, limit_g = found.with_clipped, found.clipped.limit_g
-        rows = listed('row', whole.poses_g.row[found.clipped.poses].tolist())
-        causes.append(('saturation', 'limit', limit_g, whole, f'in {rows}: an axis reads '
-                       f'{limit_g:.4g} g and its samples hardly scatter'))
+        rows = whole.poses_g.row[found.clipped.poses].tolist()
+        causes.append(('saturation', 'limit', limit_g, whole,
+                       Remark('limit', {'rows': rows, 'limit_g': limit_g})))
     if found.grid_g is not None:
-        step_mg = found.grid_g * MG
-        causes.append(('quantisation', 'step', found.grid_g, after, 'pose means are multiples of '
-                       f'{step_mg:.3g} mg, which causes {step_mg / np.sqrt(12.0):.2g} mg RMS per '
-                       'axis'))
+        causes.append(('quantisation', 'step', found.grid_g, after,
+                       Remark('grid', {'step_mg': found.grid_g * MG})))
     return [Step(
         name=name, rivals=(), probabilities={name: 1.0}, data_probabilities={name: 1.0},
-        parameters={value_name: value}, parameters_sd={}, p_value=0.0, where=where,
+        parameters={value_name: value}, parameters_sd={}, p_value=0.0, place=place,
         gap_before_mg=before.gap_mg(before.residual), gap_after_mg=after.gap_mg(after.residual),
         held_out_before_mg=before.gap_mg(before.held_out),
         held_out_after_mg=after.gap_mg(after.held_out))
-        for name, value_name, value, before, where in causes]
+        for name, value_name, value, before, place in causes]
 
 
 def beside_walk(found: Found) -> tuple[Floats, Floats]:
@@ -313,73 +284,66 @@ def beside_walk(found: Found) -> tuple[Floats, Floats]:
     return found.walk.residuals(Set.of(final.linear), final.fit.equations.force)
 
 
-def _curve(curve: EmpiricalCurve, before: State, share_mg: Floats) -> str:
-    """Return what an empirical curve changes, and the known effects that are most similar."""
-    variable = curve.variable
-    what = 'size of the force' if curve.carrier == 'force' else curve.carrier.replace('_', '-')
-    words = (f'the {what}{f" of {curve.part}" if curve.part else ""} changes with '
-             f'{variable_words(variable)} by up to {np.max(np.abs(share_mg)):.2g} mg')
-    if variable not in ('force', 'direction', 'std'):  # a variable of one number
-        values = before.poses_g[variable]
-        parts = np.array_split(np.argsort(values, kind='stable'), 5)
-        middle = [float(np.mean(values[part])) for part in parts]
-        size = [rms(share_mg[part]) for part in parts]
-        at = int(np.argmax(np.abs(np.diff(size))))
-        words += (f', most between {middle[at]:.4g} and {middle[at + 1]:.4g} '
-                  f'{unit_of(variable)}').rstrip()
-    nearest = [f'{effect} (leaves {left:.2g} mg)'
-               for effect, left in nearest_effects(before).items()]
-    return words + (f'; no known effect has this form, the nearest are {", ".join(nearest)}'
-                    if nearest else '')
-
-
-def _where(name: EffectKey, before: State, found: Found) -> str:
+def _place(name: EffectKey, before: State, found: Found) -> Remark:
     """Return where an effect acts, by its values in the final model."""
     final, effect = found.final, entry_of(name)
     poses_g = final.poses_g
-    share_mg = (final.contribution_mg(name) if name in final.model.values else
-                final.mg_of_poses(final.residual - beside_walk(found)[0]))
+    if name in final.model.values:
+        alone = Model({name: final.model.values[name]})
+        share = final.fit.equations.columns(alone) @ amplitudes_of(alone)
+    else:
+        share = final.residual - beside_walk(found)[0]
+    share_mg = final.mg_of_poses(share)
     if isinstance(name, EmpiricalCurve):
-        return _curve(name, before, share_mg)
+        return _place_of_curve(name, before, share_mg)
     if 'instant' in effect.shape:
         time, row = poses_g['time'], poses_g.row
         instant = final.model.values[name][effect.values.index('instant')]
         last, first = (int(np.nanargmin(np.where(part, np.abs(time - instant), np.nan)))
                        for part in (time < instant, time >= instant))
-        return (f'between {time[last]:.6g} and {time[first]:.6g} s (rows {row[last]} and '
-                f'{row[first]})')
+        return Remark('instant', {'times': (float(time[last]), float(time[first])),
+                                  'rows': (int(row[last]), int(row[first]))})
     column = next((key for key in effect.needs
                    if key in poses_g and key not in ('new', 'previous')), None)
     if column is None:
-        return _directions(final.fit.equations.force, share_mg)
-    return _range(column, poses_g[column], share_mg)
-
-
-def _range(column: str, values: Floats, share_mg: Floats) -> str:
-    """Return a text about the range of a quantity and the disagreement at both ends."""
+        return _largest_directions(final.fit.equations.force, share_mg)
+    values = poses_g[column]
     known = np.isfinite(values.reshape(len(share_mg), -1)).all(axis=1)
     values, share_mg = values[known], share_mg[known]
     if values.ndim > 1:
         values = np.linalg.norm(values, axis=1)
     order = np.argsort(values, kind='stable')
     ends = max(1, len(order) // 5)
-    low, high = rms(share_mg[order[:ends]]), rms(share_mg[order[-ends:]])
-    span = f'{values[order[0]]:.4g} to {values[order[-1]]:.4g} {unit_of(column)}'.rstrip()
-    return (f'over {column.replace("_", " ")} {span}: {low:.2g} mg RMS in the lowest fifth of the '
-            f'poses, {high:.2g} mg in the highest')
+    return Remark('range', {
+        'column': column, 'range': (float(values[order[0]]), float(values[order[-1]])),
+        'ends_mg': (rms(share_mg[order[:ends]]), rms(share_mg[order[-ends:]]))})
 
 
-def _directions(force: Floats, share_mg: Floats) -> str:
-    """Return a text about the three directions with the largest disagreement."""
+def _place_of_curve(curve: EmpiricalCurve, before: State, share_mg: Floats) -> Remark:
+    """Return what an empirical curve changes, and the known effects that are most similar."""
+    variable, between = curve.variable, None
+    if variable not in ('force', 'direction', 'std'):  # a variable of one number
+        values = before.poses_g[variable]
+        parts = np.array_split(np.argsort(values, kind='stable'), 5)
+        middle = [float(np.mean(values[part])) for part in parts]
+        size = [rms(share_mg[part]) for part in parts]
+        at = int(np.argmax(np.abs(np.diff(size))))
+        between = middle[at], middle[at + 1]
+    return Remark('curve', {
+        'carrier': curve.carrier, 'part': curve.part, 'variable': variable, 'between': between,
+        'most_mg': float(np.max(np.abs(share_mg))), 'nearest': nearest_effects(before)})
+
+
+def _largest_directions(force: Floats, share_mg: Floats) -> Remark:
+    """Return the three directions with the largest disagreement, by the signs of their axes."""
     signs, near = np.sign(ATTITUDES), ATTITUDES @ force.T >= _NEAR
     counts = np.sum(near, axis=1)
     means = np.where(counts > 0, near @ share_mg / np.maximum(counts, 1), 0.0)
     sizes = np.round(np.abs(means) / max(float(np.max(np.abs(means))), 1e-300), 6)
     # The first of equals, which a sum in another order does not change.
     largest = [k for k in np.argsort(-sizes, kind='stable')[:3] if counts[k]]
-    return 'with ' + ', '.join(
-        f'{axes_of_signs(signs[k])} up ({means[k]:+.2g} mg over {counts[k]} of {len(share_mg)} '
-        'poses)' for k in largest)
+    return Remark('directions', {'poses': len(share_mg), 'directions': [
+        (signs[k].tolist(), float(means[k]), int(counts[k])) for k in largest]})
 
 
 def untestable(found: Found, steps: Sequence[Step]) -> tuple[tuple[str, str], ...]:
@@ -435,114 +399,102 @@ def named_entries(also: tuple[OwnEffect, ...]) -> dict[str, Effect]:
     return {**EFFECTS, **PROCESSES, **{own.name: own.entry for own in also}}
 
 
-def _change(name: EffectKey, values: Floats, deviations: Sequence[float], date: str) -> str:
-    """Return the change of values since a stored calibration of a date, with uncertainties."""
-    effect = entry_of(unchanged(name))
-    scale, unit_name = (1e3, 'mg') if effect.is_offset else (100.0, '%')
-    shown = ', '.join(f'{"+" if value > 0.0 else ""}{with_sd(value * scale, sd * scale)}'
-                      for value, sd in zip(values.tolist(), deviations, strict=True))
-    since = f' since {date[:10]}' if date else ''
-    return f'the {effect.words} has changed by ({shown}) {unit_name}{since}'
-
-
-def advice_for(found: Found, steps: tuple[Step, ...], untestable: tuple[tuple[str, str], ...],
-               left_out: int, *, unexplained: bool = False) -> tuple[str, ...]:
+def remarks_on(found: Found, steps: tuple[Step, ...], untestable: tuple[tuple[str, str], ...],
+               left_out: int, *, unexplained: bool = False) -> tuple[Remark, ...]:
     """
-    Return advice for the user, one line each.
+    Return remarks for advice.
 
     `untestable` are the effects that the data cannot show, and the data to record for them;
     `left_out` is the number of poses that were left out; `unexplained`: a gap remains.
 
     """
-    lines, poses_g = _other_sensor(found), found.base.poses_g
+    poses_g, remarks = found.base.poses_g, list[Remark]()
+    changes = {name: float(np.max(np.abs(values)))
+               for name, values in found.final.model.values.items() if name in CHANGES}
+    worst = max(changes, key=lambda name: changes[name] / entry_of(name).repeatable_g, default='')
+    if worst and changes[worst] > entry_of(worst).repeatable_g:  # too large for one sensor
+        remarks.append(Remark('other_sensor', {'effect': worst, 'change': changes[worst]}))
     if 'new' in poses_g and 'reference' not in poses_g:
-        lines.append('a mount that has turned since the calibration cannot show: only |force| = '
-                     '1 g is known; take poses of known orientation (ref_x, ref_y, ref_z) with '
-                     'both')
+        remarks.append(Remark('mount_not_seen', {}))
+    remarks += _remarks_on_effects(found, steps)
+    if left_out:
+        remarks.append(Remark('left_out', {'poses': left_out}))
+    if found.base.dof < _FEW:
+        remarks.append(Remark('few', {'poses': len(poses_g), 'dof': found.base.dof}))
+    if unexplained and not found.taken_back and found.curve is None and WANDER not in found.added:
+        ratio = float(np.sqrt(found.final.rss / found.final.dof))
+        remarks.append(Remark('scatter', {'ratio': ratio}))
+    elif unexplained:
+        remarks.append(Remark('gap', {'taken_back': [*map(str, found.taken_back)]}))
+        entries = named_entries(found.also)
+        columns = sorted({needs for effect, needs in untestable if entries[effect].needs})
+        remarks += [Remark('record', {'columns': columns})] if columns else []
+    return tuple(remarks)
+
+
+def _remarks_on_effects(found: Found, steps: tuple[Step, ...]) -> Iterator[Remark]:
     for step in (step for step in steps if step.rivals):
         families = {entry_of(step.name).family, *(
             CATALOGUE[name].family if name in CATALOGUE else '' for name in step.rivals)}
-        family = families.pop() if len(families) == 1 else ''
-        lines.append(f'{step.effect} cannot be distinguished from {", ".join(step.rivals)} here: '
-                     f'{TO_SEPARATE[family]}')
-    lines += [line for own in found.also if own not in found.final.model.values
-              for line in _at_bounds(own, found)]
+        yield Remark('rivals', {'effect': step.effect, 'rivals': step.rivals,
+                                'family': families.pop() if len(families) == 1 else ''})
+    for own in found.also:
+        if own not in found.final.model.values:
+            for constant, value in _constants_at_bounds(own, found).items():
+                yield Remark('at_bound', {'effect': own.name, 'constant': constant,
+                                          'value': value})
     for step in steps:
-        times, effect = times_typical(step), entry_of(step.name)
-        if times > _FAR:
-            lines.append(f'{step.effect} is {times * effect.typical:.2g} {effect.unit}, typical '
-                         f'parts have about {effect.typical:.2g}: check that the sensor causes '
-                         'it, and not the setup')
+        effect = entry_of(step.name)
+        if step.times_typical > _FAR:
+            yield Remark('unusual', {
+                'effect': step.effect, 'size': step.times_typical * effect.typical,
+                'unit': effect.unit, 'typical': effect.typical})
     if found.one_curve:
-        lines.append(f'{" and ".join(found.one_curve)} may be parts of one curve: take '
-                     'more poses in all directions, which show its form')
-    if left_out:
-        were, them = ('was', 'it') if left_out == 1 else ('were', 'them')
-        lines.append(f'{counted(left_out, "pose")} {were} left out; take {them} again')
-    if found.base.dof < _FEW:
-        lines.append(f'{counted(len(poses_g), "pose")} leave '
-                     f'{counted(found.base.dof, "degree")} of freedom, which is too few to detect '
-                     'most effects: take 24 poses or more')
-    if unexplained:
-        lines += _unexplained(found, untestable)
-    return tuple(lines)
+        yield Remark('one_curve', {'effects': found.one_curve})
 
 
-def _at_bounds(own: OwnEffect, found: Found) -> list[str]:
-    """Return a line for each constant of an own effect that would help, but ends at a bound."""
+def _constants_at_bounds(own: OwnEffect, found: Found) -> dict[str, float]:
+    """Return the constants at their bounds of an own effect that would help."""
     effect, final, curve = own.entry, found.final, found.curve
     before = final if curve is None else fitted_state(Model({
         each: part for each, part in final.model.values.items() if each != curve.name}),
         final.poses_g)
     tried = () if before is None else tuple(candidates((own,), final.poses_g))
     if before is None or not tried or not effect.bounds:
-        return []
+        return {}
     alone = Set.of(linearised(before.fit, before.model.effects, tried))
     grown = alone.extended(best := alone.best_of(own))
     after = None if grown.score <= 0.0 else fitted_state(Model(with_effect(
         before.model.values, own, np.concatenate(
             [grown.values[best], alone.linear.blocks[best].shape]))), final.poses_g)
     shape = () if after is None else effect.split(after.model.values[own])[1].tolist()
-    return [f'{own} is not used, because its constant {constant} ends at its bound {value:.4g}: '
-            'widen the bounds in its definition, or use another function'
-            for constant, value, bounds in zip(effect.shape, shape, effect.bounds)
-            if value in bounds]
+    return {constant: value for constant, value, bounds in zip(
+        effect.shape, shape, effect.bounds) if value in bounds}
 
 
-def _unexplained(found: Found, untestable: tuple[tuple[str, str], ...]) -> list[str]:
-    final, nearest = found.final, ''
-    if not found.taken_back and found.curve is None and WANDER not in found.added:
-        return [f'poses repeat {np.sqrt(final.rss / final.dof):.1f} times worse than their '
-                'samples, and the scatter has no structure: clamp the sensor, let it settle '
-                'longer']
-    if found.taken_back:
-        nearest = f'; {", ".join(map(str, found.taken_back))} would explain only a part'
-    lines = [f'a gap remains that no effect testable with these data explains{nearest}: check '
-             'what differs between the poses, and repeat some of them']
-    entries = named_entries(found.also)
-    columns = sorted({needs for effect, needs in untestable if entries[effect].needs})
-    if columns:
-        lines.append(f'record {"; ".join(columns)}: their effects cannot be tested yet')
-    return lines
+def find_rivals(found: Found) -> list[dict[EffectKey, tuple[float, Fit]]]:
+    """
+    Return probability and fit of each effect and its rivals, if the data do not decide.
 
+    What is usual does not replace a pose that would show it. A random walk of the offset cannot be
+    predicted, so there are no rivals beside it.
 
-def _other_sensor(found: Found) -> list[str]:
-    """Return a line if the changes are too large for one sensor."""
-    changes = {name: float(np.max(np.abs(values)))
-               for name, values in found.final.model.values.items() if name in CHANGES}
-    by_limit = {name: change / CHANGES[name].repeatable_g for name, change in changes.items()}
-    name = max(by_limit, key=by_limit.__getitem__, default='')
-    if not name or by_limit[name] <= 1.0:
-        return []
-    return [f'this is probably another sensor: its {CHANGES[name].base} differs from the stored '
-            f'one by {changes[name]:.2g} {CHANGES[name].unit}, which is too much for one sensor; '
-            'fit a new calibration from its own poses']
-
-
-def times_typical(step: Step) -> float:
-    """Return the largest value of an effect relative to that of typical parts; 0: not known."""
-    if step.effect == EMPIRICAL:
-        return 0.0
-    effect = entry_of(step.name)
-    return max((abs(step.parameters.get(name, 0.0)) for name in effect.parameters),
-               default=0.0) / effect.typical
+    """
+    rivalries, near, final = [], found.near, found.final
+    for name in () if near.walk is not None else near.names:
+        fits, others = {name: final.fit}, near.without(name)
+        kept = {key: part for key, part in final.model.values.items() if key != name}
+        weights = probabilities(name, near, usual=False)
+        for rival, weight in weights.items():
+            if rival == WANDER or shown_name(rival) == shown_name(name) or weight <= LEAST:
+                continue
+            best = others.best_of(rival)
+            values = [others.extended(best).values[best], others.linear.blocks[best].shape]
+            model = Model(with_effect(kept, rival, np.concatenate(values)))
+            state = fitted_state(model, final.poses_g)
+            if state is not None:
+                fits[rival] = state.fit
+        total = sum(weights[each] for each in fits)
+        if len(fits) > 1 and max(weights[each] for each in fits) < ENOUGH * total:
+            rivalries.append({each: (weights[each] / total, fit) for each, fit in fits.items()})
+    return rivalries

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from .sheet import (
     ACCENT, add_bar, AFTER, BEFORE, check_matplotlib, DISC, DIVERGING, Drawing, drawn, EDGE, FAINT,
     HEIGHT_INCHES, INK, legend_below, Mark, Marks, PAPER, RIM, SEQUENTIAL)
-from ..calibration import (
-    Calibration, directions_in, errors_after, errors_before, in_g, with_history)
-from ..effects import acting_temperature, AXES, EffectKey, entry_of, rate_at, sensor_force
+from ..calibration import Calibration, directions_in, errors_after, errors_before, in_g
+from ..effects import (
+    acting_temperature, add_history, AXES, EffectKey, entry_of, rate_at, sensor_force)
 from ..geometry import uncovered, unit
 from ..statistics import over_axes, rms
 from ..table import column_of, Floats, Poses
@@ -156,7 +156,7 @@ def residuals_of(calibration: Calibration, poses: Poses | None = None) -> Residu
     """Return the residuals of a calibration on poses in its unit, by default on its own."""
     own = calibration.poses if poses is None else poses
     model, units = calibration.model, calibration.units
-    poses_g = calibration.held(with_history(in_g(own, units), model))
+    poses_g = calibration.held(add_history(in_g(own, units), model))
     reasons = {each.row: each.reason for each in calibration.rejected if poses is None}
     out = np.isin(own.row, list(reasons))
     kept = poses_g.take(~out)

@@ -13,13 +13,14 @@ import re
 import shlex
 from typing import Any
 
+from accel_calib.errors import AccelCalibError
 from accel_calib.logs import LogOptions
 from golden import inputs
 from golden.driven import session
 from golden.figures import attempt, LOOKS
 from golden.record import parted, plain
 from golden.sweeps import SWEEPS
-from inside import main, poses_of
+from inside import main, meaning, poses_of, read_log
 import numpy as np
 import yaml
 
@@ -27,6 +28,8 @@ CASES: dict[str, Any] = yaml.safe_load(
     Path(__file__).with_name('cases.yaml').read_text(encoding='utf-8'))
 _WITHOUT_JSON = ('apply', 'report', 'simulate')
 _SETTINGS = ('run', 'look', 'units', 'session')
+CORPUS = Path(__file__).parents[1] / 'corpus' / 'logs'
+"""Small logs of all dialects, by what they show, and the options with which they are read."""
 
 
 def result_of(name: str, folder: Path) -> Any:
@@ -40,6 +43,10 @@ def result_of(name: str, folder: Path) -> Any:
 
 
 def _of_case(case: dict[str, Any]) -> Any:
+    if 'names' in case:
+        return {name: attempt(meaning, name) for name in case['names']}
+    if 'read' in case:
+        return _read(case['read'])
     files = {file: made for file, made in case.items() if file not in _SETTINGS}
     for file, made in files.items():
         (kind, options), = made.items()
@@ -54,20 +61,37 @@ def _of_case(case: dict[str, Any]) -> Any:
     return {**found, 'session': session(case['session'])} if 'session' in case else found
 
 
+def _read(folder: str) -> Any:
+    """Return what each log of a folder of the corpus holds, or its refusal."""
+    Path(folder).symlink_to(CORPUS / folder)
+    given = yaml.safe_load((CORPUS / 'options.yaml').read_text(encoding='utf-8'))
+    found = {}
+    for path in sorted(Path(folder).iterdir()):
+        for options in given.get(str(path), [{}]):
+            log = attempt(read_log, path, LogOptions(**options))
+            found[f'{path.stem} {options or ""}'.strip()] = (
+                [log, log.read_as] if isinstance(log, AccelCalibError) else
+                [type(log.table).__name__, log.table.row, log])
+    return found
+
+
 def _ran(command: str) -> Any:
     """Return what a command writes."""
     arguments = shlex.split(command)
-    if arguments[0] not in _WITHOUT_JSON:
+    if arguments[0] not in _WITHOUT_JSON and '--json' not in arguments:
         arguments += ['--json', 'result.json']
-    before = {path: path.stat().st_mtime_ns for path in Path().iterdir()}
+    before = {path: path.lstat().st_mtime_ns for path in Path().rglob('*')}
     errors = io.StringIO()
     with redirect_stdout(io.StringIO()), redirect_stderr(errors):
-        status = main(arguments)
+        try:
+            status = main(arguments)
+        except SystemExit as ended:
+            status = ended.code
     assert 'internal error' not in errors.getvalue(), errors.getvalue()
-    written = sorted(path for path in Path().iterdir()
-                     if before.get(path) != path.stat().st_mtime_ns)
+    written = sorted(path for path in Path().rglob('*') if not path.is_dir()
+                     and before.get(path) != path.lstat().st_mtime_ns)
     return {'status': status, 'errors': errors.getvalue() if status == 2 else '',
-            **{path.name: _content(path) for path in written}}
+            **{str(path): _content(path) for path in written}}
 
 
 def _content(path: Path) -> Any:

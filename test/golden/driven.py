@@ -15,7 +15,7 @@ from accel_calib.messages import corrected, motion_of, output_frame, Rewriter
 from accel_calib.session import checks, state
 from accel_calib.units import units_of
 from driven import Driver
-from golden.figures import attempt, those
+from golden.figures import attempt, of_next_pose, those
 from golden.inputs import G, samples
 from inside import figures as health_figures, frame_ids, layout_with, Model, stamps_of
 import numpy as np
@@ -64,7 +64,9 @@ class _Driver(Driver):
         """Return progress, diagnostics, checks and poses."""
         drift = self.session.sensor.drift
         return [state.progress(self.session.state), dict(health_figures(self.session.state)),
-                checks(self.session.state), self.shown, self.session.sensor.live.book.poses(),
+                checks(self.session.state), self.shown and {
+                    **those(self.shown, 'up frame_id'), 'asked': of_next_pose(self.shown.asked)},
+                self.session.sensor.live.book.poses(),
                 drift and {'covariance': drift.calibration.covariance, **those(
                     drift, 'repeats temperatures rests count scatter change since without')}]
 

@@ -7,21 +7,27 @@ from collections.abc import Callable
 from typing import Any
 
 from accel_calib.calibration import (
-    Calibration, fit_partial, fit_poses, in_g, mounting_only, outlook, outside, verify,
-    with_history)
+    Calibration, fit_partial, fit_poses, in_g, mounting_only, NextPose, Outlook, outlook, outside,
+    verify)
 from accel_calib.comparison import Drift
+from accel_calib.effects import add_history
 from accel_calib.errors import AccelCalibError
 from accel_calib.estimate import estimate, Fit, judge
-from accel_calib.findings import Expected, rate
+from accel_calib.findings import Expected, plan_lines, rate, request_words
+from accel_calib.geometry import attitude_words
 from accel_calib.refinement import refine
 from accel_calib.table import Poses
 from accel_calib.units import Units
 from inside import (
-    carried, kinds, Linear, Model, probabilities, repeatability_of, rotation_free, search_effects,
-    Set, spread_directions, unseen_mistakes)
+    kinds, Linear, Model, probabilities, repeatability_of, rotation_free, search_effects, Set,
+    spread_directions, unseen_mistakes)
 import numpy as np
 
 UP = spread_directions(4)
+
+_OF_A_STEP = ('effect rivals probabilities data_probabilities parameters parameters_sd '
+              'gap_before_mg gap_after_mg held_out_before_mg held_out_after_mg p_value name '
+              'formula variable')
 
 
 def attempt(function: Callable[..., Any], *given: Any, **options: Any) -> Any:
@@ -65,7 +71,7 @@ def of_calibration(calibration: Calibration) -> dict[str, Any]:
         **those(calibration, 'name method units sensor frame rotation offset gain offset_sd '
                 'gain_sd ranges quality rejected reason warnings gyro noise'),
         'values': by_effect(calibration.model, calibration.covariance),
-        'rating': rate(calibration), 'outlook': outlook(calibration),
+        'rating': rate(calibration), 'outlook': _ahead(outlook(calibration)),
         'expected': of_expected(Expected(calibration)),
         'reading': attempt(calibration.predict, force, known),
         'force': attempt(calibration.correct, units.from_g(UP), wide),
@@ -74,8 +80,18 @@ def of_calibration(calibration: Calibration) -> dict[str, Any]:
             **those(free, 'values axes'), 'slope': np.linalg.norm(free.slope, axis=1)},
         'repeatability': (those(repeatability_of(calibration), 'chi2 dof stated belief')
                           if effects else ''),
-        'repeats': Drift(calibration).repeats ** 0.5, 'outside': outside(calibration, wide),
-        'partial': carried(calibration) if calibration.method == 'prior' and effects else ''}
+        'repeats': Drift(calibration).repeats ** 0.5, 'outside': outside(calibration, wide)}
+
+
+def _ahead(ahead: Outlook) -> dict[str, Any]:
+    """Return what the poses of a calibration determine, and the next pose in words."""
+    return {**those(ahead, 'identifiability uncertainty_mg'),
+            'next_pose': of_next_pose(ahead.next_pose)}
+
+
+def of_next_pose(asked: NextPose) -> dict[str, Any]:
+    """Return the next pose, and what is asked for."""
+    return {**those(asked, 'direction error total fits'), 'words': request_words(asked)}
 
 
 def of_expected(expected: Expected) -> dict[str, Any]:
@@ -109,15 +125,19 @@ def fits(poses: Poses, units: Units, *asked: str) -> dict[str, Any]:
 def refined(poses: Poses, units: Units, base: str) -> dict[str, Any]:
     """Return the figures of a refinement."""
     found = refine(poses, units, base=base)
-    return {**those(found, 'verdict gap_mg remaining_gap_mg steps advice refusal '
-                    'stages plan force'), 'calibration': of_calibration(found.calibration)}
+    return {**those(found, 'verdict gap_mg remaining_gap_mg advice refusal stages force'),
+            'steps': [{**those(step, _OF_A_STEP), 'where': step.where} for step in found.steps],
+            'plan': {'lines': plan_lines(found.plan), 'poses': [
+                {**those(each, 'up context separates expected'),
+                 'words': attitude_words(np.array(each.up))} for each in found.plan.poses]},
+            'calibration': of_calibration(found.calibration)}
 
 
 def searched(poses: Poses, units: Units, base: str) -> dict[str, Any]:
     """Return what a search found near its final model, with the table of candidates."""
     calibration = fit_poses(poses, units, model=base)
     model = Model(calibration.model.values)
-    found = search_effects(with_history(in_g(poses, calibration.units), model), model)
+    found = search_effects(add_history(in_g(poses, calibration.units), model), model)
     near, linear, chosen = found.near, found.near.chosen.linear, found.near.chosen
     gain, rank = chosen.gains()
     walk = linear.choice * (linear.penalty > 0.0)
@@ -165,7 +185,7 @@ def _visible(linear: Linear) -> dict[str, float]:
 
 def solved(poses: Poses, units: Units, *effects: str) -> dict[str, Any]:
     """Return the fit of any effects to the poses, and their equations before it."""
-    poses_g = with_history(in_g(poses, units), Model({}))
+    poses_g = add_history(in_g(poses, units), Model({}))
     start = Model({name: np.zeros(1 if name == 'gain' else 3) for name in effects})
     return {'kinds': kinds(poses_g), 'start': of_fit(judge(start, poses_g)),
             'fit': of_fit(estimate(start, poses_g))}

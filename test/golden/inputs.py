@@ -68,6 +68,17 @@ def fleet(path: Path) -> None:
     path.write_text(yaml.safe_dump(content), encoding='utf-8')
 
 
+def text(path: Path, *, content: str) -> None:
+    """Write a text, perhaps in a folder of its own."""
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(content, encoding='utf-8')
+
+
+def link(path: Path, *, to: str) -> None:
+    """Make a symbolic link."""
+    path.symlink_to(to)
+
+
 def real(path: Path, *, name: str) -> None:
     """Take a real recording; the test is skipped if it is missing."""
     path.symlink_to(data(name))

@@ -26,6 +26,7 @@ from typing import Any
 import accel_calib as ac
 from accel_calib.effects import EffectRecord
 from accel_calib.errors import AccelCalibError
+from accel_calib.finding import Finding, NextStep
 from accel_calib.table import Table
 import numpy as np
 
@@ -44,6 +45,9 @@ LEAST_P = 1e-6
 BY_EFFECT = ('candidates', 'visible')
 """Tables with a row per effect of the catalogue; a new effect adds a row, and changes no other."""
 
+OF_A_SESSION = ('about', 'command', 'direction')
+"""Fields of findings and steps that have a value while messages arrive, and not of results."""
+
 _WIDTH = 80
 _CHANGING = re.compile(r'\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d(\+00:00)?)?)?|'
                        + re.escape(ac.__version__))
@@ -57,8 +61,9 @@ def plain(value: Any) -> Any:
     if value is None or isinstance(value, bool | int):
         return value
     if isinstance(value, str | Path | EffectRecord):
-        text = _CHANGING.sub('…', str(value).replace(f'{Path.cwd()}/', ''))
-        return _SIGN_OF_ZERO.sub('', text)
+        here = str(Path.cwd())
+        text = str(value).replace(f'{here}/', '').replace(here, '.')
+        return _SIGN_OF_ZERO.sub('', _CHANGING.sub('…', text))
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else str(float(value))
     if isinstance(value, bytes):
@@ -70,7 +75,9 @@ def plain(value: Any) -> Any:
     if isinstance(value, Table):
         return {'rows': len(value), 'units': value.units, **plain(value.columns)}
     if is_dataclass(value):
-        value = {each.name: getattr(value, each.name) for each in fields(value)}
+        live = OF_A_SESSION if isinstance(value, Finding | NextStep) else ()
+        value = {each.name: getattr(value, each.name) for each in fields(value)
+                 if each.name not in live}
     if isinstance(value, Mapping) or hasattr(value, '_asdict'):
         items = value if isinstance(value, Mapping) else value._asdict()
         return {str(key): plain(max(each, LEAST_P) if key == 'p_value' else each)

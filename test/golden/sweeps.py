@@ -21,12 +21,13 @@ from accel_calib.geometry import coverage
 from accel_calib.table import check_units, numbered, Poses
 from accel_calib.units import FRAMES, units_of
 from golden.driven import messages
-from golden.figures import attempt, of_expected, of_fit, those
+from golden.figures import attempt, of_expected, of_fit, of_next_pose, those
 from inside import (
-    axes_of, believable, change, distinct, doubts_about_flat, equations, fault_of, is_over,
-    measured, missing_poses, Model, mounting, mounting_figures, on_one_scale, originals, outlier,
-    p_values, posterior, refuse_if_unfit, Repeatability, rounding_left, Runs, sampled, shape_words,
-    sound_rows, spread_directions, unit, unseen, with_heading, without_knocked)
+    axes_of, believable, change, distinct, doubts_about_flat, equations, fault_of,
+    find_undetermined, is_over, measured, missing_poses, Model, mounting, mounting_figures,
+    on_one_scale, originals, outlier, p_values, posterior, refuse_if_unfit, Repeatability,
+    rounding_left, Runs, sampled, shape_words, sound_rows, spread_directions, unit, with_heading,
+    without_knocked)
 import numpy as np
 
 G, MS2, NATIVE = units_of('g'), units_of('m/s2'), units_of('native')
@@ -80,12 +81,13 @@ def directions() -> Any:
         return [dilution(model, up, noise), dilution(model, up), shape_words(model, up),
                 open_ if name != 'same' else open_.dilution, missing_poses(model, up),
                 attempt(refuse_if_unfit, model, up) if name != 'same' else '',
-                next_pose(up, model, noise, noise_g=1e-4)]
+                of_next_pose(next_pose(up, model, noise, noise_g=1e-4))]
 
     def whole(name: str) -> Any:
         up = sets[name]
         open_ = identifiability('10', up).undetermined
-        return [coverage(up), distinct(up), lies_in_cone(up), unseen('4', up) if open_ else '',
+        return [coverage(up), distinct(up), lies_in_cone(up),
+                find_undetermined('4', up) if open_ else '',
                 [error_left_in('4', larger, up) for larger in ('7', '10')]]
 
     return {**_grid(of, sets, ('4', '7', '10')), **_grid(of, ('faces', 'wide'), ('12',)),
