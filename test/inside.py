@@ -21,7 +21,7 @@ from accel_calib.api import in_units_of
 from accel_calib.calibration import Calibration, determines, posterior, refuse_if_unfit, sound_rows
 from accel_calib.calibration.directions import poses_needed, rows_of, shape_words
 from accel_calib.calibration.mounting import (
-    axes_of, doubts_about_flat, fault_of, mounting, with_heading, with_heading_of)
+    axes_of, doubts_about_flat, fault_of, mounting, with_heading)
 from accel_calib.calibration.partial import common_sensors, without_knocked
 from accel_calib.calibration.planning import choose_levels, find_undetermined, missing_poses
 from accel_calib.cli.commands import COMMANDS, HIDDEN as DEMO_CHOICES, parser
@@ -29,7 +29,7 @@ from accel_calib.cli.main import main
 from accel_calib.cli.nodes import changes, screen, state
 from accel_calib.cli.options import in_one_line
 from accel_calib.cli.output import Output, shown
-from accel_calib.comparison import NAMES as PARAMETER_NAMES, rotation_free
+from accel_calib.comparison import rotation_free
 from accel_calib.comparison.agreement import (
     on_one_scale, outlier, p_values, Repeatability, repeatability_of, Runs)
 from accel_calib.comparison.drift import change, is_over, MEMORY as DRIFT_MEMORY
@@ -53,8 +53,7 @@ from accel_calib.fleet.recording import (
 from accel_calib.fleet.run import mapped
 from accel_calib.fleet.sensors import alike, drift_of, merge_sensor, write_parquet
 from accel_calib.geometry import (
-    attitude_words, distinct, OVER_THE_SPHERE, quaternion_of, rotation_from_rpy, spread_directions,
-    unit, words_of)
+    distinct, OVER_THE_SPHERE, quaternion_of, rotation_from_rpy, spread_directions, unit, words_of)
 from accel_calib.live import sources
 from accel_calib.live.sources import _interval as interval_of_lines, is_port, open_source, Source
 from accel_calib.logs import bag_samples, child, layout_with, LogOptions, open_bag, open_log, text
@@ -72,19 +71,19 @@ from accel_calib.refinement import base as refine_base
 from accel_calib.refinement.base import clipped, grid_step, off_grid, sampled, unclipped
 from accel_calib.refinement.beam import accepted, explored, reshaped
 from accel_calib.refinement.curves import (
-    _grown as grown_curve, _rss_beside as rss_beside, best_curve, FoundCurve, Near, probabilities,
-    Process, process_of, SIGNIFICANT, Walk, walk_beside)
+    _grown as grown_curve, _rss_beside as rss_beside, FoundCurve, Near, probabilities, Process,
+    process_of, SIGNIFICANT, Walk, walk_beside)
 from accel_calib.refinement.linear import (
-    _RARE as RARE, Block, LEVEL as REFINE_LEVEL, Linear, outside_of, Set, with_outliers)
+    _RARE as RARE, Block, LEVEL as REFINE_LEVEL, Linear, outside_of, Set)
 from accel_calib.refinement.search import (
     _is_better as is_better_than_walk, _less as less, search as search_effects)
 from accel_calib.refinement.state import beginning, candidates, fitted_state, linearised, WORTH
 from accel_calib.refinement.steps import remarks_on
 from accel_calib.report.page import axis_figures
 from accel_calib.report.refinement import all_drawings, curve_parts
-from accel_calib.report.residuals import residuals_of, residuals_of_refinement
+from accel_calib.report.residuals import residuals_of
 from accel_calib.report.sheet import page as page_of
-from accel_calib.report.stability import comparison_page, history_page
+from accel_calib.report.stability import comparison_page
 from accel_calib.ros.run import own_domain
 from accel_calib.session import store as session_store, worker
 from accel_calib.session.commands import poses_changed
@@ -103,8 +102,7 @@ from accel_calib.session.use import adopt as use_calibration
 from accel_calib.session.worker import Worker, WorkerProcess
 from accel_calib.stillness import rounding_left
 from accel_calib.stillness.chunks import repeated_extremes
-from accel_calib.stillness.trend import (
-    _long_run as long_run, excess_of_means, lines_through, oscillation)
+from accel_calib.stillness.trend import _long_run as long_run, excess_of_means, lines, oscillation
 from accel_calib.stored import calibration_yaml, plain_yaml
 from accel_calib.stored.calibration_yaml import calibration_bytes, calibration_from
 from accel_calib.stored.exports import (

@@ -28,6 +28,7 @@ from accel_calib.units import units_of
 from inside import COMMAND, main, Model, model_with, OVER_THE_SPHERE, predict, spread_directions
 import numpy as np
 import pytest
+import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / 'shared' / 'data'
@@ -51,6 +52,12 @@ KNOWN = {'offset': [0.03, -0.02, 0.04], 'axis_gain': [0.012, -0.015, 0.008],
 OPTIONS = [part for name, values in SENSOR.items()
            for part in ('--effect', f'{name}={",".join(map(str, values))}')]
 """Options of ``simulate`` for this sensor."""
+
+
+def table(name: str) -> Any:
+    """Return the rows of a table of the corpus."""
+    path = ROOT / 'test' / 'corpus' / 'tables' / f'{name}.yaml'
+    return yaml.safe_load(path.read_text(encoding='utf-8'))
 
 
 def data(name: str) -> Path:

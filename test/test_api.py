@@ -110,16 +110,6 @@ def test_a_data_frame_has_times_as_dates_too():
                                    atol=2e-3)
 
 
-def test_samples_without_times_are_refused():
-    pandas = pytest.importorskip('pandas')
-    recording = ac.simulate(SENSOR, recording=True, poses=6, seed=3)
-    frame = pandas.DataFrame(recording.reading, columns=['ax', 'ay', 'az'])
-    for given in (frame, recording.reading):
-        with pytest.raises(InputError, match='look like samples of a recording'):
-            ac.fit(given)
-    assert len(ac.capture(frame, rate=100.0)) == 6
-
-
 def test_a_log_is_calibrated_in_one_call(tmp_path):
     recording = ac.simulate(SENSOR, recording=True, poses=20, seed=3)
     path = tmp_path / 'log.csv'
@@ -260,12 +250,6 @@ def test_bad_input_is_refused_in_one_line(call, message, poses):
 @pytest.fixture(scope='module')
 def refinement(warm_poses: ac.Poses) -> ac.Refinement:
     return ac.refine(warm_poses, base='10')
-
-
-def test_stages_are_the_residuals_behind_the_gap(refinement: ac.Refinement) -> None:
-    assert [each.name for each in refinement.stages] == ['base', 'offset_temperature']
-    rms = [np.sqrt(np.mean(each.residual_mg ** 2)) for each in refinement.stages]
-    assert rms == pytest.approx([refinement.gap_mg, refinement.remaining_gap_mg])
 
 
 def test_a_context_is_the_middle_of_the_ranges_at_rest_or_held_at_their_limits(

@@ -11,14 +11,12 @@ the readings of the sensor.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 import re
 from typing import Any
 
 from accel_calib.calibration import Calibration, fit_poses
 from accel_calib.errors import DamagedCalibrationError
-from accel_calib.logs import write_table
 from accel_calib.stillness import capture
 from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import Autopilot, Recording
@@ -324,12 +322,3 @@ def test_the_place_in_the_autopilot_is_checked_and_not_that_of_a_corrected_copy(
     stored.write_text(text.replace('firmware: ardupilot', 'firmware: 7'))
     with pytest.raises(DamagedCalibrationError, match='autopilot'):
         read_calibration(stored)
-
-
-@pytest.mark.parametrize('stated', ['{"firmware": "other"}', '{"firmware": "px4", "instance": []}',
-                                    '"px4"', '{"no": 1}', '[1]'])
-def test_a_comment_that_is_no_place_in_an_autopilot_is_a_comment(stated, raw, tmp_path):
-    path = tmp_path / 'table.csv'
-    write_table(path, replace(raw, units='g'))
-    path.write_text(f'# autopilot: {stated}\n{path.read_text()}')
-    assert read_log(path).table.autopilot is None

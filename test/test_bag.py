@@ -311,13 +311,6 @@ def test_a_topic_without_messages_is_reported_in_one_line(make, tmp_path):
     check_refused(path, 'has no message on /imu/a', '/imu/a')
 
 
-def test_messages_of_one_receipt_have_no_rate(tmp_path):
-    path = write(tmp_path, 'mcap', [(topic, START, raw) for topic, _, raw in messages(12)])
-    with open_log(path, LogOptions(topic='/imu/a')) as stream:
-        assert '/imu/a' in stream.read_as
-        assert 'Hz' not in stream.read_as
-
-
 def test_poses_do_not_depend_on_the_size_of_blocks(recording, tmp_path, monkeypatch):
     path = write_bag(tmp_path / 'in', 'mcap', recording)
     whole = capture(read_recording(path), UNITS)

@@ -222,10 +222,3 @@ def test_a_bag_is_corrected_with_a_named_temperature(
     assert main(given) == 2
     assert main([*given, '--context', 'temperature:=/imu/temp']) == 0
     assert 'corrected 400 samples' in capsys.readouterr().out
-
-
-def test_a_calibration_without_temperature_needs_no_topic(tmp_path: Path) -> None:
-    path = write(tmp_path, {'/imu/temp': ('std_msgs/msg/Float64', warming)})
-    notes: list[str] = []
-    assert correct_bag(path, known('g'), tmp_path / 'out', note=notes.append) == COUNT
-    assert notes == []

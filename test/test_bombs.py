@@ -169,13 +169,6 @@ def test_blocks_of_large_messages_are_short(tmp_path: Path) -> None:
     assert max(sizes) <= 64
 
 
-def test_data_that_compress_well_are_read(tmp_path: Path) -> None:
-    black = [(2, RAWS[0][1] + k, bytes(8 << 20)) for k in range(4)]  # pictures
-    path = McapFile(TOPICS, 'zstd', chunk=16 << 20).write(tmp_path / 'bag.mcap', [*RAWS, *black])
-    assert len(read_recording(path)) == COUNT
-    assert correct_bag(path, shared.known(), tmp_path / 'out') == COUNT
-
-
 def test_correcting_leaves_a_database_as_it_is_and_refuses_a_copy_that_lacks_messages(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write, count = rosbag2.Writer.write, iter(range(10 ** 6))
@@ -242,12 +235,3 @@ def test_a_pipe_ends_every_command_in_one_line(
         '{}', str(pipe)) for each in command]
     assert '(FIFO)' in shared.refused(capsys, *given).partition(str(pipe))[2]
     assert not out.exists()
-
-
-@pytest.mark.parametrize('name', ['bag.mcap', 'metadata.yaml'])
-def test_a_pipe_in_the_folder_of_a_bag_is_refused(name: str, tmp_path: Path) -> None:
-    path = folder_of(StoragePlugin.MCAP)(tmp_path)
-    (path / name).unlink()
-    os.mkfifo(path / name)
-    with pytest.raises(InputError, match=f'{name} is a pipe'):
-        read_recording(path)

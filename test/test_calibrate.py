@@ -3,14 +3,16 @@
 
 """One command from any log to a calibration, a page and a verdict."""
 
+from dataclasses import replace
 import json
 
 import accel_calib as ac
+from accel_calib.errors import RefusedFitError
 from accel_calib.stored import read_calibration
-from inside import are_samples
+from inside import are_samples, calibrated_by, FitPlan, is_partial
 import numpy as np
 import pytest
-from shared import data, OPTIONS, random_directions, run, run_on_small_disk, SENSOR
+from shared import data, MPS2, OPTIONS, random_directions, run, run_on_small_disk, SENSOR
 
 
 def calibrated(capsys, *arguments):
@@ -41,21 +43,6 @@ def test_a_recording_becomes_a_calibration_a_page_and_a_verdict(recording, tmp_p
     np.testing.assert_allclose(stored.apply(stored.poses.reading[0]), (0, 0, 9.80665), atol=0.05)
     np.testing.assert_allclose(stored.offset, result['offset'])
     assert 'GOOD' in (tmp_path / 'c.html').read_text(encoding='utf-8')
-
-
-@pytest.mark.usefixtures('without_pages')
-def test_a_hidden_effect_is_added_unless_it_is_not_wanted(tmp_path, capsys):
-    path = tmp_path / 'poses.csv'
-    run('simulate', '-o', path, '--poses', 60, *OPTIONS, '--effect',
-        'quadratic=0.004,0.003,-0.004')
-    _, found, lines = calibrated(capsys, path, '-o', tmp_path / 'c.yaml')
-    assert found['refined'].startswith('refined with quadratic')
-    assert 'quadratic' in read_calibration(tmp_path / 'c.yaml').model.effects
-    assert [step['effect'] for step in found['refinement']['steps']] == ['quadratic']
-    _, plain, _ = calibrated(capsys, path, '-o', tmp_path / 'd.yaml', '--no-refine')
-    assert plain['refinement'] is None
-    assert 'quadratic' not in read_calibration(tmp_path / 'd.yaml').model.effects
-    assert any(found['refined'][:20] in line for line in lines)
 
 
 def bent(path, *, bend_mg):
@@ -128,3 +115,33 @@ def test_a_page_or_calibration_that_does_not_fit_on_the_disk_is_one_line(
     assert 'No space left' in (done.stderr if status else done.stdout)
     assert [each.name for each in copy.iterdir()] == left
     assert all(read_calibration(copy / name).name for name in left)
+
+
+# The plan of a fit beside a calibration that is in use
+
+PLAN = FitPlan(model='10', refined=False)
+
+
+def test_frame_and_mounting_of_the_calibration_in_use_are_kept() -> None:
+    first, second = (ac.simulate(SENSOR, poses=16, seed=seed) for seed in (1, 2))
+    assert not calibrated_by(second, MPS2, PLAN).calibration.is_levelled
+    before = calibrated_by(first, MPS2, replace(PLAN, flat=3, frame='android')).calibration
+    after = calibrated_by(second, MPS2, replace(PLAN, before=before)).calibration
+    assert after.frame == before.frame
+    np.testing.assert_allclose(after.rotation, before.rotation, atol=1e-3)
+    moved = calibrated_by(second, MPS2, replace(PLAN, before=before, flat=5)).calibration
+    assert np.max(np.abs(moved.rotation - before.rotation)) > 0.1
+
+
+def test_poses_near_one_direction_are_fitted_if_planned_and_replace_no_full_fit() -> None:
+    tilts = np.array([[0, 0], [0.25, 0], [-0.2, 0.1], [0, 0.25], [0.1, -0.25], [-0.15, -0.2]])
+    cone = ac.simulate(SENSOR, directions=np.column_stack([tilts, np.ones(len(tilts))]))
+    with pytest.raises(RefusedFitError):
+        calibrated_by(cone, MPS2, PLAN)
+    partial = calibrated_by(cone, MPS2, replace(PLAN, partial=True)).calibration
+    assert is_partial(partial)
+    again = calibrated_by(cone, MPS2, replace(PLAN, partial=True, before=partial)).calibration
+    assert is_partial(again)
+    full = calibrated_by(ac.simulate(SENSOR, poses=16), MPS2, PLAN).calibration
+    with pytest.raises(RefusedFitError):
+        calibrated_by(cone, MPS2, replace(PLAN, partial=True, before=full))

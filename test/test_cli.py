@@ -11,9 +11,7 @@ import shutil
 import sys
 
 from accel_calib.stillness import CaptureSettings
-from accel_calib.stored import read_calibration
-from inside import (
-    CALIBRATOR, COMMAND, COMMANDS, main, parser, rotation_from_rpy, spread_directions)
+from inside import CALIBRATOR, COMMAND, COMMANDS, main, parser, spread_directions
 import numpy as np
 import pytest
 from shared import forked, LOGS, OPTIONS, python, refused, run, run_json
@@ -37,30 +35,6 @@ def poses(made, tmp_path):
 @pytest.fixture
 def calibration(poses, made, tmp_path):
     return Path(shutil.copy(made / 'calibration.yaml', tmp_path))
-
-
-@pytest.mark.parametrize('model', ['auto', '7', '9', '10'])
-def test_fit_reports_the_next_pose_until_more_poses_no_longer_help(model, tmp_path, capsys):
-    few, many = tmp_path / 'few.csv', tmp_path / 'many.csv'
-    run('simulate', '-o', few, '--poses', 12)
-    run('simulate', '-o', many, '--poses', 30)
-    asked = run_json(capsys, 'fit', few, '--model', model)[1]['next_pose']
-    assert asked['words'].startswith('turn the sensor so that the ')
-    assert np.linalg.norm(asked['direction']) == pytest.approx(1.0)
-    result = run_json(capsys, 'fit', many, '--model', model)[1]
-    assert result['next_pose'] is None
-    assert run('fit', many, '--model', model) == 0
-    assert (f'next pose: more poses no longer help: 30 poses determine |a| to within '
-            f'{result["uncertainty_mg"]:.2g} mg' in capsys.readouterr().out) or model == 'auto'
-
-
-def test_flat_row_is_levelled_even_when_it_is_not_fitted(tmp_path, capsys):
-    path = tmp_path / 'poses.csv'
-    run('simulate', '-o', path, *OPTIONS, '--mounting', 20, -30, 0, '--poses', 30)
-    status, result = run_json(capsys, 'fit', path, '--rows', '2:30', '--flat', 1)
-    assert (status, result['poses_used']) == (0, 29)
-    expected = rotation_from_rpy(*np.radians((20, -30, 0)))[2]
-    np.testing.assert_allclose(np.array(result['rotation'])[:, 2], expected, atol=2e-3)
 
 
 def test_several_tables_return_a_list_in_their_order(tmp_path, capsys):
@@ -218,18 +192,6 @@ def test_a_defect_is_one_line_with_the_details_in_a_file(tmp_path, monkeypatch, 
     details, = tmp_path.glob('accel_calib-*.txt')
     assert str(details) in error
     assert 'Traceback' in details.read_text(encoding='utf-8')
-
-
-def test_a_refinement_is_printed_and_stored(tmp_path, capsys):
-    poses, stored = tmp_path / 'poses.csv', tmp_path / 'refined.yaml'
-    run('simulate', '-o', poses, *OPTIONS, '--effect', 'quadratic=0.006,-0.004,0.005', '--poses',
-        60)
-    assert run('refine', poses, '-o', stored, '--sensor', 'imu_link') == 0
-    printed = capsys.readouterr().out
-    for words in ('quadratic', 'square of the force', ' up', '->', 'p < ', 'GOOD',
-                  'only noise remains', 'these data cannot show'):
-        assert words in printed
-    assert read_calibration(stored).sensor == 'imu_link'
 
 
 def test_the_report_has_a_page_and_figures(poses, tmp_path):

@@ -6,20 +6,16 @@
 from dataclasses import replace
 from typing import Any
 
-from accel_calib.calibration import Calibration, fit_poses, level
+from accel_calib.calibration import Calibration, fit_poses
 from accel_calib.comparison import compare, compared, Drift, history_of, rest_errors, status
 from accel_calib.estimate import estimate
-from accel_calib.logs import read_recording
-from accel_calib.stillness import capture
 from accel_calib.table import Floats, Poses
-from accel_calib.units import units_of
 from inside import (
-    DRIFT_MEMORY, model_with, on_one_scale, PARAMETER_NAMES, predict, repeatability_of,
-    rotation_free, rotation_from_rpy, Runs, simulate_poses, spread_directions, unit, with_vector)
+    DRIFT_MEMORY, model_with, predict, rotation_free, rotation_from_rpy, simulate_poses,
+    spread_directions, with_vector)
 import numpy as np
 import pytest
-from scipy.linalg import block_diag
-from shared import data, G, random_directions, sensor
+from shared import G, random_directions, sensor
 
 
 def attitudes(rng, count):
@@ -72,25 +68,6 @@ def test_runs_whose_poses_repeat_worse_than_their_samples_agree(count, differs):
     assert alarms <= 2
 
 
-def test_a_covariance_beside_a_scatter_keeps_its_own_scale():
-    runs = scattering_runs(0, 40, 1.0)
-    scaled = on_one_scale([repeatability_of(run) for run in runs]).covariances
-    for run, covariance in zip(runs, scaled, strict=True):
-        np.testing.assert_array_equal(covariance, run.covariance)
-
-
-def test_the_spread_of_twenty_runs_matches_their_uncertainty():
-    rng = np.random.default_rng(1001)
-    found = compare(runs_of(sensor(rng), rng, 20, 24))
-    assert found.agree
-    assert found.dof == 19 * 9
-    assert found.chi2 == pytest.approx(found.dof, rel=0.4)
-    assert tuple(one.name for one in found.parameters) == PARAMETER_NAMES
-    assert np.mean([one.ratio for one in found.parameters]) == pytest.approx(1.0, abs=0.2)
-    assert np.mean([run.rms_mg / run.expected_mg for run in found.runs]) == pytest.approx(
-        1.0, abs=0.2)
-
-
 @pytest.mark.parametrize('axis', [0, 1, 2])
 def test_a_change_of_1_mg_in_one_run_is_found_and_the_run_is_named(axis):
     rng = np.random.default_rng(axis)
@@ -104,20 +81,6 @@ def test_a_change_of_1_mg_in_one_run_is_found_and_the_run_is_named(axis):
     assert min(found.runs, key=lambda run: run.p_value) is found.runs[3]
     assert abs(found.runs[3].direction[axis]) > 0.8
     assert found.runs[3].largest_mg == pytest.approx(1.0, abs=0.6)
-
-
-def test_rotation_free_parameters_are_those_of_any_axes():
-    rng = np.random.default_rng(3)
-    poses = simulate_poses(sensor(rng), attitudes(rng, 20), rng)
-    nine, ten = (fit_poses(poses, G, model=name) for name in ('9', '10'))
-    turned = level(nine, poses.reading[4], 'ros')
-    free = [rotation_free(run, {}, 1.0) for run in (nine, ten, turned)]
-    for other in free[1:]:
-        np.testing.assert_allclose(other.values, free[0].values, atol=1e-7)
-    spread = [one.slope @ run.covariance @ one.slope.T
-              for one, run in zip(free, (nine, ten), strict=False)]
-    np.testing.assert_allclose(spread[0], spread[1], rtol=1e-3, atol=1e-12)
-    np.testing.assert_allclose(np.sqrt(np.diag(spread[1])[:3]), ten.offset_sd, rtol=1e-6)
 
 
 @pytest.mark.parametrize('per_g', [1.0, 4.0])
@@ -141,24 +104,6 @@ def test_a_smaller_model_is_taken_as_exact_if_its_poses_determine_no_larger_one(
     assert found.agree
     assert found.dof == 9
     assert any('gain.xy, gain.xz, gain.yz' in note.partition('run 1')[2] for note in found.notes)
-
-
-@pytest.mark.parametrize('exact', [(), ((0, 1), (0, 2)), ((0, 1), (1, 1), (2, 1), (3, 1))])
-def test_squared_differences_are_those_of_all_contrasts(exact):
-    rng = np.random.default_rng(len(exact))
-    count, size = 4, 3
-    factors = rng.normal(size=(count, size, size)) * 1e-3
-    for run, row in exact:
-        factors[run, row] = 0.0
-    covariances = factors @ np.swapaxes(factors, 1, 2)
-    values = 1.0 + np.einsum('nij,nj->ni', factors, rng.normal(size=(count, size)))
-    contrasts = np.kron(np.eye(count)[1:] - np.eye(count)[:1], np.eye(size))
-    away = contrasts @ values.ravel()
-    matrix = contrasts @ block_diag(*covariances) @ contrasts.T
-    chi2, rank = Runs(values, covariances, np.inf).squared
-    assert rank == np.linalg.matrix_rank(matrix, hermitian=True)
-    np.testing.assert_allclose(chi2, away @ np.linalg.pinv(matrix, hermitian=True) @ away,
-                               rtol=1e-4)
 
 
 def test_a_history_compares_each_pair_with_the_uncertainty_of_the_largest_model():
@@ -256,19 +201,6 @@ def test_one_or_two_knocks_are_not_a_change(knock: float) -> None:
     assert watched.rest([UP] * 6).change is None
 
 
-def test_undetermined_parameters_are_not_a_change() -> None:
-    watched = Watched(3)
-    near_faces = np.vstack([np.eye(3), -np.eye(3)] * 3)
-    watched.calibrate(unit(near_faces + 0.04 * watched.rng.normal(size=(18, 3))), 0.01)
-    fresh, between = watched.state, np.array([1.0, 1.0, 1.0]) / np.sqrt(3.0)
-    state = watched.rest(between)
-    assert state.stated > 0.003
-    off = (3.0 * state.stated - state.rests[0].error) * between
-    for times, changed in ((1.0, False), (4.0, True)):
-        watched.state = fresh
-        assert (watched.rest([between] * 50, times * off).change is not None) is changed
-
-
 def test_offset_and_gain_are_distinguished_where_the_attitudes_allow() -> None:
     watched, faces = Watched(4, poses=36), np.vstack([np.eye(3), -np.eye(3)])
     fresh, moved = watched.state, np.array([0.004, -0.006, 0.005])
@@ -297,40 +229,12 @@ def test_change_clears_only_when_rests_clearly_read_1_g_again() -> None:
     assert (state.change, state.since, state.lasted) == (None, 0, 0)
 
 
-@pytest.mark.parametrize('seed', range(5))
-def test_a_lasting_change_is_reported_once_and_with_one_cause(seed: int) -> None:
-    watched, reports, clear = Watched(seed), 0, set()
-    for up in random_directions(60, watched.rng):
-        before = watched.state.change
-        change = watched.rest(1.015 * up).change
-        reports += (before is None) is not (change is None)
-        if change is not None and change.clear:
-            clear.add(change.kind)
-    assert reports == 1
-    assert clear <= {'gain'}
-
-
 def test_sensor_that_repeats_worse_than_stated_is_not_reported_as_changed() -> None:
     watched = Watched(6, noise=0.0001)
     for up in random_directions(1000, watched.rng):
         shift = np.sqrt(0.0003 ** 2 - 0.0001 ** 2) * watched.rng.normal(size=3)
         assert watched.rest(up, shift).change is None
     assert watched.state.scatter == pytest.approx(2.5, rel=0.5)
-
-
-def test_poses_that_repeat_badly_increase_the_stated_uncertainty() -> None:
-    watched = Watched(7, noise=0.0001)
-    reading = simulate_poses(watched.truth, spread_directions(36), watched.rng, noise_g=0.01,
-                             samples=100).reading
-    watched.calibrate(spread_directions(36), 0.001, reading=reading)
-    assert np.sqrt(watched.state.repeats) == pytest.approx(0.001, rel=0.3)
-    assert watched.rest(UP).stated > 0.0009
-
-
-def test_changes_too_small_to_matter_are_ignored() -> None:
-    watched = Watched(8, poses=60, noise=0.0001)
-    assert watched.rest([UP] * 20, 0.0008 * UP).change is None
-    assert watched.rest([UP] * 20, 0.0016 * UP).change is not None
 
 
 @pytest.mark.parametrize(('temperature', 'words'), [
@@ -345,21 +249,3 @@ def test_advice_names_the_temperature_where_it_changed(temperature: float, words
     assert ' differed by -' in line
     assert 'for 3 rests' in line
     assert line.endswith(words)
-
-
-@pytest.mark.parametrize(('name', 'unit_name'), [
-    ('mpu9150_imu0', 'm/s2'), ('mpu9150_imu1', 'm/s2'), ('xsens_mti_counts', 'native')])
-def test_real_rests_are_not_a_change_unless_shifted(name: str, unit_name: Any) -> None:
-    units = units_of(unit_name)
-    poses = capture(read_recording(data(f'{name}.csv')), units).poses
-    odd = np.arange(len(poses)) % 2 == 1
-    calibration, rests = fit_poses(poses.take(~odd), units, model='10'), poses.take(odd)
-    force = calibration.correct(rests.reading)
-    shift = calibration.predict(1.005 * force) - calibration.predict(force)
-    state = Drift(calibration)
-    for k in range(len(rests)):
-        state = after(state, calibration, rests.reading[k:k + 1], rests.noise[k:k + 1], {})
-        assert state.change is None
-    state = after(state, calibration, (rests.reading + shift)[:3], rests.noise[:3], {})
-    assert state.change is not None
-    assert state.lasted == 3

@@ -197,26 +197,6 @@ def test_a_container_without_a_table_to_read_is_refused_with_what_to_do(
         read_log(write(tmp_path, content))
 
 
-def test_an_archive_with_names_beyond_ascii_needs_no_password(tmp_path: Path) -> None:
-    text = 'time,ax,ay,az\n' + ''.join(f'{k / 50},0,{k % 2},9.8\n' for k in range(60))
-    assert len(read_log(zipped(tmp_path, {'acc_für_x': text})).table) == 60
-
-
-def test_an_export_without_gravity_is_refused_with_what_to_record(tmp_path: Path) -> None:
-    tables, _ = tables_of('phyphox')
-    del tables['Accelerometer']
-    with pytest.raises(InputError, match=r'log\.zip.*linear acceleration, gravity removed'):
-        read_log(zipped(tmp_path, tables))
-
-
-def test_a_long_name_in_a_damaged_archive_is_not_shown_whole(tmp_path: Path) -> None:
-    path = zipped(tmp_path, {60_000 * 'a': '1,2,3\n'})
-    path.write_bytes(path.read_bytes().replace(b'aaa', b'bbb', 1))
-    with pytest.raises(InputError, match='is damaged') as caught:
-        read_log(path)
-    assert len(str(caught.value)) < 1000
-
-
 def test_the_damage_of_a_sheet_is_stated_although_there_are_others(tmp_path: Path) -> None:
     tables, _ = tables_of('phyphox')
     path = written('xlsx', tmp_path, {**tables, 'Metadata Time': 'a,b\n1,2'})

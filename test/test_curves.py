@@ -7,17 +7,16 @@ import re
 
 from accel_calib.calibration import fit_poses
 from accel_calib.effects import (
-    CARRIERS, effect_named, EMPIRICAL, EmpiricalCurve, entry_of, formula_of, kind_of, MODES,
-    modes_of, VARIABLES)
+    CARRIERS, effect_named, EMPIRICAL, EmpiricalCurve, entry_of, formula_of, kind_of, modes_of,
+    VARIABLES)
 from accel_calib.findings import rate
 from accel_calib.refinement import refine
 from accel_calib.report import calibration_page
 from inside import (
-    beginning, best_curve, export, fitted_state, format_calibration, Model, model_with,
-    parse_calibration, predict, simulate_poses)
+    export, format_calibration, Model, model_with, parse_calibration, predict, simulate_poses)
 import numpy as np
 import pytest
-from shared import G, random_directions, sensor
+from shared import G, random_directions, sensor, table
 
 COUNT = 100
 CURVES = {
@@ -42,11 +41,6 @@ def hump(temperature):
     return 8e-3 * np.exp(-0.5 * ((temperature - 28.0) / 4.0) ** 2)
 
 
-def base_of(poses):
-    return beginning(poses, Model({name: np.zeros(3)
-                                   for name in ('offset', 'axis_gain', 'cross_axis')}))
-
-
 @pytest.mark.parametrize('variable', VARIABLES)
 @pytest.mark.parametrize(('carrier', 'part'), [
     *((carrier, '') for carrier in CARRIERS), ('gain', 'z'), ('cross_axis', 'yz')])
@@ -67,15 +61,7 @@ def test_the_text_of_a_curve_is_read_back(carrier, part, variable):
     assert effect.needs == (() if variable in ('force', 'direction') else (variable,))
 
 
-@pytest.mark.parametrize('name', [
-    'empirical', 'empirical-', 'empirical-offset', 'empirical-offset-time',
-    *(f'empirical-offset-time-{modes}' for modes in (
-        '', '0', f'{MODES + 1}', 'one', '-1', '1.5', '\u00b2', '1-1', '2-1')),
-    *(f'empirical-{parts}-1' for parts in (
-        'offset-count', 'offset-ax', 'mood-time', 'offset.q-time', 'offset.-time',
-        'offset.x.y-time', 'gain-force', 'gain-direction')),
-    *(f'empirical-force-direction-{degree}' for degree in (2, 7)), 'curve-offset-time-1',
-    'offset-time-1'])
+@pytest.mark.parametrize('name', table('no_curves'))
 def test_a_name_that_is_no_curve_is_refused(name):
     with pytest.raises(KeyError):
         effect_named(name)
@@ -91,13 +77,6 @@ def test_a_curve_is_constant_outside_of_its_range(name):
                       {variable: np.column_stack([at] * 3) if variable == 'std' else at})
     np.testing.assert_array_equal(reading[[0, 3]], reading[[1, 2]])
     assert np.max(np.abs(reading[2] - reading[1])) > 1e-3
-
-
-def test_a_curve_over_the_force_is_constant_beyond_1_g():
-    force = np.array([[1.0, -1.0, 0.2], [1.7, -3.0, 0.2]])
-    model = model_with({'empirical-offset-force-1-3': np.linspace(-3e-3, 4e-3, 6)})
-    added = predict(model, force, {}) - force
-    np.testing.assert_allclose(added[1], added[0], atol=1e-15)
 
 
 def test_a_gain_that_depends_on_the_direction_has_the_forms_of_its_degrees():
@@ -137,15 +116,6 @@ def test_a_nonlinearity_along_an_oblique_axis_is_described(oblique, form):
     assert re.search(r'<td>curve of force[^<]+</td><td>\d', page)
 
 
-def test_a_gain_of_all_degrees_has_each_of_them_once():
-    rng = np.random.default_rng(0)
-    curve = EmpiricalCurve('force', 'direction', tuple(modes_of('direction')))
-    values = rng.normal(size=len(curve.entry.parameters)) * 2e-3
-    model = Model({'offset': np.array([0.01, 0.02, 0.0]), curve: values})
-    poses = simulate_poses(model, random_directions(200, rng), rng, noise_g=3e-4, context={})
-    assert best_curve(base_of(poses), poses, ()).name == curve
-
-
 def test_the_values_of_a_curve_are_the_cosines_of_its_definition():
     name = 'empirical-offset.x-temperature-2-3'
     temperature = np.linspace(15.0, 35.0, 9)
@@ -157,62 +127,10 @@ def test_the_values_of_a_curve_are_the_cosines_of_its_definition():
     np.testing.assert_array_equal(added[:, 1:], 0.0)
 
 
-def test_a_curve_is_recovered_within_its_uncertainty():
-    def form(temperature):
-        share = (temperature - low) / (high - low)
-        return 5e-3 * np.cos(2.0 * np.pi * share) - 4e-3 * np.cos(5.0 * np.pi * share)
-
-    warm = with_curve(np.zeros_like)[0]['temperature']
-    low, high = np.min(warm), np.max(warm)
-    poses, truth = with_curve(form)
-    state = base_of(poses)
-    found = best_curve(state, poses, ())
-    curve = found.name
-    assert curve.changed in ('offset', 'offset.x')
-    assert (curve.variable, {2, 5} <= set(curve.modes), found.out) == ('temperature', True, ())
-    fit = fitted_state(Model({**state.model.values, curve: found.values}), poses).fit
-    at = {'temperature': np.linspace(low, high, 21)}
-    nothing = np.zeros((21, 3))
-    error = predict(fit.model, nothing, at)[:, 0] - predict(truth, nothing, at)[:, 0] - form(
-        at['temperature'])
-    basis = fit.model.basis(nothing, at).full[:, 0]
-    deviation = np.sqrt(np.einsum('np,pq,nq->n', basis, fit.covariance, basis))
-    assert np.max(np.abs(error) / deviation) < 4.0
-    assert np.max(deviation) < 5e-4
-
-
 @pytest.fixture(scope='module')
 def described():
     """Return the refinement of poses with a hump."""
     return refine(with_curve(hump)[0], G, base='10')
-
-
-def test_a_hump_over_the_temperature_is_located_and_described(described):
-    assert described.verdict == 'described'
-    (step,) = described.steps
-    assert step.effect == 'empirical'
-    assert all(words in step.where for words in ('offset', 'temperature', 'no known effect'))
-    assert step.p_value < 1e-6
-    assert step.held_out_after_mg < 0.5 * step.held_out_before_mg
-
-
-@pytest.mark.parametrize('scatter_g', [0.0, 2e-3])
-def test_noise_and_poses_that_repeat_badly_have_no_curve(scatter_g):
-    for seed in range(2):
-        poses, _ = with_curve(np.zeros_like, seed)
-        scatter = scatter_g * np.random.default_rng(seed).normal(size=(COUNT, 3))
-        poses = poses.with_columns(reading=poses.reading + scatter)
-        assert best_curve(base_of(poses), poses, ()) is None
-
-
-def test_a_curve_that_leaves_most_of_the_gap_is_not_added():
-    poses, _ = with_curve(hump)
-    along = poses.reading / np.linalg.norm(poses.reading, axis=1, keepdims=True)
-    unknown = np.random.default_rng(5).normal(size=(COUNT, 1)) * 2e-3 * along
-    poses = poses.with_columns(reading=poses.reading + unknown)
-    assert best_curve(base_of(poses), poses, ()) is not None
-    found = refine(poses, G, base='10')
-    assert (found.verdict, found.steps) == ('unexplained', ())
 
 
 def test_a_calibration_with_a_curve_is_stored_and_read_with_all_digits(described):

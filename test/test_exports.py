@@ -19,7 +19,7 @@ from inside import (
     rotation_from_rpy, simulate_poses, spread_directions)
 import numpy as np
 import pytest
-from shared import KNOWN as AFFINE, rms, run
+from shared import KNOWN as AFFINE, rms, run, table
 import yaml
 
 BY_AXIS = {name: AFFINE[name] for name in ('offset', 'axis_gain')}
@@ -147,27 +147,12 @@ def test_a_header_holds_the_temperature_in_the_range_of_the_poses(compiled):
                                    atol=3e-6 * 9.8)
 
 
-@pytest.mark.parametrize(('text', 'name'), [
-    ('calibration', 'calibration'), ('IMU left/2', 'imu_left_2'), ('9dof', 'accel_9dof'),
-    ('', 'accel'), ('*/', 'accel'), ('\u00fc', 'accel'), ('__a__', 'a'), ('x' * 99, 'x' * 40)])
+@pytest.mark.parametrize(('text', 'name'), table('identifiers'))
 def test_any_text_becomes_an_identifier(text, name):
     assert identifier(text) == name
 
 
-@pytest.mark.parametrize(('name', 'to', 'options', 'message'), [
-    *(('affine', 'c', {'name': name}, 'expected a letter')
-      for name in ('9', 'a b', 'a;', '_a', '\u00fc', 'a' * 42)),
-    ('counts', 'px4', {}, 'native readings, but .* m/s2'),
-    *(('counts', to, {}, 'native readings, but .* m/s2')
-      for to in ('ardupilot', 'realsense', 'openvins', 'dlio')),
-    ('affine', 'inav', {'counts_per_g': 1e6}, 'counts, expected at most 32767'),
-    ('affine', 'mpu6050', {'name': '*/'}, 'expected a letter'),
-    ('vast', 'mpu6050', {}, 'counts, expected at most 32767'),
-    ('counts', 'inav', {'counts_per_g': 65536.0}, 'iNav takes 1 to 8192'),
-    ('counts', 'inav', {'counts_per_g': 0.5}, 'iNav takes 1 to 8192'),
-    ('affine', 'px4', {'instance': 9}, '--instance is 9'),
-    ('affine', 'ardupilot', {'instance': 9}, '--instance is 9'),
-    ('affine', 'betaflight', {'counts_per_g': 1e6}, 'counts, expected at most 32767')])
+@pytest.mark.parametrize(('name', 'to', 'options', 'message'), table('export_refused'))
 def test_what_a_format_cannot_hold_is_refused(name, to, options, message):
     made = sensor_with({'offset': [20.0, 0.0, 0.0]}) if name == 'vast' else HEADERS[name]
     with pytest.raises(InputError, match=message):
@@ -249,19 +234,6 @@ def test_autopilots_correct_as_apply_does_if_there_is_no_cross_axis_gain(
     assert found.losses == ()
     _, force = by_autopilot(to, found.text_or_bytes, reading * factor, temperature, tmp_path)
     np.testing.assert_allclose(force, wanted * factor, atol=2e-5)
-
-
-@pytest.mark.parametrize(('to', 'instance', 'names'), [
-    ('px4', 2, ('CAL_ACC2_ID', 'TC_A2_ID')), ('ardupilot', 1, ('INS_ACC_ID',)),
-    ('ardupilot', 2, ('INS_ACC2_ID',)), ('ardupilot', 3, ('INS_ACC3_ID',))])
-def test_the_parameters_of_an_autopilot_have_its_instance_and_device(to, instance, names,
-                                                                     tmp_path):
-    made = sensor_with(BY_AXIS, THERMAL)
-    reading, temperature, wanted = samples(made)
-    text = text_of(made, to, instance=instance, device_id=2490378)
-    found, force = by_autopilot(to, text, reading, temperature, tmp_path, instance)
-    assert {found[name] for name in names} == {2490378}
-    np.testing.assert_allclose(force, wanted, atol=2e-5)
 
 
 @pytest.mark.parametrize('to', ['px4', 'ardupilot', 'betaflight'])
@@ -482,16 +454,6 @@ def test_json_and_npz_hold_everything(name):
     assert export(made, 'json').losses == ()
 
 
-def test_json_states_what_matrix_and_offset_leave_alone():
-    made = export(HEADERS['bending'], 'json')
-    found = json.loads(made.text_or_bytes)
-    reading = HEADERS['bending'].predict(spread_directions(300) * 9.80665)
-    forces = (reading - found['offset']) @ np.transpose(found['matrix'])
-    left = rms_mg(forces / 9.80665 - spread_directions(300))
-    assert f'leave {left:.2g} mg' in made.notes[0]
-    assert export(HEADERS['affine'], 'json').notes == ()
-
-
 @pytest.mark.parametrize('to', ['px4', 'ardupilot'])
 def test_the_loss_is_the_difference_that_the_written_values_leave(to, tmp_path):
     made, force = HEADERS['bending'], spread_directions(300)
@@ -503,29 +465,13 @@ def test_the_loss_is_the_difference_that_the_written_values_leave(to, tmp_path):
     assert f' leaves {left:.2g} mg' in found.losses[-1]
 
 
-@pytest.mark.parametrize(('effects', 'to', 'words'), [
-    ({'gain_temperature': [0.0005] * 3}, 'px4', 'PX4 has no gain that changes with temperature'),
-    ({'offset_temperature': [0.001] * 3}, 'imucal', 'imucal has no offset that changes with'),
-    ({'offset_temperature': [1e-3, 1e-3, 1e-3, 900.0, 0.0]}, 'c', 'C header has no lag (900 s)'),
-    ({'offset_drift': [0.01, 0.02, 0.01, 0.0]}, 'c', 'C header has no offset that drifts'),
-    ({'supply_ratio': [1.0, 0.1, 0.1, 0.1]}, 'c', 'C header has no offset and gain in proportion'),
-    ({'temperature_rate': [1.0] * 3}, 'c', 'C header has no offset in proportion to the rate'),
-    ({'hysteresis': [0.002] * 3}, 'c', 'C header has no offset that depends on the previous'),
-    ({'quadratic': [0.003] * 3}, 'imu_calib', 'imu_calib has no square of the force')])
+@pytest.mark.parametrize(('effects', 'to', 'words'), table('export_losses'))
 def test_effects_that_a_format_lacks_are_losses_in_numbers(effects, to, words):
     made = export(sensor_with(AFFINE if to != 'px4' else BY_AXIS, effects), to)
     assert len(made.losses) == 1
     assert made.losses[0].startswith(words)
     assert made.details[0].leaves_mg == pytest.approx(made.leaves_mg, rel=0.02)
     assert made.leaves_mg > 0.1
-
-
-def test_a_drift_is_exported_as_it_was_at_the_last_pose(compiled):
-    made = sensor_with(AFFINE, {'offset_drift': [0.01, 0.02, 0.01, 0.0]})
-    reading = samples(HEADERS['affine'])[0]
-    text = {'later': text_of(made, 'c', name='later')}
-    for found in compiled(text, [reading], [np.zeros(len(reading))]):
-        np.testing.assert_allclose(found[0], made.apply(reading, time=1e9), atol=3e-6 * 9.8)
 
 
 def test_the_mounting_is_a_loss_where_a_format_does_not_hold_it():
@@ -565,10 +511,3 @@ def test_the_command_writes_beside_the_calibration(to, stored, tmp_path, capsys)
     for line in wanted.losses:
         assert line in ' '.join(printed.err.split())
     assert f'stored in {path}' in ' '.join(printed.err.split())
-
-
-def test_the_command_writes_to_standard_output_and_its_losses_to_standard_error(stored, capfd):
-    assert run('export', stored, '--to', 'px4', '-o', '-') == 0
-    printed = capfd.readouterr()
-    assert printed.out == text_of(HEADERS['affine'], 'px4')
-    assert ' leaves 6.4 mg' in printed.err

@@ -224,22 +224,6 @@ def test_a_change_for_good_is_named_and_an_odd_calibration_is_not(
     assert single['date'].startswith('2026-02')
 
 
-def test_poses_that_do_not_determine_all_values_are_no_change(client: Any, tmp_path: Path) -> None:
-    folder = write_fleet(tmp_path / 'in', 1, 3)
-    few = folder / 'robot_0' / '2026-02-03.csv'
-    lines = few.read_text().splitlines()
-    few.write_text('\n'.join([*lines[:-14], *lines[-4:]]))
-    summary = run(client, found_in(folder), QUICK, Store(tmp_path / 'out'))
-    assert summary.counts == {'ok': 3}
-    rows = {Path(row['recording']).name: row for row in rows_of(tmp_path / 'out')}
-    assert [row['determined'] for row in rows.values()] == [True, False, True]
-    assert rows[few.name]['model'] == '4'
-    assert abs(rows[few.name]['gain.x'] - 1.004) > 5.0 * rows[few.name]['gain.x.sd']
-    (sensor,) = summary.sensors
-    assert (sensor['agree'], sensor['changes'], sensor['calibrations']) == (True, [], 2)
-    assert 'Not compared: 1 ' in page_of(tmp_path / 'out')
-
-
 def test_only_calibrations_with_the_effects_of_most_are_compared() -> None:
     def row(name: str, *more: str, **known: Any) -> dict[str, Any]:
         return {'calibration': name, 'determined': True,

@@ -19,7 +19,7 @@ from inside import (
     with_vector)
 import numpy as np
 import pytest
-from shared import error_mg, refused, rms, run_json
+from shared import error_mg, refused, rms, run_json, table
 
 IN_G = Units('g', 1.0)
 MEAN = np.array([0.010, -0.015, 0.030, 0.010, 0.012, -0.020, 0.004, 0.000, -0.003])
@@ -111,17 +111,7 @@ def test_files_keep_the_typical_values_and_what_was_fitted_with_them(
 
 
 @pytest.mark.parametrize(('old', 'new', 'words'), [
-    ('format: 1', 'format: 2', 'has format 2, expected 1'),
-    ('offset.x', 'offset.q', 'names are'),
-    ('mean:', 'mean_of:', "'mean'"),
-    ('models:', 'other:', "'models'"),
-    ('sensors: 40', 'sensors: -5', 'sensors is -5, expected 1 to'),
-    ('sensors: 40', f'sensors: {10**12}', 'sensors is 1000.*, expected 1 to'),
-    ('offset.x', 9000 * 'x', f'names are {100 * "x"}…, offset.y'),
-    ('sensors: 40', 'sensors: .inf', 'sensors is inf, expected a whole number'),
-    ('mean:\n  - ', 'mean:\n  - 1e308  # ', 'mean contains a number of more than 1 in magnitude'),
-    ('covariance:\n  - - ', 'covariance:\n  - - 1e308  # ', 'covariance contains a number of m'),
-    ('covariance:\n  - - ', 'covariance:\n  - - -', 'positive definite')])
+    *table('damaged_priors'), ('offset.x', 9000 * 'x', f'names are {100 * "x"}…, offset.y')])
 def test_a_damaged_file_is_refused(
         fleet: FleetPrior, tmp_path: Path, old: str, new: str, words: str) -> None:
     path = tmp_path / 'fleet.yaml'
@@ -145,19 +135,6 @@ def test_poses_that_carry_no_search_are_refined_to_the_fit_with_the_fleet(
     assert result.steps == ()
     assert all(each in result.advice[0] for each in ('6 poses', 'at least 9'))
     assert 'directions' in dict(result.not_testable)['quadratic']
-
-
-def test_a_refinement_with_the_fleet_finds_an_effect_beyond_it(fleet: FleetPrior) -> None:
-    rng = np.random.default_rng(8)
-    sensor = bent(a_sensor(rng))
-    poses = poses_of(sensor, 16, rng)
-    result = refine(poses, IN_G, base=fleet)
-    assert [step.effect for step in result.steps] == ['quadratic']
-    refined = result.calibration
-    assert refined.method == 'fleet'
-    assert error_mg(refined, sensor) < 0.2 * error_mg(fit_poses(poses, IN_G, model='10'), sensor)
-    deviation = np.sqrt(np.diag(refined.covariance))
-    assert rms((refined.model.vector - sensor.vector) / deviation) < 2.0
 
 
 @pytest.mark.usefixtures('without_pages')

@@ -7,7 +7,7 @@ import json
 from typing import Any
 
 from accel_calib.errors import RefusedFitError
-from accel_calib.session import enable, next_step, Surroundings
+from accel_calib.session import next_step, Surroundings
 from driven import Driver, GRAVITY, Person
 from inside import spread_directions
 import numpy as np
@@ -39,17 +39,6 @@ def followed(reading: Any = healthy, *, warms: float = 0.0, flat: Any = (0.0, 0.
 
 def figures(driver: Driver) -> dict[str, Any]:
     return json.loads(driver.results[-1])
-
-
-def test_a_healthy_sensor_is_done_after_poses_fit_and_level() -> None:
-    driver, person = followed()
-    assert list(dict.fromkeys(person.steps)) == ['poses', 'fit', 'level', 'done']
-    assert driver.sensor.rating.name == 'GOOD'
-    np.testing.assert_allclose(driver.calibration.offset / GRAVITY, OFFSET, atol=1e-3)
-    assert driver.finding('calibration').level == 'GOOD'
-    enable(driver.session, False)
-    assert driver.finding('calibration').level == 'USABLE'
-    assert 'call ~/enable' in driver.finding('calibration').words
 
 
 def test_an_effect_of_temperature_leads_to_refine_and_is_kept_by_a_fit() -> None:
@@ -111,27 +100,6 @@ def test_each_fit_refinement_and_levelling_is_reported_as_on_the_command_line(
         assert words in logged
 
 
-def test_an_offered_calibration_waits_for_save_and_is_reported_as_not_in_use() -> None:
-    driver, person = followed(confirm=True)
-    assert list(dict.fromkeys(person.steps)) == ['poses', 'fit', 'accept', 'level', 'done']
-    person.rest(person.flat, 4.0)
-    for command in ('calibrate_at_rest', 'set_level'):
-        driver.ask(command)
-        assert figures(driver)['in_use'] is False
-        assert figures(driver)['next']['command'] == '~/save'
-    driver.ask('save')
-    assert figures(driver)['in_use'] is True
-
-
-@pytest.mark.parametrize('command', ['set_level', 'calibrate_at_rest'])
-def test_a_mounting_alone_is_reported(command: str) -> None:
-    driver = Driver(auto_capture=False)
-    Person(driver, healthy).rest([0.1, 0.0, 1.0], 4.0)
-    driver.ask(command)
-    assert figures(driver)['rotation'][2] != [0.0, 0.0, 1.0]
-    assert not driver.logged('error')
-
-
 def test_slow_motion_by_hand_is_named_while_a_pose_is_waited_for() -> None:
     driver = Driver()
     Person(driver, healthy).rest([0.0, 0.0, 1.0])
@@ -185,13 +153,6 @@ def test_an_effect_far_beyond_those_of_parts_is_reported_and_not_used() -> None:
     assert driver.calibration is before
     driver.tick()
     assert 'temperature:=/board/temperature or /cpu' in driver.logged('warning')
-
-
-def test_the_heading_by_a_raised_nose_is_questioned() -> None:
-    driver, person = followed()
-    for questioned in (True, False):
-        person.rest([0.5, 0.0, 0.8], 4.0)
-        assert ('nose was up' in driver.ask('set_heading')) is questioned
 
 
 def test_an_effect_of_time_does_not_warn_for_ever() -> None:

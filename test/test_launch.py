@@ -21,6 +21,7 @@ from typing import Any
 from accel_calib.session import CalibratorSettings, WEB_PORT
 from inside import default_of
 import pytest
+from shared import table
 import yaml
 
 ROOT = Path(__file__).parent.parent
@@ -223,17 +224,7 @@ def test_each_topic_has_an_argument_and_is_in_the_namespace_without_a_leading_sl
     assert [node.topic(each) for each in TOPICS.values()] == topics
 
 
-GIVEN = {
-    'gravity': ('9.81', 9.81), 'passthrough': ('true', True), 'auto_fit': ('true', True),
-    'drift_warn': ('0.02', 0.02),
-    'units': ('g', 'g'), 'model': ('10', '10'), 'frame': ('ned', 'ned'),
-    'output_frame_id': ('base', 'base'), 'rotate': ('false', False),
-    'mounting_rpy': ('[0, 0.5, -1]', [0.0, 0.5, -1.0]), 'base_frame': ('base', 'base'),
-    'context': ("['supply_voltage:=battery', motor:=/motor/temp]",
-                ['supply_voltage:=battery', 'motor:=/motor/temp']),
-    'publish_tf': ('true', True), 'gyro_bias': ('True', True), 'fill_covariance': ('true', True),
-    'confirm': ('true', True), 'calibration_file': ('/x.yaml', '/x.yaml'), 'sensor': ('7', '7'),
-    'web_host': ('0.0.0.0', '0.0.0.0')}
+GIVEN = table('launch_arguments')
 ARGUMENTS = {'namespace', 'params_file', 'lifecycle', 'web', 'web_port', *TOPICS, *GIVEN}
 
 

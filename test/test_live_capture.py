@@ -14,8 +14,7 @@ from accel_calib.stored import read_calibration
 from accel_calib.table import numbered, Recording
 from accel_calib.units import units_of
 from inside import (
-    LiveCapture, model_with, new_sensor, PoseBook, rest_after, simulate_recording,
-    spread_directions, with_temperature)
+    LiveCapture, new_sensor, PoseBook, rest_after, spread_directions, with_temperature)
 import numpy as np
 import pytest
 from shared import GRAVITY, MPS2, Readings, Stored
@@ -98,20 +97,6 @@ def test_rest_counts_before_it_ends_and_its_final_average_replaces_it(readings: 
     assert np.all(np.diff(live.book.poses()['time']) > 1.5)
 
 
-@pytest.mark.parametrize(('rate', 'turn', 'dwell'), [
-    (25.0, 0.2, 1.5), (25.0, 5.0, 3.0), (25.0, 1.0, 10.0), (400.0, 0.2, 3.0), (400.0, 1.0, 1.5),
-    (400.0, 5.0, 1.5)])
-def test_no_pose_of_a_turned_sensor_is_doubtful(dwell: float, turn: float, rate: float) -> None:
-    live = LiveCapture(CaptureSettings(), MPS2)
-    recording = simulate_recording(
-        model_with({}), np.array(FACES, float), np.random.default_rng(1), noise_g=0.002,
-        rate_hz=rate, dwell=dwell, turn=turn)
-    changes = push_all(live, recording.reading * GRAVITY, rate=rate, omega=recording['rate'])
-    assert len(live.book.poses()) == 3
-    assert sum(change.doubted for change in changes) == 0
-    assert 'doubtful' not in live.book.poses()
-
-
 def test_removed_pose_is_not_captured_again_in_the_same_rest(readings: Readings) -> None:
     live, rest = LiveCapture(CaptureSettings(), MPS2), readings([[0, 0, 1]], dwell=12.0)
     push_all(live, rest[:150])
@@ -141,15 +126,6 @@ def book_of(rests: Iterable[Any], repeated: Any = 'merge') -> PoseBook:
         book.put(replace(dwell(time, direction), context=dict(zip(['temperature'], warm))),
                  ended=True)
     return book
-
-
-def test_repeated_poses_are_merged_and_undone_one_by_one() -> None:
-    book = book_of([(0.0, [0, 0, 1]), (10.0, [1, 0, 0]), (20.0, [0.01, 0, 1])])
-    assert len(book.poses()) == 2
-    assert book.poses()['count'].max() == pytest.approx(100.0)
-    assert book.undo()
-    assert book.poses()['count'].max() == pytest.approx(50.0)
-    assert len(book.poses()) == 2
 
 
 def test_poses_of_a_robot_that_parks_for_years_need_bounded_memory() -> None:

@@ -344,15 +344,6 @@ def test_a_sensor_that_falls_silent_is_noticed(idle: LivePage, viewers: Viewers)
             re.compile('^simulated sends no samples: check the board' if silent else '^$'))
 
 
-def test_a_browser_without_a_voice_says_so(idle: LivePage, viewers: Viewers) -> None:
-    page = viewers.visit(idle.link, script="""
-      speechSynthesis.speak = (utterance) => utterance.onerror({ error: 'voice-unavailable' });
-    """)
-    button(page, 'Speech').click()
-    expect(answer(page)).to_contain_text('does not speak')
-    expect(button(page, 'Speech')).to_have_attribute('aria-pressed', 'false')
-
-
 def test_a_browser_without_speech_and_wake_lock_shows_the_page_over_ipv6(
         tmp_path: Path, viewers: Viewers) -> None:
     with live_page(tmp_path, web_host='::1') as live:
@@ -383,24 +374,3 @@ def test_the_sound_switch_is_remembered_and_the_ball_turns_by_keys_until_it_foll
     follow.click()
     expect(follow).to_be_hidden()
     expect(ball).to_be_focused()
-
-
-def test_labels_of_drawings_change_at_most_every_two_seconds(
-        idle: LivePage, viewers: Viewers) -> None:
-    page = viewers.visit(idle.link)
-    page.clock.install()
-    page.clock.pause_at(page.evaluate('Date.now() + 10'))
-    page.evaluate("""async () => {
-      const { label } = await import('/page/canvas.js');
-      const drawing = document.createElement('canvas');
-      window.found = [];
-      window.show = (...all) => {
-        for (const words of all) label(drawing, words);
-        window.found.push(drawing.getAttribute('aria-label'));
-      };
-      window.show('first', 'second', 'third');
-    }""")
-    for passed, words in ((1999, []), (1, []), (1999, ['fourth']), (1, [])):
-        page.clock.run_for(passed)
-        page.evaluate('(words) => window.show(...words)', words)
-    assert page.evaluate('window.found') == ['first', 'first', 'third', 'third', 'fourth']

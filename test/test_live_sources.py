@@ -129,19 +129,6 @@ def test_times_never_run_backwards_though_characters_are_lost(timed: bool, seed:
     assert np.ptp(times) == pytest.approx(len(times) / RATE_HZ, rel=0.1) or not timed
 
 
-def test_samples_of_a_board_that_starts_again_are_kept() -> None:
-    found = received(lambda k: f'{5 * k - 1500 * (k >= 300)},{numbers(k)}\n', 500,
-                     columns=TIMED)[1]
-    assert np.sum(np.diff(found[:, 0]) < 0.0) == 1
-    assert abs(np.diff(found[:, 0])).sum() == pytest.approx(1.495 + 0.005 * (len(found) - 2))
-
-
-def test_lines_without_times_get_the_stated_rate() -> None:
-    read_as, found = received(lambda k: f'{numbers(k)}\n', 150, rate=100.0)
-    assert '100 Hz (stated)' in read_as
-    np.testing.assert_allclose(np.diff(found[:, 0]), 0.01)
-
-
 @pytest.mark.parametrize(('boots', 'late'), [
     (0, (0.0, 0.0)), (0, (0.0, 0.6)), (0, (1.5, 2.5)), (100, (0.0, 0.0))])
 def test_a_rate_is_measured_also_if_lines_are_late_or_follow_a_boot(

@@ -7,7 +7,7 @@ from pathlib import Path
 import re
 from typing import Any
 
-from accel_calib.calibration import Calibration, fit_poses, level_by_rows
+from accel_calib.calibration import Calibration, fit_poses
 from accel_calib.errors import InputError
 from accel_calib.logs import LogOptions
 from accel_calib.stillness import capture
@@ -91,25 +91,6 @@ def test_another_and_an_unknown_format_are_refused_with_what_is_lacking_or_meant
         format_named('phypox', ['Time (s)'], 'log.csv')
 
 
-def test_the_csv_of_an_older_ardupilot_log_has_no_number_of_the_sensor(tmp_path: Path) -> None:
-    lines = (LOGS / 'ardupilot/two_imus.csv').read_text(encoding='utf-8').splitlines()
-    rows = [line.split(',') for line in lines]
-    kept = [','.join(row[:2] + row[3:]) for row in rows if row[2] in ('I', '0')]
-    log = read_log(write(tmp_path, '\n'.join([*kept, '']).encode()))
-    assert isinstance(log.table, Recording)
-    check(log.table, log.units, 'ardupilot/two_imus.csv')
-
-
-def test_a_flat_pose_makes_a_level_vehicle_read_up() -> None:
-    log = read_log(LOGS / 'px4/log_sensor_accel_0.csv')
-    poses = capture(log.table, log.units).poses  # type: ignore[arg-type]
-    fitted = fit_poses(poses, log.units, model='10')
-    calibration = level_by_rows(fitted, poses, 'ros', 1, None)
-    up = calibration.apply(poses.reading[:1])[0] / log.units.per_g
-    np.testing.assert_allclose(up, [0.0, 0.0, 1.0], atol=2e-3)
-    np.testing.assert_allclose(calibration.rotation, make.FRD, atol=2e-2)
-
-
 # ---------------------------------------------------------------------------------- PX4 logs
 
 def test_a_log_of_the_default_profile_gives_the_selected_sensor_with_its_temperature() -> None:
@@ -184,13 +165,6 @@ def test_of_two_sensors_the_lowest_or_the_one_that_is_named_is_read(name: str) -
     if name.endswith('.bin'):
         assert lowest.table.sensor == 'IMU 0'
         assert any('IMU 1' in note for note in lowest.notes)
-
-
-def test_the_text_log_has_the_numbers_of_the_binary_log() -> None:
-    binary, text = ardupilot('two_imus.bin'), ardupilot('one_imu.log')
-    assert set(binary.recording.columns) == set(text.recording.columns)
-    for key, values in binary.recording.columns.items():
-        np.testing.assert_allclose(text.recording[key], values, rtol=1e-6, atol=1e-9)
 
 
 def test_garbage_within_an_ardupilot_log_is_passed_over_and_noted(tmp_path: Path) -> None:

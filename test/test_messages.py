@@ -10,26 +10,22 @@ the variable IMU_MESSAGES, 800 by default.
 """
 
 from dataclasses import replace
-from itertools import product
 import math
 import os
-import pickle
 import struct
 
-from accel_calib.effects import context_of_samples, EFFECTS, thermal_stream
+from accel_calib.effects import EFFECTS
 from accel_calib.errors import AccelCalibError, InputError
 from accel_calib.logs import (
     ACCELERATION, ACCELERATION_COVARIANCE, ANGULAR_VELOCITY, ANGULAR_VELOCITY_COVARIANCE,
     doubles_at, IMU_DOUBLES, joined, layout_of, LITTLE_ENDIAN, ORIENTATION, ORIENTATION_COVARIANCE,
-    renamed, samples_of)
+    samples_of)
 from accel_calib.messages import corrected, output_frame, Rewriter
 from accel_calib.units import STANDARD_GRAVITY
-from bag_files import swapped
-from inside import frame_ids, Model, OneReading, rotation_from_rpy, stamps_of
+from inside import Model, OneReading, rotation_from_rpy
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-from shared import known, python, random_directions, values_of, with_effects
+from shared import known, random_directions, values_of, with_effects
 
 COUNT = int(os.environ.get('IMU_MESSAGES', '800'))
 COVARIANCES = ORIENTATION_COVARIANCE, ANGULAR_VELOCITY_COVARIANCE, ACCELERATION_COVARIANCE
@@ -68,11 +64,6 @@ def calibration():
     return calibration_of({})
 
 
-@pytest.fixture(scope='module')
-def levelled():
-    return calibration_of({}, turned=True)
-
-
 def message(doubles, name='imu', stamp=(100, 0), padding=bytes(7)):
     """Return a message in little-endian CDR."""
     letters = name.encode() + b'\0'
@@ -97,39 +88,6 @@ def fields_of(count=6):
     return fields
 
 
-def test_a_message_is_corrected_for_the_context_of_its_time(calibration):
-    warm = with_effects(calibration, {'offset_temperature': [1e-3, -2e-3, 3e-3]})
-    data = message(fields_of(1)[0])
-    at = rewriter_of(data, warm)
-    forces = [doubles_of(at(data, {'temperature': each}))[-12:-9] for each in (20.0, 45.0, 20.0)]
-    assert np.all(np.abs(forces[1] - forces[0]) > 0.1)
-    np.testing.assert_array_equal(forces[2], forces[0])
-
-
-def test_with_a_mounting_all_fields_are_in_one_frame(levelled):
-    fields, rotation = fields_of(), levelled.model.rotation
-    found = corrected(levelled, fields)
-    np.testing.assert_allclose(found[:, ANGULAR_VELOCITY], fields[:, ANGULAR_VELOCITY] @ rotation)
-    for part in (ANGULAR_VELOCITY_COVARIANCE, ORIENTATION_COVARIANCE):
-        turned, given = found[:, part].reshape(-1, 3, 3), fields[:, part].reshape(-1, 3, 3)
-        np.testing.assert_allclose(rotation @ turned @ rotation.T, given, atol=1e-15)
-    before = Rotation.from_quat(fields[:, ORIENTATION])
-    after = Rotation.from_quat(found[:, ORIENTATION])
-    np.testing.assert_allclose(after.apply(found[:, ANGULAR_VELOCITY]),
-                               before.apply(fields[:, ANGULAR_VELOCITY]))
-
-
-def test_a_known_covariance_is_transformed_and_grows_by_that_of_the_calibration(levelled):
-    fields = fields_of()
-    found = corrected(levelled, fields)
-    inverse = levelled.model.rotation.T @ np.linalg.inv(levelled.gain)
-    own = inverse @ fields[:, ACCELERATION_COVARIANCE].reshape(-1, 3, 3) @ inverse.T
-    added = found[:, ACCELERATION_COVARIANCE].reshape(-1, 3, 3) - own
-    np.testing.assert_allclose(added, levelled.force_covariance(found[:, ACCELERATION]),
-                               atol=1e-15)
-    assert np.all(np.linalg.eigvalsh(added) > 0)
-
-
 @pytest.mark.parametrize('turned', [False, True])
 def test_the_bias_of_the_gyro_is_subtracted_before_the_rate_is_turned(turned):
     used, bias, fields = calibration_of({}, turned=turned), (0.01, -0.02, 0.03), fields_of(1)[0]
@@ -143,23 +101,6 @@ def test_the_bias_of_the_gyro_is_subtracted_before_the_rate_is_turned(turned):
                                    used.rotation.T @ expected, rtol=1e-12)
 
 
-@pytest.mark.parametrize('ros2', [False, True])
-@pytest.mark.parametrize('name', NAMES)
-def test_messages_get_another_frame_id(ros2, name):
-    raws = [message(each, 'imu_link', (k - 1, 5 * k)) for k, each in enumerate(fields_of(4))]
-    if ros2:
-        raws[1] = swapped(raws[1])
-    else:  # the serialization of ROS 1: four bytes of seq, no NUL, no padding
-        raws = [raw[:12] + struct.pack('<I', 8) + b'imu_link' + raw[-296:] for raw in raws]
-    before = joined(raws, 37, 'imu', ros2=ros2)
-    after = renamed(before, name)
-    again = joined([bytes(each) for each in after.each()], 37, 'imu', ros2=ros2)
-    for found in (after, again):
-        assert frame_ids(found) == [name]
-        np.testing.assert_array_equal(stamps_of(found), stamps_of(before))
-        np.testing.assert_array_equal(doubles_at(found, slice(0, 37)), fields_of(4))
-
-
 def test_single_messages_and_arrays_have_the_same_lag(calibration):
     calibration, fields = with_effects(calibration, LAGS, 1e-8), fields_of(1)[0]
     datas = [message(fields, stamp=(100 + k // 10, k % 10 * 100_000_000)) for k in range(400)]
@@ -171,36 +112,6 @@ def test_single_messages_and_arrays_have_the_same_lag(calibration):
              for data, warm in zip(datas, temperature.tolist(), strict=True)]
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
     assert np.ptp(expected[:, ACCELERATION.start]) > 1e-3
-
-
-def test_lag_carries_over_from_block_to_block(calibration):
-    calibration = with_effects(calibration, LAGS, 1e-8)
-    doubles = np.repeat(fields_of(1), 300, axis=0)
-    context = {'time': 100.0 + np.arange(300) * 0.1, 'rate': np.zeros((300, 3)),
-               'temperature': 25.0 + np.arange(300) * 0.01}
-
-    def part(rows, *stream):
-        own = {key: values[rows] for key, values in context.items()}
-        return corrected(calibration, doubles[rows],
-                         context_of_samples(own, len(doubles[rows]), calibration.model, *stream))
-
-    expected, stream = part(slice(None)), thermal_stream(calibration.model)
-    parts = [part(slice(0, 77), stream), part(slice(77, 300), stream)]
-    np.testing.assert_allclose(np.concatenate(parts), expected, rtol=1e-9)
-    assert np.max(np.abs(part(slice(77, 300)) - expected[77:])) > 1e-3
-
-
-def test_no_force_beyond_100_g_is_published(calibration):
-    raw = message(fields_of(1)[0])
-    rewriter, place = rewriter_of(raw, calibration), layout_of(raw).place(ACCELERATION)
-    data = bytearray(raw)
-    for reading, axis in product((1e3, -1e300), range(3)):
-        struct.pack_into('<3d', data, place, *(reading * np.eye(3)[axis]))
-        with pytest.raises(InputError, match='expected less than 100 g; check the calibration'):
-            rewriter(bytes(data), {'temperature': 20.0})
-    for reading in (np.nan, np.inf):
-        struct.pack_into('<3d', data, place, 0.0, reading, 9.8)
-        assert rewriter(bytes(data), {'temperature': 20.0}) is None
 
 
 def random_covariance(rng):
@@ -278,16 +189,6 @@ def test_bytes_are_corrected_as_numbers_are(effects, turned):
     assert published > COUNT // 16
 
 
-@pytest.mark.parametrize('turned', [False, True])
-@pytest.mark.parametrize('part', COVARIANCES)
-def test_a_covariance_that_is_not_finite_becomes_unknown(part, turned):
-    doubles = np.zeros(37)
-    doubles[ACCELERATION], doubles[part.start + 4] = (0.0, 0.0, STANDARD_GRAVITY), math.nan
-    data = message(doubles)
-    found = rewriter_of(data, calibration_of({}, turned=turned))(data, {'temperature': 25.0})
-    np.testing.assert_array_equal(doubles_of(found)[part], 0.0)
-
-
 OTHERS = [name for name, effect in EFFECTS.items() if not effect.linear]
 KNOWN = {'temperature': 31.0, 'supply_voltage': 3.1, 'time': 4000.0, 'rate': (1.0, -2.0, 0.5),
          'std': (0.01, 0.02, 0.03), 'previous': (0.0, 0.6, -0.8)}
@@ -332,23 +233,6 @@ def test_acting_temperature_is_limited_to_its_range_at_the_poses():
                             temperature=np.full(200, each))[-1] for each in (high, 90.0, 25.0)]
     np.testing.assert_allclose(at[0], at[1], atol=1e-6)
     assert np.max(np.abs(at[0] - at[2])) > 1e-3
-
-
-def test_what_the_worker_has_computed_is_not_computed_again_after_levelling(tmp_path):
-    calibration = lagging()
-    assert calibration.ranges
-    stored = tmp_path / 'calibration.pickle'
-    stored.write_bytes(pickle.dumps(calibration))
-    code = ('import pickle, sys; from pathlib import Path; import numpy as np; '
-            'from accel_calib.calibration import level; '
-            'given = pickle.loads(Path(sys.argv[1]).read_bytes()); '
-            'context = dict.fromkeys(("time", "temperature", "temperature_of_offset"), '
-            'np.array([25.0])); '
-            'flat = np.array([0.1, 0.2, 9.8]); '
-            'levelled = level(given, flat, "ros", context); '
-            'print(levelled.correct(flat[np.newaxis], context), "scipy.linalg" in sys.modules)')
-    found = python('-c', code, stored)
-    assert found.stdout.endswith('False\n'), found.stderr
 
 
 def test_context_of_one_reading_is_limited_to_the_ranges():

@@ -28,7 +28,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from rosbags.typesys import get_typestore, Stores
-from shared import python, random_directions, refused, run, run_json, run_snippets, SENSOR
+from shared import python, random_directions, refused, run, run_json, run_snippets, SENSOR, table
 
 DOCS = Path(__file__).parent.parent / 'docs' / 'effects.md'
 
@@ -123,25 +123,6 @@ def test_any_column_that_varies_is_a_cause_without_which_a_log_is_not_corrected_
     assert f' motor_current: {name}-motor_current' in shown
 
 
-def test_a_hump_over_any_column_is_a_curve_of_it():
-    rng = np.random.default_rng(8)
-    pressure = rng.uniform(950.0, 1050.0, 60)
-    hump = np.exp(-0.5 * ((pressure - 1003.0) / 12.0) ** 2)
-    found = ac.refine(still(rng, 60, np.outer(hump, [0.006, -0.004, 0.005]), pressure=pressure),
-                      units='g')
-    assert [(step.effect, step.variable) for step in found.steps] == [('empirical', 'pressure')]
-    assert found.verdict == 'described'
-
-
-@pytest.mark.parametrize('seed', range(3))
-def test_columns_of_noise_are_not_named(seed):
-    rng = np.random.default_rng([9, seed])
-    noise = {f'noise_{k}': np.cumsum(rng.normal(size=40)) if k % 2 else rng.normal(size=40)
-             for k in range(25)}
-    found = ac.refine(still(rng, 40, **noise), units='g')
-    assert not any(step.variable for step in found.steps)
-
-
 def test_text_and_columns_with_holes_are_no_cause(tmp_path):
     rng = np.random.default_rng(10)
     poses = still(rng, 30, room=['lab'] * 30, pressure=rng.uniform(950.0, 1050.0, 30))
@@ -199,12 +180,7 @@ def test_an_own_effect_that_cannot_work_is_refused_when_it_is_made(wrong, messag
         ac.Effect(**{'name': 'own', 'words': 'own effect', 'typical': 0.001, **wrong})
 
 
-BAD = {'1 / 0': 'fails .division by zero', 'None': 'returns NoneType', '"text"': 'returns str',
-       'x[1:]': 'of shape', 'np.log(x - 25)': r'returns \[nan', 'x + 1j': 'complex128',
-       'np.multiply(x, 2, out=x)': 'read-only',
-       'x * np.random.rand()': 'other numbers', 'x - np.mean(x)': 'other numbers',
-       'calls.append(1) or x * len(calls)': 'other numbers', 'sys.exit(0)': 'fails .SystemExit 0.',
-       'exec("raise ValueError(chr(10) + chr(27))")': 'fails .ValueError.', '[x, 1]': 'fails'}
+BAD = table('bad_functions')
 
 
 @pytest.mark.parametrize('bad', BAD)
@@ -222,11 +198,6 @@ def test_a_function_that_is_none_of_its_arguments_is_refused_in_one_line(
     assert "of the effect 'own'" in line
     assert re.search(BAD[bad], line), line
     assert line.strip().isprintable()
-
-
-def test_poses_are_read_only():
-    with pytest.raises(ValueError, match='read-only'):
-        ac.simulate().reading[0] = 0.0
 
 
 def turned(count, seed):
@@ -377,10 +348,7 @@ def test_an_own_effect_does_not_hide_one_of_the_catalogue():
         ac.load('calibration.yaml', also=[ac.Effect('quadratic', 'mine', typical=0.001)])
 
 
-@pytest.mark.parametrize(('text', 'message'), [
-    ('import accel_calib\n', 'defines no effect'), ('1 / 0\n', 'division by zero'),
-    ('def\n', 'invalid syntax'),
-    ('import sys\nsys.exit(0)\n', 'SystemExit 0')])
+@pytest.mark.parametrize(('text', 'message'), table('bad_effect_files'))
 def test_a_file_without_own_effects_is_refused(text, message, tmp_path, capsys):
     (tmp_path / 'own.py').write_text(text)
     assert message in refused(capsys, 'refine', 'poses.csv', '--also', tmp_path / 'own.py')

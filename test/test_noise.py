@@ -87,19 +87,6 @@ def test_degrees_of_freedom_are_those_of_greenhall_and_riley(component: int, alp
     assert freedom[5:] == pytest.approx(published[5:], rel=0.035)
 
 
-def test_covariance_of_the_curve_is_that_of_simulated_curves() -> None:
-    rng = np.random.default_rng(3)
-    count, sizes = 2048, np.array([0.0, 1.0, 0.02, 1e-4, 0.0])
-    lengths = octaves(count)
-    curves = [allan_variances(noise(rng, count, *np.sqrt(sizes[1:4])), lengths)
-              for _ in range(600)]
-    expected = spread_of(lengths, count).covariance(sizes)
-    deviation = np.sqrt(np.diag(expected))
-    found = np.cov(np.array(curves).T) / np.outer(deviation, deviation)
-    assert found == pytest.approx(expected / np.outer(deviation, deviation), abs=0.2)
-    assert np.mean(curves, axis=0) == pytest.approx(shares(lengths) @ sizes, rel=0.1)
-
-
 @pytest.mark.parametrize(('count', 'true'), [
     (16000, (1.0, 0.0, 0.006)), (30000, (1.0, 0.15, 0.0)), (500, (1.0, 0.0, 0.0))])
 def test_intervals_hold_the_true_value(count: int, true: tuple[float, float, float]) -> None:

@@ -7,14 +7,13 @@ from accel_calib.calibration import fit_poses, in_g
 from accel_calib.logs import read_recording
 from accel_calib.stillness import capture
 from accel_calib.table import Poses
-from accel_calib.units import STANDARD_GRAVITY, Units
+from accel_calib.units import STANDARD_GRAVITY
 from inside import (
     clipped, grid_step, Model, off_grid, simulate_recording, spread_directions, unclipped)
 import numpy as np
 import pytest
-from shared import data, G, MPS2, NATIVE, random_directions, sensor
+from shared import data, G, MPS2, random_directions, sensor
 
-COUNTS_PER_G = 4056.0
 IMU, COUNTS = 'mpu9150_imu0.csv', 'xsens_mti_counts.csv'
 
 
@@ -54,37 +53,11 @@ def test_a_clipped_recording_has_the_poses_of_the_recording_and_its_limit_is_det
     assert grid_step(poses) is None
 
 
-def test_counts_around_an_offset_are_clipped_at_different_limits():
-    poses = capture(limited(read_recording(data(COUNTS)), 29400, 36900), NATIVE).poses
-    assert len(poses) == 38
-    clip = clipped(in_g(poses, Units('native', COUNTS_PER_G)))
-    at_limit = np.any((poses.reading < 29401) | (poses.reading > 36899), axis=1)
-    assert np.sum(at_limit) > 4
-    assert set(np.flatnonzero(at_limit)) <= set(clip.poses)
-
-
 def test_one_quiet_pose_at_the_end_of_an_axis_is_no_limit():
     poses = found(simulated(3), G)
     quiet, at_end = np.ones((len(poses), 1)), int(np.argmax(poses.reading[:, 2]))
     quiet[at_end] = 0.6 * np.min(poses['std']) / np.max(poses['std'][at_end])
     assert clipped(poses.with_columns(std=poses['std'] * quiet)) is None
-
-
-def test_clipped_poses_are_left_out_although_the_base_misfits_the_others_too():
-    poses = found(limited(simulated(3), -0.93, 0.93), G)
-    too_small = Model({'offset': np.zeros(3)})
-    assert unclipped(poses, too_small)[1] is not None
-
-
-@pytest.mark.parametrize('step_mg', [4, 8, 20])
-def test_quantisation_of_a_real_recording_is_detected_with_its_step(step_mg):
-    counts = round(step_mg * 1e-3 * COUNTS_PER_G)
-    taken = capture(rounded(read_recording(data(COUNTS)), counts), NATIVE).poses
-    base = fit_poses(taken, NATIVE, model='10')
-    poses = in_g(taken, base.units)
-    assert grid_step(poses) == pytest.approx(counts / base.units.per_g, rel=2e-3)
-    assert off_grid(poses, base.model)[1] == grid_step(poses)
-    assert clipped(poses) is None
 
 
 @pytest.mark.parametrize(('ratio', 'relevant'), [

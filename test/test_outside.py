@@ -9,7 +9,7 @@ import tracemalloc
 from accel_calib.calibration import outside, SampleContext
 from accel_calib.effects import context_of_samples
 from accel_calib.findings import outside_words
-from accel_calib.logs import read_recording, write_blocks, write_table
+from accel_calib.logs import read_recording, write_table
 from accel_calib.stored import write_calibration
 from accel_calib.table import numbered, Recording
 from bag_files import write_bag
@@ -191,11 +191,3 @@ def test_an_error_in_a_late_block_leaves_the_earlier_file(stored, tmp_path, monk
     assert 'line 4501' in refused(capsys, 'apply', path, '-c', stored, '-o', out)
     assert out.read_bytes() == before
     assert sorted(each.name for each in tmp_path.iterdir()) == ['out.csv', 'recording.csv']
-
-
-def test_blocks_are_written_as_one_table(tmp_path):
-    samples = replace(samples_of(100), sensor='imu "1"')
-    write_table(tmp_path / 'whole.csv', samples)
-    parts = (samples.take(slice(k, k + 30)) for k in range(0, 100, 30))
-    assert write_blocks(tmp_path / 'blocks.csv', parts) == 100
-    assert (tmp_path / 'blocks.csv').read_bytes() == (tmp_path / 'whole.csv').read_bytes()

@@ -10,18 +10,17 @@ from pathlib import Path
 import re
 
 import accel_calib as ac
-from accel_calib.calibration import verify
 from accel_calib.comparison import compare, history_of
 from accel_calib.errors import InputError
 from accel_calib.finding import Finding, NextStep
-from accel_calib.findings import rate, rate_verification, Rating
+from accel_calib.findings import rate, Rating
 from accel_calib.refinement import refine
 from accel_calib.report import calibration_page, refinement_page
 from accel_calib.text import milli
 from accel_calib.units import Units
 from inside import (
-    all_drawings, axis_figures, comparison_page, curve_parts, history_page, linear_model,
-    model_with, page_of, residuals_of, residuals_of_refinement, simulate_poses)
+    all_drawings, axis_figures, comparison_page, curve_parts, linear_model, model_with, page_of,
+    residuals_of, simulate_poses)
 from live_bench import PATIENCE
 import numpy as np
 from playwright.sync_api import expect
@@ -204,19 +203,6 @@ def test_residuals_are_those_of_the_quality(model, units, known):
         assert ('angle' in text) is (model == '12')  # others are absent
 
 
-def test_values_and_their_deviations_are_those_of_the_calibration(calibration, text):
-    for axis, value, sd in zip('xyz', calibration.offset, calibration.offset_sd, strict=True):
-        value, sd = (part * 1e3 / 9.80665 for part in (value, sd))
-        cell = re.search(rf'<td>offset {axis}</td><td>([^<]*) ± ([^<]*) mg</td>', text)
-        assert float(cell[1].replace('−', '-')) == pytest.approx(value, abs=sd / 2.0)
-        assert float(cell[2]) == pytest.approx(sd, rel=0.06)
-    found = axis_figures(calibration.model.vector, calibration.model.effects)
-    gains = [float(cell) for cell in re.findall(r'<td>gain .</td><td>([-+][\d.]+)',
-                                                text.replace('−', '-'))]
-    np.testing.assert_allclose(gains, (found[3:6] - 1.0) * 100.0, atol=0.01)
-    assert 'MPU-6050' in text
-
-
 def test_figures_by_axis_are_those_of_the_axes():
     apart = np.radians(89.0)
     mat = np.diag([1.01, 1.0, 0.99]) @ np.array(
@@ -224,62 +210,6 @@ def test_figures_by_axis_are_those_of_the_axes():
     model = linear_model('12', mat, np.array([0.1, 0.2, 0.3]))
     np.testing.assert_allclose(axis_figures(model.vector, model.effects),
                                [0.1, 0.2, 0.3, 1.01, 1.0, 0.99, 89.0, 90.0, 90.0])
-
-
-def test_left_out_poses_are_listed_and_drawn(poses):
-    reading = poses.reading.copy()
-    reading[10] *= 1.05
-    fitted = ac.fit(poses.with_columns(reading=reading))
-    assert [each.row for each in fitted.rejected] == [11]
-    text = calibration_page(fitted, rate(fitted), 'poses.csv')
-    found = Parsed(text)
-    assert '<h2>Poses left out</h2>' in text
-    assert rows_in(found, 'use').count('11') == 1
-    assert not [mark for mark in found.marks if re.match(r'row 11, [+−]', mark)]
-    assert re.search(r'<tr data-row="11">.*left out: ', text)
-
-
-def test_page_of_a_verification_shows_the_other_poses(calibration):
-    other = simulated(seed=7, poses=9)
-    checked = verify(calibration, other)
-    text = calibration_page(calibration, rate_verification(checked, calibration), 'other.csv',
-                            verification=(checked, other))
-    found = Parsed(text)
-    assert re.search(r'<h1>Check .* imu_link</h1>', text)
-    assert rows_in(found, 'tr') == [str(row) for row in range(1, 10)]
-    residuals = residuals_of(calibration, other)
-    assert residuals.rms_mg == pytest.approx(checked.rms_after_mg)
-    assert np.sqrt(np.mean(residuals.before_mg ** 2)) == pytest.approx(checked.rms_before_mg)
-    assert 'Next pose' not in text
-
-
-def test_refinement_that_is_not_used_is_shown_beside_the_fit(calibration):
-    refined = ac.refine(ac.simulate(SENSOR, poses=16), base='7')
-    assert refined.steps
-    both = calibration_page(calibration, rate(calibration), 'poses.csv', refinement=refined)
-    assert 'not contain these' in both
-    assert refined.verdict == 'explained'
-    assert both.count('is explained') == 1
-    assert both.index('<h2>Effects that') < both.index('is explained')
-    assert f'{milli(residuals_of(calibration).after_mg[0], signed=True)} mg' in both
-    own = refinement_page(refined, 'poses.csv')
-    assert 'not contain these' not in own
-    assert 'id="refined_' not in own
-    first = residuals_of_refinement(refined).after_mg[0]
-    assert f'row 1, {milli(first, signed=True)}' in own
-
-
-def test_residuals_that_the_calibration_cannot_correct_are_shown_apart():
-    known = ac.refine(simulated(reference=True), base='10')
-    residuals = residuals_of(known.calibration)
-    assert residuals.signed
-    assert residuals.rms_mg == pytest.approx(known.calibration.quality.rms_after_mg)
-    left = residuals_of_refinement(known)
-    assert left.rms_mg == pytest.approx(known.remaining_gap_mg, rel=0.01)
-    text = refinement_page(known, 'poses.csv')
-    assert 'id="refined_' in text
-    assert f'residual: {left.rms_mg:.3g} mg' in text
-    assert f'residual: {residuals.rms_mg:.3g} mg' in text
 
 
 def test_lines_of_c_and_of_python_correct_as_apply_does(calibration, tmp_path):
@@ -327,18 +257,6 @@ def test_labels_of_a_history_are_its_dates_with_the_time_where_a_day_has_several
         history_of(dated[:1])
 
 
-def test_history_has_a_page(dated):
-    text = history_page(history_of(dated), [Path(f'{k}.yaml') for k in range(5)], dated)
-    found = Parsed(text)
-    assert not found.open
-    assert len(found.named('svg')) == 3
-    assert len(found.marks) == 5 * 9
-    assert any(re.fullmatch(r'2026-04-12, offset z \+3[34]\.\d+ ± 0\.\d+ mg, 24 °C', mark)
-               for mark in found.marks)
-    assert text.count('<td>differ, ') == 1
-    assert 'temperature [°C]' in text
-
-
 # ----------------------------------------------------------------------------- refinements
 
 @pytest.fixture(scope='module')
@@ -367,19 +285,6 @@ def test_page_is_complete_and_self_contained(warm):
     assert 'name="viewport"' in text
     assert '<b onload' not in text
     assert '&lt;b onload=&#34;x&#34;&gt;&amp;.csv' in text
-
-
-def test_before_and_after_have_one_scale(warm):
-    figures = {drawing.name: drawing.figure for drawing in all_drawings(warm)}
-    ladder = {text.get_text() for text in figures['ladder'].axes[0].texts}
-    assert '+ offset_temperature' in ladder
-    before, after = (figures[f'step1_offset_temperature_variable_{when}'].axes[0]
-                     for when in ('before', 'after'))
-    assert before.get_ylim() == after.get_ylim()
-    assert before.get_ylim()[0] == -before.get_ylim()[1]
-    maps = [figures[f'step1_offset_temperature_sphere_{when}'].axes[0].collections[-1]
-            for when in ('before', 'after')]
-    assert maps[0].get_clim() == maps[1].get_clim()
 
 
 def test_figure_of_a_curve_shows_the_truth_within_its_band():

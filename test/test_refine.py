@@ -11,10 +11,10 @@ from accel_calib.findings import value_words, verdict_words
 from accel_calib.logs import read_poses
 from accel_calib.refinement import refine
 import generator
-from inside import LARGEST_SAMPLE, model_with, simulate_poses, spread_directions
+from inside import LARGEST_SAMPLE, model_with, simulate_poses
 import numpy as np
 import pytest
-from shared import G, MPS2, random_directions, SENSOR, sensor
+from shared import G, MPS2, random_directions, SENSOR
 
 LADDER = ('offset', 'gain', 'axis_gain', 'cross_axis')
 WITHOUT_NAME = {'offset_wander', 'empirical'}
@@ -111,12 +111,6 @@ def test_a_small_effect_among_few_poses_is_named_and_both_of_two_effects(
     assert sorted(names(found)) == sorted(hidden)
 
 
-def test_the_last_step_leaves_what_the_calibration_leaves(taken):
-    found = refine(taken(2, {'hysteresis': 30.0}, poses=60)[0], MPS2, base='10')
-    assert names(found) == ['hysteresis']
-    assert found.steps[-1].gap_after_mg == pytest.approx(found.remaining_gap_mg, rel=1e-6)
-
-
 @pytest.mark.parametrize('form', [0.0, 1.0])
 @pytest.mark.parametrize('size', [0.003, 0.07])
 def test_a_hysteresis_of_any_size_leaves_the_noise_in_new_poses(size, form):
@@ -188,25 +182,11 @@ def test_a_temperature_in_steps_is_estimated_within_half_a_step(step):
             np.testing.assert_allclose(found, stated, atol=0.01)
 
 
-@pytest.mark.parametrize('seed', range(3))
-def test_a_supply_that_scales_gains_that_differ_leaves_no_gap(seed, taken):
-    hidden = {'supply_ratio': 100.0, 'offset_temperature': 3.0}
-    found = refine(taken([5, seed], hidden, poses=60, noise_mg=1.0)[0], MPS2, base='10')
-    assert (sorted(names(found)), found.verdict) == (sorted(hidden), 'explained')
-
-
 @pytest.mark.parametrize(('effect', 'poses'), [('quintic', 60), ('oblique_hinge', 200)])
 def test_a_form_outside_of_the_catalogue_is_not_named_after_its_nearest_effect(
         effect, poses, taken):
     found = refine(taken(3, {effect: 8.0}, poses=poses)[0], MPS2, base='10')
     assert names(found) == ['empirical']
-
-
-@pytest.mark.parametrize('seed', range(3))
-def test_two_nonlinearities_with_directions_of_their_own_are_explained(seed, taken):
-    found = refine(taken([3, seed], {'quadratic': 10.0, 'cubic': 6.0}, poses=60)[0], MPS2)
-    assert names(found) == ['quadratic', 'cubic']
-    assert (found.verdict, found.one_curve) == ('explained', ())
 
 
 def test_a_curve_is_not_explained_by_the_one_part_of_it_that_is_named(taken):
@@ -245,18 +225,6 @@ def test_an_effect_whose_column_is_missing_gets_no_other_name(effect, columns, t
     assert (effect, ', '.join(columns)) in found.not_testable
 
 
-@pytest.mark.parametrize(('unknown_mg', 'named'), [(1.0, ['quadratic']), (2.5, [])])
-def test_effects_that_explain_a_small_part_of_a_gap_are_removed(unknown_mg, named):
-    rng = np.random.default_rng(4)
-    model = model_with({'offset': [0.02, -0.01, 0.03], 'quadratic': [0.005, -0.005, 0.005]})
-    directions = random_directions(150, rng)
-    poses = simulate_poses(model, directions, rng)
-    unknown = directions * rng.normal(size=(150, 1)) * unknown_mg * 1e-3
-    found = refine(poses.with_columns(reading=poses.reading + unknown), G, base='10')
-    assert found.verdict == 'unexplained'
-    assert names(found) == named
-
-
 @pytest.mark.parametrize(('count', 'place'), [(300, 114), (3000, 1234)])
 def test_a_step_is_found_among_more_instants_than_are_tried(count, place):
     rng = np.random.default_rng(0)
@@ -270,15 +238,6 @@ def test_a_step_is_found_among_more_instants_than_are_tried(count, place):
     assert not found.calibration.rejected
 
 
-def test_knocked_poses_are_found_and_nothing_is_named(taken):
-    for seed in range(2):
-        poses, made = taken(seed, poses=60, knocked=3)
-        found = refine(poses, MPS2, base='10')
-        shows = {row for row, size in made.knocked.items() if abs(size) > 5e-3}
-        assert shows <= set(found.disturbed_poses) <= set(made.knocked)
-        assert names(found) == []
-
-
 def test_the_effects_of_the_ladder_are_added_to_an_ideal_sensor(taken):
     found = refine(taken(6, poses=60)[0], MPS2, base='ideal')
     steps = [step.effect for step in found.steps]
@@ -286,29 +245,6 @@ def test_the_effects_of_the_ladder_are_added_to_an_ideal_sensor(taken):
     gaps = [found.gap_mg, *(step.gap_after_mg for step in found.steps)]
     assert gaps == sorted(gaps, reverse=True)
     assert found.verdict == 'explained'
-
-
-def test_known_orientation_shows_what_the_norm_does_not():
-    rng, directions = np.random.default_rng(7), spread_directions(30)
-    model = sensor(rng, 'offset', 'axis_gain', 'cross_axis', 'misalignment')
-    poses = simulate_poses(model, directions, rng, context={'reference': directions})
-    found = refine(poses, G, base='10')
-    assert [step.effect for step in found.steps] == ['misalignment']
-    assert refine(poses, G).verdict == 'no_gap'
-
-
-def test_shared_orientation_shows_temperature_across_gravity():
-    rng = np.random.default_rng(8)
-    directions = np.repeat(random_directions(3, rng), 20, axis=0)
-    temperature = 25.0 + 8.0 * np.sin(np.arange(60.0))
-    model = model_with({'offset_temperature': np.array([5e-4, 4e-4, -4e-4])})
-    poses = simulate_poses(model, directions, rng, context={
-        'temperature': temperature, 'time': np.arange(60.0) * 3600.0,
-        'orientation': np.repeat(np.arange(3.0), 20)})
-    found = refine(poses, G)
-    assert names(found) == ['offset_temperature']
-    values = found.calibration.model.values['offset_temperature']
-    np.testing.assert_allclose(values, [5e-4, 4e-4, -4e-4, 0.0, 0.0], atol=3e-5)  # without lag
 
 
 def test_a_long_table_is_refined_from_a_sample_and_says_so(monkeypatch):

@@ -12,9 +12,7 @@ from accel_calib.refinement import refine
 from accel_calib.stillness import capture
 from accel_calib.table import Poses, Recording
 from accel_calib.units import units_of
-from inside import (
-    format_calibration, Model, parse_calibration, simulate_poses, simulate_recording,
-    spread_directions)
+from inside import Model, simulate_poses, simulate_recording, spread_directions
 import numpy as np
 import pytest
 from shared import data, G
@@ -62,28 +60,6 @@ def test_the_stated_uncertainty_covers_the_true_bias_also_without_the_noise(coun
         ratio.append(gyro.sd / found(poses).sd)
     assert 0.9 < np.mean(inside) < 0.99
     assert 0.8 < np.median(ratio) < 1.25
-
-
-def test_successive_rests_with_similar_errors_count_less():
-    slow = np.outer(np.sin(np.arange(24) / 4.0), np.ones(3)) * 1e-3
-    poses = rests(1)
-    drifting = found(poses.with_columns(rate=poses['rate'] + slow))
-    mixed = found(poses.with_columns(
-        rate=poses['rate'] + np.random.default_rng(2).permutation(slow)))
-    assert np.all(drifting.sd > 1.5 * mixed.sd)
-
-
-def test_a_slope_over_temperature_is_found_where_it_is_and_only_there():
-    warmth, slope = np.linspace(20.0, 40.0, 24), np.array([2e-4, 0.0, -3e-4])
-    for seed in range(10):
-        gyro = found(rests(seed, warmth=warmth, slope=slope))
-        assert gyro.slope[0] != 0.0
-        assert gyro.slope[2] != 0.0
-        np.testing.assert_allclose(gyro.slope, slope, atol=5e-5)
-        assert gyro.temperature == pytest.approx(30.0, abs=1.0)
-        np.testing.assert_allclose(gyro.at(25.0), BIAS + slope * -5.0, atol=5e-4)
-    slopes = [found(rests(seed, warmth=warmth)).slope for seed in range(100)]
-    assert np.mean(np.array(slopes) != 0.0) < 0.01
 
 
 @pytest.mark.parametrize('rate', [0.01, 0.05, 0.3])
@@ -194,14 +170,3 @@ def test_a_refinement_takes_the_bias_of_new_rests_with_rates_and_keeps_the_store
     bare = only(later, 'reading', 'std', 'count')
     assert refine(bare, G, base=stored).calibration.gyro is stored.gyro
     assert refine(bare, G, base='10').calibration.gyro is None
-
-
-@pytest.mark.parametrize('known', [
-    {}, {'warmth': np.linspace(20.0, 40.0, 24), 'slope': (2e-4, 0.0, -3e-4)}])
-def test_bias_and_noise_are_read_as_they_were_written(known):
-    calibration = fitted(**known)
-    text = format_calibration(calibration)
-    read = parse_calibration(text, 'x.yaml')
-    assert format_calibration(read) == text
-    assert read.warnings == calibration.warnings
-    assert (read.gyro, read.noise) == (calibration.gyro, calibration.noise)

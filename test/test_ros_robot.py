@@ -97,20 +97,6 @@ def test_the_qos_can_be_overridden_and_an_incompatible_one_is_named_with_what_to
     assert all(printed.count(words) == 1 for words in wanted)
 
 
-@pytest.mark.parametrize('publisher', sample([
-    QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT),
-    QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)], 1))
-def test_every_qos_of_a_driver_fits_and_is_not_reported(bench: Any, publisher: QoSProfile) -> None:
-    diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
-    node = bench.start('calibrator')
-    bench.client('self_test')
-    driver = bench.node.create_publisher(Imu, 'imu/data_raw', publisher)
-
-    bench.spin(lambda: driver.publish(bench.imu([0.0, 0.0, GRAVITY])) or (
-        diagnostics and 'no calibration yet' in diagnostics[-1].status[0].message))
-    assert 'QoS' not in bench.end(node, signal.SIGTERM)[1]
-
-
 def test_the_diagnostics_have_the_true_rate_and_the_resolved_names(
         bench: Any, stored: Stored) -> None:
     diagnostics = bench.listen(DiagnosticArray, '/diagnostics')

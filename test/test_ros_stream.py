@@ -93,18 +93,6 @@ def test_readings_in_g_are_published_in_si_and_without_rotation_in_the_frame_of_
     assert got.orientation == Quaternion(x=0.5, y=0.5, z=0.5, w=0.5)
 
 
-def test_nothing_is_published_before_a_calibration(bench: Any) -> None:
-    diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
-    bench.calibrator(use_sim_time=True)  # and nobody publishes /clock
-
-    def reported() -> bool:
-        bench.send(bench.imu(READING))
-        return any('no calibration yet' in array.status[0].message for array in diagnostics)
-
-    bench.spin(reported)
-    assert not bench.came_out
-
-
 def test_raw_messages_are_published_with_passthrough_and_when_switched_off(
         bench: Any, stored: Stored) -> None:
     bench.calibrator(passthrough=True, calibration_file=stored().with_name('new.yaml'),

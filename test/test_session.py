@@ -13,9 +13,9 @@ from typing import Any
 from accel_calib.calibration import level, set_heading
 from accel_calib.effects import Covariate
 from accel_calib.errors import InputError, StoredCalibrationError
-from accel_calib.finding import Finding, has, LEVELS
+from accel_calib.finding import has
 from accel_calib.logs import open_log, read_poses, write_table
-from accel_calib.session import CalibratorSettings, changed, next_step, state, Surroundings
+from accel_calib.session import state, Surroundings
 from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import Poses
 from driven import Driver, RATE
@@ -24,7 +24,7 @@ from inside import (
     spread_directions, store_of, StreamStatistics, use_calibration, writing_advice)
 import numpy as np
 import pytest
-from shared import GRAVITY, python, Readings, ROOT, Stored, with_effects
+from shared import GRAVITY, python, Readings, ROOT, Stored, table, with_effects
 
 UP, LEFT, FORWARD = [0, 0, 1], [0, 1, 0], [1, 0, 0]
 NOSE_DOWN = [-0.6, 0.0, 0.8]
@@ -110,15 +110,6 @@ def test_poses_of_another_sensor_or_unit_are_renamed(changes: Any) -> None:
     driver = Driver(sensor='arm')
     assert len(driver.poses) == 0
     assert 'arm_poses.csv.damaged1' in driver.logged()
-
-
-def test_calibration_in_g_corrects_messages_in_m_s2(stored: Stored) -> None:
-    path, reading = stored(unit='g'), np.array([[1.0, -2.0, 9.0]])
-    loaded = Driver(calibration_file=str(path)).calibration
-    assert (loaded.units.name, loaded.units.per_g) == ('m/s2', GRAVITY)
-    np.testing.assert_allclose(
-        loaded.correct(reading), read_calibration(path).correct(reading / GRAVITY) * GRAVITY,
-        rtol=1e-14)
 
 
 def test_messages_of_another_sensor_are_dropped_and_end_the_rest(readings: Readings) -> None:
@@ -241,13 +232,6 @@ def test_a_rest_is_not_used_while_the_stamps_stand(readings: Readings) -> None:
     assert captured(driver) == [UP, LEFT]
 
 
-def test_one_absurd_first_reading_does_not_spoil_the_capture(readings: Readings) -> None:
-    driver = Driver()
-    driver.feed([[0.0, 0.0, 1e200]])
-    driver.feed(readings([UP, LEFT], dwell=2.5))
-    assert captured(driver) == [UP, LEFT]
-
-
 def test_a_level_pose_that_contradicts_the_given_mounting_is_refused(
         stored: Stored, readings: Readings) -> None:
     driver = Driver(calibration_file=str(stored()), mounting_rpy=[0.5, 0.0, 0.0])
@@ -303,33 +287,6 @@ def test_context_outside_of_the_ranges_is_limited_with_a_warning(
 # Guidance
 
 
-def test_advice_changes_with_the_poses_and_with_a_request_that_is_not_followed(
-        readings: Readings) -> None:
-    driver = Driver()
-    driver.feed(readings(spread_directions(5)))
-    before = next_step(driver.session.state)
-    rest = readings([spread_directions(5)[0]], dwell=20.0)
-    driver.feed(rest[:300])
-    after = next_step(driver.session.state)
-    assert after.direction != before.direction
-    driver.feed(rest[300:])
-    assert next_step(driver.session.state) == after
-    assert driver.logged('info').count('repeats') == 1
-    driver.feed(readings(spread_directions(30)))
-    lines = len(driver.log)
-    driver.feed(readings(spread_directions(30)[:4]))  # after the last useful pose
-    assert not [line.words for line in driver.log[lines:] if 'pose' in line.words]
-
-
-def test_findings_are_logged_by_their_level(stored: Stored) -> None:
-    driver = Driver(calibration_file=str(stored()))
-    use_calibration(driver.session, replace(driver.calibration, noted=tuple(
-        Finding('note', f'about {level}', level=level) for level in LEVELS)))
-    driver.handle()
-    assert [line.severity for line in driver.log if 'about ' in line.words] == [
-        'info', 'warning', 'error']
-
-
 # Automatic fits
 
 
@@ -374,14 +331,6 @@ def statistics_of(*batches: Any, pause: float = 0.3) -> StreamStatistics:
     return found
 
 
-@pytest.mark.parametrize(('length', 'unit'), [(1.0, 'g'), (16384.0, 'native'), (9.8, '')])
-def test_readings_in_another_unit_name_it(length: float, unit: str) -> None:
-    driver = Driver()
-    driver.feed(np.full((50, 3), [0.0, 0.0, length]))
-    words = driver.finding('stream').words
-    assert words.endswith(f'units:={unit}') if unit else 'units' not in words
-
-
 def test_rate_and_faults_of_the_stamps_follow_the_last_seconds() -> None:
     times = [np.arange(60) / 200.0 + 0.3 * k for k in range(30)]
     found = statistics_of(*times)
@@ -395,15 +344,7 @@ def test_rate_and_faults_of_the_stamps_follow_the_last_seconds() -> None:
     assert statistics_of(*times[:1]).rate == 0.0
 
 
-@pytest.mark.parametrize(('settings', 'words'), [
-    ({'mounting_rpy': [0.0, 0.0, 1.0], 'base_frame': 'base_link'},
-     'both mounting_rpy and base_frame'),
-    ({'publish_tf': True, 'base_frame': 'base_link', 'output_frame_id': 'base_link'},
-     'publish_tf would make'),
-    *(({'context': [entry]}, f'entry {entry!r}, expected column:=topic') for entry in (
-        'motor_current', ':=/motor/current', 'time:=/clock', 'ax:=/x', 'two words:=/x',
-        'a__b:=/x')),
-    ({'context': ['a:=/x', 'a:=/y']}, 'each column once')])
+@pytest.mark.parametrize(('settings', 'words'), table('contradicting_settings'))
 def test_settings_that_contradict_each_other_are_refused(settings: Any, words: str) -> None:
     with pytest.raises(InputError, match=words):
         Driver(**settings)
@@ -491,18 +432,6 @@ def put(driver: Driver, readings: Readings, up: Any) -> None:
     driver.feed(readings([MOUNTING @ up], dwell=6.0)[:200])
 
 
-def test_the_heading_needs_a_level_mounting_and_the_nose_down(
-        stored: Stored, readings: Readings) -> None:
-    driver = Driver(calibration_file=str(stored()))
-    put(driver, readings, UP)
-    driver.refuses(r'not levelled; .*~/set_level first', 'set_heading')
-    driver.ask('set_level')
-    driver.refuses('within 10° of the flat pose', 'set_heading')
-    put(driver, readings, NOSE_DOWN)
-    driver.ask('set_heading')
-    np.testing.assert_allclose(driver.sensor.applied.rotation, MOUNTING, atol=0.01)
-
-
 @pytest.mark.parametrize(('frame', 'axes'), [
     ('ros', np.eye(3)), ('ned', np.diag([1.0, -1.0, -1.0])),
     ('android', [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])])
@@ -540,11 +469,6 @@ def test_a_stored_mounting_of_the_documents_is_turned_before_it_is_used(
     np.testing.assert_allclose(driver.sensor.applied.rotation,
                                MOUNTING @ np.diag([1.0, -1.0, -1.0]), atol=1e-6)
     assert f'frame {frame},' in driver.logged('warning')
-
-
-def test_a_frame_whose_readings_are_gravity_is_refused_for_messages() -> None:
-    with pytest.raises(InputError, match="'win8', expected one of ros, ned, android"):
-        changed(CalibratorSettings(), {'frame': 'win8'})
 
 
 # Further context
@@ -589,15 +513,6 @@ def test_a_quantity_is_a_column_of_poses_and_its_last_value_holds_when_it_stops(
     driver.session.close()
     np.testing.assert_allclose(Driver(sensor='arm', context=[MOTOR]).poses['motor_current'],
                                poses['motor_current'], atol=1e-6)
-
-
-def test_poses_in_one_direction_are_not_merged_over_a_quantity(readings: Readings) -> None:
-    driver = Driver(context=[MOTOR])
-    for current in (0.0, 10.0, 0.1):
-        for direction in (LEFT, UP):
-            driver.feed(readings([direction]), motor_current=current)
-    driver.feed(readings([LEFT])[:15], motor_current=0.0)
-    assert np.sort(driver.poses['motor_current'] > 5.0).tolist() == [False, False, True, True]
 
 
 @pytest.mark.parametrize('column', ['motor_current', 'temperature'])

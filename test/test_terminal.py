@@ -25,7 +25,7 @@ from inside import (
 import numpy as np
 import pytest
 from rich.console import Console
-from shared import forked, python, random_directions, ROOT, run, run_json
+from shared import forked, python, random_directions, ROOT, run, run_json, table
 
 SIMULATE = ('simulate', '--recording', '--poses', '14', '--effect', 'offset=0.02,-0.01,0.03', '-o')
 
@@ -117,13 +117,7 @@ def test_control_characters_are_escaped():
     assert shown('a ± \udc80', 'ascii') == 'a +- \\udc80'
 
 
-@pytest.mark.parametrize(('line', 'said'), [
-    ('calibrte x', '(did you mean calibrate?); see accel-calib --help\n'),
-    ('fit x.csv --modle 4', '(did you mean --model?)'),
-    ('refine x.csv --bsae 4', '(did you mean --base?)'),
-    ('fit x --units m/s', '(did you mean m/s2?)'),
-    ('fit x.csv --gravity -3', 'expected a positive number; see accel-calib fit --help'),
-    ('fit', 'the following arguments are required: '), ('fit x\0', 'has the character NUL')])
+@pytest.mark.parametrize(('line', 'said'), table('misspelt'))
 def test_a_misspelt_name_gets_a_suggestion_in_one_line_and_a_wrong_value_none(line, said, capsys):
     with pytest.raises(SystemExit, match='2'):
         main(line.split())
@@ -240,11 +234,7 @@ def test_a_reader_that_leaves_early_gets_no_error(tmp_path):
     assert 'Broken' not in done.stderr
 
 
-@pytest.mark.parametrize(('line', 'message'), [
-    ('simulate -o - --json -', 'unrecognized arguments: --json'),
-    ('capture r.csv -o - --json -', '-o and --json are both -'),
-    ('fit r.csv r.csv -o -', '-o is -, expected a folder'),
-    ('fit -', 'standard input is empty'), ('fleet r.csv -o -', '-o is -, expected a folder')])
+@pytest.mark.parametrize(('line', 'message'), table('not_piped'))
 def test_what_cannot_go_through_a_pipe_is_refused(line, message, tmp_path):
     (tmp_path / 'r.csv').write_text('time,ax,ay,az\n0,0,0,9.8\n', encoding='utf-8')
     done = forked(*line.split(), folder=tmp_path)
@@ -291,10 +281,6 @@ def drawn(view: Any, width: int = 80, height: int = 24, encoding: str = 'utf-8')
     return raw.getvalue().decode(encoding)
 
 
-def row(shown: str, label: str) -> str:
-    return next(line for line in shown.splitlines() if label in line)
-
-
 @pytest.mark.parametrize('progress', [START, ENOUGH, FITTED, replace(
     START, still=False, stillness=math.nan, accuracy=math.nan, step='', advice='')])
 def test_figures_are_read_as_they_are_written(progress: Progress) -> None:
@@ -325,6 +311,8 @@ def test_screen_shows_all_figures() -> None:
                   'direction in sensor axes: +0.58 +0.58 -0.58'):
         assert words in shown
     assert f'{ENOUGH.accuracy * 1e3:.2g} mg expected' in drawn(screen(NODE, ENOUGH))
+    for words in ('1.0213 g, corrected 1.0002 g', '-3.5 °C'):
+        assert words in drawn(screen(NODE, SEEN))
 
 
 def pose_step(*signs: float) -> Progress:
@@ -348,20 +336,6 @@ def test_every_step_is_shown_in_the_largest_words_that_fit(progress: Progress, w
     for width in (80, 40):
         lines = drawn(screen(NODE, progress), width=width).splitlines()
         assert {len(line) for line in lines} == {width}
-
-
-def test_lengths_and_temperature_are_shown_if_they_are_known() -> None:
-    before, fitted = (drawn(screen(NODE, progress)) for progress in (START, SEEN))
-    assert 'not known' in row(before, '|a|')
-    assert 'temperature' not in before
-    assert '1.0213 g, corrected 1.0002 g' in row(fitted, '|a|')
-    assert '-3.5 °C' in row(fitted, 'temperature')
-
-
-def test_terminal_without_unicode_gets_ascii() -> None:
-    shown = drawn(screen(NODE, replace(MIDDLE, stillness=1.5)), encoding='ascii')
-    assert 'FRONT LEFT BOTTOM' in shown
-    assert '#|#' in row(shown, 'stillness')
 
 
 def test_end_of_the_poses_is_clear() -> None:

@@ -13,7 +13,6 @@ degree 3 over all samples:
 
 """
 
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 import sys
@@ -21,18 +20,16 @@ import sys
 import accel_calib as ac
 from accel_calib.calibration import Curve, curve_of
 from accel_calib.effects import OFFSET_POWERS
-from accel_calib.errors import InputError
 from accel_calib.logs import write_table
-from accel_calib.report import thermal_page
-from accel_calib.stillness import capture, cells_of, Ramp, ramp_of
+from accel_calib.stillness import cells_of, Ramp, ramp_of
 from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import Recording
-from accel_calib.units import MG, units_of
+from accel_calib.units import MG
 from faults.sample import sample
 from inside import export, Intake, RampIntake, thermally_calibrated
 import numpy as np
 import pytest
-from ramps import BENT, G, LINE, offset_at, ramp, twelve_poses, TWISTED, UP, warming, write_ulog
+from ramps import BENT, G, LINE, offset_at, ramp, twelve_poses, TWISTED, UP, write_ulog
 from scipy.signal import medfilt
 from shared import data, MPS2, refused, rms, run, run_json
 from test_exports import ardupilot, qgroundcontrol
@@ -135,20 +132,6 @@ def test_coefficients_are_those_of_the_autopilots(vendor, seed, tmp_path):
                                atol=5e-4)
 
 
-@pytest.mark.parametrize('truth', [LINE, BENT, TWISTED])
-def test_the_error_on_a_second_ramp_is_not_larger_than_that_of_the_autopilots(truth):
-    """The second ramp has other temperatures, and its noise is left out."""
-    errors, warm = [], warming(2000, -9.0, 33.0, cool=True)
-    for seed in range(100, 110):
-        log = ramp(seed, truth, wander_g=1e-4)
-        offsets = [curve(log).at(warm), *(vendor_at(fit(log), warm, 25.0)
-                                          for fit in VENDORS.values())]
-        errors.append([np.sum(np.var(offset - offset_at(warm, truth), axis=0))
-                       for offset in offsets])
-    ours, *theirs = np.mean(errors, axis=0)
-    assert ours <= 1.02 * min(theirs)
-
-
 def by_rate(log: Recording, size_g: float) -> Recording:
     """Return a log whose offset changes with the rate of the temperature, too [g·s/°C]."""
     rate = np.gradient(log['temperature'], log['time'])
@@ -174,27 +157,6 @@ def test_what_differs_between_warming_and_cooling_is_corrected_on_another_run(ma
     assert np.max(np.abs(error - error.mean(axis=0))) * MG < 1.0
 
 
-def test_a_jump_along_gravity_is_a_step_of_the_sensor_and_bends_no_curve():
-    stepped = curve(bumped(900.0, UP * 0.006))
-    assert set(stepped.model.effects) == {*OFFSET_POWERS[1:3], 'offset_step'}
-    *size, instant = stepped.model.values['offset_step']
-    assert instant == pytest.approx(900.0, abs=15.0)
-    np.testing.assert_allclose(size, UP * 0.006, atol=5e-4)
-    values, deviations = coefficients(stepped)
-    assert np.all(np.abs(values - BENT) < 5.0 * deviations)
-    made = thermal(bumped(900.0, UP * 0.006))
-    assert 'thermal_step' in {each.kind for each in made.rating.findings}
-
-
-@pytest.mark.usefixtures('without_pages')
-def test_a_table_of_rests_is_a_ramp(tmp_path, capsys):
-    rests = stretches(ramp(3, BENT, minutes=80.0, cool=True)).stretches
-    write_table(tmp_path / 'rests.csv', rests.without_columns('temperature_rate'))
-    status, result = run_json(capsys, 'thermal', tmp_path / 'rests.csv', '-o', tmp_path / 'c.yaml')
-    assert (status, result['thermal']['degree']) == (0, 2)
-    assert result['thermal']['residual_mg'] < 1.0
-
-
 def test_rests_with_times_in_another_unit_are_read_right_or_refused_with_the_unit(
         tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -207,28 +169,6 @@ def test_rests_with_times_in_another_unit_are_read_right_or_refused_with_the_uni
     assert 'probably in a unit that is 1000' in refused(capsys, 'thermal', path)
 
 
-def test_few_poses_of_one_direction_are_no_ramp(tmp_path, capsys):
-    rests = stretches(ramp(3, BENT)).stretches.without_columns('temperature_rate')
-    few = rests.take(slice(None, None, 30))
-    for columns in ((), ('time',), ('temperature',)):
-        write_table(tmp_path / 'few.csv', few.without_columns(*columns))
-        assert 'same orientation' in refused(capsys, 'calibrate', tmp_path / 'few.csv')
-    write_table(tmp_path / 'few.csv', few)
-    assert 'found 9 rests' in refused(capsys, 'thermal', tmp_path / 'few.csv')
-
-
-@pytest.mark.usefixtures('without_pages')
-def test_the_cycle_of_a_real_board_leaves_two_mg_and_autopilots_state_what_they_lose(tmp_path,
-                                                                                     capsys):
-    path, out = data('poses/thermal_cycle_poses.csv'), tmp_path / 'c.yaml'
-    status, result = run_json(capsys, 'thermal', path, '-o', out)
-    assert status == 0
-    assert result['rms_after_mg'] == result['thermal']['residual_mg'] < 2.2
-    calibration = read_calibration(out)
-    for vendor in ('px4', 'ardupilot'):
-        assert any('lag' in each for each in export(calibration, vendor).losses)
-
-
 @pytest.mark.usefixtures('without_pages')
 def test_a_real_sensor_that_steps_when_it_is_heated_has_the_step_and_the_slope(tmp_path, capsys):
     path = data('poses/icm42652_rest_poses.csv')
@@ -237,13 +177,6 @@ def test_a_real_sensor_that_steps_when_it_is_heated_has_the_step_and_the_slope(t
     assert found['offset_step'][3] == pytest.approx(146.0, abs=3.0)
     assert found['offset_step'][2] == pytest.approx(2.5e-3, abs=1e-3)
     assert found['offset_temperature'][2] == pytest.approx(5e-4, abs=2e-4)
-
-
-def test_ramps_of_several_orientations_share_one_curve():
-    found = curve(ramp(5), ramp(6, up=np.array([1.0, 0.0, 0.0])))
-    assert found.degree == 2
-    values, deviations = coefficients(found)
-    assert np.all(np.abs(values - BENT) < 5.0 * deviations)
 
 
 @pytest.mark.parametrize(('low', 'high', 'reference'), [
@@ -302,66 +235,6 @@ def test_a_ramp_and_a_log_of_poses_become_one_calibration(tmp_path, capsys, monk
     assert result['thermal']['degree'] == 2
 
 
-@pytest.mark.parametrize('low', [-10.0, -35.0])
-def test_an_offset_that_does_not_change_is_a_calibration_too(low, tmp_path, capsys, monkeypatch):
-    paths = written(tmp_path, ramp=ramp(8, (), low=low, high=low + 40.0), poses=twelve_poses(11))
-    out = tmp_path / 'c.yaml'
-    assert run('thermal', paths[0], '-o', out) == 0
-    assert 'degree 0' in ' '.join(capsys.readouterr().out.split())
-    monkeypatch.setitem(sys.modules, 'matplotlib', None)  # one page is enough
-    status, result = run_json(capsys, 'thermal', *paths, '-o', out)
-    assert (status, result['thermal']['degree']) == (0, 0)
-    assert not np.any(read_calibration(out).model.values['offset_temperature'])
-
-
-def test_a_log_with_several_temperatures_is_refused_with_their_names(tmp_path, capsys):
-    path, = written(tmp_path, ramp=ramp(8))
-    text = path.read_text().splitlines()
-    head = next(k for k, line in enumerate(text) if 'ax' in line)
-    rows = [f'{line},{20 + k}' for k, line in enumerate(text[head + 1:])]
-    names = text[head].replace('temperature', 'temp1') + ',temp2'
-    path.write_text('\n'.join([*text[:head], names, *rows]))
-    assert run('thermal', path, '-o', tmp_path / 'c.yaml') == 2
-    assert 'temp1, temp2;' in ' '.join(capsys.readouterr().out.split())
-
-
-@pytest.mark.usefixtures('without_pages')
-def test_a_boards_log_of_another_sensor_does_not_fit_to_the_poses(tmp_path, capsys):
-    other = ramp(8).with_columns(reading=ramp(8).reading * 1.05)
-    paths = written(tmp_path, poses=twelve_poses(11), ramp=other)
-    status, result = run_json(capsys, 'thermal', *paths, '-o', tmp_path / 'c.yaml')
-    assert (status, result['rating']) == (1, 'BAD')
-    assert not (tmp_path / 'c.yaml').exists()
-
-
-@pytest.mark.usefixtures('without_pages')
-def test_the_result_is_described_and_calibrate_recognises_a_still_board(tmp_path, capsys):
-    path, = written(tmp_path, ramp=ramp(8))
-    status, result = run_json(capsys, 'thermal', path, '-o', tmp_path / 'c.yaml')
-    assert (status, result['rating']) == (0, 'USABLE')
-    thermal = result['thermal']
-    assert set(thermal) == {
-        'reference_c', 'range_c', 'degree', 'effects', 'band_mg', 'change_mg', 'residual_mg',
-        'held_out_mg'}
-    assert [*thermal['held_out_mg']][-1] == ' + '.join(thermal['effects'])
-    assert result['noise_floor_mg'] > 0.0
-    assert {'offset', 'gain', 'rating_reason', 'findings', 'next', 'read_as'} <= set(result)
-    assert result['file'] == [str(path)]
-    run('thermal', path, '-o', tmp_path / 'c.yaml')
-    printed = capsys.readouterr().out
-    assert 'a lag of the thermometer is not known' in ' '.join(printed.split())
-    assert 'degree 2' in printed
-    status, result = run_json(capsys, 'calibrate', path, '-o', tmp_path / 'c.yaml')
-    assert status == 0
-    assert result['thermal']['degree'] == 2
-    assert any('accel-calib thermal' in line for line in result['read_lines'])
-    stored = read_calibration(tmp_path / 'c.yaml')
-    assert 'offset_temperature_quadratic' in stored.model.effects
-    assert stored.model.values['offset_temperature'][0] == pytest.approx(5e-4, abs=5e-5)
-    assert ac.calibrate(path) == stored
-    assert ac.calibrate(ramp(8)).model.effects == stored.model.effects
-
-
 @pytest.mark.usefixtures('without_pages')
 def test_a_log_of_px4_is_read_and_its_sensor_kept(tmp_path, capsys):
     pytest.importorskip('pyulog')
@@ -371,33 +244,6 @@ def test_a_log_of_px4_is_read_and_its_sensor_kept(tmp_path, capsys):
     found = qgroundcontrol((tmp_path / 'p.params').read_text())
     assert found['TC_A0_ID'] == found['CAL_ACC0_ID'] == 1310988
     assert (found['TC_A0_TMIN'], found['TC_A0_TMAX']) == pytest.approx((-10.0, 33.6), abs=1.0)
-
-
-def bumped(seconds: float, change_g) -> Recording:
-    log = ramp(8)
-    later = (log['time'] > seconds)[:, np.newaxis]
-    return log.with_columns(reading=log.reading + later * np.array(change_g) * G)
-
-
-def without_temperature(log: Recording) -> Recording:
-    return replace(log, columns={key: log[key] for key in ('time', 'reading')})
-
-
-@pytest.mark.parametrize(('make_log', 'words'), [
-    (lambda: without_temperature(ramp(8)), 'has no temperature'),
-    (lambda: ramp(8, low=20.0, high=22.0), 'expected a range of at least 3 °C'),
-    (lambda: bumped(900.0, [0.006, 0.0, 0.0]), 'the readings jump by [5-7].* mg'),
-    (lambda: bumped(600.0, [0.0, 0.7, -0.3]), 'moved 60[01] s after .* turned by'),
-    (lambda: ramp(8, minutes=1.5), 'too fast for the thermometer'),
-    (lambda: ramp(8, minutes=0.4), 'found 2[0-9] rests .* expected at least 30'),
-], ids=['no temperature', 'narrow', 'shifted', 'turned', 'fast', 'short'])
-def test_a_log_that_cannot_show_the_temperature_is_refused_in_one_line(make_log, words, tmp_path,
-                                                                       capsys):
-    path, = written(tmp_path, ramp=make_log())
-    with pytest.raises(InputError, match=words):
-        curve(make_log())
-    refused(capsys, 'thermal', path, '-o', tmp_path / 'c.yaml')
-    assert not (tmp_path / 'c.yaml').exists()
 
 
 def test_a_shaken_part_and_a_fast_begin_are_left_out_with_a_note():
@@ -411,37 +257,8 @@ def test_a_shaken_part_and_a_fast_begin_are_left_out_with_a_note():
     assert '5 °C/min' in stretches(ramp(8, minutes=20.0)).notes[0]
 
 
-@pytest.mark.parametrize(('logs', 'words'), [
-    (('poses',), 'expected one of a still board'), (('poses', 'poses', 'ramp'), 'at most one')])
-def test_the_logs_are_of_one_board_and_at_most_one_is_of_poses(logs, words, tmp_path, capsys):
-    written(tmp_path, poses=twelve_poses(11), ramp=ramp(8))
-    assert words in refused(capsys, 'thermal', *(tmp_path / f'{name}.csv' for name in logs),
-                            '-o', tmp_path / 'c.yaml')
-
-
-def test_logs_of_several_sensors_in_counts_or_with_poses_without_temperature_are_refused():
-    with pytest.raises(InputError, match='sensors left, right, expected one'):
-        thermal(*(replace(ramp(8), sensor=name) for name in ('left', 'right')))
-    with pytest.raises(InputError, match='native units'):
-        cells_of([ramp(8)], units_of('native'))
-    poses = capture(without_temperature(twelve_poses(1)), MPS2).poses
-    with pytest.raises(InputError, match='the poses have no temperature'):
-        thermal(ramp(8), Intake(poses, MPS2))
-
-
-def test_the_title_of_the_page_names_each_log():
-    page = thermal_page(thermal(ramp(8)), ['logs/cold.csv', '.'])
-    assert ' of cold.csv, .</h1>' in page
-
-
-@pytest.mark.usefixtures('without_pages')
-def test_the_sense_hat_has_the_curve_that_others_found(tmp_path, capsys):
-    path = data('sensehat_lsm9ds1_temperature.csv')
-    lines = path.read_text().splitlines()
-    still = [line for line in lines[3:] if float(line.partition(',')[0]) > 82180.0]
-    cut = tmp_path / 'still.csv'
-    cut.write_text('\n'.join([*lines[:3], *still]))
-    assert run('thermal', cut, '-o', tmp_path / 'c.yaml') == 0
-    slopes = read_calibration(tmp_path / 'c.yaml').model.values['offset_temperature'][:3]
-    np.testing.assert_allclose(slopes * MG, [0.57, 0.41, -0.41], atol=0.02)
-    assert 'the board moved' in refused(capsys, 'thermal', path, '-o', tmp_path / 'd.yaml')
+def test_calibrate_recognises_a_still_board_in_a_file_and_in_memory(tmp_path):
+    path, = written(tmp_path, ramp=ramp(8))
+    found = ac.calibrate(path)
+    assert 'offset_temperature_quadratic' in found.model.effects
+    assert ac.calibrate(ramp(8)).model.effects == found.model.effects

@@ -10,12 +10,11 @@ import re
 from typing import Any
 
 import accel_calib as ac
-from accel_calib.calibration import fit_poses
 from accel_calib.errors import InputError
 from accel_calib.logs import LogOptions, read_recording, write_table
 from accel_calib.stored import write_calibration
 from accel_calib.table import Poses, Table
-from accel_calib.units import STANDARD_GRAVITY as GRAVITY, Units, units_of
+from accel_calib.units import STANDARD_GRAVITY as GRAVITY, Units
 from bag_files import write_bag
 from golden.record import differences
 from inside import in_units_of, model_with, read_log, simulate_recording, spread_directions
@@ -36,19 +35,6 @@ def poses(units: str, seed: int = 1, **more: object) -> Poses:
 
 def unstated(table: Table) -> Table:
     return replace(table, units='')
-
-
-@pytest.mark.parametrize('units', METRIC)
-def test_a_converted_calibration_equals_a_fit_in_that_unit(units: str) -> None:
-    here, there = (ac.fit(poses(each), model='10') for each in (units, other(units)))
-    found = here.in_units(other(units))
-    assert found.units == there.units
-    assert isinstance(found, ac.Calibration)
-    for name in ('offset', 'gain', 'matrix', 'offset_sd', 'gain_sd'):
-        np.testing.assert_allclose(getattr(found, name), getattr(there, name), rtol=1e-6,
-                                   atol=1e-9, err_msg=name)
-    np.testing.assert_allclose(found.poses['std'], there.poses['std'], rtol=1e-12)
-    np.testing.assert_allclose(found.noise.force, there.noise.force, rtol=1e-9)
 
 
 @pytest.mark.parametrize('units', METRIC)
@@ -122,36 +108,6 @@ def test_refine_starts_from_a_calibration_in_the_other_unit() -> None:
     np.testing.assert_allclose(found[0].gap_mg, found[1].gap_mg, rtol=1e-6)
     np.testing.assert_allclose(found[0].calibration.model.vector,
                                found[1].calibration.model.vector, rtol=1e-4, atol=1e-7)
-
-
-def test_compare_takes_calibrations_in_g_and_in_m_s2() -> None:
-    first, second = (ac.fit(poses('g', seed=seed), model='10') for seed in (1, 2))
-    expected = ac.compare([first, second])
-    found = ac.compare([first, second.in_units('m/s2')])
-    assert expected.agree
-    assert found.agree
-    assert found.p_value == pytest.approx(expected.p_value, rel=1e-6)
-    for one, two in zip(found.runs, expected.runs, strict=True):
-        assert one.rms_mg == pytest.approx(two.rms_mg, rel=1e-6)
-    changed = ac.fit(ac.simulate({**SENSOR, 'offset': (0.06, -0.03, 0.08)}, units='m/s2', seed=3,
-                                 noise=0.001), model='10')
-    assert not ac.compare([first, changed]).agree
-    again = ac.compare([first, first.in_units('m/s2')])
-    assert 'all their poses' in again.notes[0]
-
-
-def test_poses_are_converted_with_their_noise_and_known_forces() -> None:
-    table = poses('g', reference=True, temperature=(20.0, 30.0))
-    calibration = fit_poses(table, units_of('g'))
-    found = calibration.in_units('m/s2').poses
-    assert found.units == 'm/s2'
-    for key in ('reading', 'std', 'reference'):
-        np.testing.assert_allclose(found[key], table[key] * GRAVITY)
-    for key in ('count', 'temperature'):
-        np.testing.assert_array_equal(found[key], table[key])
-    assert calibration.name == '12'
-    assert ac.verify(found, calibration).rms_after_mg == pytest.approx(
-        ac.verify(table, calibration).rms_after_mg, rel=1e-9)
 
 
 @pytest.mark.parametrize('stated', [True, False])

@@ -4,11 +4,14 @@
 """The pose tables and recordings of the golden cases, made by seeds; each function writes one."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from accel_calib.logs import write_table
 from generator import Setup, simulate, write_csv
 import numpy as np
+import ramps
 from shared import data
 import yaml
 
@@ -77,6 +80,24 @@ def text(path: Path, *, content: str) -> None:
 def link(path: Path, *, to: str) -> None:
     """Make a symbolic link."""
     path.symlink_to(to)
+
+
+def warming(path: Path, *, seed: int = 8, change: Mapping[float, Any] = {}, times: float = 1.0,
+            without: Sequence[str] = (), poses: bool = False, sensor: str = '',
+            units: str = 'm/s2', **ramp: Any) -> None:
+    """
+    Write a log of a still board whose temperature changes, or of twelve poses of its sensor.
+
+    ``change`` are shifts of the readings [g] from a time on, and ``times`` a factor on them.
+
+    """
+    log = ramps.twelve_poses(seed) if poses else ramps.ramp(seed, **ramp)
+    reading = log.reading * times
+    for seconds, shift in change.items():
+        reading = reading + np.outer(log['time'] > seconds, shift) * G
+    columns = {**log.columns, 'reading': reading}
+    write_table(path, replace(log, sensor=sensor, units=units, columns={
+        key: each for key, each in columns.items() if key not in without}))
 
 
 def real(path: Path, *, name: str) -> None:

@@ -11,12 +11,14 @@ compare a fit with them. `README.md` has the source of each layout.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 import struct
 from typing import Any
 
 from accel_calib.table import Floats, Recording
 from inside import model_with, simulate_recording, spread_directions
 import numpy as np
+import yaml
 
 RATE_HZ, POSES, DWELL, TURN = 20.0, 12, 3.0, 0.8
 NOISE_G = 0.003
@@ -215,33 +217,8 @@ COUNTS = 2048
 """acc_1G of the simulated flight controller."""
 
 
-_SI = truth('m/s2', G)
-_WARM = truth('m/s2', G, temperature=True)
-_ALL = truth('m/s2', G, temperature=True, rate=True)
-TRUTHS: dict[str, Truth] = {
-    **{f'phyphox/{name}.csv': _SI for name in (
-        'comma_point', 'tab_point', 'semicolon_point', 'tab_comma', 'semicolon_comma')},
-    'phyphox/simple/Accelerometer.csv': _SI,
-    'phyphox/export.xls': _SI,
-    'sensor-logger/android/TotalAcceleration.csv': _SI,
-    'sensor-logger/ios/AccelerometerUncalibrated.csv': truth('g', sign=-1.0),
-    'matlab/acceleration.csv': _SI,
-    'matlab/sensorlog_accel_20260714_093012.csv': _SI,
-    'px4/default.ulg': _ALL,
-    'px4/thermal.ulg': _ALL,
-    'px4/log_sensor_accel_0.csv': _WARM,
-    'px4/log_sensor_combined_0.csv': truth('m/s2', G, rate=True),
-    'px4/log_vehicle_imu_0.csv': truth('m/s2', G, rate=True),
-    'ardupilot/two_imus.bin': _ALL,
-    'ardupilot/one_imu.log': _ALL,
-    'ardupilot/raw_acc.bin': _SI,
-    'ardupilot/two_imus.csv': _ALL,
-    'betaflight/LOG00001.01.csv': truth('native', COUNTS),
-    'betaflight/explorer.csv': truth('native', COUNTS),
-    'betaflight/units.csv': truth('m/s2', G, rate=True),
-    'esp32/counts.log': truth('native', 16384.0, temperature=True),
-    'esp32/micros.csv': truth('m/s2', G, rate=True),
-}
+TRUTHS: dict[str, Truth] = {name: truth(**given) for name, given in yaml.safe_load(
+    Path(__file__).with_name('truths.yaml').read_text(encoding='utf-8')).items()}
 """What a fit of each sample with gravity is to find."""
 
 WITHOUT_GRAVITY = ('phyphox/without_g.csv', 'sensor-logger/android/Accelerometer.csv')
