@@ -38,8 +38,8 @@ DATA = ROOT.parent / 'shared' / 'data'
 MODULES = {
     'compare': 'changes', 'watching': 'changes', 'fits': 'speed', 'refine_cost': 'speed',
     'stillness_speed': 'speed', 'geometry': 'poses', 'next_pose': 'poses',
-    'memory': 'recordings', 'rivals': 'rivals'}
-"""Modules of pages with another name, and pages without a file."""
+    'memory': 'recordings'}
+"""Modules of pages with another name."""
 
 sys.path[:0] = [str(ROOT), str(ROOT / 'test'), str(ROOT / 'benchmarks')]
 
@@ -155,7 +155,7 @@ def main() -> None:
     """
     name = sys.argv[1] if len(sys.argv) > 1 else ''
     file = ROOT / 'docs' / 'figures' / f'{name}.md'
-    if name not in MODULES and not file.exists():
+    if not file.exists():
         raise SystemExit(f'usage: {sys.argv[0]} PAGE [options]; a page is a file of docs/figures')
     page = getattr(import_module(MODULES.get(name, name)), name)
     options = argparse.ArgumentParser(prog=f'figures.py {name}')
@@ -180,12 +180,11 @@ def main() -> None:
         pool = (stack.enter_context(multiprocessing.get_context('spawn').Pool(jobs)) if jobs > 1
                 else None)
         parts = list(page(Frame(path, pool), **given))
-    text = (update(file.read_text(encoding='utf-8'), parts) if file.exists()
-            else '\n\n'.join([*parts, 'Measured at the commit .']))
+    text = update(file.read_text(encoding='utf-8'), parts)
     text = re.sub(r'(Made by\s)`[^`]*`', lambda found: f'{found[1]}`{command}`', text)
     text = re.sub(r'(Machine: |` on |^)[^,\n]+, \d+ cores, load .*?numpy [\d.]*\d',
                   lambda found: found[1] + about, text, flags=re.MULTILINE)
-    text = re.sub(r'(Measured at the commit )[^\n]*\s*$', rf'\g<1>{commit()}.\n', text)
+    text = re.sub(r'(Measured at the commit )[^\n]*', rf'\g<1>{commit()}.', text)
     print(text)
     if path is not None:
         path.write_text(text, encoding='utf-8')
@@ -213,8 +212,8 @@ def update(page: str, parts: Sequence[str]) -> str:
             tables.append(phrase)
     page = re.sub(r'^\| .*\n\|---.*\n(?:\|.*\n)*', lambda old: (
         f'{tables.pop(0)}\n' if tables else old[0]), page, flags=re.MULTILINE)
-    words, last, commit_words = page.rpartition('Measured at the commit ')
-    return ''.join([words, *(f'{each}\n\n' for each in tables), last, commit_words])
+    before, place, after = page.rpartition('Measured at the commit ')
+    return ''.join([before, *(f'{each}\n\n' for each in tables), place, after])
 
 
 def commit() -> str:

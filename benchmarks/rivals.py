@@ -8,10 +8,7 @@ All ways get the same columns: each effect of the catalogue with each shape, nea
 10, in units of the noise. They differ only in what they choose. The Gaussian process and the
 oracle need no columns: the first one predicts the residual from all that is recorded, the second
 one fits the true form. The sets are those of `refine_sets`, which nothing was tuned with for seeds
-from 2028 on. The output is the table of ``docs/figures/rivals.md``::
-
-    pip install scikit-learn pysindy
-    python benchmarks/figures.py rivals --sets 2 --seed 2029 --jobs 2
+from 2028 on. ``pip install scikit-learn pysindy`` installs what they need.
 
 """
 
