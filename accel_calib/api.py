@@ -13,12 +13,11 @@ from typing import Any, Literal, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .calibration import (
-    Calibration as Calibration, mounting_of, Verification, verify as verify_calibration)
+from .calibration import Calibration as Calibration, Verification, verify as verify_calibration
 from .comparison import compare as compare_calibrations, Comparison
 from .effects import model_with, own_effects, OwnEffect, simulate_poses, simulate_recording
 from .errors import InputError
-from .geometry import spread_directions, unit
+from .geometry import rotation_from_rpy, spread_directions, unit
 from .logs import (
     are_untimed_samples, Frame, LogOptions, read_poses as read_pose_table,
     read_recording as read_whole_recording)
@@ -443,7 +442,7 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
         _check_within(**{'poses * (dwell + turn) * rate': (count, 0, _MOST_ROWS)})
     known = units_of(units, gravity)
     # The attitude transforms from sensor to robot axes, ΔR from robot to sensor axes.
-    rotation = mounting_of(np.radians(np.asarray(mounting, float)))
+    rotation = rotation_from_rpy(*np.radians(np.asarray(mounting, float))).T
     model = model_with(effects, rotation, own_effects(also))
     if directions is None:  # in mixed order
         mixed = np.random.default_rng(poses).permutation(spread_directions(poses)[1:])

@@ -21,8 +21,7 @@ from .directions import (
     lies_in_plane, NORM_MODELS)
 from .fit import CLIPPED, fit_poses, fit_unknown, only_norm, rejected_by, sound_rows, sure_rows
 from .mounting import (
-    flat_direction, in_frame, level, level_by_rows, mounting_of, on_topics, set_heading,
-    with_given_mounting)
+    flat_direction, in_frame, level, level_by_rows, on_topics, set_heading, with_given_mounting)
 from .outside import Outside, outside, SampleContext
 from .partial import fit_partial, fit_with_fleet, FleetPrior, mounting_only, posterior
 from .planning import (
@@ -44,9 +43,9 @@ __all__ = ['CLIPPED', 'ENOUGH', 'FLEET', 'LARGEST_DILUTION', 'LARGEST_OFFSET_G',
            'errors_after', 'errors_before', 'fit_findings', 'fit_partial', 'fit_poses',
            'fit_unknown', 'fit_with_fleet', 'flat_direction', 'free_parameters', 'gated',
            'gyro_bias_of', 'has_usual_gains', 'identifiability', 'in_frame', 'in_g', 'level',
-           'level_by_rows', 'lies_in_cone', 'lies_in_plane', 'mounting_of', 'mounting_only',
-           'next_pose', 'on_topics', 'only_norm', 'outside', 'plan_refinement', 'plan_session',
-           'posterior', 'quality_of', 'record_of', 'refuse_if_unfit', 'rejected_by',
-           'sample_noise_of', 'set_heading', 'sound_rows', 'stated_uncertainty', 'sure_rows',
-           'thermal_alone', 'uncertainty_g', 'verify', 'with_curve', 'with_given_mounting',
-           'with_rest_noise', 'without_curve']
+           'level_by_rows', 'lies_in_cone', 'lies_in_plane', 'mounting_only', 'next_pose',
+           'on_topics', 'only_norm', 'outside', 'plan_refinement', 'plan_session', 'posterior',
+           'quality_of', 'record_of', 'refuse_if_unfit', 'rejected_by', 'sample_noise_of',
+           'set_heading', 'sound_rows', 'stated_uncertainty', 'sure_rows', 'thermal_alone',
+           'uncertainty_g', 'verify', 'with_curve', 'with_given_mounting', 'with_rest_noise',
+           'without_curve']

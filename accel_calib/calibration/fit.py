@@ -234,7 +234,7 @@ def fit_unknown(poses: Poses, units: Units, model: str, method: Method
     inside = np.zeros(len(poses_g), bool)
     inside[kept] = True
     fit, out = fits[name], first[~inside[first]]
-    unlike = rivals(fit, kept, out, poses_g, lambda others: _estimated(name, others))
+    unlike = rivals(fit, kept, out, poses_g, lambda others: _fit_rows(others, name, method))
     fit = stated(fit)
     noted = [*copies(original, poses_g), *rival_findings(unlike, poses_g.row),
              *fit_findings(fit, dilutions[name])]
@@ -261,8 +261,8 @@ def copies(original: Indices, poses: Poses) -> Iterator[Finding]:
 
 def only_norm(poses_g: Poses) -> Poses:
     """Return the poses with the columns that a fit by |force| = 1 g uses."""
-    kept = ('reading', 'std', 'count')
-    return Poses({key: poses_g[key] for key in kept if key in poses_g}, poses_g.row)
+    return Poses({key: poses_g[key] for key in ('reading', 'std', 'count') if key in poses_g},
+                 poses_g.row)
 
 
 def _dilutions(model: str, directions: Floats, noise: Floats | None) -> dict[str, float]:
@@ -287,10 +287,6 @@ def _fit_norm(name: str, poses_g: Poses) -> tuple[Fit, Indices]:
     return _in_own_axes(name, fit), kept
 
 
-def _estimated(name: str, poses_g: Poses) -> Fit:
-    return _in_own_axes(name, estimate(start_of(MODELS[name].norm, poses_g.reading), poses_g))
-
-
 def _in_own_axes(name: str, fit: Fit) -> Fit:
     """Return a fit in the axes of its model: those of model 9 are fixed to the sensing axes."""
     if not MODELS[name].sensing_axes:
@@ -301,7 +297,7 @@ def _in_own_axes(name: str, fit: Fit) -> Fit:
 
 def _fit_rows(poses_g: Poses, name: str, method: Method) -> Fit:
     if method == 'ml':
-        return _estimated(name, poses_g)
+        return _in_own_axes(name, estimate(start_of(MODELS[name].norm, poses_g.reading), poses_g))
     mat_w, vec_v = closed_form(name, poses_g.reading)
     if not np.all(np.isfinite(mat_w)):
         raise RefusedFitError(f'the poses are not on an ellipsoid, but model {name} needs one',

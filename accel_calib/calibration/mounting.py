@@ -40,7 +40,7 @@ rotation by another angle. A rotation can be intended, a mirror image cannot.
 
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 import math
 
@@ -53,7 +53,7 @@ from ..effects import add_history, AXES, Context, Model, sensor_force
 from ..errors import InputError
 from ..estimate import fit_12
 from ..finding import Finding, Level, without
-from ..geometry import angle_of, axes_of_signs, rotation_from_rpy, SIGNED_AXES
+from ..geometry import angle_of, axes_of_signs, SIGNED_AXES
 from ..table import Floats, Poses
 from ..units import FrameName
 
@@ -167,11 +167,6 @@ def on_topics(calibration: Calibration, frame: str) -> Calibration:
     level_up = in_frame(calibration, 'ros')
     to_left_up = np.diag([1.0, -1.0, -1.0])  # from forward-right-down
     return replace(level_up, model=Model(level_up.model.values, level_up.rotation @ to_left_up))
-
-
-def mounting_of(rpy: Sequence[float]) -> Floats:
-    """Return ΔR, (3, 3), from roll, pitch and yaw of the sensor on the robot [rad] (URDF)."""
-    return rotation_from_rpy(*rpy).T
 
 
 def level_by_rows(calibration: Calibration, poses: Poses, frame: FrameName, flat: int | None,

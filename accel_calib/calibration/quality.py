@@ -346,8 +346,8 @@ def _range_of_gains(model: Model) -> tuple[float, float]:
 
 def _check_gain(calibration: Calibration) -> None:
     mat_w, vec_v = calibration.model.linear_part
-    if not has_usual_gains(calibration.model):
-        least, most = _range_of_gains(calibration.model)
+    least, most = _range_of_gains(calibration.model)
+    if not GAINS[0] <= least <= most <= GAINS[1]:
         raise RefusedFitError('the poses are not on an ellipsoid of an accelerometer: the gains '
                               f'are {least:.3g} to {most:.3g}, expected {GAINS[0]:g} to '
                               f'{GAINS[1]:g}', f'check the units, or {_CHECK_POSES}')

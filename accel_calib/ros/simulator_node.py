@@ -27,10 +27,9 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from .declare import declared, STREAM
-from ..calibration import mounting_of
 from ..effects import (
     context_of_samples, model_with, parse_effect, predict, thermal_stream, turn_between)
-from ..geometry import spread_directions
+from ..geometry import rotation_from_rpy, spread_directions
 from ..session import parameter
 from ..table import Floats, numbered, Recording
 from ..units import STANDARD_GRAVITY
@@ -96,7 +95,7 @@ class SimulatedImu:
 
     def __init__(self, settings: SimulatorSettings) -> None:
         # The attitude transforms from sensor to robot axes, ΔR from robot to sensor axes.
-        rotation = mounting_of([math.radians(angle) for angle in settings.mounting])
+        rotation = rotation_from_rpy(*(math.radians(angle) for angle in settings.mounting)).T
         self._settings = settings
         self._model = model_with(
             dict(parse_effect(text) for text in settings.effects if text), rotation)

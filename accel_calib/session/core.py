@@ -14,11 +14,12 @@ from .settings import CalibratorSettings, own_effects
 from .store import SensorFiles
 from .stream import AGAIN, Around, StreamStatistics
 from .worker import Event, Log, Severity, Throttle
-from ..calibration import Calibration, mounting_of, with_given_mounting
+from ..calibration import Calibration, with_given_mounting
 from ..effects import OwnEffect
 from ..errors import InputError
 from ..finding import Finding
 from ..findings import mounting_words
+from ..geometry import rotation_from_rpy
 from ..table import Floats
 from ..units import FrameName, Units, units_of
 
@@ -169,9 +170,9 @@ def begin(settings: CalibratorSettings, topic: str, clock: Callable[[], float]) 
                          'set publish_tf to false, or choose another output_frame_id')
     units = units_of(settings.units, settings.gravity)
     return State(
-        settings, topic, units, new_sensor(settings, units), StreamStatistics(clock),
-        Around(clock), own=own_effects(settings),
-        given=mounting_of(settings.mounting_rpy) if any(settings.mounting_rpy) else None)
+        settings, topic, units, sensor=new_sensor(settings, units),
+        statistics=StreamStatistics(clock), around=Around(clock), own=own_effects(settings),
+        given=rotation_from_rpy(*settings.mounting_rpy).T if any(settings.mounting_rpy) else None)
 
 
 class Holder:
