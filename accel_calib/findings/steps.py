@@ -117,7 +117,7 @@ def place_words(step: Step) -> str:
     if 'change' not in figures:
         return words
     effect = entry_of(step.name)
-    scale, unit_name = (1e3, 'mg') if effect.changes == 'offset' else (100.0, '%')
+    scale, unit_name = (1e3, 'mg') if effect.is_offset else (100.0, '%')
     shown = ', '.join(f'{"+" if value > 0.0 else ""}{with_sd(value * scale, sd * scale)}'
                       for value, sd in figures['change'])
     since = f' since {figures["date"][:10]}' if figures['date'] else ''

@@ -388,7 +388,7 @@ def _of_a_turn(state: State) -> set[EffectKey]:
     values: dict[EffectKey, Floats] = {
         change.base: state.model.values[name] for name, change in changes.items()}
     gains = [name for name, change in changes.items()
-             if entry_of(change.base).changes != 'offset' and not change.known_orientation]
+             if not entry_of(change.base).is_offset and not change.known_orientation]
     if not gains or not any(entry_of(name).known_orientation for name in values):
         return set()
     mat_w, mat_c = state.model.linear_part[0], Model(values).linear_part[0] - np.eye(3)
