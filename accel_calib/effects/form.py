@@ -262,6 +262,11 @@ class Effect:
         return self.changes == 'offset'
 
     @cached_property
+    def is_offset(self) -> bool:
+        """Whether the effect is a part of V in every context."""
+        return self.linear and all(term.monomial == ONE for term in self.terms)
+
+    @cached_property
     def bends(self) -> bool:
         """Whether the effect is not affine in the force."""
         return self.of_force or any(term.monomial >= AFFINE for term in self.terms)
