@@ -257,10 +257,6 @@ class Effect:
             return 'force'
         return 'offset' if all(term.monomial == ONE for term in self.terms) else 'gain'
 
-    @property
-    def is_offset(self) -> bool:
-        return self.changes == 'offset'
-
     @cached_property
     def is_offset(self) -> bool:
         """Whether the effect is a part of V in every context."""

@@ -82,7 +82,7 @@ def write_fleet_page(store: Store, known: Overview, sensors: Sequence[Row],
         errors=[(row['recording'], row['error'], row['advice']) for row in known.errors]))
 
 
-def _distribution(values: Mapping[str, Values]) -> list[tuple[str, ...]]:
+def _distribution(values: Mapping[str, Values]) -> Sequence[tuple[str, ...]]:
     """Return the distribution of each value over the sensors."""
     table = np.array([each.mean for each in values.values()])
     rows = []
@@ -93,7 +93,7 @@ def _distribution(values: Mapping[str, Values]) -> list[tuple[str, ...]]:
     return rows
 
 
-def _typical(fleet: FleetPrior) -> list[tuple[str, ...]]:
+def _typical(fleet: FleetPrior) -> Sequence[tuple[str, ...]]:
     """Return the typical values and spreads."""
     spread = np.sqrt(np.diag(fleet.prior.covariance))
     rows = list[tuple[str, ...]]()
@@ -105,7 +105,7 @@ def _typical(fleet: FleetPrior) -> list[tuple[str, ...]]:
     return rows
 
 
-def _changes(sensors: Sequence[Row]) -> list[tuple[str, ...]]:
+def _changes(sensors: Sequence[Row]) -> Sequence[tuple[str, ...]]:
     """Return lines about the sensors whose calibrations differ."""
     rows = list[tuple[str, ...]]()
     for row in sensors:
