@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from accel_calib.errors import InputError
-from accel_calib.logs import LogOptions, open_log
+from accel_calib.logs import field_of, LogOptions, open_log
 from accel_calib.messages import correct_bag
 from accel_calib.stored import write_calibration
 from accel_calib.table import concatenated, quantity_key, Recording
@@ -198,6 +198,19 @@ def test_a_topic_without_a_temperature_is_refused(
     path = write(tmp_path, topics)
     with pytest.raises(InputError, match=words):
         read(path, temperature=asked)
+
+
+@pytest.mark.parametrize(('column', 'numbers', 'asked', 'field'), [
+    ('temperature', ('voltage', 'temperature'), '', 'temperature'),
+    ('temperature', ('fluid_pressure', 'variance'), '', ''),
+    ('pressure', ('fluid_pressure', 'variance'), '', 'fluid_pressure'),
+    ('motor_current', ('voltage', 'current'), '', 'current'),
+    ('load', ('voltage', 'current'), '', 'voltage'),
+    ('load', ('left', 'right'), '', ''), ('load', ('left', 'right'), 'right', 'right'),
+    ('load', ('left',), '', 'left'), ('load', ('left',), 'right', '')])
+def test_a_field_is_read_only_if_one_can_hold_the_column(
+        column: str, numbers: tuple[str, ...], asked: str, field: str) -> None:
+    assert field_of(column, numbers, asked) == field
 
 
 def test_a_bag_is_corrected_with_a_named_temperature(
