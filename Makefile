@@ -65,8 +65,11 @@ mutants: $(VENV)/extra-test $(VENV)/extra-mutants $(VENV)/package
 
 # For an idle machine: what else it does would be measured too.
 bench: $(VENV)/extra-test $(VENV)/package
-	@for name in imu_path recordings stillness_speed fits memory live_page; do \
-		$(BIN)/python benchmarks/$$name.py --markdown docs/figures/$$name.md || exit 1; done
+	@$(BIN)/python benchmarks/imu_path.py --markdown docs/figures/imu_path.md
+	@for page in recordings memory; do \
+		$(BIN)/python benchmarks/recordings.py $$page --markdown docs/figures/$$page.md || exit 1; done
+	@for page in stillness_speed fits; do \
+		$(BIN)/python benchmarks/speed.py $$page --markdown docs/figures/$$page.md || exit 1; done
 
 clean:
 	@rm -rf $(VENV) build *.egg-info .mypy_cache .pytest_cache .ruff_cache

@@ -74,6 +74,24 @@ KINDS: Mapping[str, str] = MappingProxyType({
     'not_seen': 'a rest does not show all figures of the noise',
     'open': 'what poses near one direction or in a plane leave open',
     'correction_in_file': 'an edited file states another correction than its effects',
+    'unusable': 'the stored calibration, or its files, cannot be used',
+    'read_only': 'the files of the sensor cannot be written',
+    'unsaved': 'the calibration in use is not stored',
+    'switched_off': 'the correction is switched off',
+    'outside': 'a quantity is outside of the range of the calibration',
+    'mismatches': 'publishers and subscribers have another quality of service',
+    'silence': 'a publisher sends no messages',
+    'no_publisher': 'nobody publishes messages',
+    'publishers': 'several publishers are on one topic',
+    'stamps': 'the stamps of the messages are wrong',
+    'unit': 'the readings are in another unit, or without gravity',
+    'not_finite': 'messages with impossible readings are dropped',
+    'foreign': 'messages of another sensor are dropped',
+    'implausible': 'corrected messages with impossible values are dropped',
+    'vibration': 'the sensor stays in one direction without a rest',
+    'no_value': 'a column of the context does not arrive',
+    'axes': 'the axes of the readings are probably swapped or inverted',
+    'step': 'the next step of a calibration that is not done',
     'note': 'a note'})
 """Kinds of findings and their meaning, the most informative reason for a rating first."""
 
@@ -96,7 +114,11 @@ STEPS: Mapping[str, str] = MappingProxyType({
 
 _STEP_OF = {'flat_pose': 'level', 'mounting': 'level', 'changed': 'fit', 'edited': 'verify',
             **dict.fromkeys(('not_calibrated', 'unnamed', 'noisy', 'not_seen',
-                             'thermal_step'), 'record')}
+                             'thermal_step'), 'record'),
+            'unusable': 'restart', 'read_only': 'save', 'unsaved': 'save',
+            'switched_off': 'enable', 'unit': 'unit', 'vibration': 'still', 'step': '',
+            **dict.fromkeys(('mismatches', 'silence', 'no_publisher', 'publishers', 'stamps',
+                             'not_finite', 'foreign', 'implausible', 'no_value'), 'connect')}
 """Step by kind of finding; for other kinds, poses are to be taken."""
 
 _RANKS = {kind: rank for rank, kind in enumerate(KINDS)}
@@ -107,17 +129,21 @@ class NextStep:
     """
     What to do next.
 
-    `kind` is one of `STEPS`, `text` has no full stop, and `rows` may have the row of the suggested
-    flat pose, 1-based.
+    `kind` is one of `STEPS`, or empty while it is not known. `text` has no full stop, and `rows`
+    may have the row of the suggested flat pose, 1-based. While messages arrive, `command` is the
+    service that does it, and `direction` the one to point up, a unit vector in the sensor axes;
+    empty: none.
 
     """
 
     kind: str
     text: str
     rows: tuple[int, ...] = ()
+    command: str = ''
+    direction: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.kind not in STEPS:
+        if self.kind and self.kind not in STEPS:
             raise ValueError(f'step is {self.kind!r}, expected one of {", ".join(STEPS)}')
 
 
@@ -140,6 +166,10 @@ class Finding:
         Rows of the poses that it is about, 1-based.
     step : str
         Kind of the step that the advice is, one of `STEPS`; empty: that of the kind.
+    about : str
+        What it is about, such as a column, where several findings can have one kind.
+    command, direction : str, tuple of float
+        As in `NextStep`.
 
     """
 
@@ -149,6 +179,9 @@ class Finding:
     level: Level = 'GOOD'
     rows: tuple[int, ...] = ()
     step: str = ''
+    about: str = ''
+    command: str = ''
+    direction: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS or self.level not in LEVELS:
@@ -157,7 +190,8 @@ class Finding:
 
     @property
     def next(self) -> NextStep:  # noqa: A003, the name in JSON
-        return NextStep(self.step or _STEP_OF.get(self.kind, 'poses'), self.advice)
+        return NextStep(self.step or _STEP_OF.get(self.kind, 'poses'), self.advice or self.text,
+                        command=self.command, direction=self.direction)
 
     @property
     def stated(self) -> dict[str, Any]:

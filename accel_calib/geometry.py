@@ -11,7 +11,7 @@ would load it between two messages.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import permutations, product
 import math
 
 import numpy as np
@@ -117,6 +117,10 @@ ATTITUDES = unit(np.array(sorted((signs for signs in product((0.0, 1.0, -1.0), r
                                   if any(signs)), key=np.count_nonzero)))
 """The 6 faces, 12 edges and 8 corners of a sensor that can point up, in this order: (26, 3) unit
 vectors, whose signs are those of the axes."""
+
+SIGNED_AXES = [np.eye(3)[list(order)] * signs for order in permutations(range(3))
+               for signs in product((1.0, -1.0), repeat=3)]
+"""The 48 ways in which axes can be swapped and inverted, (3, 3) each, including mirror images."""
 
 _NEAR = np.cos(np.radians(45.0))
 _COVERAGE_DIRECTIONS = 500

@@ -29,7 +29,7 @@ from .calibration import (
 from .effects import Context, LADDER, Model, OwnEffect, PROCESSES
 from .errors import InputError, RefusedFitError, saying
 from .finding import explained_by, Finding
-from .findings import rate, Rating
+from .findings import outside_line, rate, Rating
 from .logs import Frame, LogOptions, open_log, OpenLog, Piped, Progress
 from .stillness import (
     account_of, capture, Captured, CaptureSettings, cells_of, check_measured, is_one_direction,
@@ -560,4 +560,4 @@ class Correction:
     def notes(self) -> list[str]:
         """Return what the samples lack, and what left the range of the calibration, so far."""
         return [*filter(None, [self._context.lacking]),
-                *(each.line for each in self._context.left)]
+                *map(outside_line, self._context.left)]

@@ -4,11 +4,9 @@
 """
 Drivers and calibrators that are killed: whether the other processes notice.
 
-A driver publishes at 1 kHz, a calibrator corrects the messages, and a listener receives them and
-calls the self-test. All are processes of their own. In each trial the driver, or the calibrator,
-is started and killed by SIGKILL at a random time. The benchmark itself does not use ROS::
-
-    python benchmarks/driver_kills.py --kills 200 --markdown docs/figures/driver_kills.md
+The benchmark itself does not use ROS. Driver and listener count in memory that they share with it,
+because a killed process cannot write its records. Each message has the number of its trial, and
+its own number in it, where the orientation would be; the sensor has no orientation.
 
 """
 
@@ -17,21 +15,20 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
+import faulthandler
 import multiprocessing
 import os
 from pathlib import Path
 import signal
+import struct
 import subprocess
 import sys
 from tempfile import TemporaryDirectory
 import time
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
-
-import driver_kills_clients as clients  # noqa: E402
-from figures import busy, machine, markdown, parser, publish  # noqa: E402
-import numpy as np  # noqa: E402
+from figures import Frame, main, markdown, ROOT, tell
+import numpy as np
 
 PARTIES = ('driver', 'calibrator', 'listener')
 RATE = 1000.0
@@ -46,36 +43,23 @@ LATEST, LATEST_END = 0.5, 1.5
 UDP = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SYSTEM_DEFAULT',
        'FASTRTPS_DEFAULT_PROFILES_FILE': str(ROOT / 'config' / 'fast_dds_udp.xml')}
 LOCALHOST = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+NANO = 1_000_000_000
+
+_STAMP, _NUMBERS = struct.Struct('<iI'), struct.Struct('<dd')
+_STAMP_AT, _NUMBERS_AT = 4, -296
+"""Place of the stamp and of the orientation in a serialized Imu [bytes]."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """
-    What is killed, and how.
-
-    Parameters
-    ----------
-    words : str
-        Description for the table.
-    victim : str
-        The process that is killed.
-    starting : bool
-        Whether every second kill comes while it starts.
-    ends : bool
-        Whether the calibrator is ended by SIGTERM after each kill of the driver.
-    loops : int
-        Number of busy loops beside.
-    udp : bool
-        Whether the processes use UDP without shared memory.
-
-    """
+    """What is killed, and how; `words` is the description for the table."""
 
     words: str
     victim: str = 'driver'
-    starting: bool = False
-    ends: bool = False
-    loops: int = 0
-    udp: bool = False
+    starting: bool = False  # whether every second kill comes while it starts
+    ends: bool = False  # whether the calibrator is ended by SIGTERM after each kill of the driver
+    loops: int = 0  # number of busy loops beside
+    udp: bool = False  # whether the processes use UDP without shared memory
 
 
 CASES = {
@@ -88,61 +72,94 @@ CASES = {
     'calibrator': Case('the calibrator is killed, and started again', 'calibrator'),
     'calibrator-udp': Case('the same without shared memory', 'calibrator', udp=True)}
 
-_ABOUT = """\
-Made by `python benchmarks/driver_kills.py --kills {kills} --markdown FILE`. A driver at
-{rate:g} Hz, a calibrator and a listener are processes of their own. In each trial one of them is
-started, and killed by SIGKILL up to {latest:g} s after the listener has received messages. The
-others must live. After the kill of a driver, the self-test of the calibrator must answer. "Silent"
-are the trials in which no messages arrived, or no answer, for {patience:g} s; then all processes
-are started anew.
 
-The transport is the default one, shared memory; without it, it is UDP with
-`config/fast_dds_udp.xml`. {loads} Machine: {machine}."""
+def begin(folder: Path, environment: dict[str, str], name: str) -> Any:
+    """Work in a folder, where a crash leaves a core and the Python stack; return a ROS node."""
+    import rclpy
+    from rclpy.signals import SignalHandlerOptions
+    os.chdir(folder)
+    os.environ.clear()
+    os.environ.update(environment)
+    faulthandler.enable((folder / 'faults.log').open('a'))
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    return rclpy.create_node(name)
+
+
+def drive(folder: Path, environment: dict[str, str], trial: Any, sent: Any) -> None:
+    """Publish a sensor at rest until the process is killed."""
+    from rclpy.serialization import serialize_message
+    from sensor_msgs.msg import Imu
+    publisher = begin(folder, environment, 'driver').create_publisher(Imu, 'imu/data_raw', 100)
+    message = Imu()
+    message.header.frame_id = 'imu_link'
+    message.orientation_covariance[0] = -1.0
+    message.linear_acceleration.z = 9.81
+    data = bytearray(serialize_message(message))
+    began, count = time.monotonic_ns(), 0
+    while True:
+        wait = began + count * NANO / RATE - time.monotonic_ns()
+        if wait > 0.0:
+            time.sleep(wait / NANO)
+        count += 1
+        now, number = time.monotonic_ns(), trial.value
+        _STAMP.pack_into(data, _STAMP_AT, now // NANO, now % NANO)
+        sent[number] += 1
+        _NUMBERS.pack_into(data, len(data) + _NUMBERS_AT, number, sent[number])
+        publisher.publish(bytes(data))
+
+
+def listen(folder: Path, environment: dict[str, str], heard: Any, first: Any, asked: Any,
+           answered: Any) -> None:
+    """
+    Count the calibrated messages of each trial until the process is killed.
+
+    The self-test is called when `asked` changes, again every 5 s until it answers.
+
+    """
+    from diagnostic_msgs.srv import SelfTest
+    from rclpy.executors import SingleThreadedExecutor
+    from sensor_msgs.msg import Imu
+
+    def on_imu(data: bytes) -> None:
+        trial, number = map(int, _NUMBERS.unpack_from(data, len(data) + _NUMBERS_AT))
+        first[trial] = first[trial] or number
+        heard[trial] += 1
+
+    node, executor = begin(folder, environment, 'listener'), SingleThreadedExecutor()
+    executor.add_node(node)
+    client = node.create_client(SelfTest, 'calibrator/self_test')
+    node.create_subscription(Imu, 'imu/data_calibrated', on_imu, 100, raw=True)
+    future, called = None, 0.0
+    while True:
+        executor.spin_once(timeout_sec=0.02)
+        if answered.value != asked.value:
+            if future is not None and future.done():
+                answered.value, future = asked.value, None
+            elif future is None or time.monotonic() - called > 5.0:
+                ready = client.service_is_ready()
+                future = client.call_async(SelfTest.Request()) if ready else None
+                called = time.monotonic()
 
 
 @dataclass(frozen=True)
 class Trial:
-    """
-    One life of the victim.
+    """One life of the victim."""
 
-    Parameters
-    ----------
-    seconds : float
-        Time from its start to the first message that the listener received; NaN without one.
-    sent, heard : int
-        Messages that the driver sent, from the first one received, and that the listener
-        received.
-    died : dict
-        Exit statuses of processes that ended by themselves, or not with status 0.
-    silent : bool
-        Whether messages or an answer did not come within `PATIENCE`.
-
-    """
-
-    seconds: float
-    sent: int
-    heard: int
-    died: Mapping[str, int]
-    silent: bool
+    seconds: float  # from its start to the first message that the listener received, or NaN
+    sent: int  # messages that the driver sent, from the first one received
+    heard: int  # messages that the listener received
+    died: Mapping[str, int]  # exit statuses of those that ended by themselves, or not with 0
+    silent: bool  # whether messages or an answer did not come within `PATIENCE`
 
 
 class World:
-    """
-    The three processes.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of their logs.
-    count : int
-        Number of trials.
-
-    """
+    """The three processes, with a folder for their logs, and counters of some trials."""
 
     def __init__(self, folder: Path, count: int) -> None:
         # A server that has imported ROS starts driver and listener within 0.1 s.
         self._context = multiprocessing.get_context('forkserver')
-        self._context.set_forkserver_preload(['driver_kills_clients'])
+        self._context.set_forkserver_preload([
+            '__main__', 'numpy', 'rclpy', 'diagnostic_msgs.srv', 'sensor_msgs.msg'])
         self._folder = folder
         self.running: dict[str, Any] = {}
         self.trial = self._context.RawValue('i', 0)
@@ -160,29 +177,19 @@ class World:
                      'calibrator', '--ros-args', '-p', 'passthrough:=true'], cwd=folder,
                     stdout=log, stderr=log)
             return
-        target: Any
-        target, given = {
-            'driver': (clients.drive, (self.trial, self.sent, RATE)),
-            'listener': (clients.listen, (self.heard, self.first, self.asked, self.answered)),
-        }[name]
         # The environment is given, because that of the server is the one of its start.
-        process = self._context.Process(target=target, args=(folder, dict(os.environ), *given))
-        process.start()
-        self.running[name] = process
-
-    def status(self, name: str) -> int | None:
-        """Return the exit status of a process, or None."""
-        process = self.running[name]
-        found: int | None = (process.poll() if isinstance(process, subprocess.Popen)
-                             else process.exitcode)
-        return found
+        own, process = (folder, dict(os.environ)), self._context.Process
+        self.running[name] = (
+            process(target=drive, args=(*own, self.trial, self.sent)) if name == 'driver' else
+            process(target=listen, args=(*own, self.heard, self.first, self.asked, self.answered)))
+        self.running[name].start()
 
     def kill(self, name: str) -> None:
         """Kill a process."""
         process = self.running.pop(name, None)
         if process is not None:
             process.kill()
-            (process.wait if isinstance(process, subprocess.Popen) else process.join)()
+            (process.wait if name == 'calibrator' else process.join)()
 
     def end(self, after: float) -> dict[str, int]:
         """End the calibrator by SIGTERM; return its exit status if it is not 0."""
@@ -194,7 +201,8 @@ class World:
 
     def died(self) -> dict[str, int]:
         """Return the exit statuses of the processes that have ended."""
-        found = {name: self.status(name) for name in self.running}
+        found = {name: process.poll() if name == 'calibrator' else process.exitcode
+                 for name, process in self.running.items()}
         return {name: status for name, status in found.items() if status is not None}
 
     def wait(self, over: Callable[[], bool]) -> bool:
@@ -207,8 +215,11 @@ class World:
         return True
 
 
-def one(world: World, case: Case, number: int, rng: np.random.Generator) -> Trial:
+def run_trial(world: World, case: Case, number: int, rng: np.random.Generator) -> Trial:
     """Start the victim, kill it, and look at the others."""
+    for name in PARTIES:
+        if name != case.victim and (name not in world.running or name in world.died()):
+            world.start(name)
     world.trial.value = number
     began, seconds, silent = time.monotonic(), np.nan, False
     world.start(case.victim)
@@ -229,48 +240,38 @@ def one(world: World, case: Case, number: int, rng: np.random.Generator) -> Tria
     return Trial(seconds, sent, world.heard[number], died, silent and not died)
 
 
-def trials(world: World, case: Case, count: int, seed: int) -> Iterator[Trial]:
-    """Yield one trial after the other; start again what has ended."""
-    rng = np.random.default_rng(seed)
-    for number in range(count):
-        for name in PARTIES:
-            if name != case.victim and (name not in world.running
-                                        or world.status(name) is not None):
-                world.start(name)
-        found = one(world, case, number, rng)
-        if found.silent:
-            for name in PARTIES:
-                world.kill(name)
-        yield found
-
-
-def run(case: Case, count: int, seed: int, folder: Path | None) -> Iterator[Trial]:
-    """Run the trials of a case."""
+def run_case(case: Case, count: int, seed: int) -> Iterator[Trial]:
+    """Yield the trials of a case; start again what has ended, or all if they are silent."""
     os.environ.pop('FASTRTPS_DEFAULT_PROFILES_FILE', None)
     os.environ.update(UDP if case.udp else LOCALHOST)
+    rng = np.random.default_rng(seed)
     with ExitStack() as stack:
-        temporary = stack.enter_context(TemporaryDirectory())
-        os.environ.update(ROS_HOME=temporary, ROS_LOG_DIR=temporary)
-        stack.enter_context(busy(case.loops))
-        world = World((folder or Path(temporary)).absolute(), count)
+        folder = stack.enter_context(TemporaryDirectory())
+        os.environ.update(ROS_HOME=folder, ROS_LOG_DIR=folder)
+        for _ in range(case.loops):
+            loop = stack.enter_context(subprocess.Popen([sys.executable, '-c', 'while True: 1']))
+            stack.callback(loop.kill)
+        world = World(Path(folder), count)
         for name in PARTIES:
             stack.callback(world.kill, name)
-        for number, each in enumerate(trials(world, case, count, seed), 1):
-            print(f'{number}: {each.seconds:.2f} s, {each.heard} of {each.sent}',
-                  *(f'{name} {words_of(status)}' for name, status in each.died.items()),
-                  'silent' * each.silent, file=sys.stderr, flush=True)
+        for number in range(count):
+            each = run_trial(world, case, number, rng)
+            tell(f'{number + 1}: {each.seconds:.2f} s, {each.heard} of {each.sent}',
+                 *(f'{name} {status_words(status)}' for name, status in each.died.items()),
+                 'silent' * each.silent)
+            for name in PARTIES if each.silent else ():
+                world.kill(name)
             yield each
 
 
-def words_of(status: int) -> str:
+def status_words(status: int) -> str:
     """Return an exit status in words."""
     return signal.Signals(-status).name if status < 0 else f'status {status}'
 
 
 def row_of(case: Case, found: list[Trial]) -> tuple[object, ...]:
-    """Return the row of the table."""
-    def ended(names: tuple[str, ...]) -> str:
-        every = [words_of(status) for each in found for name, status in each.died.items()
+    def ends_of(*names: str) -> str:
+        every = [status_words(status) for each in found for name, status in each.died.items()
                  if name in names]
         return ', '.join(f'{every.count(words)} {words}' for words in sorted(set(every))) or '0'
 
@@ -279,36 +280,24 @@ def row_of(case: Case, found: list[Trial]) -> tuple[object, ...]:
     start = f'{np.median(seconds):.2f}, {seconds.max():.2f}' if len(seconds) else ''
     sent = sum(each.sent for each in found)
     lost = sent - sum(each.heard for each in found)
-    arrived = f'{lost:,} of {sent:,}' if case.victim == 'driver' and not case.ends else ''
-    return (case.words, len(found), ended(('calibrator',)), ended(('driver', 'listener')),
-            sum(each.silent for each in found), arrived, start)
+    return (case.words, len(found), ends_of('calibrator'), ends_of('driver', 'listener'),
+            sum(each.silent for each in found),
+            f'{lost:,} of {sent:,}' if case.victim == 'driver' and not case.ends else '', start)
 
 
-def main() -> int:
-    """Run the benchmark."""
-    options = parser(__doc__, seed=1)
-    options.add_argument('--cases', nargs='+', choices=list(CASES), default=list(CASES))
-    options.add_argument('--kills', type=int, default=200, help='kills of each case')
-    options.add_argument('--folder', type=Path, help='keep the logs of the processes here')
-    given = options.parse_args()
-    before = machine()
-    os.environ.update(ROS_DOMAIN_ID=str(os.getpid() % 101 + 1), PYTHONPATH=os.pathsep.join(
-        [str(ROOT), str(ROOT / 'benchmarks')]))
+def driver_kills(frame: Frame, kills: int = 200, seed: int = 1,
+                 cases: tuple[str, ...] = tuple(CASES)) -> Iterator[str]:
+    """Yield the parts of the page; `kills` is the number of each case."""
+    os.environ.update(ROS_DOMAIN_ID=str(os.getpid() % 101 + 1))
     rows, loads = [], []
-    for name in given.cases:
-        found = list(run(CASES[name], given.kills, given.seed, given.folder))
+    for name in cases:
+        rows.append(row_of(CASES[name], list(run_case(CASES[name], kills, seed))))
         loads.append(f'{os.getloadavg()[0]:.0f}')
-        rows.append(row_of(CASES[name], found))
-        print(*rows[-1], sep=', ', file=sys.stderr, flush=True)
-    about = _ABOUT.format(
-        kills=given.kills, rate=RATE, latest=LATEST, patience=PATIENCE, machine=before,
-        loads=f'Load of the machine after each case: {", ".join(loads)}.')
-    heads = ('', 'kills', 'ends of the calibrator', 'ends of the others', 'silent',
-             'messages lost', 'from the start to the first message, s: median, longest')
-    publish(f'# Figures of processes that are killed\n\n{about}\n\n{markdown(heads, rows)}\n',
-            given.markdown)
-    return 0
+    yield markdown(('', 'kills', 'ends of the calibrator', 'ends of the others', 'silent',
+                    'messages lost', 'from the start to the first message, s: median, longest'),
+                   rows)
+    yield f'Load of the machine after each case: {", ".join(loads)}.'
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main(driver_kills)

@@ -1,20 +1,43 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What benchmarks share: options, pages with what is measured beside what is asked, a load."""
+"""
+The frame of the benchmarks: arguments, sets in parallel, tables and the page.
+
+A benchmark is its sets, its measure and its table; it calls `main` with the function that makes
+its page. It imports this module first, which puts the package of this repository and the helpers
+of its tests on the path, and gives each process one thread before numpy is imported.
+
+"""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib.metadata import version
+import inspect
+import multiprocessing
 import os
 from pathlib import Path
 import platform
+import re
 import subprocess
 import sys
+import time
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+DATA = ROOT.parent / 'shared' / 'data'
+"""Folder of real recordings."""
+
+sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
+
+from accel_calib.one_thread import use_one_thread  # noqa: E402
+
+use_one_thread()
 
 
 @dataclass(frozen=True)
@@ -26,10 +49,12 @@ class Line:
     ----------
     what : str
         The quantity, with its unit.
-    measured, asked : str
-        Its value, and the limit; an empty limit if nothing is asked.
+    measured : str
+        Its value.
     sets : int
         Number of sets, repeats or poses behind the value.
+    asked : str
+        The limit; empty if nothing is asked.
     met : bool or None
         Whether the value is within the limit; None if nothing is asked.
 
@@ -37,12 +62,12 @@ class Line:
 
     what: str
     measured: str
-    asked: str
-    sets: int
-    met: bool | None
+    sets: int = 1
+    asked: str = ''
+    met: bool | None = None
 
 
-def table(lines: Sequence[Line]) -> str:
+def table(lines: Iterable[Line]) -> str:
     """Return the lines as a Markdown table."""
     words = {True: 'yes', False: '**no**', None: ''}
     return markdown(('', 'measured', 'asked', 'sets', 'met'), (
@@ -55,28 +80,142 @@ def markdown(heads: Sequence[object], rows: Iterable[Iterable[object]]) -> str:
     return '\n'.join([lines[0], '|---' * len(heads) + '|', *lines[1:]])
 
 
-def parser(about: str | None, **numbers: float) -> argparse.ArgumentParser:
-    """Return the parser of a benchmark: options with numbers, such as the seed, and the page."""
-    made = argparse.ArgumentParser(description=(about or '').strip().splitlines()[0])
-    for name, usual in numbers.items():
-        made.add_argument(f'--{name}', type=type(usual), default=usual)
-    made.add_argument('--markdown', type=Path, help='file to write the page to')
-    return made
+@dataclass(frozen=True)
+class Frame:
+    """The file of a page, None if it is only printed, and a pool of processes for its sets."""
+
+    path: Path | None
+    pool: Any = None
+
+    def run(self, work: Callable[..., Any], tasks: Iterable[tuple[Any, ...]]) -> list[Any]:
+        """Return the results of a function for each of some tuples of arguments, in this order."""
+        began, tasks = time.monotonic(), list(tasks)
+        found = (self.pool.starmap(work, tasks, chunksize=max(len(tasks) // 20, 1)) if self.pool
+                 else [work(*task) for task in tasks])
+        tell(f'{work.__name__}: {len(tasks)} sets in {time.monotonic() - began:.0f} s')
+        return found
 
 
-def publish(page: str, path: Path | None) -> None:
-    """Print a page with the commit that it is of, and write it to the path if there is one."""
-    page = f'{page.rstrip()}\n\nMeasured at the commit {commit()}.\n'
-    print(page)
+@dataclass(frozen=True)
+class Measured:
+    """The result of a function in a process of its own, and what it took."""
+
+    result: Any
+    seconds: float
+    cpu: float  # [s]
+    before: float  # resident memory with all imports and what was prepared [MB]
+    megabytes: float  # largest resident memory of the process [MB]
+
+
+def measure_alone(prepare: Callable[..., Callable[[], Any]], *given: Any) -> Measured:
+    """Return what the function takes that `prepare` returns, both called in a fresh process."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context('spawn')) as alone:
+        found: Measured = alone.submit(_measure, prepare, *given).result()
+    tell(prepare.__name__, *given, found)
+    return found
+
+
+def _measure(prepare: Callable[..., Callable[[], Any]], *given: Any) -> Measured:
+    work = prepare(*given)
+    before, began, cpu = largest_mb(), time.perf_counter(), time.process_time()
+    result = work()
+    return Measured(result, time.perf_counter() - began, time.process_time() - cpu, before,
+                    largest_mb())
+
+
+def largest_mb() -> float:
+    """Return the largest resident memory of this process so far [MB]; not that of its parent."""
+    text = Path('/proc/self/status').read_text(encoding='ascii')
+    return int(text.partition('VmHWM:')[2].split()[0]) / 1024.0
+
+
+def tell(*words: object) -> None:
+    """Show the progress."""
+    print(*words, file=sys.stderr, flush=True)
+
+
+def main(*pages: Callable[..., Iterable[str]]) -> None:
+    """
+    Make a page: parse its arguments, print it, and write it if asked to.
+
+    A page is a function with the name of its file in ``docs/figures``. It takes a `Frame` and
+    options, and yields what it finds: tables, and phrases. The words beside them stand in the
+    file. The options of the command line are those of the function, with their defaults: a
+    number, False for a switch, None for a path, or a tuple of words or numbers. `sets` brings
+    `--jobs` along. If there are several pages, the first argument names one.
+
+    """
+    parser = argparse.ArgumentParser(
+        description=str(sys.modules['__main__'].__doc__).strip().splitlines()[0])
+    several = parser.add_subparsers(required=True) if len(pages) > 1 else None
+    for page in pages:
+        options = several.add_parser(page.__name__) if several else parser
+        for name, option in list(inspect.signature(page).parameters.items())[1:]:
+            usual = option.default
+            kind: dict[str, Any] = {'type': Path if usual is None else type(usual)}
+            if usual is False:
+                kind = {'action': 'store_true'}
+            elif isinstance(usual, tuple):
+                known = usual if isinstance(usual[0], str) else None
+                kind = {'nargs': '+', 'choices': known, 'type': type(usual[0])}
+            options.add_argument(f'--{name.replace("_", "-")}', default=usual, **kind)
+            if name == 'sets':
+                options.add_argument('--jobs', type=int, default=2, help='number of processes')
+        options.add_argument('--markdown', type=Path, help='file to write the page to')
+        options.set_defaults(page=page)
+    given = vars(parser.parse_args())
+    page, path, jobs = given.pop('page'), given.pop('markdown'), given.pop('jobs', 1)
+    words = [word for word in sys.argv[1:] if word not in ('--markdown', str(path))]
+    command = ' '.join(['python', f'benchmarks/{Path(sys.argv[0]).name}', *words,
+                        '--markdown FILE'])
+    os.environ['PYTHONPATH'] = os.pathsep.join([str(ROOT), str(ROOT / 'test')])
+    about = machine()
+    with ExitStack() as stack:
+        pool = (stack.enter_context(multiprocessing.get_context('spawn').Pool(jobs)) if jobs > 1
+                else None)
+        parts = list(page(Frame(path, pool), **given))
+    file = ROOT / 'docs' / 'figures' / f'{page.__name__}.md'
+    text = update(file.read_text(encoding='utf-8'), parts) if file.exists() else '\n\n'.join(
+        [*parts, 'Measured at the commit .'])
+    text = re.sub(r'(Made by\s)`[^`]*`', lambda found: f'{found[1]}`{command}`', text)
+    text = re.sub(r'(Machine: |` on |^)[^,\n]+, \d+ cores, load .*?numpy [\d.]*\d',
+                  lambda found: found[1] + about, text, flags=re.MULTILINE)
+    text = re.sub(r'(Measured at the commit )[^\n]*\s*$', rf'\g<1>{commit()}.\n', text)
+    print(text)
     if path is not None:
-        path.write_text(page, encoding='utf-8')
+        path.write_text(text, encoding='utf-8')
+
+
+def update(page: str, parts: Iterable[str]) -> str:
+    """
+    Return a page with what was found.
+
+    A table takes the place of that with the same number in the page. A phrase gives its numbers
+    to the same words in the page, with other white space; new words are the last paragraph.
+
+    """
+    number = r'[-+]?\d[\d,.]*\d|\d'
+    tables = [part for part in parts if part.startswith('|')]
+    for phrase in (part for part in parts if not part.startswith('|')):
+        values = iter(re.findall(number, phrase))
+        words = (re.escape(each) for each in re.sub(number, '#', phrase).split())
+        pattern = r'\s+'.join(words).replace(re.escape('#'), f'(?:{number})')
+        found = re.search(pattern, page)
+        if found:
+            new = re.sub(number, lambda _: next(values), found[0])  # noqa: B023
+            page = page[:found.start()] + new + page[found.end():]
+        else:
+            page = page.replace('\n\nMeasured at', f'\n\n{phrase}\n\nMeasured at')
+    table = re.compile(r'^\| .*\n\|---.*\n(?:\|.*\n)*', re.MULTILINE)
+    assert len(tables) == len(table.findall(page)), 'expected as many tables as the page has'
+    return table.sub(lambda _: tables.pop(0) + '\n', page)
 
 
 def commit() -> str:
     """Return the short name of the commit, with ``-dirty`` if more than the pages has changed."""
     def answer(*words: str) -> str:
-        return subprocess.run(['git', *words], cwd=Path(__file__).parent, check=True,
-                              capture_output=True, text=True).stdout.strip()
+        return subprocess.run(['git', *words], cwd=ROOT, check=True, capture_output=True,
+                              text=True).stdout.strip()
 
     changed = answer('status', '--porcelain', '--untracked-files=no', '--', ':/',
                      ':(top,exclude)docs/figures')
@@ -84,7 +223,7 @@ def commit() -> str:
 
 
 def machine() -> str:
-    """Return the processor with its load before the benchmark, the system and the versions."""
+    """Return the processor with its load, the system and the versions."""
     try:
         text = Path('/proc/cpuinfo').read_text(encoding='utf-8')
         name = next(line.split(':')[1].strip() for line in text.splitlines()
@@ -93,16 +232,3 @@ def machine() -> str:
         name = platform.processor() or platform.machine()
     return (f'{name}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before; Linux '
             f'{platform.release()}, Python {platform.python_version()}, numpy {version("numpy")}')
-
-
-@contextmanager
-def busy(loops: int) -> Iterator[None]:
-    """Run this number of busy loops."""
-    processes = [subprocess.Popen([sys.executable, '-c', 'while True: pass'])
-                 for _ in range(loops)]
-    try:
-        yield
-    finally:
-        for process in processes:
-            process.kill()
-            process.wait()

@@ -9,9 +9,9 @@ One of each place is drawn at random, and of these a sample. A mutant runs with 
 execute its statement in their own process, the quickest first; so commands and nodes in other
 processes are left out, and the share that is killed is a lower bound.
 
-    python benchmarks/mutants.py [--count 300] [--seed 1] [--markdown FILE]
-
 """
+
+from __future__ import annotations
 
 import ast
 from collections import Counter, defaultdict
@@ -30,14 +30,13 @@ import sys
 from tempfile import TemporaryDirectory
 from xml.etree import ElementTree
 
+from figures import Frame, main, markdown, ROOT, tell
 from cosmic_ray.ast import ast_nodes, get_ast
 from cosmic_ray.mutating import mutate_code
 from cosmic_ray.operators.operator import Operator
 from cosmic_ray.plugins import get_operator, operator_names
 import coverage
-from figures import markdown, parser, publish
 
-ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = ('calibration', 'comparison', 'effects', 'estimate', 'findings', 'logs',
            'messages', 'refinement', 'session', 'stillness', 'stored')
 KINDS = re.compile(r'core/Replace(BinaryOperator|ComparisonOperator|UnaryOperator|AndWithOr'
@@ -48,33 +47,28 @@ ELSEWHERE = re.compile(
 LIMIT_S = 300
 """Time after which a test counts as failed: a mutant may never end."""
 
-
-@dataclass(frozen=True)
-class Place:
-    """Where an operator stands, and what can replace it, each with its number in the file."""
-
-    file: str
-    line: int
-    operators: list[tuple[Operator, int]]
+Place = tuple[str, int, list[tuple[Operator, int]]]
+"""File and line of an operator, and what can replace it, each with its number in the file."""
 
 
 @dataclass(frozen=True)
 class Mutant:
-    """One replaced operator: the statement's lines in a file of the package, before and after."""
+    """One replaced operator in a file of the package."""
 
     file: str
     line: int
-    lines: range
-    code: str
-    words: str
+    lines: range  # of the statement
+    code: str  # of the file
+    words: str  # the line before and after
 
 
-def places(file: str) -> list[Place]:
+def places_of(file: str) -> list[Place]:
     """Return the places of a file, in its order, with the operators that are possible there."""
     source = (ROOT / file).read_text()
     nodes = list(ast_nodes(get_ast(source)))
     notes = [range(note.lineno, (note.end_lineno or note.lineno) + 1)
-             for note in annotations(ast.parse(source))]
+             for node in ast.walk(ast.parse(source)) for name in ('annotation', 'returns')
+             if (note := getattr(node, name, None)) is not None]
     at = defaultdict(list)
     for name in filter(KINDS.match, operator_names()):
         operator = get_operator(name)()
@@ -82,47 +76,36 @@ def places(file: str) -> list[Place]:
         for count, start in enumerate(starts):
             if not any(start[0] in lines for lines in notes):
                 at[start].append((operator, count))
-    return [Place(file, line, possible) for (line, _), possible in sorted(at.items())]
+    return [(file, line, possible) for (line, _), possible in sorted(at.items())]
 
 
-def annotations(tree: ast.AST) -> Iterator[ast.expr]:
-    for node in ast.walk(tree):
-        for name in ('annotation', 'returns'):
-            if (note := getattr(node, name, None)) is not None:
-                yield note
-
-
-def mutant(place: Place, draw: random.Random) -> Mutant:
-    """Return one of the mutants of a place."""
-    source = (ROOT / place.file).read_text()
-    code = mutate_code(source, *draw.choice(place.operators))
-    pairs = zip(source.splitlines(), code.splitlines(), strict=True)
-    before, after = next((a.strip(), b.strip()) for a, b in pairs if a != b)
-    around = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.stmt)
-              and node.lineno <= place.line <= (node.end_lineno or node.lineno)]
-    statement = max(around, key=lambda node: node.lineno)
-    lines = range(statement.lineno, (statement.end_lineno or place.line) + 1)
-    return Mutant(place.file, place.line, lines, code, f'`{before}` → `{after}`')
-
-
-def sample(count: int, seed: int) -> list[Mutant]:
-    """Draw mutants of the folders."""
+def draw_mutants(count: int, seed: int) -> Iterator[Mutant]:
+    """Yield mutants of the folders."""
     draw = random.Random(seed)
     files = sorted(str(path.relative_to(ROOT)) for folder in FOLDERS
                    for path in (ROOT / 'accel_calib' / folder).rglob('*.py'))
-    drawn = draw.sample([place for file in files for place in places(file)], count)
-    return [mutant(place, draw) for place in drawn]
+    drawn = draw.sample([place for file in files for place in places_of(file)], count)
+    for file, line, operators in drawn:
+        source = (ROOT / file).read_text()
+        code = mutate_code(source, *draw.choice(operators))
+        pairs = zip(source.splitlines(), code.splitlines(), strict=True)
+        before, after = next((a.strip(), b.strip()) for a, b in pairs if a != b)
+        statement = max((node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.stmt)
+                         and node.lineno <= line <= (node.end_lineno or node.lineno)),
+                        key=lambda node: node.lineno)
+        lines = range(statement.lineno, (statement.end_lineno or line) + 1)
+        yield Mutant(file, line, lines, code, f'`{before}` → `{after}`'.replace('|', '\\|'))
 
 
-def copied(to: Path) -> Path:
+def copy_to(to: Path) -> Path:
     """Copy what tests need."""
     return Path(shutil.copytree(ROOT, to, symlinks=True, ignore=shutil.ignore_patterns(
         '.git', '.venv', 'build', '__pycache__', '.*_cache')))
 
 
-def pytest(where: Path, *arguments: str) -> int:
+def run_tests(where: Path, *arguments: str) -> int:
     """Run tests in a copy, and return the exit status."""
-    environment = {**os.environ, 'PYTHONDONTWRITEBYTECODE': '1',
+    environment = {**os.environ, 'PYTHONDONTWRITEBYTECODE': '1', 'PYTHONPATH': '',
                    'PATH': f'{Path(sys.executable).parent}:{os.environ["PATH"]}',
                    'COVERAGE_FILE': str(where / '.coverage')}
     command = [sys.executable, '-m', 'pytest', '-q', '-p', 'no:cacheprovider', '-o',
@@ -138,9 +121,9 @@ class Tests:
     def __init__(self, where: Path) -> None:
         files = [str(path.relative_to(where)) for path in sorted(where.glob('test/test_*.py'))
                  if not ELSEWHERE.match(path.name)]
-        status = pytest(where, '-n', str(os.cpu_count()), '--dist', 'loadfile',
-                        '--cov=accel_calib', '--cov-context=test', '--cov-report=',
-                        '--junitxml=tests.xml', *files)
+        status = run_tests(where, '-n', str(os.cpu_count()), '--dist', 'loadfile',
+                           '--cov=accel_calib', '--cov-context=test', '--cov-report=',
+                           '--junitxml=tests.xml', *files)
         if status:
             raise SystemExit(f'the tests fail without any mutant: pytest ended with {status}')
         cases = ElementTree.parse(where / 'tests.xml').getroot().iter('testcase')
@@ -179,22 +162,22 @@ def is_killed(given: Mutant, tests: Tests, where: Path) -> bool:
     original = (where / given.file).read_text()
     (where / given.file).write_text(given.code)
     try:
-        return pytest(where, '-x', '@tests.txt') != 0
+        return run_tests(where, '-x', '@tests.txt') != 0
     finally:
         (where / given.file).write_text(original)
 
 
-def main() -> None:
-    options = parser(__doc__, count=300, seed=1).parse_args()
-    drawn = sample(options.count, options.seed)
+def mutants(frame: Frame, count: int = 300, seed: int = 1) -> Iterator[str]:
+    """Yield the share that is killed by folder, and the mutants that survive."""
+    drawn = list(draw_mutants(count, seed))
     with TemporaryDirectory() as folder:
-        tests = Tests(copied(Path(folder, 'covered')))
+        tests = Tests(copy_to(Path(folder, 'covered')))
         copies: SimpleQueue[Path] = SimpleQueue()
         workers = os.cpu_count() or 1
         for number in range(workers):
-            copies.put(copied(Path(folder, str(number))))
+            copies.put(copy_to(Path(folder, str(number))))
 
-        def tried(given: Mutant) -> bool:
+        def try_one(given: Mutant) -> bool:
             where = copies.get()
             try:
                 return is_killed(given, tests, where)
@@ -203,22 +186,19 @@ def main() -> None:
 
         rows, folders, survived = [], Counter[str](), Counter[str]()
         with ThreadPoolExecutor(workers) as pool:
-            for done, (given, killed) in enumerate(zip(drawn, pool.map(tried, drawn)), 1):
+            for done, (given, killed) in enumerate(zip(drawn, pool.map(try_one, drawn)), 1):
                 folder_of = given.file.split('/')[1]
                 folders[folder_of] += 1
                 if not killed:
                     survived[folder_of] += 1
-                    rows.append((given.file, given.line, given.words.replace('|', '\\|')))
-                    print(done, *rows[-1], flush=True)
-    shares = [(each, count, f'{1.0 - survived[each] / count:.0%}')
-              for each, count in sorted(folders.items())]
-    words = ('# Mutants\n\nThe share of wrong operators that tests in their own process find, by '
-             f'folder; {len(drawn)} mutants, seed {options.seed}: '
-             f'{1.0 - len(rows) / len(drawn):.1%} killed')
-    publish('\n\n'.join((
-        words, markdown(('folder', 'mutants', 'killed'), shares),
-        markdown(('file', 'line', 'survives'), rows))), options.markdown)
+                    rows.append((given.file, given.line, given.words))
+                    tell(done, *rows[-1])
+    yield f'{len(drawn)} mutants, seed {seed}: {1.0 - len(rows) / len(drawn):.1%} killed'
+    yield markdown(('folder', 'mutants', 'killed'), (
+        (each, number, f'{1.0 - survived[each] / number:.0%}')
+        for each, number in sorted(folders.items())))
+    yield markdown(('file', 'line', 'survives'), rows)
 
 
 if __name__ == '__main__':
-    main()
+    main(mutants)

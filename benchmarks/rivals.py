@@ -7,11 +7,11 @@ Refinement beside common ways to choose terms, on the same sets.
 All ways get the same columns: each effect of the catalogue with each shape, near the fit of model
 10, in units of the noise. They differ only in what they choose. The Gaussian process and the
 oracle need no columns: the first one predicts the residual from all that is recorded, the second
-one fits the true form. The sets are those of `refine_rows`, which nothing was tuned with for seeds
-from 2028 on. The table is that of ``docs/figures/rivals.md``::
+one fits the true form. The sets are those of `refine_sets`, which nothing was tuned with for seeds
+from 2028 on. The output is the table of ``docs/figures/rivals.md``::
 
     pip install scikit-learn pysindy
-    python benchmarks/rivals.py --sets 2 --seed 2029 --jobs 2 --markdown docs/figures/rivals.md
+    python benchmarks/rivals.py --sets 2 --seed 2029 --jobs 2
 
 """
 
@@ -20,38 +20,34 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-import multiprocessing
-import os
-from pathlib import Path
-import sys
 from typing import Any
 import warnings
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / 'test'), str(ROOT / 'docs')]
-os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1')  # each process has one core
-
-from accel_calib.calibration import fit_poses, in_g  # noqa: E402
-from accel_calib.effects import add_history, EFFECTS, factors_of  # noqa: E402
-from accel_calib.estimate import judge  # noqa: E402
-from accel_calib.refinement.linear import orthonormal, SEEN  # noqa: E402
-from accel_calib.refinement.state import candidates  # noqa: E402
-from accel_calib.statistics import rms  # noqa: E402
-from accel_calib.table import Floats, Poses  # noqa: E402
-from accel_calib.units import units_of  # noqa: E402
-from figures import commit, markdown, parser  # noqa: E402
-from generator import again, basis_of, simulate, Simulated  # noqa: E402
-import numpy as np  # noqa: E402
-from refine_case import BASE, Case, poses_of, run  # noqa: E402
-from refine_rows import cases_of, PAIRED  # noqa: E402
-import scipy  # noqa: E402
-
-OWN = 'refine'
+from figures import Frame, main, markdown
+from accel_calib.calibration import fit_poses, in_g
+from accel_calib.effects import add_history, EFFECTS, factors_of
+from accel_calib.estimate import judge
+from accel_calib.refinement.linear import orthonormal, SEEN
+from accel_calib.refinement.state import candidates
+from accel_calib.statistics import rms
+from accel_calib.table import Floats, Poses
+from accel_calib.units import units_of
+from generator import again, basis_of, simulate, Simulated
+import numpy as np
+from pysindy.optimizers import STLSQ
+from refine import BASE, run_case
+from refine_sets import Case, cases_of, PAIRED
+import scipy
+from sensors import poses_of
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import ConstantKernel, RBF, WhiteKernel
+from sklearn.linear_model import LassoCV
+from sklearn.model_selection import KFold
 
 ROWS: dict[str, tuple[str, ...]] = {
     'one effect': ('alone60',), 'two or three': ('two', 'three'),
     'outside, size 3': ('outside',), 'outside, size 8': ('outside60',)}
-"""Rows of `refine_rows` by the columns of the table."""
+"""Rows of `refine_sets` by the columns of the table."""
 
 NOT_PREDICTED = 'repeatability'
 """Scatter of the poses, which nothing predicts: left out."""
@@ -59,39 +55,27 @@ NOT_PREDICTED = 'repeatability'
 MOST = 8
 """Largest number of effects that are added one by one."""
 
-_CATALOGUE = [name for name in EFFECTS if name not in BASE]
+CATALOGUE = [name for name in EFFECTS if name not in BASE]
 
 
 @dataclass(frozen=True)
 class Side:
-    """
-    Equations of n poses near the base, per noise.
+    """Equations of n poses near the base, per noise."""
 
-    Parameters
-    ----------
-    residual, scale : (n,) array
-        Errors of |force|, and the noise [g].
-    base, columns : (n, b), (n, c) array
-        Derivatives by the values of the base, and by those of every effect with each shape.
-    recorded : (n, k) array
-        All that is recorded, with mean 0 and variance 1.
-
-    """
-
-    residual: Floats
-    scale: Floats
-    base: Floats
-    columns: Floats
-    recorded: Floats
+    residual: Floats  # (n,) errors of |force|
+    scale: Floats  # (n,) noise [g]
+    base: Floats  # (n, b) derivatives by the values of the base,
+    columns: Floats  # (n, c) and by those of every effect with each shape
+    recorded: Floats  # (n, k) all that is recorded, with mean 0 and variance 1
 
     def error(self, explained: Floats | float = 0.0) -> float:
         """Return the RMS of the error that is left beside what was explained [g]."""
-        return float(rms((self.residual - explained) * self.scale))
+        return rms((self.residual - explained) * self.scale)
 
 
 @dataclass(frozen=True)
 class Library:
-    """The poses of a fit, other poses, and the names of the blocks of columns."""
+    """The poses of a fit, other poses, and blocks of columns: one for each effect and shape."""
 
     taken: Side
     fresh: Side
@@ -109,31 +93,21 @@ class Library:
         sizes[sizes <= SEEN * whole] = np.inf
         return every[:, 0], every[:, 1:] / sizes[1:], sizes[1:]
 
-    @property
-    def dof(self) -> int:
-        """Return the number of poses minus that of values of the base."""
-        return len(self.taken.residual) - self.taken.base.shape[1]
-
-    def left(self, chosen: Sequence[int], block: int | None = None) -> tuple[float, int]:
+    def left_by(self, chosen: Sequence[int]) -> tuple[float, int]:
         """Return the sum of squares that blocks leave, and the number of their values."""
         residual, columns, _ = self.outside
-        both = [*chosen, *([] if block is None else [block])]
         onto = orthonormal(np.hstack([columns[:, :0], *(columns[:, self.blocks[k]]
-                                                        for k in both)]))
+                                                        for k in chosen)]))
         return float(residual @ residual - np.sum((onto.T @ residual) ** 2)), onto.shape[1]
 
     def chance(self, chosen: Sequence[int], block: int) -> float:
         """Return the probability that noise alone makes a block as good beside the others."""
-        (before, fewer), (after, more) = self.left(chosen), self.left(chosen, block)
-        if more == fewer or more >= self.dof:
+        (before, fewer), (after, more) = self.left_by(chosen), self.left_by([*chosen, block])
+        dof = len(self.taken.residual) - self.taken.base.shape[1] - more
+        if more == fewer or dof <= 0:
             return 1.0
-        ratio = (before - after) / (more - fewer) / (after / (self.dof - more))
-        return float(scipy.special.fdtrc(more - fewer, self.dof - more, ratio))
-
-    def further(self, chosen: Sequence[int]) -> list[int]:
-        """Return the blocks of effects that are not chosen."""
-        named = {self.effects[k] for k in chosen}
-        return [k for k, effect in enumerate(self.effects) if effect not in named]
+        ratio = (before - after) / (more - fewer) / (after / dof)
+        return float(scipy.special.fdtrc(more - fewer, dof, ratio))
 
     def values(self, chosen: Sequence[int]) -> Floats:
         """Return the least squares values of all columns, 0 for those not chosen."""
@@ -151,12 +125,12 @@ class Library:
         return self.fresh.error(self.fresh.base @ base + self.fresh.columns @ given)
 
 
-def library(poses: Poses, fresh: Poses) -> Library:
+def library_of(poses: Poses, fresh: Poses) -> Library:
     """Return the equations of poses and of others near model 10 of the first ones."""
     units = units_of('m/s2')
     model = fit_poses(poses, units, model='10').model
     tables = [add_history(in_g(each, units), model) for each in (poses, fresh)]
-    tried = [*candidates(_CATALOGUE, tables[0])]
+    tried = [*candidates(CATALOGUE, tables[0])]
     sides = []
     for table in tables:
         near = judge(model, table).equations
@@ -173,10 +147,10 @@ def library(poses: Poses, fresh: Poses) -> Library:
         slice(end - width, end) for (_, width), end in zip(effects, ends, strict=True)))
 
 
-# ---------------------------------------------------------------------------- ways to choose
+# --------------------------------------------------------------------------------- ways to choose
 
-def _grown(each: Library, cost: Callable[[Sequence[int], int], float], limit: float,
-           removed: float = np.inf) -> Floats:
+def grow(each: Library, cost: Callable[[Sequence[int], int], float], limit: float,
+         removed: float = np.inf) -> Floats:
     """
     Return the values of effects that are added while the cost of the best one is below a limit.
 
@@ -184,9 +158,11 @@ def _grown(each: Library, cost: Callable[[Sequence[int], int], float], limit: fl
 
     """
     chosen: list[int] = []
-    while len(chosen) < MOST and (more := each.further(chosen)):
+    while len(chosen) < MOST:
+        named = {each.effects[k] for k in chosen}
+        more = [k for k, effect in enumerate(each.effects) if effect not in named]
         costs = [cost(chosen, block) for block in more]
-        if min(costs) >= limit:
+        if not more or min(costs) >= limit:
             break
         chosen.append(more[int(np.argmin(costs))])
         for block in chosen[:-1]:
@@ -196,149 +172,107 @@ def _grown(each: Library, cost: Callable[[Sequence[int], int], float], limit: fl
     return each.values(chosen)
 
 
-def forward_f(each: Library) -> Floats:
-    """Add the most significant effect while it is, at 1 % for all blocks together."""
-    return _grown(each, each.chance, 0.01 / len(each.blocks))
-
-
-def stepwise(each: Library) -> Floats:
-    """Add the most significant effect at 5 %, and remove what is not significant at 10 %."""
-    return _grown(each, each.chance, 0.05, 0.10)
-
-
-def bic(each: Library) -> Floats:
+def choose_by_bic(each: Library) -> Floats:
     """Add the effect that lowers the criterion of Schwarz most, while it does."""
     count = len(each.taken.residual)
 
     def change(chosen: Sequence[int], block: int) -> float:
-        (before, fewer), (after, more) = each.left(chosen), each.left(chosen, block)
+        (before, fewer), (after, more) = each.left_by(chosen), each.left_by([*chosen, block])
         return float(count * np.log(after / before) + (more - fewer) * np.log(count))
 
-    return _grown(each, change, 0.0)
+    return grow(each, change, 0.0)
 
 
-def lasso(each: Library) -> Floats:
-    """Lasso with the penalty of the best cross-validation."""
-    from sklearn.linear_model import LassoCV
-
-    residual, columns, _ = each.outside
-    return np.asarray(LassoCV(cv=5, fit_intercept=False, max_iter=5000, tol=1e-3).fit(
-        columns, residual).coef_)
-
-
-def stlsq(each: Library) -> Floats:
+def choose_by_stlsq(each: Library) -> Floats:
     """STLSQ of pysindy with the threshold of the best cross-validation, in units of the noise."""
-    from pysindy.optimizers import STLSQ
-    from sklearn.model_selection import KFold
-
     residual, columns, _ = each.outside
 
-    def fitted(rows: Any, threshold: float) -> Floats:
+    def fit(rows: Any, threshold: float) -> Floats:
         found = STLSQ(threshold=threshold, alpha=0.05, max_iter=20).fit(
             columns[rows], residual[rows, np.newaxis])
         return np.asarray(found.coef_).ravel()
 
     def error(threshold: float) -> float:
-        return sum(float(np.sum((residual[test] - columns[test] @ fitted(rows, threshold)) ** 2))
+        return sum(float(np.sum((residual[test] - columns[test] @ fit(rows, threshold)) ** 2))
                    for rows, test in KFold(5).split(columns))
 
-    return fitted(np.arange(len(residual)), min(np.geomspace(2.0, 50.0, 8).tolist(), key=error))
+    return fit(np.arange(len(residual)), min(np.geomspace(2.0, 50.0, 8).tolist(), key=error))
 
 
-def gaussian_process(each: Library) -> float:
+CHOOSERS: dict[str, Callable[[Library], Floats]] = {
+    # The most significant effect while it is, at 1 % for all blocks together; at 5 %, without
+    # what is not significant at 10 %; and Lasso with the penalty of the best cross-validation.
+    'forward F': lambda each: grow(each, each.chance, 0.01 / len(each.blocks)),
+    'BIC': choose_by_bic,
+    'stepwise': lambda each: grow(each, each.chance, 0.05, 0.10),
+    'Lasso': lambda each: np.asarray(LassoCV(
+        cv=5, fit_intercept=False, max_iter=5000, tol=1e-3).fit(
+            each.outside[1], each.outside[0]).coef_),
+    'STLSQ': choose_by_stlsq}
+
+
+def error_of_process(each: Library) -> float:
     """Return the error of other poses with a Gaussian process of all that is recorded [g]."""
-    from sklearn.gaussian_process import GaussianProcessRegressor
-    from sklearn.gaussian_process.kernels import ConstantKernel, RBF, WhiteKernel
-
     width = each.taken.recorded.shape[1]
     kernel = ConstantKernel(1.0) * RBF(np.full(width, 2.0), (0.2, 1e4)) + WhiteKernel(1.0, 'fixed')
     found = GaussianProcessRegressor(kernel).fit(each.taken.recorded, each.taken.residual)
     return each.fresh.error(found.predict(each.fresh.recorded))
 
 
-def oracle(each: Library, made: Simulated, other: Simulated) -> float:
+def error_of_oracle(each: Library, made: Simulated, other: Simulated) -> float:
     """Return the error of other poses with the true form, fitted to the poses [g]."""
     def columns(truth: Simulated, side: Side) -> Floats:
         along = truth.around.force @ np.linalg.inv(truth.traits.gain)
-        parts = [np.einsum('ni,nip->np', along, basis_of(name, truth.around, truth.traits))
-                 for name in truth.values]
-        return np.hstack([side.base, *parts]) / np.hstack(
-            [np.ones_like(side.base), *(np.repeat(side.scale[:, np.newaxis], part.shape[1], 1)
-                                        for part in parts)])
+        return np.hstack([side.base, *(
+            np.einsum('ni,nip->np', along, basis_of(name, truth.around, truth.traits))
+            / side.scale[:, np.newaxis] for name in truth.values)])
 
     values = np.linalg.lstsq(columns(made, each.taken), each.taken.residual, rcond=None)[0]
     return each.fresh.error(columns(other, each.fresh) @ values)
 
 
-CHOOSERS: dict[str, Callable[[Library], Floats]] = {
-    'forward F': forward_f, 'BIC': bic, 'stepwise': stepwise, 'Lasso': lasso, 'STLSQ': stlsq}
-
 Judged = Mapping[str, tuple[bool | None, float]]
 """By way: whether it names exactly the hidden effects, None if it cannot, and error over base."""
 
 
-def judged(case: Case) -> Judged:
+def judge_ways(case: Case) -> Judged:
     """Return how each way does on a set."""
     warnings.simplefilter('ignore')  # of sklearn and pysindy: no convergence, nothing chosen
     made = simulate(np.random.default_rng(case.seed), case.hidden, case.setup)
     other = again(np.random.default_rng((*case.seed, 1)), made)
-    each, outcome = library(poses_of(made), poses_of(other)), run(case)
-    assert outcome.fresh is not None, outcome.error
+    each, outcome = library_of(poses_of(made), poses_of(other)), run_case(case)
+    assert outcome.fresh, outcome.error
     found: dict[str, tuple[bool | None, float]] = {
-        OWN: (outcome.judgement == 'exact', outcome.fresh.refined_mg / outcome.fresh.base_mg)}
+        'refine': (outcome.judgement == 'exact', outcome.fresh[1] / outcome.fresh[0])}
     base = each.fresh.error()
     for name, choose in CHOOSERS.items():
         values = choose(each)
         named = {effect for effect, block in zip(each.effects, each.blocks, strict=True)
                  if np.any(values[block])}
         found[name] = named == set(case.hidden), each.error(values) / base
-    found['Gaussian process'] = None, gaussian_process(each) / base
-    found['oracle'] = None, oracle(each, made, other) / base
+    found['Gaussian process'] = None, error_of_process(each) / base
+    found['oracle'] = None, error_of_oracle(each, made, other) / base
     return found
 
 
-def table(results: Mapping[str, Sequence[Judged]]) -> Iterator[str]:
+def rivals(frame: Frame, sets: int = 1, seed: int = 1) -> Iterator[str]:
     """Yield the table: how often each way is exact, and its errors of other poses."""
-    heads, rows = [''], {way: [way] for sets in results.values() for way in sets[0]}
-    for name, sets in results.items():
+    heads, rows = [''], dict[str, list[str]]()
+    for name, chosen in ROWS.items():
+        cases = [(case,) for row in chosen for case in cases_of(row, sets, seed)
+                 if NOT_PREDICTED not in case.hidden
+                 and ({*case.hidden} <= {*PAIRED} or 'outside' in row)]
+        results: list[Judged] = frame.run(judge_ways, cases)
         outside = name.startswith('outside')
         heads += [f'{name}: error', 'worst'] if outside else [
-            f'{name}: exact of {len(sets)}', 'error']
-        for way, cells in rows.items():
-            exact, errors = zip(*(each[way] for each in sets), strict=True)
+            f'{name}: exact of {len(cases)}', 'error']
+        for way in results[0]:
+            exact, errors = zip(*(each[way] for each in results), strict=True)
             error = f'{rms(np.array(errors)):.2f}'
-            cells += [error, f'{max(errors):.2f}'] if outside else [
-                '' if None in exact else str(sum(exact)), error]
-    yield from markdown(heads, rows.values()).splitlines()
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the benchmark."""
-    try:
-        import pysindy  # noqa: F401
-        import sklearn  # noqa: F401
-    except ImportError as error:
-        raise SystemExit(f'{error}, expected both libraries; '
-                         'run pip install scikit-learn pysindy') from None
-    from tables import with_tables
-
-    given = parser(__doc__, jobs=2, seed=1, sets=1).parse_args(arguments)
-    results: dict[str, list[Judged]] = {}
-    with multiprocessing.get_context('spawn').Pool(given.jobs) as pool:
-        for name, rows in ROWS.items():
-            cases = [case for row in rows for case in cases_of(row, given.sets, given.seed)
-                     if NOT_PREDICTED not in case.hidden
-                     and ({*case.hidden} <= {*PAIRED} or 'outside' in row)]
-            results[name] = [*pool.imap_unordered(judged, cases)]
-            print(f'{name}: {len(cases)} sets', file=sys.stderr, flush=True)
-    lines = [*table(results), '', f'Measured at the commit {commit()}.']
-    print('\n'.join(lines))
-    if given.markdown is not None:
-        page = given.markdown.read_text(encoding='utf-8')
-        given.markdown.write_text(with_tables(page, {'rivals': lambda: iter(lines)}),
-                                  encoding='utf-8')
-    return 0
+            rows.setdefault(way, [way]).extend([error, f'{max(errors):.2f}'] if outside else [
+                '' if None in exact else str(sum(exact)), error])
+    yield markdown(heads, rows.values())
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main(rivals)

@@ -4,69 +4,49 @@
 """
 Faults of a sensor, its driver and its clock: whether they are named, and never calibrated.
 
-A simulated recording is given a fault, and calibrated as a user does it: from a CSV file, from a
-bag, by the session of a node, and by the session of the live page. It is *named* if a finding, a
-note, a line of the log or the refusal is about the fault, and *wrong* if a calibration that is not
-BAD leaves an error of |a| above 10 mg in orientations that it has not seen. A recording without a
-fault must have no finding about the samples. Faults of the text and of the order of rows are no
-faults of messages::
-
-    python benchmarks/sensor_faults.py --sets 50 --markdown docs/figures/sensor_faults.md
+A simulated recording is given a fault, and calibrated as a user does it. A recording without a
+fault must have no finding about the samples.
 
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-import multiprocessing
 from pathlib import Path
-import sys
 from tempfile import TemporaryDirectory
 from typing import Literal, NamedTuple
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
-
-from accel_calib.calibration import Calibration  # noqa: E402
-from accel_calib.effects import Model, model_with, predict, simulate_recording  # noqa: E402
-from accel_calib.errors import AccelCalibError  # noqa: E402
-from accel_calib.finding import Finding, has  # noqa: E402
-from accel_calib.findings import Rating  # noqa: E402
-from accel_calib.geometry import spread_directions, unit  # noqa: E402
-from accel_calib.logs import LogOptions, open_log  # noqa: E402
-from accel_calib.pipeline import calibrated_log, Outcome, poses_of  # noqa: E402
-from accel_calib.session import checks, columns_of  # noqa: E402
-from accel_calib.table import concatenated, Floats  # noqa: E402
-from bag_files import fill, header, IMU, imu, writer_of  # noqa: E402
-from driven import Driver  # noqa: E402
-from figures import machine, markdown, parser, publish  # noqa: E402
-import numpy as np  # noqa: E402
+from figures import Frame, main, markdown, tell
+from accel_calib.calibration import Calibration
+from accel_calib.effects import Model, model_with, predict, simulate_recording
+from accel_calib.errors import AccelCalibError
+from accel_calib.finding import Finding, has
+from accel_calib.findings import Rating
+from accel_calib.geometry import spread_directions, unit
+from accel_calib.logs import LogOptions, open_log
+from accel_calib.pipeline import calibrated_log, Outcome, poses_of
+from accel_calib.session import checks, columns_of
+from accel_calib.statistics import rms
+from accel_calib.table import concatenated, Floats
+from bag_files import fill, header, IMU, imu, writer_of
+from driven import Driver
+import numpy as np
 
 G = 9.80665
-_WRONG_MG = 10.0
+WRONG_MG = 10.0
 
 OF_SAMPLES = ('missing', 'not_taken', 'signs', 'clock', 'columns', 'limited')
 """Kinds of findings that a sound recording does not have."""
 
+OF_TEXT = ('whole seconds', 'newest first')
+"""Faults of files that are no faults of messages."""
+
 Said = tuple[str, Calibration | None, Rating | None]
 
-_PAGE = """\
-# Faults of sensors
 
-Made by `python benchmarks/sensor_faults.py {command}`. Each set is a
-recording of 14 poses with other errors of the sensor, noise, rate and orientations, and with one
-fault. It comes as a CSV file, as a bag, as messages to the session of a node, and as a recording
-that the live page plays. *Named*: a finding, a note, a line of the log or the refusal is about the
-fault. *Wrong*: a calibration that is not BAD leaves an error of |a| above 10 mg in new
-orientations.
-
-Machine: {machine}.
-
-{rows}
-"""
-
+# ------------------------------------------------------------------------------------------ faults
 
 class Log(NamedTuple):
     """Times [s], readings and rates of a recording, and how it is written."""
@@ -75,6 +55,11 @@ class Log(NamedTuple):
     reading: Floats  # [m/s²]
     rate: Floats
     header: str = 'time,ax,ay,az,gx,gy,gz'
+
+    @property
+    def units(self) -> Literal['', 'native']:
+        """Return the unit that a user states who publishes counts."""
+        return 'native' if 'accX' in self.header else ''
 
 
 @dataclass(frozen=True)
@@ -91,7 +76,7 @@ class Fault:
     right: bool = False
 
 
-def _inserted(log: Log, place: float, rows: int, value: float) -> Log:
+def insert(log: Log, place: float, rows: int, value: float) -> Log:
     """Return a log with zeros, or the reading of a place times a value, for some rows."""
     at = min(int(place * len(log.time)), len(log.time) - 1)
     period = float(np.median(np.diff(log.time)))
@@ -100,55 +85,58 @@ def _inserted(log: Log, place: float, rows: int, value: float) -> Log:
     return log._replace(time=np.arange(len(reading)) * period, reading=reading, rate=rate)
 
 
-def _starting(log: Log, rng: np.random.Generator) -> Log:
+def begin_with_filter(log: Log, rng: np.random.Generator) -> Log:
     """Return a log that begins with what a filter makes of one reading."""
-    made = _inserted(log, 0.0, 150, 1.0)
+    made = insert(log, 0.0, 150, 1.0)
     made.reading[:150] += 10.0**rng.uniform(-6.0, -3.7) * rng.normal(size=(150, 3))
     made.rate[:150] += 1e-6 * rng.normal(size=(150, 3))
     return made
 
 
-def _with_axis(log: Log, axis: int, values: Floats | float) -> Log:
+def replace_axis(log: Log, axis: int, values: Floats | float) -> Log:
+    """Return a log with other readings of an axis."""
     reading = log.reading.copy()
     reading[:, axis] = values
     return log._replace(reading=reading)
 
 
-def _fused(log: Log, rng: np.random.Generator) -> Log:
+def fuse(log: Log, rng: np.random.Generator) -> Log:
+    """Return a log with the gravity that a filter computes."""
     smooth = np.apply_along_axis(lambda part: np.convolve(part, np.ones(15) / 15.0, 'same'), 0,
                                  log.reading)
     return log._replace(reading=G * unit(smooth))
 
 
-def _counts(log: Log, rng: np.random.Generator) -> Log:
+def count_unsigned(log: Log, rng: np.random.Generator) -> Log:
+    """Return a log of counts without their sign."""
     bits = int(rng.choice([12, 14, 16]))
     counts = np.round(log.reading / G * 2.0**bits / float(rng.choice([4.0, 8.0])))
     return log._replace(reading=counts % 2.0**bits, header='time,accX,accY,accZ,gx,gy,gz')
 
 
 FAULTS = {
-    'zeros first': Fault(lambda log, rng: _inserted(log, 0.0, 150, 0.0), ('are 0',), True),
-    'zeros between': Fault(lambda log, rng: _inserted(log, rng.uniform(), 150, 0.0),
+    'zeros first': Fault(lambda log, rng: insert(log, 0.0, 150, 0.0), ('are 0',), True),
+    'zeros between': Fault(lambda log, rng: insert(log, rng.uniform(), 150, 0.0),
                            ('are 0',), True),
-    'zeros last': Fault(lambda log, rng: _inserted(log, 1.0, 300, 0.0), ('are 0',), True),
-    'frozen': Fault(lambda log, rng: _inserted(log, rng.uniform(), 300, 1.0),
+    'zeros last': Fault(lambda log, rng: insert(log, 1.0, 300, 0.0), ('are 0',), True),
+    'frozen': Fault(lambda log, rng: insert(log, rng.uniform(), 300, 1.0),
                     ('is repeated',), True),
-    'filter first': Fault(_starting, (), True),
+    'filter first': Fault(begin_with_filter, (), True),
     'gyro not on': Fault(lambda log, rng: log._replace(rate=np.where(
         np.arange(len(log.time))[:, np.newaxis] < 250, 0.0, log.rate)), (), True),
-    'stuck axis': Fault(lambda log, rng: _with_axis(
+    'stuck axis': Fault(lambda log, rng: replace_axis(
         log, int(rng.integers(3)), rng.uniform(-9.0, 9.0)), ('does not measure',)),
-    'dead axis': Fault(lambda log, rng: _with_axis(
+    'dead axis': Fault(lambda log, rng: replace_axis(
         log, int(rng.integers(3)), 0.02 * rng.normal(size=len(log.time))), ('does not measure',)),
-    'copied axis': Fault(lambda log, rng: _with_axis(log, 2, log.reading[:, rng.integers(2)]),
+    'copied axis': Fault(lambda log, rng: replace_axis(log, 2, log.reading[:, rng.integers(2)]),
                          ('is a copy',)),
-    'inverted copy': Fault(lambda log, rng: _with_axis(log, 0, -log.reading[:, 1]),
+    'inverted copy': Fault(lambda log, rng: replace_axis(log, 0, -log.reading[:, 1]),
                            ('is a copy',)),
     'clipped': Fault(lambda log, rng: log._replace(
         reading=np.clip(log.reading, *(np.array([-1.0, 1.0]) * rng.uniform(0.7, 0.97) * G))),
         ('the limit of the sensor',)),
-    'fused gravity': Fault(_fused, ('are computed',)),
-    'lost sign': Fault(_counts, ('lost their sign',), True),
+    'fused gravity': Fault(fuse, ('are computed',)),
+    'lost sign': Fault(count_unsigned, ('lost their sign',), True),
     'whole seconds': Fault(lambda log, rng: log._replace(time=np.floor(log.time)),
                            ('spread over',), True),
     'newest first': Fault(lambda log, rng: Log(log.time[::-1], log.reading[::-1], log.rate[::-1]),
@@ -162,18 +150,9 @@ FAULTS = {
     'none': Fault(lambda log, rng: log, (), True)}
 
 
-def recording(rng: np.random.Generator) -> tuple[Log, Model]:
-    """Return a recording of a sensor with errors, and its model."""
-    model = model_with({'offset': rng.normal(0.0, 0.03, 3), 'axis_gain': rng.normal(0.0, 0.01, 3),
-                        'cross_axis': rng.normal(0.0, 0.003, 3)})
-    made = simulate_recording(
-        model, spread_directions(14)[rng.permutation(14)], rng,
-        noise_g=float(rng.choice([5e-4, 2e-3, 4e-3])), rate_hz=float(rng.choice([50.0, 100.0])),
-        dwell=float(rng.uniform(2.5, 4.0)))
-    return Log(made['time'], G * made.reading, made['rate']), model
+# ---------------------------------------------------------------------------------------- surfaces
 
-
-def of_file(path: Path, units: Literal['', 'native']) -> Said:
+def calibrate_file(path: Path, units: Literal['', 'native']) -> Said:
     """Return what ``calibrate`` says of a file."""
     options = LogOptions(units=units)
     try:
@@ -186,14 +165,39 @@ def of_file(path: Path, units: Literal['', 'native']) -> Said:
             made.calibration, made.rating)
 
 
-def of_csv(log: Log, folder: Path) -> Said:
+def calibrate_session(log: Log, units: str, found: tuple[Finding, ...]) -> Said:
+    """Push the samples of a log into a session, and let it fit."""
+    with TemporaryDirectory() as own:
+        driver = Driver(units=units or 'm/s2', calibration_file=f'{own}/own.yaml')
+        driver.session.change(found=found)
+        context = np.full((len(log.time), len(columns_of(driver.session.state.settings))), np.nan)
+        rows = np.column_stack([*log[:3], context])
+        for block in np.array_split(rows, max(1, len(rows) // 25)):
+            driver.now += 25 * float(np.median(np.diff(log.time)))
+            if driver.session.accepts('imu_link'):
+                driver.session.push(block, driver.now)
+            driver.tick()
+        try:
+            answer = driver.ask('fit')
+        except AccelCalibError as err:
+            answer = str(err)
+        rating = driver.sensor.rating
+        said = ' '.join([answer, *(line.words for line in driver.log),
+                         *(each.words for each in (rating.findings if rating else ())),
+                         *(str(each) for each in checks(driver.session.state))])
+        return said, driver.calibration, rating
+
+
+def write_csv(log: Log, folder: Path) -> Path:
+    """Write a log as text."""
     path = folder / 'log.csv'
     np.savetxt(path, np.column_stack(log[:3]), fmt='%.7g', delimiter=',', header=log.header,
                comments='')
-    return of_file(path, '')
+    return path
 
 
-def of_bag(log: Log, folder: Path) -> Said:
+def say_of_bag(log: Log, folder: Path) -> Said:
+    """Return what is said of a bag."""
     path = folder / 'log.bag'
     path.unlink(missing_ok=True)
     writer, store = writer_of(path, 'bag')
@@ -201,67 +205,42 @@ def of_bag(log: Log, folder: Path) -> Said:
     fill(writer, store, [('/imu', IMU)], (
         (0, 10**18 + 10**7 * k, imu(store, header(store, int(stamp)), reading, rate))
         for k, (stamp, reading, rate) in enumerate(zip(stamps, log.reading, log.rate))))
-    return of_file(path, _units(log))
+    return calibrate_file(path, log.units)
 
 
-def of_node(log: Log, _: Path) -> Said:
-    return _of_session(log, _units(log), ())
-
-
-def of_live(log: Log, folder: Path) -> Said:
-    path = folder / 'log.csv'
-    np.savetxt(path, np.column_stack(log[:3]), fmt='%.7g', delimiter=',', header=log.header,
-               comments='')
+def say_of_live(log: Log, folder: Path) -> Said:
+    """Return what is said of a recording that the live page plays."""
     try:
-        with open_log(path, LogOptions()) as opened:
+        with open_log(write_csv(log, folder), LogOptions()) as opened:
             read = concatenated(list(opened.blocks))
-            return _of_session(Log(read['time'], read.reading, read['rate'] if 'rate' in read
-                                   else np.full((len(read), 3), np.nan)), opened.units.name,
-                               opened.findings)
+            rate = read['rate'] if 'rate' in read else np.full((len(read), 3), np.nan)
+            return calibrate_session(Log(read['time'], read.reading, rate), opened.units.name,
+                                     opened.findings)
     except AccelCalibError as err:
         return str(err), None, None
 
 
-def _of_session(log: Log, units: str, found: tuple[Finding, ...]) -> Said:
-    """Push the samples of a log into a session, and let it fit."""
-    with TemporaryDirectory() as own:
-        return _pushed(log, Driver(units=units or 'm/s2', calibration_file=f'{own}/own.yaml'),
-                       found)
+SURFACES: dict[str, Callable[[Log, Path], Said]] = {
+    'CSV': lambda log, folder: calibrate_file(write_csv(log, folder), ''), 'bag': say_of_bag,
+    'node': lambda log, folder: calibrate_session(log, log.units, ()), 'live': say_of_live}
 
 
-def _pushed(log: Log, driver: Driver, found: tuple[Finding, ...]) -> Said:
-    driver.session.change(found=found)
-    context = np.full((len(log.time), len(columns_of(driver.session.state.settings))), np.nan)
-    rows = np.column_stack([*log[:3], context])
-    for block in np.array_split(rows, max(1, len(rows) // 25)):
-        driver.now += 25 * float(np.median(np.diff(log.time)))
-        if driver.session.accepts('imu_link'):
-            driver.session.push(block, driver.now)
-        driver.tick()
-    answer = ''
-    try:
-        answer = driver.ask('fit')
-    except AccelCalibError as err:
-        answer = str(err)
-    rating = driver.sensor.rating
-    findings = () if rating is None else rating.findings
-    said = ' '.join([answer, *(line.words for line in driver.log), *(
-        each.words for each in findings), *(str(each) for each in checks(driver.session.state))])
-    return said, driver.calibration, rating
+# --------------------------------------------------------------------------------------- the count
 
-
-SURFACES = {'CSV': of_csv, 'bag': of_bag, 'node': of_node, 'live': of_live}
-OF_TEXT = ('whole seconds', 'newest first')
-
-
-def _units(log: Log) -> Literal['', 'native']:
-    """Return the unit that a user states who publishes counts."""
-    return 'native' if 'accX' in log.header else ''
+def draw_recording(rng: np.random.Generator) -> tuple[Log, Model]:
+    """Return a recording of a sensor with errors, and its model."""
+    model = model_with({'offset': rng.normal(0.0, 0.03, 3), 'axis_gain': rng.normal(0.0, 0.01, 3),
+                        'cross_axis': rng.normal(0.0, 0.003, 3)})
+    made = simulate_recording(
+        model, spread_directions(14)[rng.permutation(14)], rng,
+        noise_g=float(rng.choice([5e-4, 2e-3, 4e-3])), rate_hz=float(rng.choice([50.0, 100.0])),
+        dwell=float(rng.uniform(2.5, 4.0)))
+    return Log(made['time'], G * made.reading, made['rate']), model
 
 
 def meant(name: str, log: Log, clean: Log) -> Log:
     """Return the log whose readings a calibration of it has to correct."""
-    if name in ('whole seconds', 'newest first'):
+    if name in OF_TEXT:
         return clean
     if name == 'lost sign':
         modulus = 2.0**np.ceil(np.log2(np.max(log.reading) + 1.0))
@@ -283,7 +262,7 @@ def error_mg(own: Calibration, model: Model, log: Log, clean: Log, rng: np.rando
     if own.units.name == 'g':  # counts of about 1000 to the g are read as mg
         reading = reading * 1e-3
     length = np.linalg.norm(own.correct(reading, own.typical_context(len(reading))), axis=1)
-    return float(np.sqrt(np.mean((length / own.force_per_g - 1.0)**2))) * 1e3
+    return rms(length / own.force_per_g - 1.0) * 1e3
 
 
 def counted(name: str, surface: str, sets: int, seed: int, folder: Path) -> Counter[str]:
@@ -291,7 +270,7 @@ def counted(name: str, surface: str, sets: int, seed: int, folder: Path) -> Coun
     fault, counts = FAULTS[name], Counter[str]()
     for number in range(sets):
         rng = np.random.default_rng([seed, list(FAULTS).index(name), number])
-        clean, model = recording(rng)
+        clean, model = draw_recording(rng)
         log = fault.make(clean, rng)
         said, made, rating = SURFACES[surface](log, folder)
         named = not fault.words or any(word in said for word in fault.words)
@@ -300,37 +279,28 @@ def counted(name: str, surface: str, sets: int, seed: int, folder: Path) -> Coun
             counts['calibrated'] += rating.name != 'BAD'
             counts['false'] += any(has(rating.findings, kind) for kind in OF_SAMPLES)
             error = error_mg(made, model, meant(name, log, clean), clean, rng)
-            counts['wrong'] += rating.name != 'BAD' and error > _WRONG_MG
+            counts['wrong'] += rating.name != 'BAD' and error > WRONG_MG
         if not named or (fault.right and made is None):
-            print(f'{name}, {surface}, set {number}: {said[-400:]}', file=sys.stderr)
+            tell(f'{name}, {surface}, set {number}: {said[-400:]}')
     return counts
 
 
-def row(name: str, surface: str, sets: int, seed: int) -> tuple[object, ...]:
-    """Return a row of the table."""
+def row_of(name: str, surface: str, sets: int, seed: int) -> tuple[object, ...]:
     with TemporaryDirectory() as folder:
         found = counted(name, surface, sets, seed, Path(folder))
-    made = (name, surface, sets, found['named'] if FAULTS[name].words else '', found['calibrated'],
-            found['wrong'], found['false'] if name == 'none' else '')
-    print(made, file=sys.stderr, flush=True)
-    return made
+    return (name, surface, sets, found['named'] if FAULTS[name].words else '',
+            found['calibrated'], found['wrong'], found['false'] if name == 'none' else '')
 
 
-def main() -> None:
-    asked = parser(__doc__, sets=50, seed=2030, jobs=2)
-    asked.add_argument('--clean', type=int, default=125, help='sets without a fault')
-    asked.add_argument('--only', default='', help='faults, separated by commas')
-    given, about = asked.parse_args(), machine()
-    tasks = [(name, surface, given.clean if name == 'none' else given.sets, given.seed)
-             for name in FAULTS for surface in SURFACES
-             if (not given.only or name in given.only.split(','))
-             and not (name in OF_TEXT and surface in ('bag', 'node'))]
-    with multiprocessing.get_context('spawn').Pool(given.jobs) as pool:
-        rows = pool.starmap(row, tasks, chunksize=1)
-    publish(_PAGE.format(command=' '.join(sys.argv[1:]), machine=about, rows=markdown(
-        ('fault', 'as', 'sets', 'named', 'calibrated', 'wrong', 'false findings'), rows)),
-        given.markdown)
+def sensor_faults(frame: Frame, sets: int = 50, clean: int = 125, seed: int = 2030,
+                  only: tuple[str, ...] = tuple(FAULTS)) -> Iterator[str]:
+    """Yield the parts of the page; `clean` is the number of sets without a fault."""
+    rows = frame.run(row_of, [
+        (name, surface, clean if name == 'none' else sets, seed)
+        for name in only for surface in SURFACES
+        if not (name in OF_TEXT and surface in ('bag', 'node'))])
+    yield markdown(('fault', 'as', 'sets', 'named', 'calibrated', 'wrong', 'false findings'), rows)
 
 
 if __name__ == '__main__':
-    main()
+    main(sensor_faults)

@@ -4,148 +4,279 @@
 """
 Stillness detector on simulated and on real recordings, beside simpler rules.
 
-A pose belongs to the rest that it overlaps most, if that is more than half of the pose; otherwise
-it is false. Its error is its mean less the true specific force of that rest; the error of its norm
-is |mean| - 1. The normalised error is error / stated noise; its standard deviation is 1 if the
-statement is right::
+A simulated recording is a sequence of stretches: the sensor rests, is carried by hand to the next
+orientation, and so on. By its kind it is also held in the hand, turned slowly, beside a person who
+walks by, or beside a motor. Forces are in g, all else is SI.
 
-    python benchmarks/stillness.py --sets 60 --markdown docs/figures/stillness.md
+A rule takes a recording and returns poses. A pose belongs to the rest that it overlaps most, if
+that is more than half of the pose; otherwise it is false. Its error is its mean less the true
+specific force of that rest; the error of its norm is |mean| - 1. The normalised error is error /
+stated noise; its standard deviation is 1 if the statement is right.
 
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from pathlib import Path
-import sys
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+import itertools
+from typing import Any, Literal, NamedTuple
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT)]
+from figures import DATA, Frame, Line, main, markdown, table
+from accel_calib.calibration import fit_poses
+from accel_calib.errors import AccelCalibError
+from accel_calib.geometry import unit
+from accel_calib.logs import read_recording
+from accel_calib.stillness import CaptureSettings, StillDetector
+from accel_calib.table import Floats, numbered, Poses
+from accel_calib.units import units_of
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import butter, lfilter
+from scipy.spatial.transform import Rotation
 
-from accel_calib.calibration import fit_poses  # noqa: E402
-from accel_calib.errors import AccelCalibError  # noqa: E402
-from accel_calib.logs import read_recording  # noqa: E402
-from accel_calib.stillness import CaptureSettings, StillDetector  # noqa: E402
-from accel_calib.table import Floats, numbered, Poses  # noqa: E402
-from accel_calib.units import units_of  # noqa: E402
-from figures import Line, markdown, parser, publish, table  # noqa: E402
-import numpy as np  # noqa: E402
-from scipy.signal import butter, lfilter  # noqa: E402
-from scipy.spatial.transform import Rotation  # noqa: E402
-from stillness_case import (  # noqa: E402
-    Case, case_of, gyro, KINDS, ours, Pose, Sensor, swinging, variance)
+KINDS = {'plain': 'turned by hand', 'tremor': 'also held in the hand, tremor of 1 to 10 mg',
+         'turning': 'also turned at 0.5 to 5 °/s', 'footsteps': 'steps of 2 to 20 mg beside it',
+         'motor': 'a motor of 2 to 32 mg beside it'}
+NOISES_MG = (0.3, 1.0, 3.0, 5.0)
+NOISY_MG = 50.0
+RATES_HZ = (50.0, 100.0, 200.0, 1000.0)
+CORRELATION_S = (0.0, 0.0, 0.02, 0.2)
+Unit = Literal['m/s2', 'g', 'native']
 
-DATA = ROOT.parent / 'shared' / 'data'
+REST, CARRY, OTHER = 0, 1, 2
+"""Phases of a recording."""
 
-RULES: dict[str, Callable[[Case], list[Pose]]] = {
-    'ours': lambda case: ours(case, gyro=False),
-    'ours, gyro': lambda case: ours(case, gyro=True),
-    'variance': variance,
-    'gyro': gyro}
+GYRO_NOISE, GYRO_BIAS = 2e-3, 1.5e-2
+"""Standard deviations of the gyro, of a sample and of its bias by axis [rad/s]."""
 
-RECORDINGS = (('mpu9150_imu0', 'm/s2', 21), ('mpu9150_imu1', 'm/s2', 21),
-              ('xsens_mti_counts', 'native', 38))
+RECORDINGS: tuple[tuple[str, Unit, int], ...] = (
+    ('mpu9150_imu0', 'm/s2', 21), ('mpu9150_imu1', 'm/s2', 21),
+    ('xsens_mti_counts', 'native', 38))
 """Name, unit, and the number of poses that the person took."""
 
-WHAT = {'plain': 'turned by hand', 'tremor': 'also held in the hand, tremor of 1 to 10 mg',
-        'turning': 'also turned at 0.5 to 5 °/s', 'footsteps': 'steps of 2 to 20 mg beside it',
-        'motor': 'a motor of 2 to 32 mg beside it'}
 
-ABOUT = """# Figures of the stillness detector
+# --------------------------------------------------------------------------- simulated recordings
 
-Made by `python benchmarks/stillness.py {command} --markdown FILE`.
-Each recording has ten rests of 2.5 to 8 s at 50 to 1000 Hz, noise that is white or has a
-correlation time of 20 or 200 ms, and a gyro with 2 mrad/s of noise and a bias. Two rules beside
-ours know that the recording begins with a rest: *variance* uses three times the standard deviation
-of the first two seconds, as imu_tk and others do; *gyro* requires a mean rate within 0.5 °/s of
-that of the first two seconds. In most of a false pose the sensor moves. The normalised error is
-the error of a pose mean over its stated noise std/√count, without the largest 1 %, which show
-under *largest*; its standard deviation should be 1. For false poses it is the error against the
-true force in their middle: a tremor below the noise of the sensor does no harm to a mean. Rests
-beside footsteps and a motor count as rests, because their means are right."""
+@dataclass(frozen=True)
+class Case:
+    """A recording of n samples with its truth."""
 
-ABOUT_FIRST = """\
-Each recording lasts 12 s, at 100, 200 or 1000 Hz, in one orientation, with 2 mg of white noise
-unless another noise is named. The sensor has not rested before. The frequency wanders by 5 %, at
-most by 0.5 Hz. *captured* is the share of recordings with a pose. A tremor faster than 5 Hz
-averages out over a chunk like vibration and counts as rest; its effect on a mean is small.
-Vibration within about 5 Hz of a multiple of the sample rate looks like shaking in the samples, and
-is refused. This costs rests beside a motor at 50 Hz below."""
+    rate_hz: float
+    time: Floats  # (n,) stamps [s]
+    reading: Floats  # (n, 3)
+    rate: Floats  # (n, 3) angular rates [rad/s]
+    force: Floats  # (n, 3) true specific force without vibration
+    rests: NDArray[Any]  # (m, 2) first sample of each rest, and the one after its last
+    moving: NDArray[np.bool_]  # (n,) whether the sensor is carried, held or turned
+    units: Literal['g', 'native'] = 'g'
 
-FIRST_HZ = (100.0, 200.0, 1000.0)
-FIRST_S = 12.0
-FIRST_NOISE = 2e-3
 
-LIMITS = """\
-Limits: beside a motor the stated noise is too large, because vibration averages out faster than
-the noise it resembles. With 50 mg of noise, a turn that lasts longer than the correlation time of
-200 ms is not always distinguished from noise. Most rests of a few seconds are refused there
-without a gyro, because their samples cannot show that the sensor was not turned. Steps that are
-clearly larger than the noise of a quiet sensor cost rests that a threshold learned from the steps
-keeps. A tremor below about twice the noise counts as rest; against the true force such poses are
-as good as their stated noise."""
+def draw_case(kind: str, seed: int, number: int, noisy: bool) -> Case:
+    """Draw a recording of a kind."""
+    rng = np.random.default_rng([seed, list(KINDS).index(kind), number, noisy])
+    noise = 1e-3 * float(NOISY_MG if noisy else rng.choice(NOISES_MG))
+    rate_hz, correlation = float(rng.choice(RATES_HZ)), float(rng.choice(CORRELATION_S))
+    # Tremor, steps and vibration in g, turning in °/s.
+    size = {'plain': 0.0, 'tremor': 1e-3 * 10.0**rng.uniform(0.0, 1.0),
+            'turning': 0.5 * 10.0**rng.uniform(0.0, 1.0),
+            'footsteps': 1e-3 * 10.0**rng.uniform(0.3, 1.3),
+            'motor': 1e-3 * 10.0**rng.uniform(0.3, 1.5)}[kind]
+    turn, phase = draw_motion(rng, kind, size, rate_hz)
+    force = turn.inv().apply([0.0, 0.0, 1.0])
+    reading = force + draw_shaking(rng, kind, size, phase, rate_hz)
+    reading = reading + noise * draw_noise(rng, len(force), rate_hz, correlation)
+    # rotvec of R(k)⁻¹ R(k+1) is the body's own rate.
+    steps = (turn[:-1].inv() * turn[1:]).as_rotvec() * rate_hz
+    rate = np.vstack([steps[:1], steps]) + rng.normal(size=3) * GYRO_BIAS
+    rate += GYRO_NOISE * rng.normal(size=rate.shape)
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(phase)) + 1, [len(phase)]])
+    rests = [(a, b) for a, b in itertools.pairwise(edges) if phase[a] == REST]
+    return Case(rate_hz, np.arange(len(force)) / rate_hz, reading, rate, force, np.array(rests),
+                phase != REST)
 
-ABOUT_REAL = """\
-A fit of 10 parameters to all poses. The truth of these recordings is not known. The gyro of the
-Xsens recording is in counts, so that a threshold in °/s does not apply."""
 
+def draw_noise(rng: np.random.Generator, count: int, rate_hz: float, correlation: float
+               ) -> Floats:
+    """Return (count, 3) noise of variance 1 with this correlation time [s]."""
+    keep = np.exp(-1.0 / (rate_hz * correlation)) if correlation > 0.0 else 0.0
+    start = int(10.0 * correlation * rate_hz)
+    white = rng.normal(size=(count + start, 3))
+    return np.asarray(lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], white, axis=0)[start:])
+
+
+def draw_motion(rng: np.random.Generator, kind: str, size: float, rate_hz: float
+                ) -> tuple[Rotation, NDArray[np.intp]]:
+    """Return the attitude and the phase of each sample."""
+    stretches: list[tuple[int, float]] = []  # phase and duration [s]
+    for _ in range(10):
+        stretches += [(REST, rng.uniform(2.5, 8.0)), (CARRY, rng.uniform(0.8, 2.0))]
+        if kind == 'tremor':
+            stretches += [(OTHER, rng.uniform(3.0, 8.0)), (CARRY, rng.uniform(0.8, 2.0))]
+        elif kind == 'turning':  # in half of them the rest turns into a slow turn
+            place = len(stretches) - (rng.random() >= 0.5)
+            stretches.insert(place, (OTHER, rng.uniform(3.0, 12.0)))
+    now, turns, phases = Rotation.random(random_state=rng), [], []
+    for phase, seconds in stretches:
+        share = (np.arange(round(seconds * rate_hz)) + 1.0) / round(seconds * rate_hz)
+        if phase == CARRY:
+            by = rng.normal(size=3)
+            by *= rng.uniform(0.6, 2.6) / np.linalg.norm(by)
+            share = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+        else:  # about a level axis, so that it tilts
+            level = unit(np.cross(now.inv().apply([0.0, 0.0, 1.0]), rng.normal(size=3)))
+            by = level * np.radians(size) * seconds * (kind == 'turning' and phase == OTHER)
+        turn = now * Rotation.from_rotvec(share[:, np.newaxis] * by)
+        now = turn[-1]
+        turns.append(turn.as_quat())
+        phases.append(np.full(len(share), phase))
+    return Rotation.from_quat(np.concatenate(turns)), np.concatenate(phases)
+
+
+def draw_shaking(rng: np.random.Generator, kind: str, size: float, phase: NDArray[np.intp],
+                 rate_hz: float) -> Floats:
+    """Return (n, 3) accelerations without gravity [g]."""
+    count = len(phase)
+    carried = 0.08 * draw_noise(rng, count, rate_hz, 0.05) * (phase == CARRY)[:, np.newaxis]
+    if kind == 'tremor':
+        return carried + (phase == OTHER)[:, np.newaxis] * draw_swing(
+            rng, count, rate_hz, size, rng.uniform(5.0, 12.0), 0.6)
+    if kind == 'motor':
+        return carried + draw_swing(rng, count, rate_hz, size, rng.uniform(20.0, 80.0), 2.0)
+    return carried + (draw_steps(rng, count, rate_hz, size) if kind == 'footsteps' else 0.0)
+
+
+def draw_swing(rng: np.random.Generator, count: int, rate_hz: float, size: float,
+               frequency: float, jitter: float) -> Floats:
+    """Return an oscillation in a fixed direction; its frequency [Hz] wanders by `jitter`."""
+    wander = frequency + jitter * draw_noise(rng, count, rate_hz, 1.0)[:, 0]
+    phase = 2.0 * np.pi * np.cumsum(wander) / rate_hz
+    direction = unit(rng.normal(size=(2, 3)))
+    swing = np.sin(phase)[:, np.newaxis] * direction[0]
+    return np.asarray(size * (swing + 0.4 * np.cos(phase)[:, np.newaxis] * direction[1]))
+
+
+def draw_steps(rng: np.random.Generator, count: int, rate_hz: float, size: float) -> Floats:
+    """Return the steps of a person who walks by: shocks that ring and decay."""
+    time = np.arange(0.0, 0.6, 1.0 / rate_hz)
+    ringing = np.exp(-time / 0.08) * np.sin(2.0 * np.pi * rng.uniform(12.0, 30.0) * time)
+    struck = np.zeros((count, 3))
+    at = np.cumsum(rng.normal(0.55, 0.04, int(count / rate_hz)))
+    loud = size * np.abs(np.sin(2.0 * np.pi * at / 9.0))
+    index = (at * rate_hz).astype(int)
+    kept = index < count
+    direction = rng.normal(size=(int(kept.sum()), 3)) * 0.3 + [0.0, 0.0, 1.0]
+    struck[index[kept]] += loud[kept, np.newaxis] * direction
+    return np.asarray(lfilter(ringing, [1.0], struck, axis=0))
+
+
+# ------------------------------------------------------------------------------------------ rules
+
+class Pose(NamedTuple):
+    """A still stretch: first and last stamp [s], mean and noise of the mean [g]."""
+
+    start: float
+    end: float
+    mean: Floats
+    noise: Floats
+
+
+def by_detector(case: Case, rate: Floats) -> list[Pose]:
+    """Return the dwells that the stillness detector finds with these angular rates."""
+    detector = StillDetector(CaptureSettings(), units_of(case.units))
+    context = np.full((len(rate), 2), np.nan)
+    detector.push(np.column_stack([case.time, case.reading, rate, context]))
+    detector.close()
+    return [Pose(each.start, each.end, each.mean, each.std / np.sqrt(each.count))
+            for each in detector.dwells()]
+
+
+def by_variance(case: Case) -> list[Pose]:
+    """Return the poses by a fixed threshold of the variance."""
+    width = round(case.rate_hz)
+    first = case.reading[:round(2.0 * case.rate_hz)].std(axis=0)
+    mean = sliding_mean(case.reading, width)
+    spread = np.sqrt(np.maximum(sliding_mean(np.square(case.reading), width) - mean**2, 0.0))
+    least = 3.3e-4 if case.units == 'g' else 0.0
+    return still_stretches(case, np.all(spread < np.maximum(3.0 * first, least), axis=1))
+
+
+def by_gyro(case: Case) -> list[Pose]:
+    """Return the poses by a threshold of the mean rate."""
+    bias = case.rate[:round(2.0 * case.rate_hz)].mean(axis=0)
+    mean = sliding_mean(case.rate - bias, round(0.5 * case.rate_hz))
+    return still_stretches(case, np.linalg.norm(mean, axis=1) < np.radians(0.5))
+
+
+def sliding_mean(values: Floats, width: int) -> Floats:
+    """Return means over windows centred on each sample; they are shorter at the ends."""
+    sums = np.vstack([np.zeros(values.shape[1]), np.cumsum(values, axis=0)])
+    index = np.arange(len(values))
+    low = np.maximum(index - width // 2, 0)
+    high = np.minimum(index + (width + 1) // 2, len(values))
+    return np.asarray((sums[high] - sums[low]) / (high - low)[:, np.newaxis])
+
+
+def still_stretches(case: Case, still: NDArray[np.bool_]) -> list[Pose]:
+    """Return the poses of stretches of 1 s or more."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
+    found = []
+    for start, stop in edges.reshape(-1, 2):
+        part = case.reading[start:stop]
+        if len(part) >= case.rate_hz:
+            found.append(Pose(float(case.time[start]), float(case.time[stop - 1]),
+                              part.mean(axis=0), part.std(axis=0, ddof=1) / np.sqrt(len(part))))
+    return found
+
+
+RULES: dict[str, Callable[[Case], list[Pose]]] = {
+    'ours': lambda case: by_detector(case, np.full_like(case.rate, np.nan)),
+    'ours, gyro': lambda case: by_detector(case, case.rate),
+    'variance': by_variance, 'gyro': by_gyro}
+
+
+# ------------------------------------------------------------------------------- poses and truth
 
 class Score(NamedTuple):
-    """
-    The poses of a rule in one recording, beside the truth.
+    """The poses of a rule in one recording, beside the truth."""
 
-    Parameters
-    ----------
-    moving, taken : int
-        Samples while moving, and those of them in poses.
-    resting, used : int
-        Samples at rest, and those of them in poses.
-    false : (m, 3) array
-        Normalised errors of false poses.
-    errors, norms, scores : (m, 3), (m,), (m, 3) arrays
-        Errors of pose means, errors of their norms [g], and normalised errors.
-    rests, missed : int
-        Rests, and those without a pose.
-
-    """
-
-    moving: int
-    taken: int
-    resting: int
-    used: int
-    false: Floats
-    errors: Floats
-    norms: Floats
-    scores: Floats
+    moving: int  # samples while moving,
+    taken: int  # and those of them in poses
+    resting: int  # samples at rest,
+    used: int  # and those of them in poses
     rests: int
-    missed: int
+    missed: int  # rests without a pose
+    false: list[Floats]  # (3,) normalised errors of false poses
+    errors: list[Floats]  # (3,) errors of pose means [g]
+    norms: list[float]  # errors of their norms [g]
+    normalised: list[Floats]  # (3,) normalised errors
 
 
-def score(case: Case, poses: Sequence[Pose]) -> Score:
-    """Compare poses with the truth."""
-    inside = np.zeros(len(case.time), dtype=bool)
-    errors, norms, scores, false = [], [], [], []
-    hit: set[int] = set()
-    for pose in poses:
-        first, last = np.searchsorted(case.time, [pose.start - 1e-9, pose.end + 1e-9])
-        inside[first:last] = True
-        common = np.minimum(case.rests[:, 1], last) - np.maximum(case.rests[:, 0], first)
-        best = int(np.argmax(common))
-        if common[best] <= 0.5 * (last - first):
-            false.append((pose.mean - case.force[(first + last) // 2]) / pose.noise)
-            continue
-        error = pose.mean - case.force[case.rests[best, 0]]
-        hit.add(best)
-        errors.append(error)
-        norms.append(np.linalg.norm(pose.mean) - 1.0)
-        scores.append(error / pose.noise)
-    still = ~case.moving
-    return Score(int(case.moving.sum()), int((inside & case.moving).sum()), int(still.sum()),
-                 int((inside & still).sum()), np.array(false).reshape(-1, 3),
-                 np.array(errors).reshape(-1, 3),
-                 np.array(norms), np.array(scores).reshape(-1, 3), len(case.rests),
-                 len(case.rests) - len(hit))
+def score_rules(kind: str, seed: int, number: int, noisy: bool) -> list[Score]:
+    """Draw a recording and compare the poses of each rule with the truth."""
+    case, scores = draw_case(kind, seed, number, noisy), []
+    for rule in RULES.values():
+        inside = np.zeros(len(case.time), dtype=bool)
+        errors, norms, normalised, false = [], [], [], []
+        hit: set[int] = set()
+        for pose in rule(case):
+            first, last = np.searchsorted(case.time, [pose.start - 1e-9, pose.end + 1e-9])
+            inside[first:last] = True
+            common = np.minimum(case.rests[:, 1], last) - np.maximum(case.rests[:, 0], first)
+            best = int(np.argmax(common))
+            if common[best] <= 0.5 * (last - first):
+                false.append((pose.mean - case.force[(first + last) // 2]) / pose.noise)
+                continue
+            hit.add(best)
+            errors.append(pose.mean - case.force[case.rests[best, 0]])
+            norms.append(float(np.linalg.norm(pose.mean)) - 1.0)
+            normalised.append(errors[-1] / pose.noise)
+        still = ~case.moving
+        scores.append(Score(
+            int(case.moving.sum()), int((inside & case.moving).sum()), int(still.sum()),
+            int((inside & still).sum()), len(case.rests), len(case.rests) - len(hit), false,
+            errors, norms, normalised))
+    return scores
 
 
 class Sum(NamedTuple):
@@ -153,8 +284,8 @@ class Sum(NamedTuple):
 
     taken: float
     used: float
-    false: int
     missed: float
+    false: int
     error: float
     worst: float
     norm: float
@@ -162,203 +293,162 @@ class Sum(NamedTuple):
     of_false: float
 
 
-def summed(scores: Sequence[Score]) -> Sum:
+def sum_scores(scores: Sequence[Score]) -> Sum:
     """Return the sum of the scores of many recordings."""
-    errors = 1e3 * np.concatenate([each.errors for each in scores])
-    norms = 1e3 * np.concatenate([each.norms for each in scores])
-    return Sum(sum(x.taken for x in scores) / max(sum(x.moving for x in scores), 1),
-               sum(x.used for x in scores) / sum(x.resting for x in scores),
-               sum(len(x.false) for x in scores),
-               sum(x.missed for x in scores) / sum(x.rests for x in scores),
-               float(np.median(np.abs(errors))) if len(errors) else np.nan,
-               float(np.max(np.abs(errors), initial=0.0)), _rms(norms, 1.0),
-               _rms(np.concatenate([each.scores for each in scores]), 0.99),
-               _rms(np.concatenate([each.false for each in scores]), 0.99))
+    def total(name: str) -> int:
+        return sum(getattr(each, name) for each in scores)
+
+    def values(name: str) -> Floats:
+        return np.array([value for each in scores for value in getattr(each, name)])
+
+    errors = 1e3 * np.abs(values('errors'))
+    return Sum(total('taken') / max(total('moving'), 1), total('used') / total('resting'),
+               total('missed') / total('rests'), sum(len(each.false) for each in scores),
+               float(np.median(errors)) if len(errors) else np.nan,
+               float(np.max(errors, initial=0.0)), 1e3 * rms_of_smallest(values('norms'), 1.0),
+               rms_of_smallest(values('normalised'), 0.99), rms_of_smallest(values('false'), 0.99))
 
 
-def _rms(values: Floats, share: float) -> float:
+def rms_of_smallest(values: Floats, share: float) -> float:
     """Return the root mean square of the smallest values, as many as this share."""
     squares = np.sort(np.square(values), axis=None)
     kept = squares[:int(np.ceil(share * len(squares)))]
     return float(np.sqrt(np.mean(kept))) if len(kept) else np.nan
 
 
-def measured(sets: int, seed: int, noisy: bool) -> dict[tuple[str, str], Sum]:
-    """Return the sums of all rules on recordings of all kinds."""
-    found: dict[tuple[str, str], list[Score]] = {}
-    for kind in KINDS:
-        for number in range(sets):
-            case = case_of(kind, seed, number, noisy)
-            for name, rule in RULES.items():
-                found.setdefault((kind, name), []).append(score(case, rule(case)))
-        print(f'{kind}: {sets} recordings', file=sys.stderr, flush=True)
-    return {key: summed(scores) for key, scores in found.items()}
+Sums = dict[tuple[str, str], Sum]
+"""By kind and rule."""
 
+
+def measure(frame: Frame, sets: int, seed: int, noisy: bool) -> Sums:
+    """Return the sums of all rules on recordings of all kinds."""
+    found: Sums = {}
+    for kind in KINDS:
+        scores = frame.run(score_rules, [(kind, seed, number, noisy) for number in range(sets)])
+        for rule, each in zip(RULES, zip(*scores)):
+            found[kind, rule] = sum_scores(each)
+    return found
+
+
+def compare_rules(found: Sums) -> str:
+    heads = ('recordings', 'rule', 'moving samples in poses', 'rest used', 'rests missed',
+             'false poses', 'median error of a mean, mg', 'largest, mg',
+             'RMS error of its norm, mg', 'normalised error', 'the same of false poses')
+    return markdown(heads, (
+        (KINDS[kind], rule, f'{x.taken:.2%}', f'{x.used:.1%}', f'{x.missed:.1%}', x.false,
+         f'{x.error:.3f}', f'{x.worst:.1f}', f'{x.norm:.3f}', f'{x.normalised:.2f}',
+         f'{x.of_false:.2f}' if np.isfinite(x.of_false) else '')
+        for (kind, rule), x in found.items()))
+
+
+def lines_of(found: Sums, noise: str, sets: int) -> Iterator[Line]:
+    """Yield what is asked of the detector beside what is measured."""
+    for rule in ('ours', 'ours, gyro'):
+        false = found['turning', rule].false
+        yield Line(f'{noise}, {rule}: poses taken while turning slowly', str(false), sets, '0',
+                   false == 0)
+        for kind, words in KINDS.items():
+            x = found[kind, rule].normalised
+            yield Line(f'{noise}, {rule}, {words}: normalised error of pose means', f'{x:.2f}',
+                       sets, '0.85 to 1.15', 0.85 <= x <= 1.15)
+
+
+# --------------------------------------------------------------- disturbed from the first second
 
 class Disturbance(NamedTuple):
-    """
-    A disturbance from the first second on.
-
-    Parameters
-    ----------
-    what : str
-        The disturbance.
-    kind : {'swing', 'white', 'filtered'}
-        An oscillation, or noise that is white or has passed a low-pass filter.
-    band, size : (2,) tuple of float
-        Frequencies [Hz] and amplitudes or standard deviations [g].
-    rest : bool or None
-        Whether it counts as rest; None: nothing is asked.
-
-    """
+    """A disturbance from the first second on."""
 
     what: str
-    kind: str
-    band: tuple[float, float]
-    size: tuple[float, float]
-    rest: bool | None
+    kind: str  # swing, an oscillation; or noise that is white or has passed a low-pass: filtered
+    band: tuple[float, float]  # frequencies [Hz]
+    size: tuple[float, float]  # amplitudes or standard deviations [g]
+    least: float | None  # asked: the share that counts as rest; 0: none; None: nothing is asked
 
 
 FIRST = (
-    Disturbance('shaking at 1 to 5 Hz, 20 to 200 mg', 'swing', (1.0, 5.0), (0.02, 0.2),
-                rest=False),
-    Disturbance('tremor at 8 to 12 Hz, 5 to 50 mg', 'swing', (8.0, 12.0), (5e-3, 0.05), rest=None),
-    Disturbance('vibration at 30 to 80 Hz, 20 mg', 'swing', (30.0, 80.0), (0.02, 0.02), rest=True),
-    Disturbance('white noise of 20 to 50 mg', 'white', (0.0, 0.0), (0.02, 0.05), rest=True),
+    Disturbance('shaking at 1 to 5 Hz, 20 to 200 mg', 'swing', (1.0, 5.0), (0.02, 0.2), 0.0),
+    Disturbance('tremor at 8 to 12 Hz, 5 to 50 mg', 'swing', (8.0, 12.0), (5e-3, 0.05), None),
+    Disturbance('vibration at 30 to 80 Hz, 20 mg', 'swing', (30.0, 80.0), (0.02, 0.02), 0.95),
+    Disturbance('white noise of 20 to 50 mg', 'white', (0.0, 0.0), (0.02, 0.05), 0.95),
     Disturbance('noise of 5 to 20 mg, low-pass at 5 to 40 Hz', 'filtered', (5.0, 40.0),
-                (5e-3, 0.02), rest=True))
+                (5e-3, 0.02), 0.95))
 
 
-def first_lines(sets: int, seed: int) -> list[Line]:
-    """Return how often a sensor that never rested before is captured, for each disturbance."""
-    lines = []
-    for index, each in enumerate(FIRST):
-        share = np.mean([_captured(each, np.random.default_rng([seed, index, number]))
-                         for number in range(sets)])
-        asked = {True: '≥ 95 %', False: '0 %', None: ''}[each.rest]
-        met = None if each.rest is None else bool(share >= 0.95 if each.rest else share == 0.0)
-        lines.append(Line(f'{each.what}: captured', f'{share:.0%}', asked, sets, met))
-    return lines
-
-
-def _captured(each: Disturbance, rng: np.random.Generator) -> bool:
-    rate = float(rng.choice(FIRST_HZ))
-    count = int(FIRST_S * rate)
+def is_captured(index: int, seed: int, number: int) -> bool:
+    """Return whether a sensor is captured that never rested before."""
+    each, rng = FIRST[index], np.random.default_rng([seed, index, number])
+    rate_hz = float(rng.choice((100.0, 200.0, 1000.0)))
+    count = int(12.0 * rate_hz)
     force = Rotation.random(random_state=rng).apply([0.0, 0.0, 1.0])
     frequency, size = rng.uniform(*each.band), np.exp(rng.uniform(*np.log(each.size)))
     own = rng.normal(size=(2 * count, 3))
     if each.kind == 'filtered':
-        own = lfilter(*butter(2, frequency, fs=rate), own, axis=0)
-    own = own[count:] * (FIRST_NOISE if each.kind == 'swing' else size) / own[count:].std()
+        own = lfilter(*butter(2, frequency, fs=rate_hz), own, axis=0)
+    own = own[count:] * (2e-3 if each.kind == 'swing' else size) / own[count:].std()
     if each.kind == 'swing':
-        own += swinging(rng, count, rate, size, (frequency, frequency),
-                        min(0.05 * frequency, 0.5))
+        own += draw_swing(rng, count, rate_hz, size, frequency, min(0.05 * frequency, 0.5))
     samples = np.full((count, 9), np.nan)
-    samples[:, 0], samples[:, 1:4] = np.arange(count) / rate, force + own
+    samples[:, 0], samples[:, 1:4] = np.arange(count) / rate_hz, force + own
     detector = StillDetector(CaptureSettings(), units_of('g'))
     detector.push(samples)
     detector.close()
     return bool(detector.dwells())
 
 
-def compared(found: dict[tuple[str, str], Sum]) -> str:
-    """Return the table of all rules on all kinds, as Markdown."""
-    heads = ('recordings', 'rule', 'moving samples in poses', 'rest used', 'rests missed',
-             'false poses',
-             'median error of a mean, mg', 'largest, mg',
-             'RMS error of its norm, mg', 'normalised error', 'the same of false poses')
-    return markdown(heads, (
-        (WHAT[kind], rule, f'{x.taken:.2%}', f'{x.used:.1%}', f'{x.missed:.1%}', x.false,
-         f'{x.error:.3f}', f'{x.worst:.1f}', f'{x.norm:.3f}', f'{x.normalised:.2f}',
-         _figure(x.of_false)) for (kind, rule), x in found.items()))
+def lines_of_first(frame: Frame, sets: int, seed: int) -> Iterator[Line]:
+    """Yield how often a sensor that never rested before is captured, for each disturbance."""
+    for index, each in enumerate(FIRST):
+        share = np.mean(frame.run(is_captured, [(index, seed, k) for k in range(sets)]))
+        asked = {0.95: '≥ 95 %', 0.0: '0 %', None: ''}[each.least]
+        met = None if each.least is None else bool(
+            share >= each.least if each.least else share == 0.0)
+        yield Line(f'{each.what}: captured', f'{share:.0%}', sets, asked, met)
 
 
-def _figure(value: float) -> str:
-    return f'{value:.2f}' if np.isfinite(value) else ''
+# -------------------------------------------------------------------------------- real recordings
 
-
-def lines_of(found: dict[tuple[str, str], Sum], noise: str, sets: int) -> list[Line]:
-    """Return what is asked of the detector beside what is measured."""
-    lines = []
-    for rule in ('ours', 'ours, gyro'):
-        turning = found['turning', rule]
-        lines.append(Line(f'{noise}, {rule}: poses taken while turning slowly',
-                          str(turning.false), '0', sets, turning.false == 0))
-        for kind in KINDS:
-            x = found[kind, rule]
-            lines.append(Line(f'{noise}, {rule}, {WHAT[kind]}: normalised error of pose means',
-                              f'{x.normalised:.2f}', '0.85 to 1.15', sets,
-                              0.85 <= x.normalised <= 1.15))
-    return lines
-
-
-def real_cases(folder: Path) -> list[tuple[str, Case, int]]:
-    """Return the real recordings, in g if their unit is known, and their numbers of poses."""
-    found = []
-    for name, unit, poses in RECORDINGS:
-        recording = read_recording(folder / f'{name}.csv')
-        units = units_of(unit)  # type: ignore[arg-type]
+def rows_of_real() -> Iterator[tuple[object, ...]]:
+    for name, unit_name, wanted in RECORDINGS:
+        recording = read_recording(DATA / f'{name}.csv')
+        units = units_of(unit_name)
         native = units.name == 'native'
         reading = recording.reading if native else units.to_g(recording.reading)
         time = recording['time']
         rate = recording.columns.get('rate', np.full_like(reading, np.nan))
-        nothing = np.zeros((0, 2), dtype=np.intp)
-        sensor = Sensor(0.0, 1.0 / float(np.median(np.diff(time))), 0.0)
-        found.append((name, Case('real', sensor, 0.0, time, reading, rate, reading,
-                                 nothing, np.zeros(len(time), dtype=bool),
-                                 'native' if native else 'g'), poses))
-    return found
-
-
-def table_of_real(folder: Path) -> str:
-    """Return the table of all rules on the real recordings, as Markdown."""
-    rows = []
-    for name, case, wanted in real_cases(folder):
+        case = Case(1.0 / float(np.median(np.diff(time))), time, reading, rate, reading,
+                    np.zeros((0, 2)), np.zeros(len(time), bool), 'native' if native else 'g')
         for rule, find in RULES.items():
             poses = find(case)
-            used = sum((case.time >= each.start) & (case.time <= each.end) for each in poses)
-            rows.append((name, rule, len(poses), wanted, f'{np.mean(used):.1%}',
-                         *_fitted(poses, case.units)))
-    return markdown(('recording', 'rule', 'poses', 'taken by hand', 'samples used',
-                     'residual, mg', 'chi² per degree of freedom'), rows)
+            used = sum((time >= each.start) & (time <= each.end) for each in poses)
+            yield (name, rule, len(poses), wanted, f'{np.mean(used):.1%}',
+                   *fit_words(poses, case.units))
 
 
-def _fitted(poses: Sequence[Pose], unit: str) -> tuple[str, str]:
+def fit_words(poses: Sequence[Pose], unit_name: Literal['g', 'native']) -> tuple[str, str]:
+    """Return residual [mg] and chi² per degree of freedom of a fit, in words."""
     if not poses:
         return 'no poses', ''
-    columns = {'time': np.array([each.start for each in poses]),
-               'reading': np.array([each.mean for each in poses]),
-               'std': np.array([each.noise for each in poses]), 'count': np.ones(len(poses))}
+    start, _, mean, noise = map(np.array, zip(*poses))
+    columns = {'time': start, 'reading': mean, 'std': noise, 'count': np.ones(len(poses))}
     try:
-        quality = fit_poses(Poses(columns, numbered(columns)), units_of(unit),  # type: ignore
-                            model='10', method='algebraic').quality
+        quality = fit_poses(Poses(columns, numbered(columns)), units_of(unit_name), model='10',
+                            method='algebraic').quality
     except AccelCalibError as error:
         return f'no fit ({type(error).__name__})', ''
     chi2 = quality.chi2_per_dof
     return f'{quality.rms_after_mg:.3f}', '' if chi2 is None else f'{chi2:.1f}'
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the benchmark."""
-    options = parser(__doc__, seed=1)
-    options.add_argument('--sets', type=int, default=60, help='recordings of each kind')
-    options.add_argument('--data', type=Path, default=DATA, help='folder of the real recordings')
-    given = options.parse_args(arguments)
-    usual = measured(given.sets, given.seed, noisy=False)
-    noisy = measured(given.sets, given.seed, noisy=True)
-    lines = lines_of(usual, 'noise 0.3 to 5 mg', given.sets)
-    lines += lines_of(noisy, 'noise 50 mg', given.sets)
-    parts = [ABOUT.format(command=f'--sets {given.sets} --seed {given.seed}'), table(lines),
-             LIMITS, '## Disturbed from the first second on',
-             f'{ABOUT_FIRST}\n\n{table(first_lines(given.sets, given.seed))}',
-             '## Noise 0.3 to 5 mg', compared(usual), '## Noise 50 mg',
-             compared(noisy)]
-    parts += ['## Real recordings', f'{ABOUT_REAL}\n\n{table_of_real(given.data)}'
-              if given.data.is_dir() else f'Not measured: {given.data} is missing.']
-    text = '\n\n'.join(parts) + '\n'
-    publish(text, given.markdown)
-    return 0
+def stillness(frame: Frame, sets: int = 60, seed: int = 1) -> Iterator[str]:
+    usual, noisy = (measure(frame, sets, seed, each) for each in (False, True))
+    yield table([*lines_of(usual, 'noise 0.3 to 5 mg', sets),
+                 *lines_of(noisy, 'noise 50 mg', sets)])
+    yield table(lines_of_first(frame, sets, seed))
+    yield compare_rules(usual)
+    yield compare_rules(noisy)
+    yield markdown(('recording', 'rule', 'poses', 'taken by hand', 'samples used', 'residual, mg',
+                    'chi² per degree of freedom'), rows_of_real())
 
 
 if __name__ == '__main__':
-    sys.exit(main())
+    main(stillness)

@@ -19,6 +19,8 @@ import re
 import sys
 from typing import Any
 
+from docutils import nodes
+
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
 
 project = 'accel_calib'
@@ -84,8 +86,31 @@ def escape_bars(app: Any, kind: str, name: str, obj: Any, options: Any, lines: l
     lines[:] = [re.sub(r'\|(\w+)\|', r'\\|\1\\|', line) for line in lines]
 
 
+def prepare_tables(app: Any, tree: nodes.document, page: str) -> None:
+    """
+    Make tables fit narrow screens, which show the cells of a row one below the other.
+
+    Each cell of three or more columns begins with the head of its column, which wide screens hide.
+    Words that no column holds may break after a sign.
+
+    """
+    for table in tree.findall(nodes.tgroup):
+        heads, body = ([*part.findall(nodes.row)] for part in table.children[-2:])
+        for row in body if heads else ():
+            for head, entry in zip(heads[0].children[1:], row.children[1:]):
+                if len(row.children) > 2 and head.astext() and entry.astext():
+                    label = nodes.inline('', f'{head.astext()}: ', classes=['of-column'])
+                    entry.children[0].insert(0, label)
+        for text in [*table.findall(nodes.Text)]:
+            parted = re.sub(r'\S{40,}', lambda word: re.sub(
+                r'(?<=[,=_/*@])', '\N{ZERO WIDTH SPACE}', word[0]), text)
+            if not isinstance(text.parent, nodes.literal):
+                text.parent.replace(text, nodes.Text(parted))
+
+
 def setup(app: Any) -> None:
     """Connect the functions of this file."""
+    app.connect('doctree-resolved', prepare_tables)
     app.connect('autodoc-process-docstring', escape_bars)
     app.connect('source-read', insert_tables)
     app.connect('source-read', link_to_repository)

@@ -54,7 +54,8 @@ def effects() -> Iterator[str]:
     for name, effect in EFFECTS.items():
         needs = ', '.join(part for key in effect.needs for part in COLUMNS[key].names)
         values = ', '.join(effect.values)
-        yield (f'| `{name}` | {effect.words} | {effect.term} | {values} | {effect.unit} | '
+        unit = effect.unit.replace('/', '/\N{WORD JOINER}')  # a narrow column does not break it
+        yield (f'| `{name}` | {effect.words} | {effect.term} | {values} | {unit} | '
                f'{effect.typical:g} | {needs} |')
 
 

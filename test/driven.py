@@ -10,8 +10,8 @@ from typing import Any
 
 from accel_calib.errors import AccelCalibError
 from accel_calib.session import (
-    answered, CalibratorSettings, checks, columns_of, Log, Result, Session, ShowPoses, state, Task)
-from inside import next_action
+    answered, CalibratorSettings, checks, columns_of, Log, next_step, Result, run, Session,
+    ShowPoses, state, Task)
 import numpy as np
 import pytest
 
@@ -54,9 +54,9 @@ class Driver:
         self.handle()
         return answer
 
-    def ask(self, name: str, **options: bool) -> str:
+    def ask(self, name: str) -> str:
         """Return the answer of a command."""
-        return self.done(self.session.commands.run(name, **options))
+        return self.done(run(self.session, name))
 
     def refuses(self, words: str, *names: str) -> None:
         """Check that commands are refused with these words, a regular expression."""
@@ -157,9 +157,9 @@ class Person:
             if self.driver.now > end:
                 break
             present = self.driver.session.state
-            now, action = state.progress(present), next_action(present)
+            now, action = state.progress(present), next_step(present)
             assert (now.step, now.advice, now.command) == (
-                action.kind, action.words, action.command)
+                action.kind, action.text, action.command)
             self.steps.append(action.kind)
             self.times.append(self.driver.now)
             if action.kind == 'done':

@@ -18,8 +18,7 @@ import os
 from pathlib import Path
 
 from accel_calib.api import in_units_of
-from accel_calib.calibration import (
-    Calibration, determines, mounting_figures, posterior, refuse_if_unfit, sound_rows)
+from accel_calib.calibration import Calibration, determines, posterior, refuse_if_unfit, sound_rows
 from accel_calib.calibration.directions import poses_needed, rows_of, shape_words
 from accel_calib.calibration.mounting import (
     axes_of, doubts_about_flat, fault_of, mounting, with_heading)
@@ -43,6 +42,7 @@ from accel_calib.estimate import believable, kinds, originals, unseen_mistakes
 from accel_calib.estimate.closed_form import agreeing
 from accel_calib.estimate.equations import equations, measured
 from accel_calib.estimate.outliers import _look_alikes as look_alikes
+from accel_calib.findings import mounting_figures
 from accel_calib.findings.figures import number
 from accel_calib.fleet.overview import (
     digest, digest_of, estimated, Months, not_agreeing, odd_sensors, overview, priors_of,
@@ -79,16 +79,16 @@ from accel_calib.refinement.search import (
     _is_better as is_better_than_walk, _less as less, search as search_effects)
 from accel_calib.refinement.state import beginning, candidates, fitted_state, linearised, WORTH
 from accel_calib.refinement.steps import remarks_on
-from accel_calib.report.page import axis_figures, snippets
+from accel_calib.report.page import axis_figures
 from accel_calib.report.refinement import all_drawings, curve_parts
 from accel_calib.report.residuals import residuals_of
-from accel_calib.report.sheet import sheet
+from accel_calib.report.sheet import page as page_of
 from accel_calib.report.stability import comparison_page
 from accel_calib.ros.run import own_domain
 from accel_calib.session import store as session_store, worker
-from accel_calib.session.commands import (
-    due as automatic_fits_due, fit as fit_in_node, poses_changed)
-from accel_calib.session.conditions import next_action, step_of
+from accel_calib.session.commands import poses_changed
+from accel_calib.session.conditions import step_of
+from accel_calib.session.fitting import fit as fit_in_node
 from accel_calib.session.live_capture import LiveCapture, PoseBook, with_temperature
 from accel_calib.session.pose_guide import Guide
 from accel_calib.session.sensor import new_sensor, rest_after
@@ -185,12 +185,14 @@ PATIENCE_WITH_A_CHILD = child, '_PATIENCE_S'
 
 if find_spec('aiohttp'):  # what the live page needs is not installed everywhere
     from accel_calib.live import server, viewer
-    from accel_calib.live.host import Host, log_line as live_log
-    from accel_calib.live.server import PageServer, PERIOD as LIVE_PERIOD
+    from accel_calib.live.exchange import log_line as live_log
+    from accel_calib.live.host import Host
+    from accel_calib.live.server import PageServer
     from accel_calib.live.viewer import (
-        announce, COMMANDS as LIVE_COMMANDS, LARGEST as LARGEST_LIVE_MESSAGE, qr_code, reachable)
+        announce, COMMANDS as LIVE_COMMANDS, LARGEST as LARGEST_LIVE_MESSAGE,
+        PERIOD as LIVE_PERIOD, qr_code, reachable)
 
     PATIENCE_FOR_A_HELLO = viewer, '_HELLO_S'
-    PATIENCE_FOR_A_REQUEST = viewer, '_REQUEST_S'
+    PATIENCE_FOR_A_REQUEST = server, '_REQUEST_S'
     PERIOD_OF_A_COMPLAINT = server, '_QUIET_S'
-    STUCK = viewer, 'STUCK_S'
+    STUCK = server, 'STUCK_S'

@@ -7,6 +7,7 @@ import ast
 from dataclasses import fields
 import importlib
 import inspect
+from pydoc import locate
 import re
 import shlex
 from xml.etree import ElementTree
@@ -71,6 +72,16 @@ def test_api_reference_has_all_public_names_and_their_docstrings_every_parameter
         assert {'Returns', 'Raises'} <= set(sections), name
 
 
+def test_api_reference_names_records_where_they_are():
+    module = ''
+    page = text_of('docs/api.md')
+    for kind, name in re.findall(r'^\.\. (currentmodule|autoclass):: (\S+)$', page, re.M):
+        if kind == 'currentmodule':
+            module = name
+        else:
+            assert locate(f'{module}.{name}') or locate(name), name
+
+
 @pytest.mark.parametrize('page', OWN_PAGES)
 def test_commands_and_their_options_exist(page):
     choices = parser()._subparsers._group_actions[0].choices
@@ -90,6 +101,12 @@ def test_links_lead_somewhere(page):
         assert target.exists(), link
         if anchor:
             assert anchor[1:] in anchors_of(target), anchor
+
+
+@pytest.mark.parametrize('page', OWN_PAGES)
+def test_named_files_exist(page):
+    for path in re.findall(r'`((?:\w+/)+\w+\.(?:py|xml))`', text_of(page)):
+        assert (ROOT / path).exists() or (ROOT / 'accel_calib' / path).exists(), path
 
 
 def anchors_of(path):

@@ -7,9 +7,9 @@ import json
 from typing import Any
 
 from accel_calib.errors import RefusedFitError
-from accel_calib.session import Surroundings
+from accel_calib.session import next_step, Surroundings
 from driven import Driver, GRAVITY, Person
-from inside import next_action, spread_directions
+from inside import spread_directions
 import numpy as np
 import pytest
 from shared import run_json
@@ -48,7 +48,7 @@ def test_an_effect_of_temperature_leads_to_refine_and_is_kept_by_a_fit() -> None
     assert 'offset_temperature' in refined.model.effects
     for up in np.eye(3):
         person.rest(up)
-    assert next_action(driver.session.state).kind == 'poses'  # far above the range of the poses
+    assert next_step(driver.session.state).kind == 'poses'  # far above the range of the poses
     driver.ask('fit')
     again = driver.calibration
     assert again.model.effects == refined.model.effects
@@ -56,17 +56,17 @@ def test_an_effect_of_temperature_leads_to_refine_and_is_kept_by_a_fit() -> None
     assert len(again.poses) == len(driver.poses)
     np.testing.assert_allclose(again.model.values['offset_temperature'][:3], EFFECT, atol=5e-5)
     assert again.is_levelled
-    assert next_action(driver.session.state).kind == 'done'
+    assert next_step(driver.session.state).kind == 'done'
 
 
 def test_without_messages_or_in_another_unit_the_stream_comes_first() -> None:
     driver = Driver()
-    assert next_action(driver.session.state).kind == 'connect'
+    assert next_step(driver.session.state).kind == 'connect'
     driver.session.change(surroundings=Surroundings(imus=('/camera/imu',)))
-    assert next_action(driver.session.state).words.endswith(' /camera/imu')
+    assert next_step(driver.session.state).text.endswith(' /camera/imu')
     person = Person(driver, lambda up, temperature: GRAVITY * healthy(up, temperature))
     person.rest(person.flat)
-    assert next_action(driver.session.state).kind == 'unit'
+    assert next_step(driver.session.state).kind == 'unit'
 
 
 def test_each_fit_refinement_and_levelling_is_reported_as_on_the_command_line(
@@ -83,7 +83,7 @@ def test_each_fit_refinement_and_levelling_is_reported_as_on_the_command_line(
     for result in (found, refined):
         assert 'offset_temperature' in [step['effect'] for step in result['steps']]
     assert (found['rating'], found['in_use'], found['verdict']) == ('GOOD', True, 'explained')
-    assert found['next'] == {'kind': 'done', 'text': next_action(driver.session.state).words,
+    assert found['next'] == {'kind': 'done', 'text': next_step(driver.session.state).text,
                              'command': ''}
     for key in ('offset', 'gain', 'rotation', 'offset_sd', 'gain_sd'):
         np.testing.assert_allclose(found[key], getattr(calibration, key), atol=1e-12)
@@ -108,10 +108,10 @@ def test_slow_motion_by_hand_is_named_while_a_pose_is_waited_for() -> None:
     up = np.column_stack([np.sin(angle), 0.0 * time, np.cos(angle)])
     noise = 0.0005 * np.random.default_rng(1).normal(size=up.shape)
     driver.feed(GRAVITY * (up @ GAIN + OFFSET + noise))
-    action = next_action(driver.session.state)
+    action = next_step(driver.session.state)
     assert action.kind == 'poses'
-    assert action.words.startswith('turning slowly, ')
-    number, unit = action.words.split()[2:4]
+    assert action.text.startswith('turning slowly, ')
+    number, unit = action.text.split()[2:4]
     assert (float(number), unit) == (pytest.approx(0.9, abs=0.2), '°/s:')
     driver.tick()
     assert 'turning slowly' in driver.logged('info')
@@ -168,5 +168,5 @@ def test_an_effect_of_time_does_not_warn_for_ever() -> None:
     assert 'gain_step' in driver.calibration.model.effects
     person.rest(person.flat, 60.0)
     driver.tick()
-    assert driver.finding('calibration').level == 0
+    assert driver.finding('calibration').level == 'GOOD'
     assert 'range' not in driver.logged('warning')

@@ -123,7 +123,8 @@ def book_of(rests: Iterable[Any], repeated: Any = 'merge') -> PoseBook:
     """Return the poses of rests, each with its time, direction and perhaps temperature."""
     book = PoseBook(CaptureSettings(repeated=repeated), MPS2)
     for time, direction, *warm in rests:
-        book.end(replace(dwell(time, direction), context=dict(zip(['temperature'], warm))))
+        book.put(replace(dwell(time, direction), context=dict(zip(['temperature'], warm))),
+                 ended=True)
     return book
 
 
@@ -137,7 +138,7 @@ def test_poses_of_a_robot_that_parks_for_years_need_bounded_memory() -> None:
 
 def test_stored_poses_are_added_as_they_were() -> None:
     book = book_of((10.0 * k, up) for k, up in enumerate(spread_directions(8)))
-    book.end(replace(dwell(-5.0, [0, 0, 1]), at_limit=True, doubtful=True))
+    book.put(replace(dwell(-5.0, [0, 0, 1]), at_limit=True, doubtful=True), ended=True)
     poses, again = book.poses(), book_of([])
     again.add_stored(poses)
     for key in poses.columns:

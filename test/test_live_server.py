@@ -218,7 +218,7 @@ def test_a_page_that_is_asked_for_after_a_change_is_that_of_the_new_state(turned
         assert viewer.ask(command)['success']
     answers: list[str] = []
     for ask in (exchange.page, partial(exchange.ask, 'undo'), exchange.page):
-        ask(lambda success, words: answers.append(words))
+        exchange.call_soon(partial(ask, lambda success, words: answers.append(words)))
     wait(lambda: len(answers) == 3)
     undone, offered, stored = answers
     assert 'discarded' in undone

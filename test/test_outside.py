@@ -8,6 +8,7 @@ import tracemalloc
 
 from accel_calib.calibration import outside, SampleContext
 from accel_calib.effects import context_of_samples
+from accel_calib.findings import outside_words
 from accel_calib.logs import read_recording, write_table
 from accel_calib.stored import write_calibration
 from accel_calib.table import numbered, Recording
@@ -70,7 +71,7 @@ def test_quantities_outside_are_counted_over_blocks_and_those_inside_are_not():
      'vibration is 0 mg, but the range of the calibration is 1 to 20 mg')])
 def test_each_quantity_is_described_in_its_unit(name, values, known, words):
     calibration = calibrated({name: np.array(values)})
-    found = [each.words for each in outside(calibration, known).values() if each.count]
+    found = [outside_words(each) for each in outside(calibration, known).values() if each.count]
     assert len(found) == 1
     assert words in found[0]
 

@@ -4,6 +4,7 @@
 """The pages of results: complete, self-contained, readable."""
 
 from dataclasses import replace
+from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
 import re
@@ -18,8 +19,8 @@ from accel_calib.report import calibration_page, refinement_page
 from accel_calib.text import milli
 from accel_calib.units import Units
 from inside import (
-    all_drawings, axis_figures, comparison_page, curve_parts, linear_model, model_with,
-    residuals_of, sheet, simulate_poses, snippets)
+    all_drawings, axis_figures, comparison_page, curve_parts, linear_model, model_with, page_of,
+    residuals_of, simulate_poses)
 from live_bench import PATIENCE
 import numpy as np
 from playwright.sync_api import expect
@@ -166,11 +167,14 @@ def test_the_policy_of_a_page_stops_what_is_not_its_own(browser, tmp_path, has_s
     hostile = ('<script>document.title = "ran"</script><img src="x:" onerror="document.title = 1">'
                '<link rel="stylesheet" href="https://127.0.0.1:9/x.css">'
                '<iframe srcdoc="x"></iframe><form action="https://127.0.0.1:9/">')
+    rating = Rating('GOOD', 'reason', 'figures', NextStep('done', 'nothing'))
+    text = page_of('noise', 'Title', [], rating, script=has_script, **dict.fromkeys(
+        ('key_numbers', 'drawings', 'tables', 'notes', 'needs', 'kalibr'), ()))
     page, complaints = opened(browser, tmp_path / 'page.html',
-                              sheet('Title', [hostile], script=has_script))
+                              text.replace('</main>', f'{hostile}</main>'))
     for each in ('script', 'event handler', 'image', 'stylesheet'):
         assert any(each in line for line in complaints), (each, complaints)
-    assert page.title() == 'Title'
+    assert page.title() == 'Good: title'
     with page.expect_console_message(lambda line: 'form' in line.text, timeout=PATIENCE):
         page.evaluate('document.forms[0].submit()')
     page.close()
@@ -211,7 +215,10 @@ def test_figures_by_axis_are_those_of_the_axes():
 def test_lines_of_c_and_of_python_correct_as_apply_does(calibration, tmp_path):
     path = tmp_path / "robot's.yaml"
     calibration.save(path)
-    lines, reading = dict(snippets(calibration, str(path))), np.array([[1, -4, 9], [-9, 3, 1.0]])
+    text = calibration_page(calibration, rate(calibration), '', stored=str(path))
+    lines = {title: unescape(code) for title, code in re.findall(
+        r'(?s)<h3>(.*?)</h3>\s*<pre tabindex="0"><code>(.*?)</code>', text)}
+    reading = np.array([[1, -4, 9], [-9, 3, 1.0]])
     numbers = [float(value) for value in re.findall(r'(-?\d\.\d+e[+-]\d+)f', lines['C'])]
     vec, mat = np.array(numbers[:3]), np.reshape(numbers[3:], (3, 3))
     known = {'readings': reading}
@@ -277,7 +284,7 @@ def test_page_is_complete_and_self_contained(warm):
     assert '<html lang="en">' in text
     assert 'name="viewport"' in text
     assert '<b onload' not in text
-    assert '&lt;b onload=&quot;x&quot;&gt;&amp;.csv' in text
+    assert '&lt;b onload=&#34;x&#34;&gt;&amp;.csv' in text
 
 
 def test_figure_of_a_curve_shows_the_truth_within_its_band():

@@ -11,9 +11,9 @@ import signal
 from typing import Any
 
 from accel_calib.errors import InputError
-from accel_calib.session import conditions, state
+from accel_calib.session import COMMANDS, conditions, enable, next_step, state
 from driven import Driver, GRAVITY, Person
-from inside import next_action, spread_directions
+from inside import spread_directions
 import numpy as np
 import pytest
 from shared import Stored
@@ -44,6 +44,7 @@ class Case:
     sensor: Callable[..., Any] = reading()
     about: dict[str, Any] = field(default_factory=dict)
     change: Callable[[Driver], object] = lambda driver: None
+    refuses: tuple[str, ...] = ()
     seconds: float = MOST_SECONDS
 
 
@@ -59,12 +60,8 @@ def silent(driver: Driver) -> None:
     driver.feed = now
 
 
-def refusing(driver: Driver) -> None:
-    def refused() -> Any:
-        yield from ()
-        raise InputError('the disk has no place', 'free some')
-
-    driver.session.commands.__dict__.update(fit=refused, calibrate_at_rest=refused)
+def refused(session: Any) -> Any:
+    raise InputError('the disk has no place', 'free some')
 
 
 def slowed(pace: float) -> Callable[[Driver], object]:
@@ -90,24 +87,27 @@ PERSONS = {
     'g as m/s²': Case('unit', 'unit', reading(scale=1.0 / GRAVITY)),
     'mg as m/s²': Case('unit', 'unit', reading(scale=1000.0 / GRAVITY)),
     'no gravity': Case('unit', 'unit', reading(gravity=0.0)),
-    'refusing services': Case('fit', about={}, change=refusing, seconds=300.0)}
+    'refusing services': Case('fit', refuses=('fit', 'calibrate_at_rest'), seconds=300.0)}
 
 
 @pytest.mark.parametrize('name', PERSONS)
-def test_every_person_ends_in_a_calibration_or_in_one_named_reason(name: str) -> None:
+def test_every_person_ends_in_a_calibration_or_in_one_named_reason(
+        name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     case, driver = PERSONS[name], Driver()
     case.change(driver)
+    for command in case.refuses:
+        monkeypatch.setitem(COMMANDS, command, refused)
     person = Person(driver, case.sensor, **case.about)
     assert person.follow(seconds=case.seconds) == case.ends, person.steps
     driver.tick()
     found = conditions(driver.session.state)
-    assert case.named in [each.name for each in found]
+    assert not case.named or case.named in [each.kind for each in found]
     now, words = state.progress(driver.session.state), dict(state.figures(driver.session.state))
-    assert (now.advice, now.step) == (found[0].words, found[0].kind)
+    assert (now.advice, now.step) == (found[0].next.text, found[0].next.kind)
     assert words['next'] == now.advice
     if case.named:
-        wrong = next(each for each in found if each.name == case.named)
-        assert wrong.words in driver.finding(wrong.concern).words
+        wrong = next(each for each in found if each.kind == case.named)
+        assert wrong.words in driver.finding('stream').words
         assert wrong.words in driver.logged('warning')
     if case.ends == 'done':
         assert driver.calibration.is_levelled
@@ -123,7 +123,7 @@ def test_axes_of_a_driver_are_named_after_two_rests_and_poses_are_asked_for_as_t
         person = Person(driver, reading(axes))
         person.follow(seconds=25.0)
         assert driver.shown is not None
-        asked = next_action(driver.session.state).direction
+        asked = next_step(driver.session.state).direction
         np.testing.assert_allclose(driver.shown.asked.direction, asked)
         assert words in driver.logged('warning')
         lines = driver.logged('info').splitlines()
@@ -145,10 +145,10 @@ def test_a_calibration_for_another_start_of_the_node_is_not_set_aside_by_the_nex
     assert person.follow(seconds=60.0) == 'restart'
     assert person.called == []
     assert path.read_bytes() == before
-    words = next_action(driver.session.state).words
+    words = next_step(driver.session.state).text
     assert 'restart the node with units of the calibration' in words
     driver.ask('reset')
-    assert next_action(driver.session.state).kind == 'poses'
+    assert next_step(driver.session.state).kind == 'poses'
 
 
 def test_the_correction_and_the_range_of_the_calibration_come_before_done() -> None:
@@ -157,14 +157,15 @@ def test_the_correction_and_the_range_of_the_calibration_come_before_done() -> N
                     warming=0.5)
     assert person.follow() == 'done'
     assert 'offset_temperature' in driver.calibration.model.effects
-    driver.session.commands.enable(False)
-    assert next_action(driver.session.state).kind == 'enable'
-    driver.session.commands.enable(True)
+    enable(driver.session, False)
+    assert next_step(driver.session.state).kind == 'enable'
+    enable(driver.session, True)
     person.warming, person.temperature = 0.0, 60.0
     person.rest(person.flat, 4.0)
-    action = next_action(driver.session.state)
-    assert (action.kind, action.command, action.level) == ('poses', 'refine', 1)
-    assert action.words in driver.finding('calibration').words
+    action = next_step(driver.session.state)
+    assert (action.kind, action.command) == ('poses', 'refine')
+    assert conditions(driver.session.state)[0].level == 'USABLE'
+    assert action.text in driver.finding('calibration').words
 
 
 def test_bursts_of_absurd_readings_are_said_while_they_last_and_only_counted_then() -> None:
@@ -172,11 +173,11 @@ def test_bursts_of_absurd_readings_are_said_while_they_last_and_only_counted_the
     person = Person(driver, reading())
     person.follow()
     driver.feed(np.full((10, 3), np.nan))
-    assert next_action(driver.session.state).name == 'not_finite'
-    assert driver.finding('stream').level == 1
+    assert conditions(driver.session.state)[0].kind == 'not_finite'
+    assert driver.finding('stream').level == 'USABLE'
     person.rest(person.flat, 8.0)
-    assert next_action(driver.session.state).kind == 'done'
-    assert driver.finding('stream').level == 0
+    assert next_step(driver.session.state).kind == 'done'
+    assert driver.finding('stream').level == 'GOOD'
     assert dict(state.figures(driver.session.state))['readings not finite'] == '10'
 
 
@@ -197,10 +198,11 @@ def test_a_calibration_that_cannot_be_stored_leaves_no_file_and_is_asked_for_unt
     folder = driver.session.state.files.store.calibration.parent
     assert [path.name for path in folder.iterdir() if 'before' in path.name] == []
     assert driver.calibration is not None
-    action = next_action(driver.session.state)
-    assert (action.kind, action.command, action.level) == ('save', 'save', 2)
+    action = next_step(driver.session.state)
+    assert (action.kind, action.command) == ('save', 'save')
+    assert conditions(driver.session.state)[0].level == 'BAD'
     driver.ask('save')
-    assert next_action(driver.session.state).kind == 'level'
+    assert next_step(driver.session.state).kind == 'level'
 
 
 def test_no_step_is_named_while_the_rating_is_being_computed() -> None:
@@ -212,6 +214,6 @@ def test_no_step_is_named_while_the_rating_is_being_computed() -> None:
     lines = len(driver.log)
     driver.session.change_sensor(rating=None)
     person.rest([0.3, 0.3, 0.9])
-    action = next_action(driver.session.state)
-    assert (action.kind, action.words) == ('', '')
+    action = next_step(driver.session.state)
+    assert (action.kind, action.text) == ('', '')
     assert not [line.words for line in driver.log[lines:] if 'next: ' in line.words]

@@ -69,19 +69,19 @@ def planned(up, **context):
 
 def guide_at(guide, up):
     asked = NextPose(np.array([1.0, 0.0, 0.0]), 0.5, 12, True)
-    guide.plan = SessionPlan(asked, len(up), np.array(up, float).reshape(-1, 3), 1e-4, 0.5)
+    return guide.choose(
+        SessionPlan(asked, len(up), np.array(up, float).reshape(-1, 3), 1e-4, 0.5))
 
 
 def test_the_node_asks_for_the_poses_of_the_plan_and_then_for_refine():
-    guide = Guide()
-    guide_at(guide, [(0, 0, -1)])
-    guide.follow([planned((0.0, 0.0, 1.0)), planned((0.0, 1.0, 0.0), temperature=40.0)])
+    guide = guide_at(Guide(), [(0, 0, -1)]).follow([
+        planned((0.0, 0.0, 1.0)), planned((0.0, 1.0, 0.0), temperature=40.0)])
     assert guide.plan.asked.direction.tolist() == [0.0, 0.0, 1.0]
-    assert step_of(guide).words.endswith(' cubic from odd_quadratic')
-    guide_at(guide, [(0, 0, -1), (0, 0.1, 1)])
-    assert ' at 40 °C' in step_of(guide).words
+    assert step_of(guide).text.endswith(' cubic from odd_quadratic')
+    guide = guide_at(guide, [(0, 0, -1), (0, 0.1, 1)])
+    assert ' at 40 °C' in step_of(guide).text
     assert guide.plan.asked.direction.tolist() == [0.0, 1.0, 0.0]
-    guide_at(guide, [(0, 0, -1), (0, 0.1, 1), (0, 1, 0)])
-    assert (step_of(guide).kind, step_of(guide).command) == ('refine', 'refine')
-    guide_at(guide, [])
-    assert (step_of(guide).kind, step_of(guide).command) == ('poses', 'fit')
+    guide = guide_at(guide, [(0, 0, -1), (0, 0.1, 1), (0, 1, 0)])
+    assert (step_of(guide).step, step_of(guide).command) == ('refine', 'refine')
+    guide = guide_at(guide, [])
+    assert (step_of(guide).step, step_of(guide).command) == ('poses', 'fit')

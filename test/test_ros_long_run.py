@@ -4,7 +4,7 @@
 """The short form of `benchmarks/long_run.py`: rounds of captures, fits and refinements."""
 
 from faults.sample import FACTOR
-from long_run import long_run
+from long_run import run_rounds
 import numpy as np
 import pytest
 
@@ -28,7 +28,7 @@ ones take no more.
 
 @pytest.mark.skipif(FACTOR == 1, reason='two minutes: make faults')
 def test_a_long_run_loses_no_message_answers_every_call_and_keeps_its_memory(domain: int) -> None:
-    run = long_run(ROUNDS, ROUND, INTERVAL, RATE, domain=domain)
+    run = run_rounds(ROUNDS, ROUND, INTERVAL, RATE, domain=domain)
     assert np.all(run.count(run.sent) > 0.5 * RATE * INTERVAL)
     assert not np.any(run.lost(run.ours))
     assert [each for each in run.answers if not each.success] == []

@@ -42,7 +42,7 @@ def test_callbacks_continue_while_a_service_works(bench: Any, make_executor: Any
     node = Node('calibrator', context=context)
     logged, ticks, threads = [], [], set()
     session = Session(CalibratorSettings(), '/imu/data_raw')
-    worker = Worker(session, in_executor(node), logged.append)
+    worker = Worker(session.events, in_executor(node), logged.append)
 
     def fit() -> Task:
         found = yield Files(work)

@@ -14,9 +14,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from accel_calib.errors import AccelCalibError
-from accel_calib.session import Mounting
+from accel_calib.session import enable, Mounting, run
 from accel_calib.stored import read_calibration
-from inside import automatic_fits_due, main, spread_directions
+from inside import main, spread_directions
 import pytest
 from shared import Readings, result, Stored
 from test_session import Driver
@@ -102,8 +102,8 @@ def test_a_command_that_ends_after_another_sensor_took_over_changes_nothing_of_i
     turned = readings(spread_directions(12))
     driver.feed(turned)
     if name != 'fit':
-        driver.done(driver.session.commands.fit())
-    task = getattr(driver.session.commands, name)()
+        driver.ask('fit')
+    task = run(driver.session, name)
     found = result(next(task))
     driver.now += 3.0
     driver.feed(turned[:200], 'other')
@@ -136,21 +136,24 @@ def test_an_automatic_fit_of_a_sensor_is_not_one_of_the_next(readings: Readings)
     turned = readings(spread_directions(12))
     driver.feed(turned)
     driver.session.set_settings(replace(driver.session.state.settings, auto_fit=True))
-    task, = automatic_fits_due(driver.session)
+    driver.session.tick()
+    task, = driver.session.events
+    driver.session.events.clear()
     driver.now += 3.0
     driver.feed(turned[:200], 'other')
     assert driver.done(task) == ''
     assert driver.session.sensor.calibration is None
-    assert not automatic_fits_due(driver.session)
+    driver.session.tick()
+    assert not driver.session.events
 
 
 def test_correction_that_was_switched_off_stays_off_with_the_next_sensor(readings: Readings
                                                                          ) -> None:
     driver = Driver()
-    driver.session.commands.enable(False)
+    enable(driver.session, False)
     driver.feed(readings([[0, 0, 1]])[:30])
     assert not driver.session.state.enabled
-    assert 'nothing is published' in driver.session.commands.enable(True)
+    assert 'nothing is published' in enable(driver.session, True)
 
 
 def test_mounting_is_published_in_the_frame_of_the_messages_and_not_under_the_parameter(

@@ -15,7 +15,7 @@ from accel_calib.effects import Covariate
 from accel_calib.errors import InputError, StoredCalibrationError
 from accel_calib.finding import has
 from accel_calib.logs import open_log, read_poses, write_table
-from accel_calib.session import Level, state, Surroundings
+from accel_calib.session import state, Surroundings
 from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import Poses
 from driven import Driver, RATE
@@ -70,18 +70,18 @@ def test_second_node_on_the_same_files_is_refused_until_the_first_ends(
     first, second = Driver(calibration_file=str(path)), Driver(calibration_file=str(path))
     for driver in (first, second):
         driver.feed(readings(spread_directions(12)))
-    assert first.session.state.files.locked
-    assert not second.session.state.files.locked
-    assert second.finding('calibration').level == Level.ERROR
+    assert first.session.state.files.lock
+    assert not second.session.state.files.lock
+    assert second.finding('calibration').level == 'BAD'
     assert words in second.finding('calibration').words
     second.refuses(words, 'fit', 'save', 'load')
     assert path.read_bytes() == before
     assert len(read_poses(path.with_name('known_poses.csv'))) == 12
     first.session.close()
     second.tick()
-    assert second.session.state.files.locked
+    assert second.session.state.files.lock
     assert second.calibration is not None
-    assert second.finding('calibration').level == Level.OK
+    assert second.finding('calibration').level == 'GOOD'
 
 
 def test_files_that_cannot_be_used_are_never_overwritten(tmp_path: Path, stored: Stored,
@@ -122,7 +122,7 @@ def test_messages_of_another_sensor_are_dropped_and_end_the_rest(readings: Readi
     assert "'another', expected 'imu_link'" in driver.logged()
     assert driver.feed(rest[100:]) == len(rest) - 100
     assert driver.session.state.statistics.dropped['foreign'] == 1
-    assert driver.finding('stream').level == Level.WARN
+    assert driver.finding('stream').level == 'USABLE'
 
 
 @pytest.mark.parametrize(('units', 'per_g'), [('native', 16384.0), ('m/s2', 9.80665)])
@@ -276,7 +276,7 @@ def test_context_outside_of_the_ranges_is_limited_with_a_warning(
         read_calibration(path), {'offset_temperature': [1e-3, 0.0, 0.0]},
         temperature=np.linspace(20.0, 30.0, 20)))
     driver, forces = Driver(calibration_file=str(path)), []
-    for temperature, severity in ((25.0, Level.OK), (30.0, Level.OK), (40.0, Level.WARN)):
+    for temperature, severity in ((25.0, 'GOOD'), (30.0, 'GOOD'), (40.0, 'USABLE')):
         driver.feed(readings([UP])[:50], temperature=temperature)
         assert driver.finding('calibration').level == severity
         forces.append(driver.sensor.force_of((0.0, 0.0, GRAVITY), driver.session.state.context)[0])

@@ -46,7 +46,7 @@ The dilution is 400 for 12 poses in a 45° cone, 100 for poses in five direction
 2°, and 25 for the worst 1 % of 12 poses in random directions. With a noise of 0.3 mg per pose, 25
 corresponds to an error of 8 mg in some direction. All fits that are wrong by 10 mg over the whole
 sphere have a larger dilution; with a limit of 40, some of them would pass
-(`benchmarks/geometry.py`).
+(`benchmarks/poses.py`).
 
 """
 

@@ -143,7 +143,7 @@ def _without_doubtful(poses: Poses, units: Units, model: str, method: Method
 def _fitted(poses: Poses, units: Units, model: str, method: Method) -> Calibration:
     if model == ORIENTED or (model == 'auto' and 'reference' in poses.columns):
         return fit_known(poses, units, method)
-    return fit_unknown(poses, units, model, method)
+    return fit_unknown(poses, units, model, method)[0]
 
 
 def sound_rows(poses: Poses, units: Units) -> tuple[Poses, tuple[Rejected, ...]]:
@@ -189,7 +189,7 @@ def inside_rows(poses: Poses, units: Units
         Rejected(row, CLIPPED, 'clipped') for row in rows), (Finding(
             'limited', f'{len(rows)} of {len(poses)} poses are left out, because the readings end '
             f'at {short(limit)} {units.name}, the limit of the sensor', 'choose a larger range of '
-            'the sensor, and record again', 'USABLE', rows, 'record'),)
+            'the sensor, and record again', 'USABLE', rows, step='record'),)
 
 
 def sure_rows(poses: Poses) -> tuple[Poses, tuple[Rejected, ...]]:
@@ -202,11 +202,6 @@ def sure_rows(poses: Poses) -> tuple[Poses, tuple[Rejected, ...]]:
         for row in poses.row[doubtful])
 
 
-def fit_unknown(poses: Poses, units: Units, model: str, method: Method) -> Calibration:
-    """Fit poses of unknown orientation; parameters and errors as in `fit_poses`."""
-    return _by_norm(poses, units, model, method)[0]
-
-
 def own_scale(poses: Poses, units: Units) -> Units:
     """Return native units with the scale estimated from the poses; other units unchanged."""
     if not units.is_native:
@@ -216,7 +211,8 @@ def own_scale(poses: Poses, units: Units) -> Units:
     return Units('native', float(fit_sphere(poses.reading)[0][0, 0]))
 
 
-def _by_norm(poses: Poses, units: Units, model: str, method: Method) -> tuple[Calibration, Fit]:
+def fit_unknown(poses: Poses, units: Units, model: str, method: Method
+                ) -> tuple[Calibration, Fit]:
     """Fit model 4, 7, 9, 10 or ``auto`` by |force| = 1 g; errors as in `fit_poses`."""
     units = own_scale(poses, units)
     poses_g, directions = only_norm(in_g(poses, units)), directions_of(poses, units)
@@ -245,7 +241,8 @@ def _by_norm(poses: Poses, units: Units, model: str, method: Method) -> tuple[Ca
     if model == 'auto':
         noted += find_undetermined(list(dilutions)[-1], used, noise)
     return record_of(
-        fit, poses, units, used, name, method, covariance=covariance_with(fit, unlike),
+        fit, poses, units, used, name=name, method=method,
+        covariance=covariance_with(fit, unlike),
         rejected=rejected_by(fit.model, poses_g.take(~inside[original])), reason=reason,
         noted=tuple(noted)), fit
 
@@ -385,9 +382,14 @@ def fit_known(poses: Poses, units: Units, method: Method) -> Calibration:
     out = np.delete(everyone, kept)
     unlike = rivals(fit, kept, out, poses_g, lambda others: estimate(fit.model, others))
     fit = stated(fit)
+    judged = judge(fit.model, poses_g.take(out)) if len(out) else fit
+    away = judged.equations.of_poses(judged.residual) * MG
+    rejected = tuple(
+        Rejected(int(row), f'outlier: the reading differs by {error:.2f} mg from the fit of the '
+                 'other poses', 'outlier') for row, error in zip(poses_g.row[out], away))
     return record_of(
-        fit, poses, units, unit(fit.poses_g['reference']), ORIENTED, method,
-        covariance=covariance_with(fit, unlike), rejected=_rejected_known(fit, poses_g.take(out)),
+        fit, poses, units, unit(fit.poses_g['reference']), name=ORIENTED, method=method,
+        covariance=covariance_with(fit, unlike), rejected=rejected,
         reason=reason,
         noted=(*rival_findings(unlike, poses.row), *fit_findings(fit, 0.0), *_placement(fit)))
 
@@ -408,24 +410,13 @@ def _without_outliers(poses_g: Poses) -> tuple[Fit, Indices]:
     return fit, kept
 
 
-def _rejected_known(fit: Fit, poses_g: Poses) -> tuple[Rejected, ...]:
-    """Return outliers of known orientation with their distance from a fit."""
-    if not len(poses_g):
-        return ()
-    judged = judge(fit.model, poses_g)
-    away = judged.equations.of_poses(judged.residual) * MG
-    return tuple(Rejected(int(row), f'outlier: the reading differs by {error:.2f} mg from the fit '
-                          'of the other poses', 'outlier')
-                 for row, error in zip(poses_g.row, away, strict=True))
-
-
 def _unless_placed_well(poses: Poses, units: Units) -> Calibration | None:
     """Fit by |force| = 1 g alone if it contradicts the known orientations; otherwise None."""
     units, directions = own_scale(poses, units), directions_of(poses, units)
     if not determines('10', directions):
         return None
     try:
-        by_norm, fit = _by_norm(poses, units, '10', 'ml')
+        by_norm, fit = fit_unknown(poses, units, '10', 'ml')
     except RefusedFitError:  # without the outliers the poses do not determine the model
         return None
     seen = in_g(poses.take(np.isin(poses.row, fit.poses_g.row)), units)

@@ -42,9 +42,7 @@ rotation by another angle. A rotation can be intended, a mirror image cannot.
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from itertools import permutations, product
 import math
-from typing import Any
 
 import numpy as np
 import scipy
@@ -55,7 +53,7 @@ from ..effects import add_history, AXES, Context, Model, sensor_force
 from ..errors import InputError
 from ..estimate import fit_12
 from ..finding import Finding, Level, without
-from ..geometry import angle_of, axes_of_signs, quaternion_of, rotation_from_rpy, rpy_of
+from ..geometry import angle_of, axes_of_signs, rotation_from_rpy, SIGNED_AXES
 from ..table import Floats, Poses
 from ..units import FrameName
 
@@ -74,7 +72,6 @@ _ARBITRARY_HEADING = Finding(
     'down (~/set_heading or --nose-down), or give the mounting (mounting_rpy or base_frame)')
 
 _VERTICAL = 1e-9
-_DIGITS = 9
 _STEEP = np.cos(np.radians(10.0))
 """Cosine of the angle from the vertical within which a direction has no heading."""
 
@@ -175,40 +172,6 @@ def on_topics(calibration: Calibration, frame: str) -> Calibration:
 def mounting_of(rpy: Sequence[float]) -> Floats:
     """Return ΔR, (3, 3), from roll, pitch and yaw of the sensor on the robot [rad] (URDF)."""
     return rotation_from_rpy(*rpy).T
-
-
-def mounting_figures(rotation: Floats, sensor: str, base: str = '') -> dict[str, Any]:
-    """
-    Return a mounting as numbers and as the lines for the URDF and for TF.
-
-    The numbers are ``roll``, ``pitch`` and ``yaw`` [rad] of the sensor in the levelled frame, and
-    ``quaternion`` (x, y, z, w). The lines are for the frame_id `sensor` (if empty ``imu_link``)
-    and the frame `base` (if empty ``base_link``).
-
-    """
-    roll, pitch, yaw = (round(angle, _DIGITS) + 0.0 for angle in rpy_of(rotation.T))
-    quaternion = [round(part, _DIGITS) + 0.0 for part in quaternion_of(rotation.T)]
-    return {'roll': roll, 'pitch': pitch, 'yaw': yaw, 'quaternion': quaternion,
-            'urdf': f'<origin xyz="0 0 0" rpy="{roll} {pitch} {yaw}"/>',
-            'static_transform_publisher':
-                f'ros2 run tf2_ros static_transform_publisher --roll {roll} --pitch {pitch} '
-                f'--yaw {yaw} --frame-id {base or "base_link"} --child-frame-id '
-                f'{sensor or "imu_link"}'}
-
-
-def mounting_words(rotation: Floats, sensor: str, base: str = '') -> str:
-    """Return `mounting_figures` as one line."""
-    found = mounting_figures(rotation, sensor, base)
-    quaternion = ', '.join(f'{part:.6f}' for part in found['quaternion'])
-    return (f'mounting of the sensor: {angle_words(rotation)}; quaternion ({quaternion}); URDF '
-            f'{found["urdf"]}; or {found["static_transform_publisher"]}')
-
-
-def angle_words(rotation: Floats) -> str:
-    """Return roll, pitch and yaw of the sensor in words."""
-    found = mounting_figures(rotation, '')
-    return ', '.join(f'{name} {math.degrees(found[name]):.2f}°' for name in (
-        'roll', 'pitch', 'yaw'))
 
 
 def level_by_rows(calibration: Calibration, poses: Poses, frame: FrameName, flat: int | None,
@@ -380,7 +343,7 @@ def fault_of(mat_q: Floats) -> str | None:
     """Return the wiring fault of a matrix as from `axes_of`; None if there is none."""
     if angle_of(mat_q) <= _NEAR:  # the angle of a mirror image is 90° or more
         return None
-    nearest = max(_PERMUTATIONS, key=lambda one: float(np.sum(one * mat_q)))
+    nearest = max(SIGNED_AXES, key=lambda one: float(np.sum(one * mat_q)))
     if angle_of(mat_q @ nearest.T) > _NEAR:
         if np.linalg.det(mat_q) > 0.0:
             return f'the sensor is rotated by {_turn(mat_q.T)}'
@@ -400,12 +363,6 @@ def fault_of(mat_q: Floats) -> str | None:
         swapped = [axis for axis, own in zip(AXES, diagonal, strict=True) if own == 0.0]
         return f'{" and ".join(swapped)} are swapped'
     return f'the axes are permuted to a mirror image: {reads}'
-
-
-_PERMUTATIONS: list[Floats] = [
-    np.diag(signs) @ np.eye(3)[list(order)]
-    for order in permutations(range(3)) for signs in product((1.0, -1.0), repeat=3)]
-"""The 48 signed permutations of the axes, including mirror images."""
 
 
 def _turn(rotation: Floats) -> str:

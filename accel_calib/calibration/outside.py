@@ -10,17 +10,6 @@ import numpy as np
 from .calibration import Calibration
 from ..effects import Context, context_of_samples, entry_of, thermal_stream, variable_of
 from ..statistics import over_axes
-from ..table import column_of
-from ..text import counted
-from ..units import MG
-
-USES_LIMIT = 'the correction uses the limit of the range'
-
-_QUANTITIES: dict[str, tuple[str, str, float]] = {
-    'time': ('time since the start of the calibration', 'h', 1.0 / 3600.0),
-    'temperature_rate': ('rate of temperature', '°C/min', 60.0),
-    'std': ('vibration', 'mg', MG)}
-"""Name, unit and factor of the quantities that are not shown as in `accel_calib.table`."""
 
 
 @dataclass(frozen=True)
@@ -41,23 +30,6 @@ class Outside:
     least: float
     most: float
 
-    @property
-    def words(self) -> str:
-        """Return what was found, and the range of the calibration; times from the first pose."""
-        name, unit, factor = _QUANTITIES.get(self.key) or (
-            self.key.replace('_', ' '), column_of(self.key).unit, 1.0)
-        start, shown = self.low if self.key == 'time' else 0.0, []
-        for low, high in ((self.least, self.most), (self.low, self.high)):
-            first, last = (f'{(value - start) * factor:.4g}' for value in (low, high))
-            shown.append(f'{first if first == last else f"{first} to {last}"} {unit}'.rstrip())
-        return f'{name} is {shown[0]}, but the range of the calibration is {shown[1]}'
-
-    @property
-    def line(self) -> str:
-        """Return a line about a recording."""
-        return (f'{self.count} of {counted(self.samples, "sample")} are outside of the range of '
-                f'the calibration: {self.words}; {USES_LIMIT}')
-
 
 def outside(calibration: Calibration, known: Context) -> dict[str, Outside]:
     """Return the comparison of each column that has a range; ``count`` is 0 if all are inside."""
@@ -71,8 +43,8 @@ def outside(calibration: Calibration, known: Context) -> dict[str, Outside]:
         values = values[np.isfinite(values)]
         if len(values):
             count = int(np.sum((values < low) | (values > high)))
-            found[key] = Outside(key, count, len(values), low, high, float(np.min(values)),
-                                 float(np.max(values)))
+            found[key] = Outside(key, count, len(values), low=low, high=high,
+                                 least=float(np.min(values)), most=float(np.max(values)))
     return found
 
 

@@ -34,7 +34,7 @@ previous one. The evidence of a factor is the probability of the readings r, giv
     r ~ N(0, factor · noise² + J P Jᵀ)
 
 with P the covariance of the prior, linearised at the fit. The stated noise, a factor of 1, has the
-prior probability `_STATED`. The variance factor is that of a full fit, computed at the most
+prior probability `STATED_NOISE`. The variance factor is that of a full fit, computed at the most
 probable one, but at least as large. The readings of a sensor that is unlike its fleet could also
 come from a usual sensor with very large noise: with a fleet, the noise is limited to
 `FLEET_NOISE_G`, and the probability of a noise decreases with its factor on the stated noise.
@@ -62,6 +62,7 @@ from ..estimate import (
     estimate, Fit, judge, LARGEST_SHARE, NotConvergedError, originals, Prior, variance_factor)
 from ..finding import Finding, without
 from ..geometry import cone_of, unit
+from ..statistics import STATED_NOISE
 from ..table import check_units, Poses
 from ..text import counted, enumerated
 from ..units import Floats, Indices, MG, Units
@@ -103,11 +104,9 @@ FIRST_NOISE_G = 0.1
 _NOISE_STEP = 3.0
 """Noise of the first fit [g], and the factor by which it is reduced."""
 
-_STATED = 0.7
-"""Prior probability that the stated noise is right, as in `accel_calib.estimate.equations`."""
-
-_AS_STATED = float(np.log(_STATED / (1.0 - _STATED) * 10.0))
-"""Its logarithm relative to that of each of about ten other factors."""
+_AS_STATED = float(np.log(STATED_NOISE / (1.0 - STATED_NOISE) * 10.0))
+"""Logarithm of the prior probability that the stated noise is right, relative to that of each of
+about ten other factors."""
 
 _LEAST_FACTOR = 1e-6
 """Smallest variance factor; with 0, values that the poses do not see would have no prior."""
@@ -286,7 +285,7 @@ def mounting_only(poses: Poses, units: Units, *, sensor: str = '', date: str = '
     sound, rejected = usable(poses, units, 'a mounting')
     fit, offset = judge(Model({}), only_norm(in_g(sound, units))), EFFECTS['offset'].typical
     return finished(record_of(
-        fit, poses, units, unit(sound.reading), 'ideal', PRIOR, rejected=rejected,
+        fit, poses, units, unit(sound.reading), name='ideal', method=PRIOR, rejected=rejected,
         reason='mounting alone: offset and gain are not calibrated',
         noted=(Finding(
             'open', 'offset and gain are not calibrated: a common sensor has an offset of '
@@ -329,7 +328,7 @@ def fit_partial(poses: Poses, units: Units, *, sensor: str = '', date: str = '')
         raise ValueError(f'the {len(sound)} poses determine model {NAME}, expected poses near '
                          'one direction or in a plane: use fit_poses')
     found = most_probable(only_norm(in_g(sound, units)), priors_of(), FIRST_NOISE_G, LARGEST_SHARE)
-    calibration = _recorded(found, poses, sound, units, PRIOR, rejected)
+    calibration = _record_of(found, poses, sound, units, method=PRIOR, rejected=rejected)
     reason, left_open = _words_of_part(calibration)
     return finished(replace(calibration, reason=reason, noted=(left_open, *calibration.noted)),
                     sensor, date)
@@ -386,14 +385,14 @@ def fit_with_fleet(poses: Poses, units: Units, fleet: FleetPrior, *, sensor: str
         raise RefusedFitError('the readings contradict the values of the fleet, expected a sensor '
                               'of the same model', 'check the unit and the poses, or fit without '
                               '--prior') from None
-    calibration = _recorded(found, poses, sound, units, FLEET, rejected)
+    calibration = _record_of(found, poses, sound, units, method=FLEET, rejected=rejected)
     reason = f'{counted(len(found.kept), "pose")} with {fleet.words}'
     return finished(replace(calibration, reason=reason, noted=(
         *(UNLIKE_FLEET,) * found.is_unlike, *calibration.noted)), sensor, date)
 
 
-def _recorded(found: PriorFit, poses: Poses, sound: Poses, units: Units, method: str,
-              rejected: tuple[Rejected, ...]) -> Calibration:
+def _record_of(found: PriorFit, poses: Poses, sound: Poses, units: Units, *, method: str,
+               rejected: tuple[Rejected, ...]) -> Calibration:
     """Return a fit to the sound poses as a calibration."""
     fit, out = found.fit, sound.take(~np.isin(found.original, found.kept))
     noted = fit_findings(fit, 0.0)
@@ -402,7 +401,7 @@ def _recorded(found: PriorFit, poses: Poses, sound: Poses, units: Units, method:
                          'poses repeat as well as the noise of their samples predicts',
                          'take more poses'), *without(noted, 'no_check'))
     return record_of(
-        fit, poses, units, unit(sound.reading)[found.kept], NAME, method,
+        fit, poses, units, unit(sound.reading)[found.kept], name=NAME, method=method,
         rejected=(*rejected, *rejected_by(fit.model, in_g(out, units))),
         noted=(*copies(found.original, sound), *noted))
 

@@ -12,7 +12,7 @@ models that the poses determine.
 and 8 corners of the sensor. It is the orientation that increases the determinant of M plus the
 information of one pose spread over the whole sphere most (D-optimal design, Fedorov 1972). The
 latter represents the poses to come; without it the first poses would be chosen as if they were the
-last. `benchmarks/next_pose.py` compares this order with others.
+last. `benchmarks/poses.py` compares this order with others.
 
 With n well spread poses, the error of |force| is the noise of a pose times √(p / n), RMS over the
 sphere. Another pose reduces it by the factor 1 / 2n. More poses no longer help if the next pose
@@ -323,7 +323,7 @@ def plan_session(poses: Poses, units: Units, model: str, skipped: Sequence[Float
     # The zero of readings in other units than native ones is known.
     zero = fit_sphere(poses.reading)[1].tolist() if units.is_native and len(up) else ()
     return SessionPlan(asked, len(poses), up, math.nan if noise_g is None else noise_g,
-                       coverage(up) if len(up) else 0.0, tuple(zero))
+                       coverage(up) if len(up) else 0.0, zero=tuple(zero))
 
 
 # ----------------------------------------------------------------------------- refusals

@@ -135,8 +135,8 @@ def quality_of(fit: Fit, units: Units, directions: Floats) -> Quality:
                    coverage(directions))
 
 
-def record_of(fit: Fit, poses: Poses, units: Units, directions: Floats, name: str, method: str, *,
-              covariance: Floats | None = None, rejected: tuple[Rejected, ...] = (),
+def record_of(fit: Fit, poses: Poses, units: Units, directions: Floats, *, name: str,
+              method: str, covariance: Floats | None = None, rejected: tuple[Rejected, ...] = (),
               reason: str = '', noted: tuple[Finding, ...] = ()) -> Calibration:
     """
     Return a fit to the poses that are not rejected as a calibration, with the ΔR of its model.
@@ -148,9 +148,10 @@ def record_of(fit: Fit, poses: Poses, units: Units, directions: Floats, name: st
 
     """
     return Calibration(
-        name, method, fit.model, units, poses.sensor, 'ros', '',
-        fit.covariance if covariance is None else covariance, quality_of(fit, units, directions),
-        poses, tuple(sorted(rejected, key=lambda pose: pose.row)), reason, noted)
+        name=name, method=method, model=fit.model, units=units, sensor=poses.sensor, frame='ros',
+        date='', covariance=fit.covariance if covariance is None else covariance,
+        quality=quality_of(fit, units, directions), poses=poses,
+        rejected=tuple(sorted(rejected, key=lambda pose: pose.row)), reason=reason, noted=noted)
 
 
 def with_rest_noise(calibration: Calibration, poses: Poses) -> Calibration:

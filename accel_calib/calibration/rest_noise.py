@@ -160,19 +160,14 @@ class SampleNoise(Record):
 
 def sample_noise_of(poses: Poses) -> SampleNoise | None:
     """Return the noise of one sample, NaN on an axis that never changes; None if not stated."""
-    force, rate = (_median(poses, key) for key in ('std', 'rate_std'))
+    found = [np.median(poses[key], axis=0) if key in poses and len(poses) else np.zeros(3)
+             for key in ('std', 'rate_std')]
+    force, rate = (np.where(each > 0.0, each, np.nan) for each in found)
     if 'rate' in poses and len(poses) and not _in_rad_s(poses['rate']):
         rate = np.full(3, np.nan)
     if np.isnan(force).all() and np.isnan(rate).all():
         return None
     return SampleNoise(force, rate)
-
-
-def _median(poses: Poses, key: str) -> Floats:
-    if key not in poses or not len(poses):
-        return np.full(3, np.nan)
-    found = np.median(poses[key], axis=0)
-    return np.asarray(np.where(found > 0.0, found, np.nan))
 
 
 def _in_rad_s(rate: Floats) -> bool:
@@ -206,10 +201,10 @@ def gyro_bias_of(poses: Poses) -> GyroBias | None:
     if np.any(np.abs(bias) >= LARGEST_BIAS) or np.any(sd >= _LARGEST_SD):
         return None
     if 'temperature' not in rests:
-        return GyroBias(bias, sd, len(rests), math.nan, slope, ())
+        return GyroBias(bias, sd, len(rests), math.nan, slope, temperatures=())
     limits = range_of(rests, 'temperature')
     mean = float(np.clip(rests['temperature'].mean(), *limits))
-    return GyroBias(bias, sd, len(rests), mean, slope, limits)
+    return GyroBias(bias, sd, len(rests), mean, slope, temperatures=limits)
 
 
 def _noise_of(rests: Poses) -> Floats:

@@ -573,7 +573,7 @@ def with_curve(fitted: Calibration, curve: Curve, poses: Poses) -> Calibration:
     kept_g = add_history(in_g(every.take(~np.isin(every.row, rejected)), fitted.units), model)
     made = record_of(
         judge(model, kept_g), every, fitted.units, unit(sensor_force(
-            model, kept_g.reading, kept_g.columns)), fitted.name, fitted.method,
+            model, kept_g.reading, kept_g.columns)), name=fitted.name, method=fitted.method,
         covariance=covariance, rejected=fitted.rejected,
         reason=f'{fitted.reason}; {_words(curve)}',
         noted=(*fitted.noted, *findings_of_curve(curve)))

@@ -4,21 +4,23 @@
 """
 The commands, with the options of each.
 
-The choices of an option are imported with the options of the requested command, so that
-``--help`` does not wait for numpy.
+Each has its options as entries, as `accel_calib.cli.options` describes them.
 
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Collection
+from collections.abc import Collection
+from functools import partial
 from pathlib import Path
 import re
 import shlex
 from typing import NamedTuple, TYPE_CHECKING
 
-from . import options
+from .options import (
+    add_options, any_log, BASE, CAPTURE, late, LOG, option, Options, outputs, Parser, poses,
+    positive, report, shared, source, STANDARD_INPUT, stored, units)
 from .. import __version__
 
 if TYPE_CHECKING:
@@ -30,30 +32,32 @@ class Command(NamedTuple):
     A command.
 
     `module` of this folder has the function ``run_NAME``. `example` is the end of the help; its
-    first line is an example, without ``accel-calib NAME``. `options` adds the options to a parser.
-    `writes` is the kind of the file that ``-o`` names, empty for any, and `about` the argument
-    that an error in JSON is about.
+    first line is an example, without ``accel-calib NAME``. `writes` is the kind of the file that
+    ``-o`` names, empty for any, and `about` the argument that an error in JSON is about.
 
     """
 
     summary: str
     module: str
     example: str
-    options: Callable[[options.Parser], None] = lambda made: None
+    options: Options = ()
     writes: str = ''
     about: str = ''
 
+    def add_to(self, made: Parser) -> None:
+        """Add the options and the example to a parser."""
+        add_options(made, self.options)
+        known = {action.dest for action in made._actions}
+        add_options(made, shared(
+            *(['--force'] if known & {'output', 'json'} else ()),
+            *(['--also'] if known & {'calibration', 'calibrations', 'effect', 'refined'} else ())))
+        made.epilog = f'example:\n  {made.prog} {self.example}'
+        made.formatter_class = argparse.RawDescriptionHelpFormatter
+        if 'to' in known:
+            from ..stored.exports import FORMATS
 
-def add_options(made: options.Parser, command: Command) -> None:
-    """Add the options and the example of a command to its parser."""
-    made.epilog = f'example:\n  {made.prog} {command.example}'
-    made.formatter_class = argparse.RawDescriptionHelpFormatter
-    command.options(made)
-    known = {action.dest for action in made._actions}
-    if known & {'output', 'json'}:
-        options.share(made, '--force')
-    if known & {'calibration', 'calibrations', 'effect', 'refined'}:
-        options.share(made, '--also')
+            made.epilog = '\n'.join([f'{made.epilog}\nformats:', *(
+                f'  {name:<11}{each.what}' for name, each in FORMATS.items())])
 
 
 _NOT_CARRIED = ('json', 'jobs', 'report', 'plan', 'figures', 'force', 'verbose')
@@ -62,8 +66,8 @@ _NOT_CARRIED = ('json', 'jobs', 'report', 'plan', 'figures', 'force', 'verbose')
 
 def command_line(name: str, args: argparse.Namespace, **changed: object) -> str:
     """Return the line of a command with the options of another one, where it has them."""
-    made = options.Parser(add_help=False)
-    add_options(made, COMMANDS[name])
+    made = Parser(add_help=False)
+    COMMANDS[name].add_to(made)
     values = {**vars(args), **changed}
     words = ['accel-calib', name]
     for action in made._actions:
@@ -78,7 +82,7 @@ def _words(value: object) -> list[str]:
     from ..logs import Piped
 
     if not isinstance(value, list):
-        return [options.STANDARD_INPUT if isinstance(value, Piped) else str(value)]
+        return [STANDARD_INPUT if isinstance(value, Piped) else str(value)]
     columns = [f'{ours}={theirs}' for each in value if isinstance(each, dict)
                for ours, theirs in each.items()]
     return [','.join(columns)] if columns else [word for each in value for word in _words(each)]
@@ -100,13 +104,6 @@ def next_command(step: NextStep, args: argparse.Namespace) -> str:
         case 'verify' if written or base:
             return command_line('verify', args, poses='NEW_POSES', calibration=written or base)
     return ''
-
-
-def _any_log() -> str:
-    """Return what a log can be."""
-    from ..logs import SUFFIXES
-
-    return f'text in any dialect, or a rosbag2 folder, {", ".join(SUFFIXES)}'
 
 
 def _flat(text: str) -> int | str:
@@ -133,196 +130,25 @@ def _port(text: str) -> int:
     return port
 
 
-def _fit(made: options.Parser) -> None:
-    from ..units import METHODS, MODEL_NAMES
-
-    add = made.add_argument
-    options.add_poses(made)
-    options.add_outputs(made, 'calibration')
-    add('--model', choices=MODEL_NAMES, default='auto', help='4: offset, gain; 7: gain by axis; '
-        '9: angles of the axes; 10: cross-axis; 12: known orientation; auto (default): the '
-        'smallest that the data support')
-    add('--method', choices=METHODS, default='ml', help='ml (default) weights poses by their '
-        'noise and leaves out outliers; algebraic minimises the cost functions of AN5286 and the '
-        "ESGI'95 report, with every row")
-    add('--flat', type=int, metavar='ROW', help='row of a pose with the robot level, 1-based; it '
-        'determines the mounting')
-    options.add_mounting(made)
-    options.share(made, '--keep-bad', '--prior', '--sensor-model', '--verbose')
+def _calibration_of_logs(*names: str) -> Options:
+    """Return the options of a command from logs to a calibration and a page beside it."""
+    return (
+        option('-o', '--output', type=Path, default=Path('calibration.yaml'), metavar='FILE',
+               help='calibration to write (default: %(default)s); the page has the same name with '
+               '.html'),
+        option('--flat', type=_flat, metavar='ROW', help='pose with the robot level: its row, '
+               '1-based, or first or last; it determines the mounting'),
+        *shared('--nose-down', '--frame', '--keep-bad', *names, '--verbose', '--json'), *LOG,
+        *CAPTURE)
 
 
-def _calibrate(made: options.Parser) -> None:
-    options.add_source(made, 'log', f'recording or pose table: {_any_log()}')
-    _calibration_of_logs(made, '--prior', '--sensor-model', '--no-refine')
+_CALIBRATIONS: Options = (
+    option('calibrations', nargs='+', type=Path, metavar='CALIBRATION',
+           help='two or more stored calibrations of one sensor, in any order'),
+    report(), *shared('--json'))
 
-
-def _thermal(made: options.Parser) -> None:
-    options.add_source(
-        made, 'logs', 'log of a still board whose temperature changes; several are fitted '
-        'together, and one of them may be of poses in many directions', nargs='+', metavar='LOG')
-    _calibration_of_logs(made)
-
-
-def _calibration_of_logs(made: options.Parser, *shared: str) -> None:
-    """Add the options of a command from logs to a calibration and a page beside it."""
-    add = made.add_argument
-    add('-o', '--output', type=Path, default=Path('calibration.yaml'), metavar='FILE',
-        help='calibration to write (default: %(default)s); the page has the same name with .html')
-    add('--flat', type=_flat, metavar='ROW', help='pose with the robot level: its row, 1-based, '
-        'or first or last; it determines the mounting')
-    options.add_mounting(made)
-    options.share(made, '--keep-bad', *shared, '--verbose', '--json')
-    options.add_log(made)
-    options.add_capture(made)
-
-
-def _verify(made: options.Parser) -> None:
-    options.add_poses(made)
-    options.add_stored(made, required=True)
-    made.add_argument('--max', type=options.positive, metavar='MG', help='largest '
-                      'residual (RMS) of the corrected poses [mg]; exit status 1 above it')
-    options.add_page(made, 'page to write (HTML); a folder for several POSES')
-    options.share(made, '--jobs', '--json')
-
-
-def _refine(made: options.Parser) -> None:
-    options.add_poses(made)
-    options.add_base(made)
-    options.add_outputs(made, 'refined calibration', 'report')
-    options.share(made, '--verbose')
-    made.add_argument('--plan', type=Path, metavar='FILE', help='poses to take next, which '
-                      'separate the named effects from their rivals (CSV); not written if there '
-                      'is nothing to separate; a folder for several POSES')
-
-
-def _report(made: options.Parser) -> None:
-    add = made.add_argument
-    options.add_poses(made, None)
-    options.add_base(made)
-    add('-o', '--output', type=Path, required=True, metavar='FILE', help='report to write (HTML)')
-    add('--figures', type=Path, metavar='FOLDER', help='folder for the figures as SVG and PNG')
-
-
-def _compare(made: options.Parser) -> None:
-    made.add_argument('calibrations', nargs='+', type=Path, metavar='CALIBRATION',
-                      help='two or more stored calibrations of one sensor, in any order')
-    options.add_page(made)
-    options.share(made, '--json')
-
-
-def _capture(made: options.Parser) -> None:
-    options.add_source(made, 'recording', _any_log())
-    made.add_argument('-o', '--output', type=Path, required=True, metavar='FILE',
-                      help='pose table to write; - for standard output')
-    options.add_capture(made)
-    options.add_log(made)
-    options.share(made, '--json')
-
-
-def _apply(made: options.Parser) -> None:
-    options.add_source(made, 'recording', _any_log())
-    options.add_stored(made, required=True)
-    made.add_argument('-o', '--output', type=Path, required=True, metavar='OUT',
-                      help='CSV table or bag to write, of the same kind as the recording; - '
-                      'for a table on standard output')
-    made.add_argument('--no-rotate', action='store_true', help='correct offset and gain alone, '
-                      'and stay in the frame of the sensor; otherwise a levelled calibration '
-                      'turns everything in a message, and its frame_id ends with _levelled')
-    options.add_log(made)
-
-
-def _export(made: options.Parser) -> None:
-    from ..stored.exports import FORMATS, Options
-
-    made.epilog = '\n'.join([f'{made.epilog}\nformats:', *(
-        f'  {name:<11}{each.what}' for name, each in FORMATS.items())])
-    made.add_argument('calibration', type=Path, metavar='CALIBRATION',
-                      help='stored calibration; - for standard input')
-    made.add_argument('--to', required=True, choices=tuple(FORMATS), metavar='FORMAT',
-                      help='format, see below')
-    made.add_argument('-o', '--output', metavar='FILE', help='file to write; - for standard '
-                      'output (default: beside the calibration, named after it)')
-    made.add_argument('--noise', type=Path, metavar='FILE', help='kalibr, vins, openvins: '
-                      'result of accel-calib noise --json')
-    options.add_fields(made, Options, {
-        'name': {'help': 'c, arduino, mpu6050: first part of the names in the header (default: '
-                 'from the name of the calibration)'},
-        'instance': {'metavar': 'N', 'help': 'px4, ardupilot: number of the accelerometer '
-                     '(default: px4 0, ardupilot 1)'},
-        'device_id': {'metavar': 'ID', 'help': 'px4, ardupilot: device id of the accelerometer'},
-        'axes': {'choices': ('same', 'flu'), 'help': 'px4, ardupilot, betaflight, inav, '
-                 'mpu6050: axes of the readings; same: of the flight controller; flu: x forward, '
-                 'y left, z up, for readings from ROS (default: %(default)s)'},
-        'counts_per_g': {'metavar': 'COUNTS', 'help': 'betaflight, inav: acc_1G of the driver; '
-                         'mpu6050: counts per g of native readings (default: 2048, or the power '
-                         'of two nearest to the native units)'}})
-    options.share(made, '--json')
-
-
-def _noise(made: options.Parser) -> None:
-    options.add_source(made, 'recording', f'recording with a long rest: {_any_log()}')
-    options.add_stored(made, 'stored calibration to apply first, for readings in counts or volts')
-    options.add_page(made, 'page to write with the Allan deviation and the figures (HTML)')
-    options.add_log(made)
-    options.share(made, '--json')
-
-
-def _simulate(made: options.Parser) -> None:
-    from ..logs import LogOptions
-
-    add = made.add_argument
-    add('-o', '--output', type=Path, required=True, metavar='OUT', help='CSV table to write; - '
-        'for standard output')
-    add('--effect', action='append', default=[], metavar='NAME=VALUE,...', help='effect of the '
-        'catalogue with its values, in g (offset), g/g (gains), g/g2 (quadratic), ...; one value '
-        'is used for all axes; can be repeated')
-    add('--recording', action='store_true', help='write samples of a sensor that is turned, '
-        'instead of pose means')
-    for name, kind, default, metavar, about in (
-            ('poses', int, 24, 'N', 'number of poses'),
-            ('noise', float, 0.003, 'G', 'standard deviation of a sample [g]'),
-            ('samples', int, 100, 'N', 'samples per pose'),
-            ('rate', options.positive, 100.0, 'HZ', 'samples per second of a recording'),
-            ('dwell', options.positive, 3.0, 'S', 'duration of each rest of a recording'),
-            ('turn', options.positive, 1.0, 'S', 'duration of each turn of a recording'),
-            ('seed', int, 0, None, 'seed of the noise')):
-        made.add_argument(f'--{name}', type=kind, default=default, metavar=metavar,
-                          help=f'{about} (default: {default:g})')
-    add('--temperature', type=float, nargs=2, default=(), metavar=('FIRST', 'LAST'), help='first '
-        'and last temperature [degC]')
-    add('--mounting', type=float, nargs=3, default=(0.0, 0.0, 0.0),
-        metavar=('ROLL', 'PITCH', 'YAW'), help='attitude of the sensor on the robot [deg]; the '
-        'first pose is flat')
-    add('--reference', action='store_true', help='write the true force, too (known orientation)')
-    options.add_fields(made, LogOptions, options.units('m/s2'))
-
-
-def _fleet(made: options.Parser) -> None:
-    from ..stored.exports import CALIBRATION_ALONE
-
-    add = made.add_argument
-    add('recordings', nargs='+', metavar='RECORDINGS', help='recordings, pose tables, folders, '
-        'globs in quotes, lists (@list.txt), or addresses such as s3://bucket/folder')
-    add('-o', '--output', type=Path, required=True, metavar='FOLDER', help='folder of the '
-        'results; all workers must see it')
-    add('--scheduler', default='', metavar='ADDRESS', help='address of a Dask scheduler (default: '
-        'a cluster on this machine)')
-    add('--workers', type=int, metavar='N', help='workers on this machine (default: one per core)')
-    add('--sensor-from', type=_regex, default='', metavar='REGEX', help='take the name of the '
-        'sensor from the path: the groups, or the whole match (default: the folder and the name '
-        'in the file)')
-    add('--model-from', type=_regex, default='', metavar='REGEX', help='take the model of the '
-        'sensor from its name')
-    add('--time-limit', type=options.positive, metavar='S', help='longest time of one recording; '
-        'one that takes longer is a row with an error, and is tried again by the next run '
-        '(default: 900 s)')
-    made.add_argument('--export', action='append', default=[], choices=CALIBRATION_ALONE,
-                      metavar='FORMAT', help='write each calibration in this format, too; can be '
-                      f'repeated: {", ".join(CALIBRATION_ALONE)}')
-    options.add_log(made)
-    options.add_capture(made)
-    options.share(made, '--no-refine', '--json')
-
+_OUTPUT = {'type': Path, 'required': True}
+_EXPORT = {'of': late('stored.exports', 'Options')}
 
 HIDDEN = {
     'temperature': 'offset_temperature=4e-4,-3e-4,5e-4',
@@ -331,107 +157,206 @@ HIDDEN = {
     'quadratic': 'quadratic=0.004,-0.003,0.005'}
 """What the sensor can hide, as effects of the simulator. The lag is that of the die, 12 s."""
 
-
-def _demo(made: options.Parser) -> None:
-    from ..session import WEB_PORT
-
-    made.add_argument('--hidden', choices=HIDDEN, help='let the sensor hide this effect, and show '
-                      'that ~/refine finds it and that the corrected topic gets better')
-    made.add_argument('--web', action='store_true', help='calibrate on the live page instead, '
-                      f'at port {WEB_PORT}, until Ctrl-C')
-    options.share(made, '--json')
-
-
-def _watch(made: options.Parser) -> None:
-    add = made.add_argument
-    add('--node', default='calibrator', metavar='NAME', help='name of the calibrator node, with '
-        'its namespace if it has one (default: %(default)s)')
-    add('--once', action='store_true', help='print the progress once, and end')
-    add('--no-bell', dest='bell', action='store_false', help='no terminal bell for captured poses')
-
-
-def _live(made: options.Parser) -> None:
-    from ..session import WEB_PORT
-
-    add = made.add_argument
-    add('source', metavar='LOG-OR-PORT', help='recording to play in real time; or serial port '
-        'that sends one line for each sample, such as t,ax,ay,az')
-    add('-o', '--output', type=Path, default=Path('calibration.yaml'), metavar='FILE',
-        help='calibration to continue and to store (default: %(default)s)')
-    add('--port', type=_port, default=WEB_PORT, help='port of the page; 0: any free port '
-        '(default: %(default)s)')
-    add('--host', default='127.0.0.1', metavar='ADDRESS', help='address at which the page is '
-        'served; 0.0.0.0: to the whole network, without encryption (default: %(default)s)')
-    add('--baud', type=int, default=115200, help='baud rate of the serial port (default: '
-        '%(default)s)')
-    add('--speed', type=options.positive, default=1.0, help='speed of a recording, relative to '
-        'real time (default: %(default)s)')
-    options.add_log(made)
-    options.add_capture(made)
-    options.share(made, '--also')
-
-
+_PORT = late('session', 'WEB_PORT')
+_ALONE = late('stored.exports', 'CALIBRATION_ALONE')
 _FOR_ROS = 'all arguments after --ros-args are passed to ROS'
 
 COMMANDS = {
     'demo': Command(
         'demonstrate the calibration of a simulated Imu with the nodes, without hardware',
-        'nodes', '--hidden temperature', _demo),
+        'nodes', '--hidden temperature', (
+            option('--hidden', choices=HIDDEN, help='let the sensor hide this effect, and show '
+                   'that ~/refine finds it and that the corrected topic gets better'),
+            option('--web', action='store_true',
+                   help=partial(lambda: 'calibrate on the live page instead, at port '
+                                f'{_PORT()}, until Ctrl-C')),
+            *shared('--json'))),
     'calibrate': Command(
-        'make a calibration, a page and a verdict from any log', 'fit', 'log.csv --flat last',
-        _calibrate, 'calibration', 'log'),
+        'make a calibration, a page and a verdict from any log', 'fit', 'log.csv --flat last', (
+            source('log', any_log('recording or pose table: ')),
+            *_calibration_of_logs('--prior', '--sensor-model', '--no-refine')),
+        writes='calibration', about='log'),
     'thermal': Command(
         'fit the offset over temperature to logs of a still board that warms up', 'fit',
-        'warm_up.ulg poses.ulg -o calibration.yaml', _thermal, 'calibration', 'logs'),
+        'warm_up.ulg poses.ulg -o calibration.yaml', (
+            source('logs', 'log of a still board whose temperature changes; several are fitted '
+                   'together, and one of them may be of poses in many directions', nargs='+',
+                   metavar='LOG'),
+            *_calibration_of_logs()), writes='calibration', about='logs'),
     'capture': Command(
-        'find the still stretches of a recording and write the pose table', 'recordings',
-        'recording.mcap -o poses.csv', _capture, 'table'),
+        'find the still stretches of a recording and write the pose table', 'fit',
+        'recording.mcap -o poses.csv', (
+            source('recording', any_log()),
+            option('-o', '--output', metavar='FILE', help='pose table to write; - for standard '
+                   'output', **_OUTPUT),
+            *CAPTURE, *LOG, *shared('--json')), writes='table'),
     'fit': Command(
-        'fit a calibration to still poses', 'fit', 'poses.csv -o calibration.yaml --flat 1', _fit,
-        'calibration'),
+        'fit a calibration to still poses', 'fit', 'poses.csv -o calibration.yaml --flat 1', (
+            *poses(), *outputs('calibration'),
+            option('--model', choices=late('units', 'MODEL_NAMES'), default='auto',
+                   help='4: offset, gain; 7: gain by axis; 9: angles of the axes; 10: cross-axis; '
+                   '12: known orientation; auto (default): the smallest that the data support'),
+            option('--method', choices=late('units', 'METHODS'), default='ml',
+                   help='ml (default) weights poses by their noise and leaves out outliers; '
+                   "algebraic minimises the cost functions of AN5286 and the ESGI'95 report, with "
+                   'every row'),
+            option('--flat', type=int, metavar='ROW', help='row of a pose with the robot level, '
+                   '1-based; it determines the mounting'),
+            *shared('--nose-down', '--frame', '--keep-bad', '--prior', '--sensor-model',
+                    '--verbose')), writes='calibration'),
     'verify': Command(
         'evaluate a calibration on poses that it was not fitted to', 'compare',
         'other_log.csv -c calibration.yaml --max 5\n'
-        'exit status:\n  0: within --max, 1: above --max, 2: bad input', _verify),
+        'exit status:\n  0: within --max, 1: above --max, 2: bad input', (
+            *poses(), stored(required=True),
+            option('--max', type=positive, metavar='MG', help='largest residual (RMS) of the '
+                   'corrected poses [mg]; exit status 1 above it'),
+            report('page to write (HTML); a folder for several POSES'),
+            *shared('--jobs', '--json'))),
     'compare': Command(
         'test whether calibrations of one sensor agree within their uncertainties', 'compare',
         'monday.yaml tuesday.yaml wednesday.yaml\n'
         'exit status:\n  0: they agree, 1: they do not agree, 2: they cannot be compared',
-        _compare),
+        _CALIBRATIONS),
     'history': Command(
         'show offset and gain over the dates of calibrations of one sensor', 'compare',
-        'january.yaml april.yaml july.yaml --report history.html', _compare),
+        'january.yaml april.yaml july.yaml --report history.html', _CALIBRATIONS),
     'refine': Command(
         'find effects that a calibration lacks, and add them', 'fit',
-        'poses.csv -o refined.yaml --report report.html', _refine, 'calibration', 'poses'),
+        'poses.csv -o refined.yaml --report report.html', (
+            *poses(), *BASE, *outputs('refined calibration', 'report'), *shared('--verbose'),
+            option('--plan', type=Path, metavar='FILE', help='poses to take next, which separate '
+                   'the named effects from their rivals (CSV); not written if there is nothing to '
+                   'separate; a folder for several POSES')),
+        writes='calibration', about='poses'),
     'fleet': Command(
         'calibrate the recordings of many sensors in parallel, on Dask', 'fit',
         'recordings/ -o results/\n'
-        "  accel-calib fleet 's3://fleet/*.mcap' -o results/ --scheduler tcp://10.0.0.1:8786",
-        _fleet),
+        "  accel-calib fleet 's3://fleet/*.mcap' -o results/ --scheduler tcp://10.0.0.1:8786", (
+            option('recordings', nargs='+', metavar='RECORDINGS', help='recordings, pose tables, '
+                   'folders, globs in quotes, lists (@list.txt), or addresses such as '
+                   's3://bucket/folder'),
+            option('-o', '--output', metavar='FOLDER', help='folder of the results; all workers '
+                   'must see it', **_OUTPUT),
+            option('--scheduler', default='', metavar='ADDRESS', help='address of a Dask '
+                   'scheduler (default: a cluster on this machine)'),
+            option('--workers', type=int, metavar='N', help='workers on this machine (default: '
+                   'one per core)'),
+            option('--sensor-from', type=_regex, default='', metavar='REGEX',
+                   help='take the name of the sensor from the path: the groups, or the whole '
+                   'match (default: the folder and the name in the file)'),
+            option('--model-from', type=_regex, default='', metavar='REGEX',
+                   help='take the model of the sensor from its name'),
+            option('--time-limit', type=positive, metavar='S', help='longest time of one '
+                   'recording; one that takes longer is a row with an error, and is tried again '
+                   'by the next run (default: 900 s)'),
+            option('--export', action='append', default=[], metavar='FORMAT', choices=_ALONE,
+                   help=partial(lambda: 'write each calibration in this format, too; can be '
+                                f'repeated: {", ".join(_ALONE())}')),
+            *LOG, *CAPTURE, *shared('--no-refine', '--json'))),
     'apply': Command(
-        'correct a recording with a calibration', 'recordings',
-        'recording.mcap -c calibration.yaml -o corrected', _apply, 'table'),
+        'correct a recording with a calibration', 'fit',
+        'recording.mcap -c calibration.yaml -o corrected', (
+            source('recording', any_log()), stored(required=True),
+            option('-o', '--output', metavar='OUT', help='CSV table or bag to write, of the same '
+                   'kind as the recording; - for a table on standard output', **_OUTPUT),
+            option('--no-rotate', action='store_true', help='correct offset and gain alone, and '
+                   'stay in the frame of the sensor; otherwise a levelled calibration turns '
+                   'everything in a message, and its frame_id ends with _levelled'),
+            *LOG), writes='table'),
     'export': Command(
         'write a calibration in the format of a firmware, an autopilot or another tool',
-        'recordings', 'calibration.yaml --to c -o imu.h', _export, 'export'),
+        'fit', 'calibration.yaml --to c -o imu.h', (
+            option('calibration', type=Path, metavar='CALIBRATION', help='stored calibration; - '
+                   'for standard input'),
+            option('--to', required=True, choices=late('stored.exports', 'FORMATS'),
+                   metavar='FORMAT', help='format, see below'),
+            option('-o', '--output', metavar='FILE', help='file to write; - for standard output '
+                   '(default: beside the calibration, named after it)'),
+            option('--noise', type=Path, metavar='FILE', help='kalibr, vins, openvins: result of '
+                   'accel-calib noise --json'),
+            option('--name', help='c, arduino, mpu6050: first part of the names in the header '
+                   '(default: from the name of the calibration)', **_EXPORT),
+            option('--instance', metavar='N', help='px4, ardupilot: number of the accelerometer '
+                   '(default: px4 0, ardupilot 1)', **_EXPORT),
+            option('--device-id', metavar='ID', help='px4, ardupilot: device id of the '
+                   'accelerometer', **_EXPORT),
+            option('--axes', choices=('same', 'flu'), help='px4, ardupilot, betaflight, inav, '
+                   'mpu6050: axes of the readings; same: of the flight controller; flu: x '
+                   'forward, y left, z up, for readings from ROS (default: %(default)s)',
+                   **_EXPORT),
+            option('--counts-per-g', metavar='COUNTS', help='betaflight, inav: acc_1G of the '
+                   'driver; mpu6050: counts per g of native readings (default: 2048, or the power '
+                   'of two nearest to the native units)', **_EXPORT),
+            *shared('--json')), writes='export'),
     'noise': Command(
         'find noise density, bias instability and random walk from a long rest', 'compare',
-        'rest.mcap --json noise.json --report noise.html', _noise),
+        'rest.mcap --json noise.json --report noise.html', (
+            source('recording', any_log('recording with a long rest: ')),
+            stored('stored calibration to apply first, for readings in counts or volts'),
+            report('page to write with the Allan deviation and the figures (HTML)'), *LOG,
+            *shared('--json'))),
     'simulate': Command(
-        'simulate poses or a recording of a sensor with known effects', 'recordings',
-        '-o poses.csv --effect offset=0.02,-0.01,0.03 --effect axis_gain=0.01', _simulate,
-        'table'),
+        'simulate poses or a recording of a sensor with known effects', 'fit',
+        '-o poses.csv --effect offset=0.02,-0.01,0.03 --effect axis_gain=0.01', (
+            option('-o', '--output', metavar='OUT', help='CSV table to write; - for standard '
+                   'output', **_OUTPUT),
+            option('--effect', action='append', default=[], metavar='NAME=VALUE,...',
+                   help='effect of the catalogue with its values, in g (offset), g/g (gains), '
+                   'g/g2 (quadratic), ...; one value is used for all axes; can be repeated'),
+            option('--recording', action='store_true', help='write samples of a sensor that is '
+                   'turned, instead of pose means'),
+            *(option(f'--{name}', type=kind, default=default, metavar=metavar,
+                     help=f'{about} (default: {default:g})')
+              for name, kind, default, metavar, about in (
+                  ('poses', int, 24, 'N', 'number of poses'),
+                  ('noise', float, 0.003, 'G', 'standard deviation of a sample [g]'),
+                  ('samples', int, 100, 'N', 'samples per pose'),
+                  ('rate', positive, 100.0, 'HZ', 'samples per second of a recording'),
+                  ('dwell', positive, 3.0, 'S', 'duration of each rest of a recording'),
+                  ('turn', positive, 1.0, 'S', 'duration of each turn of a recording'),
+                  ('seed', int, 0, None, 'seed of the noise'))),
+            option('--temperature', type=float, nargs=2, default=(), metavar=('FIRST', 'LAST'),
+                   help='first and last temperature [degC]'),
+            option('--mounting', type=float, nargs=3, default=(0.0, 0.0, 0.0),
+                   metavar=('ROLL', 'PITCH', 'YAW'), help='attitude of the sensor on the robot '
+                   '[deg]; the first pose is flat'),
+            option('--reference', action='store_true', help='write the true force, too (known '
+                   'orientation)'),
+            *units('m/s2')), writes='table'),
     'report': Command(
         'write a report about effects that a calibration lacks, with figures (HTML)', 'fit',
-        'poses.csv -o report.html --figures figures', _report, 'page'),
+        'poses.csv -o report.html --figures figures', (
+            *poses(None), *BASE,
+            option('-o', '--output', metavar='FILE', help='report to write (HTML)', **_OUTPUT),
+            option('--figures', type=Path, metavar='FOLDER', help='folder for the figures as SVG '
+                   'and PNG')), writes='page'),
     'watch': Command(
         'show the progress of a calibrator node, and which pose is next', 'nodes',
-        f'--node left/calibrator\n\nCtrl-C ends it; {_FOR_ROS}', _watch),
+        f'--node left/calibrator\n\nCtrl-C ends it; {_FOR_ROS}', (
+            option('--node', default='calibrator', metavar='NAME', help='name of the calibrator '
+                   'node, with its namespace if it has one (default: %(default)s)'),
+            option('--once', action='store_true', help='print the progress once, and end'),
+            option('--no-bell', dest='bell', action='store_false', help='no terminal bell for '
+                   'captured poses'))),
     'live': Command(
         'calibrate on a page in the browser, from a serial port or a recording', 'nodes',
         '/dev/ttyUSB0 --baud 115200 -o calibration.yaml\n\n'
-        'open the link that it prints in a browser; Ctrl-C ends it', _live, 'calibration'),
+        'open the link that it prints in a browser; Ctrl-C ends it', (
+            option('source', metavar='LOG-OR-PORT', help='recording to play in real time; or '
+                   'serial port that sends one line for each sample, such as t,ax,ay,az'),
+            option('-o', '--output', type=Path, default=Path('calibration.yaml'), metavar='FILE',
+                   help='calibration to continue and to store (default: %(default)s)'),
+            option('--port', type=_port, default=_PORT, help='port of the page; 0: any free port '
+                   '(default: %(default)s)'),
+            option('--host', default='127.0.0.1', metavar='ADDRESS', help='address at which the '
+                   'page is served; 0.0.0.0: to the whole network, without encryption (default: '
+                   '%(default)s)'),
+            option('--baud', type=int, default=115200, help='baud rate of the serial port '
+                   '(default: %(default)s)'),
+            option('--speed', type=positive, default=1.0, help='speed of a recording, relative to '
+                   'real time (default: %(default)s)'),
+            *LOG, *CAPTURE, *shared('--also')), writes='calibration'),
     'node': Command(
         'run the calibrator node', 'nodes', f'--ros-args -r imu/data_raw:=/imu/raw\n\n{_FOR_ROS}'),
     'simulator': Command(
@@ -439,9 +364,9 @@ COMMANDS = {
 }
 
 
-def parser(wanted: Collection[str] = tuple(COMMANDS)) -> options.Parser:
+def parser(wanted: Collection[str] = tuple(COMMANDS)) -> Parser:
     """Return the parser of the command line, with the options of the wanted commands."""
-    top = options.Parser(
+    top = Parser(
         prog='accel-calib', description='Calibrate an accelerometer from still poses, with '
         'gravity as the reference.')
     top.add_argument('--version', action='version', version=__version__)
@@ -450,5 +375,5 @@ def parser(wanted: Collection[str] = tuple(COMMANDS)) -> options.Parser:
         what = command.summary
         made = commands.add_parser(name, help=what, description=f'{what[0].upper()}{what[1:]}.')
         if name in wanted:
-            add_options(made, command)
+            command.add_to(made)
     return top

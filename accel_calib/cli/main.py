@@ -34,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with _leaving():
         from .commands import parser
         from .options import BAD_INPUT, in_one_line
-        from ..errors import AccelCalibError, crash_words, hide_warnings, system_error
+        from ..errors import AccelCalibError, crash_words, hide_warnings, known_error
         from ..one_thread import use_one_thread
 
         use_one_thread()
@@ -56,13 +56,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     try:
         return run(args)
-    except AccelCalibError as err:
-        line = str(err)
     except BrokenPipeError:  # `accel-calib … | head`: nobody reads the rest
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return NOT_READ
-    except OSError as err:
-        line = str(system_error(err))
+    except (AccelCalibError, OSError) as err:
+        line = str(known_error(err))
     except KeyboardInterrupt:
         return INTERRUPTED
     except Exception as err:  # a defect of this program, which no user should see as a traceback

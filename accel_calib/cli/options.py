@@ -4,8 +4,11 @@
 """
 Options that several commands have, and the parser, whose errors are one line of plain characters.
 
-Each option is stated once. Options that fill a record have the names, types and defaults of its
-fields; `accel_calib.cli.frame.given` has their values.
+Each option is stated once: its names, and what ``add_argument`` takes. Beside these there are the
+`group` that it is shown in, or of which one is allowed (`ONE_OF`), and the record that it is a
+field `of`: it then has the type and the default of the field, and `accel_calib.cli.frame.given`
+has the values. A value that is a ``partial`` is made when the option is added, so that ``--help``
+does not wait for numpy.
 
 """
 
@@ -13,11 +16,12 @@ import argparse
 import codecs
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
-from functools import cache
+from functools import cache, partial
+from importlib import import_module
 from pathlib import Path
 import re
 import sys
-from typing import Any, get_type_hints, NoReturn
+from typing import Any, get_type_hints, NamedTuple, NoReturn
 
 BAD_INPUT = 2
 """Exit status for invalid input."""
@@ -130,151 +134,169 @@ def _columns(text: str) -> dict[str, str]:
 _TYPES: dict[Any, Any] = {float: positive, float | None: positive, int | None: int}
 """Types of options by those of the fields of records; others are text."""
 
-_SHARED: dict[str, dict[str, Any]] = {
-    '--rows': {'metavar': 'A:B', 'help': 'rows A to B, 1-based, inclusive'},
-    '--jobs': {'type': int, 'default': 1, 'metavar': 'N',
-               'help': 'number of tables to process in parallel'},
-    '--nose-down': {'type': int, 'metavar': 'ROW', 'help': 'row of a pose with the nose of the '
-                    'robot tilted straight down, by 10° or more; it determines the heading of the '
-                    'mounting (needs --flat)'},
-    '--no-refine': {'dest': 'refined', 'action': 'store_false', 'help': 'do not look for effects '
-                    'beyond offset, gain and cross-axis'},
-    '--prior': {'type': Path, 'metavar': 'FLEET', 'help': 'typical values of a fleet (fleet.yaml '
-                'of accel-calib fleet) for offset, gain and cross-axis, for few poses'},
-    '--sensor-model': {'default': '', 'metavar': 'NAME', 'help': 'model of the sensor in the file '
-                       'of --prior, if it has several'},
-    '--keep-bad': {'action': 'store_true', 'help': 'store a calibration that is BAD, too'},
-    '--also': {'type': Path, 'metavar': 'FILE.py', 'help': 'Python file with own effects '
-               '(accel_calib.Effect), which are known beside the catalogue; it is executed'},
-    '--verbose': {'action': 'store_true', 'help': 'print all notes and tables'},
-    '--json': {'metavar': 'FILE', 'help': 'JSON file to write with the result; - for standard '
-               'output'},
-    '--force': {'action': 'store_true', 'help': 'replace files of other kinds, too'}}
+ONE_OF = 'one of'
+
+
+class Option(NamedTuple):
+    """An option: its names, or that of an argument, and what is known about it."""
+
+    names: tuple[str, ...]
+    about: dict[str, Any]
+
+
+Options = tuple[Option, ...]
+
+
+def option(*names: str, **about: Any) -> Option:
+    return Option(names, about)
+
+
+def late(module: str, name: str) -> partial[Any]:
+    """Return a name of another module of the package, to be imported when an option is added."""
+    def named() -> Any:
+        found = getattr(import_module(f'..{module}', __package__), name)
+        return tuple(found) if isinstance(found, Mapping) else found
+
+    return partial(named)
+
+
+def add_options(made: Parser, options: Options) -> None:
+    """Add options to the parser of a command."""
+    groups: dict[str | None, Any] = {None: made}
+    for names, stated in options:
+        about = {key: each() if isinstance(each, partial) else each
+                 for key, each in stated.items()}
+        group, record = about.pop('group', None), about.pop('of', None)
+        if group not in groups:
+            groups[group] = (made.add_mutually_exclusive_group() if group == ONE_OF else
+                             made.add_argument_group(group))
+        if record is not None:
+            name = names[-1].removeprefix('--').replace('-', '_')
+            kind = get_type_hints(record)[name]
+            about = ({'action': 'store_true'} if kind is bool else
+                     {'default': record.__dataclass_fields__[name].default,
+                      'type': _TYPES.get(kind, utf8)}) | about
+        groups[group].add_argument(*names, **about)
+
+
+def shared(*names: str) -> Options:
+    """Return options of several commands."""
+    return tuple(SHARED[name] for name in names)
+
+
+def source(name: str, about: str | partial[str], **more: Any) -> Option:
+    """Return the argument for a log, which can come through standard input."""
+    return option(name, type=log_path, **{'metavar': name.upper(), **more}, help=partial(
+        lambda: f'{about if isinstance(about, str) else about()}; - for standard input'))
+
+
+def any_log(before: str = '') -> partial[str]:
+    """Return what a log can be."""
+    return partial(lambda: f'{before}text in any dialect, or a rosbag2 folder, '
+                   f'{", ".join(late("logs", "SUFFIXES")())}')
+
+
+def poses(number: str | None = '+') -> Options:
+    """Return the options for reading the poses of one or several logs."""
+    return (source('poses', 'pose table, or a recording, whose poses are captured first',
+                   nargs=number), *shared('--rows'), *LOG, *CAPTURE)
+
+
+def outputs(output: str, page: str = 'page') -> Options:
+    """Return the options for the files that a command writes for one or several POSES."""
+    return (option('-o', '--output', type=Path, metavar='FILE', help=f'{output} to write (YAML); '
+                   '- for standard output; a folder for several POSES'),
+            report(f'{page} to write (HTML); a folder for several POSES'),
+            *shared('--jobs', '--json'))
+
+
+def report(about: str = 'page to write (HTML)') -> Option:
+    return option('--report', type=Path, metavar='FILE', help=about)
+
+
+def stored(about: str = 'stored calibration', **more: Any) -> Option:
+    return option('-c', '--calibration', type=Path, metavar='FILE',
+                  help=f'{about}; - for standard input', **more)
+
+
+SHARED = {each.names[-1]: each for each in (
+    option('--rows', metavar='A:B', help='rows A to B, 1-based, inclusive'),
+    option('--jobs', type=int, default=1, metavar='N', help='number of tables to process in '
+           'parallel'),
+    option('--nose-down', type=int, metavar='ROW', help='row of a pose with the nose of the robot '
+           'tilted straight down, by 10° or more; it determines the heading of the mounting '
+           '(needs --flat)'),
+    option('--frame', choices=late('units', 'FRAMES'), default='ros',
+           help='levelled frame (default: ros, z up)'),
+    option('--no-refine', dest='refined', action='store_false', help='do not look for effects '
+           'beyond offset, gain and cross-axis'),
+    option('--prior', type=Path, metavar='FLEET', help='typical values of a fleet (fleet.yaml of '
+           'accel-calib fleet) for offset, gain and cross-axis, for few poses'),
+    option('--sensor-model', default='', metavar='NAME', help='model of the sensor in the file of '
+           '--prior, if it has several'),
+    option('--keep-bad', action='store_true', help='store a calibration that is BAD, too'),
+    option('--also', type=Path, metavar='FILE.py', help='Python file with own effects '
+           '(accel_calib.Effect), which are known beside the catalogue; it is executed'),
+    option('--verbose', action='store_true', help='print all notes and tables'),
+    option('--json', metavar='FILE', help='JSON file to write with the result; - for standard '
+           'output'),
+    option('--force', action='store_true', help='replace files of other kinds, too'))}
 """Options of several commands."""
 
-
-def share(made: Any, *names: str) -> None:
-    """Add options of several commands to a parser or a group."""
-    for name in names:
-        made.add_argument(name, **_SHARED[name])
+_LOG = {'of': late('logs', 'LogOptions')}
 
 
-def add_fields(made: Any, record: Any, options: Mapping[str, Mapping[str, Any]],
-               **usual: Any) -> None:
-    """Add options for fields of a record to a parser or a group, with types and defaults."""
-    types = get_type_hints(record)
-    for name, about in options.items():
-        kind = ({'action': 'store_true'} if types[name] is bool else
-                {'default': record.__dataclass_fields__[name].default,
-                 'type': _TYPES.get(types[name], utf8)})
-        made.add_argument(f'--{name.replace("_", "-")}', **{**kind, **usual, **about})
-
-
-def units(default: str = '') -> dict[str, dict[str, Any]]:
+def units(default: str = '') -> Options:
     """Return the options of the unit; without a default, the file states the unit."""
-    from ..units import UNIT_NAMES
-
-    return {
-        'units': {'choices': UNIT_NAMES, 'default': default, 'help': 'unit of ax,ay,az; native '
-                  'is counts or volts (default: '
-                  f'{default or "the unit in the file, or recognised"})'},
-        'gravity': {'metavar': 'M/S2', 'help': 'local gravity [m/s2] (default: %(default)s)'}}
+    return (option('--units', choices=late('units', 'UNIT_NAMES'), default=default,
+                   help='unit of ax,ay,az; native is counts or volts (default: '
+                   f'{default or "the unit in the file, or recognised"})', **_LOG),
+            option('--gravity', metavar='M/S2', help='local gravity [m/s2] (default: '
+                   '%(default)s)', **_LOG))
 
 
-def add_log(made: Parser) -> None:
-    """Add the options for reading a log."""
-    from ..logs import LogOptions, NAMES
+LOG: Options = (
+    option('--format', choices=late('logs', 'NAMES'), help='layout of the log (default: it is '
+           'recognised)', **_LOG),
+    option('--columns', type=_columns, action='append', default=[], metavar='OURS=THEIRS,...',
+           help='columns by their name or number in the log, such as '
+           'time=t_ms,ax=accX,ay=accY,az=accZ'),
+    option('--skip-bad', help='skip lines that cannot be read', **_LOG),
+    option('--rate', metavar='HZ', help='samples per second of a log without times', **_LOG),
+    option('--topic', help='Imu topic of a bag, message of a flight log, or table of an archive '
+           'or Excel file, if there are several', **_LOG),
+    option('--sensor', help='name of the sensor: frame_id of its messages, or its number in a '
+           'flight log (default: the name in the log)', **_LOG),
+    option('--context', type=utf8, action='append', default=[], metavar='COLUMN:=TOPIC[/FIELD]',
+           help='topic of a bag with a number that may act on the sensor, such as '
+           'temperature:=/imu/temp; can be repeated'),
+    *units())
+"""Options for reading a log."""
 
-    add_fields(made, LogOptions, {
-        'format': {'choices': NAMES, 'help': 'layout of the log (default: it is recognised)'},
-        'columns': {'type': _columns, 'action': 'append', 'default': [],
-                    'metavar': 'OURS=THEIRS,...', 'help': 'columns by their name or number in the '
-                    'log, such as time=t_ms,ax=accX,ay=accY,az=accZ'},
-        'skip_bad': {'help': 'skip lines that cannot be read'},
-        'rate': {'metavar': 'HZ', 'help': 'samples per second of a log without times'},
-        'topic': {'help': 'Imu topic of a bag, message of a flight log, or table of an '
-                  'archive or Excel file, if there are several'},
-        'sensor': {'help': 'name of the sensor: frame_id of its messages, or its number in a '
-                   'flight log (default: the name in the log)'},
-        'context': {'action': 'append', 'default': [], 'metavar': 'COLUMN:=TOPIC[/FIELD]',
-                    'help': 'topic of a bag with a number that may act on the sensor, such as '
-                    'temperature:=/imu/temp; can be repeated'},
-        **units()})
+_CAPTURE = {'group': 'capture of poses from a recording', 'default': None,
+            'of': late('stillness', 'CaptureSettings')}
 
+CAPTURE: Options = (
+    option('--still-window', metavar='S', help='length of the sliding window [s]', **_CAPTURE),
+    option('--still-std-max', metavar='STD', help='largest standard deviation of a still sensor, '
+           'in the unit of ax (default: adapts to the noise of the sensor)', **_CAPTURE),
+    option('--still-gyro-max', metavar='RAD/S', help='largest mean angular rate (default: not '
+           'checked)', **_CAPTURE),
+    option('--still-norm-tolerance', metavar='G', help='largest difference of |a| from 1 g, '
+           'beside what all rests have in common', **_CAPTURE),
+    option('--min-dwell', metavar='S', help='shortest still stretch that becomes a pose',
+           **_CAPTURE),
+    option('--max-dwell', metavar='S', help='split longer rests into poses with the same '
+           'orientation', **_CAPTURE),
+    option('--min-pose-angle', metavar='RAD', help='poses within this angle count as repeated',
+           **_CAPTURE),
+    option('--repeated', choices=late('stillness', 'REPEATED'), help='keep, merge or refuse '
+           'repeated poses', **_CAPTURE))
+"""Options of the capture of poses; none of them has a value by default."""
 
-def add_capture(made: Parser) -> None:
-    """Add the options of the capture of poses; none of them has a value by default."""
-    from ..stillness import CaptureSettings, REPEATED
-
-    group = made.add_argument_group('capture of poses from a recording')
-    add_fields(group, CaptureSettings, {
-        'still_window': {'metavar': 'S', 'help': 'length of the sliding window [s]'},
-        'still_std_max': {'metavar': 'STD', 'help': 'largest standard deviation of a still '
-                          'sensor, in the unit of ax (default: adapts to the noise of the '
-                          'sensor)'},
-        'still_gyro_max': {'metavar': 'RAD/S', 'help': 'largest mean angular rate (default: not '
-                           'checked)'},
-        'still_norm_tolerance': {'metavar': 'G', 'help': 'largest difference of |a| from '
-                                 '1 g, beside what all rests have in common'},
-        'min_dwell': {'metavar': 'S', 'help': 'shortest still stretch that becomes a pose'},
-        'max_dwell': {'metavar': 'S', 'help': 'split longer rests into poses with the same '
-                      'orientation'},
-        'min_pose_angle': {'metavar': 'RAD', 'help': 'poses within this angle count as repeated'},
-        'repeated': {'choices': REPEATED, 'help': 'keep, merge or refuse repeated poses'}},
-        default=None)
-
-
-def add_source(made: Parser, name: str, about: str, **more: Any) -> None:
-    """Add the argument for a log, which can come through standard input."""
-    made.add_argument(name, type=log_path, help=f'{about}; - for standard input',
-                      **{'metavar': name.upper(), **more})
-
-
-def add_poses(made: Parser, number: str | None = '+') -> None:
-    """Add the options for reading the poses of one or several logs."""
-    add_source(made, 'poses', 'pose table, or a recording, whose poses are captured first',
-               nargs=number)
-    share(made, '--rows')
-    add_log(made)
-    add_capture(made)
-
-
-def add_outputs(made: Parser, output: str, page: str = 'page') -> None:
-    """Add the options for the files that a command writes for one or several POSES."""
-    made.add_argument('-o', '--output', type=Path, metavar='FILE',
-                      help=f'{output} to write (YAML); - for standard output; a folder for '
-                      'several POSES')
-    add_page(made, f'{page} to write (HTML); a folder for several POSES')
-    share(made, '--jobs', '--json')
-
-
-def add_page(made: Parser, about: str = 'page to write (HTML)') -> None:
-    """Add ``--report``."""
-    made.add_argument('--report', type=Path, metavar='FILE', help=about)
-
-
-def add_stored(made: Any, about: str = 'stored calibration', **needed: bool) -> None:
-    """Add ``--calibration`` to a parser or a group."""
-    made.add_argument('-c', '--calibration', type=Path, metavar='FILE',
-                      help=f'{about}; - for standard input', **needed)
-
-
-def add_mounting(made: Parser) -> None:
-    """Add the options of the frame and of the mounting, without ``--flat``."""
-    from ..units import FRAMES
-
-    share(made, '--nose-down')
-    made.add_argument('--frame', choices=FRAMES, default='ros',
-                      help='levelled frame (default: ros, z up)')
-
-
-def add_base(made: Parser) -> None:
-    """Add the options for what a refinement starts from."""
-    from ..units import BASES
-
-    base = made.add_mutually_exclusive_group()
-    add_stored(base, 'stored calibration to compare with and to start from')
-    base.add_argument('--base', choices=BASES, default='auto', help='model to start from '
-                      '(default: the model that fit --model auto selects)')
-    share(base, '--prior')
-    share(made, '--sensor-model')
+BASE: Options = (
+    stored('stored calibration to compare with and to start from', group=ONE_OF),
+    option('--base', group=ONE_OF, choices=late('units', 'BASES'), default='auto',
+           help='model to start from (default: the model that fit --model auto selects)'),
+    option('--prior', group=ONE_OF, **SHARED['--prior'].about), *shared('--sensor-model'))
+"""Options for what a refinement starts from."""

@@ -114,7 +114,14 @@ def rotation_free(calibration: Calibration, context: Context, per_g: float) -> R
     slope_v = model.basis(origin, context).full[0]
     here = {key: np.repeat(column, 3, 0) for key, column in context.items()}
     slope_w = model.basis(np.zeros((3, 3)), here, np.eye(3)).full  # (column, row, p)
-    mat_s, slope_s = _polar(mat_w, np.swapaxes(slope_w, 0, 1))
+    # S and its (3, 3, p) derivative, from the eigenvectors of W Wᵀ.
+    squared, vectors = np.linalg.eigh(mat_w @ mat_w.T)
+    roots = np.sqrt(squared)
+    half = np.einsum('ijp,kj->ikp', np.swapaxes(slope_w, 0, 1), mat_w)
+    turned = np.einsum('ia,ijp,jb->abp', vectors, half + np.swapaxes(half, 0, 1), vectors)
+    turned = turned / np.add.outer(roots, roots)[:, :, np.newaxis]
+    mat_s = (vectors * roots) @ vectors.T
+    slope_s = np.einsum('ia,abp,jb->ijp', vectors, turned, vectors)
     units = calibration.units  # the common unit is the standard g, or native
     reading_scale = force_scale = (units.per_g / STANDARD_GRAVITY if units.is_si else units.per_g)
     if units.is_native:
@@ -128,17 +135,8 @@ def rotation_free(calibration: Calibration, context: Context, per_g: float) -> R
         np.concatenate([vec_v * reading_scale, mat_s[_ENTRIES] * gain_scale, model.vector[own]]),
         np.concatenate([slope_v * reading_scale, slope_s[_ENTRIES] * gain_scale,
                         np.eye(size)[own]]),
-        np.linalg.solve(mat_s, mat_w) @ model.rotation, reading_scale, force_scale)
-
-
-def _polar(mat_w: Floats, slope_w: Floats) -> tuple[Floats, Floats]:
-    """Return S (3, 3) and its (3, 3, p) derivative from W and the (3, 3, p) derivative of W."""
-    squared, vectors = np.linalg.eigh(mat_w @ mat_w.T)
-    roots = np.sqrt(squared)
-    half = np.einsum('ijp,kj->ikp', slope_w, mat_w)
-    turned = np.einsum('ia,ijp,jb->abp', vectors, half + np.swapaxes(half, 0, 1), vectors)
-    turned = turned / np.add.outer(roots, roots)[:, :, np.newaxis]
-    return (vectors * roots) @ vectors.T, np.einsum('ia,abp,jb->ijp', vectors, turned, vectors)
+        axes=np.linalg.solve(mat_s, mat_w) @ model.rotation, reading_scale=reading_scale,
+        force_scale=force_scale)
 
 
 _WORSE = 0.001
@@ -261,7 +259,7 @@ def comparable(calibrations: Sequence[Calibration]) -> tuple[Comparable, ...]:
         larger = NORM_MODELS[NORM_MODELS.index(run.name) + 1:] if run.name in NORM_MODELS else ()
         if largest in larger and run.model.effects == run.form.effects:
             with suppress(RefusedFitError):  # its poses do not determine the larger model
-                sure = fit_unknown(run.used_poses, run.units, largest, 'ml')
+                sure = fit_unknown(run.used_poses, run.units, largest, 'ml')[0]
         found.append(Comparable(run, sure, repeatability_of(sure)))
     return tuple(found)
 

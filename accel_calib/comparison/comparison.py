@@ -236,9 +236,10 @@ def compare_runs(given: Sequence[Comparable]) -> Comparison:
         apart = np.max(np.linalg.norm(up[:, np.newaxis] - up, axis=2))
         tilt_deg = float(np.degrees(2.0 * np.arcsin(apart / 2.0)))
     return Comparison(
-        p_value >= LEVEL, p_value, chi2, rank, outlier(runs) if p_value < LEVEL else None,
-        _each(prepared, p_values(runs)), tuple(parameters), tilt_deg,
-        tuple(_notes_of(given, names, stated, scaled.noisier)))
+        agree=p_value >= LEVEL, p_value=p_value, chi2=chi2, dof=rank,
+        outlier=outlier(runs) if p_value < LEVEL else None,
+        runs=_each(prepared, p_values(runs)), parameters=tuple(parameters), tilt_deg=tilt_deg,
+        notes=tuple(_notes_of(given, names, stated, scaled.noisier)))
 
 
 def _prepared(given: Sequence[Comparable], covariances: Sequence[Floats]) -> list[_Prepared]:
@@ -400,4 +401,4 @@ def history_of(calibrations: Sequence[Calibration]) -> History:
     notes = [f'calibration {number} has no date: the order is that of the input'
              for number in undated]
     return History(tuple(moments), whole.parameters, tuple(changes), whole,
-                   (*notes, *whole.notes), ordered)
+                   notes=(*notes, *whole.notes), runs=ordered)

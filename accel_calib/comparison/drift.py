@@ -99,7 +99,18 @@ def change(error: Floats, covariance: Floats, up: Floats) -> LastingChange | Non
     kind, rests = max(found, key=lambda key: found[key])
     each = [np.logaddexp.reduce([found[key] for key in found if key[0] == other])
             for other in KINDS]
-    return _described(kind, rests, bool(np.ptp(each) > np.log(_CLEAR)), error, covariance, up)
+    # The estimate, without the rests that were most likely knocked.
+    slope, size = _derivative(kind, rests, up), max(_SIZES)
+    knocked, likely = _knocks(error, covariance + _added(slope, size))
+    spread = covariance + np.diag(_KNOCK ** 2 * knocked[np.argmax(likely)])
+    weighted = slope.T @ np.linalg.inv(spread)
+    spread_of_shift = np.linalg.inv(weighted @ slope + np.eye(slope.shape[1]) / size ** 2)
+    shift = spread_of_shift @ weighted @ error
+    moved = slope[len(up) - rests:] @ shift
+    sign = float(np.sign(moved[0])) if np.ptp(np.sign(moved)) == 0.0 else 1.0
+    return LastingChange(
+        rests=rests, kind=kind, clear=bool(np.ptp(each) > np.log(_CLEAR)), shift=shift,
+        covariance=spread_of_shift, error=sign * rms(moved))
 
 
 def is_over(known: LastingChange, error: Floats, covariance: Floats, up: Floats) -> bool:
@@ -137,21 +148,6 @@ def _knocks(error: Floats, covariance: Floats) -> tuple[Floats, Floats]:
     solved = np.linalg.solve(spread, np.broadcast_to(error, knocked.shape)[:, :, np.newaxis])
     fit = solved[:, :, 0] @ error + np.linalg.slogdet(spread)[1]
     return knocked, weight - 0.5 * fit
-
-
-def _described(kind: str, rests: int, clear: bool, error: Floats, covariance: Floats,
-               up: Floats) -> LastingChange:
-    """Return the estimate of a change, without the rests that were most likely knocked."""
-    slope = _derivative(kind, rests, up)
-    prior = max(_SIZES) ** 2
-    knocked, likely = _knocks(error, covariance + _added(slope, max(_SIZES)))
-    spread = covariance + np.diag(_KNOCK ** 2 * knocked[np.argmax(likely)])
-    weighted = slope.T @ np.linalg.inv(spread)
-    found = np.linalg.inv(weighted @ slope + np.eye(slope.shape[1]) / prior)
-    shift = found @ weighted @ error
-    moved = slope[len(up) - rests:] @ shift
-    sign = float(np.sign(moved[0])) if np.ptp(np.sign(moved)) == 0.0 else 1.0
-    return LastingChange(rests, kind, clear, shift, found, sign * rms(moved))
 
 
 _LEAST_NOISE = 2e-5   # smallest noise of a rest [g]

@@ -89,10 +89,6 @@ def _lags(context: Context) -> Iterator[Floats]:
                 yield np.array([lag, of_sensor])
 
 
-def _warming_to(power: int) -> Factor:
-    return lambda context, shape: (context['temperature'] - REFERENCE_TEMPERATURE) ** power
-
-
 def _lagged_warming(key: str) -> Factor:
     """Return the factor of an effect whose acting temperature is the column `key`."""
     def factor(context: Mapping[str, Any], shape: Floats) -> Any:
@@ -190,10 +186,12 @@ EFFECTS: dict[str, Effect] = {
         lagged='temperature_of_offset'),
     'offset_temperature_quadratic': _in_time(
         'offset that changes with the square of temperature', 'second-order TCO', AXES, 'g/°C²',
-        1e-5, terms=by_axis(ONE), factor=_warming_to(2), needs=('temperature',)),
+        1e-5, terms=by_axis(ONE), needs=('temperature',),
+        factor=lambda context, shape: (context['temperature'] - REFERENCE_TEMPERATURE) ** 2),
     'offset_temperature_cubic': _in_time(
         'offset that changes with the cube of temperature', 'third-order TCO', AXES, 'g/°C³',
-        1e-7, terms=by_axis(ONE), factor=_warming_to(3), needs=('temperature',)),
+        1e-7, terms=by_axis(ONE), needs=('temperature',),
+        factor=lambda context, shape: (context['temperature'] - REFERENCE_TEMPERATURE) ** 3),
     'gain_temperature': _in_time(
         'gain that changes with temperature', 'sensitivity temperature coefficient TCS', AXES,
         '1/°C', 0.0003, terms=by_axis(FORCE), factor=_lagged_warming('temperature_of_gain'),

@@ -257,10 +257,9 @@ class Effect:
             return 'force'
         return 'offset' if all(term.monomial == ONE for term in self.terms) else 'gain'
 
-    @cached_property
+    @property
     def is_offset(self) -> bool:
-        """Whether the effect is a part of V in every context."""
-        return self.linear and all(term.monomial == ONE for term in self.terms)
+        return self.changes == 'offset'
 
     @cached_property
     def bends(self) -> bool:

@@ -19,6 +19,7 @@ import numpy as np
 
 from .form import EffectKey, MODES
 from .records import EmpiricalCurve, unit_of, variable_words
+from ..statistics import rms_of_rows
 from ..table import Floats
 from ..units import MG
 
@@ -60,7 +61,7 @@ def formula_of(effect: EffectKey, values: Floats, deviations: Mapping[str, float
     expression: _Expression = partial(_of_waves, modes, high - low)
     for group in _forms(share, high - low):
         fits = [np.linalg.lstsq(functions.T, curves.T, rcond=None)[0].T for functions, _ in group]
-        errors = [np.max(np.sqrt(np.mean((fit @ functions - curves) ** 2, axis=1)) / most)
+        errors = [np.max(rms_of_rows(fit @ functions - curves) / most)
                   for fit, (functions, _) in zip(fits, group, strict=True)]
         best = int(np.argmin(errors))
         if errors[best] <= 1.0:

@@ -23,6 +23,7 @@ from .catalogue import CATALOGUE, entry_of
 from .form import (
     ALL_AXES, AXES, by_axis, Context, CROSS, DEGREES, Effect, EffectKey, EffectRecord, FORCE,
     MODES, ONE, Term, WAVE, ZONAL, ZONES)
+from ..statistics import rms_of_rows
 from ..table import column_of, CONTEXT, Floats, is_quantity
 from ..units import MG
 
@@ -206,32 +207,34 @@ def _entry_of_curve(curve: EmpiricalCurve) -> Effect:
     variable, modes = curve.variable, curve.modes
     if variable == 'direction':  # the gain of all axes as a sum of spherical harmonics
         zones = [number for number, zone in enumerate(ZONES) if zone.degree in modes]
-        return Effect(
-            f'gain as a smooth function of {VARIABLES["direction"]}', 'empirical curve',
-            tuple(f'{degree}_{k}' for degree in modes for k in range(1, 2 * degree + 2)), 'g/g',
-            0.001, 0.5, tuple(Term(k, axis, ZONAL + 3 * number + axis)
-                              for k, number in enumerate(zones) for axis in range(3)),
-            family='force')
+        names = tuple(f'{degree}_{k}' for degree in modes for k in range(1, 2 * degree + 2))
+        terms = tuple(Term(k, axis, ZONAL + 3 * number + axis)
+                      for k, number in enumerate(zones) for axis in range(3))
+        return Effect(f'gain as a smooth function of {VARIABLES["direction"]}',
+                      'empirical curve', names, 'g/g', 0.001, plausible_g=0.5, terms=terms,
+                      family='force')
     parts, of_force = curve.parts, variable == 'force'
     carried = [term._replace(parameter=parts.index(own)) for term in _CARRIED[curve.carrier]
                if (own := CARRIERS[curve.carrier][term.parameter]) in parts]
     terms = tuple(
-        term._replace(parameter=k * len(parts) + term.parameter,
-                      monomial=WAVE + 3 * (mode - 1) + term.axis if of_force else term.monomial)
+        term._replace(
+            parameter=k * len(parts) + term.parameter,
+            monomial=WAVE + 3 * (mode - 1) + term.axis if of_force else term.monomial)
         for k, mode in enumerate(modes) for term in carried)
     names = tuple(f'{own}_{mode}' for mode in modes for own in parts)
-    words = f'{curve.changed.replace("_", "-")} as a smooth function of {variable_words(variable)}'
-    made = partial(Effect, words, 'empirical curve', names, 'g', 0.001, 0.5, terms)
+    words = (f'{curve.changed.replace("_", "-")} as a smooth function of '
+             f'{variable_words(variable)}')
+    made = Effect(words, 'empirical curve', names, 'g', 0.001, plausible_g=0.5, terms=terms)
     if of_force:
-        return made(family='force')
-    return made(factor=partial(_cosines, variable, modes, len(carried)), needs=(variable,),
-                shape=('low', 'high'), shapes=partial(_ends, variable))
+        return replace(made, family='force')
+    return replace(made, factor=partial(_cosines, variable, modes, len(carried)),
+                   needs=(variable,), shape=('low', 'high'), shapes=partial(_ends, variable))
 
 
 def _variable(variable: str, context: Mapping[str, Any]) -> Floats:
     """Return the variable of an empirical curve; for vectors, its RMS over the axes."""
     values = np.asarray(context[variable], float)
-    return np.sqrt(np.mean(values ** 2, axis=-1)) if variable == 'std' else values
+    return rms_of_rows(values) if variable == 'std' else values
 
 
 def _ends(variable: str, context: Context) -> Iterator[Floats]:
@@ -262,7 +265,8 @@ def _entry_of_covariate(covariate: Covariate) -> Effect:
 
     def departure(context: Mapping[str, Any], shape: Floats) -> Any:
         """Return the product of all column - zero, and its square."""
-        away = math.prod(context[each] - zero for each, zero in zip(columns, shape, strict=True))
+        away = math.prod(context[each] - zero
+                         for each, zero in zip(columns, shape, strict=True))
         return np.array([away] * 3 + [away ** 2] * 3) if has_square else away
 
     def means(context: Context) -> Iterator[Floats]:

@@ -127,27 +127,6 @@ def sphere_of(second: Floats, third: Floats, count: int) -> tuple[Floats, Floats
     return centre, np.sqrt(squared + (squared == 0.0))
 
 
-def quadric(reading: Floats, form: Form) -> tuple[Floats, Floats]:
-    """
-    Return W (..., 3, 3) and V (..., 3) of the quadric through (..., n, 3) readings in any unit.
-
-    Entries of A that are not in the form are zero. NaN where the quadric is no ellipsoid.
-
-    """
-    mean, r = centred(reading)
-    size = len(form.twice)
-    moments = _moments(form, r[..., :_BLOCK])
-    for start in range(_BLOCK, r.shape[-1], _BLOCK):
-        moments = moments + _moments(form, r[..., start:start + _BLOCK])
-    centre, radius = sphere_of(moments[..., size:-1, size:-1],
-                               _ONES @ moments[..., :3, size:-1], r.shape[-1])
-    radius = radius[..., np.newaxis]
-    change = _to_sphere(form, centre, radius)
-    beta = np.linalg.eigh(change.swapaxes(-1, -2) @ moments @ change)[1][..., 0]
-    mat_w, offset = _ellipsoid(form, beta)
-    return mat_w * radius[..., np.newaxis], mean + centre + offset * radius
-
-
 def _moments(form: Form, r: Floats) -> Floats:
     """Sum the products of the monomials, r and 1 over the poses; r is (..., 3, n)."""
     size = len(form.twice)
@@ -239,7 +218,19 @@ def closed_form(name: str, reading: Floats) -> tuple[Floats, Floats]:
     gains = MODELS[name].gains
     if gains == 1:
         return fit_sphere(reading)
-    return quadric(reading, DIAGONAL if gains == 3 else SYMMETRIC)
+    form = DIAGONAL if gains == 3 else SYMMETRIC
+    mean, r = centred(reading)
+    size = len(form.twice)
+    moments = _moments(form, r[..., :_BLOCK])
+    for start in range(_BLOCK, r.shape[-1], _BLOCK):
+        moments = moments + _moments(form, r[..., start:start + _BLOCK])
+    centre, radius = sphere_of(moments[..., size:-1, size:-1],
+                               _ONES @ moments[..., :3, size:-1], r.shape[-1])
+    radius = radius[..., np.newaxis]
+    change = _to_sphere(form, centre, radius)
+    beta = np.linalg.eigh(change.swapaxes(-1, -2) @ moments @ change)[1][..., 0]
+    mat_w, offset = _ellipsoid(form, beta)
+    return mat_w * radius[..., np.newaxis], mean + centre + offset * radius
 
 
 def fit_sphere(reading: Floats) -> tuple[Floats, Floats]:

@@ -59,7 +59,7 @@ import scipy
 
 from ..effects import AtContext, Context, EachShape, EffectKey, Model, times
 from ..geometry import unit
-from ..statistics import NORMAL_95, over_axes
+from ..statistics import NORMAL_95, over_axes, STATED_NOISE
 from ..table import Poses
 from ..units import Floats, Indices
 
@@ -95,9 +95,6 @@ _STRAIGHT = 1e-9
 _BELIEF = 8.0
 _BELIEF_IN_USUAL = 3.0
 """Degrees of freedom in a test that measured noise, and assumed noise, count as."""
-
-_RIGHT = 0.7
-"""Prior probability that the measured noise is correct."""
 
 _INTERVAL = 0.95
 _SCALES = np.logspace(-2.0, 4.0, 121)
@@ -295,8 +292,9 @@ def equations(model: Model, poses: Measured) -> Equations:
     groups = poses.shared.group
     residual = np.concatenate([part.residual for part in parts])
     count = len(residual) - (2 * (int(groups[-1]) + 1) if len(groups) else 0)
-    return Equations(tuple(parts), force, scale, count, poses.noise_known, residual,
-                     np.concatenate([part.pose for part in parts]))
+    return Equations(
+        parts=tuple(parts), force=force, scale=scale, count=count, noise_known=poses.noise_known,
+        residual=residual, pose=np.concatenate([part.pose for part in parts]))
 
 
 class _Alone:
@@ -419,12 +417,12 @@ def variance_factor(chi2: float, dof: int, noise_known: bool) -> float:
         return 1.0 if noise_known else _student(_BELIEF_IN_USUAL)
     if not noise_known or chi2 > _BEYOND * dof:
         return chi2 / dof * _student(dof)
-    # The measured noise may be correct: a mixture over λ, with a share of `_RIGHT` at 1.
+    # The measured noise may be correct: a mixture over λ, with a share of `STATED_NOISE` at 1.
     width, held = _grid()
     likelihood = (chi2 * (1.0 - 1.0 / _SCALES) - dof * np.log(_SCALES)) / 2.0
     largest = np.max(likelihood)
-    weight = np.exp(likelihood - largest) * (1.0 - _RIGHT)
-    weight[_ONE] += _RIGHT * len(_SCALES) * np.exp(-largest)
+    weight = np.exp(likelihood - largest) * (1.0 - STATED_NOISE)
+    weight[_ONE] += STATED_NOISE * len(_SCALES) * np.exp(-largest)
     part = (weight / np.sum(weight)) @ held
     above = int(np.argmax(part >= _INTERVAL))
     share = (_INTERVAL - part[above - 1]) / (part[above] - part[above - 1])

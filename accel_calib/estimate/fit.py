@@ -7,7 +7,7 @@ The maximum likelihood fit of any list of effects to poses of any kind, by least
 `.equations` sets up the equations of the poses. Damped least squares (Levenberg 1944, Marquardt
 1963) within bounds minimises the sum of their squared residuals; for a dozen poses,
 `scipy.optimize.least_squares` takes several times as long, mostly because of overhead
-(`benchmarks/fits.py`). The covariance is (JᵀJ)⁻¹ times the variance factor of `.equations`.
+(`benchmarks/speed.py`). The covariance is (JᵀJ)⁻¹ times the variance factor of `.equations`.
 
 The bounds of each parameter limit its contribution to a reading to `Effect.plausible_g`. A fitted
 shape constant stays near the values that the search tries. The effects of V and W have no bounds
@@ -499,12 +499,12 @@ def estimate(start: Model, poses_g: Poses, prior: Prior | None = None,
     lower, upper = _bounds(start, poses_g)
     lower, upper = lower[fitted], upper[fitted]
     values, found = solve(point_at, start.vector[fitted], lower, upper,
-                          np.add if prior is None else along_quadrics, most)
+                          move=np.add if prior is None else along_quadrics, most=most)
     at_bound = bool(np.any((values <= lower) | (values >= upper)))
     count = len(found.source.residual)
     own = None if prior is None else Point(found.residual[count:], found.columns[count:])
-    return Fit(model_at(values), poses_g, found.source, found.columns[:count],
-               free_of(start), at_bound, own, factor)
+    return Fit(model_at(values), poses_g, found.source, found.columns[:count], free_of(start),
+               at_bound=at_bound, prior=own, factor=factor)
 
 
 def _bounds(start: Model, poses_g: Poses) -> tuple[Floats, Floats]:

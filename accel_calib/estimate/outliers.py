@@ -209,7 +209,12 @@ def _removed_in_turn(residual: Floats, basis: Floats, own: Floats, rows: Indices
         before = taken[:, :now]
         new = -(before[each, :, at].swapaxes(1, 2) @ before.reshape(fits, now, count * width))
         new.reshape(fits, width, count, width)[each, :, at] += one
-        root = _inverse_root(own[each, at])
+        if width == 1:  # the root, whose square, transposed by itself, is the inverse
+            root = 1.0 / np.sqrt(np.where(own[each, at] > 0.0, own[each, at], np.inf))
+        else:
+            scale, axes = np.linalg.eigh(own[each, at])
+            scale = np.sqrt(np.where(scale > _LEAST_RELATIVE * scale[:, -1:], scale, np.inf))
+            root = (axes / scale[:, np.newaxis]).swapaxes(-1, -2)
         new = root @ new
         towards = root @ residual[each, at][..., np.newaxis]
         residual = residual - (towards.swapaxes(1, 2) @ new).reshape(residual.shape)
@@ -218,15 +223,6 @@ def _removed_in_turn(residual: Floats, basis: Floats, own: Floats, rows: Indices
         taken[:, now:now + width] = parts
         now += width
     return pose, size
-
-
-def _inverse_root(own: Floats) -> Floats:
-    """Return (..., k, k) matrices whose squares, transposed by themselves, are the inverses."""
-    if own.shape[-1] == 1:
-        return 1.0 / np.sqrt(np.where(own > 0.0, own, np.inf))
-    size, axes = np.linalg.eigh(own)
-    scale = np.sqrt(np.where(size > _LEAST_RELATIVE * size[..., -1:], size, np.inf))
-    return (axes / scale[..., np.newaxis, :]).swapaxes(-1, -2)
 
 
 def _squared(residual: Floats, own: Floats) -> Floats:

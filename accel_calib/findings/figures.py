@@ -309,35 +309,32 @@ class Expected:
         self.calibration = calibration
         self.poses = calibration.used_poses
         self.quality = calibration.quality
-
-    @cached_property
-    def noise(self) -> Floats | None:
-        """Return the noise of each pose, in the unit of the readings; None if it is not known."""
-        return pose_noise(self.poses.noise, self.directions)
+        self.directions = directions_in(self.poses, calibration)
+        self.noise = pose_noise(self.poses.noise, self.directions)
+        # Whether the errors are those of the force as a vector, not of its length.
+        self.is_vector = calibration.form.known_orientation and 'reference' in self.poses
+        # Whether the sensor could not be turned over.
+        self.is_partial = calibration.method == PRIOR
+        # The name of the smaller model if values that every sensor has are omitted.
+        effects = {name for name in calibration.model.effects if name in LADDER}
+        self.omits = next((name for name in ('4', '7') if {*MODELS[name].effects} == effects), '')
+        # The number of equations of distinct poses beyond the number of free values.
+        rows = 3 if self.is_vector else 1
+        free = (free_parameters(calibration.name) if calibration.form.sensing_axes
+                else int(np.count_nonzero(np.diag(calibration.covariance))))
+        self.dof = max(len(np.unique(self.poses.reading, axis=0)) * rows - free, 0)
+        # The ratio of an error to its residual after a fit.
+        self._per_dof = math.sqrt(len(self.poses) * rows / self.dof) if self.dof else 1.0
+        # The noise of a pose [mg], RMS over the poses; None if it is not known.
+        floor = self.quality.noise_floor_mg
+        self.noise_mg = None if floor is None else floor * self._per_dof
+        # The error without the calibration, without noise [mg]; None if it is not known.
+        self.before_mg = None if calibration.units.is_native else without_noise(
+            self.quality.rms_before_mg, self.noise_mg)
 
     @cached_property
     def next_pose(self) -> NextPose:
         return next_pose(self.directions, self.calibration.form.largest, self.noise)
-
-    @cached_property
-    def dof(self) -> int:
-        """Return the number of equations of distinct poses beyond the number of free values."""
-        calibration = self.calibration
-        rows = 3 if self.is_vector else 1
-        count = len(np.unique(self.poses.reading, axis=0)) * rows
-        free = (free_parameters(calibration.name) if calibration.form.sensing_axes
-                else int(np.count_nonzero(np.diag(calibration.covariance))))
-        return max(count - free, 0)
-
-    @cached_property
-    def is_vector(self) -> bool:
-        """Whether the errors are those of the force as a vector, not of its length."""
-        return self.calibration.form.known_orientation and 'reference' in self.poses
-
-    @cached_property
-    def is_partial(self) -> bool:
-        """Whether the sensor could not be turned over."""
-        return self.calibration.method == PRIOR
 
     @cached_property
     def stated_mg(self) -> float:
@@ -354,16 +351,6 @@ class Expected:
         return uncertainty_g(self.calibration) * MG
 
     @cached_property
-    def directions(self) -> Floats:
-        return directions_in(self.poses, self.calibration)
-
-    @cached_property
-    def omits(self) -> str:
-        """Return the name of the smaller model if values that every sensor has are omitted."""
-        effects = [name for name in self.calibration.model.effects if name in LADDER]
-        return next((name for name in ('4', '7') if set(MODELS[name].effects) == set(effects)), '')
-
-    @cached_property
     def omitted_mg(self) -> float:
         """Return the error by values that a smaller model omits [mg]; 0 if it omits none."""
         if not self.omits or self.is_partial:
@@ -377,12 +364,6 @@ class Expected:
         return min(_UNSEEN * self.stated_mg * math.sqrt(max(ratio, 0.0)), typical)
 
     @cached_property
-    def noise_mg(self) -> float | None:
-        """Return the noise of a pose [mg], RMS over the poses; None if it is not known."""
-        floor = self.quality.noise_floor_mg
-        return None if floor is None else floor * self._per_dof
-
-    @cached_property
     def few(self) -> float:
         """Return the factor on the uncertainty because few poses check the noise."""
         chi2 = self.quality.chi2_per_dof
@@ -390,12 +371,6 @@ class Expected:
             return 1.0
         stated = variance_factor(chi2 * self.dof, self.dof, True)
         return max(math.sqrt(chi2 / stated) * _few(self.dof), 1.0)
-
-    @property
-    def _per_dof(self) -> float:
-        """Return the ratio of an error to its residual after a fit."""
-        count = len(self.poses) * (3 if self.is_vector else 1)
-        return math.sqrt(count / self.dof) if self.dof else 1.0
 
     @cached_property
     def hidden_mg(self) -> float:
@@ -437,21 +412,14 @@ class Expected:
                           *(size for _, size in self.not_corrected))
 
     @property
-    def inexact_mg(self) -> float:
-        """Return the part of the expected error that more poses reduce [mg]."""
-        return math.hypot(BOUND * self.stated_mg * self.few, self.omitted_mg)
-
-    @cached_property
     def own_mg(self) -> float:
         """Return the expected error by what the poses show, without omitted values [mg]."""
         return math.hypot(self.stated_mg, self.hidden_mg)
 
-    @cached_property
-    def before_mg(self) -> float | None:
-        """Return the error without the calibration, without noise [mg]; None if not known."""
-        if self.calibration.units.is_native:
-            return None
-        return without_noise(self.quality.rms_before_mg, self.noise_mg)
+    @property
+    def inexact_mg(self) -> float:
+        """Return the part of the expected error that more poses reduce [mg]."""
+        return math.hypot(BOUND * self.stated_mg * self.few, self.omitted_mg)
 
 
 def _few(dof: int) -> float:

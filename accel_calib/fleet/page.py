@@ -13,7 +13,6 @@ does not show; `sensors.parquet` and the rows of the recordings have all of them
 
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
-from functools import partial
 from itertools import islice
 from typing import Any
 from urllib.parse import unquote
@@ -29,12 +28,11 @@ from ..comparison import NAMES
 from ..effects import MODELS, parameter_names
 from ..findings import CROSS, scale_of
 from ..report.sheet import (
-    ACCENT, add_band, AFTER, BAND, BEFORE, Drawing, drawn, EDGE, FAINT, figures, has_matplotlib,
-    legend_below, listing, Mark, Marks, paragraph, rated_sheet, scroll_table, section, THIRD,
-    write_page)
+    ACCENT, add_band, AFTER, BAND, BEFORE, Drawing, drawn, EDGE, FAINT, has_matplotlib,
+    legend_below, Mark, Marks, page, THIRD, write_page)
 from ..report.stability import change_words, GROUPS, label_dates, named_words, places_of, spoken
 from ..table import Floats
-from ..text import counted, short, with_minus
+from ..text import short, with_minus
 
 PAGE = 'fleet.html'
 
@@ -56,97 +54,60 @@ _LASTING = {True: 'for good', False: 'this calibration only', None: 'newest'}
 _DRIFTS = 0.05
 """Probability below which a drift is stated."""
 
-_figures = partial(figures, script=False)
-"""The browser shows the text of a marker that is pointed at."""
-
 
 def write_fleet_page(store: Store, known: Overview, sensors: Sequence[Row],
                      priors: Mapping[str, FleetPrior]) -> None:
     """Write the page of all sensors, with typical values by model; raise OSError if it fails."""
-    body = _body(store, known, sensors, priors)
-    write_page(store.folder / PAGE, rated_sheet(
-        'Fleet', (), rating_of(known, sensors), body, heading='Calibrations of a fleet',
-        script=False))
-
-
-def _body(store: Store, known: Overview, sensors: Sequence[Row],
-          priors: Mapping[str, FleetPrior]) -> Iterator[str]:
-    """Yield the parts of the page."""
-    differ = not_agreeing(sensors)
-    if not has_matplotlib():
-        yield paragraph('This page has no figures, because matplotlib is not installed.')
-    yield paragraph(f'Not compared: {counted(known.left_out, "recording")} whose poses do not '
-                    'determine offset, gain and cross-axis gain, or with other effects than most '
-                    'recordings of the sensor.' if known.left_out else '', 'soft')
-    odd_names: list[str] = []
-    models = sorted(known.models.items(), key=lambda each: (-len(each[1].values), each[0]))
-    for number, (model, of_model) in enumerate(models):
-        odd = odd_sensors(of_model.values)
+    differ, drawn_too, odd_names = not_agreeing(sensors), has_matplotlib(), list[str]()
+    models = []
+    for number, (name, own) in enumerate(sorted(
+            known.models.items(), key=lambda each: (-len(each[1].values), each[0]))):
+        shown = drawn_too and number < _MOST_MODELS
+        odd, prior = odd_sensors(own.values), priors.get(name)
         odd_names += [sensor for sensor, _, _, _ in odd]
-        yield from _of_model(model, of_model, odd, f'model{number}', priors.get(model),
-                             shown=number < _MOST_MODELS)
-    yield paragraph(f'Figures of the {_MOST_MODELS} models with the most sensors are shown, of '
-                    f'{len(models)} models.' if len(models) > _MOST_MODELS else '', 'soft')
-    yield _changes(differ)
-    yield _over_time(store, sensors, differ, odd_names)
-    rows = [(row['recording'], row['error'], row['advice']) for row in known.errors[:_MOST]]
-    count = sum(known.counts[status] for status in ('error', 'unread'))
-    yield section('Recordings without a calibration', scroll_table(
-        'Errors', ('recording', 'error', 'what to do'), rows, '', long=len(rows) > _LONG),
-        _not_shown(count - len(rows), 'recording'))
+        models.append({
+            'name': name, 'sensors': len(own.values),
+            'odd': [_odd_words(own, each) for each in odd],
+            'values': list(_of_values(f'model{number}_values', own, odd)) if shown else [],
+            'distribution': _distribution(own.values), 'shared': shared_effects(own.values),
+            'drift': list(_of_months(f'model{number}_months', own)) if shown else [],
+            'prior': prior, 'typical': _typical(prior) if prior else []})
+    drawings, others = _over_time(store, sensors, differ, odd_names) if drawn_too else ([], 0)
+    write_page(store.folder / PAGE, page(
+        'fleet', 'Fleet', (), rating_of(known, sensors), heading='Calibrations of a fleet',
+        script=False,  # the browser shows the text of a marker that is pointed at
+        has_figures=drawn_too, left_out=known.left_out, models=models, most_models=_MOST_MODELS,
+        differ=differ, changes=_changes(differ), over_time=drawings, others=others, most=_MOST,
+        long=_LONG, failed=sum(known.counts[status] for status in ('error', 'unread')),
+        errors=[(row['recording'], row['error'], row['advice']) for row in known.errors]))
 
 
-def _of_model(model: str, known: OfModel, odd: Sequence[Odd], prefix: str,
-              prior: FleetPrior | None, *, shown: bool) -> Iterator[str]:
-    """Yield the sections of a model of sensor; its figures if `shown` is set."""
-    shown = shown and has_matplotlib()
-    name = f' (model {model})' if model else ''
-    values = _figures(_of_values(f'{prefix}_values', known, odd)) if shown else ''
-    yield section(f'Values{name}', values, values and paragraph(
-        'Histograms over the sensors. Line: median. Triangles: odd sensors.', 'soft'),
-        _distribution(known.values))
-    yield section(f'Odd sensors{name}', listing(
-        _odd_words(known, each) for each in odd[:_MOST]),
-        _not_shown(len(odd) - _MOST, 'odd value'))
-    yield section(f'Effects that several sensors share{name}',
-                  listing(shared_effects(known.values)))
-    drift = _figures(_of_months(f'{prefix}_months', known)) if shown else ''
-    yield section(f'Drift of all sensors{name}', drift and paragraph(
-        'Difference of each calibration from the median of its sensor, by month: the median, and '
-        'bands with 50 % and 90 % of the calibrations.'), drift)
-    yield section(f'Typical values{name}', _typical(prior) if prior else '')
-
-
-def _distribution(values: Mapping[str, Values]) -> str:
-    """Return a table of the distribution of each value over the sensors."""
+def _distribution(values: Mapping[str, Values]) -> list[tuple[str, ...]]:
+    """Return the distribution of each value over the sensors."""
     table = np.array([each.mean for each in values.values()])
     rows = []
     for name, column in zip(NAMES, table.T, strict=True):
         zero, factor, unit = scale_of(name)
         parts = (np.quantile(column, [0.0, 0.1, 0.5, 0.9, 1.0]) - zero) * factor
         rows.append((f'{spoken(name)} [{unit}]', *(with_minus(short(part)) for part in parts)))
-    return scroll_table('Distribution', (counted(len(values), 'sensor'), 'smallest', '10 %',
-                                         'median', '90 %', 'largest'), rows)
+    return rows
 
 
-def _typical(fleet: FleetPrior) -> str:
-    """Return a table of the typical values and spreads."""
+def _typical(fleet: FleetPrior) -> list[tuple[str, ...]]:
+    """Return the typical values and spreads."""
     spread = np.sqrt(np.diag(fleet.prior.covariance))
-    rows = []
+    rows = list[tuple[str, ...]]()
     for name, mean, sd in zip(parameter_names(MODELS['10'].effects), fleet.prior.mean, spread,
                               strict=True):
         _, factor, unit = scale_of(name)
         rows.append((name.replace('.', ' ').replace('_', ' '), with_minus(short(mean * factor)),
                      short(sd * factor), unit))
-    words = (f'Model 10, from {counted(fleet.sensors, "sensor")}, in fleet.yaml for --prior of '
-             'fit and refine.')
-    return paragraph(words) + scroll_table(
-        'Typical values', ('value', 'typical', 'spread', 'unit'), rows)
+    return rows
 
 
-def _changes(sensors: Sequence[Row]) -> str:
-    """Return the section of the sensors whose calibrations differ."""
-    rows = []
+def _changes(sensors: Sequence[Row]) -> list[tuple[str, ...]]:
+    """Return lines about the sensors whose calibrations differ."""
+    rows = list[tuple[str, ...]]()
     for row in sensors:
         sensor, drift = row['sensor'], row.get('drift')
         for change in row['changes']:
@@ -158,19 +119,12 @@ def _changes(sensors: Sequence[Row]) -> str:
             rows.append((sensor, '', f'{words} per year', 'drift'))
         elif not row['changes']:
             rows.append((sensor, '', 'no step or drift that is significant alone', ''))
-    return '' if not rows else section('Sensors that changed', paragraph(
-        f'The calibrations of {counted(len(sensors), "sensor")} differ by more than their '
-        'uncertainty. A change is for good if the next calibration differs from the values before '
-        'it, too.'), scroll_table(
-        'Sensors that changed', ('sensor', 'first recording after it', 'change', 'lasts'),
-        rows[:_MOST], '', long=len(rows) > _LONG), _not_shown(len(rows) - _MOST, 'line'))
+    return rows
 
 
 def _over_time(store: Store, sensors: Sequence[Row], differ: Sequence[Row],
-               odd: Sequence[str]) -> str:
-    """Return the figures of single sensors: changed, odd and newest ones."""
-    if not has_matplotlib():
-        return ''
+               odd: Sequence[str]) -> tuple[list[Drawing], int]:
+    """Return figures of single sensors, changed, odd and newest ones, and how many are left."""
     by_name = {row['sensor']: row for row in sensors if row['calibrations'] > 1}
     for_good_first = sorted(differ, key=lambda row: not any(
         change['for_good'] for change in row['changes']))
@@ -186,17 +140,7 @@ def _over_time(store: Store, sensors: Sequence[Row], differ: Sequence[Row],
     drawings = [_of_sensor(f'sensor{number}', name, alike(store.of_sensor(folders[name])),
                            by_name[name]['changes'] if name in significant else [])
                 for number, name in enumerate(chosen)]
-    return section('Sensors over time', paragraph(
-        'Difference of each calibration from the median of its sensor, with 95 % band. '
-        'Line: the sensor changed for good at this recording. Dotted line: only this calibration '
-        'differs, or it is the newest one. Sensors that changed, odd sensors, and the newest '
-        'recordings.'), _figures(drawings),
-        _not_shown(len(by_name) - len(chosen), 'other sensor')) if drawings else ''
-
-
-def _not_shown(count: int, what: str) -> str:
-    """Return how many are not shown; nothing if all are."""
-    return paragraph(f'{counted(count, what)} not shown.', 'soft') if count > 0 else ''
+    return drawings, len(by_name) - len(chosen)
 
 
 # ----------------------------------------------------------------------------- figures

@@ -411,7 +411,8 @@ def calibrate_recording(found: Input, options: Options, store: Store, limit_s: f
             key = key_of(content, found, options)
             if store.has(key):
                 return 'skipped'
-            row, calibration = _apart.process.call_within(limit_s, row_of, found, path, options)
+            row, calibration = _apart.process.call(
+                row_of, found, path, options, limit_s=limit_s)
     except Exception as err:  # one recording must not stop the others
         return unread_row(found, options, _reason(err, found.path, limit_s))
     row |= {'key': key, 'content': content, 'seconds': time.perf_counter() - begin}

@@ -4,9 +4,9 @@
 """
 The live page: a calibration in a browser, served by the node or without ROS.
 
-`server` serves the page and the messages of each `viewer`. `host` makes the messages of a session:
-that of the node, or one of its own with the samples of `sources`. `page` contains the files for
-the browser.
+`server` serves the page and the messages of each `viewer`. `exchange` makes the messages of a
+session: that of the node, or that of `host` with the samples of `sources`. `page` contains the
+files for the browser.
 
 """
 

@@ -12,41 +12,48 @@ nobody can keep the owner out. Host and Origin are
 checked, so that a page of another site cannot use the server through the browser of a user. Files
 come from a fixed list.
 
+A connection is for one request. It is closed unless the request arrives within `_REQUEST_S`. A
+viewer is a connection that has become a WebSocket.
+
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections import Counter, deque
+from collections import Counter
 from concurrent.futures import Future
+from contextlib import suppress
+import errno
+from functools import partial
 import hmac
+from http import HTTPStatus
 from ipaddress import ip_address
-from itertools import takewhile
 from pathlib import Path
 import secrets
 import socket
 from threading import Thread
-from typing import Any, cast, Protocol, TYPE_CHECKING
+from typing import Any, cast, TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from aiohttp import web
 
+from .exchange import Exchange
 from .viewer import (
-    announce, Connection, LARGEST, Message, not_bound, OWNER, reachable, secured, STUCK_S,
-    TooManyError, Viewer)
-from .. import __version__
+    announce, Board, LARGEST, Message, PERIOD, reachable, secured, STUCK_S, TooManyError, Viewer)
+from ..errors import InputError
 from ..report import policy
-from ..session import Throttle
-from ..stored.exports import CALIBRATION_ALONE, FORMATS
+from ..session import Answer, Throttle
+from ..stored.exports import FORMATS
 from ..text import plain
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from ..stored.exports import Exported
+_REQUEST_S = 10.0
+"""Time within which a connection must send its request [s]."""
 
-PERIOD = 0.05
-"""Interval between two messages of progress [s]."""
+OWNER = 3
+"""Stage of a connection whose viewer has the token."""
 
 PAGE = Path(__file__).with_name('page') / 'index.html'
 """The page; what it loads is in the same folder."""
@@ -64,12 +71,6 @@ _QUIET_S = 60.0
 _ENDING_S = 1.0
 """Time in which answers are completed at the end [s]."""
 
-_LINES = 500
-"""Number of log lines that are kept."""
-
-_HISTORY_S = 60.0
-"""Time for which a new viewer gets the history [s]."""
-
 _RARELY_S = 0.2
 """Interval at which the server looks for viewers while there is none [s]."""
 
@@ -81,37 +82,6 @@ _ITS_LINK = 'open the link with the token, which the program showed on its termi
 _NO_TOKEN = f'this link has no token, so it only shows; {_ITS_LINK}'
 _WRONG_TOKEN = 'the token of this link is of another start of the program, so it only shows; ' \
                f'{_ITS_LINK}'
-
-
-class Board:
-    """What viewers are shown: the newest message of each kind, log lines, and the history."""
-
-    def __init__(self) -> None:
-        self.newest: dict[str, Message] = {}
-        self.history: deque[Message] = deque(maxlen=int(_HISTORY_S / PERIOD))
-        self._lines: deque[Message] = deque(maxlen=_LINES)
-
-    def take(self, message: Message) -> bool:
-        """Keep a message; return whether it is new."""
-        if message['kind'] == 'log':
-            self._lines.append(message)
-        elif message == self.newest.get(message['kind']):
-            return False
-        else:
-            self.newest[message['kind']] = message
-        return True
-
-    def lines_after(self, number: int) -> list[Message]:
-        """Return the log lines with larger numbers, the newest first."""
-        return list(takewhile(lambda line: line['number'] > number, reversed(self._lines)))
-
-    def welcome(self, why: str) -> Message:
-        """Return the answer to ``hello``; `why` commands are not accepted is empty if they are."""
-        kept = self.history.copy()
-        return {'kind': 'welcome', 'may': not why, 'why': why, 'version': __version__,
-                'exports': CALIBRATION_ALONE,
-                'history': {key: [each[key] for each in kept]
-                            for key in ('time', 'length', 'corrected')}}
 
 
 class Address:
@@ -149,23 +119,54 @@ class Address:
             return name in self._hosts
 
 
-class Desk(Protocol):
-    """Who answers the viewers: a `host.Exchange`."""
+class Connection(web.RequestHandler):
+    """
+    A connection from an `address`.
 
-    show: Callable[[Message], object]
+    `stage` 0: its request has not arrived; 1: it is answered; 2: a viewer; 3: the `OWNER`.
 
-    def ask(self, command: str, answer: Callable[[bool, Any], object]) -> None: ...
+    """
 
-    def page(self, answer: Callable[[bool, Any], object]) -> None: ...
+    def __init__(self, server: PageServer, http: web.Server) -> None:
+        super().__init__(http, loop=asyncio.get_running_loop(),
+                         access_log=None)  # type: ignore[arg-type]
+        self._owner, self.stage, self.address = server, 0, ''
 
-    def export(self, name: str, answer: Callable[[Exported | str], object]) -> None: ...
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Close the connection later, unless its request arrives."""
+        super().connection_made(transport)
+        self.address = str((transport.get_extra_info('peername') or [''])[0])
+        self._limit = asyncio.get_running_loop().call_later(_REQUEST_S, self.abort, 0)
+        self._owner.add(self)
 
-    def warn(self, words: str) -> None: ...
+    def connection_lost(self, exc: BaseException | None) -> None:
+        """Forget the connection."""
+        self._limit.cancel()
+        self._owner.connections.pop(self, None)
+        super().connection_lost(exc)
+
+    def abort(self, most: int = OWNER) -> None:
+        """End the connection without waiting, unless its stage is above `most`."""
+        if self.transport is not None and self.stage <= most:
+            self.transport.abort()
+
+    def handle_error(self, request: web.BaseRequest, status: int = 500,
+                     exc: BaseException | None = None, message: str | None = None
+                     ) -> web.StreamResponse:
+        """Return the answer to a request that is not HTTP, or to an unexpected error."""
+        has_left = isinstance(exc, ConnectionError)
+        if status != HTTPStatus.BAD_REQUEST and not has_left:
+            return secured(super().handle_error(request, status, exc, message))
+        self.stage = 1
+        self._owner.report('lost a visitor before its answer' if has_left else
+                           'refused a request that is not HTTP')
+        return secured(web.Response(
+            status=status, text='the request is not HTTP; open the link in a browser\n'))
 
 
 class PageServer:
     """
-    The server of the live page; `desk` answers the viewers, in the thread of the server.
+    The server of the live page; the `exchange` answers the viewers, in its own thread.
 
     It listens at the address `host`; port 0 is any free one.
 
@@ -173,21 +174,23 @@ class PageServer:
     ----------
     token : str
         What commands and exports need.
-    viewers : list of Viewer
-        The viewers that have said hello, the oldest first.
+    viewers : dict of Viewer to Connection
+        The viewers that have said hello, the oldest first, and their connections.
+    connections : dict of Connection to None
+        All connections, the oldest first.
 
     """
 
-    def __init__(self, desk: Desk, host: str, port: int) -> None:
-        self._desk, self._host, self._port = desk, host, port
+    def __init__(self, exchange: Exchange, host: str, port: int) -> None:
+        self._exchange, self._host, self._port = exchange, host, port
         self.token = secrets.token_urlsafe(16)
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._over: asyncio.Event | None = None
+        self._over = asyncio.Event()
         self._thread: Thread | None = None
         self._link_file: Path | None = None
         self.board = Board()
-        self.viewers: list[Viewer] = []
-        self._connections: list[Connection] = []
+        self.viewers: dict[Viewer, Connection] = {}
+        self.connections: dict[Connection, None] = {}
         self._reported, self._filter = Counter[str](), Throttle()
         self._files = {f'/page/{each.name}': each for each in PAGE.parent.iterdir()
                        if each.suffix in _KINDS}
@@ -205,12 +208,19 @@ class PageServer:
             started.result()
         except OSError as error:
             self._thread.join()
-            raise not_bound(error, self._host, self._port) from error
-        self._desk.show = self.show
+            if error.errno == errno.EADDRINUSE:
+                raise InputError(
+                    f'the port {self._port} of {self._host} is in use, so there is no live page',
+                    'stop the other program, or choose another port') from error
+            raise InputError(
+                f'the live page cannot be served at {self._host}, port {self._port}: '
+                f'{error.strerror or error}', 'choose an address of this machine, and a port '
+                'above 1023') from error
+        self._exchange.show = self.show
 
     def close(self) -> None:
         """Close all viewers, and stop serving."""
-        if self._thread is not None and self._loop is not None and self._over is not None:
+        if self._thread is not None:
             self._call(self._over.set)
             self._thread.join()
             self._thread = None
@@ -260,12 +270,11 @@ class PageServer:
             return
         self._address = Address(listener.sockets)
         self._port = self._address.port
-        self._over = asyncio.Event()
         started.set_result(None)
-        self._look()
-        await self._over.wait()
+        while not self._over.is_set():
+            await self._look()
         listener.close()
-        for connection in list(self._connections):
+        for connection in list(self.connections):
             if connection.stage > 1:
                 connection.abort()
         await http.shutdown(_ENDING_S)
@@ -280,42 +289,37 @@ class PageServer:
 
     def add(self, connection: Connection) -> None:
         """Add a connection; at the limit, end another one."""
-        if len(self._connections) >= _CONNECTIONS:
+        if len(self.connections) >= _CONNECTIONS:
             self.report(f'ended a connection, because {_CONNECTIONS} were open')
-            of = Counter(each.address for each in self._connections)
-            ended = max(self._connections, key=lambda each: (
+            of = Counter(each.address for each in self.connections)
+            ended = max(self.connections, key=lambda each: (
                 each.stage < OWNER, of[each.address], -each.stage))
-            self.remove(ended)
+            del self.connections[ended]
             ended.abort()
-        self._connections.append(connection)
-
-    def remove(self, connection: Connection) -> None:
-        """Remove a connection, unless it is removed already."""
-        if connection in self._connections:
-            self._connections.remove(connection)
+        self.connections[connection] = None
 
     def report(self, what: str) -> None:
         """Count what the page had to do, and log it at most once in `_QUIET_S`."""
         self._reported[what] += 1
         if self._filter.passes(what, _QUIET_S):
-            self._desk.warn(f'the live page {what} ({self._reported[what]} so far)')
+            words = f'the live page {what} ({self._reported[what]} so far)'
+            self._exchange.call_soon(lambda: self._exchange.log('warning', words))
 
-    def _look(self) -> None:
-        """Show the newest progress, close stuck viewers, and look again."""
-        loop = asyncio.get_running_loop()
-        wait = _RARELY_S
-        if self.viewers:
-            wait = PERIOD
-            if self.board.history:
-                self._take(self.board.history[-1])
-            for viewer in list(self.viewers):
-                viewer.abort_if_stuck(loop.time())
-        loop.call_later(wait, self._look)
+    async def _look(self) -> None:
+        """Show the newest progress, close stuck viewers, and wait."""
+        if self.viewers and self.board.history:
+            self._take(self.board.history[-1])
+        now = asyncio.get_running_loop().time()
+        for viewer in list(self.viewers):
+            if now - viewer.sending_since > STUCK_S:
+                viewer.abort()
+        with suppress(asyncio.TimeoutError):
+            await asyncio.wait_for(self._over.wait(), PERIOD if self.viewers else _RARELY_S)
 
     def _take(self, message: Message) -> None:
         if self.board.take(message):
             for viewer in self.viewers:
-                viewer.wake()
+                viewer.news.set()
 
     def _is_token(self, given: str) -> bool:
         return hmac.compare_digest(given.encode(errors='replace'), self.token.encode())
@@ -333,42 +337,39 @@ class PageServer:
 
     async def _file(self, request: web.BaseRequest, path: str) -> web.Response:
         """Return a file of the page, the calibration page, or an export."""
+        export = path.removeprefix('/export/')
         if path == '/calibration.html':
-            success, text = await self._asked(self._desk.page)
+            success, text = await self._asked(self._exchange.page)
             if not success:
                 return web.Response(status=404, text=f'{text}\n')
             allowed = {'Content-Security-Policy': f"{policy()}; frame-ancestors 'self'"}
             return web.Response(text=text, content_type='text/html', headers=allowed)
-        if path.startswith('/export/') and path.removeprefix('/export/') in FORMATS:
-            return await self._export(request, path.removeprefix('/export/'))
-        file = self._files.get(path)
-        if file is None:
+        if path in self._files:
+            file = self._files[path]
+            return web.Response(body=file.read_bytes(), content_type=_KINDS[file.suffix],
+                                charset='utf-8')
+        if export == path or export not in FORMATS:
             return web.Response(status=404, text='there is no such page; open /\n')
-        return web.Response(body=file.read_bytes(), content_type=_KINDS[file.suffix],
-                            charset='utf-8')
-
-    async def _export(self, request: web.BaseRequest, name: str) -> web.Response:
         kind, _, token = request.headers.get('Authorization', '').partition(' ')
         if kind.lower() != 'bearer' or not self._is_token(token.strip()):
             return web.Response(status=401, headers={'WWW-Authenticate': 'Bearer'}, text=(
                 f'the token is missing or wrong; {_ITS_LINK}\n'))
-        found, = await self._asked(lambda answer: self._desk.export(name, answer))
+        _, found = await self._asked(partial(self._exchange.export, export))
         if isinstance(found, str):
             return web.Response(status=409, text=f'{found}\n')
         return web.Response(
             body=found.data, content_type='application/octet-stream',
             headers={'Content-Disposition': f'attachment; filename="calibration{found.suffix}"'})
 
-    async def _asked(self, ask: Callable[[Any], object]) -> Any:
-        """Return what the desk answers, as a tuple."""
-        loop = asyncio.get_running_loop()
-        answered: asyncio.Future[Any] = loop.create_future()
+    async def _asked(self, ask: Callable[[Answer], object]) -> Any:
+        """Return success and answer of a function of the exchange."""
+        answered: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
 
         def take(*found: Any) -> None:
             if not answered.done():
                 answered.set_result(found)
 
-        ask(lambda *found: self._call(lambda: take(*found)))
+        self._exchange.call_soon(lambda: ask(lambda *found: self._call(lambda: take(*found))))
         return await answered
 
     async def _stream(self, request: web.BaseRequest, connection: Connection
@@ -384,18 +385,14 @@ class PageServer:
             return secured(web.Response(status=400, text='expected a WebSocket; open /\n'))
         await socket_.prepare(request)
         connection.stage = 2
-        viewer = Viewer(self, socket_, connection)
+        viewer = Viewer(self.board, socket_, connection.abort, self._ask)
         try:
-            await viewer.run()
+            await viewer.run(partial(self._admit, connection))
         finally:
-            self._forget(viewer)
+            self.viewers.pop(viewer, None)
         return socket_
 
-    def _forget(self, viewer: Viewer) -> None:
-        if viewer in self.viewers:
-            self.viewers.remove(viewer)
-
-    def admit(self, viewer: Viewer, token: str) -> None:
+    def _admit(self, connection: Connection, viewer: Viewer, token: str) -> None:
         """
         Admit a viewer that has said hello, and set why it only looks.
 
@@ -409,12 +406,13 @@ class PageServer:
             if viewer.why or not guests:
                 raise TooManyError(f'{_VIEWERS} viewers are connected already', 'close one of '
                                    'them')
-            guests[0].connection.abort()
-            self._forget(guests[0])
+            guests[0].abort()
+            del self.viewers[guests[0]]
         if not viewer.why:
-            viewer.connection.stage = OWNER
-        self.viewers.append(viewer)
+            connection.stage = OWNER
+        self.viewers[viewer] = connection
 
-    def ask(self, command: str, answer: Callable[[bool, str], object]) -> None:
-        """Ask the desk, and call `answer` in this thread."""
-        self._desk.ask(command, lambda success, words: self._call(lambda: answer(success, words)))
+    def _ask(self, command: str, answer: Callable[[bool, str], None]) -> None:
+        """Ask the exchange, and call `answer` in this thread."""
+        self._exchange.call_soon(lambda: self._exchange.ask(
+            command, lambda success, words: self._call(lambda: answer(success, words))))

@@ -9,9 +9,10 @@ them can do something else in between.
 
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 import time
 from typing import Any
@@ -115,9 +116,10 @@ def open_source(name: str, options: LogOptions, *, baud: int, speed: float = 1.0
     if is_port(name):
         with closing(_Port(name, baud)) as port:
             reader = _understood(name, port.lines(), options, baud)
-            yield Source(name, '', reader.units, reader.read_as,
-                         _in_order(_arriving(reader, port.lines())), reader.findings,
-                         lambda: port.problem)
+            first = [] if reader.first is None else [_rows(reader.first)]
+            blocks = (rows for lines in port.lines() for rows in _rows_of(reader, lines))
+            yield Source(name, '', reader.units, reader.read_as, _in_order(chain(first, blocks)),
+                         reader.findings, lambda: port.problem)
         return
     with open_log(Path(name), options) as log:
         yield Source(name, log.sensor, log.units, log.read_as, _played(log.blocks, speed),
@@ -266,14 +268,7 @@ def _interval(arrived: list[tuple[int, float]]) -> float:
     return float(np.median((seconds[half:] - seconds[:-half]) / (count[half:] - count[:-half])))
 
 
-def _arriving(reader: LineReader, lines: Iterator[list[str]]) -> Iterator[Floats]:
-    if reader.first is not None:
-        yield _rows(reader.first)
-    for new in lines:
-        yield from _rows_of(reader, new) if new else (np.empty((0, 9)),)
-
-
-def _in_order(blocks: Iterator[Floats]) -> Iterator[Floats]:
+def _in_order(blocks: Iterable[Floats]) -> Iterator[Floats]:
     """
     Leave out single samples whose time is not between those before and after.
 
@@ -293,11 +288,9 @@ def _in_order(blocks: Iterator[Floats]) -> Iterator[Floats]:
 def _rows_of(reader: LineReader, lines: list[str]) -> Iterator[Floats]:
     """Yield the samples of lines; a line whose numbers are impossible is left out."""
     try:
-        recording = reader.samples(lines)
+        recording = reader.samples(lines) if lines else None
+        yield np.empty((0, 9)) if recording is None else _rows(recording)
     except InputError:
         if len(lines) > 1:  # a lost character can make a number too large
             for line in lines:
                 yield from _rows_of(reader, [line])
-        return
-    if recording is not None:
-        yield _rows(recording)

@@ -2,14 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The link of the live page, its connections, its viewers, and the messages that they exchange.
+The link of the live page, its viewers, and the messages that they exchange.
 
 All messages are JSON. A viewer sends ``hello`` first and then ``ask``. The server sends messages
 with a ``kind``. Numbers that are not known are null. Lengths of vectors and the accuracy are in g,
 temperatures in °C, and times in seconds: of a log line since 1970, otherwise of a steady clock.
-
-A connection is for one request. It is closed unless the request arrives within `_REQUEST_S`. A
-viewer is a connection that has become a WebSocket.
 
 A task of the viewer sends what is new for it: the newest progress, poses and state, the log lines
 that it does not have, and the answers to its commands. Nothing else is queued. A viewer that takes
@@ -22,9 +19,6 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-import errno
-from http import HTTPStatus
 import io
 from ipaddress import ip_address
 import json
@@ -33,19 +27,18 @@ import os
 from pathlib import Path
 import socket
 import sys
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from aiohttp import web, WSCloseCode, WSMsgType
 
+from .. import __version__
 from ..errors import InputError
 from ..session import COMMANDS as COMMANDS_OF_A_SESSION, ros_home
+from ..stored.exports import CALIBRATION_ALONE
 from ..text import read_json
 
 STUCK_S = 10.0
 """Time after which a viewer that takes no data, or does not answer, is closed [s]."""
-
-_REQUEST_S = 10.0
-"""Time within which a connection must send its request [s]."""
 
 _HELLO_S = 5.0
 """Time within which a new viewer must say hello [s]."""
@@ -69,61 +62,23 @@ COMMANDS = (*COMMANDS_OF_A_SESSION, 'enable', 'disable')
 LARGEST = 4096
 """Largest message of a viewer [bytes]."""
 
-OWNER = 3
-"""Stage of a connection whose viewer has the token."""
-
 Answered = TypeVar('Answered', bound=web.StreamResponse)
 
 _BUFFER = 65536
 """Size of the buffers of a viewer [bytes]; more waits in the viewer's task."""
 
+PERIOD = 0.05
+"""Interval between two messages of progress [s]."""
 
-class Serving(Protocol):
-    """What connections and viewers need of their server."""
+_LINES = 500
+"""Number of log lines that are kept."""
 
-    board: Any
+_HISTORY_S = 60.0
+"""Time for which a new viewer gets the history [s]."""
 
-    def add(self, connection: Connection) -> None: ...
-
-    def remove(self, connection: Connection) -> None: ...
-
-    def report(self, what: str) -> None: ...
-
-    def admit(self, viewer: Viewer, token: str) -> None: ...
-
-    def ask(self, command: str, answer: Callable[[bool, str], object]) -> None: ...
-
-
-@dataclass(frozen=True)
-class Hello:
-    """The first message: the token, and the number of the last log line that the viewer has."""
-
-    token: str
-    seen: int
-
-
-@dataclass(frozen=True)
-class Ask:
-    """A command, with a number for its answer."""
-
-    id: int  # noqa: A003, the name in the message
-    command: str
-
-
-def request_of(text: str) -> Hello | Ask:
-    """Return the message of a viewer; InputError if the text is none."""
-    wrong = InputError('the message is not understood, expected {"hello": {"token", "seen"}} or '
-                       '{"ask": {"id", "command"}}', 'load the page again')
-    try:
-        found = read_json(text)
-    except ValueError:
-        raise wrong from None
-    match found:
-        case {'hello': {'token': str(token), 'seen': int(seen)}}:
-            return Hello(token, seen)
-        case {'ask': {'id': int(number), 'command': str(command)}}:
-            return Ask(number, command)
-    raise wrong
+_NOT_UNDERSTOOD = InputError(
+    'the message is not understood, expected {"hello": {"token", "seen"}} or {"ask": {"id", '
+    '"command"}}', 'load the page again')
 
 
 def qr_code(link: str) -> str:
@@ -163,16 +118,6 @@ def announce(link: str, name: str) -> tuple[str, Path | None]:
     return f'{words}; its link with the token is in {file}', file
 
 
-def not_bound(error: OSError, host: str, port: int) -> InputError:
-    """Return the error for an address that cannot be used."""
-    if error.errno == errno.EADDRINUSE:
-        return InputError(f'the port {port} of {host} is in use, so there is no live page',
-                          'stop the other program, or choose another port')
-    return InputError(f'the live page cannot be served at {host}, port {port}: '
-                      f'{error.strerror or error}', 'choose an address of this machine, and a '
-                      'port above 1023')
-
-
 def reachable(host: str) -> str:
     """Return an address for a link: that of the network if the server listens everywhere."""
     try:
@@ -199,49 +144,31 @@ def secured(response: Answered) -> Answered:
     return response
 
 
-class Connection(web.RequestHandler):
-    """
-    A connection from an `address`.
+class Board:
+    """What viewers are shown: the newest message of each kind, log lines, and the history."""
 
-    `stage` 0: its request has not arrived; 1: it is answered; 2: a viewer; 3: the `OWNER`.
+    def __init__(self) -> None:
+        self.newest: dict[str, Message] = {}
+        self.history: deque[Message] = deque(maxlen=int(_HISTORY_S / PERIOD))
+        self.lines: deque[Message] = deque(maxlen=_LINES)
 
-    """
+    def take(self, message: Message) -> bool:
+        """Keep a message; return whether it is new."""
+        if message['kind'] == 'log':
+            self.lines.append(message)
+        elif message == self.newest.get(message['kind']):
+            return False
+        else:
+            self.newest[message['kind']] = message
+        return True
 
-    def __init__(self, server: Serving, http: web.Server) -> None:
-        super().__init__(http, loop=asyncio.get_running_loop(),
-                         access_log=None)  # type: ignore[arg-type]
-        self._owner, self.stage, self.address = server, 0, ''
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Close the connection later, unless its request arrives."""
-        super().connection_made(transport)
-        self.address = str((transport.get_extra_info('peername') or [''])[0])
-        self._limit = asyncio.get_running_loop().call_later(_REQUEST_S, self.abort, 0)
-        self._owner.add(self)
-
-    def connection_lost(self, exc: BaseException | None) -> None:
-        """Forget the connection."""
-        self._limit.cancel()
-        self._owner.remove(self)
-        super().connection_lost(exc)
-
-    def abort(self, most: int = OWNER) -> None:
-        """End the connection without waiting, unless its stage is above `most`."""
-        if self.transport is not None and self.stage <= most:
-            self.transport.abort()
-
-    def handle_error(self, request: web.BaseRequest, status: int = 500,
-                     exc: BaseException | None = None, message: str | None = None
-                     ) -> web.StreamResponse:
-        """Return the answer to a request that is not HTTP, or to an unexpected error."""
-        has_left = isinstance(exc, ConnectionError)
-        if status != HTTPStatus.BAD_REQUEST and not has_left:
-            return secured(super().handle_error(request, status, exc, message))
-        self.stage = 1
-        self._owner.report('lost a visitor before its answer' if has_left else
-                           'refused a request that is not HTTP')
-        return secured(web.Response(
-            status=status, text='the request is not HTTP; open the link in a browser\n'))
+    def welcome(self, why: str) -> Message:
+        """Return the answer to ``hello``; `why` commands are not accepted is empty if they are."""
+        kept = self.history.copy()
+        return {'kind': 'welcome', 'may': not why, 'why': why, 'version': __version__,
+                'exports': CALIBRATION_ALONE,
+                'history': {key: [each[key] for each in kept]
+                            for key in ('time', 'length', 'corrected')}}
 
 
 class TooManyError(InputError):
@@ -250,46 +177,40 @@ class TooManyError(InputError):
 
 class Viewer:
     """
-    A viewer.
+    A viewer, which is shown what is on a board; `ask` runs its commands, and `abort` ends it.
 
-    `why` it only looks is set when it is admitted, and empty if its commands are accepted.
+    `why` it only looks is set when it is admitted, and empty if its commands are accepted. `news`
+    is set when there is something new. It has been sending the same since `sending_since`, by the
+    clock of the loop [s].
 
     """
 
-    def __init__(self, server: Serving, websocket: web.WebSocketResponse,
-                 connection: Connection) -> None:
-        self._server, self._socket, self.connection = server, websocket, connection
+    def __init__(self, board: Board, websocket: web.WebSocketResponse, abort: Callable[[], None],
+                 ask: Callable[[str, Callable[[bool, str], None]], object]) -> None:
+        self._board, self._socket, self.abort, self._ask = board, websocket, abort, ask
         self._sent: dict[str, Message] = {}
         self._answers: deque[Message] = deque()
-        self._seen = 0
-        self.why, self._asking = '', 0
-        self._news = asyncio.Event()
-        self._sending_since = math.inf
+        self._seen = self._asking = 0
+        self.why, self.sending_since = '', math.inf
+        self.news = asyncio.Event()
         raw = websocket.get_extra_info('socket')
         if raw is not None:
             raw.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
 
-    def wake(self) -> None:
-        """Note that there is something new."""
-        self._news.set()
-
-    def abort_if_stuck(self, now: float) -> None:
-        """End the connection if it has taken no data for too long; `now` is of the loop [s]."""
-        if now - self._sending_since > STUCK_S:
-            self.connection.abort()
-
-    async def run(self) -> None:
-        """Serve the viewer until it ends."""
+    async def run(self, admit: Callable[[Viewer, str], None]) -> None:
+        """Serve the viewer until it ends; `admit` it with its token."""
         sending: asyncio.Task[None] | None = None
         try:
-            hello = await self._next(_HELLO_S)
-            if isinstance(hello, Hello):
-                self._seen = hello.seen
-                self._server.admit(self, hello.token)
-                sending = asyncio.create_task(self._send_all())
-                while request := await self._next(None):
-                    if isinstance(request, Ask):
-                        self._ask(request)
+            while (request := await self._next(_HELLO_S if sending is None else None)) is not None:
+                match request:
+                    case {'hello': {'token': str(token), 'seen': int(seen)}} if sending is None:
+                        self._seen = seen
+                        admit(self, token)
+                        sending = asyncio.create_task(self._send_all())
+                    case {'ask': {'id': int(number), 'command': str(command)}} if sending:
+                        self._run_command(number, command)
+                    case _:
+                        raise _NOT_UNDERSTOOD
         except InputError as error:
             code = (WSCloseCode.TRY_AGAIN_LATER if isinstance(error, TooManyError) else
                     WSCloseCode.POLICY_VIOLATION)
@@ -298,60 +219,58 @@ class Viewer:
             if sending is not None:
                 sending.cancel()
 
-    async def _next(self, timeout: float | None) -> Hello | Ask | None:
+    async def _next(self, timeout: float | None) -> Any:
         """Return the next message of the viewer; None: it has ended."""
         try:
             message = await self._socket.receive(timeout=timeout)
+            return read_json(message.data) if message.type is WSMsgType.TEXT else None
         except asyncio.TimeoutError:
             raise InputError('no hello came', 'load the page again') from None
-        return request_of(message.data) if message.type is WSMsgType.TEXT else None
+        except ValueError:
+            raise _NOT_UNDERSTOOD from None
 
-    def _ask(self, request: Ask) -> None:
+    def _run_command(self, number: int, command: str) -> None:
         """Run a command, if the viewer may."""
         def answer(success: bool, words: str) -> None:
             self._asking -= 1
-            self._answers.append({'kind': 'answer', 'id': request.id, 'success': success,
+            self._answers.append({'kind': 'answer', 'id': number, 'success': success,
                                   'words': words})
-            self.wake()
+            self.news.set()
 
         if self._asking + len(self._answers) >= _COMMANDS:
             raise InputError(f'{_COMMANDS} commands wait for their answers', 'load the page again')
         self._asking += 1
         if self.why:
             answer(False, self.why)
-        elif request.command not in COMMANDS:
-            answer(False, f'the page asks for {request.command[:40]!r}, expected one of '
+        elif command not in COMMANDS:
+            answer(False, f'the page asks for {command[:40]!r}, expected one of '
                    f'{", ".join(COMMANDS)}; load the page again')
         else:
-            self._server.ask(request.command, answer)
+            self._ask(command, answer)
 
     async def _send_all(self) -> None:
         """Send what is new, until the viewer ends or takes no data."""
         try:
-            await self._send(self._server.board.welcome(self.why))
+            await self._send(self._board.welcome(self.why))
             while True:
-                self._news.clear()
-                await self._send_new()
-                await self._news.wait()
+                self.news.clear()
+                answers = len(self._answers)  # later ones may be about a state that is not sent
+                for line in [each for each in self._board.lines if each['number'] > self._seen]:
+                    await self._send(line)
+                    self._seen = line['number']
+                for kind in ('state', 'poses', 'progress'):
+                    newest = self._board.newest.get(kind)
+                    if newest is not None and newest is not self._sent.get(kind):
+                        self._sent[kind] = newest
+                        await self._send(newest)
+                for _ in range(answers):
+                    await self._send(self._answers.popleft())
+                await self.news.wait()
         except ConnectionError:
-            self.connection.abort()
-
-    async def _send_new(self) -> None:
-        """Send the log lines, the newest message of each kind, and then the answers."""
-        answers = len(self._answers)  # later ones may be about a state that is not sent yet
-        for line in reversed(self._server.board.lines_after(self._seen)):
-            await self._send(line)
-            self._seen = line['number']
-        for kind in ('state', 'poses', 'progress'):
-            newest = self._server.board.newest.get(kind)
-            if newest is not None and newest is not self._sent.get(kind):
-                self._sent[kind] = newest
-                await self._send(newest)
-        for _ in range(answers):
-            await self._send(self._answers.popleft())
+            self.abort()
 
     async def _send(self, message: Message) -> None:
         text = json.dumps(message, ensure_ascii=False, allow_nan=False, separators=(',', ':'))
-        self._sending_since = asyncio.get_running_loop().time()
+        self.sending_since = asyncio.get_running_loop().time()
         await self._socket.send_str(text)  # waits only if the buffers are full
-        self._sending_since = math.inf
+        self.sending_since = math.inf

@@ -24,7 +24,7 @@ import numpy as np
 import scipy
 
 from .components import (
-    AxisNoise, COMPONENTS, FIGURES, fit_components, Kind, KINDS, LEVEL, NoiseFigures, shown_unit)
+    FIGURES, AxisNoise, COMPONENTS, fit_components, Kind, KINDS, LEVEL, NoiseFigures, shown_unit)
 from .curve import (
     allan_variances, check_allantools, coarse_step, FLAT, longest_rest, LongRest, octaves, shares,
     Spread, spread_of)
@@ -210,7 +210,8 @@ def noise_of(recording: Recording, units: Units, gravity: float = STANDARD_GRAVI
     for k, (values, (kind, axis)) in enumerate(zip(rest.values, product(KINDS, 'xyz'))):
         unit, scale = scales[kind]
         if np.ptp(values) > 0.0 and np.std(values) > 0.0:
-            axes.append(_axis(kind, axis, unit, values * scale, rest.rate, spread))
+            axes.append(_axis_noise(values * scale, rest.rate, spread, kind=kind, axis=axis,
+                                    unit=unit))
         else:
             notes.append(f'{kind} {axis}: all samples of the rest are the same, so that the axis '
                          'shows no noise; record with more digits or a smaller range')
@@ -221,12 +222,13 @@ def noise_of(recording: Recording, units: Units, gravity: float = STANDARD_GRAVI
         means = [float(np.mean(part)) for part in np.array_split(known, min(100, len(known)))]
         temperature = min(means), max(means)
     return NoiseFigures(
-        tuple(axes), rest.start, rest.seconds, rest.samples, rest.rate, temperature,
-        (*notes, *notes_of(axes, temperature)), needs_of(axes, rest))
+        axes=tuple(axes), start=rest.start, seconds=rest.seconds, samples=rest.samples,
+        rate=rest.rate, temperature=temperature, notes=(*notes, *notes_of(axes, temperature)),
+        needs=needs_of(axes, rest))
 
 
-def _axis(kind: Kind, axis: str, unit: str, values: Floats, rate: float, spread: Spread
-          ) -> AxisNoise:
+def _axis_noise(values: Floats, rate: float, spread: Spread, *, kind: Kind, axis: str, unit: str
+                ) -> AxisNoise:
     lengths = octaves(len(values))
     size = float(np.std(values))
     variances = np.maximum(allan_variances(values / size, lengths), _LEAST_VARIANCE)
@@ -244,13 +246,14 @@ def _axis(kind: Kind, axis: str, unit: str, values: Floats, rate: float, spread:
     across = np.diff(np.eye(len(lengths)), axis=0)
     relative = covariance / np.outer(expected, expected)
     return AxisNoise(
-        kind, axis, unit, tau, size * np.sqrt(variances), size * low, size * high,
-        size * np.sqrt(expected), 0.5 * np.diff(np.log2(variances)),
-        0.5 / np.log(2.0) * np.sqrt(np.diag(across @ relative @ across.T)),
-        {name: each.times(size * (1.0 / rate) ** _POWERS[name])
-         for name, each in zip(COMPONENTS, fitted.components, strict=True)},
-        (float(tau[fitted.first]), float(tau[fitted.last])), fitted.p_value,
-        coarse_step(values, size * float(np.sqrt(variances[0]))))
+        kind=kind, axis=axis, unit=unit, tau=tau, deviation=size * np.sqrt(variances),
+        low=size * low, high=size * high, model=size * np.sqrt(expected),
+        slope=0.5 * np.diff(np.log2(variances)),
+        slope_sd=0.5 / np.log(2.0) * np.sqrt(np.diag(across @ relative @ across.T)),
+        figures={name: each.times(size * (1.0 / rate) ** _POWERS[name])
+                 for name, each in zip(COMPONENTS, fitted.components, strict=True)},
+        used=(float(tau[fitted.first]), float(tau[fitted.last])), p_value=fitted.p_value,
+        step=coarse_step(values, size * float(np.sqrt(variances[0]))))
 
 
 _CURVE = ('axis', 'unit', 'tau', 'deviation', 'low', 'high', 'model', 'slope', 'slope_sd', 'used',

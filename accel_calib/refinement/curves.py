@@ -161,8 +161,8 @@ def _of_part(whole: Linear, family: _Family, part: str, which: slice) -> Linear:
     """Return the problem with each mode of a carrier, or of its part, as a candidate."""
     curves = [replace(family.curve, modes=(mode,), part=part) for mode in family.curve.modes]
     ends = np.cumsum([0, *(len(each.entry.parameters) for each in curves)]).tolist()
-    blocks = tuple(Block(each, family.shape, slice(*ends[k:k + 2]), family.curve.entry, 0, k + 1.0)
-                   for k, each in enumerate(curves))
+    blocks = tuple(Block(each, family.shape, slice(*ends[k:k + 2]), family.curve.entry,
+                         tried=k + 1.0) for k, each in enumerate(curves))
     return replace(whole, every=np.vstack([whole.every[:-1][which], whole.residual]),
                    sizes=whole.sizes[which], blocks=blocks)
 
@@ -197,6 +197,8 @@ def _grown(problem: Linear, least_rss: float, least: float) -> Set:
             break
         scores = now.scores_beside
         scores[list(now.blocks)] = -np.inf
+        if not np.max(scores) > -np.inf:  # all are there, or none is outside of the others
+            break
         now = now.extended(int(np.argmax(scores)))
         if now.parameters > _LARGEST_SHARE * problem.dof:
             break

@@ -197,14 +197,6 @@ class Linear:
         return [(np.concatenate(numbers), np.concatenate(index), np.concatenate(products))
                 for numbers, index, products in (zip(*parts) for parts in found.values())]
 
-    def of_effect(self, effect: EffectKey) -> Iterator[Group]:
-        """Yield the blocks of an effect, which are consecutive, as `by_width`."""
-        numbers = self.numbers_of[effect]
-        for own, index, products in self.by_width:
-            first, end = np.searchsorted(own, (numbers[0], numbers[-1] + 1))
-            if first < end:
-                yield own[first:end], index[first:end], products[first:end]
-
     def score(self, rss: Any, parameters: Any, charge: Any) -> Any:
         """Return the score of sets from their RSS, number of values and other charges."""
         whole = self.worth + self.dof
@@ -273,7 +265,7 @@ class Set:
             root = turn / np.sqrt(np.maximum(size, 1e-12))  # against division by zero
             linear.without_poses[out] = root, root.T @ across
         root, across = linear.without_poses[out]
-        found = cls(linear, (), out, root, across, np.eye(len(across)))
+        found = cls(linear, (), out, root, across, mix=np.eye(len(across)))
         for block in blocks:
             found = found.extended(block)
         return found
@@ -290,7 +282,7 @@ class Set:
         mix[:rows, :count], mix[:rows, count:] = self.mix, -self.mix @ (along @ new)
         mix[rows:, count:] = new
         return Set(self.linear, (*self.blocks, block), self.out, self.root,
-                   np.concatenate([self.across, new.T @ left]), mix)
+                   np.concatenate([self.across, new.T @ left]), mix=mix)
 
     def instead(self, blocks: Iterable[int]) -> Set:
         """Return the set of other blocks, with the same poses left out."""
@@ -376,7 +368,13 @@ class Set:
         linear, across = self.linear, self.across
         along = linear.with_residual[:-1] - across[:, -1] @ across[:, :-1]
         gain, rank = np.zeros(len(linear.blocks)), np.zeros(len(linear.blocks))
-        groups = linear.by_width if effect is None else linear.of_effect(effect)
+        groups = linear.by_width
+        if effect is not None:  # its blocks are consecutive
+            first, last = linear.numbers_of[effect][[0, -1]]
+            ranges = [(group, slice(*np.searchsorted(group[0], (first, last + 1))))
+                      for group in groups]
+            groups = [(own[part], index[part], products[part])
+                      for (own, index, products), part in ranges if part.start < part.stop]
         for numbers, index, left in self.beside(groups):
             gain[numbers], rank[numbers] = _explained(left, along[index])
         return gain, rank

@@ -393,7 +393,8 @@ def base_of(poses: Poses, units: Units, name: str) -> Calibration:
         values = {'offset': vec_v / units.per_g}
     poses_g = in_g(poses, units)
     fit = judge(Model(values), poses_g)
-    return record_of(fit, poses, units, unit(poses_g.reading), 'ideal', 'ml', reason='ideal')
+    return record_of(fit, poses, units, unit(poses_g.reading), name='ideal', method='ml',
+                     reason='ideal')
 
 
 def with_changes(model: Model) -> tuple[Model, Floats]:

@@ -126,8 +126,9 @@ def search(poses_g: Poses, base: Model, also: tuple[OwnEffect, ...] = ()) -> Fou
     found = _search(poses_g, base, also)
     for again in (_with_own_noise, _with_scatter):
         found = again(found, poses_g, base, also)
-    found = replace(found, base=_weighted(found.base), final=_weighted(found.final))
-    return replace(found, outliers=everyone[found.outliers], clipped=clip, grid_g=grid,
+    base_state, final = _weighted(found.base), _weighted(found.final)
+    return replace(found, base=base_state, final=final, walk=_walk(final, found.near),
+                   outliers=everyone[found.outliers], clipped=clip, grid_g=grid,
                    with_clipped=whole, also=also)
 
 

@@ -97,7 +97,7 @@ def settle(state: State, poses_g: Poses, fixed: tuple[EffectKey, ...],
     trial = Trial(poses_g, fixed,
                   tuple(candidates((each for each in effects if each not in fixed), poses_g)),
                   Model({}) if of_ladder else left_open(state), walks=not of_ladder)
-    settled: tuple[tuple[EffectKey, ...], tuple[int, ...], Process | None] | None = None
+    settled: tuple[tuple[EffectKey, ...], tuple[int, ...], bool] | None = None
     begun = set(state.model.effects) <= set(fixed) and len(state.poses_g) == len(poses_g)
     refused: set[frozenset[EffectKey]] = set()
     linear = trial.near(state)
@@ -116,8 +116,7 @@ def settle(state: State, poses_g: Poses, fixed: tuple[EffectKey, ...],
             refused.add(frozenset(near.names))
             continue
         seen += asked, near.key
-        process = None if near.walk is None else near.walk.process
-        settled = near.names, near.chosen.out, process
+        settled = near.names, near.chosen.out, near.walk is not None
         # Were the equations linear enough, near the fit the same would be found.
         error, variance = abs(near.beside.rss - after.rss), after.rss / max(after.dof, 1)
         predicted = after.dof > 0 and error < _EXACT * max(variance, 1.0)
@@ -127,7 +126,8 @@ def settle(state: State, poses_g: Poses, fixed: tuple[EffectKey, ...],
             break
     if settled is None and len(state.poses_g) < len(poses_g):  # the set has all poses
         state = fit_without(state, poses_g, ())
-    return state, _at(linear, *(settled or ((), (), None)), trial), trial
+    names, out, walks = settled or ((), (), False)
+    return state, _at(linear, trial, names, out, walks=walks), trial
 
 
 def _best_fit(near: Near, state: State, trial: Trial) -> tuple[Near, State | None]:
@@ -175,15 +175,15 @@ def _best_near(linear: Linear, trial: Trial, refused: set[frozenset[EffectKey]])
     return best
 
 
-def _at(linear: Linear, names: tuple[EffectKey, ...], out: tuple[int, ...],
-        process: Process | None, trial: Trial) -> Near:
-    """Return a set near its fit; its effects are in the order of their contribution."""
-    blocks = [int(linear.numbers_of[name][-1]) for name in names]
+def _at(linear: Linear, trial: Trial, names: tuple[EffectKey, ...], out: tuple[int, ...], *,
+        walks: bool) -> Near:
+    """Return a set near its fit, perhaps with a walk; the largest contribution is first."""
+    blocks, process = [int(linear.numbers_of[name][-1]) for name in names], trial.process(linear)
     plain = Set.of(linear, blocks, out)
-    walk = None if process is None else walk_beside(plain, process)
+    walk = walk_beside(plain, process) if walks and process is not None else None
     whole = plain if walk is None else plain.within(walk.whitened(linear))
     blocks.sort(key=lambda block: -whole.without(block).rss)
-    return Near(whole.instead(blocks), linear, walk, trial.process(linear))
+    return Near(whole.instead(blocks), linear, walk, process)
 
 
 def fit_without(state: State, poses_g: Poses, out: tuple[int, ...]) -> State:
@@ -214,8 +214,8 @@ def make_sound(state: State, near: Near, trial: Trial, base: Model,
     fixed = tuple(name for name in state.model.values if name not in near.names)
     if {*fixed} != {*trial.fixed}:
         trial = replace(trial, fixed=fixed)
-        near = _at(trial.near(state), near.names, near.chosen.out,
-                   None if near.walk is None else near.process, trial)
+        near = _at(trial.near(state), trial, near.names, near.chosen.out,
+                   walks=near.walk is not None)
     while (doubt := _doubtful(state, near)) is not None:
         name, other = doubt
         exchanged = _exchanged(state, near, name, other, trial)
@@ -270,9 +270,8 @@ def _exchanged(state: State, near: Near, name: EffectKey, other: EffectKey, tria
     after = trial.fitted(chosen, state)
     if after is None:
         return None
-    walks = other == WANDER or near.walk is not None
-    new = _at(trial.near(after), chosen.effects, chosen.out, near.process if walks else None,
-              trial)
+    new = _at(trial.near(after), trial, chosen.effects, chosen.out,
+              walks=other == WANDER or near.walk is not None)
     if new.walk is not None and new.walk.likelihood_ratio < SIGNIFICANT:
         new = replace(new, walk=None, chosen=new.beside)
     return None if other == WANDER and new.walk is None else (after, new)

@@ -108,7 +108,7 @@ class Candidate:
         for shape in self.shapes:
             new = searched and not np.array_equal(shape, entry.usual)
             yield Block(self.effect, shape, slice(start, start + count), entry, int(new),
-                        (self.tried if new else 1.0) * alike)
+                        tried=(self.tried if new else 1.0) * alike)
             start += count
 
 
@@ -141,7 +141,7 @@ def linearised(fit: Fit, base: tuple[EffectKey, ...], tried: Iterable[Candidate]
     further = Model({name: values for name, values in model.values.items() if name not in base})
     residual = near.residual
     if further.values:
-        residual = residual + near.columns(further) @ _amplitudes(further)
+        residual = residual + near.columns(further) @ amplitudes_of(further)
     onto = orthonormal(np.hstack([near.columns(held)[:, held.fitted], near.columns(beside)]))
     tried = [each.beside(further.values.get(each.effect), fit.context) for each in tried]
     alike = Counter(kind_of(each.effect) for each in tried)
@@ -175,7 +175,7 @@ def left_open(state: State) -> Model:
     return linear_model(largest, np.eye(3), np.zeros(3))
 
 
-def _amplitudes(model: Model) -> Floats:
+def amplitudes_of(model: Model) -> Floats:
     """Return the (p,) values of a model with those of its shapes set to zero."""
     parts = [np.concatenate([values[:len(effect.parameters)], np.zeros(len(effect.shape))])
              for effect, values in zip(model.terms.effects, model.values.values(), strict=True)]
@@ -241,11 +241,6 @@ class State:
     def mg_of_poses(self, residual: Floats) -> Floats:
         """Return the (n,) residuals of poses from (m,) residuals of the equations [mg]."""
         return self.fit.equations.of_poses(residual) * MG
-
-    def contribution_mg(self, effect: EffectKey) -> Floats:
-        """Return the (n,) contributions of an effect of the model to the poses [mg]."""
-        alone = Model({effect: self.model.values[effect]})
-        return self.mg_of_poses(self.fit.equations.columns(alone) @ _amplitudes(alone))
 
     @property
     def floor_mg(self) -> float | None:

@@ -27,7 +27,8 @@ from .curves import LEAST, nearest_effects, probabilities
 from .linear import is_seen, Set
 from .search import Found
 from .settle import ladder_set
-from .state import candidates, fitted_state, is_noise, linearised, State, with_effect
+from .state import (
+    amplitudes_of, candidates, fitted_state, is_noise, linearised, State, with_effect)
 from ..calibration import ENOUGH
 from ..effects import (
     CATALOGUE, CHANGES, Effect, EffectKey, EFFECTS, EMPIRICAL, EmpiricalCurve, entry_of,
@@ -287,8 +288,12 @@ def _place(name: EffectKey, before: State, found: Found) -> Remark:
     """Return where an effect acts, by its values in the final model."""
     final, effect = found.final, entry_of(name)
     poses_g = final.poses_g
-    share_mg = (final.contribution_mg(name) if name in final.model.values else
-                final.mg_of_poses(final.residual - beside_walk(found)[0]))
+    if name in final.model.values:
+        alone = Model({name: final.model.values[name]})
+        share = final.fit.equations.columns(alone) @ amplitudes_of(alone)
+    else:
+        share = final.residual - beside_walk(found)[0]
+    share_mg = final.mg_of_poses(share)
     if isinstance(name, EmpiricalCurve):
         return _place_of_curve(name, before, share_mg)
     if 'instant' in effect.shape:

@@ -6,9 +6,9 @@ Figures, and the pages of results: self-contained HTML files.
 
 `page` has the page of one calibration, for `fit`, `calibrate`, `verify`, `refine` and `thermal`,
 with the figures of `residuals` and of `refinement`. `stability` has those of `noise`, `compare`
-and `history`, which are imported from there. `sheet` is the skeleton and the style of all pages
-and figures, with the style sheet and the script of the folder ``page``. matplotlib is imported
-only when a figure is drawn.
+and `history`, which are imported from there. They make what a page shows; its text stands in a
+template of the folder ``page``, which `sheet` fills. `sheet` also has the style of all figures.
+matplotlib is imported only when a figure is drawn.
 
 """
 

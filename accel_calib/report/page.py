@@ -21,23 +21,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-import shlex
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from .refinement import refusal_lines, search_sections
+from .refinement import search_values
 from .residuals import of_before_after, of_coverage, of_remainder, Residuals, residuals_of
 from .sheet import (
-    ACCENT, add_band, AFTER, BAND, block, Drawing, drawn, EDGE, figures, HEIGHT_INCHES, HINT,
-    how_to_read, INK, legend_below, listing, Mark, Marks, numbers, paragraph, rated_sheet,
-    scroll_table, section)
-from ..calibration import Calibration, Curve, mounting_figures, outlook
+    ACCENT, add_band, AFTER, BAND, Drawing, drawn, EDGE, HEIGHT_INCHES, INK, legend_below, Mark,
+    Marks, page)
+from ..calibration import Calibration, Curve, outlook
 from ..effects import (
     AXES, EffectKey, EmpiricalCurve, entry_of, REFERENCE_TEMPERATURE, value_unit, variable_words,
     with_vector)
 from ..findings import (
-    effect_figures, rate_refinement, request_words, residual_figures, verdict_words)
+    effect_figures, mounting_figures, rate_refinement, request_words, residual_figures,
+    verdict_words)
 from ..geometry import coverage
 from ..table import Floats
 from ..text import counted, milli, percentage, short, signed, with_minus
@@ -53,33 +52,12 @@ if TYPE_CHECKING:
 STORED = 'calibration.yaml'
 """Name of the file of the calibration in the lines that use it, if it is not known."""
 
-_HOW_TO_READ = (
-    'The residual is the RMS of |corrected| − 1 g over the poses, or of the vector error if the '
-    'orientation is known or shared. The noise floor is the expected residual of a correct model.',
-    'Of new poses (held out): each pose is predicted from a fit of other orientations.',
-    'Maps have equal areas and show each hemisphere from above its pole: the direction of up in '
-    'the sensor axes. A hollow square is a pose that was left out.')
-_HOW_TO_READ_THERMAL = (
-    'Each marker is the mean of a short stretch of the log, minus that of the board at the '
-    'reference temperature. One orientation shows only this change, not the offset itself.',
-    'An effect is added if parts of the log that were held out are predicted better with it.',
-    'Deviations include a slow wander of the offset, whose size is estimated from what the '
-    'effects leave. Bands are 95 % intervals.',
-    'The curve is that of a steady temperature. Warming and cooling differ by a lag, or by the '
-    'rate of the temperature.')
-_HOW_TO_READ_STEPS = (
-    'If the held-out residual decreases together with the residual, the effect is in the sensor '
-    'and not an artefact of the fit.',
-    'p is the probability that noise alone makes one of all candidates this good.',
-    'Rivals are effects that these poses cannot distinguish from the named effect.')
 _STEP = 1e-6
 _SAME = 1e-9
 _PAIRS = ((0, 1), (0, 2), (1, 2))
 
 _USUAL = {'x': '±50 mg', 'y': '±50 mg', 'z': '±80 mg', 'gain': '±3 %', 'angle': '±2 %, 1.1°'}
-_SOURCE = (
-    'Usual: the initial tolerances of a common part, the MPU-6050 (data sheet PS-MPU-6000A, '
-    'revision 3.4, section 6.2). For other effects: the typical size in the catalogue of effects.')
+"""Initial tolerances of a common part, the MPU-6050."""
 
 _SMALL = 1e-3
 """Typical size below which a value is given in millionths."""
@@ -122,32 +100,42 @@ def calibration_page(calibration: Calibration, rating: Rating, source: str, *,
                           and np.array_equal(own.vector, refined.vector)) else None
     what = 'Calibration' if checked is None else 'Check of the calibration'
     name = calibration.sensor or Path(source).name
-    title = f'{what} of {name}' if name else what
-    about = [source, f'sensor {calibration.sensor}' if calibration.sensor else '',
-             f'fitted {calibration.date}' if calibration.date else '']
-    searched = [] if refinement is None else [*search_sections(
-        refinement, residuals, used=used is not None)]
-    first = refinement is not None and bool(refinement.steps)
-    body = [_key_numbers(calibration, residuals, checked), *(searched if first else ()),
-            values_section(calibration),
-            _covered(calibration, residuals, plan=refinement is None and checked is None),
-            section('Before and after', figures([of_before_after(
-                residuals, (checked or calibration.quality).noise_floor_mg)], 'wide'),
-                kind='half'),
-            section('Warnings', listing((
-                *(() if used is None else refusal_lines(used)), *calibration.warnings))),
-            section('What to do', listing(() if used is None else used.advice)),
-            section('Poses left out', listing(
-                f'row {row}: {reason}' for row, reason in sorted(residuals.reasons.items()))),
-            section('What remains', figures(of_remainder(residuals))),
-            *(() if first else searched),
-            _pose_table(residuals, calibration),
-            '' if used is not None and used.refusal else section('Use it', *(
-                block(title, text) for title, text in snippets(calibration, stored))),
-            section('How the log was read', listing(notes)),
-            how_to_read(*_HOW_TO_READ, *(_HOW_TO_READ_STEPS if refinement else ()))]
-    return rated_sheet(title, about, rating, body,
-                       more='' if used is None else verdict_words(used))
+    covered, asked = coverage(residuals.force), None
+    if (refinement is None and checked is None and own.effects
+            and all(entry_of(each).linear for each in own.effects)):
+        asked = outlook(calibration, 'auto').next_pose
+    figures = [(each.label, f'{short(each.value)} {each.unit}')
+               for each in residual_figures(checked or calibration.quality)
+               if each.key != 'max_before_mg']
+    left_out = len(residuals.left_out)
+    refusal = '' if refinement is None or not refinement.refusal else (
+        'the refined calibration must not be used: '
+        f'{refinement.refusal[0]}; {refinement.refusal[1]}')
+    refused = refusal if used is not None else ''
+    head, rows = _pose_table(residuals, calibration)
+    sensor = calibration.sensor and f'sensor {calibration.sensor}'
+    return page(
+        'calibration', f'{what} of {name}' if name else what,
+        (source, sensor, _fitted(calibration)), rating,
+        more='' if used is None else verdict_words(used),
+        key_numbers=[*figures, ('poses used', str(len(residuals.poses_g))),
+                     *([('poses left out', str(left_out))] if left_out else ()),
+                     ('coverage', percentage(covered))],
+        searched={} if refinement is None else search_values(refinement, residuals),
+        used=used is not None, refusal=refusal, refused=bool(refused),
+        coverage=of_coverage(residuals, covered, None if asked is None else asked.direction),
+        next_pose='' if asked is None else (
+            f'Next pose: {request_words(asked)}.'.replace('..', '.')),
+        before_after=of_before_after(residuals, (checked or calibration.quality).noise_floor_mg),
+        warnings=[*filter(None, [refused]), *calibration.warnings],
+        advice=() if used is None else used.advice,
+        left_out=[f'row {row}: {reason}' for row, reason in sorted(residuals.reasons.items())],
+        remainder=of_remainder(residuals), head=head, poses=rows, notes=notes,
+        **_values(calibration, stored))
+
+
+def _fitted(calibration: Calibration) -> str:
+    return calibration.date and f'fitted {calibration.date}'
 
 
 def thermal_page(outcome: ThermalOutcome, sources: Sequence[str], *, stored: str = STORED,
@@ -167,26 +155,17 @@ def thermal_page(outcome: ThermalOutcome, sources: Sequence[str], *, stored: str
     """
     calibration, curve = outcome.calibration, outcome.curve
     names = ', '.join(Path(source).name or source for source in sources)
-    title = f'Offset over temperature of {calibration.sensor or names}'
     low, high = curve.range_c
-    body = [numbers([('range', f'{low:.1f} to {high:.1f} °C'), ('degree', str(curve.degree)),
+    return page(
+        'thermal', f'Offset over temperature of {calibration.sensor or names}',
+        (', '.join(sources), _fitted(calibration)), outcome.rating,
+        key_numbers=[('range', f'{low:.1f} to {high:.1f} °C'), ('degree', str(curve.degree)),
                      ('change', f'{short(curve.change_mg)} mg'),
                      ('residual', f'{short(curve.residual_mg)} mg'),
-                     ('uncertainty up to', f'{short(curve.band_mg)} mg')]),
-            section('Offset over temperature', figures(
-                _of_axis(curve, axis) for axis in range(3)), HINT),
-            values_section(calibration),
-            section('Held out', scroll_table(
-                'Error of held-out parts', ('effects', 'error of parts that were held out [mg]'),
-                [(name or 'none', short(error)) for name, error in curve.held_out_mg.items()]),
-                kind='half'),
-            section('Warnings', listing(calibration.warnings)),
-            section('Use it', *(block(name, text) for name, text in snippets(
-                calibration, stored))),
-            section('How the log was read', listing(notes)), how_to_read(*_HOW_TO_READ_THERMAL)]
-    return rated_sheet(title, [
-        ', '.join(sources), f'fitted {calibration.date}' if calibration.date else ''],
-        outcome.rating, body)
+                     ('uncertainty up to', f'{short(curve.band_mg)} mg')],
+        drawings=(_of_axis(curve, axis) for axis in range(3)),
+        held_out=[(name or 'none', short(error)) for name, error in curve.held_out_mg.items()],
+        notes=notes, **_values(calibration, stored))
 
 
 def _of_axis(curve: Curve, axis: int) -> Drawing:
@@ -216,47 +195,17 @@ def _of_axis(curve: Curve, axis: int) -> Drawing:
 
 # ----------------------------------------------------------------------------- the calibration
 
-def _key_numbers(calibration: Calibration, residuals: Residuals, checked: Verification | None
-                 ) -> str:
-    """Return the residual before and after, noise floor, number of poses and coverage."""
-    pairs = [(figure.label, f'{short(figure.value)} {figure.unit}')
-             for figure in residual_figures(checked or calibration.quality)
-             if figure.key != 'max_before_mg']
-    pairs.append(('poses used', str(len(residuals.poses_g))))
-    if len(residuals.left_out):
-        pairs.append(('poses left out', str(len(residuals.left_out))))
-    return numbers([*pairs, ('coverage', percentage(coverage(residuals.force)))])
-
-
-def _covered(calibration: Calibration, residuals: Residuals, *, plan: bool) -> str:
-    """Return the section about coverage; with the next pose if `plan` is set."""
-    direction, words = None, ''
-    linear = all(entry_of(name).linear for name in calibration.model.effects)
-    if plan and linear and calibration.model.effects:
-        asked = outlook(calibration, 'auto').next_pose
-        direction = asked.direction
-        words = f'Next pose: {request_words(asked)}.'.replace('..', '.')
-    return section('Coverage of the sphere', figures(
-        [of_coverage(residuals, coverage(residuals.force), direction)], 'wide'),
-        paragraph(words), HINT, kind='half')
-
-
-def values_section(calibration: Calibration) -> str:
-    """Return the section with the values of the calibration."""
+def _values(calibration: Calibration, stored: str) -> dict[str, Any]:
+    """Return what a page shows of the values of a calibration, and of its file `stored`."""
     rows = [*_linear_rows(calibration), *_effect_rows(calibration)]
     if calibration.is_levelled:
         found = mounting_figures(calibration.rotation, calibration.sensor)
         rows += [(f'mounting, {name}', with_minus(f'{np.degrees(found[name]):+.2f}°'), '')
                  for name in ('roll', 'pitch', 'yaw')]
-    if not rows:
-        return ''
-    thermal = any('temperature' in str(effect) for effect in calibration.model.effects)
-    note = f'The values hold at {REFERENCE_TEMPERATURE:g} °C.' if thermal else ''
-    words = f'{calibration.name}: {calibration.reason}'.replace('ideal: ideal', 'ideal')
-    return section('The calibration', paragraph(f'Model {words}'),
-                   scroll_table('Values of the calibration', ('', 'value ± deviation', 'usual'),
-                                rows, 'whole-cells values'),
-                   paragraph(note, 'soft'), paragraph(_SOURCE, 'soft'), kind='half tall')
+    return {'calibration': calibration, 'units': calibration.units, 'value_rows': rows,
+            'reference': REFERENCE_TEMPERATURE, 'stored': stored,
+            'matrix': calibration.rotation.T @ calibration.matrix,
+            'beyond': [each for each in calibration.model.effects if not entry_of(each).linear]}
 
 
 def axis_figures(vec: Floats, effects: tuple[EffectKey, ...]) -> Floats:
@@ -321,8 +270,9 @@ def _effect_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
                f'±{short(typical * factor)} {unit}' if 0.0 < typical < np.inf else '')
 
 
-def _pose_table(residuals: Residuals, calibration: Calibration) -> str:
-    """Return the section with the table of all poses, in order of rows."""
+def _pose_table(residuals: Residuals, calibration: Calibration
+                ) -> tuple[list[str], dict[int, tuple[str, ...]]]:
+    """Return the head of the table of all poses, and its lines by row, in their order."""
     kept, out = residuals.poses_g, residuals.left_out
     context: dict[str, list[str]] = {}
     if 'label' in kept:
@@ -333,59 +283,13 @@ def _pose_table(residuals: Residuals, calibration: Calibration) -> str:
         context['°C'] = [f'{each:.1f}' for each in kept['temperature']]
     sizes = ([milli(each, signed=residuals.signed) for each in values]
              for values in (residuals.before_mg, residuals.after_mg))
-    cells = zip(*context.values(), *_axis_cells(calibration.units.from_g(kept.reading)), *sizes,
-                strict=True)
-    rows = dict(zip(kept.row.tolist(), cells, strict=True))
-    rows |= {row: (*[''] * len(context), *reading, '', '', f'left out: {residuals.reasons[row]}')
-             for row, *reading in zip(out.row.tolist(), *_axis_cells(out.reading), strict=True)}
+    used, left = ([[f'{each:.6g}' for each in column] for column in reading.T]
+                  for reading in (calibration.units.from_g(kept.reading), out.reading))
+    cells = {row: (str(row), *line) for row, *line in zip(
+        kept.row.tolist(), *context.values(), *used, *sizes, strict=True)}
+    cells |= {row: (str(row), *[''] * len(context), *reading, '', '',
+                    f'left out: {residuals.reasons[row]}')
+              for row, *reading in zip(out.row.tolist(), *left, strict=True)}
     head = ['row', *context, *(f'{axis} [{calibration.units.symbol}]' for axis in AXES),
             'before [mg]', 'after [mg]', *(['note'] if residuals.reasons else [])]
-    return section('Poses', paragraph(
-        f'{counted(len(rows), "pose")}, with the residual before and after.'),
-        scroll_table('Poses', head, [(str(row), *rows[row]) for row in sorted(rows)],
-                     long=len(rows) > 25, poses=sorted(rows)))
-
-
-def _axis_cells(reading: Floats) -> list[list[str]]:
-    """Return (n, 3) readings as a column of cells for each axis."""
-    return [[f'{each:.6g}' for each in column] for column in reading.T]
-
-
-# ----------------------------------------------------------------------------- lines of code
-
-def snippets(calibration: Calibration, stored: str) -> tuple[tuple[str, str], ...]:
-    """Return titles and lines of code that use the calibration in the file `stored`."""
-    path = shlex.quote(stored) if Path(stored).is_absolute() else f'"$PWD"/{shlex.quote(stored)}'
-    ros = ('ros2 launch accel_calib calibrator.launch.py imu:=imu/data_raw \\\n'
-           f'  units:={calibration.units.name} calibration_file:={path}')
-    launch = ("Node(package='accel_calib', executable='calibrator',\n"
-              f"     parameters=[{{'calibration_file': {stored!r},\n"
-              f"                  'units': {calibration.units.name!r}}}],\n"
-              "     remappings=[('imu/data_raw', 'imu/data_raw')])")
-    known = ''.join(f', {key}={key}' for key in calibration.model.needs
-                    if key in ('time', 'temperature', 'supply_voltage', 'rate'))
-    symbol = calibration.units.symbol
-    units = 'native units -> g' if calibration.units.is_native else f'{symbol} -> {symbol}'
-    python = ('import accel_calib as ac\n\n'
-              f'calibration = ac.load({stored!r})\n'
-              f'force = calibration.apply(readings{known})  # (n, 3), {units}')
-    mat = calibration.rotation.T @ calibration.matrix
-    rows = ',\n'.join(f'  {{{_floats(row)}}}' for row in mat)
-    beyond = [str(name) for name in calibration.model.effects if not entry_of(name).linear]
-    note = '' if not beyond else (
-        f'/* Without {", ".join(beyond)}:\n'
-        '   accel-calib export --to c writes the terms that C can hold. */\n')
-    c99 = (f'{note}static const float B[3] = {{{_floats(calibration.offset)}}};\n'
-           f'static const float M[3][3] = {{\n{rows}}};\n\n'
-           'static void accel_correct(const float raw[3], float a[3])\n{\n'
-           '  for (int i = 0; i < 3; ++i)\n'
-           '    a[i] = M[i][0] * (raw[0] - B[0]) + M[i][1] * (raw[1] - B[1])\n'
-           '         + M[i][2] * (raw[2] - B[2]);\n}')
-    return (('ROS 2', ros), ('ROS 2 launch file', launch), ('Python', python), ('C', c99),
-            ('C header, Arduino, PX4, ArduPilot and others',
-             f'accel-calib export {shlex.quote(stored)} --to c -o calibration.h'))
-
-
-def _floats(numbers: Floats) -> str:
-    """Return float constants of C."""
-    return ', '.join(f'{value:.8e}f' for value in numbers)
+    return head, dict(sorted(cells.items()))

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from typing import Any, cast, TYPE_CHECKING
 
@@ -24,8 +23,8 @@ from .residuals import (
     against, are_spread, limit_mg, of_remainder, Residuals, residuals_of_refinement, sphere_map,
     variable_of, variables_of, with_thermal)
 from .sheet import (
-    ACCENT, add_band, AFTER, AXIS_COLOURS, BAND, BEFORE, code, Drawing, drawn, FAINT, figures,
-    HEIGHT_INCHES, INK, PAPER, paragraph, save, scroll_table, section)
+    ACCENT, add_band, AFTER, AXIS_COLOURS, BAND, BEFORE, Drawing, drawn, FAINT, HEIGHT_INCHES, INK,
+    PAPER, save)
 from ..effects import AXES, EMPIRICAL, EmpiricalCurve, entry_of, parameter_names, variable_words
 from ..findings import base_words, chance_words, odds_words, value_words, verdict_words
 from ..refinement import named_entries
@@ -38,70 +37,36 @@ if TYPE_CHECKING:
     from ..refinement import Refinement, Step
 
 
-def search_sections(result: Refinement, residuals: Residuals, *, used: bool) -> Iterator[str]:
+def search_values(result: Refinement, residuals: Residuals) -> dict[str, Any]:
     """
-    Yield the sections about a search for effects.
+    Return what a page shows of a search for effects.
 
     What the refinement leaves is shown if the calibration of the page leaves something else. They
     differ for effects that a calibration cannot correct, such as a slow change of the offset, and
     for poses of known or shared orientation, whose residual is the vector error.
 
     """
-    if result.steps:
-        note = '' if used else ' '.join((
-            'The calibration of this page does not contain these effects.',
-            *refusal_lines(result)))
-        yield section('Effects that were found', paragraph(note), paragraph(verdict_words(result)),
-                      figures([ladder(result)], 'wide'), kind='half')
-        yield section('Steps', scroll_table(
-            'Steps', ('', 'effect', 'residual [mg]', 'held out [mg]', 'chance'),
-            [(str(number), step.effect,
-              f'{short(step.gap_before_mg)} → {short(step.gap_after_mg)}',
-              f'{short(step.held_out_before_mg)} → {short(step.held_out_after_mg)}',
-              chance_words(step.p_value)) for number, step in enumerate(result.steps, 1)]),
-            kind='half')
-    for number, step in enumerate(result.steps, 1):
-        yield _step(result, number, step)
-    left = residuals_of_refinement(result)
-    if not np.isclose(left.rms_mg, residuals.rms_mg, rtol=0.01):
-        yield section('What remains after the refinement', figures(of_remainder(left, 'refined')))
-    entries = named_entries(result.also)
-    rows = [(f'{entries[name].words} ({name})', needs) for name, needs in result.not_testable]
-    yield section('What these data cannot show', scroll_table(
-        'Effects that cannot be tested', ('effect', 'to see it, record'), rows, ''))
-
-
-def _step(result: Refinement, number: int, step: Step) -> str:
-    """Return the section of a step, from 1: where it was found, and what it changes."""
-    effect = entry_of(step.name)
-    rivals = ', '.join(f'{code(name)} ({odds})' for name, odds in odds_words(step).items())
-    story = (f'{code(step.effect)} ({escape(effect.term)}). Found '
-             f'{escape(step.where)}. With this effect the residual decreases from '
-             f'{short(step.gap_before_mg)} to <strong>{short(step.gap_after_mg)} mg</strong>, '
-             f'and the held-out residual from {short(step.held_out_before_mg)} to '
-             f'{short(step.held_out_after_mg)} mg; '
-             f'<span class="whole">{escape(chance_words(step.p_value))}</span>.'
-             + (f' These poses cannot distinguish it from {rivals}.' if rivals else ''))
-    shown = value_words(step)
-    table = paragraph(step.formula) if step.formula else scroll_table(
-        f'Values of step {number}', [name for name, _ in shown],
-        [[value for _, value in shown]] if shown else [])
-    curve = figures([of_curve(result, number - 1)], 'wide') if _is_drawn(step) else ''
-    return section(f'{number}. {effect.words.capitalize()}', f'<p>{story}</p>\n', table,
-                   figures(of_step(result, number - 1)), curve)
+    left, entries = residuals_of_refinement(result), named_entries(result.also)
+    same = np.isclose(left.rms_mg, residuals.rms_mg, rtol=0.01)
+    return {
+        'verdict': verdict_words(result), 'ladder': ladder(result) if result.steps else None,
+        'rows': [(str(number), step.effect,
+                  f'{short(step.gap_before_mg)} → {short(step.gap_after_mg)}',
+                  f'{short(step.held_out_before_mg)} → {short(step.held_out_after_mg)}',
+                  chance_words(step.p_value)) for number, step in enumerate(result.steps, 1)],
+        'steps': [{'step': step, 'effect': entry_of(step.name), 'rivals': odds_words(step),
+                    'chance': chance_words(step.p_value),
+                   'values': value_words(step), 'drawings': of_step(result, k),
+                   'curve': [of_curve(result, k)] if _is_drawn(step) else []}
+                  for k, step in enumerate(result.steps)],
+        'left': None if same else of_remainder(left, 'refined'),
+        'not_testable': [(f'{entries[name].words} ({name})', needs)
+                         for name, needs in result.not_testable]}
 
 
 def _is_drawn(step: Step) -> bool:
     """Return whether a step is a curve over one variable; one over directions is on the sphere."""
     return step.effect == EMPIRICAL and step.variable != 'direction'
-
-
-def refusal_lines(result: Refinement) -> tuple[str, ...]:
-    """Return the reason why the calibration must not be used, if there is one."""
-    if not result.refusal:
-        return ()
-    found, advice = result.refusal
-    return (f'the refined calibration must not be used: {found}; {advice}',)
 
 
 # ----------------------------------------------------------------------------- figures

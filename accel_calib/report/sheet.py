@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-What all pages have in common: one self-contained HTML file, its building blocks, and its figures.
+What all pages have in common: one self-contained HTML file, and its figures.
 
-The folder ``page`` has the style sheet and the script, which each page contains.
+The folder ``page`` has the templates of the pages, which share the frame ``sheet.html`` and the
+parts of ``parts.html``, and the style sheet and the script, which each page contains.
 
 **Figures.** A figure has half the width of the page: a phone shows one column, a desktop two
 columns, with the same text size. The colours are from Okabe and Ito's palette and from RdBu, which
@@ -18,16 +19,16 @@ is drawn.
 from __future__ import annotations
 
 from base64 import b64encode
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from hashlib import sha256
-from html import escape
 from importlib.resources import files
 from importlib.util import find_spec
 import io
 from pathlib import Path
+import shlex
 from typing import Any, TYPE_CHECKING
 from xml.etree import ElementTree
 
@@ -36,15 +37,13 @@ from ..disk import write_atomically
 from ..errors import InputError
 from ..statistics import NORMAL_95
 from ..table import Floats
-from ..text import table
+from ..text import counted, short, table
 
 if TYPE_CHECKING:
+    from jinja2 import Environment
     from matplotlib.figure import Figure
 
     from ..findings import Rating
-
-HINT = ('<p class="soft hint">Point at a marker to see its values, or select a figure with the '
-        'tab key and move with the arrow keys.</p>\n')
 
 
 def write_page(path: Path, text: str) -> None:
@@ -52,49 +51,49 @@ def write_page(path: Path, text: str) -> None:
     write_atomically(path, lambda file: file.write(text))
 
 
-def rated_sheet(title: str, about: Iterable[str], rating: Rating, body: Iterable[str], *,
-                more: str = '', heading: str = '', script: bool = True) -> str:
+def page(name: str, title: str, about: Iterable[str], rating: Rating, *, script: bool = True,
+         **values: Any) -> str:
     """
     Return a page as HTML, which begins with its heading and its verdict.
 
     Parameters
     ----------
+    name : str
+        Template of the page, without suffix.
     title : str
         Title; the browser shows the verdict before it.
     about : iterable of str
         Where the content comes from; empty parts are left out.
     rating : Rating
         The verdict.
-    body : iterable of str
-        The sections.
-    more : str
-        Text of the verdict, beside its reason.
-    heading : str
-        Heading, if it is not the title.
     script : bool
         Whether figures show the texts of their markers themselves, not the browser.
+    **values
+        What the template shows; `heading` is the heading if it is not the title, and `more` a text
+        of the verdict, beside its reason.
 
     """
-    line = ' · '.join(part for part in (*about, f'accel_calib {__version__}') if part)
-    return sheet(f'{rating.name.capitalize()}: {title[0].lower()}{title[1:]}', (
-        f'<h1>{escape(heading or title)}</h1>\n<p class="about">{escape(line)}</p>\n'
-        f'<div class="verdict {escape(rating.name)}" role="note">\n'
-        f'<p><strong>{escape(rating.name)}</strong> '
-        f'{escape(rating.figures.replace("->", "→"))}</p>\n'
-        f'{paragraph(_sentence(rating.reason))}{paragraph(more)}'
-        f'<p><b>Next:</b> {escape(_sentence(rating.next.text))}</p>\n</div>\n',
-        *body), script=script)
+    about = filter(None, (*about, f'accel_calib {__version__}'))
+    return _templates().get_template(f'{name}.html').render({
+        'heading': title, 'more': '', 'title': title, 'about': about, 'rating': rating,
+        'script': script, 'policy': policy(script=script), **values})
 
 
-def sheet(title: str, body: Iterable[str], *, script: bool = True) -> str:
-    """Return a page with this title and these parts, as HTML; the title is escaped."""
-    live = ('<div id="tip" role="status" aria-live="polite"></div>\n'
-            f'<script>{_part_of_page("script.js")}</script>\n') if script else ''
-    return ('<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-            f'<meta http-equiv="Content-Security-Policy" content="{policy(script=script)}">\n'
-            '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-            f'<title>{escape(title)}</title>\n<style>{_part_of_page("style.css")}</style>\n</head>'
-            f'\n<body>\n<main>\n{"".join(body)}</main>\n{live}</body>\n</html>\n')
+@cache
+def _templates() -> Environment:
+    """Return the templates of all pages, which escape all text."""
+    # The import is here because it would slow down commands that write no page.
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+    from markupsafe import Markup
+
+    made = Environment(loader=PackageLoader('accel_calib.report', 'page'), autoescape=True,
+                       undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    made.filters |= {'counted': counted, 'quoted': shlex.quote, 'repr': repr, 'short': short,
+                     'sentence': lambda text: text and f'{text[0].upper()}{text[1:].rstrip(".")}.',
+                     'svg': lambda drawing: Markup(_inline_svg(drawing))}
+    made.globals |= {'file': lambda name: Markup(_part_of_page(name)),
+                     'table': lambda *about: Markup(table(*about))}
+    return made
 
 
 @cache
@@ -106,72 +105,10 @@ def policy(*, script: bool = True) -> str:
             "base-uri 'none'; form-action 'none'")
 
 
-@cache
 def _part_of_page(name: str) -> str:
     """Return the style sheet or the script of all pages, without its licence."""
     text = (files(__package__) / 'page' / name).read_text(encoding='utf-8')
     return text.partition('\n\n')[2]
-
-
-def _sentence(text: str) -> str:
-    """Return text with a capital letter and a full stop."""
-    return text and f'{text[0].upper()}{text[1:].rstrip(".")}.'
-
-
-def section(title: str, *parts: str, kind: str = '') -> str:
-    """Return a section with its heading; nothing if all parts are empty."""
-    body = ''.join(parts)
-    opening = f'<section class="{kind}">' if kind else '<section>'
-    return f'{opening}\n<h2>{escape(title)}</h2>\n{body}</section>\n' if body else ''
-
-
-def how_to_read(*lines: str) -> str:
-    """Return the section that explains the page."""
-    return section('How to read this', listing(lines), kind='reading')
-
-
-def numbers(pairs: Iterable[tuple[str, str]]) -> str:
-    """Return names and values as a row of large numbers."""
-    parts = [f'<div><dt>{escape(name)}</dt><dd class="whole">{escape(value)}</dd></div>'
-             for name, value in pairs]
-    return f'<dl class="numbers">{"".join(parts)}</dl>\n'
-
-
-def scroll_table(name: str, head: Iterable[str], rows: Sequence[Iterable[str]],
-                 kind: str = 'whole-cells', *, long: bool = False, poses: Sequence[int] = ()
-                 ) -> str:
-    """
-    Return a table that scrolls inside of the page; nothing without rows.
-
-    `name` is for those who do not see the table, and `kind` its CSS class. A `long` one also
-    scrolls up and down. `poses` is the row of the pose of each line, which a marker highlights.
-
-    """
-    return (f'<div class="scroll{" long" if long else ""}" tabindex="0" role="region" '
-            f'aria-label="{escape(name)}">{table(head, rows, kind, poses)}</div>\n'
-            ) if rows else ''
-
-
-def listing(lines: Iterable[str]) -> str:
-    """Return lines as a list; nothing without lines."""
-    items = ''.join(f'<li>{escape(line)}</li>\n' for line in lines)
-    return f'<ul>\n{items}</ul>\n' if items else ''
-
-
-def paragraph(text: str, kind: str = '') -> str:
-    """Return a paragraph of the CSS class `kind`; nothing without text."""
-    opening = f'<p class="{kind}">' if kind else '<p>'
-    return f'{opening}{escape(text)}</p>\n' if text else ''
-
-
-def code(name: str) -> str:
-    """Return a name as code."""
-    return f'<code>{escape(name)}</code>'
-
-
-def block(title: str, text: str) -> str:
-    """Return lines of code under a heading."""
-    return f'<h3>{escape(title)}</h3>\n<pre tabindex="0"><code>{escape(text)}</code></pre>\n'
 
 
 # ----------------------------------------------------------------------------- drawing figures
@@ -247,6 +184,11 @@ class Drawing:
     figure: Figure
     hover: Mapping[str, Marks] = field(default_factory=dict)
 
+    @property
+    def is_live(self) -> bool:
+        """Whether it has markers with a text."""
+        return any(self.hover.values())
+
 
 def has_matplotlib() -> bool:
     """Return whether figures can be drawn."""
@@ -320,17 +262,6 @@ def save(drawing: Drawing, path: Path) -> None:
 
 
 # ----------------------------------------------------------------------------- figures on a page
-
-def figures(drawings: Iterable[Drawing], kind: str = 'pair', *, script: bool = True) -> str:
-    """Return figures, in a grid of the CSS class `kind`: ``wide`` or ``pair``."""
-    parts = []
-    for drawing in drawings:
-        label = escape(f'{drawing.title}. Arrow keys move from marker to marker.')
-        live = (f' class="live" tabindex="0" role="group" aria-label="{label}"'
-                if script and any(drawing.hover.values()) else '')
-        parts.append(f'<figure{live}>{_inline_svg(drawing)}</figure>')
-    return f'<div class="figures {kind}">\n' + '\n'.join(parts) + '\n</div>\n' if parts else ''
-
 
 def _inline_svg(drawing: Drawing) -> str:
     """

@@ -22,12 +22,11 @@ import numpy as np
 
 from .sheet import (
     ACCENT, add_band, add_bar, AFTER, AXIS_COLOURS, BAND, BEFORE, Drawing, drawn, EDGE, FAINT,
-    figures, HEIGHT_INCHES, HINT, how_to_read, INK, legend_below, listing, Mark, Marks, numbers,
-    PAPER, paragraph, rated_sheet, scroll_table, section, THERMAL, THIRD)
+    HEIGHT_INCHES, INK, legend_below, Mark, Marks, page, PAPER, THERMAL, THIRD)
 from ..comparison import Comparison, History, Parameter
 from ..findings import (
     change_in_words, CROSS, GAINS, in_words, OFFSETS, rate_comparison, rate_noise, scale_of)
-from ..noise import AxisNoise, duration, FIGURES, Kind, NoiseFigures, shown_unit, TYPICAL, WORDS
+from ..noise import FIGURES, AxisNoise, duration, Kind, NoiseFigures, shown_unit, TYPICAL, WORDS
 from ..statistics import rms
 from ..table import Floats
 from ..text import power_of_ten, short, with_minus, with_sd
@@ -45,16 +44,6 @@ _KALIBR: dict[tuple[Kind, str], str] = {
     ('gyroscope', 'noise_density'): 'rad/s/√Hz', ('gyroscope', 'random_walk'): 'rad/s²/√Hz'}
 """Units of Kalibr's imu.yaml."""
 
-_HOW_TO_READ_NOISE = (
-    'The Allan deviation at τ is the typical change between two successive averages over τ, '
-    'divided by √2.',
-    'White noise falls with slope −1/2; its density N is the value of that line at τ = 1 s. The '
-    'flat part is 0.664 times the bias instability B. A random walk K rises with slope +1/2, '
-    'and is K/√3 on that line at τ = 1 s (IEEE Std 952 and 1293).',
-    'Data sheets state the noise density for positive frequencies alone, which is √2 N. Kalibr '
-    'and VINS use N.',
-    'Bands are 95 % intervals. At long τ few averages remain, and the bands are wide.')
-
 
 def noise_page(found: NoiseFigures, source: str) -> str:
     """Return the page of the noise of the recording in the file `source`, as HTML."""
@@ -63,14 +52,10 @@ def noise_page(found: NoiseFigures, source: str) -> str:
     if found.temperature is not None:
         low, high = found.temperature
         pairs.append(('temperature', f'{low:.1f} to {high:.1f} °C'))
-    body = [numbers(pairs), figures(_allan(found.of(kind)) for kind in found.kinds),
-            *(_table(found, kind) for kind in found.kinds),
-            section('Notes', listing(found.notes)),
-            section('Not seen', listing(need_lines(found))),
-            section('For Kalibr and VINS', listing(kalibr_lines(found))),
-            how_to_read(*_HOW_TO_READ_NOISE)]
-    return rated_sheet(f'Noise of {Path(source).name or source}', [source], rate_noise(found),
-                       body)
+    return page('noise', f'Noise of {Path(source).name or source}', [source], rate_noise(found),
+                key_numbers=pairs, drawings=(_allan(found.of(kind)) for kind in found.kinds),
+                tables=[_table(found, kind) for kind in found.kinds], notes=found.notes,
+                needs=need_lines(found), kalibr=kalibr_lines(found))
 
 
 def _allan(axes: Sequence[AxisNoise]) -> Drawing:
@@ -101,18 +86,13 @@ def _allan(axes: Sequence[AxisNoise]) -> Drawing:
                    figure, hover)
 
 
-def _table(found: NoiseFigures, kind: Kind) -> str:
-    """Return the table of the figures of one sensor."""
+def _table(found: NoiseFigures, kind: Kind) -> tuple[Kind, list[str], list[list[str]]]:
+    """Return the kind of a sensor, and the head and the rows of the table of its figures."""
     axes = found.of(kind)
     rows = [[f'{label} [{unit}]', *cells] for label, unit, cells in figure_rows(axes)]
     rows.append(['from τ', *(f'{duration(axis.used[0])} to {duration(axis.used[1])}'
                              for axis in axes), ''])
-    head = ['', *(axis.axis for axis in axes), 'typical']
-    return section(kind.capitalize(), scroll_table(f'Noise of the {kind}', head, rows),
-                   paragraph('± is one standard deviation; < is the upper limit with 95 % '
-                             'probability of a figure that the curve does not show. Typical: '
-                             'common parts, from the data sheets of ICM-42688-P and MPU-6050, '
-                             'divided by √2; data sheets do not state the other figures.', 'soft'))
+    return kind, ['', *(axis.axis for axis in axes), 'typical'], rows
 
 
 def figure_rows(axes: Sequence[AxisNoise]) -> Iterator[tuple[str, str, list[str]]]:
@@ -270,15 +250,6 @@ def label_dates(panel: Any, at: Floats, label: str, *, dated: bool) -> None:
     panel.set_xlabel(label)
 
 
-_HOW_TO_READ = (
-    'The parameters do not depend on the axes of the model, and are at the same temperature for '
-    'all calibrations, if their models contain its effect.',
-    'The test uses all parameters at once and each one alone. p is the probability of differences '
-    'at least this large, if the sensor has not changed.',
-    'RMS and largest: difference of |force| from the mean of the other calibrations, over all '
-    'directions.')
-
-
 def comparison_page(comparison: Comparison, rating: Rating, sources: Sequence[Path],
                     calibrations: Sequence[Calibration]) -> str:
     """Return the page of a comparison of the calibrations in the files `sources`, as HTML."""
@@ -287,14 +258,11 @@ def comparison_page(comparison: Comparison, rating: Rating, sources: Sequence[Pa
     runs = [(label, each.date[:10], each.name, short(run.rms_mg), short(run.expected_mg),
              short(run.largest_mg), f'{run.p_value:.2g}')
             for label, each, run in zip(labels, calibrations, comparison.runs, strict=True)]
-    body = [section('Calibrations', scroll_table('Calibrations', (
-                'run', 'date', 'model', 'RMS [mg]', 'expected [mg]', 'largest [mg]', 'p'), runs)),
-            section('Parameters', figures(of_parameters(comparison, labels)), HINT,
-                    scroll_table('Parameters', ('', 'mean', 'spread', 'stated', 'ratio'),
-                                 list(parameter_rows(comparison)))),
-            section('Notes', listing(filter(None, (*comparison.notes, comparison.tilt_words)))),
-            how_to_read(*_HOW_TO_READ)]
-    return rated_sheet(title, map(str, sources), rating, body)
+    return page('comparison', title, map(str, sources), rating, history=False, runs=runs, head=(
+                    'run', 'date', 'model', 'RMS [mg]', 'expected [mg]', 'largest [mg]', 'p'),
+                drawings=of_parameters(comparison, labels),
+                parameters=list(parameter_rows(comparison)),
+                notes=filter(None, (*comparison.notes, comparison.tilt_words)))
 
 
 def _of_sensor(calibrations: Sequence[Calibration]) -> str:
@@ -328,13 +296,9 @@ def history_page(history: History, sources: Sequence[Path],
                         short(moment.residual_mg), *(
                             in_words(each.name, each.values[k], each.stated_sd[k])
                             for each in history.parameters)))
-    body = [section('Over the dates', figures(of_history(history)), HINT),
-            section('Changes', scroll_table('Changes', (
-                'from', 'to', 'verdict', 'p', 'largest change', 'RMS [mg]'), changes)),
-            section('Calibrations', scroll_table('Calibrations', (
-                '', 'date', 'file', 'model', '°C', 'residual [mg]',
-                *(spoken(each.name) for each in history.parameters)), moments)),
-            section('Notes', listing(history.notes)), how_to_read(*_HOW_TO_READ)]
-    return rated_sheet(f'History of {len(calibrations)} calibrations{_of_sensor(calibrations)}',
-                       [f'{history.labels[0]} to {history.labels[-1]}'],
-                       rate_comparison(history.whole), body)
+    return page('comparison',
+                f'History of {len(calibrations)} calibrations{_of_sensor(calibrations)}',
+                [f'{history.labels[0]} to {history.labels[-1]}'], rate_comparison(history.whole),
+                history=True, drawings=of_history(history), changes=changes, runs=moments, head=(
+                    '', 'date', 'file', 'model', '°C', 'residual [mg]',
+                    *(spoken(each.name) for each in history.parameters)), notes=history.notes)

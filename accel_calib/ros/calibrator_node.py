@@ -17,9 +17,8 @@ EventsExecutor.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import replace
-from functools import partial
+from collections.abc import Callable
+from functools import partial, partialmethod
 from queue import SimpleQueue
 from time import monotonic
 from traceback import format_exc
@@ -44,19 +43,20 @@ from .declare import (
 from .stream import ContextTopics, Stream
 from ..calibration import NextPose
 from ..errors import AccelCalibError
+from ..finding import LEVELS
 from ..findings import request_words
 from ..live import check_installed
 from ..messages.correction import output_frame
 from ..session import (
-    CalibratorSettings, CallSoon, checks, COMMANDS, Condition, context_topics, diagnostics, Event,
-    figures, Level, Log, Mounting, next_action, Result, Session, ShowPoses, state, Still,
+    figures, CalibratorSettings, CallSoon, Check, checks, COMMANDS, conditions, context_topics,
+    diagnostics, enable, Event, Log, Mounting, progress, Result, run, Session, ShowPoses, Still,
     Surroundings, Task, Worker)
 from ..table import Floats
 
 if TYPE_CHECKING:
     from rclpy.lifecycle import LifecycleState
 
-    from ..live.host import Exchange
+    from ..live.exchange import Exchange
     from ..live.server import PageServer
 
 _PROGRESS_EVERY = 0.25
@@ -68,6 +68,7 @@ _ASKED_FOR = (1.0, 0.6, 0.0, 1.0)
 _WORDS = (1.0, 1.0, 1.0, 1.0)
 _SPHERE = (0.6, 0.6, 0.7, 0.15)
 _NUMBER_AT, _WORDS_AT = 1.12, 1.35
+_TEXT = Marker.TEXT_VIEW_FACING
 _CENTRE = np.zeros(3)
 _ABOVE = np.array([0.0, 0.0, _WORDS_AT])
 _DOT, _LETTER, _SHAFT = 0.1, 0.1, 0.04
@@ -83,34 +84,27 @@ def pose_markers(directions: Floats, asked: NextPose, frame_id: str) -> MarkerAr
     markers = [Marker(action=Marker.DELETEALL), _marker('sphere', 0, Marker.SPHERE, _SPHERE, 2.0)]
     for k, direction in enumerate(directions):
         markers += [_marker('poses', k, Marker.SPHERE, _CAPTURED, _DOT, direction),
-                    _text('numbers', k, str(k + 1), direction * _NUMBER_AT)]
-    if asked.direction is None:
-        markers.append(_text('next', 1, request_words(asked), _ABOVE))
-    else:
-        arrow = _marker('next', 0, Marker.ARROW, _ASKED_FOR, _SHAFT)
-        arrow.points = [Point(), _point(asked.direction)]
-        markers += [arrow, _text('next', 1, request_words(asked),
-                                 asked.direction * _WORDS_AT)]
+                    _marker('numbers', k, _TEXT, _WORDS, _LETTER, direction * _NUMBER_AT,
+                            text=str(k + 1))]
+    words_at = _ABOVE
+    if asked.direction is not None:
+        words_at = asked.direction * _WORDS_AT
+        markers.append(_marker('next', 0, Marker.ARROW, _ASKED_FOR, _SHAFT))
+        markers[-1].points = [Point(), _point(asked.direction)]
+        markers[-1].scale.y = markers[-1].scale.z = 2.0 * _SHAFT
+    markers.append(_marker('next', 1, _TEXT, _WORDS, _LETTER, words_at, text=request_words(asked)))
     for marker in markers:
         marker.header.frame_id = frame_id
     return MarkerArray(markers=markers)
 
 
 def _marker(namespace: str, number: int, kind: int, color: tuple[float, ...], size: float,
-            at: Floats = _CENTRE) -> Marker:
+            at: Floats = _CENTRE, text: str = '') -> Marker:
     red, green, blue, alpha = color
-    marker = Marker(ns=namespace, id=number, type=kind, action=Marker.ADD,
+    marker = Marker(ns=namespace, id=number, type=kind, action=Marker.ADD, text=text,
                     color=ColorRGBA(r=red, g=green, b=blue, a=alpha))
     marker.scale.x = marker.scale.y = marker.scale.z = size
-    if kind == Marker.ARROW:
-        marker.scale.y = marker.scale.z = 2.0 * size
     marker.pose.position, marker.pose.orientation.w = _point(at), 1.0
-    return marker
-
-
-def _text(namespace: str, number: int, text: str, at: Floats) -> Marker:
-    marker = _marker(namespace, number, Marker.TEXT_VIEW_FACING, _WORDS, _LETTER, at)
-    marker.text = text
     return marker
 
 
@@ -128,7 +122,7 @@ class Calibrator:
     """
 
     def __init__(self, node: Node) -> None:
-        self._node = node
+        self._node, self._steady = node, Clock(clock_type=ClockType.STEADY_TIME)
         self._name = node.get_fully_qualified_name().lstrip('/')
         self._topic = node.resolve_topic_name('imu/data_raw')
         settings = declared(node, CalibratorSettings)
@@ -140,7 +134,7 @@ class Calibrator:
         self._followed = follow(node, lambda: self.session.state.settings,
                                 self.session.set_settings)
         self._call_soon = in_executor(node)
-        self._worker = Worker(self.session, self._call_soon, self._show,
+        self._worker = Worker(self.session.events, self._call_soon, self._show,
                               lambda: self.stream.flush())
         self._progress_at = 0.0
         self._still = node.create_publisher(Bool, '~/still', LATCHED)
@@ -149,23 +143,17 @@ class Calibrator:
         self._result = node.create_publisher(String, '~/result', LATCHED)
         self._diagnostics = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._overrides = QoSOverridingOptions.with_default_policies()
-        outputs = [self._published(Imu, 'imu/data_calibrated'), self._published(Imu, '~/preview'),
-                   self._published(Vector3Stamped, '~/linear_acceleration')]
-        self.stream = Stream(self.session, outputs, self._on_samples)
+        self.stream = Stream(self.session, [
+            node.create_publisher(kind, topic, STREAM, qos_overriding_options=self._overrides)
+            for kind, topic in ((Imu, 'imu/data_calibrated'), (Imu, '~/preview'),
+                                (Vector3Stamped, '~/linear_acceleration'))], self._on_samples)
         self._page: Exchange | None = None
         self._server: PageServer | None = None
         self._still.publish(Bool(data=False))
-        self._serve()
-
-    def _published(self, kind: Any, topic: str) -> Any:
-        return self._node.create_publisher(kind, topic, STREAM,
-                                           qos_overriding_options=self._overrides)
-
-    def _serve(self) -> None:
         for name in COMMANDS:
-            serve(self._node, name, partial(self.session.commands.run, name), self._worker)
-        self._node.create_service(SetBool, '~/enable', self._on_enable, qos_profile=CALLS)
-        self._node.create_service(SelfTest, '~/self_test', self._on_self_test, qos_profile=CALLS)
+            serve(node, name, partial(run, self.session, name), self._worker)
+        node.create_service(SetBool, '~/enable', self._on_enable, qos_profile=CALLS)
+        node.create_service(SelfTest, '~/self_test', self._on_self_test, qos_profile=CALLS)
 
     def start(self) -> None:
         """Start; to be called when the node has an executor."""
@@ -179,25 +167,27 @@ class Calibrator:
                 Temperature, 'temperature',
                 lambda message: around.take('temperature', message.temperature),
                 SENSOR, qos_overriding_options=overrides)
-        node.create_timer(1.0, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        node.create_timer(1.0, self._on_tick, clock=self._steady)
         if self.session.state.settings.web_port:
             try:
-                self._serve_page(self.session.state.settings)
+                self._serve_page()
             except AccelCalibError as error:
                 self._worker.log('error', str(error))
 
-    def _serve_page(self, settings: CalibratorSettings) -> None:
+    def _serve_page(self) -> None:
         """Serve the live page; its server has its own thread."""
         check_installed()
-        from ..live.host import Exchange
-        from ..live.server import PageServer, PERIOD
-        page = Exchange(self.session, self._worker, self._call_soon)
+        from ..live.exchange import Exchange
+        from ..live.server import PageServer
+        from ..live.viewer import PERIOD
+        page, settings = Exchange(self.session, self._worker, self._call_soon), (
+            self.session.state.settings)
         server = PageServer(page, settings.web_host, settings.web_port)
         server.start()
         self._page, self._server = page, server
         self._worker.log('info', server.announce())
         self._node.create_timer(PERIOD, lambda: page.show_progress(self.stream.newest),
-                                clock=Clock(clock_type=ClockType.STEADY_TIME))
+                                clock=self._steady)
 
     def _on_transforms(self) -> None:
         """Take the mounting from the static transforms, as soon as they connect the frames."""
@@ -221,33 +211,29 @@ class Calibrator:
         self._on_transforms()
         self._on_samples()
         if self._diagnostics.get_subscription_count():
-            self._show_diagnostics()
+            state = self.session.state
+            first, *others = map(self._status, diagnostics(state))
+            first.values = [KeyValue(key=key, value=value) for key, value in figures(state)]
+            array = DiagnosticArray(status=[first, *others])
+            array.header.stamp = self._node.get_clock().now().to_msg()
+            self._diagnostics.publish(array)
         if self._page is not None:
             self._page.show_state()
 
-    def _show_diagnostics(self) -> None:
-        first, *others = diagnostics(self.session.state)
-        array = DiagnosticArray(status=[
-            self._status(first, figures(self.session.state)), *map(self._status, others)])
-        array.header.stamp = self._node.get_clock().now().to_msg()
-        self._diagnostics.publish(array)
-
-    def _status(self, check: Condition, values: Iterable[tuple[str, str]] = ()
-                ) -> DiagnosticStatus:
+    def _status(self, check: Check) -> DiagnosticStatus:
         return DiagnosticStatus(
-            level=bytes([check.level]), name=f'{self._name}: {check.concern}', message=check.words,
-            hardware_id=self.session.state.name,
-            values=[KeyValue(key=key, value=value) for key, value in values])
+            level=bytes([LEVELS.index(check.level)]), name=f'{self._name}: {check.concern}',
+            message=check.words, hardware_id=self.session.state.name)
 
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> Any:
-        response.success, response.message = True, self.session.commands.enable(request.data)
+        response.success, response.message = True, enable(self.session, request.data)
         return response
 
     def _on_self_test(self, request: SelfTest.Request, response: SelfTest.Response) -> Any:
         self.stream.flush()
         found = checks(self.session.state)
         response.id, response.status = self.session.state.name, list(map(self._status, found))
-        response.passed = bytes([all(each.level == Level.OK for each in found)])
+        response.passed = bytes([all(each.level == LEVELS[0] for each in found)])
         return response
 
     def _on_samples(self) -> None:
@@ -258,44 +244,37 @@ class Calibrator:
             self._show_progress()
 
     def _show_progress(self) -> None:
-        self._progress_at = monotonic()
-        now = state.progress(self.session.state)
-        step = replace(next_action(self.session.state), concern='progress')
-        self._progress.publish(self._status(step, now.figures()))
+        self._progress_at, now = monotonic(), self.session.state
+        first = conditions(now)[0]
+        status = self._status(Check('progress', first.text, first.level))
+        status.values = [KeyValue(key=key, value=value)
+                         for key, value in progress(now).figures()]
+        self._progress.publish(status)
 
     def _show(self, event: Event) -> None:
         if self._page is not None:
             self._page.show_event(event)
-        if isinstance(event, Log):
-            self._log(event)
-        elif isinstance(event, Still):
-            self._still.publish(Bool(data=event.still))
-        elif isinstance(event, ShowPoses):
-            self._poses.publish(pose_markers(event.up, event.asked, event.frame_id))
-            self._show_progress()
-        elif isinstance(event, Mounting):
-            self._broadcast(event)
-        elif isinstance(event, Result):
-            self._result.publish(String(data=event.text))
-
-    def _broadcast(self, event: Mounting) -> None:
-        """Publish the levelled frame as a child of the frame of the sensor."""
-        calibration = self.session.sensor.calibration
-        if self._broadcaster is None or calibration is None or not event.frame_id:
-            return
-        settings = self.session.state.settings
-        child = output_frame(calibration, event.frame_id, settings.output_frame_id)
-        self._broadcaster.publish(self._node.get_clock().now().to_msg(), event.frame_id, child,
-                                  event.rotation)
-
-    def _log(self, line: Log) -> None:
-        log = self._node.get_logger()  # rclpy needs a separate line of code for each severity
-        if line.severity == 'error':
-            log.error(line.words)
-        elif line.severity == 'warning':
-            log.warning(line.words)
-        else:
-            log.info(line.words)
+        log, calibration = self._node.get_logger(), self.session.sensor.calibration
+        match event:  # rclpy needs a separate line of code for each severity
+            case Log('error', words):
+                log.error(words)
+            case Log('warning', words):
+                log.warning(words)
+            case Log(_, words):
+                log.info(words)
+            case Still(still):
+                self._still.publish(Bool(data=still))
+            case ShowPoses(up, asked, frame_id):
+                self._poses.publish(pose_markers(up, asked, frame_id))
+                self._show_progress()
+            case Result(text):
+                self._result.publish(String(data=text))
+            case Mounting(rotation, frame_id) if (
+                    self._broadcaster is not None and calibration is not None and frame_id):
+                settings = self.session.state.settings
+                self._broadcaster.publish(
+                    self._node.get_clock().now().to_msg(), frame_id, output_frame(
+                        calibration, frame_id, settings.output_frame_id), rotation)
 
     def close(self) -> None:
         """Finish writing, and release the files."""
@@ -304,11 +283,12 @@ class Calibrator:
         if self._server is not None:
             self._server.close()
         self._worker.close()
+        self.session.close()
 
 
 def in_executor(node: Node) -> CallSoon:
     """Return a function that lets the executor of a node call functions, in their order."""
-    waiting: SimpleQueue[Callable[[], None]] = SimpleQueue()
+    waiting: SimpleQueue[Callable[[], object]] = SimpleQueue()
 
     def call_next() -> None:
         try:
@@ -316,7 +296,7 @@ def in_executor(node: Node) -> CallSoon:
         except Exception:  # EventsExecutor crashes on an exception in a task (rclpy issue 1641)
             node.get_logger().error(f'unexpected error in accel_calib:\n{format_exc()}')
 
-    def call_soon(function: Callable[[], None]) -> None:
+    def call_soon(function: Callable[[], object]) -> None:
         waiting.put(function)
         executor = node.executor
         if executor is not None:
@@ -360,11 +340,8 @@ class ManagedCalibrator(LifecycleNode):
             self._settings = declared(self, CalibratorSettings, fixed=False)
         except AccelCalibError as error:
             self.get_logger().error(f'{error}; set it before configuring')
-        follow(self, lambda: self._settings, self._set_settings, runs=False)
-
-    def _set_settings(self, settings: CalibratorSettings) -> None:
-        """Keep the parameters of the next configuration, which are checked now."""
-        self._settings = settings
+        # The parameters of the next configuration are checked now.
+        follow(self, lambda: self._settings, partial(setattr, self, '_settings'), runs=False)
 
     def start(self) -> None:
         """Do nothing: transitions start the calibrator."""
@@ -377,17 +354,9 @@ class ManagedCalibrator(LifecycleNode):
             self.get_logger().error(str(error))
             self._destroy_entities()
             return TransitionCallbackReturn.FAILURE
-        self._set_active(active=False)
+        self._calibrator.stream.set_active(active=False)
         self._calibrator.start()
         return TransitionCallbackReturn.SUCCESS
-
-    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Publish corrected messages."""
-        return self._set_active(active=True)
-
-    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop publishing corrected messages."""
-        return self._set_active(active=False)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Close the files and remove all topics and services."""
@@ -397,10 +366,14 @@ class ManagedCalibrator(LifecycleNode):
 
     on_shutdown = on_cleanup
 
-    def _set_active(self, *, active: bool) -> TransitionCallbackReturn:
+    def _set_active(self, state: LifecycleState, *, active: bool) -> TransitionCallbackReturn:
+        """Publish corrected messages, or stop it."""
         if self._calibrator is not None:
             self._calibrator.stream.set_active(active=active)
         return TransitionCallbackReturn.SUCCESS
+
+    on_activate = partialmethod(_set_active, active=True)
+    on_deactivate = partialmethod(_set_active, active=False)
 
     def close(self) -> None:
         """Finish writing, and release the files."""
@@ -417,9 +390,5 @@ class ManagedCalibrator(LifecycleNode):
             for each in list(kinds):
                 if each not in self._own:
                     # The executor calls these for the events that it has already received.
-                    each.callback = each.send_response = _ignore
+                    each.callback = each.send_response = lambda *given: None
                     destroy(each)
-
-
-def _ignore(*given: Any) -> None:
-    """Do nothing with a message, a request, a response, or at the time of a timer."""

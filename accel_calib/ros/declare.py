@@ -46,11 +46,13 @@ def declared(node: Node, kind: type[Settings], *, fixed: bool = True) -> Setting
 
     """
     try:
-        values = {parameter.name: _declared(node, parameter, fixed).value
-                  for parameter in fields(kind)}
+        for each in fields(kind):
+            if not node.has_parameter(each.name):  # a managed node may be configured again
+                node.declare_parameter(each.name, default_of(each), _descriptor(each, fixed))
     except InvalidParameterValueException as error:
         raise InputError(str(error), 'correct the value') from error
-    return changed(kind(), values)
+    return changed(kind(), {each.name: node.get_parameter(each.name).value
+                            for each in fields(kind)})
 
 
 def misspelt(node: Node) -> list[str]:
@@ -61,14 +63,6 @@ def misspelt(node: Node) -> list[str]:
     near = {name: ' or '.join(get_close_matches(name, known)) for name in names}
     return [f'there is no parameter {name}, expected {words or "one of ros2 param list"}: correct '
             'the name' for name, words in near.items()]
-
-
-def _declared(node: Node, parameter: Field[Any], fixed: bool) -> Parameter:
-    """Return a parameter; a managed node that is configured again has declared it before."""
-    if node.has_parameter(parameter.name):
-        return node.get_parameter(parameter.name)
-    return node.declare_parameter(parameter.name, default_of(parameter),
-                                  _descriptor(parameter, fixed))
 
 
 def follow(node: Node, settings: Callable[[], Settings],
@@ -234,7 +228,14 @@ class StaticTransforms:
                              f'expected that {child} is not above {parent}',
                              'correct the node that publishes it, or restart this node if the '
                              'frames were rearranged')
-        rotation = _rotation_of(quaternion, f'the static transform from {parent} to {child}')
+        x, y, z, w = quaternion
+        squared = x * x + y * y + z * z + w * w
+        if not abs(squared - 1.0) < _LENGTH_TOLERANCE:  # NaN too
+            raise InputError(
+                f'the static transform from {parent} to {child} has the quaternion ({x:g}, {y:g}, '
+                f'{z:g}, {w:g}) of length {math.sqrt(squared):.3g}, expected length 1',
+                'correct the node that publishes it')
+        rotation = rotation_from_quaternion(quaternion)
         before = self._parents.get(child)
         self._parents[child] = (parent, rotation)
         return before is None or before[0] != parent or not np.array_equal(before[1], rotation)
@@ -302,14 +303,3 @@ class MountingBroadcaster:
 def _plain(frame: str) -> str:
     """Return the name of a frame as tf2 has it, without a leading slash."""
     return frame.removeprefix('/')
-
-
-def _rotation_of(quaternion: Sequence[float], what: str) -> Floats:
-    """Return the rotation matrix of a quaternion (x, y, z, w), which must have length 1."""
-    x, y, z, w = quaternion
-    squared = x * x + y * y + z * z + w * w
-    if not abs(squared - 1.0) < _LENGTH_TOLERANCE:  # NaN too
-        raise InputError(
-            f'{what} has the quaternion ({x:g}, {y:g}, {z:g}, {w:g}) of length '
-            f'{math.sqrt(squared):.3g}, expected length 1', 'correct the node that publishes it')
-    return rotation_from_quaternion(quaternion)

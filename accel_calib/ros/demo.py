@@ -148,7 +148,9 @@ class User(Node):
         self._messages: dict[str, dict[int, tuple[float, float, float]]] = {
             name: {} for name in _KINDS}
         self.create_subscription(MarkerArray, 'calibrator/poses', self._on_poses, LATCHED)
-        self.create_subscription(Temperature, 'temperature', self._on_temperature, SENSOR)
+        self.create_subscription(
+            Temperature, 'temperature',
+            lambda message: setattr(self, '_temperature', message.temperature), SENSOR)
         for name, topic, kind in (('raw', 'imu/data_raw', Imu),
                                   ('corrected', 'imu/data_calibrated', Imu),
                                   ('truth', 'simulator/truth', Vector3Stamped)):
@@ -159,9 +161,6 @@ class User(Node):
     def _on_poses(self, markers: MarkerArray) -> None:
         at = [marker.pose.position for marker in markers.markers if marker.ns == 'poses']
         self._poses = np.array([[point.x, point.y, point.z] for point in at]).reshape(-1, 3)
-
-    def _on_temperature(self, message: Temperature) -> None:
-        self._temperature = message.temperature
 
     def _keeper(self, name: str) -> Callable[[Any], None]:
         kept = self._messages[name]
@@ -231,26 +230,27 @@ class User(Node):
     def level(self) -> str:
         """Put the robot flat, and call ``~/set_level`` as soon as the rest is long enough."""
         self.turn('flat')
-        for count in range(_SETTLED, _LONGEST_REST, _SETTLED):
+        count = _SETTLED
+        while True:
             self._spin(partial(self._has_rested, count, 'raw'), 'a longer rest')
-            answer = self._request('calibrator/set_level')
-            if answer.success:
-                return str(answer.message)
-        raise _refused('calibrator/set_level', answer)
+            try:
+                return self.call('calibrator/set_level')
+            except AccelCalibError:
+                count += _SETTLED
+                if count >= _LONGEST_REST:
+                    raise
 
     def call(self, service: str) -> str:
         """Call a service, and return its answer; AccelCalibError if it fails."""
-        answer = self._request(service)
-        if not answer.success:
-            raise _refused(service, answer)
-        return str(answer.message)
-
-    def _request(self, service: str) -> Trigger.Response:
         client = self._triggers[service]
         self._spin(client.service_is_ready, f'the service {service}')
         future = client.call_async(Trigger.Request())
         self._spin(future.done, f'the answer of {service}')
-        return future.result()
+        answer = future.result()
+        if not answer.success:
+            raise AccelCalibError(f'{service} answered: {answer.message}',
+                                  'run the demonstration again')
+        return str(answer.message)
 
     def _spin(self, until: Callable[[], bool], what: str) -> None:
         """Spin until a condition is true; the text names the condition in errors."""
@@ -269,10 +269,6 @@ class User(Node):
         """Leave DDS."""
         self._executor.shutdown()
         self.destroy_node()
-
-
-def _refused(service: str, answer: Trigger.Response) -> AccelCalibError:
-    return AccelCalibError(f'{service} answered: {answer.message}', 'run the demonstration again')
 
 
 def demonstrate(report: Callable[[str], None], hidden: str = '') -> Outcome:
@@ -298,21 +294,16 @@ def demonstrate(report: Callable[[str], None], hidden: str = '') -> Outcome:
         raw, calibrated = (_errors(rests, name) for name in ('raw', 'corrected'))
         if not hidden:
             return Outcome(len(rests), raw, calibrated, time.monotonic() - began)
-        found, lag_s = _refined(demo, report, folder / 'accel_calib' / 'demo.yaml')
+        stored = folder / 'accel_calib' / 'demo.yaml'
+        fitted = read_calibration(stored).model
+        report(f'~/refine: {demo.call("calibrator/refine")}')
+        report(f'~/set_level: {demo.level()}')
+        refined = read_calibration(stored).model
+        lag = refined.lags.get('temperature_of_offset')
         again = _errors(demo.measure(_CHECKED_HIDDEN), 'corrected')
-        return Outcome(len(rests), calibrated, again, time.monotonic() - began,
-                       parse_effect(hidden)[0], found, lag_s)
-
-
-def _refined(demo: User, report: Callable[[str], None], stored: Path
-             ) -> tuple[tuple[str, ...], float]:
-    """Refine and level; return the effects that are new in the stored model, and their lag [s]."""
-    fitted = read_calibration(stored).model
-    report(f'~/refine: {demo.call("calibrator/refine")}')
-    report(f'~/set_level: {demo.level()}')
-    refined = read_calibration(stored).model
-    lag = refined.lags.get('temperature_of_offset')
-    return (tuple(str(name) for name in refined.effects if name not in fitted.effects),
+        return Outcome(
+            len(rests), calibrated, again, time.monotonic() - began, parse_effect(hidden)[0],
+            tuple(str(name) for name in refined.effects if name not in fitted.effects),
             0.0 if lag is None else lag.seconds)
 
 

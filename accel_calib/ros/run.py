@@ -22,7 +22,7 @@ transition      effect
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 import gc
 from importlib import import_module
@@ -32,16 +32,10 @@ import signal
 from socket import AF_INET, SOCK_DGRAM, socket
 import sys
 from threading import Thread
-from typing import TYPE_CHECKING
+from typing import Any
 
-from ..errors import AccelCalibError, hide_warnings, NEEDS_ROS
+from ..errors import AccelCalibError, hide_warnings, InputError, NEEDS_ROS
 from ..one_thread import use_one_thread
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from rclpy.executors import Executor
-    from rclpy.task import Future
 
 _OK, _BAD_INPUT = 0, 2
 
@@ -91,84 +85,73 @@ def run(node: str, args: Sequence[str] | None = None) -> int:
     for number in _SIGNALS:
         signal.signal(number, lambda number, frame: None)  # Python writes to the pipe
     try:
-        return _run(node, args, came)
+        _start(node, args, came)
+    except AccelCalibError as error:
+        print(f'accel-calib: {error}', file=sys.stderr)
+        return _BAD_INPUT
     finally:
         # Under launch, Ctrl-C arrives twice; Python would raise the second one while it exits.
         for number in _SIGNALS:
             signal.signal(number, signal.SIG_IGN)
         signal.set_wakeup_fd(-1)
+    return _OK
 
 
-def _run(node: str, args: Sequence[str] | None, came: int) -> int:
+def _start(node: str, args: Sequence[str] | None, came: int) -> None:
     """Start ROS, run the node, and shut down ROS."""
     try:
         import rclpy
     except ImportError as error:
-        return _refuse(f'ROS 2 is not installed ({error}), expected rclpy of ROS 2 Jazzy; '
-                       f'{NEEDS_ROS}')
+        raise InputError(f'ROS 2 is not installed ({error}), expected rclpy of ROS 2 Jazzy',
+                         NEEDS_ROS) from error
     from rclpy.signals import SignalHandlerOptions
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:
-        return _refuse(f'ROS 2 does not start: {str(error).splitlines()[0]}; check the '
-                       'parameters and arguments')
+        raise InputError(f'ROS 2 does not start: {str(error).splitlines()[0]}',
+                         'check the parameters and arguments') from error
     try:
-        _spin(node, came)
-    except AccelCalibError as error:
-        return _refuse(str(error))
+        module, name = node.split(':')
+        _spin(getattr(import_module(module, __package__), name)(), came)
     finally:
         # rclpy.try_shutdown() would also restore signal handlers, for an instant the default ones.
         rclpy.get_default_context().try_shutdown()
-    return _OK
 
 
-def _spin(node: str, came: int) -> None:
-    from rclpy.executors import ExternalShutdownException
+def _spin(node: Any, came: int) -> None:
+    """Run a node until a signal came."""
+    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
     from rclpy.task import Future
 
     from .declare import misspelt
-    module, name = node.split(':')
-    instance = getattr(import_module(module, __package__), name)()
-    executor = _executor()
-    executor.add_node(instance)
+    try:
+        from rclpy.experimental import EventsExecutor as Executor  # it has the least overhead
+    except ImportError:
+        Executor = SingleThreadedExecutor
+    executor, ended = Executor(), Future()
+
+    def end() -> None:
+        """Wait for a signal and end the node; a busy executor does not return after `_TURN`."""
+        os.read(came, 1)
+        ended.set_result(None)
+
+    executor.add_node(node)
     sys.setswitchinterval(_SWITCH)
     try:
-        instance.start()
-        for line in misspelt(instance):
-            instance.get_logger().error(line)
+        node.start()
+        for line in misspelt(node):
+            node.get_logger().error(line)
         gc.freeze()  # permanent objects are not scanned again, which would take tens of ms
-        ended = Future()
-        Thread(target=_end, args=(came, ended), daemon=True).start()
-        while instance.context.ok() and not ended.done():
+        Thread(target=end, daemon=True).start()
+        while node.context.ok() and not ended.done():
             # Without a time limit, EventsExecutor has a busy loop. Each call leaks 35 bytes.
             executor.spin_until_future_complete(ended, timeout_sec=_TURN)
     except ExternalShutdownException:
         pass  # the node has ended itself
     finally:
-        instance.close()
+        node.close()
         executor.shutdown()
-        instance.destroy_node()
-
-
-def _end(came: int, ended: Future) -> None:
-    """Wait for a signal and end the node; a busy executor does not return after `_TURN`."""
-    os.read(came, 1)
-    ended.set_result(None)
-
-
-def _executor() -> Executor:
-    """Return the executor with the least overhead."""
-    try:
-        from rclpy.experimental import EventsExecutor
-    except ImportError:
-        from rclpy.executors import SingleThreadedExecutor
-        return SingleThreadedExecutor()
-    return EventsExecutor()
-
-
-def _refuse(line: str) -> int:
-    print(f'accel-calib: {line}', file=sys.stderr)
-    return _BAD_INPUT
+        node.destroy_node()
 
 
 _DOMAINS = range(1, 102)

@@ -102,7 +102,13 @@ class SimulatedImu:
             dict(parse_effect(text) for text in settings.effects if text), rotation)
         self._thermal = thermal_stream(self._model)
         self._rng = np.random.default_rng(settings.seed)
-        self.directions = _directions(settings)
+        count, spread = settings.poses, spread_directions(settings.poses)
+        if settings.mixed:  # in an order of which every part is spread over the sphere
+            stride = next(step for step in range(round(_GOLDEN * count), 2 * count + 1)
+                          if math.gcd(step, count) == 1)
+            spread = spread[np.arange(count) * stride % count]
+        self.directions = np.vstack([
+            *[_FLAT] * settings.flat_first, spread, *[_FLAT] * settings.flat_last])
         self._coming = cycle(self.directions) if settings.loop else iter(self.directions)
         self._up = next(self._coming)
         self.next_pose = 1
@@ -136,14 +142,25 @@ class SimulatedImu:
 
     def samples(self, count: int) -> Recording:
         """Return the next samples [g], at most this number; none after the end."""
-        while len(self._path) < count and self._extend(count - len(self._path)):
-            pass
+        settings = self._settings
+        while (lacking := count - len(self._path)) > 0:
+            up = self._next() if self._resting else None
+            if up is not None:
+                self._append(up)
+            elif settings.hold or not self._resting:
+                self._path = np.concatenate([self._path, self._rest(lacking)])
+            else:
+                break
         path, self._path = self._path[:count], self._path[count:]
         force, rate = path[:, :3], path[:, 3:]
-        time = (self._sent + np.arange(len(path))) / self._settings.rate
+        time = (self._sent + np.arange(len(path))) / settings.rate
         self._sent += len(path)
-        noise_g = self._settings.noise / self._settings.gravity
-        known = {'time': time, 'temperature': self._temperatures(time)}
+        first, last = settings.temperature
+        swing = 0.5 - 0.5 * np.cos(2.0 * np.pi * time / (settings.temperature_period or np.inf))
+        noise_g = settings.noise / settings.gravity
+        known = {'time': time, 'temperature': first + (last - first) * (
+            swing if settings.temperature_period else np.interp(time, [0.0, self.duration], [
+                0.0, 1.0]))}
         context = {**context_of_samples(known, len(path), self._model, self._thermal),
                    'std': np.full_like(force, noise_g)}
         rng, rotation = self._rng, self._model.rotation
@@ -151,19 +168,8 @@ class SimulatedImu:
             **known, 'reference': force,
             'reading': predict(self._model, force, context) + rng.normal(
                 size=force.shape) * noise_g,
-            'rate': rate @ rotation.T + rng.normal(size=force.shape) * self._settings.gyro_noise}
+            'rate': rate @ rotation.T + rng.normal(size=force.shape) * settings.gyro_noise}
         return Recording(columns, numbered(columns))
-
-    def _extend(self, lacking: int) -> bool:
-        """Append the next pose, or this number of samples at rest; return whether there is any."""
-        up = self._next() if self._resting else None
-        if up is not None:
-            self._append(up)
-        elif self._settings.hold or not self._resting:
-            self._path = np.concatenate([self._path, self._rest(lacking)])
-        else:
-            return False
-        return True
 
     def _append(self, up: Floats) -> None:
         """Append the turn to a direction, and the rest there."""
@@ -176,14 +182,6 @@ class SimulatedImu:
     def _rest(self, count: int) -> Floats:
         """Return force and rate of a rest, (count, 6)."""
         return np.tile(np.append(self._up, np.zeros(3)), (count, 1))
-
-    def _temperatures(self, time: Floats) -> Floats:
-        """Return the temperature at each sample, which starts at the first value."""
-        first, last = self._settings.temperature
-        period = self._settings.temperature_period
-        if not period:
-            return np.interp(time, [0.0, self.duration], [first, last])
-        return first + (last - first) * (0.5 - 0.5 * np.cos(2.0 * np.pi * time / period))
 
 
 class SimulatorNode(Node):
@@ -198,7 +196,12 @@ class SimulatorNode(Node):
         self._truth = self.create_publisher(Vector3Stamped, '~/truth', STREAM)
         self.create_service(Trigger, '~/next', self._on_next)
         self.create_service(Trigger, '~/flat', self._on_flat)
-        self._message = _empty_message(self.settings)
+        self._message = Imu()  # with the fields that do not change
+        self._message.orientation_covariance[0] = -1.0
+        self._message.angular_velocity_covariance = (
+            np.eye(3) * self.settings.gyro_noise ** 2).ravel()
+        self._message.linear_acceleration_covariance = (
+            np.eye(3) * self.settings.noise ** 2).ravel()
         self._sent = 0
         self._began = Time()
         self._began_steady = 0.0
@@ -254,24 +257,6 @@ class SimulatorNode(Node):
 
     def close(self) -> None:
         """Do nothing, because there is nothing to finish."""
-
-
-def _directions(settings: SimulatorSettings) -> Floats:
-    count, spread = settings.poses, spread_directions(settings.poses)
-    if settings.mixed:  # in an order of which every part is spread over the sphere
-        stride = next(step for step in range(round(_GOLDEN * count), 2 * count + 1)
-                      if math.gcd(step, count) == 1)
-        spread = spread[np.arange(count) * stride % count]
-    return np.vstack([*[_FLAT] * settings.flat_first, spread, *[_FLAT] * settings.flat_last])
-
-
-def _empty_message(settings: SimulatorSettings) -> Imu:
-    """Return a message with the fields that do not change."""
-    message = Imu()
-    message.orientation_covariance[0] = -1.0
-    message.angular_velocity_covariance = (np.eye(3) * settings.gyro_noise ** 2).ravel()
-    message.linear_acceleration_covariance = (np.eye(3) * settings.noise ** 2).ravel()
-    return message
 
 
 def vector3(numbers: Floats) -> Vector3:

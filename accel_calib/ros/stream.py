@@ -14,6 +14,7 @@ encoding (byte order) is serialized again in the usual encoding and then process
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from importlib import import_module
 from itertools import groupby
 import math
@@ -143,7 +144,15 @@ class ContextTopics:
                 or [each for each in _USUAL if each in numbers]
                 or numbers[:len(numbers) == 1])
             if not fields:
-                self._missing[column] = self._why(topic, field, kinds, numbers)
+                others = sorted({each for topics in published_by_others(self._node, _WITH_A_NUMBER)
+                                 for each in topics})
+                usable = f'; topics with a number: {", ".join(others)}' if others else ''
+                have = f'the numbers {some(numbers)}' if numbers else 'no number that can be read'
+                found = f'there is no topic {topic}: start its driver, or' if not kinds else (
+                    f'{topic} has the type {" and ".join(map(_short, kinds))} with {have}, '
+                    f'expected {field or "one, or its name after the topic"}:')
+                self._missing[column] = (
+                    f'{found} correct context, and restart the node{usable}')
                 continue
             del self._waiting[column]
             value = operator.attrgetter(fields[0])
@@ -152,18 +161,6 @@ class ContextTopics:
                     column, float(value(message))), SENSOR)
             self._missing[column] = f'nothing comes on {topic} ({_short(kinds[0])})'
         return self._missing
-
-    def _why(self, topic: str, field: str, types: Sequence[str], numbers: Sequence[str]) -> str:
-        """Return why a topic cannot be used, and which ones can be."""
-        others = sorted({each for topics in published_by_others(self._node, _WITH_A_NUMBER)
-                         for each in topics})
-        usable = f'; topics with a number: {", ".join(others)}' if others else ''
-        found = f'there is no topic {topic}: start its driver, or '
-        if types:
-            have = f'the numbers {some(numbers)}' if numbers else 'no number that can be read'
-            found = (f'{topic} has the type {" and ".join(map(_short, types))} with {have}, '
-                     f'expected {field or "one, or its name after the topic"}: ')
-        return f'{found}correct context, and restart the node{usable}'
 
 
 def _short(name: str) -> str:
@@ -253,11 +250,13 @@ class Stream:
     def _adopted(self, data: bytes) -> bytes | None:
         """Return a message with a new layout as usual; None: not readable, or another sensor."""
         layout = layout_of(data)
+        if layout is None:  # not in the usual encoding
+            with suppress(Exception):  # each middleware has its own errors
+                data = bytes(serialize_message(deserialize_message(data, Imu)))
+                layout = layout_of(data)
         if layout is None:
-            data = _usual(data)
-            layout = layout_of(data)
-        if layout is None:
-            self._session.reports.unreadable(len(data))
+            self._session.drop('not_finite', 'warning', f'an Imu message of {len(data)} bytes '
+                               'cannot be read; it is dropped: check the driver')
             return None
         if layout != self._layout:
             self.flush()
@@ -288,7 +287,7 @@ class Stream:
         try:
             corrected = rewriter(data, self._state.around.filled)
         except AccelCalibError as error:
-            self._session.reports.uncorrected(error)
+            self._session.drop('implausible', 'error', f'messages are not corrected: {error}')
             return
         if corrected is None:
             return
@@ -315,8 +314,10 @@ class Stream:
             messages, self._waiting = self._waiting, []
             contexts, self._contexts = self._contexts, []
             found = samples_of(joined(messages, IMU_DOUBLES, 'imu/data_raw'))
-            rows = np.column_stack([found['time'], found['reading'], found['rate'],
-                                    self._around(contexts)])
+            runs = [(known, len([*same])) for known, same in groupby(contexts)]
+            around = np.repeat([[known.get(column, math.nan) for column in self._columns]
+                                for known, _ in runs], [count for _, count in runs], axis=0)
+            rows = np.column_stack([found['time'], found['reading'], found['rate'], around])
             self._collected = rows, self._arrived
 
     def _pass_on(self) -> None:
@@ -325,17 +326,3 @@ class Stream:
             collected, self._collected = self._collected, None
             self._session.push(*collected)
             self._on_events()
-
-    def _around(self, contexts: Sequence[Mapping[str, float]]) -> Floats:
-        """Return the columns of the context of each message, (n, k)."""
-        runs = [(known, len([*same])) for known, same in groupby(contexts)]
-        values = [[known.get(column, math.nan) for column in self._columns] for known, _ in runs]
-        return np.repeat(values, [count for _, count in runs], axis=0)
-
-
-def _usual(data: bytes) -> bytes:
-    """Return an Imu message in the usual encoding; empty if the middleware cannot read it."""
-    try:
-        return bytes(serialize_message(deserialize_message(data, Imu)))
-    except Exception:  # each middleware has its own errors; the caller reports the message
-        return b''

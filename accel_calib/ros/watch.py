@@ -11,6 +11,7 @@ once per second. A longer silence therefore means that the node or the network i
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from time import monotonic
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -42,31 +43,28 @@ _NEXT = 1.5
 _SUFFIX = '/progress'
 
 
-class _Receiver:
+class _Receiver(Node):
     """The progress of a calibrator: full name, such as ``/left/calibrator``, and messages."""
 
-    def __init__(self, node: Node, executor: SingleThreadedExecutor, name: str) -> None:
-        self._node, self._executor = node, executor
+    def __init__(self, name: str) -> None:
+        # A leading underscore hides the node from ros2 node list.
+        super().__init__('_accel_calib_watch', enable_rosout=False, start_parameter_services=False)
         self._arrived = monotonic()
         self.progress: Progress | None = None
-        self.messages = 0
-        topic = f'{name.rstrip("/")}{_SUFFIX}'
+        self.received = 0
         try:
-            found = node.create_subscription(DiagnosticStatus, topic, self._on_message, LATCHED)
+            found = self.create_subscription(
+                DiagnosticStatus, f'{name.rstrip("/")}{_SUFFIX}', self._on_message, LATCHED)
         except InvalidTopicNameException as err:
             raise InputError(f'--node is {name!r}, expected the name of a node',
                              'set it to a name such as calibrator or left/calibrator') from err
         self._topic = found.topic_name
-        self.name = self._topic.removesuffix(_SUFFIX)
+        self.calibrator = self._topic.removesuffix(_SUFFIX)
 
     def _on_message(self, message: DiagnosticStatus) -> None:
         self.progress = Progress.from_figures({each.key: each.value for each in message.values})
         self._arrived = monotonic()
-        self.messages += 1
-
-    def spin(self) -> None:
-        """Wait a short time for a message."""
-        self._executor.spin_once(timeout_sec=_LOOK_EVERY)
+        self.received += 1
 
     @property
     def silence(self) -> float:
@@ -76,22 +74,22 @@ class _Receiver:
     @property
     def is_silent(self) -> bool:
         """Whether a message is overdue."""
-        return self.silence > (_SILENT if self.messages else _FIRST)
+        return self.silence > (_SILENT if self.received else _FIRST)
 
     def problem(self) -> tuple[str, str]:
         """Return what was found and expected, and what to do, if no messages arrive."""
-        node, topic = self._node, self._topic
-        others = [name.removesuffix(_SUFFIX) for name, kinds in node.get_topic_names_and_types()
+        topic = self._topic
+        others = [name.removesuffix(_SUFFIX) for name, kinds in self.get_topic_names_and_types()
                   if name.endswith(_SUFFIX) and 'diagnostic_msgs/msg/DiagnosticStatus' in kinds
-                  and name != topic and node.count_publishers(name)]
+                  and name != topic and self.count_publishers(name)]
         expected = f'expected a message on {topic} every second'
-        if node.count_publishers(topic):
-            return (f'{self.name} sends no message, {expected}',
+        if self.count_publishers(topic):
+            return (f'{self.calibrator} sends no message, {expected}',
                     'check that the node still runs, and the network')
         if others:
-            return (f'found {" and ".join(sorted(others))}, but not {self.name}, {expected}',
+            return (f'found {" and ".join(sorted(others))}, but not {self.calibrator}, {expected}',
                     f'set --node {min(others).lstrip("/")}')
-        return (f'found no calibrator {self.name}, {expected}',
+        return (f'found no calibrator {self.calibrator}, {expected}',
                 'start it with accel-calib node, or check --node and ROS_DOMAIN_ID')
 
 
@@ -105,17 +103,17 @@ def watch(name: str, show: Show, is_over: Callable[[], bool], args: Sequence[str
     another version.
 
     """
-    with _receiver(name, args) as receiver:
+    with _receiver(name, args) as (receiver, spin):
         shown, problem = 0, ''
-        show(receiver.name, None, problem)
+        show(receiver.calibrator, None, problem)
         while not is_over():
-            receiver.spin()
+            spin()
             before, problem = problem, ''
             if receiver.is_silent:
                 problem = '; '.join(receiver.problem())
-            if receiver.messages != shown or problem != before:
-                shown = receiver.messages
-                show(receiver.name, receiver.progress, problem)
+            if receiver.received != shown or problem != before:
+                shown = receiver.received
+                show(receiver.calibrator, receiver.progress, problem)
 
 
 def current(name: str, is_over: Callable[[], bool], args: Sequence[str] = ()
@@ -126,31 +124,28 @@ def current(name: str, is_over: Callable[[], bool], args: Sequence[str] = ()
     Parameters and errors are as in `watch`; InputError also if no node answers.
 
     """
-    with _receiver(name, args) as receiver:
-        while receiver.messages < 2 and not is_over():
-            receiver.spin()
-            if receiver.messages and receiver.silence > _NEXT:
+    with _receiver(name, args) as (receiver, spin):
+        while receiver.received < 2 and not is_over():
+            spin()
+            if receiver.received and receiver.silence > _NEXT:
                 break
             if receiver.is_silent:
                 raise InputError(*receiver.problem())
-        return receiver.name, receiver.progress
+        return receiver.calibrator, receiver.progress
 
 
 @contextmanager
-def _receiver(name: str, args: Sequence[str]) -> Iterator[_Receiver]:
-    """Yield a receiver; the process keeps its own signal handlers."""
+def _receiver(name: str, args: Sequence[str]) -> Iterator[tuple[_Receiver, Callable[[], None]]]:
+    """Yield a receiver, and what waits for its messages; the process keeps its signal handlers."""
     try:
         rclpy.init(args=list(args), signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as err:
         raise InputError(f'ROS 2 does not start: {str(err).splitlines()[0]}',
                          'check the arguments after --ros-args') from err
-    # A leading underscore hides the node from ros2 node list.
-    node = Node('_accel_calib_watch', enable_rosout=False, start_parameter_services=False)
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
     try:
-        yield _Receiver(node, executor, name)
+        receiver = _Receiver(name)
+        with SingleThreadedExecutor() as executor:
+            executor.add_node(receiver)
+            yield receiver, partial(executor.spin_once, timeout_sec=_LOOK_EVERY)
     finally:
-        executor.shutdown()
-        node.destroy_node()
         rclpy.try_shutdown()

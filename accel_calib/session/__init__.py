@@ -5,35 +5,36 @@
 The calibrator without ROS: it takes samples and commands, and returns answers and events.
 
 `session` is the entry point, and `core` the state that all other modules read. `commands` contains
-what the user can ask for, and `use` what follows when the calibration or the poses change.
+what the user can ask for, `fitting` their computations, and `use` what follows when the
+calibration or the poses change.
 `sensor` is what belongs to one sensor: `live_capture` captures its poses, and `pose_guide` chooses
-the next one. `stream` describes the messages. `conditions` is what is the case, and the next step;
-`reports` logs it, and `state` is what topics and pages show. `store` manages and locks files.
+the next one. `stream` describes the messages. `conditions` is what is the case, and the next step,
+and `state` is what topics and pages show. `store` manages and locks files.
 `worker` runs the tasks and defines the events. `settings` defines the parameters. Imports point
 one way.
 
 """
 
 from . import state
-from .commands import COMMANDS, Commands
-from .conditions import Condition, conditions, Level, next_action
+from .commands import COMMANDS, enable, run
+from .conditions import APART, conditions, next_step
 from .core import State, Surroundings
 from .sensor import title
 from .session import BATCH, Session
 from .settings import (
     CalibratorSettings, changed, columns_of, context_topics, default_of, expected, parameter,
     Settings, WEB_PORT)
-from .state import checks, diagnostics, figures, Progress, words_of_state
+from .state import figures, Check, checks, diagnostics, Progress, progress, words_of_state
 from .store import ros_home
 from .stream import Around
 from .worker import (
     Answer, answered, CallSoon, Compute, Event, Files, Log, Mounting, nothing, Result, Severity,
     ShowPoses, Step, Still, Task, Throttle, Worker, WorkerProcess)
 
-__all__ = ['BATCH', 'COMMANDS', 'WEB_PORT', 'Answer', 'Around', 'CalibratorSettings', 'CallSoon',
-           'Commands', 'Compute', 'Condition', 'Event', 'Files', 'Level', 'Log', 'Mounting',
-           'Progress', 'Result', 'Session', 'Settings', 'Severity', 'ShowPoses', 'State', 'Step',
-           'Still', 'Surroundings', 'Task', 'Throttle', 'Worker', 'WorkerProcess', 'answered',
-           'changed', 'checks', 'columns_of', 'conditions', 'context_topics', 'default_of',
-           'diagnostics', 'expected', 'figures', 'next_action', 'nothing', 'parameter', 'ros_home',
-           'state', 'title', 'words_of_state']
+__all__ = ['APART', 'BATCH', 'COMMANDS', 'WEB_PORT', 'Answer', 'Around', 'CalibratorSettings',
+           'CallSoon', 'Check', 'Compute', 'Event', 'Files', 'Log', 'Mounting', 'Progress',
+           'Result', 'Session', 'Settings', 'Severity', 'ShowPoses', 'State', 'Step', 'Still',
+           'Surroundings', 'Task', 'Throttle', 'Worker', 'WorkerProcess', 'answered', 'changed',
+           'checks', 'columns_of', 'conditions', 'context_topics', 'default_of', 'diagnostics',
+           'enable', 'expected', 'figures', 'next_step', 'nothing', 'parameter', 'progress',
+           'ros_home', 'run', 'state', 'title', 'words_of_state']

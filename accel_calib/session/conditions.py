@@ -4,85 +4,57 @@
 """
 What is the case with a session, and the next step.
 
-`conditions` is the one list, in the order in which to act. Its first entry is the next step, which
-the log, ``~/progress``, the answers of the services and the pages show. The diagnostics show all
-of it. What is over is in no entry.
+`conditions` is the one list, in the order in which to act: everything that is wrong, and the next
+step of a calibration (kind ``step``). The step of its first entry is the next one, which the log,
+``~/progress``, the answers of the services and the pages show. The diagnostics show all of it.
+What is over is in no entry.
 
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from enum import IntEnum
+from dataclasses import replace
 import math
+from typing import Any
 
 from .core import State
 from .pose_guide import Guide, NOT_FOLLOWED
 from .settings import context_topics
 from .stream import SILENT, StreamStatistics
-from ..calibration import USES_LIMIT
 from ..comparison import status
-from ..findings import request_words
+from ..finding import Finding, NextStep
+from ..findings import outside_words, request_words, USES_LIMIT
 from ..pipeline import FEWEST_IN_CONE, is_partial
 from ..table import column_of, CONTEXT, is_quantity
 from ..text import counted
 from ..units import MG, Units
 
+CONCERNS = {'step': 'calibration', 'unusable': 'calibration', 'switched_off': 'calibration',
+            'outside': 'calibration', 'changed': 'drift', 'read_only': 'storage',
+            'unsaved': 'storage'}
+"""The check of the diagnostics by kind of finding; the others are of the stream."""
 
-class Level(IntEnum):
-    """Severity, as in diagnostic_msgs/DiagnosticStatus."""
-
-    OK = 0
-    WARN = 1
-    ERROR = 2
-
-
-@dataclass(frozen=True)
-class Condition:
-    """
-    What is the case, and what to do about it.
-
-    Parameters
-    ----------
-    kind : str
-        Kind of the step, one of `accel_calib.finding.STEPS`; empty: not known yet.
-    words : str
-        What is the case and what to do.
-    command : str
-        Name of the service for it; may be empty.
-    direction : tuple of float
-        Direction to point up, a unit vector in the sensor axes; empty: none.
-    level : Level
-        Severity.
-    concern : str
-        The check of the diagnostics that it belongs to.
-    name : str
-        Name among all that can be wrong, for the log; empty: an ordinary step.
-
-    """
-
-    kind: str
-    words: str
-    command: str = ''
-    direction: tuple[float, ...] = ()
-    level: Level = Level.OK
-    concern: str = 'calibration'
-    name: str = ''
-
+APART = ('step', 'unusable', 'switched_off', 'changed', 'read_only')
+"""Kinds of findings that are logged when they begin, and not with the others."""
 
 _SERVICES = {'fit': 'fit', 'refine': 'refine', 'level': 'set_level', 'save': 'save'}
 """Service for each kind of step that has one."""
 
 
-def calling(kind: str, text: str) -> Condition:
+def _step(kind: str, text: str, command: str = '', **about: Any) -> Finding:
+    """Return a step of a calibration."""
+    return Finding('step', text, step=kind, command=command, **about)
+
+
+def _calling(kind: str, text: str) -> Finding:
     """Return a step with the call of its service."""
     command = _SERVICES.get(kind, '')
-    return Condition(kind, f'{text}; call ~/{command}' if command else text, command)
+    return _step(kind, f'{text}; call ~/{command}' if command else text, command)
 
 
-_LEVEL = Condition('level', 'place the robot level, hold it still and call ~/set_level; a sensor '
-                   'alone is done', 'set_level')
+_LEVEL = _step('level', 'place the robot level, hold it still and call ~/set_level; a sensor '
+               'alone is done', 'set_level')
 
 _FAR = 0.25
 """Part of the range of a calibration beyond which poses are asked for."""
@@ -91,113 +63,110 @@ _NEEDS_SAMPLES = ('poses', 'level', 'done', '')
 """Kinds of steps that need samples; the others use the poses so far."""
 
 
-def conditions(state: State) -> list[Condition]:
-    """Return what is the case and what to do about it; the next step is the first entry."""
-    step, files, of_use = _ordinary(state), list(_files(state)), list(_use(state))
+def conditions(state: State) -> list[Finding]:
+    """Return what is the case and what to do about it; the next step is that of the first one."""
+    step, files, of_use = _ordinary(state), [], list(_use(state))
+    if state.problem:
+        files.append(Finding('unusable', state.problem, level='BAD'))
+    store = state.files.store
+    if store is not None and not store.is_writable():
+        files.append(Finding(
+            'read_only', f'{state.files.path} cannot be written: correct the permissions, or '
+            'restart the node with another calibration_file', level='BAD'))
     blocks = bool(state.files.problem) or state.is_refused
     first, files = (files[:1], files[1:]) if blocks else ([], files)
     ended = state.surroundings.ended
     around = [] if ended else [*_stream(state), *_context(state)]
-    if step.kind == 'level' and ended:  # nothing can be levelled any more
-        step = replace(step, kind='done', words='use the calibration', command='')
-    if step.kind not in _NEEDS_SAMPLES:
+    if step.step == 'level' and ended:  # nothing can be levelled any more
+        step = replace(step, step='done', text='use the calibration', command='')
+    if step.step not in _NEEDS_SAMPLES:
         found = [step, *files, *around, *of_use]
-    elif step.kind == 'done':
-        to_do = [each for each in of_use if each.kind != 'done']
+    elif step.step == 'done':
+        to_do = [each for each in of_use if each.step != 'done']
         found = [*files, *around, *to_do, step, *(each for each in of_use if each not in to_do)]
     else:  # whoever turns the sensor is told of the files, and goes on
-        told = '; '.join(filter(None, [*(each.words for each in files), step.words]))
-        level = max([step.level, *(each.level for each in files)])
-        found = [*around, replace(step, words=told, level=level), *files, *of_use]
+        told = '; '.join(filter(None, [*(each.text for each in files), step.text]))
+        level = 'BAD' if files else step.level
+        found = [*around, replace(step, text=told, level=level), *files, *of_use]
     if axes := state.sensor.guide.axes_words:
-        found.append(Condition('poses', axes, level=Level.WARN, concern='stream', name='axes'))
+        found.append(Finding('axes', axes, level='USABLE'))
     return [*first, *found]
 
 
-def next_action(state: State) -> Condition:
+def next_step(state: State) -> NextStep:
     """Return the next step; without a kind while the poses or the rating are being computed."""
-    return conditions(state)[0]
+    return conditions(state)[0].next
 
 
 def next_words(state: State) -> str:
     """Return the next step as the end of an answer."""
-    action = next_action(state)
-    return f'; next: {action.words}' if action.words else ''
+    step = next_step(state)
+    return f'; next: {step.text}' if step.text else ''
 
 
 # ----------------------------------------------------------------------------- poses and fits
 
-def _ordinary(state: State) -> Condition:
+def _ordinary(state: State) -> Finding:
     """Return the next step of a calibration of which nothing is in the way."""
     step = _with_sensor(state)
     refusal = state.refusal_of(step.command)
-    if refusal and step.kind != 'poses':
-        step = replace(step, words=refusal, command='')
-    if step.kind == 'poses' and step.level == Level.OK:
-        step = _within_reach(state, step)
-        held = slow_turn(state)
-        step = replace(step, words=f'{held}; {step.words}') if held else step
-    if state.sensor.calibration is None:
-        step = replace(step, level=max(step.level, Level.WARN))
-    return step
+    if refusal and step.step != 'poses':
+        step = replace(step, text=refusal, command='')
+    if step.step == 'poses' and step.kind == 'step':
+        step, turning = _within_reach(state, step), slow_turn(state)
+        step = replace(step, text=f'{turning}; {step.text}') if turning else step
+    missing = state.sensor.calibration is None and step.level == 'GOOD'
+    return replace(step, level='USABLE') if missing else step
 
 
-def _with_sensor(state: State) -> Condition:
+def _with_sensor(state: State) -> Finding:
     """Return the next step with the poses and calibrations of the sensor."""
-    sensor, rating = state.sensor, state.sensor.rating
+    sensor, rating, guide = state.sensor, state.sensor.rating, state.sensor.guide
     if sensor.offered is not None:
         verdict = '' if rating is None else f', {rating.name}: {rating.reason}'
-        return Condition('accept', f'a new calibration waits{verdict}; call ~/save to use and '
-                         'store it, or ~/undo to discard it', 'save')
+        return _step('accept', f'a new calibration waits{verdict}; call ~/save to use and '
+                     'store it, or ~/undo to discard it', 'save')
     if sensor.unsaved:
-        return replace(calling('save', 'the calibration in use is not stored'),
-                       level=Level.ERROR, concern='storage', name='unsaved')
+        return Finding('unsaved', 'the calibration in use is not stored; call ~/save',
+                       level='BAD', step='save', command='save')
     if sensor.drift is not None and sensor.has_changed:
-        return Condition('poses', status(sensor.drift), sensor.drift.remedy[1],
-                         level=Level.WARN, concern='drift')
+        return Finding('changed', status(sensor.drift), level='USABLE', step='poses',
+                       command=sensor.drift.remedy[1])
     if sensor.calibration is not None and rating is None:
-        return Condition('', '')
+        return _step('', '')
     if rating is not None and rating.name == 'GOOD':
-        if sensor.calibration is not None and not sensor.calibration.is_levelled:
-            return _LEVEL
-        return Condition('done', rating.next.text if rating.next.kind == 'done' else
-                         'use the calibration')
-    return _with_poses(state)
-
-
-def _with_poses(state: State) -> Condition:
-    """Return the next step without a calibration that is good."""
-    sensor, rating, guide = state.sensor, state.sensor.rating, state.sensor.guide
+        is_done = sensor.calibration is None or sensor.calibration.is_levelled
+        return _LEVEL if not is_done else _step(
+            'done', rating.next.text if rating.next.kind == 'done' else 'use the calibration')
     if rating is not None and rating.findings and rating.findings[0].kind == 'flat_pose':
-        return Condition('level', f'{rating.reason}; if it is mounted so, place it level again '
-                         'and call ~/set_level once more', 'set_level')
+        return _step('level', f'{rating.reason}; if it is mounted so, place it level again '
+                     'and call ~/set_level once more', 'set_level')
     if refusal := state.refusal_of('poses'):
-        return Condition('poses', refusal)
+        return _step('poses', refusal)
     asked, is_fitted = step_of(guide), 0 < guide.poses == sensor.fitted_poses  # to all poses
     if rating is None or not is_fitted or guide.planned is not None:
         return asked
     if rating.next.kind == 'poses' and asked.direction:
-        return replace(asked, words=f'{rating.reason}; {asked.words}')
-    return calling(rating.next.kind, rating.next.text)
+        return replace(asked, text=f'{rating.reason}; {asked.text}')
+    return _calling(rating.next.kind, rating.next.text)
 
 
-def step_of(guide: Guide) -> Condition:
+def step_of(guide: Guide) -> Finding:
     """Return what to do next with the poses; without a kind before the first choice."""
     plan = guide.plan
     if guide.planned == ():
-        return calling('refine', 'all poses of the plan are taken')
+        return _calling('refine', 'all poses of the plan are taken')
     if plan is None:
-        return Condition('', '')
-    words = request_words(plan.asked)
-    if plan.asked.direction is None:
-        return calling('fit', words)
-    command = ''
-    if plan.asked.fits:
-        words, command = f'{words}, or call ~/fit', 'fit'
-    return Condition('poses', words, command, tuple(plan.asked.direction.tolist()))
+        return _step('', '')
+    asked = plan.asked
+    words = request_words(asked)
+    if asked.direction is None:
+        return _calling('fit', words)
+    return _step('poses', f'{words}, or call ~/fit' if asked.fits else words,
+                 'fit' if asked.fits else '', direction=tuple(asked.direction.tolist()))
 
 
-def _within_reach(state: State, step: Condition) -> Condition:
+def _within_reach(state: State, step: Finding) -> Finding:
     """Return a step that a robot which cannot be turned further can do, too."""
     guide, present = state.sensor.guide, state.sensor.present
     is_refused = bool(state.refusal_of('poses'))
@@ -205,16 +174,16 @@ def _within_reach(state: State, step: Condition) -> Condition:
         return step
     if present is None and not is_refused and guide.poses >= FEWEST_IN_CONE and not (
             state.refusal_of('fit')):
-        return replace(step, words=f'{step.words}; if it cannot be turned further, call ~/fit',
+        return replace(step, text=f'{step.text}; if it cannot be turned further, call ~/fit',
                        command='fit')
     if present is None and not state.refusal_of('calibrate_at_rest'):
-        return replace(step, words=f'{step.words}; if it cannot be turned over, place the robot '
+        return replace(step, text=f'{step.text}; if it cannot be turned over, place the robot '
                        'level, hold it still and call ~/calibrate_at_rest',
                        command='calibrate_at_rest')
     if present is None or not (is_partial(present) or guide.missed >= NOT_FOLLOWED):
         return step
-    return (Condition('done', f'use the calibration in these orientations; for others: '
-                      f'{step.words}') if present.is_levelled else _LEVEL)
+    return (_step('done', f'use the calibration in these orientations; for others: '
+                  f'{step.text}') if present.is_levelled else _LEVEL)
 
 
 def slow_turn(state: State) -> str:
@@ -226,57 +195,39 @@ def slow_turn(state: State) -> str:
     return f'turning slowly, {rate:.1f} °/s: rest it on something' if rate else ''
 
 
-# ----------------------------------------------------------------------------- files and use
-
-def _files(state: State) -> Iterator[Condition]:
-    """Yield what is wrong with the files."""
-    if state.problem:
-        yield Condition('restart', state.problem, level=Level.ERROR)
-    store = state.files.store
-    if store is not None and not store.is_writable():
-        yield Condition(
-            'save', f'{state.files.path} cannot be written: correct the permissions, or restart '
-            'the node with another calibration_file', level=Level.ERROR, concern='storage')
-
-
-def _use(state: State) -> Iterator[Condition]:
+def _use(state: State) -> Iterator[Finding]:
     """Yield what is wrong with the use of the calibration."""
     if not state.enabled:
-        yield Condition('enable', 'correction switched off, raw messages are published: call '
-                        '~/enable with true to correct them', level=Level.WARN)
+        yield Finding('switched_off', 'correction switched off, raw messages are published: call '
+                      '~/enable with true to correct them', level='USABLE', step='enable')
     for key, each in state.sensor.limits_left(state.context).items():
         beyond = max(each.low - each.least, each.most - each.high)
-        kind = 'poses' if beyond > _FAR * (each.high - each.low) else 'done'
-        yield Condition(kind, f'{each.words}: {USES_LIMIT}; capture poses there and call '
-                        '~/refine', 'refine', level=Level.WARN, name=f'range of {key}')
+        step = 'poses' if beyond > _FAR * (each.high - each.low) else 'done'
+        yield Finding('outside', f'{outside_words(each)}: {USES_LIMIT}; capture poses there and '
+                      'call ~/refine', level='USABLE', step=step, about=key, command='refine')
 
 
 # ----------------------------------------------------------------------------- samples
 
-def _context(state: State) -> Iterator[Condition]:
+def _context(state: State) -> Iterator[Finding]:
     """Yield the columns of the context that are missing, why, and what follows."""
-    calibration, around = state.sensor.calibration, state.around
+    calibration, around, outside = state.sensor.calibration, state.around, state.surroundings
     needs = () if calibration is None else calibration.model.needs
     wanted = [*context_topics(state.settings), *(
         key for key in needs if key in CONTEXT or is_quantity(key))]
     for column in filter(around.is_missing, dict.fromkeys(wanted)):
+        why = outside.missing.get(column) or (
+            'the samples do not have it' if outside.publishers is None else
+            thermometer_words(state) if column == 'temperature' else
+            f"start the node with context:=['{column}:=TOPIC'], and its topic")
         follows = ''
         if column in around.values:
             follows = '; the last value holds'
         elif column in needs:
             value = around.assumed.get(column, math.nan)
             follows = f'; {value:.4g} {column_of(column).unit}'.rstrip() + ' is used instead'
-        yield Condition(
-            'connect', f'no {column} arrives: {_why_missing(state, column)}{follows}',
-            level=Level.WARN, concern='stream', name=column)
-
-
-def _why_missing(state: State, column: str) -> str:
-    around = state.surroundings
-    return around.missing.get(column) or (
-        'the samples do not have it' if around.publishers is None else
-        thermometer_words(state) if column == 'temperature' else
-        f"start the node with context:=['{column}:=TOPIC'], and its topic")
+        yield Finding('no_value', f'no {column} arrives: {why}{follows}', level='USABLE',
+                      about=column)
 
 
 def thermometer_words(state: State) -> str:
@@ -307,28 +258,23 @@ _UNITS = (('g', 0.8, 1.2), ('m/s2', 8.0, 12.0))
 """Units with the lowest and highest |reading| of a resting sensor in this unit."""
 
 
-def _stream(state: State) -> Iterator[Condition]:
-    """Yield what is wrong with the messages, and what to do."""
+def _stream(state: State) -> list[Finding]:
+    """Return what is wrong with the messages, and what to do."""
     statistics, around = state.statistics, state.surroundings
-    names = around.publishers or ()
-    told = {'mismatches': '; '.join(around.mismatches),
-            'silence' if names else 'no_publisher': _silence(state)}
+    names, unit = around.publishers or (), _wrong_unit(statistics, state.units)
+    found = {'mismatches': '; '.join(around.mismatches),
+             'silence' if names else 'no_publisher': _silence(state)}
     if len(names) > 1:
-        told['publishers'] = (
+        found['publishers'] = (
             f'{"two" if len(names) == 2 else len(names)} publishers on the topic {state.topic}: '
             f'{", ".join(names)}; expected one sensor: stop the others, or give each sensor its '
             'own topic; a driver that was killed disappears after about 20 s')
-    told['stamps'] = statistics.stamp_fault
-    told['unit'] = _wrong_unit(statistics, state.units)
+    found |= {'stamps': statistics.stamp_fault, 'unit': unit}
     if statistics.dropped_ago < _LASTS:
-        told |= {kind: f'dropped {counted(statistics.dropped[kind], what)} {why}'
-                 for kind, (what, why) in _DROPPED.items() if statistics.dropped[kind]}
-    told['vibration'] = '' if told['unit'] else _vibration(state)
-    kinds = {'unit': 'unit', 'vibration': 'still'}
-    for name, words in told.items():
-        if words:
-            yield Condition(kinds.get(name, 'connect'), words, level=Level.WARN,
-                            concern='stream', name=name)
+        found |= {kind: f'dropped {counted(statistics.dropped[kind], what)} {why}'
+                  for kind, (what, why) in _DROPPED.items() if statistics.dropped[kind]}
+    found['vibration'] = '' if unit else _vibration(state)
+    return [Finding(kind, text, level='USABLE') for kind, text in found.items() if text]
 
 
 def _silence(state: State) -> str:

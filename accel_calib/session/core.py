@@ -1,7 +1,7 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a session knows: its one state, and the holder that goes on to the next one."""
+"""What a session knows: its one state, and who goes on to the next one."""
 
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -12,12 +12,13 @@ from typing import Any
 from .sensor import new_sensor, Sensor
 from .settings import CalibratorSettings, own_effects
 from .store import SensorFiles
-from .stream import Around, StreamStatistics
+from .stream import AGAIN, Around, StreamStatistics
 from .worker import Event, Log, Severity, Throttle
-from ..calibration import Calibration, mounting_of, mounting_words, with_given_mounting
+from ..calibration import Calibration, mounting_of, with_given_mounting
 from ..effects import OwnEffect
 from ..errors import InputError
 from ..finding import Finding
+from ..findings import mounting_words
 from ..table import Floats
 from ..units import FrameName, Units, units_of
 
@@ -55,8 +56,7 @@ class State:
     """
     The state of the calibrator of one sensor.
 
-    The stream is counted in `statistics`, `around` and `files`. All else changes only with another
-    state.
+    The stream is counted in `statistics` and `around`. All else changes only with another state.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ class State:
     statistics, around : StreamStatistics, Around
         The messages, and what is known beside them.
     files : SensorFiles
-        The files of the sensor.
+        The files of the sensor, and their lock.
     own : tuple of OwnEffect
         The effects of the user.
     given : (3, 3) array or None
@@ -105,7 +105,7 @@ class State:
     sensor: Sensor
     statistics: StreamStatistics
     around: Around
-    files: SensorFiles
+    files: SensorFiles = SensorFiles()
     own: tuple[OwnEffect, ...] = ()
     given: Floats | None = None
     frame_id: str | None = None
@@ -128,11 +128,6 @@ class State:
     def frame(self) -> FrameName:
         """Levelled frame of calibrations; messages in ned are those of ros, turned."""
         return 'ros' if self.settings.frame == 'ned' else self.settings.frame
-
-    @property
-    def stillness(self) -> float:
-        """Spread of the last samples, relative to the largest of a still sensor."""
-        return self.statistics.spread / self.sensor.live.detector.threshold
 
     @property
     def context(self) -> dict[str, float]:
@@ -172,11 +167,10 @@ def begin(settings: CalibratorSettings, topic: str, clock: Callable[[], float]) 
         raise InputError(f'publish_tf would make {settings.base_frame!r}, the frame of the '
                          'robot, a child of the frame of the sensor',
                          'set publish_tf to false, or choose another output_frame_id')
-    units, own = units_of(settings.units, settings.gravity), own_effects(settings)
+    units = units_of(settings.units, settings.gravity)
     return State(
-        settings, topic, units, sensor=new_sensor(settings, units),
-        statistics=StreamStatistics(clock), around=Around(clock),
-        files=SensorFiles(settings, topic, own), own=own,
+        settings, topic, units, new_sensor(settings, units), StreamStatistics(clock),
+        Around(clock), own=own_effects(settings),
         given=mounting_of(settings.mounting_rpy) if any(settings.mounting_rpy) else None)
 
 
@@ -216,6 +210,11 @@ class Holder:
         """Note that a command is refused, or ``poses`` for a fit, and what to do."""
         refused = words, self.state.situation_of(command)
         self.change(refusals={**self.state.refusals, command: refused})
+
+    def drop(self, kind: str, severity: Severity, words: str, count: int = 1) -> None:
+        """Count dropped messages of a kind, and log why, at most once in `AGAIN`."""
+        self.state.statistics.drop(kind, count)
+        self.log(severity, words, kind, AGAIN)
 
     def log(self, severity: Severity, words: str, kind: str = '', once_in: float = 0.0) -> None:
         """Add a log line to the events; of a kind, if it has one, at most one in `once_in` [s]."""

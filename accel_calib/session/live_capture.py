@@ -56,13 +56,9 @@ class PoseBook:
         self.held: list[Dwell] = []
         self._made: tuple[list[Dwell], Poses] | None = None
 
-    @property
-    def _all(self) -> list[Dwell]:
-        return [*self._earlier, *self._dwells, *self.held]
-
     def poses(self) -> Poses:
         """Return the pose table, with NaN where a pose lacks a column of the context."""
-        dwells, made = self._all, self._made
+        dwells, made = [*self._earlier, *self._dwells, *self.held], self._made
         if made is None or len(made[0]) != len(dwells) or not all(map(is_, made[0], dwells)):
             # Merging compares all pairs; the diagnostics ask every second.
             made = self._made = dwells, poses_from(
@@ -80,7 +76,7 @@ class PoseBook:
 
     def lacking(self, column: str) -> tuple[int, int]:
         """Return how many dwells have no value in a column of the context, and how many have."""
-        known = [column in each.context for each in self._all]
+        known = [column in each.context for each in (*self._earlier, *self._dwells, *self.held)]
         return known.count(False), known.count(True)
 
     def add_stored(self, poses: Poses) -> None:
@@ -95,21 +91,11 @@ class PoseBook:
         """Return whether a rest is part of no pose, provisional or doubtful ones included."""
         return not any(overlap(rest, each) for each in (*self.held, *self._dwells))
 
-    def _has(self, dwell: Dwell) -> bool:
-        """Return whether a rest is known already: a recording is played again."""
-        return any(_same_samples(each, dwell) for each in (*self._earlier, *self._dwells))
-
-    def hold(self, dwell: Dwell) -> None:
-        """Add or update the provisional pose of an ongoing rest."""
+    def put(self, dwell: Dwell, *, ended: bool) -> None:
+        """Add the pose of a rest, or replace its provisional one; provisional until it `ended`."""
         self.held = [each for each in self.held if not overlap(dwell, each)]
-        if not self._has(dwell):
-            self.held.append(dwell)
-
-    def end(self, dwell: Dwell) -> None:
-        """Add a rest that ended, in place of its provisional pose."""
-        self.held = [each for each in self.held if not overlap(dwell, each)]
-        if not self._has(dwell):
-            self._dwells.append(dwell)
+        if not any(_has_same_samples(each, dwell) for each in (*self._earlier, *self._dwells)):
+            (self._dwells if ended else self.held).append(dwell)
         if len(self._dwells) > _SEPARATE:
             self._earlier = self._selected([*self._earlier, self._dwells.pop(0)])
 
@@ -118,7 +104,7 @@ class PoseBook:
         over = [each for each in self.held if is_over(each)]
         self.held = [each for each in self.held if not is_over(each)]
         for dwell in over:
-            self.end(replace(dwell, doubtful=True))
+            self.put(replace(dwell, doubtful=True), ended=True)
         return len(over)
 
     def mark(self, marked: Callable[[Dwell], Dwell]) -> int:
@@ -169,8 +155,8 @@ def overlap(one: Dwell | Rest, other: Dwell) -> bool:
     return one.start <= other.end and other.start <= one.end
 
 
-def _same_samples(one: Dwell, other: Dwell) -> bool:
-    """Return whether two dwells have the same stamps, and the same mean within its noise."""
+def _has_same_samples(one: Dwell, other: Dwell) -> bool:
+    """Return whether two dwells have the same stamps and mean: a recording is played again."""
     noise = np.hypot(one.std / np.sqrt(one.count), other.std / np.sqrt(other.count))
     return (overlap(one, other) and not one.doubtful
             and bool(np.all(np.abs(one.mean - other.mean) <= _SAME_MEAN * noise)))
@@ -234,7 +220,7 @@ class LiveCapture:
         self._settings, self._begun = settings, -math.inf
         self._rest: Dwell | None = None
         self._declined: Dwell | None = None
-        self._looked = self._known_until = self._was_still = 0.0
+        self._looked = self._was_still = 0.0
         self._judged_at = float('inf')
 
     @property
@@ -286,14 +272,14 @@ class LiveCapture:
 
     def capture(self, rest: Dwell) -> None:
         """Capture the ongoing rest as a pose."""
-        self.book.hold(rest)
+        self.book.put(rest, ended=False)
         self._declined = None
 
     def refresh(self) -> None:
         """Update the pose of the ongoing rest, if it is a provisional one."""
         dwell = self.detector.current() if self.book.held else None
         if dwell is not None and self.book.holds(dwell):
-            self.book.hold(dwell)
+            self.book.put(dwell, ended=False)
 
     def undo(self) -> bool:
         """Remove the last pose and do not capture it again; return whether a pose was removed."""
@@ -305,36 +291,36 @@ class LiveCapture:
         self._declined, self._begun = self._rest, self._looked
         self.book.clear()
 
-    def _look(self, time: float, capture: bool) -> Change | None:
-        """Return the changes by the ongoing rest at this time, if it is due."""
-        still = self.detector.still
-        if still:
-            self._was_still = time
-        until = self._known_until if still else self._looked + _LOOK_EVERY
-        if self._looked <= time < until:
-            return None
-        self._looked, self._known_until = time, time + _LOOK_EVERY
-        if not still:
-            return self._doubt_held(time)
-        dwell = self.detector.current()
-        if dwell is None or _length(dwell) < _due(_length(self._rest, dwell)):
-            return None
-        self._rest = dwell
-        self._known_until = dwell.start + _due(_length(dwell))
-        held = self._is_captured(dwell, capture)
-        if held:
-            self.book.hold(dwell)
-        return Change(rest=dwell, poses=held)
-
     def _is_captured(self, dwell: Dwell, capture: bool) -> bool:
         """Return whether a rest is a pose: already provisional, or every rest becomes a pose."""
         declined = self._declined is not None and overlap(self._declined, dwell)
         return self.book.holds(dwell) or (capture and not declined)
 
+    def _look(self, time: float, capture: bool) -> Change | None:
+        """Return the changes by the ongoing rest at this time, if it is due."""
+        still, rest = self.detector.still, self._rest
+        if still:
+            self._was_still = time
+        if self._looked <= time < self._looked + _LOOK_EVERY:
+            return None
+        self._looked = time
+        if not still:
+            return self._doubt_held(time)
+        dwell = self.detector.current()
+        if dwell is None:
+            return None
+        known = rest.end - rest.start if rest is not None and overlap(rest, dwell) else 0.0
+        if dwell.end - dwell.start < min(2.0 * known, known + LONG_REST):
+            return None
+        self._rest, captured = dwell, self._is_captured(dwell, capture)
+        if captured:
+            self.book.put(dwell, ended=False)
+        return Change(rest=dwell, poses=captured)
+
     def _end(self, ended: list[Dwell], capture: bool) -> Change:
         captured = [dwell for dwell in ended if self._is_captured(dwell, capture)]
         for dwell in captured:
-            self.book.end(dwell)
+            self.book.put(dwell, ended=True)
         last, rest = ended[-1], self._rest
         latest = rest is None or rest.start <= last.end
         if latest:
@@ -353,21 +339,9 @@ class LiveCapture:
         """Mark provisional poses as doubtful that will not get a final average."""
         def is_over(dwell: Dwell) -> bool:
             windows, samples = _SURELY_OVER
-            period = _length(dwell) / dwell.samples
+            period = (dwell.end - dwell.start) / dwell.samples
             away = max(windows * self._settings.still_window, samples * period)
             return not dwell.start <= time <= max(dwell.end, self._was_still) + away
 
         count = self.book.doubt_held(is_over)
         return Change(poses=True, doubted=count) if count else None
-
-
-def _due(length: float) -> float:
-    """Return the length of a rest at its next update [s]."""
-    return min(2.0 * length, length + LONG_REST)
-
-
-def _length(dwell: Dwell | None, same_as: Dwell | None = None) -> float:
-    """Return the length of a rest [s]; 0 without a rest, or for another rest than `same_as`."""
-    if dwell is None or (same_as is not None and not overlap(dwell, same_as)):
-        return 0.0
-    return dwell.end - dwell.start

@@ -16,16 +16,14 @@ request is not repeated.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
-from dataclasses import replace
-from itertools import permutations, product
+from dataclasses import dataclass, field, replace
 import math
 
 import numpy as np
 
 from ..calibration import lies_in_cone, NextPose, PlannedPose, SessionPlan
-from ..geometry import ATTITUDES, axes_of_signs, TAKEN, unit
+from ..geometry import ATTITUDES, axes_of_signs, SIGNED_AXES, TAKEN, unit
 from ..table import Floats, Poses
 from ..units import MG, Units
 
@@ -41,6 +39,9 @@ _WITHOUT_NEW = 30.0
 NOT_FOLLOWED = 3
 """Number of requests in a row that are not followed, with the same meaning."""
 
+_ANSWERS = 4
+"""Number of answers from which the axes are found."""
+
 _FEWEST_WRONG = 2
 """Smallest number of wrong answers that show swapped or inverted axes."""
 
@@ -49,44 +50,61 @@ _AGREES = math.cos(math.radians(25.0))
 seldom agrees by chance (`benchmarks/persons.py`)."""
 
 
-_AXES = sorted((np.eye(3)[list(order)] * signs for order in permutations(range(3))
-                for signs in product((1.0, -1.0), repeat=3)),
+_AXES = sorted(SIGNED_AXES,
                key=lambda axes: np.sum(np.diag(axes) != 1.0) + 0.1 * np.sum(axes < 0.0))
-"""The 48 ways in which axes can be swapped and inverted, the most likely first: reading = A up."""
+"""The ways in which axes can be swapped and inverted, the most likely first: reading = A up."""
 
 _SIMPLE = 7
 """Number of them with no, or with one axis inverted, or two swapped."""
 
 
+@dataclass(frozen=True, eq=False)
 class Guide:
     """
-    The next pose, and the lines about captured poses.
+    The next pose, and the lines about captured poses; the methods return the guide after them.
 
-    `planned` are the poses of a refinement that are still asked for, () once all are taken; None:
-    the poses are for a fit. `axes` are the axes of the readings in those of the sensor, one of the
-    48 with right angles. `missed` counts the last requests in a row that were not followed, and
-    `skipped` are directions that are not asked for. `is_stale`: because of the last rest, another
-    pose is to be asked for.
+    Parameters
+    ----------
+    chosen : SessionPlan or None
+        The next pose for a fit; None before the first choice.
+    planned : tuple of PlannedPose or None
+        The poses of a refinement that are still asked for, () once all are taken; None: the poses
+        are for a fit.
+    begun : int
+        Number of poses when they were planned.
+    axes : (3, 3) array
+        The axes of the readings in those of the sensor, one of the 48 with right angles.
+    skipped : tuple of (3,) array
+        Directions that are not asked for.
+    is_stale : bool
+        Whether another pose is to be asked for because of the last rest.
+    answers : tuple of (array, array)
+        The last requests, and the directions that were read instead.
+    missed : int
+        Number of the last requests in a row that were not followed.
+    count, new_at : int, float
+        Number of poses, and the header stamp at which it changed [s].
+    rest : float
+        Start of the last rest that has a line [s].
 
     """
 
-    def __init__(self) -> None:
-        self._plan: SessionPlan | None = None
-        self.planned: tuple[PlannedPose, ...] | None = None
-        self.axes: Floats = _AXES[0]
-        self.skipped: list[Floats] = []
-        self.is_stale = False
-        self._answers = deque[tuple[Floats, Floats]](maxlen=4)
-        self.missed = 0
-        self._begun = 0
-        self._count = 0
-        self._new_at = math.inf
-        self._rest = -math.inf
+    chosen: SessionPlan | None = None
+    planned: tuple[PlannedPose, ...] | None = None
+    begun: int = 0
+    axes: Floats = field(default_factory=lambda: _AXES[0])
+    skipped: tuple[Floats, ...] = ()
+    is_stale: bool = False
+    answers: tuple[tuple[Floats, Floats], ...] = ()
+    missed: int = 0
+    count: int = 0
+    new_at: float = math.inf
+    rest: float = -math.inf
 
     @property
     def plan(self) -> SessionPlan | None:
         """Return the next pose, or that of a followed refinement; None before the first choice."""
-        plan = self._plan
+        plan = self.chosen
         if plan is None:
             return None
         asked = plan.asked
@@ -94,74 +112,59 @@ class Guide:
             first = self.planned[0]
             asked = NextPose(self.axes.T @ first.up, asked.error, plan.poses + len(self.planned),
                              fits=False, planned=first)
-        elif asked.direction is not None and not self._is_usual:
+        elif asked.direction is not None:
             asked = replace(asked, direction=self.axes.T @ asked.direction)
         return replace(plan, asked=asked)
 
-    @plan.setter
-    def plan(self, plan: SessionPlan | None) -> None:
-        self._plan, self.is_stale = plan, False
-        if plan is None or plan.poses < self._begun:
-            self.planned = None
-        elif self.planned:
-            new = plan.up[self._begun:]
-            self.planned = tuple(
-                each for each in self.planned if not np.any(new @ each.up >= TAKEN))
+    def choose(self, plan: SessionPlan | None) -> Guide:
+        """Ask for another pose; those of a refinement that are taken now are not asked for."""
+        planned = self.planned
+        if plan is None or plan.poses < self.begun:
+            planned = None
+        elif planned:
+            new = plan.up[self.begun:]
+            planned = tuple(each for each in planned if not np.any(new @ each.up >= TAKEN))
+        return replace(self, chosen=plan, planned=planned, is_stale=False)
 
-    @property
-    def _is_usual(self) -> bool:
-        return np.array_equal(self.axes, _AXES[0])
-
-    def follow(self, planned: Sequence[PlannedPose]) -> None:
+    def follow(self, planned: Sequence[PlannedPose]) -> Guide:
         """Ask for these poses of a refinement next; for none, ask for poses for a fit."""
-        self.planned, self._begun = tuple(planned) or None, self.poses
+        return replace(self, planned=tuple(planned) or None, begun=self.poses)
 
     @property
     def poses(self) -> int:
         """Return the number of poses for which the next pose was chosen."""
-        return 0 if self._plan is None else self._plan.poses
+        return 0 if self.chosen is None else self.chosen.poses
 
-    def added(self, count: int, stamp: float) -> int:
-        """Note the number of poses at a header stamp [s]; return by how many it has changed."""
-        change, self._count = count - self._count, count
-        if change:
-            self._new_at = stamp
-        return change
+    def note(self, count: int, stamp: float) -> Guide:
+        """Note the number of poses at a header stamp [s]."""
+        return self if count == self.count else replace(self, count=count, new_at=stamp)
 
     def is_stuck(self, stamp: float) -> bool:
         """Return whether several requests were not followed, or no pose is new for a time."""
-        return self.missed >= NOT_FOLLOWED or stamp - self._new_at >= _WITHOUT_NEW
+        return self.missed >= NOT_FOLLOWED or stamp - self.new_at >= _WITHOUT_NEW
 
-    def is_new_rest(self, start: float) -> bool:
-        """Return whether a captured rest with this start has no line yet, and note it."""
-        new = start > self._rest
-        self._rest = max(start, self._rest)
-        return new
-
-    def rested(self, mean: Floats, units: Units) -> str:
-        """Note the mean reading of a new rest; return how it is not what was asked for, or ''."""
+    def answer(self, mean: Floats, units: Units) -> tuple[Guide, str]:
+        """Note the mean reading of a new rest; return also how it is not what was asked for."""
         plan = self.plan
         if plan is None or not plan.poses or plan.asked.direction is None or (
                 units.is_native and not plan.zero):
-            return ''
+            return self, ''
         asked, read = plan.asked.direction, unit(mean - np.array(plan.zero or (0.0, 0.0, 0.0)))
-        self._answers.append((asked, read))
+        noted = replace(self, answers=(*self.answers, (asked, read))[-_ANSWERS:])
         wanted = self.axes @ asked
         if read @ wanted >= _FOLLOWED:
-            self.missed = 0
-            return ''
-        words = f'asked for {_signs(asked)}, the sensor reads {_signs(read)}'
-        if all(each @ wanted < TAKEN for each in self.skipped):
-            self.skipped.append(wanted)
-        self.missed, self.is_stale = self.missed + 1, True
-        axes = self._likely_axes(plan.up)
+            return replace(noted, missed=0), ''
+        skips = all(each @ wanted < TAKEN for each in self.skipped)
+        noted = replace(noted, skipped=(*self.skipped, *([wanted] if skips else [])),
+                        missed=self.missed + 1, is_stale=True)
+        axes = noted._likely_axes(plan.up)
         if not np.array_equal(axes, self.axes):
-            self.axes, self.skipped, self.missed = axes, [], 0
-        return words
+            noted = replace(noted, axes=axes, skipped=(), missed=0)
+        return noted, f'asked for {_signs(asked)}, the sensor reads {_signs(read)}'
 
     def _likely_axes(self, up: Floats) -> Floats:
         """Return the axes in which the last answers follow; `up` are the poses, (n, 3)."""
-        asked, read = map(np.array, zip(*self._answers, strict=True))
+        asked, read = map(np.array, zip(*self.answers, strict=True))
         # Opposite requests show one axis alone, and a robot that tilts reads the same without end.
         telling = np.min(np.abs(asked @ asked.T)) < _APART and not lies_in_cone(
             np.vstack([up, read]))
@@ -175,7 +178,7 @@ class Guide:
     @property
     def axes_words(self) -> str:
         """Return how the axes are probably swapped or inverted; empty if they are not."""
-        if self._is_usual:
+        if np.array_equal(self.axes, _AXES[0]):
             return ''
         reads = {f'+{name}': _signs(read) for name, read in zip('xyz', self.axes.T)}
         wrong = {name: read for name, read in reads.items() if name != read}

@@ -57,9 +57,9 @@ class Sensor:
     """
     The poses, the plan, the calibration, its drift, and the last rest of one sensor.
 
-    What streams is followed in `live`, `guide` and `temperatures`. All else changes only with
-    another `Sensor`, which the methods return. Two of them are of the same sensor if they have the
-    same `live`.
+    What streams is followed in `live` and `temperatures`. All else changes only with another
+    `Sensor`, which the methods return. Two of them are of the same sensor if they have the same
+    `live`.
 
     Parameters
     ----------

@@ -13,25 +13,26 @@ uses a steady clock.
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+import math
 from time import monotonic
 from typing import Any
 
 import numpy as np
 
-from .commands import Commands, due, poses_changed
-from .conditions import next_action
+from .commands import fit_if_due, poses_changed
+from .conditions import APART, CONCERNS, conditions, next_step, slow_turn, thermometer_words
 from .core import begin, Holder
 from .live_capture import Change
-from .reports import FAULT_AGAIN, Reports
 from .sensor import new_sensor
-from .settings import CalibratorSettings
+from .settings import CalibratorSettings, context_topics
+from .store import Identity, SensorFiles, store_of
 from .stream import AGAIN, SILENT
-from .use import adopt, load, show_mounting, show_poses
+from .use import adopt, open_files, show_mounting, show_poses
 from .worker import answered, ShowPoses, Still, Task
-from ..calibration import mounting_words
 from ..comparison import status
+from ..findings import mounting_words
 from ..table import Floats
-from ..text import counted
+from ..text import counted, LONGEST_NAME, one_line
 
 BATCH = 0.3
 """
@@ -41,6 +42,12 @@ A batch takes several ms on a slow machine, and messages that arrive in this tim
 and 3 batches per second, these are less than 1 % of the messages.
 
 """
+
+_FAULT_AGAIN = 60.0
+"""Shortest time between two equal log lines about another fault of the stream [s]."""
+
+_OFTEN = ('silence', 'no_publisher')
+"""Findings that are logged again after `AGAIN`."""
 
 _LARGEST_G, _LARGEST_NATIVE = 1e4, 2.0 ** 32
 """Larger readings are not of a sensor, and would cost the detector its digits [g, native]."""
@@ -61,19 +68,12 @@ class Session(Holder):
     known : mapping of str to object
         Fields of the first state that are not those of a new one, such as `found`.
 
-    Attributes
-    ----------
-    commands : Commands
-        What the user can ask for.
-    reports : Reports
-        The log lines about the messages.
-
     """
 
     def __init__(self, settings: CalibratorSettings, topic: str,
                  clock: Callable[[], float] = monotonic, **known: Any) -> None:
         super().__init__(replace(begin(settings, topic, clock), **known), clock)
-        self.commands, self.reports = Commands(self), Reports(self)
+        self._told: list[tuple[str, str]] = []  # kinds and subjects of the logged findings
         units = self.state.units
         self._largest = _LARGEST_NATIVE if units.is_native else _LARGEST_G * units.per_g
         is_named = settings.sensor or settings.calibration_file
@@ -87,17 +87,55 @@ class Session(Holder):
         if settings.rotate != before.rotate:
             self.change(sensor=self.sensor.turn(settings))
         if settings.model != before.model:
-            self.sensor.guide.plan = None
+            self.change_sensor(guide=self.sensor.guide.choose(None))
             show_poses(self, store=False)
 
     def tick(self) -> None:
         """Check the stream, and try to lock the files; to be called about once per second."""
-        store = self.state.files.try_again()
-        if store is not None:
-            self.events.append(load(self, store, self.sensor))
+        files = self.state.files
+        if files.store is not None and files.lock is None:
+            self.change(files=files.take())
+            if self.state.files.lock is not None:
+                self.events.append(open_files(self, files.store, self.sensor))
         self._report_still()
-        self.reports.tick()
-        self.events += due(self)
+        self._report_findings()
+        self._report_context()
+        fit_if_due(self)
+
+    def _report_findings(self) -> None:
+        """Log what is wrong, and what is over."""
+        state, statistics = self.state, self.state.statistics
+        now = {(each.kind, each.about): each.text for each in conditions(state)
+               if each.level != 'GOOD' and each.kind not in APART}
+        waits = not statistics.messages and not state.surroundings.mismatches
+        for (kind, about), text in now.items():
+            name, is_stream = f'{kind} {about}', kind not in CONCERNS
+            again = AGAIN if kind in _OFTEN else _FAULT_AGAIN if is_stream else math.inf
+            self.log('info' if waits else 'warning', f'waiting: {text}' if waits else text, name,
+                     again if (kind, about) in self._told else 0.0)
+        over = [key for key in self._told if key not in now and key[0] not in CONCERNS]
+        for _, about in over:
+            if about in state.around.values:
+                self.log('info', f'{about} arrives')
+        if over and statistics.rate and all(kind in CONCERNS for kind, _ in now):
+            self.log('info', f'messages arrive as expected, {statistics.rate:.1f} Hz')
+        self._told = list(now)
+
+    def _report_context(self) -> None:
+        """Log what would be needed for a pose, or for the effects of a quantity."""
+        state, topics = self.state, context_topics(self.state.settings)
+        if (turn := slow_turn(state)) and state.settings.auto_capture:
+            self.log('info', f'no pose yet: {turn}', 'slow_turn', AGAIN)
+        if (state.surroundings.thermometers and state.statistics.messages
+                and 'temperature' not in topics and math.isnan(state.around.temperature)):
+            self.log('warning', f'no temperature arrives; {thermometer_words(state)}',
+                     'thermometers', 10.0 * _FAULT_AGAIN)
+        for column in topics:
+            lack, have = state.sensor.live.book.lacking(column)
+            if lack and have:
+                self.log('info', f'{lack} of {counted(lack + have, "pose")} have no {column}, '
+                         'so that ~/refine cannot use it', f'poses without {column}',
+                         10.0 * _FAULT_AGAIN)
 
     def close(self) -> None:
         """Unlock the files."""
@@ -122,7 +160,7 @@ class Session(Holder):
             if self.state.files.store is None or self.sensor.owners - {self.state.name}:
                 self._begin_again()
             elif not self.state.settings.sensor:
-                self.state.files.take(self.state.name)
+                self._find_store()
             return True
         is_replaced = self.state.statistics.age > SILENT
         if is_replaced:
@@ -135,10 +173,8 @@ class Session(Holder):
                 self._begin_again()
             self._show_frame()
             return True
-        self.state.statistics.drop('foreign')
-        self.log('error', f'an Imu message has frame_id {frame_id!r}, expected '
-                 f'{self.state.frame_id!r}; it is dropped: use a separate topic for each sensor',
-                 'foreign', AGAIN)
+        self.drop('foreign', 'error', f'an Imu message has frame_id {frame_id!r}, expected '
+                  f'{self.state.frame_id!r}; it is dropped: use a separate topic for each sensor')
         return False
 
     def push(self, samples: Floats, arrived: float) -> None:
@@ -155,11 +191,10 @@ class Session(Holder):
         """
         good = (np.abs(samples[:, 1:4]) <= self._largest).all(axis=1)  # and no NaN
         if not np.all(good):
-            self.state.statistics.drop('not_finite', int(np.sum(~good)))
             reading = tuple(samples[~good, 1:4][0].tolist())
-            self.log('warning', f'an Imu message has the linear_acceleration {reading}, expected '
-                     f'three finite numbers up to {self._largest:.3g}; it is dropped: check the '
-                     'driver', 'absurd', AGAIN)
+            self.drop('not_finite', 'warning', f'an Imu message has the linear_acceleration '
+                      f'{reading}, expected three finite numbers up to {self._largest:.3g}; it is '
+                      'dropped: check the driver', int(np.sum(~good)))
             samples = samples[good]
         if len(samples):
             since = arrived - self.state.statistics.arrived
@@ -174,7 +209,7 @@ class Session(Holder):
                 self.log('warning', f'the stamps jumped {where} by {abs(last[0].seconds):.1f} s; '
                          'the rest before it has ended, and the poses are kept: unless a '
                          'recording is played, check the clock of the driver',
-                         f'jump {where}', FAULT_AGAIN)
+                         f'jump {where}', _FAULT_AGAIN)
 
     def _change(self, changes: Iterable[Change]) -> None:
         least = self.state.settings.drift_warn / self.state.settings.gravity
@@ -194,12 +229,14 @@ class Session(Holder):
                          'out such poses if the others are sufficient')
             for rest in change.refused:
                 if 2.0 * (rest.end - rest.start) > self.state.settings.min_dwell and (
-                        next_action(self.state).kind == 'poses'):
+                        next_step(self.state).kind == 'poses'):
                     self.log('info', f'this rest gave no pose: {rest.words}', rest.reason, AGAIN)
             if change.poses:
-                new = change.rest is not None and sensor.guide.is_new_rest(change.rest.start)
-                poses_changed(self, ended=bool(change.ended),
-                              new_rest=change.rest if new else None)
+                new, guide = change.rest, self.sensor.guide
+                new = new if new is not None and new.start > guide.rest else None
+                if new is not None:
+                    self.change_sensor(guide=replace(guide, rest=new.start))
+                poses_changed(self, ended=bool(change.ended), new_rest=new)
         self._report_still()
 
     def _report_still(self) -> None:
@@ -231,12 +268,26 @@ class Session(Holder):
 
     def _open(self, run: Callable[[Task], object]) -> bool:
         """Lock and load the files of the sensor; return whether no other node uses them."""
-        store = self.state.files.take(self.state.name)
-        self.change(problem=self.state.files.problem)
-        self.log('error', self.state.problem)
-        if store is not None:
-            run(load(self, store, self.sensor))
-        return store is not None
+        self._find_store()
+        files = self.state.files
+        self.change(problem=files.problem)
+        self.log('error', files.problem)
+        if files.store is not None and files.lock is not None:
+            run(open_files(self, files.store, self.sensor))
+        return files.lock is not None
+
+    def _find_store(self) -> None:
+        """Go on with the files of the sensor, locked unless another node uses them."""
+        state, before = self.state, self.state.files
+        settings = state.settings
+        identity = Identity(one_line(state.name).strip()[:LONGEST_NAME], state.topic,
+                            bool(settings.sensor))
+        store = store_of(settings.calibration_file, identity, settings.units, state.own)
+        files = replace(before, store=store)
+        if before.path != files.path:
+            before.release()
+            files = SensorFiles(store)
+        self.change(files=files.take())
 
     def set_mounting(self, rotation: Floats) -> None:
         """Use a mounting ΔR that is known from elsewhere, (3, 3)."""

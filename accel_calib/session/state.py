@@ -11,21 +11,21 @@ The state of a session, as its topics and pages show it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, MISSING
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from .conditions import Condition, conditions, Level, next_action, thermometer_words
+from .conditions import CONCERNS, conditions, next_step, thermometer_words
 from .core import State
 from .sensor import title
 from .settings import context_topics
 from .stream import SILENT
 from ..comparison import status
 from ..errors import InputError
-from ..finding import has
+from ..finding import has, Level, LEVELS
 from ..messages.one_reading import Triple
 from ..pipeline import is_partial
 from ..table import column_of
@@ -128,74 +128,69 @@ class Progress:
         return cls(**found)
 
 
-Newest = tuple[tuple[float, ...], float, float]
-"""A reading: direction (empty if not known), |a| and corrected |a| [g] (NaN: not known)."""
-
-_NOT_KNOWN: Newest = (), math.nan, math.nan
-
-
 def progress(state: State, reading: Triple | None = None) -> Progress:
     """Return the progress; `reading` is the newest one, by default the last that was pushed."""
     sensor, statistics = state.sensor, state.statistics
     plan, silent = sensor.guide.plan, statistics.age > SILENT
-    up, length, corrected = _NOT_KNOWN if silent else _newest(state, reading)
-    action, rating = next_action(state), sensor.rating
+    up, length, corrected = ((), math.nan, math.nan) if silent else _newest(state, reading)
+    step, rating = next_step(state), sensor.rating
     # NaN if it is not known, or not the noise alone.
     noisy = rating is not None and has(rating.findings, 'beyond_noise')
-    accuracy = math.nan if plan is None or noisy else plan.asked.error * plan.noise_g
     return Progress(
         still=state.still and not silent,
-        stillness=math.nan if silent else state.stillness,
+        stillness=math.nan if silent else statistics.spread / sensor.live.detector.threshold,
         dwell=statistics.stamp - state.still_since if state.still else 0.0,
         min_dwell=state.settings.min_dwell, poses=sensor.guide.poses,
         total=0 if plan is None else plan.asked.total,
         coverage=0.0 if plan is None else plan.coverage,
-        accuracy=accuracy, step=action.kind, advice=action.words,
-        command=action.command,
-        direction=action.direction,
+        accuracy=math.nan if plan is None or noisy else plan.asked.error * plan.noise_g,
+        step=step.kind, advice=step.text, command=step.command, direction=step.direction,
         up=up, length=length, corrected=corrected, temperature=state.around.temperature)
 
 
-def _newest(state: State, reading: Triple | None) -> Newest:
-    """Describe the newest reading; a native one has a direction only if its zero is known."""
-    sensor, newest = state.sensor, state.statistics.newest
-    if reading is None:
-        if newest is None:
-            return _NOT_KNOWN
+def _newest(state: State, reading: Triple | None) -> tuple[tuple[float, ...], float, float]:
+    """Return direction (empty: not known), |a| and corrected |a| [g] of the newest reading."""
+    sensor, newest, native = state.sensor, state.statistics.newest, state.units.is_native
+    if reading is None and newest is not None:
         reading = tuple(newest.tolist())
-    force = sensor.force_of(reading, state.context)
+    if reading is None:
+        return (), math.nan, math.nan
+    x, y, z = reading
+    force = sensor.force_of((x, y, z), state.context)
     corrected = math.nan if force is None else math.hypot(*force)
-    if not state.units.is_native:
-        length = math.hypot(*reading)
-        return _unit(reading, length), length / state.units.per_g, corrected
-    if sensor.present is None or force is None:
+    along: list[float] = [x, y, z]
+    if native and sensor.present is not None and force is not None:
+        along = (sensor.present.rotation @ force).tolist()
+    elif native:  # the direction is known only with the zero
         zero = () if sensor.guide.plan is None else sensor.guide.plan.zero
-        parts = [part - at for part, at in zip(reading, zero, strict=False)]
-        return _unit(parts, math.hypot(*parts)), math.nan, math.nan
-    return _unit((sensor.present.rotation @ force).tolist(), corrected), math.nan, corrected
+        along = [part - at for part, at in zip(along, zero, strict=False)]
+    size = math.hypot(*along)
+    up = tuple(part / size for part in along) if 0.0 < size < math.inf else ()
+    return up, math.nan if native else size / state.units.per_g, corrected
 
 
-def _unit(vector: Sequence[float], length: float) -> tuple[float, ...]:
-    return tuple(part / length for part in vector) if 0.0 < length < math.inf else ()
+class Check(NamedTuple):
+    """The result of a check: what is right or wrong, and its level as of a finding."""
+
+    concern: str
+    words: str
+    level: Level
 
 
-def diagnostics(state: State) -> list[Condition]:
-    """Return the state, which is the first of the most severe conditions, and all `checks`."""
+def diagnostics(state: State) -> list[Check]:
+    """Return the state, which is the first of the most severe findings, and all `checks`."""
     found = conditions(state)
-    by_concern = {each.concern: each for each in _checked(state, found)}
-    first = max(found, key=lambda each: each.level)
-    words = by_concern[first.concern].words if first.level else words_of_state(state)
-    return [Condition('', words, level=first.level, concern='state'), *by_concern.values()]
+    worst = max(found, key=lambda each: LEVELS.index(each.level))
+    checked = checks(state)
+    concern = CONCERNS.get(worst.kind, 'stream')
+    words = words_of_state(state) if worst.level == 'GOOD' else next(
+        each.words for each in checked if each.concern == concern)
+    return [Check('state', words, worst.level), *checked]
 
 
-def checks(state: State) -> list[Condition]:
-    """Return the results of all checks, one for each concern."""
-    return diagnostics(state)[1:]
-
-
-def _checked(state: State, found: Sequence[Condition]) -> Iterator[Condition]:
-    """Yield for each concern the conditions that are wrong, or that all is fine."""
-    sensor, drift = state.sensor, state.sensor.drift
+def checks(state: State) -> list[Check]:
+    """Return for each concern what is wrong, or that all is fine."""
+    sensor, drift, found, all_found = state.sensor, state.sensor.drift, [], conditions(state)
     fine = {'stream': f'{state.statistics.rate:.1f} Hz on {state.topic}',
             'calibration': '' if sensor.calibration is None else title(sensor.calibration),
             'drift': 'no calibration yet' if drift is None else status(drift),
@@ -204,12 +199,14 @@ def _checked(state: State, found: Sequence[Condition]) -> Iterator[Condition]:
         count = counted(len(sensor.live.book.poses()), 'pose')
         fine['calibration'] = f'no calibration yet, captured {count}'
     for concern, words in fine.items():
-        wrong = [each for each in found if each.concern == concern and each.level]
-        said = list(dict.fromkeys(each.words for each in wrong))
-        if not any(each.name or each.level == Level.ERROR for each in wrong):  # a mere step
+        wrong = [each for each in all_found if each.level != 'GOOD'
+                 and CONCERNS.get(each.kind, 'stream') == concern]
+        said = list(dict.fromkeys(each.text for each in wrong))
+        if all(each.kind in ('step', 'switched_off') and each.level != 'BAD' for each in wrong):
             said[:1] = [': '.join(filter(None, [words, *said[:1]]))]
-        yield Condition('', '; '.join(said), concern=concern,
-                        level=max([Level.OK, *(each.level for each in wrong)]))
+        level = max((each.level for each in wrong), key=LEVELS.index, default=LEVELS[0])
+        found.append(Check(concern, '; '.join(said), level))
+    return found
 
 
 def words_of_state(state: State) -> str:
@@ -271,7 +268,7 @@ def _figures_of_capture(state: State) -> Iterator[tuple[str, str]]:
     poses, breaks = live.book.poses(), live.detector.interruptions
     yield 'poses captured', str(len(poses))
     yield 'poses doubtful', str(int(np.sum(poses['doubtful'])) if 'doubtful' in poses else 0)
-    yield 'next', next_action(state).words or 'turn the sensor'
+    yield 'next', next_step(state).text or 'turn the sensor'
     yield 'interruptions of the clock', str(len(breaks))
     yield 'last interruption', (
         f'{breaks[-1].kind}, {breaks[-1].seconds:.2f} s' if breaks else 'none')

@@ -15,6 +15,8 @@ It is held until it is released or the process ends.
 
 """
 
+from __future__ import annotations
+
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 import errno
@@ -29,7 +31,6 @@ import stat
 
 import numpy as np
 
-from .settings import CalibratorSettings
 from ..calibration import Calibration, check_sensor
 from ..disk import check_regular, copy_atomically, remove_leftovers, write_atomically
 from ..effects import OwnEffect
@@ -39,7 +40,6 @@ from ..errors import (
 from ..logs import read_poses, write_table
 from ..stored import calibration_bytes, read_calibration
 from ..table import LARGEST, Poses
-from ..text import LONGEST_NAME, one_line
 from ..units import UnitName
 
 _UNSAFE = re.compile(r'[^A-Za-z0-9_-]+')
@@ -194,28 +194,27 @@ class Store:
         """Return a copy of a good file for `step_back`, or an empty step if there is none."""
         if not is_good:
             aside(self.calibration, 'other')
-        steps = self.steps()
-        step = self._step(1 + max(self._numbers(), default=0))
+        kept, used = [*self.steps().values()], [number for number, _ in self._named_as_steps()]
+        step = self.calibration.with_name(
+            f'{self.calibration.name}.before{1 + max(used, default=0)}')
         if _exists(self.calibration):
             copy_atomically(self.calibration, step)
         else:
             step.touch()
-        for old in steps[:max(len(steps) + 1 - MOST_STEPS, 0)]:
-            self._step(old).unlink(missing_ok=True)
+        for old in kept[:max(len(kept) + 1 - MOST_STEPS, 0)]:
+            old.unlink(missing_ok=True)
         return step
 
-    def steps(self) -> list[int]:
-        """Return the numbers of the kept steps, oldest first."""
-        return [number for number in self._numbers() if self._step(number).is_file()]
+    def steps(self) -> dict[int, Path]:
+        """Return the kept steps by number, the oldest first."""
+        return {number: path for number, path in self._named_as_steps() if path.is_file()}
 
-    def _numbers(self) -> list[int]:
-        """Return the numbers that are in use, also by what is not a file, in order."""
-        names = self.calibration.parent.glob(f'{glob.escape(self.calibration.name)}.before*')
-        numbers = (path.name.removeprefix(f'{self.calibration.name}.before') for path in names)
-        return sorted(int(number) for number in numbers if _NUMBER.fullmatch(number))
-
-    def _step(self, number: int) -> Path:
-        return self.calibration.with_name(f'{self.calibration.name}.before{number}')
+    def _named_as_steps(self) -> list[tuple[int, Path]]:
+        """Return what has the name of a step, also what is not a file, with its number."""
+        start = f'{self.calibration.name}.before'
+        found = ((path.name.removeprefix(start), path)
+                 for path in self.calibration.parent.glob(f'{glob.escape(start)}*'))
+        return sorted((int(number), path) for number, path in found if _NUMBER.fullmatch(number))
 
     def step_back(self) -> Calibration | None:
         """
@@ -230,7 +229,7 @@ class Store:
             check_regular(self.calibration)
             now = self.calibration.read_bytes()
         # The last step that differs from the file; equal ones come from failed writes.
-        for step in map(self._step, reversed(self.steps())):
+        for step in reversed(self.steps().values()):
             if step.read_bytes() != now:
                 break
             step.unlink()
@@ -364,61 +363,46 @@ def lock(store: Store) -> ExitStack:
         return held.pop_all()
 
 
+@dataclass(frozen=True)
 class SensorFiles:
-    """The store of a sensor, None until the sensor is known; and why it cannot be used, or ''."""
+    """
+    The store of a sensor, None until the sensor is known, and its `lock`, None without it.
 
-    def __init__(self, settings: CalibratorSettings, topic: str, own: tuple[OwnEffect, ...]
-                 ) -> None:
-        self._settings, self._topic, self._own = settings, topic, own
-        self._lock: ExitStack | None = None
-        self.store: Store | None = None
-        self.problem = ''
+    `problem` is why another node has the lock; empty if none has it.
+
+    """
+
+    store: Store | None = None
+    lock: ExitStack | None = None
+    problem: str = ''
 
     @property
     def path(self) -> str:
         """Path of the calibration; empty until the sensor is known."""
         return '' if self.store is None else str(self.store.calibration)
 
-    @property
-    def locked(self) -> bool:
-        """Whether this node has locked the files."""
-        return self._lock is not None
-
-    def take(self, sensor: str) -> Store | None:
-        """Lock the files of a sensor and return the store; None if another node uses them."""
-        identity = Identity(one_line(sensor).strip()[:LONGEST_NAME], self._topic,
-                            bool(self._settings.sensor))
-        before, self.store = self.store, store_of(self._settings.calibration_file, identity,
-                                                  self._settings.units, self._own)
-        if before is None or before.calibration != self.store.calibration:
-            self.release()
-        return self.store if self.locked else self.try_again()
-
-    def try_again(self) -> Store | None:
-        """Lock the files if they have become free; return the store, or otherwise None."""
-        if self.store is None or self.locked:
-            return None
+    def take(self) -> SensorFiles:
+        """Return the files, locked unless another node uses them."""
+        if self.store is None or self.lock is not None:
+            return self
         try:
-            self._lock, self.problem = lock(self.store), ''
+            return replace(self, lock=lock(self.store), problem='')
         except StoreInUseError as error:
-            self.problem = str(error)
-            return None
-        return self.store
+            return replace(self, problem=str(error))
 
     def usable(self) -> Store:
         """Return the locked store; InputError if the sensor is not known, or it is not locked."""
         if self.store is None:
             raise InputError('the name of the sensor is not known, because there is no Imu '
                              'message yet', 'start the driver, or set the parameter sensor')
-        if not self.locked:
+        if self.lock is None:
             raise InputError(self.problem, 'this node stores nothing')
         return self.store
 
     def release(self) -> None:
         """Unlock the files."""
-        if self._lock is not None:
-            self._lock.close()
-        self._lock = None
+        if self.lock is not None:
+            self.lock.close()
 
 
 def tidied(store: Store) -> list[str]:

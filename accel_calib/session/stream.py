@@ -12,10 +12,10 @@ is played at another speed. They cover the last `_SPAN` seconds.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
-from itertools import islice
+from collections.abc import Callable, Iterable, Mapping
+from copy import deepcopy
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -254,13 +254,6 @@ _RECENT = int(2.0 * LONG_REST / _APART)
 """Number of recent points whose columns are kept; they cover the longest rest."""
 
 
-_Columns = deque[tuple[float, dict[str, float]]]
-"""Columns by time [s]."""
-
-_Followed = tuple[ThermalStream | None, _Columns]
-"""The stream of a model, None if it needs none, and its columns at the recent points."""
-
-
 class TemperatureHistory:
     """
     Temperatures of the last hours, and the columns that a model needs from them.
@@ -271,7 +264,8 @@ class TemperatureHistory:
 
     def __init__(self) -> None:
         self._points: deque[tuple[float, float]] = deque(maxlen=_POINTS)
-        self._followed: dict[tuple[object, ...], _Followed] = {}
+        # By what a model needs: its stream, and the columns at the recent points.
+        self._followed: dict[object, tuple[ThermalStream, deque[tuple[float, Any]]]] = {}
 
     def forget(self) -> None:
         """Compute no columns any more, except for the models that are asked for from now on."""
@@ -300,13 +294,11 @@ class TemperatureHistory:
             later = np.flatnonzero(time[begin:] >= due)
             end = begin + int(later[0]) + 1 if len(later) else len(time)
             now = float(time[end - 1])
-            followed = [(stream, columns) for stream, columns in self._followed.values() if stream]
-            for stream, _ in followed:
-                stream.add_all(time[begin:end], temperature[begin:end])
             if len(later):
                 self._points.append((now, float(temperature[end - 1])))
-                for stream, columns in followed:
-                    columns.append((now, stream.value))
+            for stream, columns in self._followed.values():
+                stream.add_all(time[begin:end], temperature[begin:end])
+                columns.extend([(now, stream.value)] if len(later) else [])
             begin = end
 
     def columns_of(self, model: Model) -> Mapping[str, float]:
@@ -316,7 +308,7 @@ class TemperatureHistory:
 
     def stream(self, model: Model) -> ThermalStream | None:
         """Return the lag and rate for a model after this history; None if it needs none."""
-        return self._replayed(model)[0]
+        return deepcopy(self._follow(model)[0])
 
     def during(self, model: Model, start: float, end: float) -> Context:
         """Return the mean columns that a model needs between two times; empty if not known."""
@@ -326,22 +318,16 @@ class TemperatureHistory:
             return {}
         return {key: np.array([np.mean([each[key] for each in inside])]) for key in inside[0]}
 
-    def _follow(self, model: Model) -> _Followed:
-        """Return the stream and columns of a model, which are computed from now on."""
-        key = tuple(model.lags.items()), 'temperature_rate' in model.over
-        if key not in self._followed:
-            self._followed[key] = self._replayed(model)
-        return self._followed[key]
-
-    def _replayed(self, model: Model) -> _Followed:
-        """Return the stream of a model after this history, and the columns at its last points."""
-        stream, columns = thermal_stream(model), _Columns(maxlen=_RECENT)
+    def _follow(self, model: Model) -> tuple[ThermalStream | None, Iterable[tuple[float, Any]]]:
+        """Return the stream of a model, which is followed from now on, and its recent columns."""
+        key, stream = (tuple(model.lags.items()), 'temperature_rate' in model.over), (
+            thermal_stream(model))
         if stream is None:
-            return None, columns
-        old = max(len(self._points) - _RECENT, 0)
-        if old:
-            stream.add_all(*np.array(list(islice(self._points, old))).T)
-        for time, temperature in islice(self._points, old, None):
-            stream.add(time, temperature)
-            columns.append((time, stream.value))
-        return stream, columns
+            return None, ()
+        if key not in self._followed:
+            columns = deque[tuple[float, Any]](maxlen=_RECENT)
+            for time, temperature in self._points:
+                stream.add(time, temperature)
+                columns.append((time, stream.value))
+            self._followed[key] = stream, columns
+        return self._followed[key]

@@ -10,23 +10,23 @@ Ratings, plans and files take time, so they are tasks, which are added to the ev
 
 import json
 import math
-from typing import Any, cast
 
 import numpy as np
 
-from .conditions import next_action
+from .conditions import next_step
 from .core import Holder
+from .fitting import rated
 from .sensor import Sensor, title
 from .store import Store, tidied, unusable, writing_advice
 from .stream import AGAIN
 from .worker import Compute, Files, Mounting, nothing, Parse, Result, Severity, ShowPoses, Task
-from ..calibration import Calibration, in_frame, mounting_figures, on_topics, outlook, plan_session
+from ..calibration import Calibration, in_frame, on_topics, plan_session
 from ..errors import DamagedCalibrationError, StoredCalibrationError
-from ..findings import calibration_json, rate as rating_of, Rating, rating_json, refinement_json
+from ..findings import mounting_figures, Rating, rating_json
 from ..refinement import Refinement
 from ..stillness import Dwell
 from ..table import CONTEXT, is_quantity, Poses
-from ..text import counted, plain
+from ..text import counted
 
 _SEVERITY: dict[str, Severity] = {'GOOD': 'info', 'USABLE': 'warning', 'BAD': 'error'}
 """Severity of the log line about a finding, by its level."""
@@ -90,7 +90,7 @@ def _report_rating(session: Holder, calibration: Calibration, refinement: Refine
     if session.sensor.present is not calibration:
         return ''
     session.change_sensor(rating=rating)
-    action = next_action(session.state)
+    action = next_step(session.state)
     if action.kind:
         found['in_use'] = session.sensor.offered is not calibration
         if calibration.is_levelled:
@@ -99,35 +99,29 @@ def _report_rating(session: Holder, calibration: Calibration, refinement: Refine
                 session.state.settings.base_frame)
         command = action.command and f'~/{action.command}'
         session.events.append(Result(json.dumps({
-            **found, **rating_json(rating, action.kind, action.words, command)})))
+            **found, **rating_json(rating, action.kind, action.text, command)})))
     return ''
-
-
-def rated(calibration: Calibration, refinement: Refinement | None, rating: Rating | None,
-          model: str) -> tuple[Rating, dict[str, Any]]:
-    """Return the rating of a calibration, if it is not known, and its JSON as of commands."""
-    found = {} if refinement is None else refinement_json(refinement)
-    whole = {**calibration_json(calibration, outlook(calibration, model)), **found}
-    return (rating_of(calibration, refinement=refinement) if rating is None else rating,
-            cast('dict[str, Any]', plain(whole)))
 
 
 def show_poses(session: Holder, *, store: bool, new_rest: Dwell | None = None) -> None:
     """Add a task that stores the poses, and draws them with the next pose."""
-    sensor = session.sensor
+    sensor, guide = session.sensor, session.sensor.guide
     poses = sensor.live.book.poses()
-    added = sensor.guide.added(len(poses), session.state.statistics.stamp)
+    session.change_sensor(guide=guide.note(len(poses), session.state.statistics.stamp))
     session.events.append(_draw_poses(
-        session, sensor, poses, added, new_rest, session.state.files.store if store else None))
+        session, sensor, poses, len(poses) - guide.count, new_rest,
+        session.state.files.store if store else None))
 
 
 def _draw_poses(session: Holder, sensor: Sensor, poses: Poses, added: int,
                 new_rest: Dwell | None, store: Store | None) -> Task:
     """Store and draw poses, this number more than before; return the line of a new rest."""
-    guide = sensor.guide
-    missed = '' if new_rest is None else guide.rested(new_rest.mean, session.state.units)
-    due, given = added != 0 or guide.plan is None or guide.is_stale, (
-        poses, session.state.units, session.state.settings.model, tuple(guide.skipped))
+    state, guide, missed = session.state, session.sensor.guide, ''
+    if new_rest is not None and state.sensor.live is sensor.live:
+        guide, missed = guide.answer(new_rest.mean, state.units)
+        session.change_sensor(guide=guide)
+    due = added != 0 or guide.chosen is None or guide.is_stale
+    given = poses, state.units, state.settings.model, guide.skipped
     try:
         yield Files(nothing) if store is None else Files(store.save_poses, poses)
     except OSError as error:
@@ -137,23 +131,23 @@ def _draw_poses(session: Holder, sensor: Sensor, poses: Poses, added: int,
     plan = yield Compute(plan_session, *given) if due and len(poses) else Compute(nothing)
     if due and not len(poses):  # without the start of the worker process
         plan = plan_session(*given)
-    is_same = session.sensor.live is sensor.live
-    if plan is not None and is_same:
-        guide.plan = plan
-        asked = plan.asked if guide.plan is None else guide.plan.asked  # as the next step asks
-        session.events.append(ShowPoses(plan.up, asked, session.state.frame_id or ''))
-    if new_rest is None or not is_same:
+    if session.sensor.live is not sensor.live:
         return ''
+    if plan is not None:
+        session.change_sensor(guide=session.sensor.guide.choose(plan))
+        asked = session.sensor.guide.plan or plan  # as the next step asks
+        session.events.append(ShowPoses(plan.up, asked.asked, session.state.frame_id or ''))
+    if new_rest is None:
+        return ''
+    guide, step = session.sensor.guide, next_step(session.state)
     session.log('warning', guide.axes_words, f'axes {guide.axes.tolist()}', math.inf)
-    action, line = next_action(session.state), ''
-    if action.kind:
-        line = guide.line(poses, session.state.units,
-                          '' if action.kind == 'done' else action.words,
-                          asks=action.kind == 'poses', added=added > 0)
+    line = '' if not step.kind else guide.line(
+        poses, session.state.units, '' if step.kind == 'done' else step.text,
+        asks=step.kind == 'poses', added=added > 0)
     return '; '.join(filter(None, (missed, line)))
 
 
-def load(session: Holder, store: Store, sensor: Sensor) -> Task:
+def open_files(session: Holder, store: Store, sensor: Sensor) -> Task:
     """Read the files of a sensor, and use them unless another one has replaced it."""
     calibration: Calibration | None = None
     poses: Poses | None = None

@@ -49,7 +49,7 @@ import sys
 from threading import Lock, Thread
 from time import monotonic
 from traceback import format_exc
-from typing import Any, BinaryIO, cast, Literal, Protocol, TypeVar
+from typing import Any, BinaryIO, cast, Literal, TypeVar
 
 from .store import writing_advice
 from ..calibration import NextPose
@@ -104,23 +104,15 @@ class WorkerProcess:
         except OSError:
             self._process = None
 
-    def call(self, function: Callable[..., Found], *given: Any) -> Found:
+    def call(self, function: Callable[..., Found], *given: Any, limit_s: float | None = None
+             ) -> Found:
         """
         Return the result of a module-level function, called in the process.
 
         Arguments and result are pickled. An error of the function is raised here, too; InputError
-        if the node is ending. Other threads wait for their turn.
-
-        """
-        with self._turn:
-            return self._call(function, given)
-
-    def call_within(self, limit_s: float, function: Callable[..., Found], *given: Any) -> Found:
-        """
-        Return the result of a module-level function, called in the process alone.
-
-        After `limit_s` [s] the process is ended: TimeoutError. EOFError if it dies. The next call
-        starts another one.
+        if the node is ending. Other threads wait for their turn. If the process dies, the function
+        is called here. With `limit_s` [s] it is not, but EOFError is raised; after this time the
+        process is ended, and TimeoutError is raised.
 
         """
         with self._turn:
@@ -140,9 +132,8 @@ class WorkerProcess:
 
     def _call(self, function: Callable[..., Found], given: tuple[Any, ...],
               limit_s: float | None = None) -> Found:
-        self.start()
         try:
-            good, found = self._ask(function, given, limit_s)
+            good, found = self._ask(pickle.dumps((function, given)), limit_s)
         except (OSError, EOFError, pickle.UnpicklingError) as err:
             if self._closed:
                 raise ClosedError('the node is shutting down', 'start it again') from None
@@ -154,20 +145,19 @@ class WorkerProcess:
             raise found
         return cast('Found', found)
 
-    def _ask(self, function: Callable[..., Any], given: tuple[Any, ...],
-             limit_s: float | None = None) -> tuple[bool, Any]:
+    def _ask(self, request: bytes, limit_s: float | None) -> tuple[bool, Any]:
+        self.start()
         process = self._process
         if self._closed:  # perhaps while another thread started the process
             self._end()
         if process is None or process.stdin is None or process.stdout is None:
             raise EOFError
-        process.stdin.write(pickle.dumps((function, given)))
+        process.stdin.write(request)
         process.stdin.flush()
         if self._idle and not select([process.stdout], [], [], _PATIENCE)[0]:
             self._idle = False  # raising the priority needs privileges, so restart it
             self._end()
-            self.start()
-            return self._ask(function, given)
+            return self._ask(request, limit_s)
         if not select([process.stdout], [], [], limit_s)[0]:
             raise TimeoutError
         return pickle.load(process.stdout)
@@ -216,11 +206,6 @@ def _read(stream: BinaryIO, calls: SimpleQueue[Any]) -> None:
         os._exit(0)
 
 
-def here(function: Callable[..., Found], *given: object) -> Found:
-    """Call a function in this process."""
-    return function(*given)
-
-
 def nothing() -> None:
     """Do nothing: a task with such a step only waits until the steps before it are done."""
 
@@ -236,10 +221,10 @@ class Step(partial[Any]):
 
     def run(self, call: Callable[..., Any]) -> Any:
         """Return the result; `call` is `WorkerProcess.call`."""
-        return None if self.func is nothing else call(self.func, *self._given(call))
-
-    def _given(self, call: Callable[..., Any]) -> list[Any]:
-        return [each.run(call) if isinstance(each, Step) else each for each in self.args]
+        given = [each.run(call) if isinstance(each, Step) else each for each in self.args]
+        if self.func is nothing:
+            return None
+        return self.func(*given) if isinstance(self, Files) else call(self.func, *given)
 
 
 class Parse(Step):
@@ -254,10 +239,6 @@ class Parse(Step):
 class Files(Parse):
     """A function that writes files, in this process, which holds their lock."""
 
-    def run(self, call: Callable[..., Any]) -> Any:
-        """Return the result; only a step among the arguments uses the worker process."""
-        return self.func(*self._given(call))
-
 
 class Compute(Step):
     """A function that computes, in the worker process; commands and files do not wait for it."""
@@ -269,7 +250,7 @@ def answered(task: Task) -> Any:
         step = next(task)
         while True:
             try:
-                found = step.run(here)
+                found = step.run(lambda function, *given: function(*given))
             except Exception as error:  # the task can handle it
                 step = task.throw(error)
             else:
@@ -350,31 +331,17 @@ class Throttle:
         self._last[kind] = now
         return True
 
-    def forget(self, kind: str) -> None:
-        """Let the next one of this kind be due."""
-        self._last.pop(kind, None)
-
 
 Answer = Callable[[bool, Any], object]
 """Function of the success of a task, and of its answer or the words of its error."""
 
-CallSoon = Callable[[Callable[[], None]], None]
+CallSoon = Callable[[Callable[[], object]], None]
 """Function that lets the thread of the session call a function, one after the other."""
-
-
-class Reporting(Protocol):
-    """What a worker needs of a session."""
-
-    events: deque[Event]
-
-    def log(self, severity: Severity, words: str) -> None: ...
-
-    def close(self) -> None: ...
 
 
 class Worker:
     """
-    The threads for the tasks of a session.
+    The threads for the tasks of a session, which come with its `events`.
 
     `running` names the commands that are not answered, the oldest first. `call_soon` lets the
     thread of the session call a function. `show` is called with each event that is no task, in
@@ -383,9 +350,9 @@ class Worker:
 
     """
 
-    def __init__(self, session: Reporting, call_soon: CallSoon, show: Callable[[Any], object],
+    def __init__(self, events: deque[Event], call_soon: CallSoon, show: Callable[[Any], object],
                  flush: Callable[[], object] = lambda: None) -> None:
-        self._session, self._call_soon, self._show = session, call_soon, show
+        self._events, self._call_soon, self._show = events, call_soon, show
         self._flush = flush
         self._files = ThreadPoolExecutor(1, 'accel_calib_files')
         self._computation = ThreadPoolExecutor(1, 'accel_calib')
@@ -398,17 +365,16 @@ class Worker:
 
     def handle_events(self) -> None:
         """Show the events of the session, run its tasks, and log their answers."""
-        events = self._session.events
-        while events:
-            event = events.popleft()
+        while self._events:
+            event = self._events.popleft()
             if isinstance(event, Generator):
                 self.run(event, self._log_answer)
             else:
                 self._show(event)
 
     def log(self, severity: Severity, words: str) -> None:
-        """Log a line, and show it at once."""
-        self._session.log(severity, words)
+        """Log a line, unless it is empty, and show it at once."""
+        self._events += [Log(severity, words)] if words else []
         self.handle_events()
 
     def _log_answer(self, success: bool, words: str) -> None:
@@ -423,12 +389,8 @@ class Worker:
             answer(success, found)
 
         self.running.append(name)
-        self._commands.append((self._fresh(command), done, None))
+        self._commands.append((command, done, None))
         self._advance()
-
-    def _fresh(self, command: Task) -> Task:
-        self._flush()
-        return (yield from command)
 
     def run(self, task: Task, answer: Answer) -> None:
         """Begin a task now, run its steps, and call `answer`."""
@@ -438,36 +400,33 @@ class Worker:
         """Begin what waits, until a step uses the files; such steps come first, commands last."""
         while not self._is_busy and not self._closed:
             if self._steps:
-                self._use_files(*self._steps.popleft())
+                step, task, answer = self._steps.popleft()
+                self._is_busy = True
+                self._submit(self._files, step, self._process.call_if_free,
+                             partial(self._resume, task, answer))
             elif waiting := self._computed or self._commands:
                 self._resume(*waiting.popleft())
             else:
                 return
 
-    def _use_files(self, step: Parse, task: Task, answer: Answer) -> None:
-        def then(done: Future[Any]) -> None:
-            self._resume(task, answer, done)
+    def _submit(self, pool: ThreadPoolExecutor, step: Step, call: Callable[..., Any],
+                then: Callable[[Future[Any]], object]) -> None:
+        """Run a step in a pool; what is `then` to be done, and what waits, is done here."""
+        def finish(done: Future[Any]) -> None:
+            then(done)
             self._advance()
 
-        self._is_busy = True
-        self._submit(self._files, step, self._process.call_if_free, then)
-
-    def _later(self, task: Task, answer: Answer, done: Future[Any]) -> None:
-        """Continue a task that computed when no files are used."""
-        self._computed.append((task, answer, done))
-        self._advance()
-
-    def _submit(self, pool: ThreadPoolExecutor, step: Step, call: Callable[..., Any],
-                then: Callable[[Future[Any]], None]) -> None:
         future = pool.submit(step.run, call)
-        future.add_done_callback(lambda done: self._call_soon(lambda: then(done)))
+        future.add_done_callback(lambda done: self._call_soon(partial(finish, done)))
 
-    def _resume(self, task: Task, answer: Answer, done: Future[Any] | None = None) -> None:
+    def _resume(self, task: Task, answer: Answer, done: Future[Any] | None) -> None:
         """Continue a task with the result of its step; nothing else begins meanwhile."""
         if self._closed:
             return  # rclpy may have destroyed the publishers
         self._is_busy = True
         try:
+            if done is None:  # a command begins
+                self._flush()
             outcome = self._outcome(task, done)
             self.handle_events()  # first, so that a command is answered after its poses are stored
             self._proceed(task, answer, outcome)
@@ -481,7 +440,7 @@ class Worker:
             self._advance()
         elif isinstance(found, Step):
             self._submit(self._computation, found, self._process.call,
-                         partial(self._later, task, answer))
+                         lambda done: self._computed.append((task, answer, done)))
         else:
             answer(success, found)
 
@@ -504,11 +463,10 @@ class Worker:
                            'the log')
 
     def close(self) -> None:
-        """Stop the computation, finish writing, and unlock the files."""
+        """Stop the computation, and finish writing."""
         self._closed = True
         self._process.close()
         self._computation.shutdown(wait=True)
         for step, _, _ in self._steps:
             self._files.submit(step.run, self._process.call_if_free)
         self._files.shutdown(wait=True)
-        self._session.close()

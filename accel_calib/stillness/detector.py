@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from .account import MISSING, Rest
 from .chunks import (
     CaptureSettings, chained, Chunker, Chunks, CHUNKS_PER_WINDOW, Interruption, MOTION, Records)
-from .dwell import Dwell, figures, figures_type, judged, OngoingDwell, Tracker
+from .dwell import figures, Dwell, figures_type, judged, OngoingDwell, Tracker
 from .levels import Known
 from .rule import Rule
 from .sensor import Lengths

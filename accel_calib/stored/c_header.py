@@ -19,13 +19,13 @@ smallest one after which u changes by less than the precision of a float.
 
 from dataclasses import dataclass, replace
 import re
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .made import (
-    frame_words, literal, Made, Options, polynomial, single, steady_at, steady_grid,
-    temperature_range)
+    frame_words, Made, Options, polynomial, single, steady_at, steady_grid, temperature_range)
 from ..calibration import Calibration
 from ..effects import (
     CUBE, MONOMIALS, ODD_SQUARE, PRODUCT, REFERENCE_TEMPERATURE, SIZE, SQUARE, WAVE, ZONAL, ZONES)
@@ -40,6 +40,10 @@ _NOTHING_G = 1e-10
 """Smaller coefficients are rounding errors."""
 
 _LARGEST_STEPS = 20
+_KINDS = {'square': SQUARE, 'cube': CUBE, 'odd_square': ODD_SQUARE, 'size': SIZE,
+          'product': PRODUCT, 'wave': WAVE, 'zone': ZONAL}
+"""First index in `MONOMIALS` of each kind of bending terms."""
+
 _NAME = re.compile(r'[A-Za-z][A-Za-z0-9_]{0,40}')
 _BEYOND = 2.0
 """The repetitions converge for forces up to this [g]."""
@@ -151,15 +155,15 @@ def header(calibration: Calibration, options: Options) -> Made:
     degrees = sorted({ZONES[(index - ZONAL) // 3].degree
                       for index in made.monomial.tolist() if index >= ZONAL})
     values = {
-        'name': name, 'roots': bool(np.any(made.monomial >= WAVE)),
-        'M': _array('M', made.matrix) if made.is_affine else '', 'B': _array('B', made.vec_v[0]),
-        'N': _array('N', made.inverse), 'R': _array('R', made.turn), 'steps': made.steps,
-        'V': [_horner(column) for column in made.vec_v.T], 'per_unit': 1.0 / made.per_g,
-        'bend': [_added(made, axis, name) for axis in range(3)],
-        'legendre': [(degree, _horner(np.array(next(
-            zone.polynomial for zone in ZONES if zone.degree == degree)))) for degree in degrees],
+        'name': name, 'affine': made.is_affine, 'M': made.matrix, 'B': made.vec_v[0],
+        'N': made.inverse, 'R': made.turn, 'steps': made.steps, 'V': list(made.vec_v.T),
+        'roots': bool(np.any(made.monomial >= WAVE)),
+        'per_unit': 1.0 / made.per_g,
+        'bend': [_terms(made, axis) for axis in range(3)],
+        'legendre': [(degree, np.array(next(zone.polynomial for zone in ZONES
+                                            if zone.degree == degree))) for degree in degrees],
         'unit': 'm/s^2' if calibration.units.is_si else 'g', 'frame': frame_words(calibration),
-        's': {'unknown': REFERENCE_TEMPERATURE, 'middle': _signed(made.middle),
+        's': {'unknown': REFERENCE_TEMPERATURE, 'middle': made.middle,
               'low': made.middle - made.half, 'high': made.middle + made.half,
               'per_half': 1.0 / made.half} if made.of_temperature else None}
     return Made(values, lambda reading, temperature: (
@@ -181,64 +185,14 @@ def identifier(text: str) -> str:
     return name if name[:1].isalpha() else f'accel_{name}'.rstrip('_')
 
 
-def _array(kind: str, values: Floats) -> str:
-    """Return the definition of a C array of one or two dimensions."""
-    sizes = ''.join(f'[{size}]' for size in values.shape)
-    parts = ([f'{{{", ".join(map(literal, row))}}}' for row in values] if values.ndim == 2
-             else list(map(literal, values)))
-    start = f'    static const float {kind}{sizes} = '
-    text = f'{start}{{{", ".join(parts)}}};'
-    if len(text) <= 99:
-        return text
-    lines = ',\n        '.join(parts)
-    return f'{start}{{\n        {lines}}};'
-
-
-def _signed(value: float) -> str:
-    """Return a literal, in brackets if it is negative."""
-    return f'({literal(value)})' if value < 0 else literal(value)
-
-
-def _horner(polynomial: Floats) -> str:
-    """Return the C expression of a polynomial in s, in brackets if it has more than one part."""
-    kept = np.trim_zeros(polynomial, 'b')
-    text = _signed(kept[-1]) if len(kept) else '0.0f'
-    for value in kept[-2::-1]:
-        text = f'({_signed(value)} + s * {text})' if value else f's * {text}'
-    return text
-
-
-def _added(header: Header, axis: int, name: str) -> str:
-    """Return the C terms that are taken from d of an axis."""
-    parts = []
-    for column in range(3):
-        change = np.append(0.0, header.mat_w[1:, axis, column])
-        if np.any(change):
-            parts.append(f'{_horner(change)} * u[{column}]')
+def _terms(header: Header, axis: int) -> list[dict[str, Any]]:
+    """Return the terms that are taken from d of an axis: a polynomial in s times a monomial."""
+    found = [{'polynomial': np.append(0.0, header.mat_w[1:, axis, column]), 'kind': 'force',
+              'axis': column} for column in range(3)]
     for k in np.flatnonzero(header.axis == axis):
-        if np.any(header.bend[:, k]):
-            parts.append(f'{_horner(header.bend[:, k])} * '
-                         f'{_monomial(int(header.monomial[k]), name)}')
-    return ''.join(f'\n            - {part}' for part in parts)
-
-
-def _monomial(index: int, name: str) -> str:
-    x, size = (f'u[{(index - SQUARE) % 3}]', '({0} < 0.0f ? -{0} : {0})')
-    if index >= ZONAL:
-        number, axis = divmod(index - ZONAL, 3)
-        cosine = ' + '.join(f'{_signed(towards)} * v[{k}]'
-                            for k, towards in enumerate(ZONES[number].towards))
-        return f'u[{axis}] * {name}_p{ZONES[number].degree}({cosine})'
-    if index >= WAVE:
-        mode, axis = divmod(index - WAVE, 3)
-        x = f'u[{axis}]'
-        held = f'({x} < -1.0f ? -1.0f : ({x} > 1.0f ? 1.0f : {x}))'
-        return f'cosf({literal((mode + 1) * np.pi / 2.0)} * ({held} + 1.0f))'
-    if index >= PRODUCT:
-        one, two = ((0, 1), (0, 2), (1, 2))[index - PRODUCT]
-        return f'u[{one}] * u[{two}]'
-    if index >= SIZE:
-        return size.format(x)
-    if index >= ODD_SQUARE:
-        return f'{x} * {size.format(x)}'
-    return f'{x} * {x} * {x}' if index >= CUBE else f'{x} * {x}'
+        kind, first = max((each for each in _KINDS.items() if each[1] <= header.monomial[k]),
+                          key=lambda each: each[1])
+        which, of = divmod(int(header.monomial[k]) - first, 3)
+        found.append({**(ZONES[which]._asdict() if kind == 'zone' else {}), 'kind': kind,
+                      'axis': of, 'which': which, 'polynomial': header.bend[:, k]})
+    return [each for each in found if np.any(each['polynomial'])]

@@ -26,8 +26,8 @@ from .plain_yaml import (
     values_at)
 from .. import __version__
 from ..calibration import (
-    Calibration, FleetPrior, gated, GyroBias, in_g, LARGEST_OFFSET_G, mounting_figures, Quality,
-    Rejected, RejectedKind, SampleNoise, STORED_METHODS)
+    Calibration, FleetPrior, gated, GyroBias, in_g, LARGEST_OFFSET_G, Quality, Rejected,
+    RejectedKind, SampleNoise, STORED_METHODS)
 from ..disk import FIRST_LINE, FORMAT, write_atomically
 from ..effects import (
     add_history, CHANGES, effect_named, EffectKey, entry_of, factors_of, Model, MODELS, OwnEffect,
@@ -37,6 +37,7 @@ from ..errors import (
     StoredCalibrationError)
 from ..estimate import Prior
 from ..finding import Finding, KINDS, LEVELS, without
+from ..findings import mounting_figures
 from ..statistics import rms
 from ..table import Autopilot, check_values, COLUMNS, Floats, is_quantity, LARGEST, Poses
 from ..text import counted, LONGEST_NAME, plain, some
@@ -95,7 +96,7 @@ def calibration_bytes(calibration: Calibration) -> bytes:
     """
     text: str = yaml.dump(_content(gated(calibration)), Dumper=SafeDumper, sort_keys=False,
                           allow_unicode=True, width=99, default_flow_style=None).rstrip()
-    data = f'{text}{_CHECKSUM}{_digest(text)}\n'.encode()
+    data = f'{text}{_CHECKSUM}{hashlib.sha256(text.encode()).hexdigest()}\n'.encode()
     try:
         calibration_from(data, 'its file', [
             each for each in calibration.model.effects if isinstance(each, OwnEffect)])
@@ -104,10 +105,6 @@ def calibration_bytes(calibration: Calibration) -> bytes:
                          f'stored: {err.message}', 'fit fewer poses, or shorten their texts'
                          ) from err
     return data
-
-
-def _digest(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _content(calibration: Calibration) -> dict[str, Any]:
@@ -211,12 +208,20 @@ def _checked(data: bytes, name: str, own: Sequence[OwnEffect]) -> Calibration:
     _check_known(content, name, own)
     with np.errstate(all='ignore'):  # the checks refuse what is not finite
         calibration = gated(_calibration(content, own))
-    _check_own(calibration, content, name)
+    for each, effect in zip(calibration.model.effects, calibration.model.terms.effects,
+                            strict=True):
+        if effect.own and not np.isclose(
+                _own_rms(calibration, each),
+                number_at(content['effects'][str(each)], 'own_rms'), _SAME_OWN, 0.0):
+            raise StoredCalibrationError(
+                f'{name} needs the effect {shown(str(each))} as it was when it was fitted, found '
+                'another definition', 'use that definition, or refine again')
     body, found, digest = text.rpartition(_CHECKSUM)
     if not found:
         raise ValueError('its last line, the checksum, is missing')
-    return (calibration if digest.strip() == _digest(body.rstrip()) else
-            _edited(calibration, content))
+    if digest.strip() != hashlib.sha256(body.rstrip().encode()).hexdigest():
+        return _edited(calibration, content)
+    return calibration
 
 
 def _check_known(content: Mapping[str, Any], name: str, own: Sequence[OwnEffect]) -> None:
@@ -228,18 +233,6 @@ def _check_known(content: Mapping[str, Any], name: str, own: Sequence[OwnEffect]
                 f'{name} needs the effect {shown(each)} of the user ({shown(values.get("what"))}),'
                 ' expected its definition', 'use --also FILE.py with the file that defines it, '
                 'the parameter also of the node, or also=[effect] in Python')
-
-
-def _check_own(calibration: Calibration, content: Mapping[str, Any], name: str) -> None:
-    """Refuse a calibration whose own effects are now defined in another way."""
-    model = calibration.model
-    for each, effect in zip(model.effects, model.terms.effects, strict=True):
-        if effect.own and not np.isclose(
-                _own_rms(calibration, each),
-                number_at(content['effects'][str(each)], 'own_rms'), _SAME_OWN, 0.0):
-            raise StoredCalibrationError(
-                f'{name} needs the effect {shown(str(each))} as it was when it was fitted, found '
-                'another definition', 'use that definition, or refine again')
 
 
 def _edited(calibration: Calibration, content: Mapping[str, Any]) -> Calibration:
@@ -270,6 +263,7 @@ def _calibration(content: Mapping[str, Any], own: Sequence[OwnEffect]) -> Calibr
     model = Model(_effects(value_at(content, 'effects', dict), own),
                   array_at(content, 'rotation', (3, 3)))
     units, size = _units(value_at(content, 'units', dict)), int(np.sum(model.stated))
+    quality: dict[str, Any] = value_at(content, 'quality', dict)
     rejected = tuple(Rejected(value_at(each, 'row', int), value_at(each, 'reason', str),
                               choice_at(each, 'kind', get_args(RejectedKind)))
                      for each in values_at(content, 'rejected', dict))
@@ -279,7 +273,9 @@ def _calibration(content: Mapping[str, Any], own: Sequence[OwnEffect]) -> Calibr
         sensor=value_at(content, 'sensor', str), stream=value_at(content, 'stream', str),
         frame=choice_at(content, 'frame', FRAMES), date=value_at(content, 'date', str),
         covariance=array_at(content, 'covariance', (size, size), finite=False, most=LARGEST),
-        quality=_quality(value_at(content, 'quality', dict)),
+        quality=Quality(**{each.name: None if quality[each.name] is None and each.name in (
+            'held_out_rms_mg', 'noise_floor_mg', 'chi2_per_dof') else number_at(quality, each.name)
+            for each in fields(Quality)}),
         poses=_poses(value_at(content, 'poses', dict), _optional(
             content, 'autopilot', lambda stated: Autopilot(**stated))),
         rejected=rejected, reason=value_at(content, 'reason', str),
@@ -288,7 +284,13 @@ def _calibration(content: Mapping[str, Any], own: Sequence[OwnEffect]) -> Calibr
             text=value_at(each, 'text', str), advice=value_at(each, 'advice', str),
             level=choice_at(each, 'level', LEVELS))
             for each in values_at(content, 'findings', dict)),
-        gyro=_optional(content, 'gyro_bias', _gyro_bias),
+        gyro=_optional(content, 'gyro_bias', lambda stated: GyroBias(
+            **{key: array_at(stated, key, (3,)) for key in ('bias', 'sd', 'slope')},
+            temperature=(np.nan if stated['temperature'] is None else
+                         number_at(stated, 'temperature')),
+            temperatures=tuple(array_at(stated, 'temperatures', (
+                len(value_at(stated, 'temperatures', list)),)).tolist()),
+            rests=value_at(stated, 'rests', int))),
         noise=_optional(content, 'noise', lambda stated: SampleNoise(*(
             array_at(stated, key, (3,), finite=False) for key in ('force', 'rate')))))
 
@@ -328,22 +330,6 @@ def _effects(stated: Mapping[str, Any], own: Sequence[OwnEffect]) -> dict[Effect
         known = {**dict(zip(effect.shape, effect.usual)), **values}
         found[key] = np.array([number_at(known, part, LARGEST) for part in effect.values])
     return found
-
-
-def _quality(stated: Mapping[str, Any]) -> Quality:
-    optional = ('held_out_rms_mg', 'noise_floor_mg', 'chi2_per_dof')
-    figures: dict[str, Any] = {
-        each.name: None if each.name in optional and stated[each.name] is None
-        else number_at(stated, each.name) for each in fields(Quality)}
-    return Quality(**figures)
-
-
-def _gyro_bias(stated: Mapping[str, Any]) -> GyroBias:
-    bias, sd, slope = (array_at(stated, key, (3,)) for key in ('bias', 'sd', 'slope'))
-    temperature = np.nan if stated['temperature'] is None else number_at(stated, 'temperature')
-    limits = array_at(stated, 'temperatures', (len(value_at(stated, 'temperatures', list)),))
-    return GyroBias(bias, sd, value_at(stated, 'rests', int), temperature, slope,
-                    tuple(limits.tolist()))
 
 
 def _poses(stated: Mapping[str, Any], autopilot: Autopilot | None) -> Poses:
@@ -465,21 +451,19 @@ def _fleets_in(data: bytes, path: Path) -> list[FleetPrior]:
         if content['format'] != _PRIORS:
             raise InputError(f'{path} has format {shown(content["format"])}, expected {_PRIORS}',
                              'update accel_calib, or make the file again')
-        return [_fleet_of(each) for each in values_at(content, 'models', dict)]
+        size, found = len(_PRIOR_NAMES), list[FleetPrior]()
+        for each in values_at(content, 'models', dict):
+            if tuple(names := values_at(each, 'names', str)) != _PRIOR_NAMES:
+                raise ValueError(f'names are {some(names)}, expected {some(_PRIOR_NAMES)}')
+            covariance = array_at(each, 'covariance', (size, size), most=LARGEST_OFFSET_G)
+            if not np.allclose(covariance, covariance.T):
+                raise ValueError('covariance is not symmetric')
+            prior = Prior(array_at(each, 'mean', (size,), most=LARGEST_OFFSET_G), covariance)
+            _ = prior.whitening  # raises LinAlgError unless it is positive definite
+            if not 1 <= (sensors := value_at(each, 'sensors', int)) <= _MOST_SENSORS:
+                raise ValueError(f'sensors is {shown(sensors)}, expected 1 to {_MOST_SENSORS}')
+            found.append(FleetPrior(str(each['model']), sensors, prior))
+        return found
     except (KeyError, TypeError, ValueError, np.linalg.LinAlgError) as err:
         raise InputError(f'{path} has no typical values of a fleet: {err}',
                          'use fleet.yaml of accel-calib fleet') from err
-
-
-def _fleet_of(content: Mapping[str, Any]) -> FleetPrior:
-    size = len(_PRIOR_NAMES)
-    if tuple(names := values_at(content, 'names', str)) != _PRIOR_NAMES:
-        raise ValueError(f'names are {some(names)}, expected {some(_PRIOR_NAMES)}')
-    covariance = array_at(content, 'covariance', (size, size), most=LARGEST_OFFSET_G)
-    if not np.allclose(covariance, covariance.T):
-        raise ValueError('covariance is not symmetric')
-    prior = Prior(array_at(content, 'mean', (size,), most=LARGEST_OFFSET_G), covariance)
-    _ = prior.whitening  # raises LinAlgError unless it is positive definite
-    if not 1 <= (sensors := value_at(content, 'sensors', int)) <= _MOST_SENSORS:
-        raise ValueError(f'sensors is {shown(sensors)}, expected 1 to {_MOST_SENSORS}')
-    return FleetPrior(str(content['model']), sensors, prior)

@@ -5,8 +5,8 @@
 Exports of a calibration to the places where it is used, and the plan of poses as CSV.
 
 An export is one entry of `FORMATS`, and a template of the same name in the folder ``templates``.
-The values for the templates are made in `.c_header`, `.flight_controllers`, `.affine` and
-`.noise_figures`; `.made` measures what an export does not hold, and fills the template.
+The values for the templates are made in `.c_header` and `.formats`; `.made` measures what an
+export does not hold, and fills the template.
 
 """
 
@@ -24,12 +24,11 @@ from typing import Any, TextIO, TYPE_CHECKING
 
 import numpy as np
 
-from .affine import affine, imucal
 from .c_header import header, identifier
 from .calibration_yaml import CORRECTION
-from .flight_controllers import ardupilot, counts, px4
+from .formats import (
+    affine, ardupilot, counts, imucal, Noise, noise_alone, openvins, px4, read_noise)
 from .made import difference_mg, Format, LEAST_LOSS_MG, Loss, losses_of, Made, Options, rendered
-from .noise_figures import Noise, noise_alone, openvins, read_noise
 from .. import __version__
 from ..calibration import Calibration
 from ..disk import write_atomically
@@ -109,81 +108,88 @@ def _content(calibration: Calibration) -> dict[str, Any]:
 FORMATS: Mapping[str, Format] = MappingProxyType({
     'c': Format(
         'C header', '.h', 'header in C99 and C++, single precision',
-        'force = M (raw - B), and [more](#c-and-arduino)',
-        'all but lag, time, supply and rotation', header, needs='options'),
+        equation='force = M (raw - B), and [more](#c-and-arduino)', holds='all but lag, time, '
+        'supply and rotation', make=header, needs='options'),
     'arduino': Format(
-        'Arduino header', '.h', 'header for an Arduino sketch', 'as `c`', 'as `c`', header,
-        needs='options'),
+        'Arduino header', '.h', 'header for an Arduino sketch', equation='as `c`', holds='as `c`',
+        make=header, needs='options'),
     'px4': Format(
         'PX4', '_px4.params', 'parameter file of QGroundControl',
-        '(raw - thermal(T - TREF) - OFF) SCALE', _BY_AXIS, px4,
-        _GITHUB + 'PX4/PX4-Autopilot/blob/main/src/lib/sensor_calibration/Accelerometer.hpp',
-        needs='options', metric=True),
+        equation='(raw - thermal(T - TREF) - OFF) SCALE', holds=_BY_AXIS, make=px4,
+        needs='options', metric=True, source=_GITHUB + 'PX4/PX4-Autopilot/blob/main/src/lib/'
+        'sensor_calibration/Accelerometer.hpp'),
     'ardupilot': Format(
         'ArduPilot', '_ardupilot.param', 'parameter file of Mission Planner and MAVProxy',
-        '(raw - p(T - 35) + p(CALTEMP - 35) - OFFS) SCAL', _BY_AXIS, ardupilot,
-        _GITHUB + 'ArduPilot/ardupilot/blob/master/libraries/AP_InertialSensor/'
-        'AP_InertialSensor_Backend.cpp', needs='options', metric=True),
+        equation='(raw - p(T - 35) + p(CALTEMP - 35) - OFFS) SCAL', holds=_BY_AXIS, make=ardupilot,
+        needs='options', metric=True, source=_GITHUB + 'ArduPilot/ardupilot/blob/master/libraries/'
+        'AP_InertialSensor/AP_InertialSensor_Backend.cpp'),
     'betaflight': Format(
         'Betaflight', '_betaflight.txt', 'commands for its command line',
-        '(raw - acc_calibration) / acc_1G', 'offset in counts',
-        partial(counts, label='Betaflight'),
-        _GITHUB + 'betaflight/betaflight/blob/master/src/main/sensors/acceleration.c',
+        equation='(raw - acc_calibration) / acc_1G', holds='offset in counts',
+        make=partial(counts, label='Betaflight'),
+        source=_GITHUB + 'betaflight/betaflight/blob/master/src/main/sensors/acceleration.c',
         needs='options'),
     'inav': Format(
-        'iNav', '_inav.txt', 'commands for its command line',
-        '(raw - acczero) accgain / 4096 / acc_1G', 'offset, gain of each axis',
-        partial(counts, label='iNav', with_gain=True),
-        _GITHUB + 'iNavFlight/inav/blob/master/src/main/sensors/acceleration.c', needs='options'),
+        'iNav', '_inav.txt', 'commands for its command line', equation='(raw - acczero) accgain / '
+        '4096 / acc_1G', holds='offset, gain of each axis',
+        make=partial(counts, label='iNav', with_gain=True),
+        source=_GITHUB + 'iNavFlight/inav/blob/master/src/main/sensors/acceleration.c',
+        needs='options'),
     'mpu6050': Format(
         'MPU-6050', '_mpu6050.h', 'change of the offset registers; MPU-6500 and 9250, too',
-        'raw + change, in 1/2048 g', 'offset in 0.98 mg',
-        partial(counts, label='MPU-6050', register_per_g=2048.0, step=2, notes=(
+        equation='raw + change, in 1/2048 g', holds='offset in 0.98 mg',
+        make=partial(counts, label='MPU-6050', register_per_g=2048.0, step=2, notes=(
             'add the change to the words that the chip has after power-on, each time, and verify '
             'it with new poses: drivers state 1/2048 g, but also 1/4096 g for the MPU-6050',)),
-        'RM-MPU-9250A-00 rev. 1.4, section 4.39, and mpu_set_accel_bias_6050_reg of InvenSense',
-        needs='options'),
+        source='RM-MPU-9250A-00 rev. 1.4, section 4.39, and mpu_set_accel_bias_6050_reg of '
+        'InvenSense', needs='options'),
     'fusion': Format(
         'Fusion', '_fusion.h', 'parameters of FusionCalibrationInertial by x-io',
-        'force = misalignment ((raw - offset) * sensitivity)', _ALL,
-        partial(affine, force_per_g=1.0),
-        _GITHUB + 'xioTechnologies/Fusion/blob/main/Fusion/FusionModel.h'),
+        equation='force = misalignment ((raw - offset) * sensitivity)', holds=_ALL,
+        make=partial(affine, force_per_g=1.0),
+        source=_GITHUB + 'xioTechnologies/Fusion/blob/main/Fusion/FusionModel.h'),
     'realsense': Format(
         'RealSense', '_realsense.json', 'calibration.json of rs-imu-calibration',
-        'force = scale_and_alignment^T raw - bias', f'{_ALL}, gyro bias',
-        partial(affine, notes=(
+        equation='force = scale_and_alignment^T raw - bias', holds=f'{_ALL}, gyro bias',
+        make=partial(affine, notes=(
             'it is for readings that are recorded with enable_motion_correction = 0',)),
-        _GITHUB + 'IntelRealSense/librealsense/blob/master/tools/rs-imu-calibration/'
-        'rs-imu-calibration.py', metric=True),
+        metric=True, source=_GITHUB + 'IntelRealSense/librealsense/blob/master/tools/'
+        'rs-imu-calibration/rs-imu-calibration.py'),
     'openvins': Format(
         'OpenVINS', '_imu_chain.yaml', 'kalibr_imu_chain.yaml with gains and noise',
-        'force = R_IMUtoACC^T Ta^-1 (raw - estimated bias)', 'gains, noise',
-        openvins, _GITHUB + 'rpng/open_vins/blob/master/ov_msckf/src/state/Propagator.cpp',
+        equation='force = R_IMUtoACC^T Ta^-1 (raw - estimated bias)', holds='gains, noise',
+        make=openvins,
+        source=_GITHUB + 'rpng/open_vins/blob/master/ov_msckf/src/state/Propagator.cpp',
         needs='noise', metric=True),
     'dlio': Format(
-        'DLIO', '_dlio.yaml', 'parameters of its ROS 2 node', 'force = sm raw - bias',
-        'offset, gains, gyro bias',
-        partial(affine, levelled=False, notes=(
+        'DLIO', '_dlio.yaml', 'parameters of its ROS 2 node', equation='force = sm raw - bias',
+        holds='offset, gains, gyro bias',
+        make=partial(affine, levelled=False, notes=(
             'DLIO turns readings by extrinsics/baselink2imu/R first: this file is for R = 1',)),
-        _GITHUB + 'vectr-ucla/direct_lidar_inertial_odometry/blob/master/src/dlio/odom.cc',
+        source=_GITHUB + 'vectr-ucla/direct_lidar_inertial_odometry/blob/master/src/dlio/odom.cc',
         metric=True),
     'imu_calib': Format(
-        'imu_calib', '_imu_calib.yaml', 'YAML file of the ROS package', 'force = SM raw - bias',
-        _ALL, affine, _GITHUB + 'dpkoch/imu_calib/blob/master/src/accel_calib/accel_calib.cpp'),
+        'imu_calib', '_imu_calib.yaml', 'YAML file of the ROS package',
+        equation='force = SM raw - bias', holds=_ALL, make=affine,
+        source=_GITHUB + 'dpkoch/imu_calib/blob/master/src/accel_calib/accel_calib.cpp'),
     'imucal': Format(
         'imucal', '_imucal.json', 'FerrarisCalibrationInfo as JSON',
-        'force = R_a^-1 K_a^-1 (raw - b_a)', f'{_ALL}, gyro bias', imucal,
-        'https://imucal.readthedocs.io/en/latest/modules/generated/imucal.html'),
+        equation='force = R_a^-1 K_a^-1 (raw - b_a)', holds=f'{_ALL}, gyro bias', make=imucal,
+        source='https://imucal.readthedocs.io/en/latest/modules/generated/imucal.html'),
     'kalibr': Format(
-        'Kalibr', '_imu.yaml', 'imu.yaml with the noise', 'none', 'noise',
-        partial(noise_alone, label='Kalibr'), _GITHUB + 'ethz-asl/kalibr/wiki/IMU-Noise-Model',
-        needs='noise'),
+        'Kalibr', '_imu.yaml', 'imu.yaml with the noise', equation='none', holds='noise',
+        make=partial(noise_alone, label='Kalibr'),
+        source=_GITHUB + 'ethz-asl/kalibr/wiki/IMU-Noise-Model', needs='noise'),
     'vins': Format(
-        'VINS', '_vins.yaml', 'lines of the noise for its configuration', 'none', 'noise',
-        partial(noise_alone, label='VINS'), _GITHUB + 'HKUST-Aerial-Robotics/VINS-Fusion/blob/'
-        'master/vins_estimator/src/factor/integration_base.h', needs='noise'),
-    'json': Format('JSON', '.json', 'all values', _OF_FILE, 'everything', _json),
-    'npz': Format('NumPy', '.npz', 'all values as arrays', _OF_FILE, 'everything', _npz)})
+        'VINS', '_vins.yaml', 'lines of the noise for its configuration', equation='none',
+        holds='noise', make=partial(noise_alone, label='VINS'),
+        needs='noise', source=_GITHUB + 'HKUST-Aerial-Robotics/VINS-Fusion/blob/master/'
+        'vins_estimator/src/factor/integration_base.h'),
+    'json': Format(
+        'JSON', '.json', 'all values', equation=_OF_FILE, holds='everything', make=_json),
+    'npz': Format(
+        'NumPy', '.npz', 'all values as arrays', equation=_OF_FILE, holds='everything',
+        make=_npz)})
 """The formats by name."""
 
 CALIBRATION_ALONE = tuple(name for name, each in FORMATS.items() if each.needs != 'noise')

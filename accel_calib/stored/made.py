@@ -201,25 +201,6 @@ def single(values: Floats) -> Floats:
     return np.asarray(np.asarray(values, np.float32), float)
 
 
-def affine_fit(calibration: Calibration) -> tuple[Floats, Floats]:
-    """
-    Return M (3, 3) and c (3,) with levelled force = M reading - c [g].
-
-    For a model of offset and gain they are exact; for others they are the least-squares fit over
-    the sphere and the range of the temperature.
-
-    """
-    if all(effect.linear for effect in calibration.model.terms.effects):
-        matrix = np.linalg.inv(calibration.model.linear_part[0]) / calibration.units.per_g
-        offset = matrix @ calibration.offset
-    else:
-        grid, scale = steady_grid(calibration), calibration.units.per_g
-        columns = np.column_stack([grid.reading / scale, np.ones(len(grid.reading))])
-        found = np.linalg.lstsq(columns, grid.force, rcond=None)[0]
-        matrix, offset = found[:3].T / scale, -found[3]
-    return calibration.rotation.T @ matrix, calibration.rotation.T @ offset
-
-
 # The losses
 
 
@@ -366,7 +347,8 @@ def _environment() -> 'Environment':
     made = Environment(loader=PackageLoader('accel_calib.stored'), undefined=StrictUndefined,
                        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)
     made.policies['json.dumps_kwargs'] = {'allow_nan': False}
-    made.filters |= {'yaml': _yaml, 'single': _single, 'literal': literal,
+    made.filters |= {'yaml': _yaml, 'single': _single, 'literal': literal, 'signed': signed,
+                     'horner': horner,
                      'lines': lambda lines, mark: '\n'.join(
                          f'{mark} {line}'.rstrip() for line in lines),
                      'flat': lambda rows: np.ravel(rows).tolist(),
@@ -396,3 +378,17 @@ def literal(value: Any) -> str:
         return f'{{{", ".join(map(literal, value))}}}'
     text = str(np.float32(value))
     return f'{text}f' if set('.e') & set(text) else f'{text}.0f'
+
+
+def signed(value: float) -> str:
+    """Return a literal, in brackets if it is negative."""
+    return f'({literal(value)})' if value < 0 else literal(value)
+
+
+def horner(polynomial: Sequence[float]) -> str:
+    """Return the C expression of a polynomial in s, in brackets if it has more than one part."""
+    kept = np.trim_zeros(np.array(polynomial), 'b')
+    text = signed(kept[-1]) if len(kept) else '0.0f'
+    for value in kept[-2::-1]:
+        text = f'({signed(value)} + s * {text})' if value else f's * {text}'
+    return text

@@ -26,6 +26,7 @@ from typing import Any
 import accel_calib as ac
 from accel_calib.effects import EffectRecord
 from accel_calib.errors import AccelCalibError
+from accel_calib.finding import Finding, NextStep
 from accel_calib.table import Table
 import numpy as np
 
@@ -43,6 +44,9 @@ LEAST_P = 1e-6
 
 BY_EFFECT = ('candidates', 'visible')
 """Tables with a row per effect of the catalogue; a new effect adds a row, and changes no other."""
+
+OF_A_SESSION = ('about', 'command', 'direction')
+"""Fields of findings and steps that have a value while messages arrive, and not of results."""
 
 _WIDTH = 80
 _CHANGING = re.compile(r'\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d(\+00:00)?)?)?|'
@@ -71,7 +75,9 @@ def plain(value: Any) -> Any:
     if isinstance(value, Table):
         return {'rows': len(value), 'units': value.units, **plain(value.columns)}
     if is_dataclass(value):
-        value = {each.name: getattr(value, each.name) for each in fields(value)}
+        live = OF_A_SESSION if isinstance(value, Finding | NextStep) else ()
+        value = {each.name: getattr(value, each.name) for each in fields(value)
+                 if each.name not in live}
     if isinstance(value, Mapping) or hasattr(value, '_asdict'):
         items = value if isinstance(value, Mapping) else value._asdict()
         return {str(key): plain(max(each, LEAST_P) if key == 'p_value' else each)

@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Parameters of flight controllers, and registers of a chip.
+The values of the exports: of flight controllers, of matrices with an offset, and of the noise.
+
+**Flight controllers**, and the registers of a chip:
 
 =========== ============================================================== ====================
 format      equation, by axis                                              readings
@@ -18,11 +20,23 @@ T is limited to the range of the polynomial. The values are the least-squares fi
 and the range of the temperature. They are applied before the rotation of the board. Readings of a
 flight log have the axes of the sensor (`accel_calib.logs.autopilot`), so that the values replace
 those of the vehicle; the log also states the place of the sensor in the parameters. ROS drivers
-turn readings to x forward, y left, z up;
-``axes='flu'`` turns them back by 180° about x, which changes the sign of the offsets of y and z.
+turn readings to x forward, y left, z up; ``axes='flu'`` turns them back by 180° about x, which
+changes the sign of the offsets of y and z.
 
 Sources beside those of the formats (`exports`): temperature of PX4 [1]_ and of
 ArduPilot [2]_, and the parameter file of QGroundControl [3]_.
+
+**A matrix and an offset.** Each program has its own parameters for the same calibration:
+
+    force = M raw - c = M (raw - V),   M = A diag(s),   M = inv(K R),   M = Q L
+
+A has columns of length 1, which is the rotation of the axes where the gains are those of each axis
+(Fusion). K is diagonal, and R has rows of length 1 (imucal). Q is a rotation, and L is lower
+triangular with a positive diagonal (OpenVINS, as Kalibr has it). For a model with more than offset
+and gain, M and c are the least-squares fit to it.
+
+**Noise.** The figures are those of ``accel-calib noise --json``, per square root of hertz.
+VINS-Fusion takes the noise of one sample, which is the density times the square root of the rate.
 
 .. [1] https://docs.px4.io/main/en/advanced_config/sensor_thermal_calibration
 .. [2] https://ardupilot.org/copter/docs/common-imutempcal.html
@@ -30,17 +44,24 @@ ArduPilot [2]_, and the parameter file of QGroundControl [3]_.
 
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.polynomial import Polynomial
 
 from .c_header import name_of
-from .made import Made, Options, polynomial, single, steady_at, steady_grid, temperature_range
+from .made import (
+    frame_words, Made, Options, plain_text, polynomial, single, steady_at, steady_grid,
+    temperature_range, unit_in_ascii)
+from .plain_yaml import beginning_of, decoded, shown
 from ..calibration import Calibration
 from ..errors import InputError
 from ..logs import ARDUPILOT_REFERENCE, ByAxis, DEGREE, PER_MILLION
 from ..table import Autopilot, Firmware, Floats
+from ..text import read_json
 from ..units import STANDARD_GRAVITY
 
 _COUNTS_PER_G = 2048.0
@@ -213,3 +234,158 @@ def _device(options: Options, prefix: str) -> Parameters:
 
 def _three(start: str, end: str, values: Floats) -> Parameters:
     return {f'{start}{axis}{end}': float(value) for axis, value in zip('XYZ', values)}
+
+
+# A matrix and an offset
+
+
+def affine(calibration: Calibration, force_per_g: float | None = None, levelled: bool = True,
+           notes: tuple[str, ...] = ()) -> Made:
+    """
+    Return a calibration as M, c and the other parameters above.
+
+    The force is in the unit of `Calibration.apply`, or has this many units per g. What is not
+    `levelled` leaves the mounting out.
+
+    """
+    calibration = calibration if levelled else calibration.in_sensor_frame
+    unit, gyro = force_per_g or calibration.force_per_g, calibration.gyro
+    bias = np.zeros(3) if gyro is None else gyro.bias
+    unknown = [] if gyro else ['the bias of the gyro is not known: it is 0']
+    if all(effect.linear for effect in calibration.model.terms.effects):
+        sensor = np.linalg.inv(calibration.model.linear_part[0]) / calibration.units.per_g
+        constant = sensor @ calibration.offset
+    else:
+        grid, scale = steady_grid(calibration), calibration.units.per_g
+        columns = np.column_stack([grid.reading / scale, np.ones(len(grid.reading))])
+        found = np.linalg.lstsq(columns, grid.force, rcond=None)[0]
+        sensor, constant = found[:3].T / scale, -found[3]
+    matrix, constant = ((calibration.rotation.T @ each) * unit for each in (sensor, constant))
+    sensitivity, inverse = np.linalg.norm(matrix, axis=0), np.linalg.inv(matrix)
+    gain = np.linalg.norm(inverse, axis=1)
+    orthogonal, triangular = (part[..., ::-1] for part in np.linalg.qr(matrix[:, ::-1]))
+    triangular, signs = triangular[::-1], np.sign(np.diag(triangular[::-1]))
+    turn = calibration.rotation.T
+    values = {
+        'M': matrix, 'c': constant, 'V': inverse @ constant,
+        'A': matrix / sensitivity, 's': sensitivity, 'K': np.diag(gain),
+        'R': inverse / gain[:, np.newaxis], 'Q': orthogonal * signs,
+        'inverse_of_L': np.linalg.inv(signs[:, np.newaxis] * triangular), 'turn': turn,
+        'gyro': bias, 'turned_gyro': turn @ bias, 'unknown': unknown}
+    return Made(values, lambda reading, temperature: (reading @ matrix.T - constant) / unit,
+                levelled, (f'force: {frame_words(calibration)}',), notes)
+
+
+def imucal(calibration: Calibration) -> Made:
+    """Return the values of FerrarisCalibrationInfo, in m/s² for native readings."""
+    units = calibration.units
+    made = affine(calibration, STANDARD_GRAVITY if units.is_native else None)
+    return replace(made, values={
+        **made.values, 'unit': 'm/s^2' if units.is_native else unit_in_ascii(units, ''),
+        'from_unit': unit_in_ascii(units, 'a.u.')})
+
+
+# The noise
+
+_NOISE = {'accelerometer_noise_density': 'm/s^2/sqrt(Hz)',
+          'accelerometer_random_walk': 'm/s^3/sqrt(Hz)',
+          'gyroscope_noise_density': 'rad/s/sqrt(Hz)',
+          'gyroscope_random_walk': 'rad/s^2/sqrt(Hz)', 'update_rate': 'Hz'}
+"""Figures of ``accel-calib noise --json``, and their units."""
+
+_LARGEST = 1e6
+"""Largest figure; noise and rate of any sensor are far below."""
+
+Noise = Mapping[str, Any]
+
+
+def noise_alone(calibration: Calibration, noise: Noise | None, label: str) -> Made:
+    """Return the figures of a program that takes the readings as they are."""
+    figures, notes = _noise_figures(noise, label)
+    root = figures['update_rate'] ** 0.5
+    values = {
+        # The topic of most examples, if that of the readings is not known.
+        'topic': plain_text(calibration.stream) or '/imu0', 'units': _NOISE,
+        'gravity': calibration.units.per_g if calibration.units.is_si else STANDARD_GRAVITY,
+        'figures': _short(figures), 'sample': _short({
+            key: each * root for key, each in figures.items()})}
+    return Made(values, lambda reading, temperature: calibration.units.to_g(reading), False, notes,
+                ('the correction is not in this file: use accel-calib apply for recordings, or '
+                 'the calibrator node', *notes))
+
+
+def openvins(calibration: Calibration, noise: Noise | None) -> Made:
+    """Return the figures of the noise and the gains; OpenVINS estimates the offset itself."""
+    of_noise = noise_alone(calibration, noise, 'OpenVINS')
+    made = affine(calibration, levelled=False)
+    start = ', '.join(f'{each:.6g}' for each in made.values['V'])
+    advice = ('OpenVINS estimates the offset; estimator_config.yaml holds its start: '
+              f'init_dyn_bias_a: [{start}]')
+    return replace(
+        made, values={**of_noise.values, **made.values},
+        correct=lambda reading, temperature: (
+            calibration.units.to_g(reading) @ made.values['M'].T),
+        comment=(*made.comment, advice, *of_noise.comment), notes=(advice, *of_noise.comment))
+
+
+def _short(figures: Mapping[str, float]) -> dict[str, float]:
+    return {key: float(f'{value:.9g}') for key, value in figures.items()}
+
+
+def _noise_figures(noise: Noise | None, label: str) -> tuple[dict[str, float], tuple[str, ...]]:
+    """
+    Return the figures of the noise that a file needs, and notes about them.
+
+    A random walk that is not seen in the recording is replaced by its upper limit. Other figures
+    that are missing or not positive raise InputError.
+
+    """
+    if noise is None:
+        raise InputError(f'{label} needs the noise of the sensor, but --noise is not given',
+                         'run accel-calib noise RECORDING --json noise.json, and add --noise '
+                         'noise.json')
+    figures, notes = {}, []
+    for key in _NOISE:
+        value, limits = noise.get(key), noise.get(f'{key}_axes_upper')
+        reason = plain_text(str(noise.get(f'{key}_reason') or ''))
+        if (value is None and 'random_walk' in key and isinstance(limits, list) and limits
+                and all(map(_is_positive, limits))):
+            value = max(limits)
+            notes.append(f'{key} is not seen ({reason or "no reason is stated"}): its upper limit '
+                         f'{value:.3g} is used')
+        if not _is_positive(value):
+            found = f'has no {key}' if value is None else f'has {key} {shown(value)}'
+            raise InputError(f'the file of the noise {found}{reason and ": "}{reason}, but '
+                             f'{label} needs a number above 0, up to {_LARGEST:g}',
+                             'record a longer rest and run accel-calib noise again, or write the '
+                             'figure of the data sheet into the file')
+        figures[key] = value
+    return figures, tuple(notes)
+
+
+def _is_positive(value: object) -> TypeGuard[float]:
+    return (isinstance(value, int | float) and not isinstance(value, bool)
+            and 0.0 < value <= _LARGEST)
+
+
+def read_noise(path: Path) -> Noise:
+    """
+    Read a file of ``accel-calib noise --json``.
+
+    Raises
+    ------
+    InputError
+        If it is not a JSON object, or is too large.
+    OSError
+        If the file cannot be read.
+
+    """
+    content, fault = None, 'contains no JSON object'
+    try:
+        content = read_json(decoded(beginning_of(path)))
+    except ValueError as err:
+        fault = f'is not a JSON file ({err})'
+    if not isinstance(content, Mapping):
+        raise InputError(f'{path} {fault}, expected the result of accel-calib noise --json',
+                         'run accel-calib noise RECORDING --json noise.json')
+    return content

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Sets of poses for `robustness` and `fits`: sensors, directions, noise, knocks, placement.
+Random sensors, directions and poses of the benchmarks.
 
-The arithmetic of sensors, readings and derivatives is written out here; it shares no code with the
-models and the simulation of the package.
+The arithmetic of `Sensor`, its readings and derivatives is written out here; it shares no code
+with the models and the simulation of the package.
 
 """
 
@@ -13,11 +13,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from accel_calib.calibration import Calibration
-from accel_calib.geometry import spread_directions
-from accel_calib.table import Floats, numbered, Poses
+from accel_calib.effects import Model, model_with
+from accel_calib.geometry import spread_directions, unit
+from accel_calib.statistics import rms
+from accel_calib.table import COLUMNS, concatenated, Floats, numbered, Poses
 from accel_calib.units import MG
-from directions import random_directions
+from generator import Simulated
 import numpy as np
 
 NOISE = 3e-4
@@ -26,7 +27,50 @@ NOISE = 3e-4
 SAMPLES = 100
 JITTER = np.radians(8.0)
 FACES = np.vstack([np.eye(3), -np.eye(3)])
-_FRESH = 300
+
+
+def random_directions(count: int, rng: np.random.Generator) -> Floats:
+    """Return (count, 3) unit vectors, uniformly distributed over the sphere."""
+    return unit(rng.normal(size=(count, 3)))
+
+
+def tilt(directions: Floats, degrees: float, rng: np.random.Generator) -> Floats:
+    """Turn each of (n, 3) directions by some degrees in each of two axes."""
+    off = rng.normal(size=directions.shape) * np.radians(degrees)
+    return unit(directions + off - directions * np.sum(off * directions, axis=1, keepdims=True))
+
+
+def spread(count: int, rng: np.random.Generator) -> Floats:
+    """Return directions spread over the sphere, in a random attitude, with jitter."""
+    turned = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    return unit(spread_directions(count) @ turned + JITTER * rng.normal(size=(count, 3)))
+
+
+def draw_model(rng: np.random.Generator, offset: float = 0.03) -> Model:
+    """Draw a sensor with offset, gains and cross-axis gains, as a model of the package."""
+    sizes = {'offset': offset, 'axis_gain': 0.02, 'cross_axis': 0.01}
+    return model_with({name: rng.normal(size=3) * size for name, size in sizes.items()})
+
+
+def join(poses: Poses, more: Poses) -> Poses:
+    """Return poses followed by others."""
+    columns = concatenated([poses, more]).columns
+    return Poses(columns, numbered(columns))
+
+
+def poses_of(made: Simulated) -> Poses:
+    """Return poses of the independent simulator of the tests, as the reader of tables does."""
+    columns = {}
+    for key, column in COLUMNS.items():
+        parts = [made.columns[name] for name in column.names if name in made.columns]
+        if len(parts) == len(column.names):
+            columns[key] = np.column_stack(parts) if len(parts) > 1 else parts[0]
+    return Poses(columns, numbered(columns))
+
+
+def length_error_mg(force: Floats) -> float:
+    """Return the RMS error of |force| [mg]."""
+    return rms(np.linalg.norm(force, axis=1) - 1.0) * MG
 
 
 @dataclass(frozen=True)
@@ -75,32 +119,16 @@ class Sensor:
 
 @dataclass(frozen=True)
 class Case:
-    """
-    A sensor and its poses.
-
-    Parameters
-    ----------
-    sensor : Sensor
-        The sensor.
-    poses : Poses
-        Its poses, in g.
-    force : (n, 3) array
-        True specific force of each pose [g].
-    shows_mg : (n,) array
-        Change of |force| by a knock; 0 if the pose was not knocked.
-    noise : (n,) array
-        True standard deviation of each pose, by axis, with its scatter [g].
-
-    """
+    """A sensor and its n poses."""
 
     sensor: Sensor
-    poses: Poses
-    force: Floats
-    shows_mg: Floats
-    noise: Floats
+    poses: Poses  # in g
+    force: Floats  # (n, 3) true specific force of each pose [g]
+    noise: Floats  # (n,) true standard deviation of each pose, by axis, with its scatter [g]
+    shows_mg: Floats  # (n,) change of |force| by a knock; 0 if the pose was not knocked
 
 
-def draw_sensor(rng: np.random.Generator, kind: str) -> Sensor:
+def draw_sensor(rng: np.random.Generator, kind: str = '10') -> Sensor:
     """Draw a sensor of 4, 7, 10 or 12 parameters, with errors of a few percent."""
     gain = np.eye(3) * (1.0 + 0.02 * rng.normal())
     if kind != '4':
@@ -113,19 +141,9 @@ def draw_sensor(rng: np.random.Generator, kind: str) -> Sensor:
     return Sensor(gain, 0.03 * rng.normal(size=3))
 
 
-def spread(count: int, rng: np.random.Generator) -> Floats:
-    """Return directions spread over the sphere, in a random attitude, with jitter."""
-    turned = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    return unit(spread_directions(count) @ turned + JITTER * rng.normal(size=(count, 3)))
-
-
-def unit(vectors: Floats) -> Floats:
-    """Return (n, 3) vectors scaled to length 1."""
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-
-
-def draw(rng: np.random.Generator, count: int, kind: str = '10', *, noise: Floats | float = NOISE,
-         scatter: float = 0.0, stated: float = 1.0, force: Floats | None = None) -> Case:
+def draw_case(rng: np.random.Generator, count: int, kind: str = '10', *,
+              noise: Floats | float = NOISE, scatter: float = 0.0, stated: float = 1.0,
+              force: Floats | None = None) -> Case:
     """
     Draw a sensor and its poses.
 
@@ -155,7 +173,7 @@ def draw(rng: np.random.Generator, count: int, kind: str = '10', *, noise: Float
     columns = {'reading': sensor.reading(force) + true * rng.normal(size=(count, 3)),
                'std': stated * each * np.sqrt(SAMPLES) * measured,
                'count': np.full(count, float(SAMPLES))}
-    return Case(sensor, Poses(columns, numbered(columns)), force, np.zeros(count), true[:, 0])
+    return Case(sensor, Poses(columns, numbered(columns)), force, true[:, 0], np.zeros(count))
 
 
 def knock(case: Case, rng: np.random.Generator, count: int, size: float = 0.05) -> Case:
@@ -167,23 +185,10 @@ def knock(case: Case, rng: np.random.Generator, count: int, size: float = 0.05) 
     return replace(case, poses=case.poses.with_columns(reading=reading), shows_mg=shows)
 
 
-def misplaced(rng: np.random.Generator, count: int, degrees: float) -> Case:
+def misplace(rng: np.random.Generator, count: int, degrees: float) -> Case:
     """Draw poses of known orientation, six faces and others, each misplaced by an angle."""
     stated = np.vstack([FACES, spread(count - 6, rng)])
     across = unit(np.cross(stated, random_directions(count, rng)))
     angle = np.radians(degrees)
-    case = draw(rng, count, '12', force=np.cos(angle) * stated + np.sin(angle) * across)
+    case = draw_case(rng, count, '12', force=np.cos(angle) * stated + np.sin(angle) * across)
     return replace(case, poses=case.poses.with_columns(reference=stated))
-
-
-def without_noise(case: Case) -> Case:
-    """Return the case with poses that state no noise."""
-    kept = {key: values for key, values in case.poses.columns.items()
-            if key not in ('std', 'count')}
-    return replace(case, poses=Poses(kept, case.poses.row))
-
-
-def error_mg(calibration: Calibration, sensor: Sensor, rng: np.random.Generator) -> float:
-    """Return the RMS error of |a| on fresh directions [mg]."""
-    force = calibration.correct(sensor.reading(random_directions(_FRESH, rng)))
-    return float(np.sqrt(np.mean((np.linalg.norm(force, axis=1) - 1.0) ** 2))) * MG
