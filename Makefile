@@ -61,15 +61,12 @@ faults: $(VENV)/extra-test $(VENV)/package
 		$(BIN)/python test/faults/fuzz.py --count 2000 --seed $$seed || exit 1; done
 
 mutants: $(VENV)/extra-test $(VENV)/extra-mutants $(VENV)/package
-	@$(BIN)/python benchmarks/mutants.py --markdown docs/figures/mutants.md
+	@$(BIN)/python benchmarks/figures.py mutants --markdown docs/figures/mutants.md
 
 # For an idle machine: what else it does would be measured too.
 bench: $(VENV)/extra-test $(VENV)/package
-	@$(BIN)/python benchmarks/imu_path.py --markdown docs/figures/imu_path.md
-	@for page in recordings memory; do \
-		$(BIN)/python benchmarks/recordings.py $$page --markdown docs/figures/$$page.md || exit 1; done
-	@for page in stillness_speed fits; do \
-		$(BIN)/python benchmarks/speed.py $$page --markdown docs/figures/$$page.md || exit 1; done
+	@for name in imu_path recordings stillness_speed fits memory; do \
+		$(BIN)/python benchmarks/figures.py $$name --markdown docs/figures/$$name.md || exit 1; done
 
 clean:
 	@rm -rf $(VENV) build *.egg-info .mypy_cache .pytest_cache .ruff_cache

@@ -502,7 +502,17 @@ def _asked(given: Source | Poses | Recording | Data, units: UnitName | None,
     if _is_log(given):
         source = Path(given) if isinstance(given, str | PathLike) else Frame(given)
     elif not isinstance(given, Table):
-        source = _array(given)
+        columns = {'reading': np.asarray(given, float)}
+        shape = columns['reading'].shape
+        if len(shape) != 2 or shape[1] != 3:
+            raise InputError(f'the array has shape {shape}, expected (n, 3) readings',
+                             'pass such an array, a table or a DataFrame')
+        check_values(columns, 'the array')
+        if are_untimed_samples(columns):
+            raise InputError(f'the {shape[0]} rows of the array look like samples of a recording, '
+                             'expected one row for each pose', 'pass a Recording, or a DataFrame '
+                             'with a column time')
+        source = Poses(columns, numbered(columns))
     return source, options, {name: settings[name] for name in settings if name not in of_log}
 
 
@@ -528,18 +538,3 @@ def in_units_of(calibration: Calibration, table: Table) -> Calibration:
     length = median_length(table.reading)
     border = math.sqrt(own.per_g * other.units.per_g)
     return other if (length > border) is (other.units.per_g > border) else calibration
-
-
-def _array(given: Data) -> Poses:
-    """Return an (n, 3) array of readings as poses."""
-    columns = {'reading': np.asarray(given, float)}
-    shape = columns['reading'].shape
-    if len(shape) != 2 or shape[1] != 3:
-        raise InputError(f'the array has shape {shape}, expected (n, 3) readings',
-                         'pass such an array, a table or a DataFrame')
-    check_values(columns, 'the array')
-    if are_untimed_samples(columns):
-        raise InputError(f'the {shape[0]} rows of the array look like samples of a recording, '
-                         'expected one row for each pose', 'pass a Recording, or a DataFrame with '
-                         'a column time')
-    return Poses(columns, numbered(columns))

@@ -3,14 +3,9 @@
 
 """Statistics that several parts of the package use."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-if TYPE_CHECKING:
-    from .table import Floats
+from .units import Floats
 
 NORMAL_95 = 1.959964
 """Half the width of the interval that holds a normal value in 95 % of all cases [σ]."""

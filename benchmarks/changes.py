@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
-from figures import Frame, Line, main, table, tell
 from accel_calib.calibration import Calibration, fit_poses
 from accel_calib.comparison import (
     compare as compare_runs, compared, Comparison, Drift, rest_errors)
@@ -23,6 +22,7 @@ from accel_calib.effects import Model, model_with, predict, simulate_poses
 from accel_calib.geometry import rotation_from_rpy, spread_directions, unit
 from accel_calib.table import Floats, Poses
 from accel_calib.units import MG, units_of
+from figures import Frame, Line, table, tell
 import numpy as np
 from sensors import draw_model, FACES, random_directions
 
@@ -280,7 +280,3 @@ def watching(frame: Frame, sets: int = 200, long: int = 20, rests: int = 10_000,
 
     """
     yield table(lines_of_monitoring(sets, long, rests, seed))
-
-
-if __name__ == '__main__':
-    main(compare, watching)

@@ -27,7 +27,7 @@ from tempfile import TemporaryDirectory
 import time
 from typing import Any
 
-from figures import Frame, main, markdown, ROOT, tell
+from figures import Frame, markdown, ROOT, tell
 import numpy as np
 
 PARTIES = ('driver', 'calibrator', 'listener')
@@ -297,7 +297,3 @@ def driver_kills(frame: Frame, kills: int = 200, seed: int = 1,
                     'messages lost', 'from the start to the first message, s: median, longest'),
                    rows)
     yield f'Load of the machine after each case: {", ".join(loads)}.'
-
-
-if __name__ == '__main__':
-    main(driver_kills)

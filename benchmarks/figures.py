@@ -4,9 +4,10 @@
 """
 The frame of the benchmarks: arguments, sets in parallel, tables and the page.
 
-A benchmark is its sets, its measure and its table; it calls `main` with the function that makes
-its page. It imports this module first, which puts the package of this repository and the helpers
-of its tests on the path, and gives each process one thread before numpy is imported.
+A benchmark is its sets, its measure and its table. ``python benchmarks/figures.py PAGE`` runs it,
+on the package of this repository and with the helpers of its tests::
+
+    python benchmarks/figures.py geometry --sets 20 --markdown docs/figures/geometry.md
 
 """
 
@@ -17,6 +18,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
+from importlib import import_module
 from importlib.metadata import version
 import inspect
 import multiprocessing
@@ -33,7 +35,13 @@ ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / 'shared' / 'data'
 """Folder of real recordings."""
 
-sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
+MODULES = {
+    'compare': 'changes', 'watching': 'changes', 'fits': 'speed', 'refine_cost': 'speed',
+    'stillness_speed': 'speed', 'geometry': 'poses', 'next_pose': 'poses',
+    'memory': 'recordings', 'rivals': 'rivals'}
+"""Modules of pages with another name, and pages without a file."""
+
+sys.path[:0] = [str(ROOT), str(ROOT / 'test'), str(ROOT / 'benchmarks')]
 
 from accel_calib.one_thread import use_one_thread  # noqa: E402
 
@@ -134,49 +142,46 @@ def tell(*words: object) -> None:
     print(*words, file=sys.stderr, flush=True)
 
 
-def main(*pages: Callable[..., Iterable[str]]) -> None:
+def main() -> None:
     """
-    Make a page: parse its arguments, print it, and write it if asked to.
+    Make the page that the first argument names: print it, and write it if asked to.
 
     A page is a function with the name of its file in ``docs/figures``. It takes a `Frame` and
     options, and yields what it finds: tables, and phrases. The words beside them stand in the
     file. The options of the command line are those of the function, with their defaults: a
     number, False for a switch, None for a path, or a tuple of words or numbers. `sets` brings
-    `--jobs` along. If there are several pages, the first argument names one.
+    `--jobs` along.
 
     """
-    parser = argparse.ArgumentParser(
-        description=str(sys.modules['__main__'].__doc__).strip().splitlines()[0])
-    several = parser.add_subparsers(required=True) if len(pages) > 1 else None
-    for page in pages:
-        options = several.add_parser(page.__name__) if several else parser
-        for name, option in list(inspect.signature(page).parameters.items())[1:]:
-            usual = option.default
-            kind: dict[str, Any] = {'type': Path if usual is None else type(usual)}
-            if usual is False:
-                kind = {'action': 'store_true'}
-            elif isinstance(usual, tuple):
-                known = usual if isinstance(usual[0], str) else None
-                kind = {'nargs': '+', 'choices': known, 'type': type(usual[0])}
-            options.add_argument(f'--{name.replace("_", "-")}', default=usual, **kind)
-            if name == 'sets':
-                options.add_argument('--jobs', type=int, default=2, help='number of processes')
-        options.add_argument('--markdown', type=Path, help='file to write the page to')
-        options.set_defaults(page=page)
-    given = vars(parser.parse_args())
-    page, path, jobs = given.pop('page'), given.pop('markdown'), given.pop('jobs', 1)
+    name = sys.argv[1] if len(sys.argv) > 1 else ''
+    file = ROOT / 'docs' / 'figures' / f'{name}.md'
+    if name not in MODULES and not file.exists():
+        raise SystemExit(f'usage: {sys.argv[0]} PAGE [options]; a page is a file of docs/figures')
+    page = getattr(import_module(MODULES.get(name, name)), name)
+    options = argparse.ArgumentParser(prog=f'figures.py {name}')
+    for option, parameter in list(inspect.signature(page).parameters.items())[1:]:
+        usual = parameter.default
+        kind: dict[str, Any] = {'type': Path if usual is None else type(usual)}
+        if usual is False:
+            kind = {'action': 'store_true'}
+        elif isinstance(usual, tuple):
+            known = usual if isinstance(usual[0], str) else None
+            kind = {'nargs': '+', 'choices': known, 'type': type(usual[0])}
+        options.add_argument(f'--{option.replace("_", "-")}', default=usual, **kind)
+        if option == 'sets':
+            options.add_argument('--jobs', type=int, default=2, help='number of processes')
+    options.add_argument('--markdown', type=Path, help='file to write the page to')
+    given = vars(options.parse_args(sys.argv[2:]))
+    path, jobs, about = given.pop('markdown'), given.pop('jobs', 1), machine()
     words = [word for word in sys.argv[1:] if word not in ('--markdown', str(path))]
-    command = ' '.join(['python', f'benchmarks/{Path(sys.argv[0]).name}', *words,
-                        '--markdown FILE'])
-    os.environ['PYTHONPATH'] = os.pathsep.join([str(ROOT), str(ROOT / 'test')])
-    about = machine()
+    command = ' '.join(['python benchmarks/figures.py', *words, '--markdown FILE'])
+    os.environ['PYTHONPATH'] = os.pathsep.join(sys.path[:3])
     with ExitStack() as stack:
         pool = (stack.enter_context(multiprocessing.get_context('spawn').Pool(jobs)) if jobs > 1
                 else None)
         parts = list(page(Frame(path, pool), **given))
-    file = ROOT / 'docs' / 'figures' / f'{page.__name__}.md'
-    text = update(file.read_text(encoding='utf-8'), parts) if file.exists() else '\n\n'.join(
-        [*parts, 'Measured at the commit .'])
+    text = (update(file.read_text(encoding='utf-8'), parts) if file.exists()
+            else '\n\n'.join([*parts, 'Measured at the commit .']))
     text = re.sub(r'(Made by\s)`[^`]*`', lambda found: f'{found[1]}`{command}`', text)
     text = re.sub(r'(Machine: |` on |^)[^,\n]+, \d+ cores, load .*?numpy [\d.]*\d',
                   lambda found: found[1] + about, text, flags=re.MULTILINE)
@@ -186,12 +191,12 @@ def main(*pages: Callable[..., Iterable[str]]) -> None:
         path.write_text(text, encoding='utf-8')
 
 
-def update(page: str, parts: Iterable[str]) -> str:
+def update(page: str, parts: Sequence[str]) -> str:
     """
     Return a page with what was found.
 
-    A table takes the place of that with the same number in the page. A phrase gives its numbers
-    to the same words in the page, with other white space; new words are the last paragraph.
+    Tables take the place of those in the page, in their order. A phrase is found in the page by
+    its words, and its numbers take the place of those there. What has no place comes last.
 
     """
     number = r'[-+]?\d[\d,.]*\d|\d'
@@ -205,10 +210,11 @@ def update(page: str, parts: Iterable[str]) -> str:
             new = re.sub(number, lambda _: next(values), found[0])  # noqa: B023
             page = page[:found.start()] + new + page[found.end():]
         else:
-            page = page.replace('\n\nMeasured at', f'\n\n{phrase}\n\nMeasured at')
-    table = re.compile(r'^\| .*\n\|---.*\n(?:\|.*\n)*', re.MULTILINE)
-    assert len(tables) == len(table.findall(page)), 'expected as many tables as the page has'
-    return table.sub(lambda _: tables.pop(0) + '\n', page)
+            tables.append(phrase)
+    page = re.sub(r'^\| .*\n\|---.*\n(?:\|.*\n)*', lambda old: (
+        f'{tables.pop(0)}\n' if tables else old[0]), page, flags=re.MULTILINE)
+    words, last, commit_words = page.rpartition('Measured at the commit ')
+    return ''.join([words, *(f'{each}\n\n' for each in tables), last, commit_words])
 
 
 def commit() -> str:
@@ -232,3 +238,8 @@ def machine() -> str:
         name = platform.processor() or platform.machine()
     return (f'{name}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before; Linux '
             f'{platform.release()}, Python {platform.python_version()}, numpy {version("numpy")}')
+
+
+if __name__ == '__main__':
+    import figures  # as the pages do, so that there is one module
+    figures.main()

@@ -8,7 +8,7 @@ The pose tables are made first. Every sensor has values of its own; some sensors
 for good, some are far from the others, and some files are damaged. A second call with the same
 folder continues the first one::
 
-    python benchmarks/fleet.py --folder /tmp/fleet --markdown docs/figures/fleet.md
+    python benchmarks/figures.py fleet --folder /tmp/fleet --markdown docs/figures/fleet.md
 
 """
 
@@ -31,7 +31,6 @@ import time
 from typing import Any
 from unittest import mock
 
-from figures import Frame, Line, main, table, tell
 import accel_calib as ac
 from accel_calib.fleet import cluster, Input, Options, recordings, run, Store, Summary
 from accel_calib.fleet.overview import not_agreeing
@@ -39,6 +38,7 @@ from accel_calib.fleet.recording import Row
 from accel_calib.geometry import unit
 from accel_calib.logs import write_table
 import accel_calib.pipeline as pipeline
+from figures import Frame, Line, table, tell
 import numpy as np
 
 RUN, SENSORS, ROWS = (import_module(f'accel_calib.fleet.{name}')
@@ -411,7 +411,3 @@ def fleet(frame: Frame, sensors: int = 10_000, calibrations: int = 20, workers: 
     yield f'{sensors:,} simulated sensors with {calibrations} pose tables of {POSES} poses each'
     yield f'in one process on {len(staged)} recordings of whole sensors'
     yield f'million robots with {calibrations} recordings each need the core hours'
-
-
-if __name__ == '__main__':
-    main(fleet)

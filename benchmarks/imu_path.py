@@ -13,7 +13,6 @@ from pathlib import Path
 import tempfile
 import time
 
-from figures import Frame, Line, main, markdown, ROOT, table, tell
 from accel_calib.calibration import Calibration, fit_poses, level
 from accel_calib.effects import EffectKey, Model, model_with, simulate_poses
 from accel_calib.geometry import spread_directions
@@ -21,6 +20,7 @@ from accel_calib.logs import write_table
 from accel_calib.stored import write_calibration
 from accel_calib.table import Floats
 from accel_calib.units import units_of
+from figures import Frame, Line, markdown, ROOT, table, tell
 from nodes import Caller, node_command, relay_command, run_trial, Trial
 import numpy as np
 
@@ -222,7 +222,3 @@ def imu_path(frame: Frame, turns: int = 5, quick: bool = False) -> Iterator[str]
     yield table([*lines_at_1_khz(steady), *lines_of_starts(starts),
                  *lines_under_load(flood, many, long), *lines_of_calls(runs)])
     yield plain_figures(steady)
-
-
-if __name__ == '__main__':
-    main(imu_path)

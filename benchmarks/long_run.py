@@ -17,7 +17,7 @@ from pathlib import Path
 import time
 from typing import Any
 
-from figures import Frame, Line, main, markdown, table, tell
+from figures import Frame, Line, markdown, table, tell
 from nodes import Caller, cpu_seconds, node_command, relay_command, run_trial, Stamps, Trial
 import numpy as np
 from numpy.typing import NDArray
@@ -277,7 +277,3 @@ def long_run(frame: Frame, minutes: float = 60.0, rate: float = 1000.0) -> Itera
     yield f'through poses at {rate:g} Hz'
     yield f'at the end of each round of {seconds:g} s'
     yield f'after a warm-up of {run.warm * interval / 60.0:g} min'
-
-
-if __name__ == '__main__':
-    main(long_run)

@@ -30,12 +30,12 @@ import sys
 from tempfile import TemporaryDirectory
 from xml.etree import ElementTree
 
-from figures import Frame, main, markdown, ROOT, tell
 from cosmic_ray.ast import ast_nodes, get_ast
 from cosmic_ray.mutating import mutate_code
 from cosmic_ray.operators.operator import Operator
 from cosmic_ray.plugins import get_operator, operator_names
 import coverage
+from figures import Frame, markdown, ROOT, tell
 
 FOLDERS = ('calibration', 'comparison', 'effects', 'estimate', 'findings', 'logs',
            'messages', 'refinement', 'session', 'stillness', 'stored')
@@ -198,7 +198,3 @@ def mutants(frame: Frame, count: int = 300, seed: int = 1) -> Iterator[str]:
         (each, number, f'{1.0 - survived[each] / number:.0%}')
         for each, number in sorted(folders.items())))
     yield markdown(('file', 'line', 'survives'), rows)
-
-
-if __name__ == '__main__':
-    main(mutants)

@@ -32,8 +32,8 @@ import threading
 import time
 from typing import Any
 
-from figures import ROOT
 from accel_calib.ros.simulator_node import SimulatedImu, SimulatorSettings
+from figures import ROOT
 import numpy as np
 from numpy.typing import NDArray
 import rclpy

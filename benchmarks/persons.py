@@ -10,11 +10,11 @@ import os
 from tempfile import TemporaryDirectory
 from unittest.mock import patch
 
-from figures import Frame, main, markdown
 from accel_calib.geometry import ATTITUDES, spread_directions, unit
 from accel_calib.session import COMMANDS, conditions
 from accel_calib.statistics import rms
 from driven import Driver, GRAVITY, Person
+from figures import Frame, markdown
 import numpy as np
 import test_persons
 
@@ -82,7 +82,3 @@ def persons(frame: Frame, sets: int = 40, seed: int = 1) -> Iterator[str]:
                    rows)
     yield (f'Of {len(told)} who turn a sound sensor in an own order of sides, of sides and edges, '
            f'or of any directions, {sum(told)} were told')
-
-
-if __name__ == '__main__':
-    main(persons)

@@ -14,11 +14,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from figures import Frame, Line, main, table
 from accel_calib.calibration import PlannedPose
 from accel_calib.refinement import refine, Refinement, Step
 from accel_calib.table import Floats
 from accel_calib.units import units_of
+from figures import Frame, Line, table
 from generator import Around, basis_of, plain_reading, Setup, simulate, Simulated
 from generator_effects import STANDARD_GRAVITY
 import numpy as np
@@ -179,7 +179,3 @@ def plans(frame: Frame, sets: int = 12, seed: int = 1) -> Iterator[str]:
                 break
         lines += lines_of(f'{first} and {second}', outcomes[:sets]) if outcomes else []
     yield table(lines)
-
-
-if __name__ == '__main__':
-    main(plans)

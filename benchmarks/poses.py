@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 import re
 
-from figures import Frame, Line, main, markdown, table
 from accel_calib.calibration import directions_of, fit_poses, next_pose as next_asked
 from accel_calib.effects import predict, sensor_force, simulate_poses
 from accel_calib.errors import RefusedFitError
@@ -17,6 +16,7 @@ from accel_calib.estimate import closed_form, estimate, pose_noise, start_of
 from accel_calib.geometry import ATTITUDES, spread_directions, unit
 from accel_calib.table import Floats, Poses
 from accel_calib.units import units_of
+from figures import Frame, Line, markdown, table
 import numpy as np
 from sensors import draw_model, FACES, join, length_error_mg, random_directions, tilt
 
@@ -277,7 +277,3 @@ def next_pose(frame: Frame, sets: int = 200, seed: int = 1) -> Iterator[str]:
 def words_of(count: int) -> str:
     """Return a number of poses as text."""
     return f'over {MOST}' if count > MOST else str(count)
-
-
-if __name__ == '__main__':
-    main(geometry, next_pose)

@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from figures import Frame, Line, main, markdown, table
 from accel_calib.calibration import Calibration, fit_poses
 from accel_calib.errors import AccelCalibError
 from accel_calib.findings import Expected, GOOD_MG, rate, rate_refinement, Rating
@@ -22,6 +21,7 @@ from accel_calib.geometry import unit
 from accel_calib.refinement import refine
 from accel_calib.table import Floats, numbered, Poses
 from accel_calib.units import MG, units_of
+from figures import Frame, Line, markdown, table
 import numpy as np
 from sensors import draw_sensor, FACES, length_error_mg, random_directions, Sensor, spread
 
@@ -218,7 +218,3 @@ def rating(frame: Frame, sets: int = 100, seed: int = 4051) -> Iterator[str]:
         for number in range(max(sets // (4 if kind.refined else 1), 1))])
     yield table(lines_of(results))
     yield markdown(('set', *NAMES, 'median true error [mg]', 'largest of GOOD'), rows_of(results))
-
-
-if __name__ == '__main__':
-    main(rating)

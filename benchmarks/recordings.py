@@ -17,7 +17,6 @@ import sys
 from tempfile import TemporaryDirectory
 import time
 
-from figures import DATA, Frame, Line, main, measure_alone, Measured, ROOT, table, tell
 import accel_calib as ac
 from accel_calib.calibration import fit_poses
 from accel_calib.cli.main import main as accel_calib
@@ -29,6 +28,7 @@ from accel_calib.stillness import capture
 from accel_calib.stored import read_calibration
 from accel_calib.units import units_of
 from bag_files import write_bag
+from figures import DATA, Frame, Line, measure_alone, Measured, ROOT, table, tell
 import numpy as np
 from rosbags.highlevel import AnyReader
 
@@ -282,7 +282,3 @@ def memory(frame: Frame, millions: tuple[float, ...] = (1.0, 3.0, 10.0), seed: i
                 f'{MOST_RISE_MB:.0f} MB in all' if flat else '',
                 after - before < MOST_RISE_MB if flat else None))
     yield table(lines)
-
-
-if __name__ == '__main__':
-    main(recordings, memory)

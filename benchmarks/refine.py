@@ -24,12 +24,12 @@ import time
 import traceback
 from typing import Any
 
-from figures import Frame, Line, main, markdown, table, tell
 from accel_calib.calibration import fit_poses, verify
 from accel_calib.refinement import refine as refine_poses
 from accel_calib.statistics import rms
 from accel_calib.table import Poses
 from accel_calib.units import MG, units_of
+from figures import Frame, Line, markdown, table, tell
 from generator import again, ON_OUTPUT, simulate, Simulated
 import numpy as np
 from refine_sets import (
@@ -523,7 +523,3 @@ def refine(frame: Frame, sets: int = 20, seed: int = 1, only: tuple[str, ...] = 
                     'clean poses left out', 'parameters inside 3 sd',
                     'held-out residual over true form', 'located', 'fresh over base',
                     'fresh over noise', 'instead'), rows_of_effects(everything))
-
-
-if __name__ == '__main__':
-    main(refine)

@@ -11,7 +11,7 @@ one fits the true form. The sets are those of `refine_sets`, which nothing was t
 from 2028 on. The output is the table of ``docs/figures/rivals.md``::
 
     pip install scikit-learn pysindy
-    python benchmarks/rivals.py --sets 2 --seed 2029 --jobs 2
+    python benchmarks/figures.py rivals --sets 2 --seed 2029 --jobs 2
 
 """
 
@@ -23,7 +23,6 @@ from functools import cached_property
 from typing import Any
 import warnings
 
-from figures import Frame, main, markdown
 from accel_calib.calibration import fit_poses, in_g
 from accel_calib.effects import add_history, EFFECTS, factors_of
 from accel_calib.estimate import judge
@@ -32,6 +31,7 @@ from accel_calib.refinement.state import candidates
 from accel_calib.statistics import rms
 from accel_calib.table import Floats, Poses
 from accel_calib.units import units_of
+from figures import Frame, markdown
 from generator import again, basis_of, simulate, Simulated
 import numpy as np
 from pysindy.optimizers import STLSQ
@@ -272,7 +272,3 @@ def rivals(frame: Frame, sets: int = 1, seed: int = 1) -> Iterator[str]:
             rows.setdefault(way, [way]).extend([error, f'{max(errors):.2f}'] if outside else [
                 '' if None in exact else str(sum(exact)), error])
     yield markdown(heads, rows.values())
-
-
-if __name__ == '__main__':
-    main(rivals)

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-from figures import Frame, Line, main, table
 from accel_calib.calibration import Calibration, fit_poses
 from accel_calib.effects.simulate import path
 from accel_calib.errors import AccelCalibError
@@ -16,6 +15,7 @@ from accel_calib.statistics import rms
 from accel_calib.stillness import capture
 from accel_calib.table import Floats, numbered, Recording
 from accel_calib.units import units_of
+from figures import Frame, Line, table
 import numpy as np
 from scipy.signal import lfilter
 from sensors import (
@@ -303,7 +303,3 @@ ROWS = {'knocks': knocks, 'bounds': bounds, 'placements': placements, 'intervals
 def robustness(frame: Frame, sets: int = 200, seed: int = 1, only: tuple[str, ...] = tuple(ROWS)
                ) -> Iterator[str]:
     yield table(line for name in only for line in ROWS[name](frame, sets, 100_000 * seed))
-
-
-if __name__ == '__main__':
-    main(robustness)

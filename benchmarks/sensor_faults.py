@@ -18,7 +18,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Literal, NamedTuple
 
-from figures import Frame, main, markdown, tell
 from accel_calib.calibration import Calibration
 from accel_calib.effects import Model, model_with, predict, simulate_recording
 from accel_calib.errors import AccelCalibError
@@ -32,6 +31,7 @@ from accel_calib.statistics import rms
 from accel_calib.table import concatenated, Floats
 from bag_files import fill, header, IMU, imu, writer_of
 from driven import Driver
+from figures import Frame, markdown, tell
 import numpy as np
 
 G = 9.80665
@@ -300,7 +300,3 @@ def sensor_faults(frame: Frame, sets: int = 50, clean: int = 125, seed: int = 20
         for name in only for surface in SURFACES
         if not (name in OF_TEXT and surface in ('bag', 'node'))])
     yield markdown(('fault', 'as', 'sets', 'named', 'calibrated', 'wrong', 'false findings'), rows)
-
-
-if __name__ == '__main__':
-    main(sensor_faults)

@@ -10,7 +10,6 @@ from functools import partial
 import time
 import tracemalloc
 
-from figures import Frame, Line, main, measure_alone, table, tell
 from accel_calib.calibration import fit_poses
 from accel_calib.estimate import closed_form
 from accel_calib.geometry import unit
@@ -18,6 +17,7 @@ from accel_calib.refinement import refine
 from accel_calib.stillness import capture, CaptureSettings, StillDetector
 from accel_calib.table import Floats, Recording
 from accel_calib.units import units_of
+from figures import Frame, Line, measure_alone, table, tell
 from generator import Setup, simulate
 import numpy as np
 from scipy.optimize import least_squares
@@ -221,7 +221,3 @@ def stillness_speed(frame: Frame, largest: int = 3 * 10**7, seed: int = 1) -> It
     yield f'A sample costs {1e9 * fast:.0f} ns at 1000 Hz and {1e9 * slow:.0f} ns at 100 Hz'
     yield f'always rests gives {1e-6 / still:.0f} million samples/s at 100 Hz'
     yield f'difference is {1e6 * (slow - still) * 100.0 * (REST + SHAKEN):.0f} µs per rest'
-
-
-if __name__ == '__main__':
-    main(fits, refine_cost, stillness_speed)

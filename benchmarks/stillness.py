@@ -22,7 +22,6 @@ from dataclasses import dataclass
 import itertools
 from typing import Any, Literal, NamedTuple
 
-from figures import DATA, Frame, Line, main, markdown, table
 from accel_calib.calibration import fit_poses
 from accel_calib.errors import AccelCalibError
 from accel_calib.geometry import unit
@@ -30,6 +29,7 @@ from accel_calib.logs import read_recording
 from accel_calib.stillness import CaptureSettings, StillDetector
 from accel_calib.table import Floats, numbered, Poses
 from accel_calib.units import units_of
+from figures import DATA, Frame, Line, markdown, table
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, lfilter
@@ -448,7 +448,3 @@ def stillness(frame: Frame, sets: int = 60, seed: int = 1) -> Iterator[str]:
     yield compare_rules(noisy)
     yield markdown(('recording', 'rule', 'poses', 'taken by hand', 'samples used', 'residual, mg',
                     'chi² per degree of freedom'), rows_of_real())
-
-
-if __name__ == '__main__':
-    main(stillness)

@@ -4,10 +4,10 @@
 """Properties that hold for any sensor and any poses, tried on random cases."""
 
 
-from accel_calib.calibration import Calibration, fit_poses, outlook
+from accel_calib.calibration import Calibration, fit_poses
 from accel_calib.effects import EFFECTS, EmpiricalCurve, modes_of, VARIABLES
 from accel_calib.errors import RefusedFitError
-from accel_calib.findings import rate
+from accel_calib.findings import outlook, rate
 from accel_calib.units import MG, units_of
 from inside import (
     correct, Model, model_with, OVER_THE_SPHERE, predict, rotation_from_rpy, simulate_poses,

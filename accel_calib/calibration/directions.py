@@ -58,9 +58,6 @@ NORM_MODELS = tuple(name for name, form in MODELS.items() if form.norm == name a
 
 _SINGULAR, _NOTHING = 1e-6, 1e-14
 
-_OPEN_PART = 0.1
-"""Part of a parameter in the open combinations above which it is not determined."""
-
 _MAIN_PART = 0.3
 """Weights above this part of the largest weight are included in the words."""
 
@@ -186,13 +183,6 @@ class Identifiability:
     undetermined: tuple[Combination, ...]
     dilution: float
     mean_dilution: float
-
-    @property
-    def open_parameters(self) -> tuple[str, ...]:
-        """Names of the parameters that the poses do not determine."""
-        part = {name: sum(open_.weights.get(name, 0.0) ** 2 for open_ in self.undetermined)
-                for name in self.deviations}
-        return tuple(name for name in self.deviations if part[name] > _OPEN_PART ** 2)
 
 
 def identifiability(name: str, directions: Floats, noise: Floats | None = None) -> Identifiability:

@@ -49,12 +49,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .calibration import Calibration, ORIENTED
+from .calibration import ORIENTED
 from .directions import (
-    determines, dilution, dilution_of, directions_in, directions_of, error_left_in,
-    Identifiability, identifiability, information_of, left_out, NORM_MODELS, poses_needed, rows_of,
-    shape_words, WEAK_DILUTION)
-from .quality import stated_uncertainty
+    determines, dilution, dilution_of, directions_of, error_left_in, identifiability,
+    information_of, left_out, NORM_MODELS, poses_needed, rows_of, shape_words, WEAK_DILUTION)
 from ..effects import EffectKey, entry_of, Model
 from ..errors import RefusedFitError
 from ..estimate import Fit, fit_sphere, judge, kinds, pose_noise
@@ -236,41 +234,6 @@ def _choose_attitude(name: str, directions: Floats, information: Floats) -> Floa
     to_come = np.linalg.inv(information + _mean_information(name))
     gains = np.linalg.slogdet(np.eye(rows.shape[1]) + rows @ to_come @ np.swapaxes(rows, 1, 2))[1]
     return up[np.argmax(np.where(free, np.round(gains, 6), -1.0))]  # the first of equals
-
-
-@dataclass(frozen=True)
-class Outlook:
-    """
-    What the poses of a calibration determine, and the pose that improves it most.
-
-    `identifiability` and `next_pose` are for the requested model; for the largest model if the
-    choice was ``auto``. `uncertainty_mg` is the stated one of the corrected |force| (model 12: of
-    the force), RMS over the sphere, with effects in the middle of their range [mg]; None for a
-    mounting alone or an offset over temperature alone.
-
-    """
-
-    identifiability: Identifiability
-    next_pose: NextPose
-    uncertainty_mg: float | None
-
-
-def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
-    """Return what the poses of a calibration determine, and the next pose for a model."""
-    poses = calibration.used_poses
-    directions = directions_in(poses, calibration)
-    noise = pose_noise(poses.noise, directions)
-    uncertainty = stated_uncertainty(calibration)
-    planned = asked
-    if asked in ('auto', ORIENTED):  # with wrong orientations model 12 became 10
-        planned = ORIENTED if calibration.form.known_orientation else NORM_MODELS[-1]
-    noise_g = None
-    if uncertainty is not None and calibration.form.effects and determines(
-            calibration.name, directions, noise):
-        noise_g = uncertainty / identifiability(calibration.name, directions, noise).mean_dilution
-    return Outlook(identifiability(planned, directions, noise),
-                   next_pose(directions, planned, noise, noise_g=noise_g),
-                   None if uncertainty is None else uncertainty * MG)
 
 
 @dataclass(frozen=True)

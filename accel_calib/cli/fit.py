@@ -26,13 +26,13 @@ from .frame import (
     check_target, console, Done, FAILED, given, intake, log_options, prior, read_lines,
     rows_between, settings, stored_calibration, Target)
 from .output import error_line, Output, progress, short_if_known, table, Verdict, working
-from ..calibration import Calibration, NORM_MODELS, outlook
+from ..calibration import Calibration, NORM_MODELS
 from ..disk import STANDARD_OUTPUT, write_atomically
 from ..effects import AXES, entry_of, parse_effect
 from ..errors import InputError
 from ..findings import (
     base_words, calibration_json, chance_words, curve_json, effect_figures, linear_figures,
-    plan_lines, rate_refinement, refinement_json, request_words, rival_words, value_words,
+    outlook, plan_lines, rate_refinement, refinement_json, request_words, rival_words, value_words,
     verdict_words)
 from ..logs import is_bag, open_log, write_blocks, write_table
 from ..pipeline import (

@@ -26,7 +26,7 @@ import os
 from pathlib import Path
 import re
 import sys
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import Any, NamedTuple
 
 from .commands import COMMANDS, next_command
 from .options import BAD_INPUT, STANDARD_INPUT
@@ -35,15 +35,13 @@ from ..calibration import Calibration, FleetPrior
 from ..disk import replaceable, STANDARD_OUTPUT, write_atomically
 from ..effects import effects_of_file, OwnEffect
 from ..errors import AccelCalibError, InputError, known_error, RefusedFitError, saying
+from ..findings import Rating, rating_json
 from ..logs import LogOptions, named_topics, OpenLog
 from ..pipeline import Intake, options_for, poses_of
 from ..stillness import CaptureSettings
 from ..stored import calibration_from, OF_FILE, read_calibration, read_prior
 from ..table import Poses
 from ..text import counted, plain
-
-if TYPE_CHECKING:
-    from ..findings import Rating
 
 FAILED = 1
 """Exit status for a result that is BAD, or if a check that was asked for fails."""
@@ -224,8 +222,6 @@ def _in_parallel(function: Any, items: Sequence[Any], jobs: int) -> list[Any]:
 
 def rated(rating: Rating, args: argparse.Namespace) -> dict[str, Any]:
     """Return a rating for JSON."""
-    from ..findings import rating_json
-
     step = rating.next
     return rating_json(rating, step.kind, step.text, next_command(step, args))
 

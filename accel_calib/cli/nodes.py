@@ -263,7 +263,14 @@ def screen(node: str, progress: Progress | None, problem: str = '') -> Renderabl
         rows.add_column(no_wrap=True, min_width=_WORDS)
         for row in _rows(progress):
             rows.add_row(Text(row.label), '' if math.isnan(row.share) else row, Text(row.words))
-        parts += [rows, '', *_next(node, progress)]
+        sides = _sides(progress)
+        large = (_Large(_CALLS[progress.step], f'bold {GOOD}') if progress.step in _CALLS else
+                 _Large(sides, NEXT) if sides else None)
+        parts += [rows, '', *([large, ''] if large else ()),
+                  Text(progress.advice or 'wait', style='bold'),
+                  *([Text(_direction(progress), style='dim')] if sides else ()),
+                  *([Text(service_call(node, progress.command), style='dim')]
+                    if progress.command else ())]
     elif not problem:
         parts.append(Text('waiting for the first message'))
     return Panel(Group(*parts), title=Text(node), border_style=BAD if problem else 'dim')
@@ -339,20 +346,6 @@ def _accuracy(progress: Progress) -> str:
 
 def _direction(progress: Progress) -> str:
     return f'direction in sensor axes: {" ".join(f"{part:+.2f}" for part in progress.direction)}'
-
-
-def _next(node: str, progress: Progress) -> Iterator[RenderableType]:
-    """Yield the next action, in large words if it is a pose or the fit."""
-    sides = _sides(progress)
-    if progress.step in _CALLS:
-        yield from (_Large(_CALLS[progress.step], f'bold {GOOD}'), '')
-    elif sides:
-        yield from (_Large(sides, NEXT), '')
-    yield Text(progress.advice or 'wait', style='bold')
-    if sides:
-        yield Text(_direction(progress), style='dim')
-    if progress.command:
-        yield Text(service_call(node, progress.command), style='dim')
 
 
 def _sides(progress: Progress) -> str:

@@ -18,7 +18,7 @@ from contextlib import contextmanager
 import re
 import sys
 from textwrap import wrap
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from rich import box
 from rich.console import Console
@@ -26,10 +26,8 @@ from rich.table import Table
 from rich.text import Text
 
 from .options import plain_character, plain_handler
+from ..logs import Progress
 from ..text import short
-
-if TYPE_CHECKING:
-    from ..logs import Progress
 
 _NO_BREAK = '\N{NO-BREAK SPACE}'
 _MARK = '\ue000'
@@ -66,18 +64,18 @@ class Output(Console):
 
     def print(self, *objects: Any, **options: Any) -> None:  # noqa: A003
         """Print; lines of text break at words, and the rest of a line is indented."""
-        if len(objects) == 1 and isinstance(objects[0], str):
-            super().print(self._line(objects[0]), soft_wrap=True, **options)
-        else:
+        if len(objects) != 1 or not isinstance(line := objects[0], str):
             super().print(*objects, **options)
-
-    def _line(self, line: str) -> Text:
-        if not isinstance(line, Verdict):
-            return self.render_str('\n'.join(map(self._broken, line.split('\n'))))
-        end, mark = line.start + len(line.rating), _MARK * len(line.rating)
-        before, _, after = self._broken(f'{line[:line.start]}{mark}{line[end:]}').partition(mark)
-        return Text.assemble(self.render_str(before), (line.rating, _COLOURS[line.rating]),
-                             self.render_str(after))
+            return
+        if isinstance(line, Verdict):
+            end, mark = line.start + len(line.rating), _MARK * len(line.rating)
+            before, _, after = self._broken(
+                f'{line[:line.start]}{mark}{line[end:]}').partition(mark)
+            text = Text.assemble(self.render_str(before), (line.rating, _COLOURS[line.rating]),
+                                 self.render_str(after))
+        else:
+            text = self.render_str('\n'.join(map(self._broken, line.split('\n'))))
+        super().print(text, soft_wrap=True, **options)
 
     def _broken(self, line: str) -> str:
         tied = re.sub(_TIED, _NO_BREAK, line)

@@ -24,8 +24,8 @@ it must not be used. All limits are in `LIMITS`.
 
 from .figures import (
     calibration_json, change_in_words, CROSS, curve_json, effect_figures, Expected, Figure,
-    figures_of, GAINS, GOOD_MG, in_words, Limit, LIMITS, linear_figures, OFFSETS, rating_json,
-    refinement_json, residual_figures, scale_of)
+    figures_of, GAINS, GOOD_MG, in_words, Limit, LIMITS, linear_figures, OFFSETS, Outlook, outlook,
+    rating_json, refinement_json, residual_figures, scale_of)
 from .mounting import angle_words, mounting_figures, mounting_words
 from .outside import outside_line, outside_words, USES_LIMIT
 from .poses import combination_words, NOTHING_TO_PLAN, plan_lines, request_words
@@ -37,11 +37,11 @@ from .steps import (
 from ..finding import Rating
 
 __all__ = ['CROSS', 'GAINS', 'GOOD_MG', 'LIMITS', 'NOTHING_TO_PLAN', 'OFFSETS', 'USES_LIMIT',
-           'Expected', 'Figure', 'Limit', 'Rating', 'advice_lines', 'angle_words', 'base_words',
-           'calibration_json', 'chance_words', 'change_in_words', 'combination_words',
-           'curve_json', 'effect_figures', 'figures_of', 'in_words', 'linear_figures',
-           'mounting_figures', 'mounting_words', 'odds_words', 'outside_line', 'outside_words',
-           'place_words', 'plan_lines', 'rate', 'rate_comparison', 'rate_fleet', 'rate_noise',
-           'rate_refinement', 'rate_verification', 'rating_json', 'refinement_json',
-           'request_words', 'residual_figures', 'rival_words', 'scale_of', 'value_words',
-           'verdict_words']
+           'Expected', 'Figure', 'Limit', 'Outlook', 'Rating', 'advice_lines', 'angle_words',
+           'base_words', 'calibration_json', 'chance_words', 'change_in_words',
+           'combination_words', 'curve_json', 'effect_figures', 'figures_of', 'in_words',
+           'linear_figures', 'mounting_figures', 'mounting_words', 'odds_words', 'outlook',
+           'outside_line', 'outside_words', 'place_words', 'plan_lines', 'rate', 'rate_comparison',
+           'rate_fleet', 'rate_noise', 'rate_refinement', 'rate_verification', 'rating_json',
+           'refinement_json', 'request_words', 'residual_figures', 'rival_words', 'scale_of',
+           'value_words', 'verdict_words']

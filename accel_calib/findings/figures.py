@@ -28,9 +28,9 @@ import scipy
 
 from .poses import combination_words, plan_lines, request_words
 from ..calibration import (
-    Calibration, Curve, deviations_g, directions_in, error_left_in, free_parameters,
-    identifiability, next_pose, NextPose, Outlook, PRIOR, Quality, stated_uncertainty,
-    uncertainty_g, Verification)
+    Calibration, Curve, determines, deviations_g, directions_in, error_left_in, free_parameters,
+    Identifiability, identifiability, next_pose, NextPose, NORM_MODELS, ORIENTED, PRIOR, Quality,
+    stated_uncertainty, uncertainty_g, Verification)
 from ..comparison import NAMES
 from ..effects import (
     AXES, effect_named, EffectKey, entry_of, LADDER, Model, MODELS, ParameterName, predict,
@@ -44,6 +44,9 @@ from ..units import MG
 
 if TYPE_CHECKING:
     from ..refinement import Refinement, Step
+
+_OPEN_PART = 0.1
+"""Part of a parameter in the open combinations above which it is not determined."""
 
 OFFSETS, GAINS, CROSS = NAMES[:3], NAMES[3:6], NAMES[6:]
 
@@ -138,11 +141,48 @@ def change_in_words(name: str, change: float, sd: float) -> str:
     return signed(change * factor, sd * factor, unit)
 
 
+@dataclass(frozen=True)
+class Outlook:
+    """
+    What the poses of a calibration determine, and the pose that improves it most.
+
+    `identifiability` and `next_pose` are for the requested model; for the largest model if the
+    choice was ``auto``. `uncertainty_mg` is the stated one of the corrected |force| (model 12: of
+    the force), RMS over the sphere, with effects in the middle of their range [mg]; None for a
+    mounting alone or an offset over temperature alone.
+
+    """
+
+    identifiability: Identifiability
+    next_pose: NextPose
+    uncertainty_mg: float | None
+
+
+def outlook(calibration: Calibration, asked: str = 'auto') -> Outlook:
+    """Return what the poses of a calibration determine, and the next pose for a model."""
+    poses = calibration.used_poses
+    directions = directions_in(poses, calibration)
+    noise = pose_noise(poses.noise, directions)
+    uncertainty = stated_uncertainty(calibration)
+    planned = asked
+    if asked in ('auto', ORIENTED):  # with wrong orientations model 12 became 10
+        planned = ORIENTED if calibration.form.known_orientation else NORM_MODELS[-1]
+    noise_g = None
+    if uncertainty is not None and calibration.form.effects and determines(
+            calibration.name, directions, noise):
+        noise_g = uncertainty / identifiability(calibration.name, directions, noise).mean_dilution
+    return Outlook(identifiability(planned, directions, noise),
+                   next_pose(directions, planned, noise, noise_g=noise_g),
+                   None if uncertainty is None else uncertainty * MG)
+
+
 def calibration_json(calibration: Calibration, ahead: Outlook) -> dict[str, Any]:
     """Return a calibration for JSON, with what its poses determine; None: not known."""
     gyro, noise = calibration.gyro, calibration.noise
     seen, asked = ahead.identifiability, ahead.next_pose
-    unseen, own_names = seen.open_parameters, dict[str, Any]()
+    part = {name: sum(open_.weights.get(name, 0.0) ** 2 for open_ in seen.undetermined)
+            for name in seen.deviations}
+    own_names = dict[str, Any]()
     if calibration.form.sensing_axes:  # names of the ESGI'95 report
         axes = sensing_axes(calibration.gain, calibration.offset)
         own_names = {'shifts': axes.shifts, 'scales': axes.scales,
@@ -166,8 +206,9 @@ def calibration_json(calibration: Calibration, ahead: Outlook) -> dict[str, Any]
         'uncertainty_mg': ahead.uncertainty_mg,
         'identifiability': {
             'model': seen.model, 'dilution': seen.dilution, 'mean_dilution': seen.mean_dilution,
-            'parameters': {name: {'determined': name not in unseen, 'dilution': deviation}
-                           for name, deviation in seen.deviations.items()},
+            'parameters': {
+                name: {'determined': part[name] <= _OPEN_PART ** 2, 'dilution': deviation}
+                for name, deviation in seen.deviations.items()},
             'undetermined': [{'weights': dict(open_.weights), 'words': combination_words(open_)}
                              for open_ in seen.undetermined]},
         'next_pose': None if asked.direction is None else {

@@ -24,7 +24,7 @@ from .figures import (
 from .poses import request_words
 from ..calibration import (
     Calibration, directions_in, flat_direction, free_parameters, lies_in_plane, Verification)
-from ..comparison import LEVEL
+from ..comparison import Comparison, LEVEL
 from ..effects import EmpiricalCurve, WANDER
 from ..errors import TAKE_ALL_SIDES
 from ..finding import Finding, NextStep, ranked, rated, Rating, without
@@ -34,7 +34,6 @@ from ..text import counted, listed
 from ..units import MG
 
 if TYPE_CHECKING:
-    from ..comparison import Comparison
     from ..noise import NoiseFigures
     from ..refinement import Refinement
 

@@ -18,7 +18,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, ExitStack
 from dataclasses import dataclass
 from functools import cache
-from operator import attrgetter
 from pathlib import Path
 import shutil
 import sqlite3
@@ -28,7 +27,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from .serialized import frame_ids, IMU_DOUBLES, joined, Messages, NANO, samples_of
+from .serialized import frame_ids, IMU_DOUBLES, joined, Messages, samples_of
 from ..disk import check_regular
 from ..errors import InputError
 from ..table import Floats
@@ -77,6 +76,11 @@ class Bag:
 
     def topics(self, msgtype: str) -> list[str]:
         return sorted({c.topic for c in self.reader.connections if c.msgtype == msgtype})
+
+    @property
+    def all_topics(self) -> str:
+        """Return the topics with their types, for a message."""
+        return some(sorted({f'{c.topic} ({c.msgtype})' for c in self.reader.connections}))
 
     def connections(self, topic: str, msgtype: str = IMU) -> list[Connection]:
         """Return the connections of a topic; a topic can have several."""
@@ -129,21 +133,20 @@ class Bag:
                              'record while the sensor publishes')
         return frame_ids(self.joined(block, topic, msgtype))[0] if block else ''
 
-    def fields(self, msgtype: str, field: str, block: Sequence[Received]) -> tuple[Floats, Floats]:
-        """Return stamps [s], NaN without header, and values of a field: ``status.voltage``."""
-        store = _types(block[0][0], ros2=self.ros2)
-        read = store.deserialize_cdr if self.ros2 else store.deserialize_ros1
-        messages = [read(raw, msgtype) for _, _, raw in block]
-        stamps = [getattr(getattr(each, 'header', None), 'stamp', None) for each in messages]
-        return (np.array([np.nan if each is None else each.sec + each.nanosec * NANO
-                          for each in stamps]),
-                np.array([*map(attrgetter(field), messages)], float))
+    def types(self, connection: Connection) -> Typestore:
+        """Return the types of a connection: those that the bag defines, or the usual ones."""
+        from rosbags.typesys import get_typestore, Stores
+
+        definition = connection.msgdef
+        if definition.data:
+            return _defined(definition.format.name, definition.data, connection.msgtype)
+        return get_typestore(Stores.ROS2_JAZZY if self.ros2 else Stores.ROS1_NOETIC)
 
     def numbers(self, connection: Connection) -> tuple[str, ...]:
         """Return the paths of the single numbers of a message, without headers and times."""
         from rosbags.interfaces import Nodetype
 
-        types = _types(connection, ros2=self.ros2).fielddefs
+        types = self.types(connection).fielddefs
 
         def below(msgtype: str, path: tuple[str, ...]) -> Iterator[str]:
             for name, (kind, about) in types[msgtype][1]:
@@ -161,9 +164,8 @@ class Bag:
         """Return the Imu topic, or check the given one; it must be one that the bag has."""
         topics = self.topics(IMU)
         if not topics:
-            others = sorted(f'{c.topic} ({c.msgtype})' for c in self.reader.connections)
-            raise InputError(f'{self.path} has {some(others) or "no topics"}, expected a topic of '
-                             f'type {IMU}', 'record the Imu topic')
+            raise InputError(f'{self.path} has {self.all_topics or "no topics"}, expected a topic '
+                             f'of type {IMU}', 'record the Imu topic')
         if topic not in topics and (topic or len(topics) > 1):
             found = (f'has the Imu topics {some(topics)}, expected {topic}' if topic else
                      f'has {len(topics)} Imu topics, expected one: {some(topics)}')
@@ -225,16 +227,6 @@ def open_bag(path: Path) -> Iterator[Bag]:
         source, notes = _readable(path, stack)
         reader: Any = stack.enter_context((Reader2 if ros2 else Reader1)(source))
         yield Bag(path, reader, ros2, tuple(notes))
-
-
-def _types(connection: Connection, *, ros2: bool) -> Typestore:
-    """Return the types of a connection: those that the bag defines, otherwise the usual ones."""
-    from rosbags.typesys import get_typestore, Stores
-
-    definition = connection.msgdef
-    if definition.data:
-        return _defined(definition.format.name, definition.data, connection.msgtype)
-    return get_typestore(Stores.ROS2_JAZZY if ros2 else Stores.ROS1_NOETIC)
 
 
 @cache

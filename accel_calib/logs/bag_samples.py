@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Collection, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
+from operator import attrgetter
 from pathlib import Path
 import re
 from typing import Any, TYPE_CHECKING
@@ -32,7 +33,7 @@ from .columns import topic_and_field
 from .names import ZEROS
 from .serialized import doubles_at, NANO, stamps_of
 from ..errors import InputError
-from ..table import concatenated, Floats, Recording
+from ..table import concatenated, CONTEXT, Floats, Recording
 from ..text import counted, listed, some
 
 if TYPE_CHECKING:
@@ -82,18 +83,34 @@ QUANTITIES = (
              (('V', 0.5, 200.0, 1.0, 0.0), ('mV', 200.0, 2e5, 1e-3, 0.0))))
 
 
-@dataclass(frozen=True)
-class Track:
-    """Finite values of a quantity, in order of time [s]."""
+_USUAL_FIELDS = ('data', 'voltage', 'fluid_pressure', 'temperature')
+"""Fields of messages with several numbers that are read for a column of the user."""
 
-    time: Floats
-    value: Floats
 
-    def at(self, time: Floats) -> Floats:
-        """Return the (n,) interpolated values; NaN if the track is empty."""
-        if not len(self.time):
-            return np.full(len(time), np.nan)
-        return np.interp(time, self.time, self.value)
+def quantity_of(column: str) -> Quantity:
+    """Return the quantity of a column of the context; that of a user can have any value."""
+    return next((each for each in QUANTITIES if each.key == column), Quantity(
+        column, column.replace('_', ' '), (column,), (column.lower(),),
+        (('', -math.inf, math.inf, 1.0, 0.0),)))
+
+
+def field_of(column: str, numbers: Sequence[str], asked: str = '') -> str:
+    """
+    Return the field of a message that holds a column of the context; '' if none or several can.
+
+    `numbers` are the paths of all numbers in the message, and `asked` the one that a user names.
+
+    """
+    quantity, last = quantity_of(column), {each: each.rpartition('.')[2].lower()
+                                           for each in numbers}
+    choices = [[each for each in numbers if each == asked]] if asked else [
+        *([each for each in numbers if last[each] == name] for name in quantity.fields),
+        [each for each in numbers if any(part in last[each] for part in quantity.parts)],
+        [each for each in numbers if each in column],
+        *([each] for each in _USUAL_FIELDS if each in numbers and quantity not in QUANTITIES),
+        list(numbers) if len(numbers) == 1 else []]
+    fields = next(filter(None, choices), [])
+    return fields[0] if len(fields) == 1 else ''
 
 
 @dataclass(frozen=True)
@@ -125,18 +142,24 @@ class ContextTopic:
             messages = self.bag.joined(block, self.topic, TEMPERATURE)
             stamps, values = stamps_of(messages), doubles_at(messages, slice(0, 1))[:, 0]
         else:
-            stamps, values = self.bag.fields(self.msgtype, self.field, block)
+            store = self.bag.types(block[0][0])
+            read = store.deserialize_cdr if self.bag.ros2 else store.deserialize_ros1
+            found = [read(raw, self.msgtype) for _, _, raw in block]
+            values = np.array([*map(attrgetter(self.field), found)], float)
+            parts = [getattr(getattr(each, 'header', None), 'stamp', None) for each in found]
+            stamps = np.array([np.nan if each is None else each.sec + each.nanosec * NANO
+                               for each in parts])
         time = stamps if self.late is None else _received(block) + self.late
         return time, values * self.factor + self.summand
 
-    def track(self) -> Track:
-        """Return the values of the whole bag."""
+    def track(self) -> Floats:
+        """Return the times [s] and finite values of the whole bag, (2, n); one NaN if none is."""
         connections = self.bag.connections(self.topic, self.msgtype)
         blocks = [self.values(block) for block in self.bag.blocks(connections)]
         time, value = np.hstack([np.zeros((2, 0)), *map(np.array, blocks)])
         known = np.flatnonzero(np.isfinite(value))
         order = known[np.argsort(time[known], kind='stable')]
-        return Track(time[order], value[order])
+        return np.array([time[order], value[order]] if len(order) else [[0.0], [np.nan]])
 
 
 def _received(block: Sequence[Received]) -> Floats:
@@ -165,11 +188,7 @@ def context_of(bag: Bag, imu: str, sensor: str, options: LogOptions
     """
     used: list[ContextTopic] = []
     notes: list[str] = []
-    known = {each.key for each in QUANTITIES}
-    of_user = (Quantity(column, column.replace('_', ' '), (column,), (column.lower(),),
-                        (('', -math.inf, math.inf, 1.0, 0.0),))
-               for column in options.context if column not in known)
-    for quantity in (*QUANTITIES, *of_user):
+    for quantity in map(quantity_of, dict.fromkeys((*CONTEXT, *options.context))):
         asked = options.context.get(quantity.key, '')
         found = (_asked(bag, quantity, asked) if asked else
                  _own(bag, imu, sensor) if quantity.key == 'temperature' else None)
@@ -185,18 +204,11 @@ def _asked(bag: Bag, quantity: Quantity, asked: str) -> ContextTopic:
     topic, field = topic_and_field(asked, {c.topic for c in bag.reader.connections})
     known = [connection for connection in bag.reader.connections if connection.topic == topic]
     if not known:
-        others = sorted({f'{c.topic} ({c.msgtype})' for c in bag.reader.connections})
-        raise InputError(f'{bag.path} has the topics {some(others)}, expected {topic}',
+        raise InputError(f'{bag.path} has the topics {bag.all_topics}, expected {topic}',
                          f'choose one of them with --context {quantity.key}:=TOPIC')
     numbers = bag.numbers(known[0])
-    last = {path: path.rpartition('.')[2].lower() for path in numbers}
-    choices = [[path for path in numbers if path == field]] if field else [
-        *([path for path in numbers if last[path] == name] for name in quantity.fields),
-        [path for path in numbers if any(part in last[path] for part in quantity.parts)],
-        list(numbers) if len(numbers) == 1 else []]
-    fields = next(filter(None, choices), [])
-    if len(fields) == 1:
-        return ContextTopic(bag, quantity, topic, known[0].msgtype, fields[0])
+    if found := field_of(quantity.key, numbers, field):
+        return ContextTopic(bag, quantity, topic, known[0].msgtype, found)
     have = f'the numbers {some(numbers)}' if numbers else 'no single number'
     raise InputError(
         f'{bag.path}: topic {topic} ({known[0].msgtype}) has {have}, expected '
@@ -306,7 +318,7 @@ def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool,
     for block in bag.blocks(bag.connections(topic), BLOCK):
         messages = bag.joined(block, topic, before=before)
         columns, which = imus_of(messages, f'{bag.path}, {topic}', before, sensor, chosen=chosen)
-        columns |= {key: track.at(columns['time']) for key, track in tracks.items()}
+        columns |= {key: np.interp(columns['time'], *track) for key, track in tracks.items()}
         samples = Recording(columns, before + np.arange(len(block)) + 1, 'm/s2', sensor)
         parts.append(samples if np.all(which) else samples.take(which))
         before += len(block)
@@ -321,8 +333,8 @@ def imu_samples(bag: Bag, topic: str, sensor: str, *, chosen: bool,
 # ---------------------------------------------------------------------------------- messages
 
 def _needed(bag: Bag, needs: Collection[str], used: Sequence[ContextTopic], notes: Sequence[str]
-            ) -> dict[str, Track]:
-    """Return all values of the quantities that a calibration needs; InputError without one."""
+            ) -> dict[str, Floats]:
+    """Return the tracks of the quantities that a calibration needs; InputError without one."""
     topics, tracks = {source.quantity: source for source in used}, {}
     for quantity in dict.fromkeys([*QUANTITIES, *topics]):
         if quantity.key not in needs:
@@ -333,7 +345,7 @@ def _needed(bag: Bag, needs: Collection[str], used: Sequence[ContextTopic], note
                              f'depends on the {quantity.words}', 'name the topic with --context '
                              f'{quantity.key}:=TOPIC, or use a calibration without it')
         track = tracks[quantity.key] = topics[quantity].track()
-        if not len(track.time):
+        if np.isnan(track[1, 0]):
             raise InputError(f'{bag.path}: {topics[quantity].topic} has no finite number, '
                              f'expected the {quantity.words}', 'name another topic')
     return tracks
@@ -359,7 +371,7 @@ def messages_of(path: Path, options: LogOptions, needs: Collection[str]) -> Gene
         number = {id(each): k for k, each in enumerate(connections)}
         imu = [number[id(each)] for each in bag.connections(topic)]
         yield {'topic': topic, 'sensor': sensor, 'count': bag.count(topic), 'imu': imu,
-               'tracks': {key: vars(track) for key, track in tracks.items()},
+               'tracks': tracks,
                'compression': getattr(bag.reader, 'compression_mode', None),
                'connections': [{
                    'topic': each.topic, 'msgtype': each.msgtype, 'msgdef': each.msgdef.data,

@@ -30,6 +30,11 @@ from ..units import STANDARD_GRAVITY, UnitName
 FRACTION = 'time_ns'
 """Key of a column with the nanoseconds of a time in whole seconds."""
 
+BY_ORDER: Mapping[int, tuple[str, ...]] = {
+    3: READING, 4: ('time', *READING), 5: ('time', *READING, 'temperature'),
+    7: ('time', *READING, *RATE), 8: ('time', *READING, *RATE, 'temperature')}
+"""Columns of a table without header, by their number."""
+
 OF_POSES = {'count', 'orientation', 'std'}
 """Columns that only poses have."""
 
@@ -205,10 +210,10 @@ def chosen(layout: Layout, options: LogOptions) -> Chosen:
             found['time'] = counted
     else:
         check_sensor(header[:MOST], layout.path)
-        found = _sources(layout, {**maker.present(header), **given})
-        found |= {f'{key}/': column(layout, name) for key, name in maker.divisors.items()}
-        if maker.instance:
-            found['instance'] = column(layout, maker.instance)
+        theirs = maker.present(header)
+        ours = {key: theirs.pop(key) for key in OURS if key in theirs}
+        found = _sources(layout, {**ours, **given})
+        found |= {key: column(layout, name) for key, name in theirs.items()}
     sources = {key: tuple(found[name] for name in own.names) for key, own in COLUMNS.items()
                if found.keys() >= {*own.names}}
     sources |= {key: (source,) for key, source in found.items() if key not in OURS}
@@ -243,26 +248,6 @@ def _are_numbers(cells: Sequence[str]) -> bool:
 def _sources(layout: Layout, given: Mapping[str, str]) -> dict[str, Source]:
     """Return columns under our names; `given` are those that the user or a maker names."""
     header = layout.header
-    found = _given(layout, given)
-    if set(READING) <= set(header) and not set(READING) & set(found):
-        for name, count in Counter(header).items():
-            if count > 1 and name in OURS:
-                raise InputError(f'{layout.path} has {count} columns {name}, expected one',
-                                 'remove or rename the others')
-        found = {**{name: _source(layout, header.index(name)) for own in COLUMNS.values()
-                    if not own.made and {*own.names} <= {*header} for name in own.names}, **found}
-    elif not set(READING) <= set(found):
-        found = {**(_readings(layout) if header else _by_order(layout)), **found}
-    if header:
-        found = {**_contexts(layout, found), **found}
-    # What is not asked for, and holds other text than numbers, does not stand in the way.
-    plain = {ours: source for ours, source in found.items()
-             if ours not in (*RATE, *CONTEXT) or ours in given or source.name == ours
-             or _are_numbers(layout.first(source.index)[:_FIRST_ROWS])}
-    return {ours: source for ours, source in plain.items() if given.get(ours, ours)}
-
-
-def _given(layout: Layout, given: Mapping[str, str]) -> dict[str, Source]:
     for ours in given:
         if ours not in OURS:
             raise InputError(f'--columns names {ours!r}, expected one of {", ".join(OURS)}',
@@ -272,7 +257,22 @@ def _given(layout: Layout, given: Mapping[str, str]) -> dict[str, Source]:
     if partly and not set(READING) <= set(found):
         raise InputError(f'--columns names {", ".join(sorted(partly))}, expected ax, ay and az',
                          'name all three')
-    return found
+    if set(READING) <= set(header) and not set(READING) & set(found):
+        for name, count in Counter(header).items():
+            if count > 1 and name in OURS:
+                raise InputError(f'{layout.path} has {count} columns {name}, expected one',
+                                 'remove or rename the others')
+        found = {**{name: _source(layout, header.index(name)) for own in COLUMNS.values()
+                    if not own.made and {*own.names} <= {*header} for name in own.names}, **found}
+    elif not set(READING) <= set(found):
+        found = {**_readings(layout), **found}
+    if header:
+        found = {**_contexts(layout, found), **found}
+    # What is not asked for, and holds other text than numbers, does not stand in the way.
+    plain = {ours: source for ours, source in found.items()
+             if ours not in (*RATE, *CONTEXT) or ours in given or source.name == ours
+             or _are_numbers(layout.first(source.index)[:_FIRST_ROWS])}
+    return {ours: source for ours, source in plain.items() if given.get(ours, ours)}
 
 
 def column(layout: Layout, theirs: str) -> Source:
@@ -300,20 +300,16 @@ def _source(layout: Layout, index: int) -> Source:
     return Source(index, layout.name(index), unit)
 
 
-def _by_order(layout: Layout) -> dict[str, Source]:
-    """Return the columns of a table without header, by their order."""
-    orders = {3: READING, 4: ('time', *READING), 5: ('time', *READING, 'temperature'),
-              7: ('time', *READING, *RATE), 8: ('time', *READING, *RATE, 'temperature')}
-    if layout.width not in orders:
-        raise InputError(f'{layout.path} has no header line and {layout.width} columns, expected '
-                         '3 (ax, ay, az), 4 (time first), 5 (temperature last), 7 (angular rate '
-                         'last) or 8 (temperature last)', 'add a header line, or name them with '
-                         '--columns time=1,ax=2,ay=3,az=4')
-    return {name: Source(k, str(k + 1)) for k, name in enumerate(orders[layout.width])}
-
-
 def _readings(layout: Layout) -> dict[str, Source]:
+    """Return the columns of the accelerometer; those of a table without header by their order."""
     header = layout.header
+    if not header:
+        if layout.width not in BY_ORDER:
+            raise InputError(f'{layout.path} has no header line and {layout.width} columns, '
+                             'expected 3 (ax, ay, az), 4 (time first), 5 (temperature last), 7 '
+                             '(angular rate last) or 8 (temperature last)', 'add a header line, '
+                             'or name them with --columns time=1,ax=2,ay=3,az=4')
+        return {name: Source(k, str(k + 1)) for k, name in enumerate(BY_ORDER[layout.width])}
     groups = list(_triples('reading', header).values())
     words = {triple[0]: set(meaning(header[triple[0]]).group) for triple in groups}
     with_gravity = [triple for triple in groups if not FREE_WORDS & words[triple[0]]]

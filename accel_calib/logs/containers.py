@@ -43,7 +43,7 @@ import numpy as np
 import scipy
 
 from .child import LogFile
-from .columns import is_log_header, LogOptions
+from .columns import BY_ORDER, is_log_header, LogOptions
 from .dialect import shown
 from ..errors import InputError
 from ..table import ABOUT
@@ -321,9 +321,6 @@ def columnar(kind: str, path: Path, _: ExitStack) -> list[Member]:
 
 # -------------------------------------------------------------------------- NumPy, MATLAB, HDF5
 
-_BY_ORDER = (3, 4, 5, 7, 8)
-"""Widths of arrays that are read by the order of their columns."""
-
 _NUMBERS = re.compile(r'double|single|u?int\d+|float\d+|datetime64.*|void\d+')
 _EXPORT = 'store arrays of numbers'
 _EXPORT_MATLAB = ('write a CSV file in MATLAB: writetimetable(Acceleration, "log.csv"), or '
@@ -409,12 +406,12 @@ def _tables(path: Path, held: Mapping[str, _Held], advice: str) -> list[Member]:
         by_length.setdefault(len(values), {})[name] = values
     for group in by_length.values():
         header = [cell for name, values in group.items() for cell in _names(name, values)]
-        alone = len(group) == 1 and len(header) in _BY_ORDER
+        alone = len(group) == 1 and len(header) in BY_ORDER
         if is_log_header(LogOptions(), header) and not alone:
             tables.append(_table(', '.join(group), header, *group.values()))
         else:
             tables += [_table(name, [], values) for name, values in group.items()
-                       if values.shape[1] in _BY_ORDER]
+                       if values.shape[1] in BY_ORDER]
     return tables or [_table(name, _names(name, values), values)
                       for name, values in arrays.items()]
 

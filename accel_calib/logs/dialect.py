@@ -58,7 +58,6 @@ _LABELLED_UNIT = re.compile(r'(?<=[\d.]) *(?:m?g|m/s(?:\^?2|²|/s)|(?:°|deg|rad
                             r'(?=[\s,;|]|$)')
 """Unit after a number with a name."""
 
-_ONE_LABEL = re.compile(r'\s*([A-Za-z]\w*)(?:\s*[:=]\s*|\s+)[-+]?\d*\.?\d+(?:\s*\D{0,6})?')
 _MOTIONCAL = re.compile(r'Raw:(?:-?\d+,){8}-?\d+\s*')
 _MOTIONCAL_NAMES = ('accX', 'accY', 'accZ', *6 * ('',))
 """Names of the counts that the sketches for MotionCal print; those of gyro and magnetometer have
@@ -72,16 +71,21 @@ _UNREADABLE = re.compile('[\x00-\x08\x0e-\x1a\x1c-\x1f\x7f\ufffd]')
 _SHOWN_CHARACTERS = 40
 _EXAMPLE = 'such as time,ax,ay,az and one row for each pose or sample'
 
+COMMENTS = ('#', '//', '%')
+"""Beginnings of the lines that are comments."""
+
 RATES_HZ = (1.0, 10_000.0)
 """Plausible numbers of samples per second."""
 
 EPOCH_S = (1e9, 4e9)
 """Unix times from 2001 to 2096 [s]."""
 
-_CLOCK = re.compile(
+CLOCK = re.compile(
     r'(?:(\d{4}[-/]\d{1,2}[-/]\d{1,2}|\d{1,2}-[A-Za-z]{3}-\d{4}|\d{1,2}[./]\d{1,2}[./]\d{4})'
     r',?[T ])?(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,:](\d+))?)? ?([AaPp]\.?[Mm]\.?)? ?'
     r'(Z|UTC|[-+]\d{2}(?::?\d{2})?)?', re.ASCII)
+"""Date, which may be absent, and time of the day."""
+
 _DAYS = ('%Y-%m-%d', '%d-%b-%Y', '%d.%m.%Y', '%m-%d-%Y', '%d-%m-%Y')
 
 IsHeader = Callable[[Sequence[str]], bool]
@@ -93,8 +97,7 @@ class Dialect:
     How the cells of a table are parted; an empty delimiter is any run of blanks.
 
     `monitor`: each line begins with the time of a serial monitor. `labelled`: each number follows
-    its name. `prefix`: begin of the lines that are rows, and `marks`: first characters of those
-    that are not.
+    its name. `prefix`: begin of the lines that are rows, and `marks`: those of lines that are not.
 
     """
 
@@ -102,22 +105,31 @@ class Dialect:
     monitor: bool = False
     labelled: bool = False
     prefix: str = ''
-    marks: str = '#'
+    marks: tuple[str, ...] = COMMENTS
 
     def is_row(self, line: str) -> bool:
         """Return whether a line can be a row."""
-        return not (line[0] in self.marks or line.isspace()) and self.prefix in line
+        return not (line.startswith(self.marks) or line.isspace()) and self.prefix in line
 
     def cells(self, line: str) -> list[str]:
-        """Return the cells of a line, without quotes and blanks around them."""
-        return split(self.plain(line), self.delimiter)
+        """
+        Return the cells of a line, without quotes and blanks around them, and without names.
 
-    def plain(self, line: str) -> str:
-        """Return a line without names, and with the time of a monitor as its first cell."""
+        The time of a monitor is the first cell.
+
+        """
+        delimiter = self.delimiter
         if self.monitor:
-            line = _MONITOR.sub(lambda found: found[1] + (self.delimiter or ' '), line)
+            line = _MONITOR.sub(lambda found: found[1] + (delimiter or ' '), line)
         line = line.removeprefix(self.prefix)
-        return _LABEL.sub('', _LABELLED_UNIT.sub('', line)) if self.labelled else line
+        if self.labelled:
+            line = _LABEL.sub('', _LABELLED_UNIT.sub('', line))
+        cells = line.split(delimiter or None)
+        if '"' in line:
+            with suppress(csv.Error):  # A cell is longer than 131,072 characters.
+                cells = next(csv.reader(
+                    [line], delimiter=delimiter or ' ', skipinitialspace=True), [])
+        return [cell.strip() for cell in cells]
 
 
 @dataclass(frozen=True)
@@ -181,17 +193,6 @@ class Cells:
         return Cells(numbers, texts, self.row[which])
 
 
-def split(line: str, delimiter: str) -> list[str]:
-    """Return the cells of a line, without quotes and blanks around them."""
-    if '"' in line:
-        try:
-            found = next(csv.reader([line], delimiter=delimiter or ' ', skipinitialspace=True), [])
-        except csv.Error:  # A cell is longer than 131,072 characters.
-            found = line.split(delimiter or None)
-        return [cell.strip() for cell in found]
-    return [cell.strip() for cell in line.split(delimiter)] if delimiter else line.split()
-
-
 def is_number(text: str) -> bool:
     """Return whether a cell is a finite number, with a decimal point."""
     return _NUMBER.fullmatch(text) is not None and math.isfinite(float(text))
@@ -199,13 +200,7 @@ def is_number(text: str) -> bool:
 
 def is_clock(text: str) -> bool:
     """Return whether a text is a date with a time, or a time of the day."""
-    return _CLOCK.fullmatch(text) is not None
-
-
-def has_date(text: str) -> bool:
-    """Return whether a text is a date with a time."""
-    match = _CLOCK.fullmatch(text)
-    return match is not None and match[1] is not None
+    return CLOCK.fullmatch(text) is not None
 
 
 def seconds_of(texts: NDArray[np.object_], path: Path, rows: NDArray[np.int64]) -> Floats:
@@ -219,7 +214,7 @@ def seconds_of(texts: NDArray[np.object_], path: Path, rows: NDArray[np.int64]) 
 
 
 def _seconds(text: str) -> float | None:
-    match = _CLOCK.fullmatch(text)
+    match = CLOCK.fullmatch(text)
     if match is None:
         return None
     date, hours, minute, second, digits, half, zone = match.groups()
@@ -244,19 +239,6 @@ def _day(date: str) -> float | None:
             day = datetime.strptime(date.replace('/', '-'), form)
             return day.replace(tzinfo=timezone.utc).timestamp()
     return None
-
-
-def first_label(head: Sequence[str]) -> str:
-    """Return the first name of numbers that stand one per line; empty if they do not."""
-    names = [match[1] for match in map(_ONE_LABEL.fullmatch, head) if match]
-    cycle = list(dict.fromkeys(names))
-    repeats = len(cycle) >= 3 and names[:3 * len(cycle)] == 3 * cycle
-    return cycle[0] if repeats and 4 * len(names) > len(head) else ''
-
-
-def is_comment(line: str) -> bool:
-    """Return whether a line is a comment."""
-    return line.startswith(('#', '//', '%'))
 
 
 def short(text: str) -> str:
@@ -291,20 +273,20 @@ def layout_of(path: Path, head: Sequence[str], is_header: IsHeader, encoding: st
         raise InputError(f'{path} has no table of numbers in its first '
                          f'{counted(len(head), "line")}, expected a header line {_EXAMPLE}',
                          'check that this is the intended file')
-    cells = {k: found.dialect.cells(head[k]) for k in finder.plain if k > found.at}
-    below = [k for k in cells if k >= found.line]
+    dialect, header, at, first = found
+    cells = {k: dialect.cells(head[k]) for k in finder.plain if k > at}
+    below = [k for k in cells if k >= first]
     start = next((k for k in below if any(map(_LIKE_NUMBER.fullmatch, cells[k]))),
                  below[0] if below else len(head))
-    rate_hz = None if found.header else _rate_below_start([cells[k] for k in below
-                                                           if k >= start][:2])
+    rate_hz = None if header else _rate_below_start([cells[k] for k in below if k >= start][:2])
     if rate_hz is not None and len(below) > 2:
         start = below[2]
-    passed = [short(head[k]) for k in finder.plain if k < start and k != found.at]
+    passed = [short(head[k]) for k in finder.plain if k < start and k != at]
     skipped = f'skipped {counted(len(passed), "line")} before the table'
     notes = [f'{skipped}{":" if len(passed) == 1 else ", the first is"} {each!r}'
              for each in passed[:1]]
-    between = [tuple(cells[k]) for k in cells if k < start and found.at >= 0]
-    units_row = next((each for each in between if len(each) == len(found.header)), ())
+    between = [tuple(cells[k]) for k in cells if k < start and at >= 0]
+    units_row = next((each for each in between if len(each) == len(header)), ())
     rows = [cells[k] for k in cells if k >= start]
     stated = {float(before or after) * (1000.0 if any(kilo) else 1.0) for line in head[:start]
               for before, *kilo, after in _RATE.findall(line[:1000])}
@@ -312,8 +294,8 @@ def layout_of(path: Path, head: Sequence[str], is_header: IsHeader, encoding: st
         rate_hz = stated.pop()
     decimal = {match[1] for row in rows[:_TRIED_LINES] for match in map(_DECIMAL.fullmatch, row)
                if match}
-    return Layout(path, found.dialect, min(decimal, default=''), found.header, units_row,
-                  _width(found.header, rows), start, encoding, _about(path, head), tuple(notes),
+    return Layout(path, dialect, min(decimal, default=''), header, units_row,
+                  _width(header, rows), start, encoding, _about(path, head), tuple(notes),
                   tuple(map(tuple, rows[:_TRIED_LINES])), rate_hz)
 
 
@@ -327,14 +309,8 @@ def _rate_below_start(rows: Sequence[Sequence[str]]) -> float | None:
     return rate_hz if begun > EPOCH_S[0] and RATES_HZ[0] <= rate_hz <= RATES_HZ[1] else None
 
 
-@dataclass(frozen=True)
-class _Found:
-    """Dialect, names, the first line after them, and the index of the header line (or -1)."""
-
-    dialect: Dialect
-    header: tuple[str, ...]
-    line: int
-    at: int = -1
+_Found = tuple[Dialect, tuple[str, ...], int, int]
+"""Dialect, names, and the indices of the header line (or -1) and of the first line below it."""
 
 
 class _Finder:
@@ -346,9 +322,8 @@ class _Finder:
         is_gcdc = any(line.startswith(';Headers,') for line in head)
         self.dialect = Dialect(',', timed > len(self.filled) / 2,
                                prefix='Raw:' if raw > len(self.filled) / 3 else '',
-                               marks='#;' if is_gcdc else '#')
-        self.plain = [k for k in self.filled
-                      if self.dialect.is_row(head[k]) and not is_comment(head[k])]
+                               marks=(*COMMENTS, ';') if is_gcdc else COMMENTS)
+        self.plain = [k for k in self.filled if self.dialect.is_row(head[k])]
 
     def named(self) -> _Found | None:
         """Return the names in the first line with known names."""
@@ -358,8 +333,9 @@ class _Finder:
             cells = self._names(k, dialect)
             if cells and self.is_header(cells):
                 row = next((dialect.cells(self.head[j]) for j in self.plain if j > k), [])
-                if len(row) == len(cells) or (delimiter and not is_comment(self.head[k])):
-                    return _Found(dialect, tuple(cells), k + 1, k)
+                if len(row) == len(cells) or (
+                        delimiter and not self.head[k].startswith(COMMENTS)):
+                    return dialect, tuple(cells), k, k + 1
         return None
 
     def _names(self, k: int, dialect: Dialect) -> list[str]:
@@ -370,7 +346,7 @@ class _Finder:
 
         """
         line = self.head[k].removeprefix(';Headers,')
-        cells = dialect.cells(line.lstrip('#/% ') if is_comment(line) else line)
+        cells = dialect.cells(line.lstrip('#/% ') if line.startswith(COMMENTS) else line)
         if dialect.monitor and cells and is_clock(cells[0]):
             cells[0] = 'time'
         return [] if len(cells) < 3 or any(map(_LIKE_NUMBER.fullmatch, cells)) else cells
@@ -391,24 +367,25 @@ class _Finder:
         first = next((k for k in self.plain
                       if _row_width(dialect.cells(self.head[k]))[0] == width), self.plain[-1])
         if dialect.prefix:
-            return _Found(dialect, _MOTIONCAL_NAMES, first)
+            return dialect, _MOTIONCAL_NAMES, -1, first
         if dialect.labelled:
             line = _LABELLED_UNIT.sub('', _MONITOR.sub('', self.head[first]))
             names = tuple(name.strip(' :=\t') for name in _LABEL.findall(line))
-            return _Found(dialect, (*('time',) * dialect.monitor, *names), first)
+            return dialect, (*('time',) * dialect.monitor, *names), -1, first
         before = ((k, self._names(k, dialect)) for k in reversed(self.filled) if k < first)
-        return next((_Found(dialect, tuple(cells), first, k) for k, cells in before
-                     if len(cells) == width), _Found(dialect, (), first))
+        return next(((dialect, tuple(cells), k, first) for k, cells in before
+                     if len(cells) == width), (dialect, (), -1, first))
 
     def narrow(self) -> _Found | None:
         """Return the first line as the names of a table with too few columns, or None."""
-        numbers = [k for k in self.plain if any(map(_LIKE_NUMBER.fullmatch,
-                                                    split(self.head[k], ',')))]
+        dialect = Dialect(',')
+        cells = {k: dialect.cells(self.head[k]) for k in self.plain}
+        numbers = [k for k in cells if any(map(_LIKE_NUMBER.fullmatch, cells[k]))]
         if not numbers:
             return None
         first = self.plain[0]
-        names = () if numbers[0] == first else tuple(split(self.head[first], ','))
-        return _Found(Dialect(','), names, first + 1 if names else first, first)
+        names = () if numbers[0] == first else tuple(cells[first])
+        return dialect, names, first, first + 1 if names else first
 
 
 def _row_width(cells: Sequence[str]) -> tuple[int, int]:

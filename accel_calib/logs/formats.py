@@ -41,7 +41,7 @@ from ..disk import check_regular, FIRST_LINE
 from ..errors import DamagedLogError, InputError, needing, saying
 from ..finding import Finding
 from ..table import check_units, check_values, concatenated, CONTEXT, Poses, Recording
-from ..text import some
+from ..text import counted, some
 from ..units import Units, units_of
 
 _HEAD, _TAIL = 8192, 65536
@@ -426,23 +426,6 @@ def is_bag(path: Path) -> bool:
     return path.is_dir() or path.suffix.lower() in BAG.suffixes
 
 
-def _format_of(path: Path) -> Format:
-    """Return the format of a file; InputError if it is none that is read."""
-    known = BAG
-    if not is_bag(path):
-        with path.open('rb') as file:
-            head = file.read(_HEAD)
-            file.seek(max(file.tell(), path.stat().st_size - _TAIL))
-            known = recognised(path, head + file.read())
-    if known.advice:
-        raise InputError(f'{path} is {known.name}, expected a log or a table that is read',
-                         known.advice.format(path.name))
-    if known.needs and find_spec(known.needs) is None:
-        with needing(known.needs, known.name):
-            raise ImportError(f'no module {known.needs}')
-    return known
-
-
 @contextmanager
 def open_log(path: Path | Piped | Frame, options: LogOptions = LogOptions()) -> Iterator[OpenLog]:
     """
@@ -465,11 +448,43 @@ def open_log(path: Path | Piped | Frame, options: LogOptions = LogOptions()) -> 
 
     """
     if isinstance(path, Path):
+        known = BAG
         if not path.is_dir():
             check_regular(path)
-        known = _format_of(path)
+        if not is_bag(path):
+            with path.open('rb') as file:
+                head = file.read(_HEAD)
+                file.seek(max(file.tell(), path.stat().st_size - _TAIL))
+                known = recognised(path, head + file.read())
+        if known.advice:
+            raise InputError(f'{path} is {known.name}, expected a log or a table that is read',
+                             known.advice.format(path.name))
+        if known.needs and find_spec(known.needs) is None:
+            with needing(known.needs, known.name):
+                raise ImportError(f'no module {known.needs}')
         opened = (known.opened if known.plain else _binary)(known, path, options)
     else:
         opened = _tables(TEXT, Path(str(path)), options, [path.table])
     with opened as log, saying(log.read_as):
         yield log
+
+
+def read_poses(path: Path, *, partial: bool = False) -> Poses:
+    """
+    Return the poses of a pose table; a recording is an InputError, as others in `open_log`.
+
+    `partial`: columns of the context with empty cells, which are NaN, are kept.
+
+    """
+    with open_log(path, LogOptions(partial=partial)) as log:
+        if log.poses is not None:
+            return log.poses
+        raise InputError(f'{path} is a recording of {counted(sum(map(len, log.blocks)), "sample")}'
+                         ', expected a pose table', 'use capture')
+
+
+def read_recording(path: Path, topic: str = '', sensor: str = '', *, in_child: bool = True
+                   ) -> Recording:
+    """Return all samples of a recording; options as in `LogOptions`, errors as in `open_log`."""
+    with open_log(path, LogOptions(topic=topic, sensor=sensor, in_child=in_child)) as log:
+        return concatenated(list(log.blocks))

@@ -22,7 +22,7 @@ depends on the sign. A flat pose does, and `LogFormat.note` names the frame for 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import lru_cache
 import math
@@ -88,7 +88,7 @@ COUNTERS = frozenset(('counter', 'packetcounter', 'packetnumber', 'packet', 'fra
 TICKS = {'sampletimefine': {'ticks of 100 µs': 1e-4, 'µs': 1e-6}}
 """Units of clocks with a name of their own: of Xsens, by the model."""
 
-MICRO, MILLI, DEGREE = 1e-6, 1e-3, math.pi / 180.0
+MICRO, MILLI, DEGREE_RAD = 1e-6, 1e-3, math.pi / 180.0
 _UNITS = {
     'reading': {
         ('m/s2', 1.0): 'ms2 m/s2 m/s/s ms-2 mps2 mss mpss mpsps m/sec2 m/ss meter/s2 meters/s2',
@@ -101,9 +101,9 @@ _UNITS = {
         ('native', 1.0): 'lsb lsbs count counts digit digits v volt volts mv'},
     'rate': {
         ('rad/s', 1.0): 'rad/s rads radps rad/sec rads-1 rad radsec radians/s',
-        ('°/s', DEGREE): 'deg/s degs dps degps deg/sec degs-1 deg degrees/s degree/s degsec '
-                         'degrees/sec',
-        ('m°/s', 1e-3 * DEGREE): 'mdps mdeg/s',
+        ('°/s', DEGREE_RAD): 'deg/s degs dps degps deg/sec degs-1 deg degrees/s degree/s degsec '
+                             'degrees/sec',
+        ('m°/s', 1e-3 * DEGREE_RAD): 'mdps mdeg/s',
         ('rpm', math.pi / 30.0): 'rpm'},
     'time': {
         ('s', 1.0): 's sec secs second seconds',
@@ -271,13 +271,13 @@ class LogFormat:
     """
     One layout of a text log, named as ``--format`` has it.
 
-    `columns` are the names in the file of our columns. By key of `COLUMNS`, `divisors` are the
-    names of columns by which ours are divided, and `scales` factors from the unit of the file to
+    `columns` are the names in the file of our columns. With a key of `COLUMNS`, ``KEY/`` is the
+    name of the column by which ours are divided; ``instance`` is that of the number of the sensor,
+    if rows of several alternate. By such a key, `scales` are factors from the unit of the file to
     ours; a time without one is in a unit that the reader recognises. `units` is the unit of the
-    reading, empty if the file does not determine it. `instance` is the column with the number of
-    the sensor, if rows of several alternate.
+    reading, empty if the file does not determine it.
 
-    The names of time, readings, `divisors` and `marks` together determine the layout if it is
+    The names of time, readings, divisors and `marks` together determine the layout if it is
     `plain`; otherwise it is used only where the user names it. `without_gravity` are the maker's
     columns of acceleration without gravity, and its files of it (``.csv``); `other_sensors` are
     its files of other sensors with the same columns. `record` is what to use instead of these
@@ -293,21 +293,20 @@ class LogFormat:
     without_gravity: tuple[str, ...] = ()
     other_sensors: tuple[str, ...] = ()
     record: str = ''
-    divisors: Mapping[str, str] = field(default_factory=dict)
-    instance: str = ''
     note: str = ''
     plain: bool = True
 
     @property
     def needed(self) -> tuple[str, ...]:
         """Names that a header of this layout has, in any order."""
-        ours = [self.columns[key] for key in ('time', *READING) if key in self.columns]
-        return tuple(dict.fromkeys((*ours, *self.divisors.values(), *self.marks)))
+        ours = [name for key, name in self.columns.items()
+                if key in ('time', *READING) or key.endswith('/')]
+        return tuple(dict.fromkeys((*ours, *self.marks)))
 
-    def fits(self, header: Sequence[str]) -> bool:
-        """Return whether a header has the names of this layout; case and spacing are ignored."""
+    def lacking(self, header: Sequence[str]) -> list[str]:
+        """Return the names that a header lacks for this layout; case and spacing are ignored."""
         given = {folded(name) for name in header}
-        return bool(self.columns) and {folded(name) for name in self.needed} <= given
+        return [name for name in self.needed if folded(name) not in given]
 
     def present(self, header: Sequence[str]) -> dict[str, str]:
         """Return the columns of this layout in a header, with the spelling of the header."""
@@ -399,13 +398,13 @@ PX4_SPANS = {'reading': 'delta_velocity_dt', 'rate': 'delta_angle_dt'}
 def _px4(message: str, marks: tuple[str, ...] = (), note: str = _FRD, *, changes: bool = False,
          **others: str) -> LogFormat:
     """Return the layout of a message; `changes` are divided by their intervals."""
-    divisors = PX4_SPANS if changes else {}
+    spans = PX4_SPANS if changes else {}
     return LogFormat(
         'px4', {'time': 'timestamp', **others, **{
             axis: name for key, names in PX4_FIELDS[message].items()
-            for axis, name in zip(COLUMNS[key].names, names)}},
-        {'time': MICRO, **dict.fromkeys(divisors, 1.0 / MICRO)}, marks=marks, divisors=divisors,
-        note=note)
+            for axis, name in zip(COLUMNS[key].names, names)},
+            **{f'{key}/': name for key, name in spans.items()}},
+        {'time': MICRO, **dict.fromkeys(spans, 1.0 / MICRO)}, marks=marks, note=note)
 
 
 _PX4_FORMATS = (
@@ -423,9 +422,8 @@ _PX4_FORMATS = (
 _ACC = _axes('Acc{}', names=_UPPER)
 
 _ARDUPILOT_FORMATS = tuple(
-    LogFormat('ardupilot', {'time': time, **_ACC, **more}, {'time': MICRO}, marks=marks,
-              instance='I',
-              note=f'Readings are corrected by the stored INS_ACC parameters. {_FRD}')
+    LogFormat('ardupilot', {'time': time, **_ACC, **more, 'instance': 'I'}, {'time': MICRO},
+              marks=marks, note=f'Readings are corrected by the stored INS_ACC parameters. {_FRD}')
     for time, more, marks in (
         ('TimeUS', {**_axes('Gyr{}', RATE, _UPPER), 'temperature': 'T'}, ('GyrX',)),
         ('SampleUS', {}, ('TimeUS',)),
@@ -439,7 +437,7 @@ _ARDUPILOT_FORMATS = tuple(
 
 _BLACKBOX_TIMES = {'time (us)': MICRO, 'time (ms)': MILLI, 'time (s)': 1.0, 'time': MICRO}
 _BLACKBOX_UNITS: dict[str, UnitName] = {'': 'native', ' (g)': 'g', ' (m/s/s)': 'm/s2'}
-_BLACKBOX_RATES = {' (deg/s)': DEGREE, ' (rad/s)': 1.0, '': 0.0}
+_BLACKBOX_RATES = {' (deg/s)': DEGREE_RAD, ' (rad/s)': 1.0, '': 0.0}
 
 
 def _betaflight(time: str, unit: str, rate: str) -> LogFormat:
@@ -471,8 +469,8 @@ NAMES: tuple[str, ...] = tuple(dict.fromkeys(each.name for each in FORMATS))
 
 def recognise(header: Sequence[str]) -> LogFormat | None:
     """Return the layout whose names a header has, or None; the one with most names, if several."""
-    fitting = [each for each in FORMATS if each.plain and each.fits(header)]
-    return _closest(fitting, header) if fitting else None
+    fitting = [each for each in FORMATS if each.plain and not each.lacking(header)]
+    return max(fitting, key=lambda each: len(each.needed), default=None)
 
 
 def format_named(name: str, header: Sequence[str], source: str) -> LogFormat:
@@ -482,22 +480,13 @@ def format_named(name: str, header: Sequence[str], source: str) -> LogFormat:
         close = get_close_matches(name, NAMES, 1)
         raise InputError(f'format is {name!r}, expected one of {", ".join(NAMES)}',
                          f'use {close[0]}' if close else 'leave the format out: it is recognised')
-    fitting = [each for each in layouts if each.fits(header) or not each.columns]
-    if fitting:
-        return _closest(fitting, header)
-    given = {folded(column) for column in header}
-    nearest = max(layouts, key=lambda each: len({*map(folded, each.needed)} & given))
-    lacking = [column for column in nearest.needed if folded(column) not in given]
-    raise InputError(f'{source} has the columns {some(header)}, and lacks '
-                     f'{", ".join(lacking)} of a log of {name}',
-                     'leave the format out, or name the columns with --columns')
-
-
-def _closest(fitting: Sequence[LogFormat], header: Sequence[str]) -> LogFormat:
-    found = max(fitting, key=lambda each: len(each.needed))
-    # Logs of ArduPilot before version 4.1 have no column with the number of the sensor.
-    there = folded(found.instance) in {folded(name) for name in header}
-    return found if there else replace(found, instance='')
+    nearest = max(layouts, key=lambda each: (not each.lacking(header), len(each.needed) - len(
+        each.lacking(header))))
+    if lacking := nearest.lacking(header):
+        raise InputError(f'{source} has the columns {some(header)}, and lacks '
+                         f'{", ".join(lacking)} of a log of {name}',
+                         'leave the format out, or name the columns with --columns')
+    return nearest
 
 
 def check_sensor(header: Sequence[str], path: Path) -> None:
@@ -520,7 +509,7 @@ def record_instead(header: Sequence[str], path: Path) -> str:
     for layout in FORMATS:
         marks = {folded(name) for name in layout.without_gravity if not name.endswith('.csv')}
         if (marks and marks <= given) or (
-                layout.plain and layout.fits(header)
+                layout.plain and not layout.lacking(header)
                 and _file(path.name) in map(_file, layout.without_gravity)):
             return layout.record
     return ''

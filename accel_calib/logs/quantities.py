@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from .columns import Chosen, LogOptions, OF_POSES, unused
 from .dialect import Cells
-from .names import DEGREE, meaning, READING, record_instead, unit_of, ZEROS
+from .names import DEGREE_RAD, meaning, READING, record_instead, unit_of, ZEROS
 from .times import Clock, clock_of
 from ..errors import InputError, saying
 from ..finding import Finding
@@ -281,9 +281,15 @@ def _instance(columns: Chosen, first: Cells, options: LogOptions, notes: list[st
 def _decide_reading(made: Quantities, first: Cells, options: LogOptions, *, samples: bool
                     ) -> None:
     """Decide the unit of the readings; raise InputError if what states it is contradicted."""
-    columns = made.chosen
-    named, factor = _named(columns)
+    columns, maker = made.chosen, made.chosen.maker
     path, of_file = columns.layout.path, columns.layout.about.get('units', '')
+    found = ({(maker.units, maker.scales.get('reading', 1.0))} if maker and maker.units else
+             {unit_of('reading', source.unit) for source in columns.sources['reading']})
+    if len(found) > 1:
+        raise InputError(f'{path} has the columns {", ".join(columns.names("reading"))} in '
+                         'several units, expected one unit',
+                         'correct the names, or convert the columns')
+    named, factor = found.pop() or ('', 1.0)
     if options.units and of_file and options.units != of_file:
         raise InputError(f'{path} is in {of_file}, but --units is {options.units}',
                          'remove --units, or correct the file')
@@ -291,7 +297,8 @@ def _decide_reading(made: Quantities, first: Cells, options: LogOptions, *, samp
     if stated and stated != named:
         factor = 1.0
     rests = rests_of(made.numbers(first, 'reading') * factor, samples=samples)
-    name, words = stated or named, compact(columns.names('reading'))
+    name = cast(UnitName | Literal[''], stated or named)
+    words = compact(columns.names('reading'))
     with saying(', '.join([*made.said, f'{words} in {name}' if name else words])):
         _check_rests(columns, rests, units_of(name, options.gravity) if name else None,
                      stated=bool(stated))
@@ -310,19 +317,6 @@ def _decide_reading(made: Quantities, first: Cells, options: LogOptions, *, samp
         made.notes.append('nothing in the file says what the numbers are: they are taken for '
                           'those of an accelerometer in counts or volts; a magnetometer looks '
                           'alike')
-
-
-def _named(columns: Chosen) -> tuple[UnitName | Literal[''], float]:
-    """Return the unit that the maker or the names state, and the factor to it."""
-    if columns.maker is not None and columns.maker.units:
-        return columns.maker.units, columns.maker.scales.get('reading', 1.0)
-    found = {unit_of('reading', source.unit) for source in columns.sources['reading']}
-    if len(found) > 1:
-        raise InputError(f'{columns.layout.path} has the columns '
-                         f'{", ".join(columns.names("reading"))} in several units, expected one '
-                         'unit', 'correct the names, or convert the columns')
-    name, factor = found.pop() or ('', 1.0)
-    return cast(UnitName, name), factor
 
 
 def _check_rests(columns: Chosen, rests: Rests, units: Units | None, *, stated: bool) -> None:
@@ -414,42 +408,37 @@ class Rests:
 
 def rests_of(reading: Floats, *, samples: bool) -> Rests:
     """Return the rests in (n, 3) readings in the unit of the file; rows are samples or poses."""
-    still, windows = reading, _windows(reading)
-    if samples and len(windows) >= 2:
-        still = windows[_quietest(windows)].mean(axis=1)
+    windows, = _quiet_windows(reading) if samples else (reading[:0],)
+    still = windows.mean(axis=1) if len(windows) else reading
+    radius, size = math.nan, float(np.abs(still).max(initial=0.0))
     with np.errstate(over='ignore', invalid='ignore'):
         length = float(np.median(np.linalg.norm(still, axis=1)))
-        radius = _radius(still)
+        if len(still) >= _SPHERE_POINTS and 0.0 < size < 1e150:
+            centred = still / size
+            centred = centred - centred.mean(axis=0)
+            scales = np.linalg.svd(centred, compute_uv=False)
+            if scales[2] >= _SPREAD * scales[0]:
+                found, off = sphere_through(centred)
+                radius = found * size if off < _OFF_SPHERE * found else math.nan
     whole = bool(np.all(reading[:1000] == np.round(reading[:1000])))
     return Rests(length, radius, whole)
 
 
-def _windows(values: Floats) -> Floats:
-    """Return (n, 3) values as (m, k, 3) windows."""
-    size = int(np.clip(len(values) // _WINDOWS, _SHORTEST, _LONGEST))
-    count = len(values) // size
-    return values[:count * size].reshape(count, size, 3)
+def _quiet_windows(reading: Floats, *beside: Floats) -> list[Floats]:
+    """
+    Return the windows (m, k, 3) of (n, 3) readings with the least scatter, of others the same.
 
+    They are empty if the readings are too few for two windows.
 
-def _quietest(windows: Floats) -> NDArray[np.intp]:
-    """Return which windows have the least scatter."""
+    """
+    size = int(np.clip(len(reading) // _WINDOWS, _SHORTEST, _LONGEST))
+    count = len(reading) // size
+    windows = [values[:count * size].reshape(count, size, 3) for values in (reading, *beside)]
     with np.errstate(over='ignore', invalid='ignore'):
-        scatter = np.linalg.norm(windows.std(axis=1), axis=1)
-    return np.argsort(scatter, kind='stable')[:max(2, int(_QUIET_SHARE * len(windows)))]
-
-
-def _radius(still: Floats) -> float:
-    """Return the radius of the sphere through readings at rest; NaN if they determine none."""
-    size = float(np.abs(still).max()) if len(still) else 0.0
-    if len(still) < _SPHERE_POINTS or not 0.0 < size < 1e150:
-        return math.nan
-    scaled = still / size
-    centred = scaled - scaled.mean(axis=0)
-    scales = np.linalg.svd(centred, compute_uv=False)
-    if scales[2] < _SPREAD * scales[0]:
-        return math.nan
-    radius, off = sphere_through(centred)
-    return radius * size if off < _OFF_SPHERE * radius else math.nan
+        scatter = np.linalg.norm(windows[0].std(axis=1), axis=1)
+    most = max(2, int(_QUIET_SHARE * count)) if count >= 2 else 0
+    quiet = np.argsort(scatter, kind='stable')[:most]
+    return [values[quiet] for values in windows]
 
 
 def are_samples(columns: Mapping[str, NDArray[Any]]) -> bool:
@@ -508,7 +497,7 @@ def _decide_rate(made: Quantities, first: Cells) -> None:
         return
     seen = next(iter(rests.items())) if rests and len(rests) == 1 else None
     unit, factor = stated or seen or (
-        ('rad/s', 1.0) if largest < _LIKELY_RATE else ('°/s', DEGREE))
+        ('rad/s', 1.0) if largest < _LIKELY_RATE else ('°/s', DEGREE_RAD))
     made.scales['rate'] = factor, 0.0
     read_as = f'{words} in {unit}{"" if unit == "rad/s" else " -> rad/s"}'
     made.said.append(read_as if stated else f'{read_as} (assumed)')
@@ -525,18 +514,17 @@ def _units_at_rest(made: Quantities, first: Cells) -> dict[str, float] | None:
     the bias and the noise of the gyro. Rates without noise are computed, and show no unit.
 
     """
-    windows, rates = (_windows(made.numbers(first, key)) for key in ('reading', 'rate'))
-    if len(windows) < 2:
+    readings, rates = _quiet_windows(made.numbers(first, 'reading'), made.numbers(first, 'rate'))
+    if not len(readings):
         return None
-    quiet = _quietest(windows)
-    length = np.median(np.linalg.norm(windows[quiet].mean(axis=1), axis=1))
-    if np.median(np.max(windows[quiet].std(axis=1), axis=1)) > _SCATTER_AT_REST * length:
+    length = np.median(np.linalg.norm(readings.mean(axis=1), axis=1))
+    if np.median(np.max(readings.std(axis=1), axis=1)) > _SCATTER_AT_REST * length:
         return None
-    bias = float(np.median(np.max(np.abs(rates[quiet].mean(axis=1)), axis=1)))
-    noise = float(np.median(np.max(rates[quiet].std(axis=1), axis=1)))
+    bias = float(np.median(np.max(np.abs(rates.mean(axis=1)), axis=1)))
+    noise = float(np.median(np.max(rates.std(axis=1), axis=1)))
     if noise <= _GYRO_NOISE[0]:
         return None
-    return {unit: factor for unit, factor in (('rad/s', 1.0), ('°/s', DEGREE))
+    return {unit: factor for unit, factor in (('rad/s', 1.0), ('°/s', DEGREE_RAD))
             if bias * factor < _LARGEST_BIAS
             and _GYRO_NOISE[0] < noise * factor < _GYRO_NOISE[1]}
 

@@ -2,10 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Numbers and texts of a text table of any dialect, block by block.
+Numbers and texts of a text table of any dialect, block by block; lines of a port; our own tables.
 
 The rows are read once, in blocks, so the memory needed does not depend on the length of the file.
 `numpy.loadtxt` parses all numbers. A row is looked at on its own only if its block has a fault.
+
+Our own tables have ``#`` comments, one header line, and columns by name: those of
+`accel_calib.table.COLUMNS`; other columns of numbers are quantities. Three kinds of comments are
+read, with values in JSON: ``# units: "m/s2"``, ``# sensor: "imu_link"`` and ``# autopilot: {…}``.
 
 """
 
@@ -13,21 +17,26 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
+import csv
+from dataclasses import replace
 from functools import partial
 import io
 from itertools import chain, islice, pairwise
+import json
 from pathlib import Path
 import re
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .columns import chosen, is_log_header, LogOptions
-from .dialect import Cells, first_label, is_clock, is_comment, is_number, layout_of, short, split
+from .dialect import Cells, COMMENTS, is_clock, is_number, layout_of, short
+from .quantities import decided
+from ..disk import write_atomically
 from ..errors import InputError
-from ..table import Floats
-from ..text import counted
+from ..table import check_values, column_of, COLUMNS, Floats, Recording, Table
+from ..text import counted, one_line
 
 ROWS = 65536
 """Number of lines in a block."""
@@ -43,6 +52,8 @@ PEEKED = 1 << 16
 _BLANK = ' \t\r\n,;|'
 """Characters of a row without any value, as spreadsheets write at the end of a table."""
 
+_ONE_LABEL = re.compile(r'\s*([A-Za-z]\w*)(?:\s*[:=]\s*|\s+)[-+]?\d*\.?\d+(?:\s*\D{0,6})?')
+
 
 def text_table(path: Path, options: LogOptions, raw: io.BufferedReader[Any], size: int
                ) -> TextTable:
@@ -50,8 +61,11 @@ def text_table(path: Path, options: LogOptions, raw: io.BufferedReader[Any], siz
     encoding = _encoding(raw.peek())
     text = io.TextIOWrapper(raw, encoding, errors='replace', newline=None)
     head, rows = _head(path, text), iter(text)
-    if label := first_label(head):
-        rows = _readings(chain(head, text), label)
+    names = [match[1] for match in map(_ONE_LABEL.fullmatch, head) if match]
+    cycle = list(dict.fromkeys(names))  # of numbers that stand one per line
+    repeats = len(cycle) >= 3 and names[:3 * len(cycle)] == 3 * cycle
+    if repeats and 4 * len(names) > len(head):
+        rows = _readings(chain(head, text), cycle[0])
         head = list(islice(rows, _HEAD_LINES))
     return TextTable(path, head, rows, options, encoding, size)
 
@@ -179,10 +193,8 @@ class TextTable:
         layout, columns = self.layout, self.columns.numeric
         dialect, delimiter = layout.dialect, layout.dialect.delimiter
         texts, breaks = lines, layout.width - 1
-        if dialect.monitor or dialect.labelled or dialect.prefix:
-            texts = list(map(dialect.plain, lines))
-        if '"' in ''.join(texts):  # lines without quotes, parted by tabs
-            rows = [split(line, delimiter) for line in texts]
+        if dialect.monitor or dialect.labelled or dialect.prefix or '"' in ''.join(lines):
+            rows = list(map(dialect.cells, lines))  # without quotes, parted by tabs
             if any(len(row) != layout.width for row in rows):
                 return None
             texts = ['\t'.join([row[k] for k in columns]) for row in rows]
@@ -208,7 +220,8 @@ class TextTable:
             fault = self._fault(line)
             if fault is None:
                 good.append(k)
-            elif is_comment(line.lstrip()) or not line.replace('""', '').strip(_BLANK):
+            elif (line.lstrip().startswith(COMMENTS)
+                  or not line.replace('""', '').strip(_BLANK)):
                 continue
             elif not self._skip_bad or not self._bad:
                 self._bad = f'{f"line {place[k]}: " if place else ""}row {rows[k]}{fault}'
@@ -246,3 +259,89 @@ def _joined_quotes(lines: list[str]) -> list[str]:
         joined.append(''.join(lines[k:end + 1]))
         k = end + 1
     return joined
+
+
+# ----------------------------------------------------------------------------- serial ports
+
+class LineReader:
+    """
+    Samples of lines that are read as the lines of a text log are.
+
+    Dialect, columns and units are recognised from the `head`, the first complete lines; `first`
+    are their samples, and `interval` is the time from one line to the next [s]. `name` is that of
+    the port. A line that cannot be read is skipped, because a serial port can lose characters.
+    Raise InputError if the lines have no accelerometer, contradict the options, or hold no
+    gravity.
+
+    """
+
+    def __init__(self, name: str, head: Sequence[str], interval: float, options: LogOptions
+                 ) -> None:
+        lines = [f'{line}\n' for line in head]
+        self._name = name
+        self._table = TextTable(Path(name), lines, iter(()), replace(options, skip_bad=True))
+        rows = lines[self._table.layout.start:]
+        first = self._table.read(rows)
+        if not len(first.row):
+            raise InputError(f'{name} sends no row of numbers, expected one line for each sample',
+                             'check the format of the lines')
+        timed = 'time' in self._table.columns.sources
+        rate_hz = options.rate or len(first.row) / len(rows) / interval
+        self._quantities = decided(self._table.columns, first, options if timed else
+                                   replace(options, rate=rate_hz))
+        self.units = self._quantities.units
+        rate = f'no times, {rate_hz:.4g} Hz ({"stated" if options.rate else "measured"})'
+        self.read_as = ', '.join(filter(None, (self._quantities.read_as, '' if timed else rate)))
+        self.first, self.findings = self._recording(first), tuple(self._quantities.findings)
+
+    def samples(self, lines: Sequence[str]) -> Recording | None:
+        """Return the samples of the next complete lines; None if there are none."""
+        return self._recording(self._table.read([f'{line}\n' for line in lines]))
+
+    def _recording(self, cells: Cells) -> Recording | None:
+        if not len(cells.row):
+            return None
+        columns, row = self._quantities.columns(cells)
+        check_values(columns, self._name)
+        return Recording(columns, row, self.units.name) if len(row) else None
+
+
+# -------------------------------------------------------------------------- writing of tables
+
+def write_table(path: Path, table: Table) -> None:
+    """Write poses or samples; errors as in `write_blocks`."""
+    write_blocks(path, (table,))
+
+
+def write_blocks(path: Path, blocks: Iterable[Table]) -> int:
+    """
+    Write poses or samples block by block, and return the number of rows.
+
+    The memory needed is that of one block. The tables have the same columns, units and sensor. If
+    the file cannot be written (OSError), or the iterable fails, an earlier file is unchanged.
+
+    """
+    rows = 0
+
+    def write(file: TextIO) -> None:
+        nonlocal rows
+        writer = csv.writer(file, lineterminator='\n')
+        keys: list[str] = []
+        for block in blocks:
+            if not keys:
+                keys = [key for key, column in COLUMNS.items() if key in block and not column.made]
+                keys += block.quantities
+                file.writelines(f'# {name}: {one_line(json.dumps(value, ensure_ascii=False))}\n'
+                                for name, value in block.about.items())
+                writer.writerow([name for key in keys for name in column_of(key).names])
+            columns: list[list[str]] = []
+            for values in (block[key] for key in keys):
+                digits = '.16g' if values.ndim == 1 else '.12g'  # stamps need all digits
+                columns += [values.tolist()] if values.dtype.kind in 'US' else [
+                    ['' if value != value else format(value, digits) for value in column.tolist()]
+                    for column in np.atleast_2d(values.T)]
+            writer.writerows(zip(*columns, strict=True))
+            rows += len(block)
+
+    write_atomically(path, write)
+    return rows

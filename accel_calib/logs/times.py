@@ -16,10 +16,9 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .columns import Chosen, FRACTION, LogOptions, rates_beside
-from .dialect import Cells, EPOCH_S, has_date, RATES_HZ, seconds_of
+from .dialect import Cells, CLOCK, EPOCH_S, RATES_HZ, seconds_of
 from .names import bare_name, COUNTERS, READING, TICKS, unit_of, UNITS
 from ..errors import InputError
 from ..finding import Finding
@@ -116,7 +115,16 @@ class Clock:
         """Return the times of the next block, which go on where the counter starts again [s]."""
         seconds = self.seconds(cells)
         before = np.concatenate([[self.last], seconds[:-1]])
-        within = self._within(seconds != before) if self.period else 0.0
+        within: Floats | float = 0.0  # since the stamp of each row
+        if self.period and len(seconds):
+            index = np.arange(len(seconds))
+            changes = seconds != before
+            first = np.maximum.accumulate(np.where(changes, index, -1 - self.since))
+            if self.since < 0:  # the first stamp of the log may lack samples
+                size = int(np.argmax(changes[1:])) + 1
+                first[:size] -= max(round(self.interval / self.period) - size, 0)
+            self.since = int(index[-1] - first[-1])
+            within = np.minimum((index - first) * self.period, self.interval)
         steps = np.zeros(len(seconds))
         for period in self.periods:
             again = ((before >= (1.0 - _NEAR_END) * period) & (before < 1.000001 * period)
@@ -127,18 +135,6 @@ class Clock:
         if len(seconds):
             self.last, self.added = float(seconds[-1]), float(total[-1])
         return seconds + total + within
-
-    def _within(self, changes: NDArray[np.bool_]) -> Floats:
-        """Return the times since the stamp of each row, given which rows change the stamp [s]."""
-        index = np.arange(len(changes))
-        first = np.maximum.accumulate(np.where(changes, index, -1 - self.since))
-        if self.since < 0 and len(changes):  # the first stamp of the log may lack samples
-            size = int(np.argmax(changes[1:])) + 1
-            most = round(self.interval / self.period)
-            first[:size] -= max(most - size, 0)
-        if len(changes):
-            self.since = int(index[-1] - first[-1])
-        return np.minimum((index - first) * self.period, self.interval)
 
 
 def clock_of(columns: Chosen, first: Cells, options: LogOptions) -> Clock:
@@ -167,7 +163,8 @@ def _stated_clock(columns: Chosen, first: Cells, options: LogOptions) -> Clock:
         raise InputError(f'{layout.path} has times, but --rate is {options.rate:g}',
                          'remove --rate, or leave the times out with --columns time=')
     if columns.dates:
-        dated = has_date(first.texts[source.index][0])
+        match = CLOCK.fullmatch(first.texts[source.index][0])
+        dated = match is not None and match[1] is not None
         rate = _rate_words(_step_of(Clock(columns).seconds(first)))
         return Clock(columns, periods=() if dated else (_DAY_S,), words=(
             f'{source.name}: {"dates" if dated else "times of the day"}{rate} -> s'))

@@ -11,7 +11,7 @@ Correction of a bag: a copy with a corrected Imu topic; all other messages are u
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 import errno
@@ -22,7 +22,7 @@ import shutil
 import sqlite3
 from tempfile import mkdtemp
 import time
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
@@ -32,13 +32,10 @@ from ..disk import check_regular
 from ..errors import InputError
 from ..logs import (
     BAG, doubles_at, IMU_DOUBLES, imus_of, joined, LogOptions, Messages, messages_of, open_bag,
-    parts_of, Progress, put_doubles, renamed, Track)
+    parts_of, Progress, put_doubles, renamed)
 from ..pipeline import Correction
 from ..table import check_units, Recording
 from ..units import Units, units_of
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 _PARTIAL = '.partial'
 _STALE_S = 86400.0
@@ -147,7 +144,7 @@ class _Imus:
         if not self.done:
             check_units(samples, self.units, str(self.path))
         known = self.correction.context(samples.with_columns(**{
-            key: Track(**track).at(columns['time'])
+            key: np.interp(columns['time'], *track)
             for key, track in self.known['tracks'].items()}))
         doubles = doubles_at(messages, slice(0, IMU_DOUBLES))
         with np.errstate(over='ignore', invalid='ignore'):  # damaged numbers become infinite
@@ -233,26 +230,22 @@ def _added(imus: _Imus, writer: Any) -> list[Any]:
     made: dict[str, Any] = {}
     outputs = []
     for each in imus.known['connections']:
-        key = str([each[name] for name in ('topic', 'msgtype', 'msgdef', 'ext')])
-        if key not in made:
-            made[key] = writer.add_connection(each['topic'], each['msgtype'], **_about(
-                each, ros2=imus.ros2))
+        topic, msgtype, msgdef, digest, ext = (each[name] for name in (
+            'topic', 'msgtype', 'msgdef', 'digest', 'ext'))
+        key = str([topic, msgtype, msgdef, ext])
+        if key not in made and imus.ros2:
+            from rosbags.rosbag2.metadata import parse_qos
+            from rosbags.typesys import get_typestore, Stores
+
+            known = get_typestore(Stores.ROS2_JAZZY)
+            if msgtype in known.types:
+                msgdef = msgdef or known.generate_msgdef(msgtype, ros_version=2)[0]
+                digest = digest or known.hash_rihs01(msgtype)
+            made[key] = writer.add_connection(
+                topic, msgtype, msgdef=msgdef, rihs01=digest or _NO_HASH,
+                serialization_format=ext[0], offered_qos_profiles=parse_qos(ext[1]))
+        elif key not in made:
+            made[key] = writer.add_connection(topic, msgtype, msgdef=msgdef, md5sum=digest,
+                                              **dict(zip(('callerid', 'latching'), ext)))
         outputs.append(made[key])
     return outputs
-
-
-def _about(connection: Mapping[str, Any], *, ros2: bool) -> dict[str, Any]:
-    """Return what a writer needs to know of a connection."""
-    msgtype, msgdef, digest, ext = (connection[key] for key in (
-        'msgtype', 'msgdef', 'digest', 'ext'))
-    if not ros2:
-        return {'msgdef': msgdef, 'md5sum': digest, **dict(zip(('callerid', 'latching'), ext))}
-    from rosbags.rosbag2.metadata import parse_qos
-    from rosbags.typesys import get_typestore, Stores
-
-    known = get_typestore(Stores.ROS2_JAZZY)
-    if msgtype in known.types:
-        msgdef = msgdef or known.generate_msgdef(msgtype, ros_version=2)[0]
-        digest = digest or known.hash_rihs01(msgtype)
-    return {'msgdef': msgdef, 'rihs01': digest or _NO_HASH, 'serialization_format': ext[0],
-            'offered_qos_profiles': parse_qos(ext[1])}

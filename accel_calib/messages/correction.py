@@ -36,13 +36,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 import math
 import struct
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .one_reading import AtReading, OneReading, Triple
-from ..calibration import Calibration
+from ..calibration import Calibration, SampleNoise
 from ..effects import context_of_samples, thermal_stream, ThermalStream
 from ..errors import InputError
 from ..geometry import quaternion_of
@@ -51,9 +51,6 @@ from ..logs import (
     layout_with, LITTLE_ENDIAN, NAME_AT, NINE, ORIENTATION, ORIENTATION_COVARIANCE, STAMP,
     STAMP_AT, THREE)
 from ..table import Floats
-
-if TYPE_CHECKING:
-    from ..calibration import SampleNoise
 
 
 def output_scale(calibration: Calibration, gravity: float) -> float:

@@ -10,7 +10,7 @@ returns these by axis, with their limits in words, and as JSON.
 
 """
 
-from .components import FIGURES, AxisNoise, Kind, NoiseFigures, shown_unit, TYPICAL, WORDS
+from .components import AxisNoise, FIGURES, Kind, NoiseFigures, shown_unit, TYPICAL, WORDS
 from .curve import check_allantools, whole
 from .figures import duration, noise_of, to_json
 

@@ -24,7 +24,7 @@ import numpy as np
 import scipy
 
 from .components import (
-    FIGURES, AxisNoise, COMPONENTS, fit_components, Kind, KINDS, LEVEL, NoiseFigures, shown_unit)
+    AxisNoise, COMPONENTS, FIGURES, fit_components, Kind, KINDS, LEVEL, NoiseFigures, shown_unit)
 from .curve import (
     allan_variances, check_allantools, coarse_step, FLAT, longest_rest, LongRest, octaves, shares,
     Spread, spread_of)

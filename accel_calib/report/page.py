@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
@@ -30,24 +30,19 @@ from .residuals import of_before_after, of_coverage, of_remainder, Residuals, re
 from .sheet import (
     ACCENT, add_band, AFTER, BAND, Drawing, drawn, EDGE, HEIGHT_INCHES, INK, legend_below, Mark,
     Marks, page)
-from ..calibration import Calibration, Curve, outlook
+from ..calibration import Calibration, Curve, Verification
 from ..effects import (
     AXES, EffectKey, EmpiricalCurve, entry_of, REFERENCE_TEMPERATURE, value_unit, variable_words,
     with_vector)
 from ..findings import (
-    effect_figures, mounting_figures, rate_refinement, request_words, residual_figures,
-    verdict_words)
+    effect_figures, mounting_figures, outlook, rate_refinement, Rating, request_words,
+    residual_figures, verdict_words)
 from ..geometry import coverage
-from ..table import Floats
+from ..pipeline import ThermalOutcome
+from ..refinement import Refinement
+from ..table import Floats, Poses
 from ..text import counted, milli, percentage, short, signed, with_minus
 from ..units import MG
-
-if TYPE_CHECKING:
-    from ..calibration import Verification
-    from ..findings import Rating
-    from ..pipeline import ThermalOutcome
-    from ..refinement import Refinement
-    from ..table import Poses
 
 STORED = 'calibration.yaml'
 """Name of the file of the calibration in the lines that use it, if it is not known."""

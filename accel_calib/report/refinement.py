@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast, TYPE_CHECKING
+from typing import Any, cast
 
 import numpy as np
 
@@ -27,14 +27,11 @@ from .sheet import (
     PAPER, save)
 from ..effects import AXES, EMPIRICAL, EmpiricalCurve, entry_of, parameter_names, variable_words
 from ..findings import base_words, chance_words, odds_words, value_words, verdict_words
-from ..refinement import named_entries
+from ..refinement import named_entries, Refinement, Step
 from ..statistics import over_axes
 from ..table import Floats
 from ..text import short
 from ..units import MG
-
-if TYPE_CHECKING:
-    from ..refinement import Refinement, Step
 
 
 def search_values(result: Refinement, residuals: Residuals) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,13 +25,11 @@ from ..calibration import Calibration, directions_in, errors_after, errors_befor
 from ..effects import (
     acting_temperature, add_history, AXES, EffectKey, entry_of, rate_at, sensor_force)
 from ..geometry import uncovered, unit
+from ..refinement import Refinement, Stage
 from ..statistics import over_axes, rms
 from ..table import column_of, Floats, Poses
 from ..text import milli, percentage, short, with_minus
 from ..units import MG
-
-if TYPE_CHECKING:
-    from ..refinement import Refinement, Stage
 
 _CONTEXT = ('temperature', 'time', 'supply_voltage', 'std', 'rate')
 

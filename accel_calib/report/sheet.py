@@ -35,6 +35,7 @@ from xml.etree import ElementTree
 from .. import __version__
 from ..disk import write_atomically
 from ..errors import InputError
+from ..findings import Rating
 from ..statistics import NORMAL_95
 from ..table import Floats
 from ..text import counted, short, table
@@ -42,8 +43,6 @@ from ..text import counted, short, table
 if TYPE_CHECKING:
     from jinja2 import Environment
     from matplotlib.figure import Figure
-
-    from ..findings import Rating
 
 
 def write_page(path: Path, text: str) -> None:

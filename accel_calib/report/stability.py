@@ -16,25 +16,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from .sheet import (
     ACCENT, add_band, add_bar, AFTER, AXIS_COLOURS, BAND, BEFORE, Drawing, drawn, EDGE, FAINT,
     HEIGHT_INCHES, INK, legend_below, Mark, Marks, page, PAPER, THERMAL, THIRD)
+from ..calibration import Calibration
 from ..comparison import Comparison, History, Parameter
 from ..findings import (
-    change_in_words, CROSS, GAINS, in_words, OFFSETS, rate_comparison, rate_noise, scale_of)
-from ..noise import FIGURES, AxisNoise, duration, Kind, NoiseFigures, shown_unit, TYPICAL, WORDS
+    change_in_words, CROSS, GAINS, in_words, OFFSETS, rate_comparison, rate_noise, Rating,
+    scale_of)
+from ..noise import AxisNoise, duration, FIGURES, Kind, NoiseFigures, shown_unit, TYPICAL, WORDS
 from ..statistics import rms
 from ..table import Floats
 from ..text import power_of_ten, short, with_minus, with_sd
 from ..units import is_native
-
-if TYPE_CHECKING:
-    from ..calibration import Calibration
-    from ..findings import Rating
 
 _LOOKS = dict(zip('xyz', zip(AXIS_COLOURS, 'os^')))
 """Colour and marker of each axis."""

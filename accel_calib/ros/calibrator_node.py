@@ -48,8 +48,8 @@ from ..findings import request_words
 from ..live import check_installed
 from ..messages.correction import output_frame
 from ..session import (
-    figures, CalibratorSettings, CallSoon, Check, checks, COMMANDS, conditions, context_topics,
-    diagnostics, enable, Event, Log, Mounting, progress, Result, run, Session, ShowPoses, Still,
+    CalibratorSettings, CallSoon, Check, checks, COMMANDS, conditions, context_topics, diagnostics,
+    enable, Event, figures, Log, Mounting, progress, Result, run, Session, ShowPoses, Still,
     Surroundings, Task, Worker)
 from ..table import Floats
 

@@ -33,8 +33,8 @@ from .declare import published_by_others, SENSOR
 from ..calibration import Calibration
 from ..errors import AccelCalibError, InputError
 from ..logs import (
-    ACCELERATION, IMU_DOUBLES, joined, Layout, layout_of, LITTLE_ENDIAN, NAME_AT, samples_of,
-    THREE, topic_and_field)
+    ACCELERATION, field_of, IMU_DOUBLES, joined, Layout, layout_of, LITTLE_ENDIAN, NAME_AT,
+    samples_of, THREE, topic_and_field)
 from ..messages.correction import motion_of, output_frame, Rewriter
 from ..messages.one_reading import Triple
 from ..session import Around, BATCH, CalibratorSettings, columns_of, context_topics, Session, State
@@ -76,9 +76,6 @@ class Output:
                                      sensor.noise if fills else None,
                                      sensor.temperatures.stream(calibration.model))
 
-
-_USUAL = ('data', 'voltage', 'fluid_pressure', 'temperature')
-"""Fields that are read of messages with several numbers, unless another one is named."""
 
 _WITH_A_NUMBER = tuple(f'{package}/msg/{name}' for package, names in (
     ('sensor_msgs', ('BatteryState', 'FluidPressure', 'Temperature')),
@@ -139,11 +136,8 @@ class ContextTopics:
             kinds = types.get(topic, [])
             kind = _type_of(kinds[0]) if len(kinds) == 1 else None
             numbers = [] if kind is None else _fields_of(kind)
-            fields = [each for each in numbers if each == field] if field else (
-                [each for each in numbers if each in column]
-                or [each for each in _USUAL if each in numbers]
-                or numbers[:len(numbers) == 1])
-            if not fields:
+            read = field_of(column, numbers, field)
+            if not read:
                 others = sorted({each for topics in published_by_others(self._node, _WITH_A_NUMBER)
                                  for each in topics})
                 usable = f'; topics with a number: {", ".join(others)}' if others else ''
@@ -155,7 +149,7 @@ class ContextTopics:
                     f'{found} correct context, and restart the node{usable}')
                 continue
             del self._waiting[column]
-            value = operator.attrgetter(fields[0])
+            value = operator.attrgetter(read)
             self._node.create_subscription(
                 kind, topic, lambda message, column=column, value=value: around.take(
                     column, float(value(message))), SENSOR)

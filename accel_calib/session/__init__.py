@@ -24,7 +24,7 @@ from .session import BATCH, Session
 from .settings import (
     CalibratorSettings, changed, columns_of, context_topics, default_of, expected, parameter,
     Settings, WEB_PORT)
-from .state import figures, Check, checks, diagnostics, Progress, progress, words_of_state
+from .state import Check, checks, diagnostics, figures, Progress, progress, words_of_state
 from .store import ros_home
 from .stream import Around
 from .worker import (

@@ -9,10 +9,11 @@ from typing import Any, cast
 import numpy as np
 
 from .settings import CalibratorSettings
-from ..calibration import Calibration, outlook
+from ..calibration import Calibration
 from ..effects import OwnEffect, shown_name
 from ..findings import (
-    calibration_json, rate, rate_refinement, Rating, refinement_json, rival_words, verdict_words)
+    calibration_json, outlook, rate, rate_refinement, Rating, refinement_json, rival_words,
+    verdict_words)
 from ..geometry import angle_of, spread_directions
 from ..pipeline import calibrated, is_partial, is_refined, Plan
 from ..refinement import refine as refine_poses, Refinement

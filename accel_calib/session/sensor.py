@@ -186,8 +186,9 @@ class Sensor:
     def update(self, rest: Dwell, least: float) -> Sensor:
         """Compare an ongoing rest with 1 g; `least` is the smallest change to report [g]."""
         past, counted, part = self.past, self.counted, self._uncounted(rest)
-        if part is not None and part.end - part.start >= LONG_REST:
-            past, counted = self._with(rest, least), _as_noisy_as(part, rest)
+        if part is not None and part.end - part.start >= LONG_REST:  # a slow change is no noise
+            past, counted = self._with(rest, least), replace(
+                rest, std=part.std, count=part.count / part.samples * rest.samples)
         return replace(self, rest=rest, past=past, counted=counted)._compare(least)
 
     def end(self, rest: Dwell, least: float) -> Sensor:
@@ -308,14 +309,9 @@ def rest_after(part: Dwell, whole: Dwell) -> Dwell:
 
     context = {key: mean(part.context.get(key, value), value)
                for key, value in whole.context.items()}
-    rest = replace(whole, start=part.end, time=mean(part.time, whole.time), samples=samples,
-                   mean=mean(part.mean, whole.mean), context=context)
-    return _as_noisy_as(part, rest)
-
-
-def _as_noisy_as(part: Dwell, rest: Dwell) -> Dwell:
-    """Return a rest with the noise of a part of it, because a slow change is not noise."""
-    return replace(rest, std=part.std, count=part.count / part.samples * rest.samples)
+    return replace(whole, start=part.end, time=mean(part.time, whole.time), samples=samples,
+                   mean=mean(part.mean, whole.mean), context=context, std=part.std,
+                   count=part.count / part.samples * samples)
 
 
 def title(calibration: Calibration) -> str:

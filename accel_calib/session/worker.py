@@ -388,8 +388,12 @@ class Worker:
                 self._log_answer(success, found)
             answer(success, found)
 
+        def fresh() -> Task:
+            self._flush()
+            return (yield from command)
+
         self.running.append(name)
-        self._commands.append((command, done, None))
+        self._commands.append((fresh(), done, None))
         self._advance()
 
     def run(self, task: Task, answer: Answer) -> None:
@@ -425,8 +429,6 @@ class Worker:
             return  # rclpy may have destroyed the publishers
         self._is_busy = True
         try:
-            if done is None:  # a command begins
-                self._flush()
             outcome = self._outcome(task, done)
             self.handle_events()  # first, so that a command is answered after its poses are stored
             self._proceed(task, answer, outcome)

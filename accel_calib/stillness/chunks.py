@@ -299,6 +299,7 @@ class Chunker:
         self._length = self._epoch = self._latest = self._period = 0.0
         self._pending: Floats = np.empty(0)
         self.interruptions: deque[Interruption] = deque(maxlen=10_000)
+        self.fresh = True  # the present segment has no chunk yet
         self.restart()
 
     def feed(self, samples: Floats, last: bool) -> Iterator[Chunks]:
@@ -323,7 +324,17 @@ class Chunker:
             starts = np.append(0, np.flatnonzero(index[1:] != index[:-1]) + 1)
             if stop := int(starts[-1]):  # where the last chunk starts, which is not complete
                 self._latest = float(time[stop - 1])
-                yield self._chunks(pending[:, :stop], starts[:-1])
+                done, starts = pending[:, :stop], starts[:-1]
+                found = sums_of(done, starts, self._epoch, self._origin, self._kind)
+                found['sums']['at_limit'], self._highest = repeated_extremes(
+                    done[1:4], starts, self._highest)
+                for which in range(min(len(done), MOTION) // 3):
+                    step = smallest_steps(
+                        done[1 + 3 * which:4 + 3 * which], starts, self._least[which])
+                    self._least[which] = min(self._least[which], float(step.min()))
+                    found['step'][:, which] = step
+                yield Chunks(found, self._epoch, self._origin, self._length, self._period,
+                             self.fresh)
                 self.fresh = False
             if len(time) == pending.shape[1]:
                 pending = pending[:, stop:]
@@ -339,7 +350,7 @@ class Chunker:
         """Start a new segment with the next sample."""
         self._pending = np.empty((4, 0))
         self._period = -1.0
-        self.fresh = True  # the present segment has no chunk yet
+        self.fresh = True
 
     def _learned(self, time: Floats, last: bool) -> bool:
         if self._period >= 0.0:
@@ -370,14 +381,3 @@ class Chunker:
         self.interruptions.append(Interruption(
             float(ordered[cut]), 'gap' if step[cut] > 0.0 else 'jump_back', float(step[cut])))
         return ordered[1:cut + 1]
-
-    def _chunks(self, samples: Floats, starts: Indices) -> Chunks:
-        found = sums_of(samples, starts, self._epoch, self._origin, self._kind)
-        found['sums']['at_limit'], self._highest = repeated_extremes(
-            samples[1:4], starts, self._highest)
-        for which, rows in enumerate((slice(1, 4), slice(4, 7))):
-            if len(samples) >= rows.stop:
-                step = smallest_steps(samples[rows], starts, self._least[which])
-                self._least[which] = min(self._least[which], float(step.min()))
-                found['step'][:, which] = step
-        return Chunks(found, self._epoch, self._origin, self._length, self._period, self.fresh)

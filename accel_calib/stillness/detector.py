@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from .account import MISSING, Rest
 from .chunks import (
     CaptureSettings, chained, Chunker, Chunks, CHUNKS_PER_WINDOW, Interruption, MOTION, Records)
-from .dwell import figures, Dwell, figures_type, judged, OngoingDwell, Tracker
+from .dwell import Dwell, figures, figures_type, judged, OngoingDwell, Tracker
 from .levels import Known
 from .rule import Rule
 from .sensor import Lengths
@@ -38,6 +38,7 @@ from ..units import Units
 
 _BLOCK = 1 << 14     # samples summed at a time; they fit in the cache
 _AT_ONCE = 1 << 17   # samples passed to the detector at a time
+_BESIDE = 100        # earlier dwells together with which a new one is judged
 
 
 class StillDetector:
@@ -103,7 +104,8 @@ class StillDetector:
         dwell = self._tracker.current()
         if dwell is None:
             return None
-        found, = self._beside(figures(dwell, known_units=self._rule.known), self._kept)
+        now = figures(dwell, known_units=self._rule.known)
+        found, = judged(chained(self._kept[-_BESIDE:], now), self._rule, self._context)[-1:]
         return None if found.reason else found
 
     def dwells(self) -> list[Dwell]:
@@ -192,14 +194,9 @@ class StillDetector:
         count = min(self._keep(found), len(self._kept))
         if not count:
             return []
-        every = self._beside(self._kept[-count:], self._kept[:-count])
+        every = judged(self._kept[-count - _BESIDE:], self._rule, self._context)[-count:]
         self.refused += tuple(each.rest for each in every if each.reason)
         return [each for each in every if not each.reason]
-
-    def _beside(self, found: Records, earlier: Records) -> list[Dwell]:
-        """Return dwells as they are judged together with the last 100 of the earlier ones."""
-        earlier = earlier[-100:]
-        return judged(chained(earlier, found), self._rule, self._context, len(earlier))
 
     def _miss(self, verdict: Records, length: float) -> None:
         """Note the chunks of zeros, and the windows in which samples are missing otherwise."""

@@ -13,7 +13,6 @@ one orientation, while the rests of a sensor that is turned have one variance in
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..table import Floats
 
@@ -74,22 +73,22 @@ class Levels:
     def least(self) -> Floats:
         """Return the (6,) variances at rest where something was far quieter; 0 elsewhere."""
         if self._found is None:
-            self._found = np.array([self._least(*each) for each in zip(
-                self._counts, self._lowest, self._highest, strict=True)])
+            self._found = np.zeros(6)
+            for axis, counts in enumerate(self._counts):
+                lowest, highest = self._lowest[axis], self._highest[axis]
+                near = np.convolve(counts, np.ones(2 * _NEAR + 1), 'same')
+                most = int(np.argmax(near))
+                rests = slice(max(most - _NEAR, 0), most + _NEAR + 1)
+                peak = rests.start + int(np.argmax(counts[rests]))
+                quieter = slice(1, max(peak - _BELOW, 1))
+                count = int(np.sum(counts[quieter]))
+                if not (count + counts[0] and max(count * _RARE, counts[0]) < near[most]):
+                    continue
+                low, high = lowest[rests].min(axis=0), highest[rests].max(axis=0)
+                turned = np.max(high - low)
+                way = np.max(highest[quieter].max(axis=0, initial=-np.inf)
+                             - lowest[quieter].min(axis=0, initial=np.inf))
+                size = np.linalg.norm(np.maximum(np.abs(low), np.abs(high)))
+                if turned > _TURNED * size and way < _ONE_WAY * turned:
+                    self._found[axis] = 2.0**(peak - _ZERO)
         return self._found
-
-    def _least(self, counts: NDArray[np.int64], lowest: Floats, highest: Floats) -> float:
-        near = np.convolve(counts, np.ones(2 * _NEAR + 1), 'same')
-        most = int(np.argmax(near))
-        rests = slice(max(most - _NEAR, 0), most + _NEAR + 1)
-        peak = rests.start + int(np.argmax(counts[rests]))
-        quieter = slice(1, max(peak - _BELOW, 1))
-        count = int(np.sum(counts[quieter]))
-        if not (count + counts[0] and max(count * _RARE, counts[0]) < near[most]):
-            return 0.0
-        low, high = lowest[rests].min(axis=0), highest[rests].max(axis=0)
-        turned = np.max(high - low)
-        way = np.max(highest[quieter].max(axis=0, initial=-np.inf)
-                     - lowest[quieter].min(axis=0, initial=np.inf))
-        size = np.linalg.norm(np.maximum(np.abs(low), np.abs(high)))
-        return 2.0**(peak - _ZERO) if turned > _TURNED * size and way < _ONE_WAY * turned else 0.0

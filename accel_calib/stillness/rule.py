@@ -52,7 +52,7 @@ from numpy.typing import NDArray
 
 from .chunks import CaptureSettings, chained, Chunks, CHUNKS_PER_WINDOW, Records
 from .levels import Known, Levels
-from .trend import columns_of, oscillation, sliding_max, sliding_sum, Stretch, stretch
+from .trend import oscillation, sliding, Stretch, stretch, windows_of
 from ..statistics import rms
 from ..table import Floats
 from ..units import Units
@@ -218,17 +218,19 @@ class Rule:
         if self._axes == 3 and np.isfinite(sums['first'][:, 3]).any():
             self._axes = 6
         axes, size = self._axes, len(judged)
-        columns = columns_of(sums, axes, chunks.origin)
-        mean, recent = columns.mean[:, -size:], columns.level[:, -size:]
-        seen = {length: stretch(columns, length, size, chunks.length) for length in SLOPE_CHUNKS}
+        means, level = windows_of(sums, axes, chunks.origin)
+        mean, recent = means[:, -size:], level[:, -size:]
+        seen = {length: stretch(sums, level, length, size, chunks.length)
+                for length in SLOPE_CHUNKS}
         # Windows that have samples of zeros, and those of one reading, as 1.
-        zero = sliding_max(columns.zeros, CHUNKS_PER_WINDOW)
-        constant = (columns.repeats == columns.count - 1.0).astype(float)
-        equal = ((sliding_sum(constant, CHUNKS_PER_WINDOW) == CHUNKS_PER_WINDOW)
-                 & np.all(columns.level[:3] <= _tiny(columns.mean[:3]), axis=0)).astype(float)
-        gaps = (zero, zero + equal, np.where(columns.level[3:] == 0.0, 1.0, 0.0))
+        zero = sliding(np.maximum, (sums['zeros'] > 0.0).astype(float), CHUNKS_PER_WINDOW)
+        constant = (sums['repeats'] == sums['count'] - 1.0).astype(float)
+        equal = ((sliding(np.add, constant, CHUNKS_PER_WINDOW) == CHUNKS_PER_WINDOW)
+                 & np.all(level[:3] <= _tiny(means[:3]), axis=0)).astype(float)
+        gaps = (zero, zero + equal, np.where(level[3:] == 0.0, 1.0, 0.0))
         noise, varied = self._learn(seen[LONG], mean, judged['step'].T, *(
-            sliding_max(each, LONG - CHUNKS_PER_WINDOW + 1)[..., -size:] > 0.0 for each in gaps))
+            sliding(np.maximum, each, LONG - CHUNKS_PER_WINDOW + 1)[..., -size:] > 0.0
+            for each in gaps))
         missing = np.where(zero[-size:] > 0.0, 1, np.where((equal[-size:] > 0.0) & varied, 2, 0))
         quiet = np.all(QUIETER * recent[:3] < self._given.least[:3, np.newaxis], axis=0)
         missing[quiet & (missing == 0) & (equal[-size:] == 0.0)] = 3

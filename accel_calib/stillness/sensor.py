@@ -72,8 +72,14 @@ def check_axes(reading: Floats, units: Units) -> None:
     """
     if len(reading) < _FEWEST:
         return
-    if units.is_native:
-        _check_signs(reading)
+    largest = float(np.max(reading))
+    modulus = 2.0**math.ceil(math.log2(max(largest, 1.0)))
+    if units.is_native and np.min(reading) >= 0.0 and largest >= _NEAR_END * modulus and np.all(
+            np.abs(reading / modulus - 0.5) >= _EMPTY):
+        raise RefusedFitError(
+            f'the readings are near 0 or near {modulus:.0f} counts, and none is between: numbers '
+            f'of {math.log2(modulus):.0f} bits have lost their sign; expected counts with a sign',
+            'read them as signed numbers in the driver')
     middle = np.mean(reading, axis=0)
     _, sizes, turn = np.linalg.svd(reading - middle, full_matrices=False)
     flat = (reading - middle) @ turn[:2].T
@@ -85,9 +91,9 @@ def check_axes(reading: Floats, units: Units) -> None:
     if sizes[2] > _FLAT * sizes[1] or not wide or off < _OFF_CIRCLE * radius:
         return
     normal = np.abs(turn[2])
-    largest = int(np.argmax(normal))
-    if normal[largest] > _ALONG:
-        what = (f'the {AXES[largest]} axis reads {short(middle[largest])} {units.name} in each of '
+    axis = int(np.argmax(normal))
+    if normal[axis] > _ALONG:
+        what = (f'the {AXES[axis]} axis reads {short(middle[axis])} {units.name} in each of '
                 f'{len(reading)} orientations: it does not measure')
     elif (1.0 - np.min(normal)**2) > _ALONG and np.ptp(np.sort(normal)[1:]) < 1.0 - _ALONG:
         one, other = (AXES[k] for k in np.sort(np.argsort(normal)[1:]))
@@ -97,19 +103,6 @@ def check_axes(reading: Floats, units: Units) -> None:
         return
     raise RefusedFitError(f'{what}, expected three axes that each read their part of gravity',
                           'check the wiring, the driver and the columns of the log')
-
-
-def _check_signs(reading: Floats) -> None:
-    """Refuse (n, 3) counts of which those below zero stand at the other end of their range."""
-    largest = float(np.max(reading))
-    modulus = 2.0**math.ceil(math.log2(max(largest, 1.0)))
-    if (np.min(reading) < 0.0 or largest < _NEAR_END * modulus
-            or np.any(np.abs(reading / modulus - 0.5) < _EMPTY)):
-        return
-    raise RefusedFitError(
-        f'the readings are near 0 or near {modulus:.0f} counts, and none is between: numbers of '
-        f'{math.log2(modulus):.0f} bits have lost their sign; expected counts with a sign',
-        'read them as signed numbers in the driver')
 
 
 def is_one_direction(reading: Floats) -> bool:

@@ -7,10 +7,9 @@ Slopes, oscillations and the noise of means, over sliding windows of a series of
 **Sliding sums.** A window of length L is composed of windows of length 1, 2, 4, …, so the cost
 grows with the logarithm of L, and the result depends only on the values in the window.
 
-**Slope.** With k = 0 … L-1 and t = k - (L-1)/2, the least squares slope is Σ t x / Σ t², computed
-from Σ x and Σ k x. The power of the residuals r and the product of neighbours are computed without
-the residuals, from Σ x² and Σ x x' (x' is the next value). With m the mean, T = Σ t x and b the
-slope:
+**Slope.** With t = -(L-1)/2 … (L-1)/2, the least squares slope is Σ t x / Σ t². The power of the
+residuals r and the product of neighbours are computed without the residuals, from Σ x² and Σ x x'
+(x' is the next value). With m the mean, T = Σ t x and b the slope:
 
     Σ r²   = Σ x² - L m² - b T
     Σ r r' = Σ x x' - m (2 Σ x - x_0 - x_L-1) + (L-1) m²
@@ -44,12 +43,12 @@ References
 
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from .chunks import CHUNKS_PER_WINDOW, Records
@@ -81,66 +80,38 @@ class Line(NamedTuple):
     length: int
 
 
-def sliding_sum(values: Floats, length: int) -> Floats:
-    """Return the sums over windows of this length along the last axis: (..., n - length + 1)."""
-    return _folded(values, length, lambda one, other, apart: one + other)
-
-
-def sliding_max(values: Floats, length: int) -> Floats:
-    """Return the maxima over windows of this length."""
-    return _folded(values, length, lambda one, other, apart: np.maximum(one, other))
-
-
-def _folded(values: Floats, length: int, fold: Callable[[Floats, Floats, int], Floats]) -> Floats:
-    """Return what windows of this length hold, from the parts and how far they are apart."""
+def sliding(fold: np.ufunc, values: Floats, length: int) -> Floats:
+    """Return the sums (`numpy.add`) or maxima over windows of this length along the last axis."""
     count = values.shape[-1] - length + 1
     found: Floats | None = None
     size, start = 1, 0
     while True:
         if length & size:
             part = values[..., start:start + count]
-            found = part if found is None else fold(found, part, start)
+            found = part if found is None else fold(found, part)
             start += size
         if start == length:
             return np.asarray(found)
-        values = fold(values[..., :-size], values[..., size:], size)
+        values = fold(values[..., :-size], values[..., size:])
         size *= 2
 
 
 def lines(values: Floats, length: int) -> Line:
-    """Return the lines through all windows of this length, (axes, n - length + 1)."""
-    if values.shape[-1] == length:
-        centred = values - values.sum(axis=1, keepdims=True) / length
-        return lines_through(centred[:, np.newaxis])
-    total, weighted = _folded(  # Σ x and Σ k x of two windows in a row, from those of each
-        np.stack([values, np.zeros_like(values)]), length, lambda one, other, apart: np.stack(
-            [one[0] + other[0], one[1] + other[1] + apart * other[0]]))
-    first, last = values[..., :1 - length], values[..., length - 1:]
-    square = sliding_sum(values * values, length)
-    product = sliding_sum(values[..., :-1] * values[..., 1:], length - 1)
+    """Return the lines through all windows of this length: (..., n) to (..., n - length + 1)."""
+    windows = sliding_window_view(values, length, axis=-1)
     time = np.arange(length) - 0.5 * (length - 1)
     time_square = float(np.sum(time**2))
-    moment = weighted - 0.5 * (length - 1) * total
-    slope = moment / time_square
-    mean = total / length
+    total, moment = windows.sum(axis=-1), np.einsum('...t,t->...', windows, time)
+    slope, mean = moment / time_square, total / length
+    first, last = windows[..., 0], windows[..., -1]
     # Relative to the mean: digits of a small noise on a large mean are lost only once.
-    square -= total * mean
+    square = np.einsum('...t,...t->...', windows, windows) - total * mean
     square -= slope * moment
+    product = np.einsum('...t,...t->...', windows[..., 1:], windows[..., :-1])
     product -= mean * (2.0 * total - first - last) - (length - 1) * mean * mean
     product -= slope * (2.0 * moment - (time[-1] + 1.0) * (last - first))
     product += slope * slope * float(np.sum(time[1:] * time[:-1]))
     return Line(slope, np.maximum(square, 0.0), product, time_square, length)
-
-
-def lines_through(centred: Floats) -> Line:
-    """Return the lines through whole series, (..., K) values minus the mean of each series."""
-    size = centred.shape[-1]
-    time = np.arange(size) - 0.5 * (size - 1)
-    time_square = np.sum(time**2)
-    slope = np.einsum('...t,t->...', centred, time) / time_square
-    left = centred - slope[..., np.newaxis] * time
-    return Line(slope, np.einsum('...t,...t->...', left, left),
-                np.einsum('...t,...t->...', left[..., 1:], left[..., :-1]), time_square, size)
 
 
 def oscillation(values: Floats, length: int, index: NDArray[np.intp]) -> Floats:
@@ -246,41 +217,20 @@ _DIGITS = 1e-14
 """Rounding error of differences of sums, relative to the squared reading."""
 
 
-@dataclass(frozen=True)
-class Columns:
+def windows_of(sums: Records, axes: int, origin: Floats) -> tuple[Floats, Floats]:
     """
-    Sums of n chunks as contiguous arrays, and the windows that end with them.
+    Return means and variances, (axes, m), of the m windows of n chunks.
 
-    `first` (axes, n) are those of reading and rate. `repeats` (n,) are the samples that repeat the
-    one before; `zeros` is 1 for chunks with zeros. `mean` and `level`, (axes, m), are the means
-    and variances of the m windows.
-
-    """
-
-    count: Floats
-    first: Floats
-    at_limit: Floats
-    repeats: Floats
-    zeros: Floats
-    mean: Floats
-    level: Floats
-
-
-def columns_of(sums: Records, axes: int, origin: Floats) -> Columns:
-    """
-    Return the sums of n chunks for the reading (3 axes), or reading and rate (6).
-
-    They are relative to the `origin` (6,), which is added to the means.
+    The sums are relative to the `origin` (6,), which is added to the means; `axes` is 3 for the
+    reading alone, or 6 with the rate.
 
     """
     first, second = (np.ascontiguousarray(sums[name].T[:axes]) for name in ('first', 'second'))
-    count = sums['count'].copy()
-    inside, total = (sliding_sum(each, CHUNKS_PER_WINDOW) for each in (count, first))
+    inside, total, power = (sliding(np.add, each, CHUNKS_PER_WINDOW)
+                            for each in (sums['count'], first, second))
     mean = total / inside
-    power = np.maximum(sliding_sum(second, CHUNKS_PER_WINDOW) - total * mean, 0.0)
-    return Columns(count, first, np.ascontiguousarray(sums['at_limit'].T), sums['repeats'].copy(),
-                   (sums['zeros'] > 0.0).astype(float), mean + origin[:axes, np.newaxis],
-                   power / (inside - 1.0))
+    power = np.maximum(power - total * mean, 0.0)
+    return mean + origin[:axes, np.newaxis], power / (inside - 1.0)
 
 
 @dataclass(frozen=True)
@@ -310,30 +260,29 @@ class Stretch:
     white: Floats
 
 
-def stretch(sums: Columns, length: int, size: int, spacing: float) -> Stretch:
-    """Return the figures over `length` chunks that end at each of the last `size` chunks."""
-    start = len(sums.count) - size - length + 1
-    counts, first = sums.count[start:], sums.first[:, start:]
+def stretch(sums: Records, level: Floats, length: int, size: int, spacing: float) -> Stretch:
+    """
+    Return the figures over `length` chunks that end at each of the last `size` chunks.
+
+    `sums` are those of at least as many chunks, `level` the (axes, m) variances of the windows
+    that end with the last of them, and `spacing` is the length of a chunk [s].
+
+    """
+    sums = sums[len(sums) - size - length + 1:]
     inner = length - CHUNKS_PER_WINDOW + 1
-    level = sums.level[:, sums.level.shape[1] - size - inner + 1:]
-    variance = sliding_sum(level, inner) / inner
-    count = sliding_sum(counts, length)
-    cells = first / counts
-    white = variance * (length / count)
-    square = np.square(cells[:, length - 1:]).reshape(-1, 3, size).sum(axis=1)
-    white += _DIGITS * square.repeat(3, axis=0)
+    level = level[:, level.shape[1] - size - inner + 1:]
+    variance = sliding(np.add, level, inner) / inner
+    count = sliding(np.add, sums['count'], length)
+    # Reading and rate are (3, groups, …).
+    cells = sums['first'].T[:len(level)] / sums['count']
+    cells = cells.reshape(-1, 3, cells.shape[1]).swapaxes(0, 1)
+    white = (variance * (length / count)).reshape(-1, 3, size).swapaxes(0, 1)
+    white = white + _DIGITS * np.sum(np.square(cells[..., length - 1:]), axis=0)
     line = lines(cells, length)
-    scatter = np.sum(line.square, axis=0) / length
-    line = line._replace(slope=_grouped(line.slope), square=_grouped(line.square),
-                         neighbours=_grouped(line.neighbours))
-    found = strength_of(line, spacing, _grouped(white))
+    found = strength_of(line, spacing, white)
     reading = Trend(found.slope[:, 0], *(part[0] for part in found[1:]))
-    at_limit = sliding_sum(sums.at_limit[:, start:], length) / count
-    same = sliding_sum(sums.repeats[start:], length) / np.maximum(count - length, 1.0)
-    return Stretch(reading, found.excess, variance, sliding_max(level[:3], inner), count, at_limit,
-                   same, cells[:3], scatter, np.sum(white, axis=0))
-
-
-def _grouped(values: Floats) -> Floats:
-    """Reshape (axes, n) to (3, groups, n)."""
-    return values.reshape(-1, 3, values.shape[-1]).swapaxes(0, 1)
+    return Stretch(
+        reading, found.excess, variance, sliding(np.maximum, level[:3], inner), count,
+        sliding(np.add, sums['at_limit'].T, length) / count,
+        sliding(np.add, sums['repeats'], length) / np.maximum(count - length, 1.0),
+        cells[:, 0], np.sum(line.square, axis=(0, 1)) / length, np.sum(white, axis=(0, 1)))

@@ -187,8 +187,9 @@ def identifier(text: str) -> str:
 
 def _terms(header: Header, axis: int) -> list[dict[str, Any]]:
     """Return the terms that are taken from d of an axis: a polynomial in s times a monomial."""
-    found = [{'polynomial': np.append(0.0, header.mat_w[1:, axis, column]), 'kind': 'force',
-              'axis': column} for column in range(3)]
+    found: list[dict[str, Any]] = [
+        {'polynomial': np.append(0.0, header.mat_w[1:, axis, column]), 'kind': 'force',
+         'axis': column} for column in range(3)]
     for k in np.flatnonzero(header.axis == axis):
         kind, first = max((each for each in _KINDS.items() if each[1] <= header.monomial[k]),
                           key=lambda each: each[1])

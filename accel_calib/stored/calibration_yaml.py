@@ -263,7 +263,11 @@ def _calibration(content: Mapping[str, Any], own: Sequence[OwnEffect]) -> Calibr
     model = Model(_effects(value_at(content, 'effects', dict), own),
                   array_at(content, 'rotation', (3, 3)))
     units, size = _units(value_at(content, 'units', dict)), int(np.sum(model.stated))
-    quality: dict[str, Any] = value_at(content, 'quality', dict)
+    stated: dict[str, Any] = value_at(content, 'quality', dict)
+    quality: dict[str, Any] = {
+        each.name: None if stated[each.name] is None and each.name in (
+            'held_out_rms_mg', 'noise_floor_mg', 'chi2_per_dof') else number_at(stated, each.name)
+        for each in fields(Quality)}
     rejected = tuple(Rejected(value_at(each, 'row', int), value_at(each, 'reason', str),
                               choice_at(each, 'kind', get_args(RejectedKind)))
                      for each in values_at(content, 'rejected', dict))
@@ -273,9 +277,7 @@ def _calibration(content: Mapping[str, Any], own: Sequence[OwnEffect]) -> Calibr
         sensor=value_at(content, 'sensor', str), stream=value_at(content, 'stream', str),
         frame=choice_at(content, 'frame', FRAMES), date=value_at(content, 'date', str),
         covariance=array_at(content, 'covariance', (size, size), finite=False, most=LARGEST),
-        quality=Quality(**{each.name: None if quality[each.name] is None and each.name in (
-            'held_out_rms_mg', 'noise_floor_mg', 'chi2_per_dof') else number_at(quality, each.name)
-            for each in fields(Quality)}),
+        quality=Quality(**quality),
         poses=_poses(value_at(content, 'poses', dict), _optional(
             content, 'autopilot', lambda stated: Autopilot(**stated))),
         rejected=rejected, reason=value_at(content, 'reason', str),

@@ -7,13 +7,12 @@ from collections.abc import Callable
 from typing import Any
 
 from accel_calib.calibration import (
-    Calibration, fit_partial, fit_poses, in_g, mounting_only, NextPose, Outlook, outlook, outside,
-    verify)
+    Calibration, fit_partial, fit_poses, in_g, mounting_only, NextPose, outside, verify)
 from accel_calib.comparison import Drift
 from accel_calib.effects import add_history
 from accel_calib.errors import AccelCalibError
 from accel_calib.estimate import estimate, Fit, judge
-from accel_calib.findings import Expected, plan_lines, rate, request_words
+from accel_calib.findings import Expected, Outlook, outlook, plan_lines, rate, request_words
 from accel_calib.geometry import attitude_words
 from accel_calib.refinement import refine
 from accel_calib.table import Poses
