@@ -133,24 +133,6 @@ def test_axes_of_a_driver_are_named_after_two_rests_and_poses_are_asked_for_as_t
         assert np.array_equal(driver.sensor.guide.axes, axes)
 
 
-def test_words_and_direction_come_from_one_pose() -> None:
-    driver = Driver()
-    person = Person(driver, reading())
-    person.rest(person.flat)
-    for _ in range(24):
-        if next_step(driver.session.state).command == 'fit':
-            driver.ask('fit')
-        action = next_step(driver.session.state)
-        if not action.direction:
-            break
-        signs = ' '.join(f'{"+" if part > 0 else "-"}{axis}' for axis, part in zip(
-            'xyz', action.direction, strict=True) if part)
-        assert f'({signs})' in action.text
-        person.rest(action.direction)
-    assert driver.calibration is not None
-    assert action.kind == 'level'
-
-
 @pytest.mark.parametrize('count', [0, 20])
 def test_a_calibration_for_another_start_of_the_node_is_not_set_aside_by_the_next_step(
         stored: Stored, count: int) -> None:

@@ -5,6 +5,7 @@
 
 from contextlib import redirect_stderr, redirect_stdout
 import csv
+from html import unescape
 import io
 import json
 import os
@@ -106,7 +107,7 @@ def _content(path: Path) -> Any:
         return _of_yaml(yaml.safe_load(text))
     if path.suffix == '.html':
         text = re.sub(r'(?s)<section>\n<h2>What these data cannot show.*?</section>', '', text)
-        text = re.sub(r'(?s)<(svg|script|style).*?</\1>|<[^>]*>', '\n', text)
+        text = unescape(re.sub(r'(?s)<(svg|script|style).*?</\1>|<[^>]*>', '\n', text))
     return [line.strip() for line in text.splitlines() if line.strip()]
 
 
