@@ -169,7 +169,8 @@ def _captured(source: Source, log: OpenLog, options: LogOptions, settings: Mappi
     advice = f'{more} with still_std_max {limit:.3g}'
     if not count:
         name = 'the recording' if isinstance(source, Recording) else str(source)
-        raise _nothing_still(name, found, log.units, asked, findings, advice if more else '')
+        raise _nothing_still(name, found, log.units, asked, findings,
+                             finds=advice if more else '')
     lines = [f'captured {counted(count, "pose")} from {counted(found.recorded, "sample")} in '
              f'{found.seconds:.0f} s']
     if more >= 2 * count:

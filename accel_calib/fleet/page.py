@@ -229,8 +229,8 @@ def _of_months(prefix: str, known: OfModel) -> Iterator[Drawing]:
             for panel, name in zip(panels, names, strict=True):
                 lines = found[:, :, NAMES.index(name)].T * scale_of(name)[1]
                 panel.axhline(0.0, color=FAINT, linewidth=1.2)
-                add_band(panel, days, lines[0], lines[4], AFTER, 0.18)
-                add_band(panel, days, lines[1], lines[3], AFTER, 0.35)
+                add_band(panel, days, lines[0], lines[4], AFTER, alpha=0.18)
+                add_band(panel, days, lines[1], lines[3], AFTER, alpha=0.35)
                 panel.plot(days, lines[2], color=AFTER)
                 panel.set_ylabel(name.partition('.')[2])
             label_dates(panels[-1], days, 'month of the recording', dated=True)

@@ -162,8 +162,8 @@ def residuals_of(calibration: Calibration, poses: Poses | None = None) -> Residu
     vectors = calibration.form.known_orientation and 'reference' in own
     before = errors_before(kept, units, vectors=vectors)
     after = errors_after(model, kept, vectors=vectors)
-    return Residuals(kept, unit(force[~out]), before * MG, after * MG, own.take(out),
-                     unit(force[out]), reasons, not vectors)
+    return Residuals(kept, unit(force[~out]), before * MG, after * MG, left_out=own.take(out),
+                     left_out_force=unit(force[out]), reasons=reasons, signed=not vectors)
 
 
 def residuals_of_refinement(result: Refinement) -> Residuals:

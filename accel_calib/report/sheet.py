@@ -24,6 +24,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from hashlib import sha256
+from html import escape
 from importlib.resources import files
 from importlib.util import find_spec
 import io
@@ -87,7 +88,8 @@ def _templates() -> Environment:
 
     made = Environment(loader=PackageLoader('accel_calib.report', 'page'), autoescape=True,
                        undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    made.filters |= {'counted': counted, 'quoted': shlex.quote, 'repr': repr, 'short': short,
+    made.filters |= {'counted': counted, 'escaped': lambda text: Markup(escape(str(text))),
+                     'quoted': shlex.quote, 'repr': repr, 'short': short,
                      'sentence': lambda text: text and f'{text[0].upper()}{text[1:].rstrip(".")}.',
                      'svg': lambda drawing: Markup(_inline_svg(drawing))}
     made.globals |= {'file': lambda name: Markup(_part_of_page(name)),

@@ -221,7 +221,7 @@ def counts(calibration: Calibration, options: Options, label: str, with_gain: bo
               'gain': gain.astype(int)}
     return Made(values, lambda reading, temperature: (
         reading * factor * signs - zero) * signs * gain / (_UNIT_GAIN * unit), False,
-        (_AXES[options.axes], f'1 g = {unit:g} counts'), notes, rounded)
+        (_AXES[options.axes], f'1 g = {unit:g} counts'), notes=notes, rounded=rounded)
 
 
 def _signs(options: Options) -> Floats:
