@@ -71,9 +71,6 @@ _UNREADABLE = re.compile('[\x00-\x08\x0e-\x1a\x1c-\x1f\x7f\ufffd]')
 _SHOWN_CHARACTERS = 40
 _EXAMPLE = 'such as time,ax,ay,az and one row for each pose or sample'
 
-COMMENTS = ('#', '//', '%')
-"""Beginnings of the lines that are comments."""
-
 RATES_HZ = (1.0, 10_000.0)
 """Plausible numbers of samples per second."""
 
@@ -105,7 +102,7 @@ class Dialect:
     monitor: bool = False
     labelled: bool = False
     prefix: str = ''
-    marks: tuple[str, ...] = COMMENTS
+    marks: tuple[str, ...] = ('#', '//', '%')
 
     def is_row(self, line: str) -> bool:
         """Return whether a line can be a row."""
@@ -322,7 +319,7 @@ class _Finder:
         is_gcdc = any(line.startswith(';Headers,') for line in head)
         self.dialect = Dialect(',', timed > len(self.filled) / 2,
                                prefix='Raw:' if raw > len(self.filled) / 3 else '',
-                               marks=(*COMMENTS, ';') if is_gcdc else COMMENTS)
+                               marks=(*Dialect.marks, ';') if is_gcdc else Dialect.marks)
         self.plain = [k for k in self.filled if self.dialect.is_row(head[k])]
 
     def named(self) -> _Found | None:
@@ -334,7 +331,7 @@ class _Finder:
             if cells and self.is_header(cells):
                 row = next((dialect.cells(self.head[j]) for j in self.plain if j > k), [])
                 if len(row) == len(cells) or (
-                        delimiter and not self.head[k].startswith(COMMENTS)):
+                        delimiter and not self.head[k].startswith(Dialect.marks)):
                     return dialect, tuple(cells), k, k + 1
         return None
 
@@ -346,7 +343,7 @@ class _Finder:
 
         """
         line = self.head[k].removeprefix(';Headers,')
-        cells = dialect.cells(line.lstrip('#/% ') if line.startswith(COMMENTS) else line)
+        cells = dialect.cells(line.lstrip('#/% ') if line.startswith(Dialect.marks) else line)
         if dialect.monitor and cells and is_clock(cells[0]):
             cells[0] = 'time'
         return [] if len(cells) < 3 or any(map(_LIKE_NUMBER.fullmatch, cells)) else cells

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .columns import chosen, is_log_header, LogOptions
-from .dialect import Cells, COMMENTS, is_clock, is_number, layout_of, short
+from .dialect import Cells, Dialect, is_clock, is_number, layout_of, short
 from .quantities import decided
 from ..disk import write_atomically
 from ..errors import InputError
@@ -220,7 +220,7 @@ class TextTable:
             fault = self._fault(line)
             if fault is None:
                 good.append(k)
-            elif (line.lstrip().startswith(COMMENTS)
+            elif (line.lstrip().startswith(Dialect.marks)
                   or not line.replace('""', '').strip(_BLANK)):
                 continue
             elif not self._skip_bad or not self._bad:

@@ -295,7 +295,7 @@ def _place(name: EffectKey, before: State, found: Found) -> Remark:
         share = final.residual - beside_walk(found)[0]
     share_mg = final.mg_of_poses(share)
     if isinstance(name, EmpiricalCurve):
-        return _place_of_curve(name, before, share_mg)
+        return _place_of_curve(name, before, poses_g, share_mg)
     if 'instant' in effect.shape:
         time, row = poses_g['time'], poses_g.row
         instant = final.model.values[name][effect.values.index('instant')]
@@ -319,11 +319,12 @@ def _place(name: EffectKey, before: State, found: Found) -> Remark:
         'ends_mg': (rms(share_mg[order[:ends]]), rms(share_mg[order[-ends:]]))})
 
 
-def _place_of_curve(curve: EmpiricalCurve, before: State, share_mg: Floats) -> Remark:
-    """Return what an empirical curve changes, and the known effects that are most similar."""
+def _place_of_curve(curve: EmpiricalCurve, before: State, poses_g: Poses, share_mg: Floats
+                    ) -> Remark:
+    """Return what a curve changes in these poses, and the known effects that are most similar."""
     variable, between = curve.variable, None
     if variable not in ('force', 'direction', 'std'):  # a variable of one number
-        values = before.poses_g[variable]
+        values = poses_g[variable]
         parts = np.array_split(np.argsort(values, kind='stable'), 5)
         middle = [float(np.mean(values[part])) for part in parts]
         size = [rms(share_mg[part]) for part in parts]

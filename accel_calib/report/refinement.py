@@ -52,7 +52,7 @@ def search_values(result: Refinement, residuals: Residuals) -> dict[str, Any]:
                   f'{short(step.held_out_before_mg)} → {short(step.held_out_after_mg)}',
                   chance_words(step.p_value)) for number, step in enumerate(result.steps, 1)],
         'steps': [{'step': step, 'effect': entry_of(step.name), 'rivals': odds_words(step),
-                    'chance': chance_words(step.p_value),
+                   'chance': chance_words(step.p_value),
                    'values': value_words(step), 'drawings': of_step(result, k),
                    'curve': [of_curve(result, k)] if _is_drawn(step) else []}
                   for k, step in enumerate(result.steps)],
