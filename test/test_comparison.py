@@ -9,14 +9,17 @@ from typing import Any
 from accel_calib.calibration import Calibration, fit_poses, level
 from accel_calib.comparison import compare, compared, Drift, history_of, rest_errors, status
 from accel_calib.estimate import estimate
+from accel_calib.logs import read_recording
+from accel_calib.stillness import capture
 from accel_calib.table import Floats, Poses
+from accel_calib.units import units_of
 from inside import (
     DRIFT_MEMORY, model_with, on_one_scale, predict, repeatability_of, rotation_free,
     rotation_from_rpy, Runs, simulate_poses, spread_directions, unit, with_vector)
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
-from shared import G, random_directions, sensor
+from shared import data, G, random_directions, sensor
 
 
 def attitudes(rng, count):
@@ -341,3 +344,21 @@ def test_advice_names_the_temperature_where_it_changed(temperature: float, words
     assert ' differed by -' in line
     assert 'for 3 rests' in line
     assert line.endswith(words)
+
+
+@pytest.mark.parametrize(('name', 'unit_name'), [
+    ('mpu9150_imu0', 'm/s2'), ('mpu9150_imu1', 'm/s2'), ('xsens_mti_counts', 'native')])
+def test_real_rests_are_not_a_change_unless_shifted(name: str, unit_name: Any) -> None:
+    units = units_of(unit_name)
+    poses = capture(read_recording(data(f'{name}.csv')), units).poses
+    odd = np.arange(len(poses)) % 2 == 1
+    calibration, rests = fit_poses(poses.take(~odd), units, model='10'), poses.take(odd)
+    force = calibration.correct(rests.reading)
+    shift = calibration.predict(1.005 * force) - calibration.predict(force)
+    state = Drift(calibration)
+    for k in range(len(rests)):
+        state = after(state, calibration, rests.reading[k:k + 1], rests.noise[k:k + 1], {})
+        assert state.change is None
+    state = after(state, calibration, (rests.reading + shift)[:3], rests.noise[:3], {})
+    assert state.change is not None
+    assert state.lasted == 3

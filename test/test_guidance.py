@@ -46,9 +46,9 @@ def test_a_healthy_sensor_is_done_after_poses_fit_and_level() -> None:
     assert list(dict.fromkeys(person.steps)) == ['poses', 'fit', 'level', 'done']
     assert driver.sensor.rating.name == 'GOOD'
     np.testing.assert_allclose(driver.calibration.offset / GRAVITY, OFFSET, atol=1e-3)
-    assert driver.finding('calibration').level == 0
-    driver.session.commands.enable(False)
-    assert driver.finding('calibration').level == 1
+    assert driver.finding('calibration').level == 'GOOD'
+    enable(driver.session, False)
+    assert driver.finding('calibration').level == 'USABLE'
     assert 'call ~/enable' in driver.finding('calibration').words
 
 

@@ -442,3 +442,32 @@ def test_few_changes_are_found_although_all_changes_at_once_are_nearly_as_good(s
                      'cubic': np.array([2e-3, -1e-3, 1e-3])})
     found = refine(poses_of(changed, rng, 30), G, base=base)
     assert (found.verdict, {*names(found)}) == ('explained', {'offset', 'axis_gain'})
+
+
+@pytest.mark.parametrize('count', [12, 24])
+def test_the_change_of_each_axis_is_stated_with_its_own_uncertainty_and_date(count):
+    away = []
+    for seed in range(8):
+        rng = np.random.default_rng([77, seed])
+        model, moved = with_effects(rng), rng.normal(size=3) * 0.003
+        base = fit_poses(poses_of(model, rng, 30), G, date='2026-11-02T00:00:00')
+        truth = Model({**model.values, 'offset': model.values['offset'] + moved})
+        found = refine(poses_of(truth, rng, count), G, base=base)
+        assert names(found) == ['offset']
+        np.testing.assert_allclose(found.calibration.offset, truth.linear_part[1], atol=1e-3)
+        step, = found.steps
+        words = re.search(r'has changed by \((.*)\) mg since 2026-11-02', step.where)[1]
+        np.testing.assert_allclose(
+            [float(change) for each in words.split(', ') for change in each.split(' ± ')],
+            [1e3 * part[axis] for axis in 'xyz' for part in (step.parameters, step.parameters_sd)],
+            rtol=0.05, atol=0.01)
+        away += [(step.parameters[axis] - change) / step.parameters_sd[axis]
+                 for axis, change in zip('xyz', moved)]
+    assert 0.7 < np.sqrt(np.mean(np.square(away))) < 1.4  # chi² of 24 values: 0.72 to 1.28 at 95 %
+    assert np.max(np.abs(away)) < 4.0
+
+
+def test_a_curve_that_explains_outliers_is_placed_among_all_poses():
+    found = ac.refine(table((5, 23, 6, 0), {'gain_temperature_quadratic': 8.0}), base='10')
+    assert not found.disturbed_poses
+    assert 'temperature' in found.steps[-1].where

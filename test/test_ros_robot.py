@@ -273,3 +273,17 @@ def test_the_managed_node_loads_on_configure_and_publishes_when_active(
         state = bench.ask(GetState, 'calibrator/get_state').current_state
         assert state.label == 'unconfigured'
     assert bench.end(process, signal.SIGINT)[0] == 0
+
+
+@pytest.mark.parametrize('publisher', sample([
+    QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT),
+    QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)], 1))
+def test_every_qos_of_a_driver_fits_and_is_not_reported(bench: Any, publisher: QoSProfile) -> None:
+    diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
+    node = bench.start('calibrator')
+    bench.client('self_test')
+    driver = bench.node.create_publisher(Imu, 'imu/data_raw', publisher)
+
+    bench.spin(lambda: driver.publish(bench.imu([0.0, 0.0, GRAVITY])) or (
+        diagnostics and 'no calibration yet' in diagnostics[-1].status[0].message))
+    assert 'QoS' not in bench.end(node, signal.SIGTERM)[1]

@@ -167,3 +167,15 @@ def test_messages_in_another_encoding_are_corrected_and_unusable_ones_dropped_an
         bench.spin(lambda words=words: any(words in array.status[0].message
                                            for array in diagnostics))
     assert diagnostics[-1].status[0].level == DiagnosticStatus.WARN
+
+
+def test_nothing_is_published_before_a_calibration(bench: Any) -> None:
+    diagnostics = bench.listen(DiagnosticArray, '/diagnostics')
+    bench.calibrator(use_sim_time=True)  # and nobody publishes /clock
+
+    def reported() -> bool:
+        bench.send(bench.imu(READING))
+        return any('no calibration yet' in array.status[0].message for array in diagnostics)
+
+    bench.spin(reported)
+    assert not bench.came_out

@@ -262,3 +262,15 @@ def test_calibrate_recognises_a_still_board_in_a_file_and_in_memory(tmp_path):
     found = ac.calibrate(path)
     assert 'offset_temperature_quadratic' in found.model.effects
     assert ac.calibrate(ramp(8)).model.effects == found.model.effects
+
+
+@pytest.mark.usefixtures('without_pages')
+def test_the_cycle_of_a_real_board_leaves_two_mg_and_autopilots_state_what_they_lose(tmp_path,
+                                                                                     capsys):
+    path, out = data('poses/thermal_cycle_poses.csv'), tmp_path / 'c.yaml'
+    status, result = run_json(capsys, 'thermal', path, '-o', out)
+    assert status == 0
+    assert result['rms_after_mg'] == result['thermal']['residual_mg'] < 2.2
+    calibration = read_calibration(out)
+    for vendor in ('px4', 'ardupilot'):
+        assert any('lag' in each for each in export(calibration, vendor).losses)
