@@ -7,7 +7,7 @@ import json
 from typing import Any
 
 from accel_calib.errors import RefusedFitError
-from accel_calib.session import next_step, Surroundings
+from accel_calib.session import enable, next_step, Surroundings
 from driven import Driver, GRAVITY, Person
 from inside import spread_directions
 import numpy as np
