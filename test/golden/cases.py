@@ -103,7 +103,7 @@ def _content(path: Path) -> Any:
         return {name: _column(each) for name, each in zip(head, zip(*rows), strict=True)}
     if path.suffix == '.json':
         return json.loads(text)
-    if path.suffix == '.yaml':
+    if '.yaml' in path.suffixes:
         return _of_yaml(yaml.safe_load(text))
     if path.suffix == '.html':
         text = re.sub(r'(?s)<section>\n<h2>What these data cannot show.*?</section>', '', text)
