@@ -84,16 +84,14 @@ def _templates() -> Environment:
     """Return the templates of all pages, which escape all text."""
     # The import is here because it would slow down commands that write no page.
     from jinja2 import Environment, PackageLoader, StrictUndefined
-    from markupsafe import Markup
 
     made = Environment(loader=PackageLoader('accel_calib.report', 'page'), autoescape=True,
                        undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    made.filters |= {'counted': counted, 'escaped': lambda text: Markup(escape(str(text))),
+    made.filters |= {'counted': counted, 'escaped': lambda text: escape(str(text)),
                      'quoted': shlex.quote, 'repr': repr, 'short': short,
                      'sentence': lambda text: text and f'{text[0].upper()}{text[1:].rstrip(".")}.',
-                     'svg': lambda drawing: Markup(_inline_svg(drawing))}
-    made.globals |= {'file': lambda name: Markup(_part_of_page(name)),
-                     'table': lambda *about: Markup(table(*about))}
+                     'svg': _inline_svg}
+    made.globals |= {'file': _part_of_page, 'table': table}
     return made
 
 
