@@ -232,7 +232,8 @@ def fit(poses: Source | Poses | Data, *, units: UnitName | None = None,
     gravity : float
         Local gravity [m/s²].
     model : {'auto', '4', '7', '9', '10', '12'}
-        Number of parameters, or the smallest of 4, 7 and 10 that the poses support.
+        Number of parameters, or the smallest of 4, 7 and 10 that the poses support. Poses in a
+        plane are fitted by 10, with the typical values of sensors for what they do not show.
     method : {'ml', 'algebraic'}
         Maximum likelihood, or the cost functions of AN5286 and the ESGI'95 report.
     flat : int, optional

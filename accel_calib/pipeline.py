@@ -341,7 +341,9 @@ def calibrated(poses: Poses, units: Units, plan: Plan = Plan()) -> Outcome:
     with explained_by(poses.findings):
         calibration = _fit(chosen, units, plan, date)
     refinement, line = None, 'not refined, as asked'
-    if plan.refined:
+    if plan.refined and is_partial(calibration):
+        line = 'not refined: poses in a plane do not show which effect is missing'
+    elif plan.refined:
         refinement, line = _refinement(chosen, units, plan, date)
     if refinement is not None and refinement.steps and not refinement.refusal:
         calibration = refinement.calibration

@@ -89,8 +89,9 @@ def test_poses_of_a_robot_that_turns_on_one_axis_hold_in_their_plane(count):
         model, up = common_sensor(rng), around[::60 // count]
         up = unit(up + np.outer(rng.uniform(-0.1, 0.1, len(up)), np.eye(3)[0]))
         poses = simulate_poses(model, up, rng, noise_g=0.003)
-        found = calibrated_by(poses, G, FitPlan(refined=False, partial=True)).calibration
-        assert found.method == PRIOR
+        outcome = calibrated_by(poses, G, FitPlan())
+        found = outcome.calibration
+        assert (found.method, outcome.refinement) == (PRIOR, None)
         error, stated = errors(found, model, around)
         held.append(np.mean(np.abs(error) < 1.96 * stated))
     assert np.mean(held) > 0.88
