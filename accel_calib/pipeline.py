@@ -23,13 +23,14 @@ from typing import Any, Literal, TYPE_CHECKING, TypeVar
 import numpy as np
 
 from .calibration import (
-    Calibration, check_sensor, Curve, curve_of, directions_of, fit_partial, fit_poses,
+    Calibration, check_sensor, Curve, curve_of, determines, directions_of, fit_partial, fit_poses,
     fit_with_fleet, flat_direction, FleetPrior, level, level_by_rows, lies_in_cone, lies_in_plane,
-    PRIOR, SampleContext, thermal_alone, with_curve, without_curve)
+    NORM_MODELS, PRIOR, SampleContext, thermal_alone, with_curve, without_curve)
 from .effects import Context, LADDER, Model, OwnEffect, PROCESSES
 from .errors import InputError, RefusedFitError, saying
 from .finding import explained_by, Finding
 from .findings import outside_line, rate, Rating
+from .geometry import unit
 from .logs import Frame, LogOptions, open_log, OpenLog, Piped, Progress
 from .stillness import (
     account_of, capture, Captured, CaptureSettings, cells_of, check_measured, is_one_direction,
@@ -371,8 +372,9 @@ def _fit(poses: Poses, units: Units, plan: Plan, date: str) -> Calibration:
     if ((before is None or is_partial(before)) and not units.is_native
             and len(poses) >= FEWEST_IN_CONE):
         up = directions_of(poses, units)
-        in_plane = (plan.model, plan.method) == ('auto', 'ml') and 'reference' not in poses and (
-            lies_in_plane(up))
+        in_plane = ((plan.model, plan.method) == ('auto', 'ml') and 'reference' not in poses
+                    and lies_in_plane(up)
+                    and not determines(NORM_MODELS[-1], unit(poses.reading)))
         if in_plane or (plan.partial and lies_in_cone(up)):
             return fit_partial(poses, units, sensor=plan.sensor, date=date)
     return fit_poses(poses, units, model=plan.model, method=plan.method, sensor=plan.sensor,

@@ -250,3 +250,12 @@ def test_a_partial_fit_has_the_name_that_is_given_or_that_of_the_poses():
     poses = replace(tilting(18)[1], sensor='left')
     assert fit_partial(poses, G).sensor == 'left'
     assert fit_partial(poses, G, sensor='right').sensor == 'right'
+
+
+def test_poses_of_which_a_few_leave_a_plane_have_a_full_fit():
+    turn = np.radians(np.arange(0, 360, 12))
+    flat = np.column_stack([np.zeros(30), np.cos(turn), np.sin(turn)])
+    beside = [(x, *each) for x in (-1.0, 1.0) for each in [*np.eye(2), *-np.eye(2), (0.0, 0.0)]]
+    poses = simulate_poses(Model({}), unit(np.vstack([*[flat] * 20, beside])),
+                           np.random.default_rng(1))
+    assert calibrated_by(poses, G, FitPlan(refined=False)).calibration.method != PRIOR
