@@ -29,7 +29,7 @@ from faults.sample import sample
 from inside import export, Intake, RampIntake, thermally_calibrated
 import numpy as np
 import pytest
-from ramps import BENT, G, LINE, offset_at, ramp, twelve_poses, TWISTED, UP, write_ulog
+from ramps import BENT, G, LINE, offset_at, ramp, twelve_poses, TWISTED, UP, warming, write_ulog
 from scipy.signal import medfilt
 from shared import data, MPS2, refused, rms, run, run_json
 from test_exports import ardupilot, qgroundcontrol
@@ -274,3 +274,55 @@ def test_the_cycle_of_a_real_board_leaves_two_mg_and_autopilots_state_what_they_
     calibration = read_calibration(out)
     for vendor in ('px4', 'ardupilot'):
         assert any('lag' in each for each in export(calibration, vendor).losses)
+
+
+@pytest.mark.parametrize('truth', [LINE, BENT, TWISTED])
+def test_the_error_on_a_second_ramp_is_not_larger_than_that_of_the_autopilots(truth):
+    """The second ramp has other temperatures, and its noise is left out."""
+    errors, warm = [], warming(2000, -9.0, 33.0, cool=True)
+    for seed in range(100, 110):
+        log = ramp(seed, truth, wander_g=1e-4)
+        offsets = [curve(log).at(warm), *(vendor_at(fit(log), warm, 25.0)
+                                          for fit in VENDORS.values())]
+        errors.append([np.sum(np.var(offset - offset_at(warm, truth), axis=0))
+                       for offset in offsets])
+    ours, *theirs = np.mean(errors, axis=0)
+    assert ours <= 1.02 * min(theirs)
+
+
+def bumped(seconds: float, change_g) -> Recording:
+    log = ramp(8)
+    later = (log['time'] > seconds)[:, np.newaxis]
+    return log.with_columns(reading=log.reading + later * np.array(change_g) * G)
+
+
+def test_a_jump_along_gravity_is_a_step_of_the_sensor_and_bends_no_curve():
+    stepped = curve(bumped(900.0, UP * 0.006))
+    assert set(stepped.model.effects) == {*OFFSET_POWERS[1:3], 'offset_step'}
+    *size, instant = stepped.model.values['offset_step']
+    assert instant == pytest.approx(900.0, abs=15.0)
+    np.testing.assert_allclose(size, UP * 0.006, atol=5e-4)
+    values, deviations = coefficients(stepped)
+    assert np.all(np.abs(values - BENT) < 5.0 * deviations)
+    made = thermal(bumped(900.0, UP * 0.006))
+    assert 'thermal_step' in {each.kind for each in made.rating.findings}
+
+
+def test_ramps_of_several_orientations_share_one_curve():
+    found = curve(ramp(5), ramp(6, up=np.array([1.0, 0.0, 0.0])))
+    assert found.degree == 2
+    values, deviations = coefficients(found)
+    assert np.all(np.abs(values - BENT) < 5.0 * deviations)
+
+
+@pytest.mark.usefixtures('without_pages')
+def test_the_sense_hat_has_the_curve_that_others_found(tmp_path, capsys):
+    path = data('sensehat_lsm9ds1_temperature.csv')
+    lines = path.read_text().splitlines()
+    still = [line for line in lines[3:] if float(line.partition(',')[0]) > 82180.0]
+    cut = tmp_path / 'still.csv'
+    cut.write_text('\n'.join([*lines[:3], *still]))
+    assert run('thermal', cut, '-o', tmp_path / 'c.yaml') == 0
+    slopes = read_calibration(tmp_path / 'c.yaml').model.values['offset_temperature'][:3]
+    np.testing.assert_allclose(slopes * MG, [0.57, 0.41, -0.41], atol=0.02)
+    assert 'the board moved' in refused(capsys, 'thermal', path, '-o', tmp_path / 'd.yaml')

@@ -227,8 +227,7 @@ def words_of_state(state: State) -> str:
 def figures(state: State) -> Iterator[tuple[str, str]]:
     """Yield names and values for the diagnostics."""
     sensor, counts, warm = state.sensor, state.statistics, state.around.temperature
-    gravity, rest, drift, live = sensor.gravity, sensor.rest, sensor.drift, sensor.live
-    poses, breaks = live.book.poses(), live.detector.interruptions
+    gravity, rest, drift = sensor.gravity, sensor.rest, sensor.drift
     yield 'state', words_of_state(state)
     yield 'sensor', state.name
     yield 'calibration', 'none' if sensor.calibration is None else title(sensor.calibration)
@@ -251,7 +250,22 @@ def figures(state: State) -> Iterator[tuple[str, str]]:
             low, high = drift.temperatures
             yield 'temperature when calibrated [°C]', f'{low:.1f} to {high:.1f}'
     yield 'since last rest [s]', _number(math.nan if rest is None else (
-        0.0 if live.still else max(0.0, counts.stamp - rest.end)))
+        0.0 if sensor.live.still else max(0.0, counts.stamp - rest.end)))
+    yield from _figures_of_capture(state)
+    yield 'mounting', state.mounting_words(sensor.calibration) or 'not known'
+    gyro, noise = sensor.gyro, sensor.noise
+    if gyro is not None:
+        yield 'gyro bias [rad/s]', _vector(gyro.at(warm))
+        yield 'gyro bias, standard deviation [rad/s]', _vector(gyro.sd)
+    if noise is not None:
+        yield 'noise of acceleration [m/s² or native]', _vector(noise.force)
+        yield 'noise of angular velocity [rad/s]', _vector(noise.rate)
+
+
+def _figures_of_capture(state: State) -> Iterator[tuple[str, str]]:
+    """Yield the figures of the poses, of the clock, and of what is known beside the messages."""
+    live, warm = state.sensor.live, state.around.temperature
+    poses, breaks = live.book.poses(), live.detector.interruptions
     yield 'poses captured', str(len(poses))
     yield 'poses doubtful', str(int(np.sum(poses['doubtful'])) if 'doubtful' in poses else 0)
     yield 'next', next_step(state).text or 'turn the sensor'
@@ -268,14 +282,6 @@ def figures(state: State) -> Iterator[tuple[str, str]]:
             yield f'{column} [{unit}]' if unit else column, _number(
                 state.around.values.get(column, math.nan))
     yield 'still below [m/s² or native]', f'{live.detector.threshold:.4g}'
-    yield 'mounting', state.mounting_words(sensor.calibration) or 'not known'
-    gyro, noise = sensor.gyro, sensor.noise
-    if gyro is not None:
-        yield 'gyro bias [rad/s]', _vector(gyro.at(warm))
-        yield 'gyro bias, standard deviation [rad/s]', _vector(gyro.sd)
-    if noise is not None:
-        yield 'noise of acceleration [m/s² or native]', _vector(noise.force)
-        yield 'noise of angular velocity [rad/s]', _vector(noise.rate)
 
 
 def _vector(values: Iterable[float]) -> str:
