@@ -279,7 +279,8 @@ class Plan:
         frame and its mounting are kept.
     partial : bool
         Fit poses that are all near one direction, too, with typical values of sensors, unless
-        `before` is a full fit. Poses in a plane are always fitted so by ``auto``.
+        `before` is a full fit. Poses in a plane from which ``auto`` would fit a smaller model
+        are always fitted so.
 
     """
 
@@ -371,10 +372,11 @@ def _fit(poses: Poses, units: Units, plan: Plan, date: str) -> Calibration:
         return refitted(before, poses, sensor=plan.sensor, date=date)
     if ((before is None or is_partial(before)) and not units.is_native
             and len(poses) >= FEWEST_IN_CONE):
-        up = directions_of(poses, units)
-        in_plane = ((plan.model, plan.method) == ('auto', 'ml') and 'reference' not in poses
-                    and lies_in_plane(up)
-                    and not determines(NORM_MODELS[-1], unit(poses.reading)))
+        up, raw = directions_of(poses, units), unit(poses.reading)
+        smallest, *_, largest = NORM_MODELS
+        in_plane = (  # a smaller model would be fitted, and assume what the poses do not show
+            (plan.model, plan.method) == ('auto', 'ml') and 'reference' not in poses
+            and lies_in_plane(up) and determines(smallest, raw) and not determines(largest, raw))
         if in_plane or (plan.partial and lies_in_cone(up)):
             return fit_partial(poses, units, sensor=plan.sensor, date=date)
     return fit_poses(poses, units, model=plan.model, method=plan.method, sensor=plan.sensor,

@@ -80,7 +80,7 @@ def test_corrected_length_is_right_within_the_cone(count, degrees):
     assert np.median(sizes) < 1e-3
 
 
-@pytest.mark.parametrize('count', [5, 12])
+@pytest.mark.parametrize('count', [10, 20])
 def test_poses_of_a_robot_that_turns_on_one_axis_hold_in_their_plane(count):
     held, turn = [], np.radians(np.arange(0, 360, 6))
     around = np.column_stack([np.zeros(60), np.cos(turn), np.sin(turn)])
@@ -95,7 +95,7 @@ def test_poses_of_a_robot_that_turns_on_one_axis_hold_in_their_plane(count):
         error, stated = errors(found, model, around)
         held.append(np.mean(np.abs(error) < 1.96 * stated))
     assert np.mean(held) > 0.88
-    assert count == 5 or np.max(stated) < 0.01
+    assert np.max(stated) < 0.01
 
 
 def test_poses_that_tell_nothing_leave_the_spread_of_common_sensors():
@@ -259,3 +259,10 @@ def test_poses_of_which_a_few_leave_a_plane_have_a_full_fit():
     poses = simulate_poses(Model({}), unit(np.vstack([*[flat] * 20, beside])),
                            np.random.default_rng(1))
     assert calibrated_by(poses, G, FitPlan(refined=False)).calibration.method != PRIOR
+
+
+def test_a_short_arc_is_refused_as_any_poses_that_determine_no_model():
+    turn = np.radians(np.linspace(-40.0, 40.0, 11))
+    up = np.column_stack([np.zeros(11), np.sin(turn), np.cos(turn)])
+    with pytest.raises(RefusedFitError):
+        calibrated_by(simulate_poses(Model({}), up, np.random.default_rng(1)), G, FitPlan())
