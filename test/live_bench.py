@@ -129,13 +129,6 @@ class LivePage:
             self.sensor.turn_to(asked)
             expect(page.locator('#poses')).not_to_have_text(re.compile(rf'^{count}\b'))
 
-    def turn_half(self, page: Page) -> None:
-        """Begin the turn that the page asks for, and stop when about half of it is done."""
-        asked = asked_on(page)
-        assert asked is not None
-        self.sensor.turn_to(self.sensor.up + asked)
-        expect(page.locator('#ring')).to_have_attribute('data-kind', 'holding')
-
 
 def asked_on(page: Page) -> Floats | None:
     """Return the direction of the sides, such as “Front left edge up”; None: another action."""

@@ -106,9 +106,7 @@ def test_each_fit_refinement_and_levelling_is_reported_as_on_the_command_line(
     assert all('arm.yaml' not in answer and 'changes offset' not in answer for answer in answers)
     logged = driver.logged('info')
     assert logged.count(f'stored in {store.calibration}') >= len(answers)
-    for words in ('changes offset by', 'static_transform_publisher --roll',
-                  figures(driver)['mounting']['urdf']):
-        assert words in logged
+    assert figures(driver)['mounting']['urdf'] in logged
 
 
 def test_an_offered_calibration_waits_for_save_and_is_reported_as_not_in_use() -> None:

@@ -263,8 +263,6 @@ def test_the_figures_are_printed_beside_those_of_common_parts_written_and_drawn(
     printed = capsys.readouterr().out
     lines = printed.splitlines()
     assert all(len(line) <= 60 or str(tmp_path) in line for line in lines)
-    assert '±' in printed
-    assert '…' not in printed
     assert [line.split()[3:] for line in lines if line.startswith('typical')] == [
         ['49', 'to', '280', 'µg/√Hz'], ['2', 'to', '3.5', 'm°/s/√Hz']]
     assert any(line.startswith('USABLE') for line in lines)
@@ -274,9 +272,7 @@ def test_the_figures_are_printed_beside_those_of_common_parts_written_and_drawn(
     assert made['accelerometer_random_walk'] is None
     assert all(limit > 0.0 for limit in made['accelerometer_random_walk_axes_upper'])
     text = (tmp_path / 'noise.html').read_text()
-    for words in ('<svg', 'white noise', 'bias instability', 'accelerometer_noise_density',
-                  '49 to 280', 'class="verdict USABLE"'):
-        assert words in text
+    assert 'class="verdict USABLE"' in text
     assert not re.search('https?:', text)
 
 

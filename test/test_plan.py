@@ -39,15 +39,10 @@ def simulated(rng, up=None, *, noise_g, context=None, **effects):
                           noise_g=noise_g, context=context)
 
 
-def test_a_plan_that_separates_rivals_is_written_and_shown(tmp_path, capsys):
+def test_a_plan_that_separates_rivals_is_written(tmp_path):
     path, found = tmp_path / 'plan.csv', tmp_path / 'found.json'
     twins = table(tmp_path / 'twins.csv', 'cubic', size=3, seed=[5, 3])
     assert run('refine', twins, '--plan', path, '--json', found) == 0
-    printed = ' '.join(capsys.readouterr().out.split())
-    for words in ('plan: to separate', 'take these poses:', 'plan: hold the ', ' up (',
-                  'the expected probability of the right one is then', '%)',
-                  'advice: next pose to separate', f'stored in {tmp_path}'):
-        assert words in printed
     result, poses = json.loads(found.read_text()), read_plan(path)
     assert 1 <= len(poses) <= 6
     for step in result['steps']:

@@ -358,7 +358,6 @@ def test_terminal_without_unicode_gets_ascii() -> None:
 
 def test_end_of_the_poses_is_clear() -> None:
     shown = drawn(screen(NODE, ENOUGH))
-    assert 'more poses no longer help' in shown
     assert f'ros2 service call {NODE}/fit std_srvs/srv/Trigger' in shown
     assert '██████  ██  ██████' in shown  # FIT
     line, = changes(NODE, MIDDLE, ENOUGH)
