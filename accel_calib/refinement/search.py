@@ -18,7 +18,7 @@ The search for missing effects.
    the better description.
 6. In the final model, an effect is removed if it is not significant or does not lower the held-out
    residual, and gives way to one that is more probable in its place.
-7. If a scatter that all poses have (`accel_calib.estimate.scatter`) is as good an explanation as
+7. If a scatter that all poses have (`accel_calib.estimate.outliers`) is as good an explanation as
    what was found, the search is repeated with it as part of the noise.
 
 A set is kept only if its fit converged, the cost decreased and its values are plausible.
