@@ -417,8 +417,7 @@ class Tracker:
         twin = copy.copy(self)
         twin._dwell = copy.copy(self._dwell)
         list(twin.feed(last=True))
-        found = twin._finished()
-        return None if found is None or found.short else found
+        return next((each for each in twin._end() if not each.short), None)
 
     def _extend(self, chunks: Records) -> Iterator[OngoingDwell]:
         before = self._held
@@ -450,20 +449,13 @@ class Tracker:
         self._dwell.add(chunks)
 
     def _end(self) -> Iterator[OngoingDwell]:
-        found = self._finished()
+        found, self._dwell, self._held = self._dwell, None, _NONE
         if found is not None:
-            yield found
-        if self._dwell is not None:
             self._number += 1
-        self._dwell = None
-        self._held = _NONE
-
-    def _finished(self) -> OngoingDwell | None:
-        least = min(max(_LEAST_REST * self._shortest, CHUNKS_PER_WINDOW), self._shortest)
-        if self._longest:  # the end of a rest that was split is no rest
-            least = self._shortest
-        if self._dwell is None or self._dwell.chunks < least:
-            return None
-        self._dwell.beside_slope = self._beside_slope
-        self._dwell.short = self._dwell.chunks < self._shortest
-        return self._dwell
+            found.beside_slope = self._beside_slope
+            found.short = found.chunks < self._shortest
+            # The end of a rest that was split is no rest.
+            least = self._shortest if self._longest else min(
+                max(_LEAST_REST * self._shortest, CHUNKS_PER_WINDOW), self._shortest)
+            if found.chunks >= least:
+                yield found

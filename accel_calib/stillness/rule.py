@@ -271,15 +271,31 @@ class Rule:
 
         An offset and the gains by axis are common to all rests: once these determine them, they do
         not count as a difference. Before, the differences that a sensor can have are allowed.
+        The ellipsoid of the rests has its axes along those of the sensor: Σ a x² + b x = 1. Rests
+        are left out, that which decreases the sum of squares most first, until the others agree.
 
         """
         if not self.known:
             return np.ones(len(means), bool)
-        lengths = common_lengths(means / self._per_g)
-        if lengths is None:
-            length = np.linalg.norm(means, axis=1) / self._per_g
-            return np.asarray((length > PLAUSIBLE_G[0]) & (length < PLAUSIBLE_G[1]))
-        return np.asarray(np.abs(lengths - 1.0) <= self._settings.still_norm_tolerance)
+        means_g = means / self._per_g
+        columns, kept = np.hstack([means_g**2, means_g]), np.arange(len(means_g))
+        while len(kept) >= max(FEWEST_IN_COMMON, LEAST_IN_COMMON * len(means_g)):
+            onto, sizes, turn = np.linalg.svd(columns[kept], full_matrices=False)
+            values = (onto.sum(axis=0) / np.maximum(sizes, 1e-300)) @ turn
+            if sizes[-1] < LEAST_SPREAD * sizes[0] or np.any(values[:3] <= 0.0):
+                break
+            centre = -values[3:] / (2.0 * values[:3])
+            radius = np.sqrt((1.0 + np.sum(values[:3] * centre**2)) / values[:3])
+            lengths = np.linalg.norm((means_g - centre) / radius, axis=1)
+            if rms(lengths[kept] - 1.0) < AGREE_G:
+                if np.any(np.abs(centre) >= LARGEST_OFFSET_G):
+                    break
+                return np.asarray(np.abs(lengths - 1.0) <= self._settings.still_norm_tolerance)
+            left = columns[kept] @ values - 1.0
+            own = np.maximum(1.0 - np.sum(onto**2, axis=1), 1e-9)
+            kept = np.delete(kept, np.argmax(left**2 / own))
+        length = np.linalg.norm(means_g, axis=1)
+        return np.asarray((length > PLAUSIBLE_G[0]) & (length < PLAUSIBLE_G[1]))
 
     def _trending(self, seen: Mapping[int, Stretch], mean: Floats, limit: Floats, scale: Floats
                   ) -> NDArray[np.intp]:
@@ -343,32 +359,6 @@ class Rule:
         self._counts, self._same, self.repeats = counts[:, -1], float(same[-1]), not varied[-1]
         noise = np.fmax(np.where(varied, floors[0], floors[1]), self.least[:axes, np.newaxis])
         return at_least(noise, steps, mean), varied
-
-
-def common_lengths(means_g: Floats) -> Floats | None:
-    """
-    Return the (n,) lengths of (n, 3) rests relative to the ellipsoid that they have in common [g].
-
-    It has its axes along those of the sensor: Σ a x² + b x = 1. Rests are left out, that which
-    decreases the sum of squares most first, until the others agree. None if they do not, do not
-    determine it, or if it is not that of a sensor.
-
-    """
-    columns, kept = np.hstack([means_g**2, means_g]), np.arange(len(means_g))
-    while len(kept) >= max(FEWEST_IN_COMMON, LEAST_IN_COMMON * len(means_g)):
-        onto, sizes, turn = np.linalg.svd(columns[kept], full_matrices=False)
-        values = (onto.sum(axis=0) / np.maximum(sizes, 1e-300)) @ turn
-        if sizes[-1] < LEAST_SPREAD * sizes[0] or np.any(values[:3] <= 0.0):
-            return None
-        centre = -values[3:] / (2.0 * values[:3])
-        radius = np.sqrt((1.0 + np.sum(values[:3] * centre**2)) / values[:3])
-        lengths = np.linalg.norm((means_g - centre) / radius, axis=1)
-        if rms(lengths[kept] - 1.0) < AGREE_G:
-            return lengths if np.all(np.abs(centre) < LARGEST_OFFSET_G) else None
-        left = columns[kept] @ values - 1.0
-        own = np.maximum(1.0 - np.sum(onto**2, axis=1), 1e-9)
-        kept = np.delete(kept, np.argmax(left**2 / own))
-    return None
 
 
 def _half_range(low: Floats, high: Floats, noise: Floats) -> Floats:
