@@ -19,7 +19,7 @@ from .effects import model_with, own_effects, OwnEffect, simulate_poses, simulat
 from .errors import InputError
 from .geometry import rotation_from_rpy, spread_directions, unit
 from .logs import (
-    are_untimed_samples, Frame, LogOptions, read_poses as read_pose_table,
+    are_samples, Frame, LogOptions, read_poses as read_pose_table,
     read_recording as read_whole_recording)
 from .pipeline import calibrated, calibrated_log, captured_from, Flat, options_for, Plan, poses_of
 from .refinement import refine as find_effects, Refinement as Refinement
@@ -508,7 +508,7 @@ def _asked(given: Source | Poses | Recording | Data, units: UnitName | None,
             raise InputError(f'the array has shape {shape}, expected (n, 3) readings',
                              'pass such an array, a table or a DataFrame')
         check_values(columns, 'the array')
-        if are_untimed_samples(columns):
+        if are_samples(columns):
             raise InputError(f'the {shape[0]} rows of the array look like samples of a recording, '
                              'expected one row for each pose', 'pass a Recording, or a DataFrame '
                              'with a column time')
