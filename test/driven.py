@@ -10,7 +10,7 @@ from typing import Any
 
 from accel_calib.errors import AccelCalibError
 from accel_calib.session import (
-    answered, CalibratorSettings, checks, columns_of, Log, next_step, Result, run, Session,
+    answered, CalibratorSettings, columns_of, diagnostics, Log, next_step, Result, run, Session,
     ShowPoses, state, Task)
 import numpy as np
 import pytest
@@ -104,7 +104,7 @@ class Driver:
         return '\n'.join(line.words for line in self.log if line.severity == severity)
 
     def finding(self, name: str) -> Any:
-        return next(each for each in checks(self.session.state) if each.concern == name)
+        return next(each for each in diagnostics(self.session.state) if each.concern == name)
 
 
 class Person:

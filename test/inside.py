@@ -96,8 +96,7 @@ from accel_calib.session.sensor import new_sensor, rest_after
 from accel_calib.session.settings import capture_settings, changed, default_of
 from accel_calib.session.state import figures
 from accel_calib.session.store import (
-    aside, Identity, lock as lock_files, MOST_STEPS, Store as SensorStore, store_of,
-    writing_advice)
+    aside, Identity, MOST_STEPS, SensorFiles, Store as SensorStore, store_of, writing_advice)
 from accel_calib.session.stream import StreamStatistics, TemperatureHistory
 from accel_calib.session.use import adopt as use_calibration
 from accel_calib.session.worker import Worker, WorkerProcess
@@ -185,7 +184,6 @@ PATIENCE_WITH_A_CHILD = child, '_PATIENCE_S'
 
 if find_spec('aiohttp'):  # what the live page needs is not installed everywhere
     from accel_calib.live import server, viewer
-    from accel_calib.live.exchange import log_line as live_log
     from accel_calib.live.host import Host
     from accel_calib.live.server import PageServer
     from accel_calib.live.viewer import (

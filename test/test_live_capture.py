@@ -179,13 +179,13 @@ def test_change_is_reported_during_the_third_rest_and_survives_a_new_level(store
 
     for time, off in ((0.0, 0.0), (10.0, 0.05), (20.0, 0.0), (30.0, 0.005), (40.0, 0.005)):
         sensor = sensor.update(rest(time, off), 0.001)
-        sensor = sensor.end(rest(time, off), 0.001)
+        sensor = sensor.update(rest(time, off), 0.001, ended=True)
         assert sensor.drift.change is None
     sensor = sensor.update(rest(50.0, 0.005), 0.001)
     assert sensor.drift.change is not None
     sensor = sensor.update(rest(50.0, 0.0), 0.001)
     assert sensor.drift.change is not None  # what is reported stays for rests without it
-    sensor = sensor.end(rest(50.0, 0.005), 0.001)
+    sensor = sensor.update(rest(50.0, 0.005), 0.001, ended=True)
     assert sensor.drift.change is not None
     assert sensor.drift.count == 6
     flat = calibration.predict(np.array([[0.0, 0.6, 0.8]]) * GRAVITY)[0]
@@ -200,9 +200,9 @@ def test_rest_that_is_reported_late_does_not_hide_the_ongoing_rest(stored: Store
     early, late = dwell(0.0, [0, 0, 1]), dwell(10.0, [0, 0, 1.01])
     sensor = sensor.update(early, 0.001)
     sensor = sensor.update(late, 0.001)
-    sensor = sensor.end(early, 0.001)
+    sensor = sensor.update(early, 0.001, ended=True)
     assert sensor.drift.count == 2
-    sensor = sensor.end(late, 0.001)
+    sensor = sensor.update(late, 0.001, ended=True)
     assert sensor.drift.count == 2
     sensor = sensor.update(replace(late, end=late.end + 1e3), 0.001)  # by a clock that has jumped
     assert sensor.drift.count == 2

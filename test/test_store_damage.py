@@ -16,7 +16,7 @@ from accel_calib.errors import InputError, StoredCalibrationError
 from accel_calib.finding import Level
 from accel_calib.stored import read_calibration
 from inside import (
-    aside, Identity, lock_files, MOST_BYTES, SensorStore, spread_directions, store_of)
+    aside, Identity, MOST_BYTES, SensorFiles, SensorStore, spread_directions, store_of)
 import numpy as np
 import pytest
 from shared import Readings, Stored
@@ -239,7 +239,7 @@ def test_whatever_is_in_place_of_the_lock_is_left_as_it_is(
     lock = store.calibration.with_name('known.lock')
     make(lock)
     before = kept(lock)
-    lock_files(store).close()
+    SensorFiles(store).take().release()
     assert kept(lock) == before
     assert precious.read_text() == 'kept'
     assert Driver(calibration_file=str(store.calibration)).session.sensor.calibration

@@ -98,25 +98,18 @@ class Address:
     def refusal(self, request: web.BaseRequest) -> str:
         """Return why a request is refused by its Host or Origin; empty if it is not."""
         hosts, origins = (request.headers.getall(name, []) for name in ('Host', 'Origin'))
-        if len(hosts) != 1 or not self._is_own(hosts[0]):
-            return 'the header Host is not an address of this server; open its own link'
-        if origins and [each.lower() for each in origins] != [f'http://{hosts[0].lower()}']:
-            return 'the header Origin is of another site; open the link of this server'
-        return ''
-
-    def _is_own(self, host: str) -> bool:
-        """Return whether a Host is an address of this server, with its port."""
-        try:
+        host, is_own = hosts[0] if len(hosts) == 1 else '', False
+        with suppress(ValueError):  # it cannot be parsed
             parts = urlsplit(f'//{host}')
             name, port = (parts.hostname or '').removesuffix('.'), parts.port or 80
-        except ValueError:
-            return False
-        if port != self.port or '@' in host or parts.path or parts.query or parts.fragment:
-            return False
-        try:
-            return ip_address(name).version in self._versions
-        except ValueError:
-            return name in self._hosts
+            is_own = name in self._hosts or ip_address(name).version in self._versions
+            is_own &= port == self.port and not (
+                '@' in host or parts.path or parts.query or parts.fragment)
+        if not is_own:
+            return 'the header Host is not an address of this server; open its own link'
+        if origins and [each.lower() for each in origins] != [f'http://{host.lower()}']:
+            return 'the header Origin is of another site; open the link of this server'
+        return ''
 
 
 class Connection(web.RequestHandler):
@@ -133,11 +126,19 @@ class Connection(web.RequestHandler):
         self._owner, self.stage, self.address = server, 0, ''
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Close the connection later, unless its request arrives."""
+        """Close the connection later, unless its request arrives; at the limit, another one."""
         super().connection_made(transport)
         self.address = str((transport.get_extra_info('peername') or [''])[0])
         self._limit = asyncio.get_running_loop().call_later(_REQUEST_S, self.abort, 0)
-        self._owner.add(self)
+        everyone = self._owner.connections
+        if len(everyone) >= _CONNECTIONS:
+            self._owner.report(f'ended a connection, because {_CONNECTIONS} were open')
+            of = Counter(each.address for each in everyone)
+            ended = max(everyone, key=lambda each: (
+                each.stage < OWNER, of[each.address], -each.stage))
+            del everyone[ended]
+            ended.abort()
+        everyone[self] = None
 
     def connection_lost(self, exc: BaseException | None) -> None:
         """Forget the connection."""
@@ -258,7 +259,7 @@ class PageServer:
     # In the thread of the server
 
     async def _serve(self, started: Future[None]) -> None:
-        """Serve until `close` is called."""
+        """Serve until `close` is called: show the newest progress, and close stuck viewers."""
         self._loop = loop = asyncio.get_running_loop()
         loop.set_exception_handler(self._on_error)
         http = web.Server(self._answer)
@@ -272,7 +273,13 @@ class PageServer:
         self._port = self._address.port
         started.set_result(None)
         while not self._over.is_set():
-            await self._look()
+            if self.viewers and self.board.history:
+                self._take(self.board.history[-1])
+            for viewer in list(self.viewers):
+                if loop.time() - viewer.sending_since > STUCK_S:
+                    viewer.abort()
+            with suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._over.wait(), PERIOD if self.viewers else _RARELY_S)
         listener.close()
         for connection in list(self.connections):
             if connection.stage > 1:
@@ -287,34 +294,12 @@ class PageServer:
         else:
             loop.default_exception_handler(context)
 
-    def add(self, connection: Connection) -> None:
-        """Add a connection; at the limit, end another one."""
-        if len(self.connections) >= _CONNECTIONS:
-            self.report(f'ended a connection, because {_CONNECTIONS} were open')
-            of = Counter(each.address for each in self.connections)
-            ended = max(self.connections, key=lambda each: (
-                each.stage < OWNER, of[each.address], -each.stage))
-            del self.connections[ended]
-            ended.abort()
-        self.connections[connection] = None
-
     def report(self, what: str) -> None:
         """Count what the page had to do, and log it at most once in `_QUIET_S`."""
         self._reported[what] += 1
         if self._filter.passes(what, _QUIET_S):
             words = f'the live page {what} ({self._reported[what]} so far)'
             self._exchange.call_soon(lambda: self._exchange.log('warning', words))
-
-    async def _look(self) -> None:
-        """Show the newest progress, close stuck viewers, and wait."""
-        if self.viewers and self.board.history:
-            self._take(self.board.history[-1])
-        now = asyncio.get_running_loop().time()
-        for viewer in list(self.viewers):
-            if now - viewer.sending_since > STUCK_S:
-                viewer.abort()
-        with suppress(asyncio.TimeoutError):
-            await asyncio.wait_for(self._over.wait(), PERIOD if self.viewers else _RARELY_S)
 
     def _take(self, message: Message) -> None:
         if self.board.take(message):

@@ -118,12 +118,13 @@ def open_source(name: str, options: LogOptions, *, baud: int, speed: float = 1.0
             reader = _understood(name, port.lines(), options, baud)
             first = [] if reader.first is None else [_rows(reader.first)]
             blocks = (rows for lines in port.lines() for rows in _rows_of(reader, lines))
-            yield Source(name, '', reader.units, reader.read_as, _in_order(chain(first, blocks)),
-                         reader.findings, lambda: port.problem)
+            yield Source(name, sensor='', units=reader.units, read_as=reader.read_as,
+                         blocks=_in_order(chain(first, blocks)), findings=reader.findings,
+                         problem=lambda: port.problem)
         return
     with open_log(Path(name), options) as log:
-        yield Source(name, log.sensor, log.units, log.read_as, _played(log.blocks, speed),
-                     log.findings)
+        yield Source(name, log.sensor, log.units, log.read_as,
+                     blocks=_played(log.blocks, speed), findings=log.findings)
 
 
 # ----------------------------------------------------------------------------- a recording

@@ -162,14 +162,6 @@ class Board:
             self.newest[message['kind']] = message
         return True
 
-    def welcome(self, why: str) -> Message:
-        """Return the answer to ``hello``; `why` commands are not accepted is empty if they are."""
-        kept = self.history.copy()
-        return {'kind': 'welcome', 'may': not why, 'why': why, 'version': __version__,
-                'exports': CALIBRATION_ALONE,
-                'history': {key: [each[key] for each in kept]
-                            for key in ('time', 'length', 'corrected')}}
-
 
 class TooManyError(InputError):
     """There are too many viewers."""
@@ -251,7 +243,11 @@ class Viewer:
     async def _send_all(self) -> None:
         """Send what is new, until the viewer ends or takes no data."""
         try:
-            await self._send(self._board.welcome(self.why))
+            kept = self._board.history.copy()
+            await self._send({
+                'kind': 'welcome', 'may': not self.why, 'why': self.why, 'version': __version__,
+                'exports': CALIBRATION_ALONE, 'history': {
+                    key: [each[key] for each in kept] for key in ('time', 'length', 'corrected')}})
             while True:
                 self.news.clear()
                 answers = len(self._answers)  # later ones may be about a state that is not sent

@@ -16,7 +16,7 @@ succeeds on a slow machine.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import takewhile
@@ -139,6 +139,7 @@ class User(Node):
 
     def __init__(self, processes: Sequence[subprocess.Popen[bytes]],
                  report: Callable[[str], None]) -> None:
+        rclpy.init(args=[])
         super().__init__('demo')
         self._processes, self._report = processes, report
         self._executor = SingleThreadedExecutor()
@@ -154,7 +155,7 @@ class User(Node):
         for name, topic, kind in (('raw', 'imu/data_raw', Imu),
                                   ('corrected', 'imu/data_calibrated', Imu),
                                   ('truth', 'simulator/truth', Vector3Stamped)):
-            self.create_subscription(kind, topic, self._keeper(name), SENSOR)
+            self.create_subscription(kind, topic, partial(self._keep, name), SENSOR)
         # Made once: DDS drops an answer to a client that the node has not discovered yet.
         self._triggers = {name: self.create_client(Trigger, name) for name in _SERVICES}
 
@@ -162,15 +163,10 @@ class User(Node):
         at = [marker.pose.position for marker in markers.markers if marker.ns == 'poses']
         self._poses = np.array([[point.x, point.y, point.z] for point in at]).reshape(-1, 3)
 
-    def _keeper(self, name: str) -> Callable[[Any], None]:
-        kept = self._messages[name]
-
-        def keep(message: Any) -> None:
-            stamp = message.header.stamp
-            vector = message.vector if name == 'truth' else message.linear_acceleration
-            kept[stamp.sec * 10 ** 9 + stamp.nanosec] = vector.x, vector.y, vector.z
-
-        return keep
+    def _keep(self, name: str, message: Any) -> None:
+        stamp = message.header.stamp
+        vector = message.vector if name == 'truth' else message.linear_acceleration
+        self._messages[name][stamp.sec * 10 ** 9 + stamp.nanosec] = vector.x, vector.y, vector.z
 
     @property
     def _up(self) -> tuple[float, ...]:
@@ -192,9 +188,6 @@ class User(Node):
         up = self._rest('raw').sum(axis=(0, 1))
         return bool(np.any(self._poses @ up > _SAME_POSE * np.linalg.norm(up)))
 
-    def _has_rested(self, count: int, *names: str) -> bool:
-        return len(self._rest(*names)) >= count
-
     def turn(self, service: str = 'next') -> None:
         """Turn the sensor, and wait until it rests."""
         self._spin(lambda: bool(self._up), 'a message of the simulator')
@@ -202,8 +195,8 @@ class User(Node):
         self.call(f'simulator/{service}')
         for kept in self._messages.values():
             kept.clear()
-        self._spin(lambda: self._up not in ((), before)
-                   and self._has_rested(_SETTLED, 'truth'), 'rest of the simulated sensor')
+        self._spin(lambda: self._up not in ((), before) and len(self._rest('truth')) >= _SETTLED,
+                   'rest of the simulated sensor')
 
     def capture(self, count: int) -> None:
         """Let the calibrator capture this number of poses."""
@@ -219,7 +212,7 @@ class User(Node):
         rests = []
         for done in range(1, count + 1):
             self.turn()
-            self._spin(lambda: self._has_rested(_SAMPLES, *_KINDS) and self._has_captured(),
+            self._spin(lambda: len(self._rest(*_KINDS)) >= _SAMPLES and self._has_captured(),
                        f'rest {done}')
             rests.append(dict(zip(_KINDS, self._rest(*_KINDS).mean(axis=0))))
             error = np.linalg.norm(rests[-1]['corrected'] - rests[-1]['truth']) * MG
@@ -230,15 +223,11 @@ class User(Node):
     def level(self) -> str:
         """Put the robot flat, and call ``~/set_level`` as soon as the rest is long enough."""
         self.turn('flat')
-        count = _SETTLED
-        while True:
-            self._spin(partial(self._has_rested, count, 'raw'), 'a longer rest')
-            try:
+        for count in range(_SETTLED, _LONGEST_REST, _SETTLED):
+            self._spin(lambda wanted=count: len(self._rest('raw')) >= wanted, 'a longer rest')
+            with suppress(AccelCalibError):
                 return self.call('calibrator/set_level')
-            except AccelCalibError:
-                count += _SETTLED
-                if count >= _LONGEST_REST:
-                    raise
+        return self.call('calibrator/set_level')
 
     def call(self, service: str) -> str:
         """Call a service, and return its answer; AccelCalibError if it fails."""
@@ -269,6 +258,7 @@ class User(Node):
         """Leave DDS."""
         self._executor.shutdown()
         self.destroy_node()
+        rclpy.try_shutdown()
 
 
 def demonstrate(report: Callable[[str], None], hidden: str = '') -> Outcome:
@@ -286,14 +276,14 @@ def demonstrate(report: Callable[[str], None], hidden: str = '') -> Outcome:
     simulated = {**_HELD, 'effects': [*_EFFECTS, *([hidden] if hidden else [])]}
     with (_isolated() as folder, running('node', _NODE) as node,
           running('simulator', simulated) as simulator,
-          user_of([node, simulator], report) as demo):
+          closing(User([node, simulator], report)) as demo):
         demo.capture(_POSES_HIDDEN if hidden else _POSES)
         report(f'~/fit: {demo.call("calibrator/fit")}')
         report(f'~/set_level: {demo.level()}')
         rests = demo.measure(_CHECKED_HIDDEN if hidden else _CHECKED)
         raw, calibrated = (_errors(rests, name) for name in ('raw', 'corrected'))
         if not hidden:
-            return Outcome(len(rests), raw, calibrated, time.monotonic() - began)
+            return Outcome(len(rests), raw, calibrated, seconds=time.monotonic() - began)
         stored = folder / 'accel_calib' / 'demo.yaml'
         fitted = read_calibration(stored).model
         report(f'~/refine: {demo.call("calibrator/refine")}')
@@ -302,9 +292,10 @@ def demonstrate(report: Callable[[str], None], hidden: str = '') -> Outcome:
         lag = refined.lags.get('temperature_of_offset')
         again = _errors(demo.measure(_CHECKED_HIDDEN), 'corrected')
         return Outcome(
-            len(rests), calibrated, again, time.monotonic() - began, parse_effect(hidden)[0],
-            tuple(str(name) for name in refined.effects if name not in fitted.effects),
-            0.0 if lag is None else lag.seconds)
+            len(rests), calibrated, again, time.monotonic() - began,
+            hidden=parse_effect(hidden)[0],
+            found=tuple(str(name) for name in refined.effects if name not in fitted.effects),
+            lag_s=0.0 if lag is None else lag.seconds)
 
 
 def _errors(rests: Sequence[Rest], name: str) -> Errors:
@@ -359,19 +350,6 @@ def running(command: str, parameters: dict[str, Any], severity: str = 'error'
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
-
-
-@contextmanager
-def user_of(processes: Sequence[subprocess.Popen[bytes]], report: Callable[[str], None]
-            ) -> Iterator[User]:
-    """Yield the user of the nodes."""
-    rclpy.init(args=[])
-    user = User(processes, report)
-    try:
-        yield user
-    finally:
-        user.close()
-        rclpy.try_shutdown()
 
 
 def _check_running(processes: Sequence[subprocess.Popen[bytes]]) -> None:

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 import gc
 from importlib import import_module
 import os
@@ -47,25 +48,6 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 _SWITCH = 1e-4
 """Switch interval of the interpreter [s]; the longest wait of a message for another thread."""
-
-
-def calibrator(args: Sequence[str] | None = None) -> int:
-    """Run the calibrator until it is ended; parameters and exit status as `run`."""
-    return run('.calibrator_node:CalibratorNode', args)
-
-
-def calibrator_lifecycle(args: Sequence[str] | None = None) -> int:
-    """Run the managed calibrator until it is ended; parameters and exit status as `run`."""
-    return run('.calibrator_node:ManagedCalibrator', args)
-
-
-def simulator(args: Sequence[str] | None = None) -> int:
-    """Run the simulator until it is ended; parameters and exit status as `run`."""
-    return run('.simulator_node:SimulatorNode', args)
-
-
-EXECUTABLES = {each.__name__: each for each in (calibrator, calibrator_lifecycle, simulator)}
-"""The executables by name: ``python -m accel_calib.ros.run calibrator``."""
 
 
 def run(node: str, args: Sequence[str] | None = None) -> int:
@@ -95,6 +77,15 @@ def run(node: str, args: Sequence[str] | None = None) -> int:
             signal.signal(number, signal.SIG_IGN)
         signal.set_wakeup_fd(-1)
     return _OK
+
+
+calibrator = partial(run, '.calibrator_node:CalibratorNode')
+calibrator_lifecycle = partial(run, '.calibrator_node:ManagedCalibrator')
+simulator = partial(run, '.simulator_node:SimulatorNode')
+
+EXECUTABLES = {'calibrator': calibrator, 'calibrator_lifecycle': calibrator_lifecycle,
+               'simulator': simulator}
+"""The executables by name: ``python -m accel_calib.ros.run calibrator``."""
 
 
 def _start(node: str, args: Sequence[str] | None, came: int) -> None:

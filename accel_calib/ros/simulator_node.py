@@ -126,14 +126,7 @@ class SimulatedImu:
         self._up, self._path = self._path[0, :3] if len(self._path) else self._up, self._path[:0]
         self._append(up)
 
-    def turn_on(self) -> bool:
-        """Let the sensor turn to the next pose now; return whether there is one."""
-        up = self._next()
-        if up is not None:
-            self.turn_to(up)
-        return up is not None
-
-    def _next(self) -> Floats | None:
+    def advance(self) -> Floats | None:
         """Return the direction of the next pose, which is then one of those so far; None: over."""
         up = next(self._coming, None)
         self.next_pose += up is not None
@@ -143,7 +136,7 @@ class SimulatedImu:
         """Return the next samples [g], at most this number; none after the end."""
         settings = self._settings
         while (lacking := count - len(self._path)) > 0:
-            up = self._next() if self._resting else None
+            up = self.advance() if self._resting else None
             if up is not None:
                 self._append(up)
             elif settings.hold or not self._resting:
@@ -212,7 +205,10 @@ class SimulatorNode(Node):
                           clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _on_next(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success = self._simulated.turn_on()
+        up = self._simulated.advance()
+        if up is not None:
+            self._simulated.turn_to(up)
+        response.success = up is not None
         response.message = (
             f'turning to pose {self._simulated.next_pose}' if response.success else
             f'all {self.settings.poses} poses are taken, expected another one: restart the '

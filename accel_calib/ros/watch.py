@@ -71,13 +71,10 @@ class _Receiver(Node):
         """Time since the last message, or since the start [s]."""
         return monotonic() - self._arrived
 
-    @property
-    def is_silent(self) -> bool:
-        """Whether a message is overdue."""
-        return self.silence > (_SILENT if self.received else _FIRST)
-
-    def problem(self) -> tuple[str, str]:
-        """Return what was found and expected, and what to do, if no messages arrive."""
+    def problem(self) -> tuple[str, ...]:
+        """Return what was found and expected, and what to do, if a message is overdue."""
+        if self.silence <= (_SILENT if self.received else _FIRST):
+            return ()
         topic = self._topic
         others = [name.removesuffix(_SUFFIX) for name, kinds in self.get_topic_names_and_types()
                   if name.endswith(_SUFFIX) and 'diagnostic_msgs/msg/DiagnosticStatus' in kinds
@@ -108,9 +105,7 @@ def watch(name: str, show: Show, is_over: Callable[[], bool], args: Sequence[str
         show(receiver.calibrator, None, problem)
         while not is_over():
             spin()
-            before, problem = problem, ''
-            if receiver.is_silent:
-                problem = '; '.join(receiver.problem())
+            before, problem = problem, '; '.join(receiver.problem())
             if receiver.received != shown or problem != before:
                 shown = receiver.received
                 show(receiver.calibrator, receiver.progress, problem)
@@ -129,8 +124,8 @@ def current(name: str, is_over: Callable[[], bool], args: Sequence[str] = ()
             spin()
             if receiver.received and receiver.silence > _NEXT:
                 break
-            if receiver.is_silent:
-                raise InputError(*receiver.problem())
+            if problem := receiver.problem():
+                raise InputError(*problem)
         return receiver.calibrator, receiver.progress
 
 

@@ -24,7 +24,7 @@ from .session import BATCH, Session
 from .settings import (
     CalibratorSettings, changed, columns_of, context_topics, default_of, expected, parameter,
     Settings, WEB_PORT)
-from .state import Check, checks, diagnostics, figures, Progress, progress, words_of_state
+from .state import Check, diagnostics, figures, Progress, progress, words_of_state
 from .store import ros_home
 from .stream import Around
 from .worker import (
@@ -35,6 +35,6 @@ __all__ = ['APART', 'BATCH', 'COMMANDS', 'WEB_PORT', 'Answer', 'Around', 'Calibr
            'CallSoon', 'Check', 'Compute', 'Event', 'Files', 'Log', 'Mounting', 'Progress',
            'Result', 'Session', 'Settings', 'Severity', 'ShowPoses', 'State', 'Step', 'Still',
            'Surroundings', 'Task', 'Throttle', 'Worker', 'WorkerProcess', 'answered', 'changed',
-           'checks', 'columns_of', 'conditions', 'context_topics', 'default_of', 'diagnostics',
+           'columns_of', 'conditions', 'context_topics', 'default_of', 'diagnostics',
            'enable', 'expected', 'figures', 'next_step', 'nothing', 'parameter', 'progress',
            'ros_home', 'run', 'state', 'title', 'words_of_state']

@@ -138,31 +138,28 @@ def _auto_fit(session: Holder, sensor: Sensor) -> Task:
 
 def fit(session: Holder) -> Part[Fitted]:
     """Fit the poses; the values of a refined calibration are fitted anew."""
-    state = session.state
-    return (yield from _compute(session, fitting.fit, state.units, state.settings, state.name,
-                                state.sensor.present))
+    return (yield from _compute(session, fitting.fit, settings=session.state.settings))
 
 
 def refine(session: Holder) -> Part[Fitted]:
     """Refine the calibration."""
     state = session.state
     hint = '' if 'temperature' in state.around.values else thermometer_words(state)
-    fitted = yield from _compute(session, fitting.refine, state.units, state.name,
-                                 state.sensor.present, hint, state.own)
+    fitted = yield from _compute(session, fitting.refine, hint=hint, own=state.own)
     session.change_sensor(guide=session.sensor.guide.follow(fitted.refinement.plan.poses))
     return fitted
 
 
-def _compute(session: Holder, function: Callable[..., Fitted], *given: Any) -> Part[Any]:
+def _compute(session: Holder, function: Callable[..., Fitted], **given: Any) -> Part[Any]:
     """Return what a function makes of the poses; fail if it is not fit for use, or outdated."""
     session.state.files.usable()
-    sensor, name = session.sensor, function.__name__
-    sensor.live.refresh()
-    count = len(sensor.live.book.poses())
-    session.change(computing=session.state.computing + 1)
+    state, sensor, name = session.state, session.sensor, function.__name__
+    session.change(computing=state.computing + 1)
     try:
-        poses = sensor.live.poses(session.state.found)
-        found = yield Compute(function, poses, *given)
+        poses = sensor.live.poses(state.found)
+        count = len(sensor.live.book.poses())
+        found = yield Compute(function, poses, units=state.units, sensor=state.name,
+                              before=sensor.present, **given)
     except RefusedFitError as error:
         session.refuse('poses', error.advice)
         raise
@@ -171,11 +168,15 @@ def _compute(session: Holder, function: Callable[..., Fitted], *given: Any) -> P
     if session.sensor.live is not sensor.live or session.sensor.changes != sensor.changes:
         raise ChangedError(f'another command changed the calibration during ~/{name}; '
                            'the result is discarded', f'call ~/{name} again')
-    if found.refusal:
-        why, advice = found.refusal
+    rating, refinement = found.rating, found.refinement
+    refusal = (rating.reason, rating.next.text) if rating.name == 'BAD' else ()
+    if refinement is not None and refinement.refusal:
+        refusal = refinement.refusal
+    if refusal:
+        why, advice = refusal
         session.refuse('poses', advice)
-        if found.refinement is not None:
-            rate(session, found.refinement)
+        if refinement is not None:
+            rate(session, refinement)
         raise RefusedFitError(f'{found.words}; not used: {why}', advice)
     session.change_sensor(fitted_poses=count)
     return found

@@ -22,7 +22,6 @@ import math
 from operator import is_, is_not
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..finding import Finding
 from ..stillness import (
@@ -68,8 +67,16 @@ class PoseBook:
     def _selected(self, dwells: list[Dwell]) -> list[Dwell]:
         """Keep, merge or refuse repeated poses, separately in each band of the context."""
         dwells = with_temperature(dwells)
+        keys = sorted({key for dwell in dwells for key in dwell.context} - {'rate'})
+        numbers = np.full((len(dwells), len(keys)), -1, np.int64)  # of the bands; unknown: -1
+        for k, key in enumerate(keys):
+            values = np.array([dwell.context.get(key, np.nan) for dwell in dwells], float)
+            known = np.isfinite(values)
+            least, width = np.min(values[known]), np.ptp(values[known]) / _BANDS
+            least, width = (0.0, _BAND) if key == 'temperature' else (least, width or 1.0)
+            numbers[known, k] = np.round((values[known] - least) / width)
         bands: dict[bytes, list[Dwell]] = {}
-        for dwell, band in zip(dwells, _bands(dwells), strict=True):
+        for dwell, band in zip(dwells, numbers, strict=True):
             bands.setdefault(band.tobytes(), []).append(dwell)
         return [dwell for band in bands.values()
                 for dwell in select(band, self._settings, self._units)]
@@ -80,8 +87,19 @@ class PoseBook:
         return known.count(False), known.count(True)
 
     def add_stored(self, poses: Poses) -> None:
-        """Insert stored poses before the others."""
-        self._earlier[:0] = [_dwell_of(poses, k) for k in range(len(poses))]
+        """Insert stored poses before the others, each with an orientation of its own."""
+        stored, unknown = [], np.full(3, np.nan)
+        for k in range(len(poses)):
+            row = {key: poses[key][k] for key in poses.columns}
+            time, count = float(row.get('time', 0.0)), float(row.get('count', 1.0))
+            stored.append(Dwell(
+                start=time, end=time, time=time, mean=row['reading'],
+                std=row.get('std', np.zeros(3)), count=count, samples=max(1, round(count)),
+                context={key: row[key] for key in (*CONTEXT, 'rate', *poses.quantities)
+                         if key in row and np.all(np.isfinite(row[key]))},
+                orientation=-1 - k, doubtful=bool(row.get('doubtful', False)),
+                rate_std=row.get('rate_std', unknown), at_limit=bool(row.get('at_limit', False))))
+        self._earlier[:0] = stored
 
     def holds(self, dwell: Dwell) -> bool:
         """Return whether this rest is a provisional pose."""
@@ -94,15 +112,18 @@ class PoseBook:
     def put(self, dwell: Dwell, *, ended: bool) -> None:
         """Add the pose of a rest, or replace its provisional one; provisional until it `ended`."""
         self.held = [each for each in self.held if not overlap(dwell, each)]
-        if not any(_has_same_samples(each, dwell) for each in (*self._earlier, *self._dwells)):
+        for each in (*self._earlier, *self._dwells):
+            noise = np.hypot(dwell.std / np.sqrt(dwell.count), each.std / np.sqrt(each.count))
+            if (overlap(each, dwell) and not each.doubtful
+                    and np.all(np.abs(each.mean - dwell.mean) <= _SAME_MEAN * noise)):
+                break  # the same stamps and mean: a recording is played again
+        else:
             (self._dwells if ended else self.held).append(dwell)
         if len(self._dwells) > _SEPARATE:
             self._earlier = self._selected([*self._earlier, self._dwells.pop(0)])
 
-    def doubt_held(self, is_over: Callable[[Dwell], bool]) -> int:
-        """Mark provisional poses without a final average as doubtful; return their number."""
-        over = [each for each in self.held if is_over(each)]
-        self.held = [each for each in self.held if not is_over(each)]
+    def doubt(self, over: list[Dwell]) -> int:
+        """Mark poses that will get no final average as doubtful; return their number."""
         for dwell in over:
             self.put(replace(dwell, doubtful=True), ended=True)
         return len(over)
@@ -120,19 +141,6 @@ class PoseBook:
     def clear(self) -> None:
         """Remove all poses."""
         self._earlier, self._dwells, self.held = [], [], []
-
-
-def _bands(dwells: list[Dwell]) -> NDArray[np.int64]:
-    """Return the (n, k) band of each dwell in each column of the context; unknown: -1."""
-    keys = sorted({key for dwell in dwells for key in dwell.context} - {'rate'})
-    found = np.full((len(dwells), len(keys)), -1, np.int64)
-    for k, key in enumerate(keys):
-        values = np.array([dwell.context.get(key, np.nan) for dwell in dwells], float)
-        known = np.isfinite(values)
-        least, width = np.min(values[known]), np.ptp(values[known]) / _BANDS
-        least, width = (0.0, _BAND) if key == 'temperature' else (least, width or 1.0)
-        found[known, k] = np.round((values[known] - least) / width)
-    return found
 
 
 def with_temperature(dwells: list[Dwell]) -> list[Dwell]:
@@ -153,27 +161,6 @@ def with_temperature(dwells: list[Dwell]) -> list[Dwell]:
 def overlap(one: Dwell | Rest, other: Dwell) -> bool:
     """Return whether two dwells overlap in time; they are then the same rest."""
     return one.start <= other.end and other.start <= one.end
-
-
-def _has_same_samples(one: Dwell, other: Dwell) -> bool:
-    """Return whether two dwells have the same stamps and mean: a recording is played again."""
-    noise = np.hypot(one.std / np.sqrt(one.count), other.std / np.sqrt(other.count))
-    return (overlap(one, other) and not one.doubtful
-            and bool(np.all(np.abs(one.mean - other.mean) <= _SAME_MEAN * noise)))
-
-
-def _dwell_of(poses: Poses, k: int) -> Dwell:
-    """Return a row of a table as a dwell, with an orientation of its own."""
-    time = float(poses['time'][k]) if 'time' in poses else 0.0
-    count = float(poses['count'][k]) if 'count' in poses else 1.0
-    std = poses['std'][k] if 'std' in poses else poses.reading[k] * 0.0
-    context = {key: poses[key][k] for key in (*CONTEXT, 'rate', *poses.quantities)
-               if key in poses and np.all(np.isfinite(poses[key][k]))}
-    doubtful, at_limit = (name in poses and bool(poses[name][k])
-                          for name in ('doubtful', 'at_limit'))
-    rate_std = poses['rate_std'][k] if 'rate_std' in poses else np.full(3, np.nan)
-    return Dwell(time, time, time, poses.reading[k], std, count, max(1, round(count)), context,
-                 -1 - k, doubtful, rate_std, at_limit=at_limit)
 
 
 LONG_REST = 300.0
@@ -255,9 +242,13 @@ class LiveCapture:
         """
         Return the poses with findings about their samples: these, and those of the rests.
 
-        RefusedFitError if no sensor measures so.
+        The provisional pose of the ongoing rest is updated. RefusedFitError if no sensor measures
+        so.
 
         """
+        ongoing = self.detector.current() if self.book.held else None
+        if ongoing is not None and self.book.holds(ongoing):
+            self.book.put(ongoing, ended=False)
         check_measured(self.detector.lengths, self._units)
         judged = self.detector.judged()
         ends = {each.start: each.at_limit for each in judged}  # the later ones show it, too
@@ -274,12 +265,6 @@ class LiveCapture:
         """Capture the ongoing rest as a pose."""
         self.book.put(rest, ended=False)
         self._declined = None
-
-    def refresh(self) -> None:
-        """Update the pose of the ongoing rest, if it is a provisional one."""
-        dwell = self.detector.current() if self.book.held else None
-        if dwell is not None and self.book.holds(dwell):
-            self.book.put(dwell, ended=False)
 
     def undo(self) -> bool:
         """Remove the last pose and do not capture it again; return whether a pose was removed."""
@@ -305,7 +290,13 @@ class LiveCapture:
             return None
         self._looked = time
         if not still:
-            return self._doubt_held(time)
+            over, (windows, samples) = [], _SURELY_OVER
+            for held in self.book.held:
+                period = (held.end - held.start) / held.samples
+                away = max(windows * self._settings.still_window, samples * period)
+                if not held.start <= time <= max(held.end, self._was_still) + away:
+                    over.append(held)
+            return Change(poses=True, doubted=self.book.doubt(over)) if over else None
         dwell = self.detector.current()
         if dwell is None:
             return None
@@ -326,7 +317,7 @@ class LiveCapture:
         if latest:
             self._rest = last
         # Rests end in order: an older provisional pose will not get a final average.
-        doubted = self.book.doubt_held(lambda dwell: dwell.end < last.start)
+        doubted = self.book.doubt([each for each in self.book.held if each.end < last.start])
         threshold = self.detector.threshold
         if threshold <= _NOISE_FELL * self._judged_at:
             self._judged_at = threshold
@@ -334,14 +325,3 @@ class LiveCapture:
             doubted += self.book.mark(lambda each: replace(each, doubtful=True) if (
                 each.start in moved and not each.doubtful) else each)
         return Change(last if latest else None, tuple(ended), bool(captured or doubted), doubted)
-
-    def _doubt_held(self, time: float) -> Change | None:
-        """Mark provisional poses as doubtful that will not get a final average."""
-        def is_over(dwell: Dwell) -> bool:
-            windows, samples = _SURELY_OVER
-            period = (dwell.end - dwell.start) / dwell.samples
-            away = max(windows * self._settings.still_window, samples * period)
-            return not dwell.start <= time <= max(dwell.end, self._was_still) + away
-
-        count = self.book.doubt_held(is_over)
-        return Change(poses=True, doubted=count) if count else None

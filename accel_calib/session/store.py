@@ -326,49 +326,13 @@ _TO_LOCK = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 """A link is not followed, because the lock would empty its target; a pipe does not block."""
 
 
-class StoreInUseError(AccelCalibError):
-    """Another node uses the files."""
-
-
-def lock(store: Store) -> ExitStack:
-    """
-    Lock the files of a store until the result is closed.
-
-    StoreInUseError if another process has locked them.
-
-    """
-    path = store.calibration.with_name(f'{store.calibration.stem}.lock')
-    with ExitStack() as held:
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            handle = os.open(path, _TO_LOCK, 0o644)
-        except OSError:
-            return held  # the folder cannot be written, so there is nothing to protect
-        held.callback(os.close, handle)
-        if not stat.S_ISREG(os.fstat(handle).st_mode):
-            return held
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            holder = os.read(handle, 32).decode(errors='replace').strip()
-            raise StoreInUseError(
-                f'{store.calibration} is used by the node with process id {holder or "unknown"}',
-                'stop that node, or restart this node with another calibration_file or sensor'
-            ) from None
-        except OSError:
-            return held  # this file system has no locks
-        with suppress(OSError):  # without space on the disk, the lock does not name its holder
-            os.ftruncate(handle, 0)
-            os.pwrite(handle, f'{os.getpid()}\n'.encode(), 0)
-        return held.pop_all()
-
-
 @dataclass(frozen=True)
 class SensorFiles:
     """
     The store of a sensor, None until the sensor is known, and its `lock`, None without it.
 
-    `problem` is why another node has the lock; empty if none has it.
+    `problem` is why another node has the lock; empty if none has it. Where files cannot be locked,
+    the lock is empty.
 
     """
 
@@ -382,13 +346,32 @@ class SensorFiles:
         return '' if self.store is None else str(self.store.calibration)
 
     def take(self) -> SensorFiles:
-        """Return the files, locked unless another node uses them."""
+        """Return the files, locked until `release` unless another process has locked them."""
         if self.store is None or self.lock is not None:
             return self
-        try:
-            return replace(self, lock=lock(self.store), problem='')
-        except StoreInUseError as error:
-            return replace(self, problem=str(error))
+        path, mine = self.store.calibration, replace(self, lock=ExitStack(), problem='')
+        with ExitStack() as lock:
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                handle = os.open(path.with_name(f'{path.stem}.lock'), _TO_LOCK, 0o644)
+            except OSError:
+                return mine  # the folder cannot be written, so there is nothing to protect
+            lock.callback(os.close, handle)
+            if not stat.S_ISREG(os.fstat(handle).st_mode):
+                return mine
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                holder = os.read(handle, 32).decode(errors='replace').strip() or 'unknown'
+                return replace(self, problem=str(InputError(
+                    f'{path} is used by the node with process id {holder}', 'stop that node, or '
+                    'restart this node with another calibration_file or sensor')))
+            except OSError:
+                return mine  # this file system has no locks
+            with suppress(OSError):  # without space on the disk, the lock does not name its holder
+                os.ftruncate(handle, 0)
+                os.pwrite(handle, f'{os.getpid()}\n'.encode(), 0)
+            return replace(mine, lock=lock.pop_all())
 
     def usable(self) -> Store:
         """Return the locked store; InputError if the sensor is not known, or it is not locked."""

@@ -8,6 +8,7 @@ Ratings, plans and files take time, so they are tasks, which are added to the ev
 
 """
 
+from dataclasses import replace
 import json
 import math
 
@@ -107,13 +108,15 @@ def show_poses(session: Holder, *, store: bool, new_rest: Dwell | None = None) -
     """Add a task that stores the poses, and draws them with the next pose."""
     sensor, guide = session.sensor, session.sensor.guide
     poses = sensor.live.book.poses()
-    session.change_sensor(guide=guide.note(len(poses), session.state.statistics.stamp))
+    if len(poses) != guide.count:
+        session.change_sensor(guide=replace(
+            guide, count=len(poses), new_at=session.state.statistics.stamp))
     session.events.append(_draw_poses(
-        session, sensor, poses, len(poses) - guide.count, new_rest,
-        session.state.files.store if store else None))
+        session, sensor, poses, added=len(poses) - guide.count, new_rest=new_rest,
+        store=session.state.files.store if store else None))
 
 
-def _draw_poses(session: Holder, sensor: Sensor, poses: Poses, added: int,
+def _draw_poses(session: Holder, sensor: Sensor, poses: Poses, *, added: int,
                 new_rest: Dwell | None, store: Store | None) -> Task:
     """Store and draw poses, this number more than before; return the line of a new rest."""
     state, guide, missed = session.state, session.sensor.guide, ''

@@ -46,7 +46,7 @@ from select import select
 import signal
 import subprocess
 import sys
-from threading import Lock, Thread
+from threading import RLock, Thread
 from time import monotonic
 from traceback import format_exc
 from typing import Any, BinaryIO, cast, Literal, TypeVar
@@ -87,7 +87,7 @@ class WorkerProcess:
         self._process: subprocess.Popen[bytes] | None = None
         self._closed = False
         self._idle = idle
-        self._turn = Lock()
+        self._turn = RLock()
 
     def start(self) -> None:
         """Start the process unless it is running, without waiting for it."""
@@ -116,7 +116,18 @@ class WorkerProcess:
 
         """
         with self._turn:
-            return self._call(function, given, limit_s)
+            try:
+                good, found = self._ask(pickle.dumps((function, given)), limit_s)
+            except (OSError, EOFError, pickle.UnpicklingError) as err:
+                if self._closed:
+                    raise ClosedError('the node is shutting down', 'start it again') from None
+                self._end()
+                if limit_s is not None:
+                    raise err if isinstance(err, TimeoutError) else EOFError from err
+                return function(*given)
+        if not good:
+            raise found
+        return cast('Found', found)
 
     def call_if_free(self, function: Callable[..., Found], *given: Any) -> Found:
         """Call a function as `call` does, or at once in this process if the other one is busy."""
@@ -124,26 +135,11 @@ class WorkerProcess:
             return function(*given)
         try:
             is_running = self._process is not None and self._process.poll() is None
-            return self._call(function, given) if is_running else function(*given)
+            return self.call(function, *given) if is_running else function(*given)
         except ClosedError:  # what the user has asked to store is stored
             return function(*given)
         finally:
             self._turn.release()
-
-    def _call(self, function: Callable[..., Found], given: tuple[Any, ...],
-              limit_s: float | None = None) -> Found:
-        try:
-            good, found = self._ask(pickle.dumps((function, given)), limit_s)
-        except (OSError, EOFError, pickle.UnpicklingError) as err:
-            if self._closed:
-                raise ClosedError('the node is shutting down', 'start it again') from None
-            self._end()
-            if limit_s is not None:
-                raise err if isinstance(err, TimeoutError) else EOFError from err
-            return function(*given)
-        if not good:
-            raise found
-        return cast('Found', found)
 
     def _ask(self, request: bytes, limit_s: float | None) -> tuple[bool, Any]:
         self.start()
@@ -224,7 +220,8 @@ class Step(partial[Any]):
         given = [each.run(call) if isinstance(each, Step) else each for each in self.args]
         if self.func is nothing:
             return None
-        return self.func(*given) if isinstance(self, Files) else call(self.func, *given)
+        function = partial(self.func, **self.keywords)
+        return function(*given) if isinstance(self, Files) else call(function, *given)
 
 
 class Parse(Step):
