@@ -187,8 +187,8 @@ if find_spec('aiohttp'):  # what the live page needs is not installed everywhere
     from accel_calib.live.host import Host
     from accel_calib.live.server import PageServer
     from accel_calib.live.viewer import (
-        announce, COMMANDS as LIVE_COMMANDS, LARGEST as LARGEST_LIVE_MESSAGE,
-        PERIOD as LIVE_PERIOD, qr_code, reachable)
+        announce, BUTTONS, LARGEST as LARGEST_LIVE_MESSAGE, PERIOD as LIVE_PERIOD, qr_code,
+        reachable)
 
     PATIENCE_FOR_A_HELLO = viewer, '_HELLO_S'
     PATIENCE_FOR_A_REQUEST = server, '_REQUEST_S'

@@ -21,9 +21,9 @@ from accel_calib.session import CalibratorSettings
 from accel_calib.table import Floats
 from accel_calib.units import units_of
 from inside import (
-    CALIBRATION_ALONE, Host, LARGEST_LIVE_MESSAGE, LIVE_COMMANDS, LIVE_PERIOD, model_with,
-    PAGE_FOLDER, PageServer, PATIENCE_FOR_A_HELLO, PATIENCE_FOR_A_REQUEST, PERIOD_OF_A_COMPLAINT,
-    qr_code, reachable, simulate_recording, Source, spread_directions, STUCK)
+    BUTTONS, CALIBRATION_ALONE, Host, LARGEST_LIVE_MESSAGE, LIVE_PERIOD, model_with, PAGE_FOLDER,
+    PageServer, PATIENCE_FOR_A_HELLO, PATIENCE_FOR_A_REQUEST, PERIOD_OF_A_COMPLAINT, qr_code,
+    reachable, simulate_recording, Source, spread_directions, STUCK)
 import numpy as np
 import pytest
 from shared import children, GRAVITY, wait
@@ -231,7 +231,7 @@ def test_without_the_token_the_page_only_shows(shared: Bench, token: str, words:
     wait(lambda: viewer.of('progress'))
     assert not viewer.got[0]['may']
     assert words in viewer.got[0]['why']
-    for command in LIVE_COMMANDS:
+    for command in BUTTONS:
         answer = viewer.ask(command)
         assert (answer['success'], answer['words']) == (False, viewer.got[0]['why'])
     assert shared.host.server.token not in str(viewer.got)

@@ -24,8 +24,8 @@ from ..findings import angle_words, rate, residual_figures
 from ..messages.one_reading import Triple
 from ..report import calibration_page, STORED
 from ..session import (
-    Answer, APART, CallSoon, Compute, conditions, enable, Event, Log, progress, Result, run,
-    Session, ShowPoses, Task, title, words_of_state, Worker)
+    Answer, APART, CallSoon, Compute, conditions, Event, Log, progress, Result, run, Session,
+    ShowPoses, Task, title, words_of_state, Worker)
 from ..stored.exports import export
 
 Show = Callable[[Message], object]
@@ -122,7 +122,7 @@ class Exchange:
     # The page asks
 
     def ask(self, name: str, answer: Answer) -> None:
-        """Run a command of `viewer.COMMANDS`, and call `answer`."""
+        """Run one of `BUTTONS`, and call `answer`."""
         if name in self._worker.running:
             answer(False, f'{name} is still running; wait for its answer')
             return
@@ -131,14 +131,9 @@ class Exchange:
             self.show_state()  # a viewer knows what has changed when the answer comes
             answer(success, words)
 
-        self._worker.do(name, self._command(name), done)
+        self._worker.do(name, run(self._session, name, offers=True), done)
         if self._worker.running:
             self.show_state()
-
-    def _command(self, name: str) -> Task:
-        if name in ('enable', 'disable'):
-            return enable(self._session, name == 'enable')
-        return (yield from run(self._session, name, offers=True))
 
     def page(self, answer: Answer) -> None:
         """Call `answer` with the calibration page, which is drawn once, or why there is none."""

@@ -324,7 +324,7 @@ class PageServer:
         """Return a file of the page, the calibration page, or an export."""
         export = path.removeprefix('/export/')
         if path == '/calibration.html':
-            success, text = await self._asked(self._exchange.page)
+            success, text = await self._ask(self._exchange.page)
             if not success:
                 return web.Response(status=404, text=f'{text}\n')
             allowed = {'Content-Security-Policy': f"{policy()}; frame-ancestors 'self'"}
@@ -339,23 +339,19 @@ class PageServer:
         if kind.lower() != 'bearer' or not self._is_token(token.strip()):
             return web.Response(status=401, headers={'WWW-Authenticate': 'Bearer'}, text=(
                 f'the token is missing or wrong; {_ITS_LINK}\n'))
-        _, found = await self._asked(partial(self._exchange.export, export))
+        _, found = await self._ask(partial(self._exchange.export, export))
         if isinstance(found, str):
             return web.Response(status=409, text=f'{found}\n')
         return web.Response(
             body=found.data, content_type='application/octet-stream',
             headers={'Content-Disposition': f'attachment; filename="calibration{found.suffix}"'})
 
-    async def _asked(self, ask: Callable[[Answer], object]) -> Any:
+    async def _ask(self, ask: Callable[[Answer], object]) -> Any:
         """Return success and answer of a function of the exchange."""
-        answered: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
-
-        def take(*found: Any) -> None:
-            if not answered.done():
-                answered.set_result(found)
-
-        self._exchange.call_soon(lambda: ask(lambda *found: self._call(lambda: take(*found))))
-        return await answered
+        answered: Future[Any] = Future()
+        answered.set_running_or_notify_cancel()  # its answer comes even if nobody waits any more
+        self._exchange.call_soon(lambda: ask(lambda *found: answered.set_result(found)))
+        return await asyncio.wrap_future(answered)
 
     async def _stream(self, request: web.BaseRequest, connection: Connection
                       ) -> web.StreamResponse:
@@ -370,7 +366,8 @@ class PageServer:
             return secured(web.Response(status=400, text='expected a WebSocket; open /\n'))
         await socket_.prepare(request)
         connection.stage = 2
-        viewer = Viewer(self.board, socket_, connection.abort, self._ask)
+        viewer = Viewer(self.board, socket_, connection.abort,
+                        lambda command: self._ask(partial(self._exchange.ask, command)))
         try:
             await viewer.run(partial(self._admit, connection))
         finally:
@@ -396,8 +393,3 @@ class PageServer:
         if not viewer.why:
             connection.stage = OWNER
         self.viewers[viewer] = connection
-
-    def _ask(self, command: str, answer: Callable[[bool, str], None]) -> None:
-        """Ask the exchange, and call `answer` in this thread."""
-        self._exchange.call_soon(lambda: self._exchange.ask(
-            command, lambda success, words: self._call(lambda: answer(success, words))))

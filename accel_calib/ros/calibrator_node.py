@@ -46,11 +46,11 @@ from ..errors import AccelCalibError
 from ..finding import LEVELS
 from ..findings import request_words
 from ..live import check_installed
+from ..logs import named_topics
 from ..messages.correction import output_frame
 from ..session import (
-    CalibratorSettings, CallSoon, Check, COMMANDS, conditions, context_topics, diagnostics, enable,
-    Event, figures, Log, Mounting, progress, Result, run, Session, ShowPoses, Still, Surroundings,
-    Task, Worker)
+    CalibratorSettings, CallSoon, Check, COMMANDS, conditions, diagnostics, enable, Event, figures,
+    Log, Mounting, progress, Result, run, Session, ShowPoses, Still, Surroundings, Task, Worker)
 from ..table import Floats
 
 if TYPE_CHECKING:
@@ -159,7 +159,7 @@ class Calibrator:
         node, overrides, settings = self._node, self._overrides, self.session.state.settings
         node.create_subscription(Imu, 'imu/data_raw', self.stream.on_message, SENSOR, raw=True,
                                  qos_overriding_options=overrides)
-        if 'temperature' not in context_topics(settings):
+        if 'temperature' not in named_topics(settings.context):
             around = self.session.state.around
             node.create_subscription(
                 Temperature, 'temperature',
@@ -346,7 +346,7 @@ class ManagedCalibrator(LifecycleNode):
             self._calibrator = Calibrator(self)
         except AccelCalibError as error:
             self.get_logger().error(str(error))
-            self._destroy_entities()
+            self.on_cleanup(state)
             return TransitionCallbackReturn.FAILURE
         self._calibrator.stream.set_active(active=False)
         self._calibrator.start()
@@ -355,7 +355,15 @@ class ManagedCalibrator(LifecycleNode):
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Close the files and remove all topics and services."""
         self.close()
-        self._destroy_entities()
+        for kinds, destroy in ((self.publishers, self.destroy_publisher),
+                               (self.subscriptions, self.destroy_subscription),
+                               (self.services, self.destroy_service),
+                               (self.timers, self.destroy_timer)):
+            for each in list(kinds):
+                if each not in self._own:
+                    # The executor calls these for the events that it has already received.
+                    each.callback = each.send_response = lambda *given: None
+                    destroy(each)
         return TransitionCallbackReturn.SUCCESS
 
     on_shutdown = on_cleanup
@@ -374,15 +382,3 @@ class ManagedCalibrator(LifecycleNode):
         if self._calibrator is not None:
             self._calibrator.close()
             self._calibrator = None
-
-    def _destroy_entities(self) -> None:
-        """Remove what the calibrator has created in this node."""
-        for kinds, destroy in ((self.publishers, self.destroy_publisher),
-                               (self.subscriptions, self.destroy_subscription),
-                               (self.services, self.destroy_service),
-                               (self.timers, self.destroy_timer)):
-            for each in list(kinds):
-                if each not in self._own:
-                    # The executor calls these for the events that it has already received.
-                    each.callback = each.send_response = lambda *given: None
-                    destroy(each)

@@ -16,8 +16,7 @@ have no leading slash.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import fields
-from difflib import get_close_matches
+from dataclasses import dataclass, field, fields
 import math
 from typing import Any, TYPE_CHECKING
 
@@ -66,16 +65,6 @@ def declared(node: Node, kind: type[Settings], *, fixed: bool = True) -> Setting
         raise InputError(str(error), 'correct the value') from error
     return changed(kind(), {each.name: node.get_parameter(each.name).value
                             for each in fields(kind)})
-
-
-def misspelt(node: Node) -> list[str]:
-    """Return one line for each parameter that was given to a node and that it does not have."""
-    names = [name for name in node._parameter_overrides if not node.has_parameter(name)
-             and not name.startswith('qos_overrides.')]
-    known = list(node.get_parameters_by_prefix(''))
-    near = {name: ' or '.join(get_close_matches(name, known)) for name in names}
-    return [f'there is no parameter {name}, expected {words or "one of ros2 param list"}: correct '
-            'the name' for name, words in near.items()]
 
 
 def follow(node: Node, settings: Callable[[], Settings],
@@ -196,11 +185,11 @@ def needs_tf2(parameter: str) -> Any:
     return TFMessage
 
 
+@dataclass(frozen=True)
 class StaticTransforms:
-    """A tree of frames, and the rotations between them."""
+    """A tree of frames: the parent of each frame, and the rotation of vectors to the parent."""
 
-    def __init__(self) -> None:
-        self._parents: dict[str, tuple[str, Floats]] = {}
+    parents: dict[str, tuple[str, Floats]] = field(default_factory=dict)
 
     def add(self, parent: str, child: str, quaternion: Sequence[float]) -> bool:
         """
@@ -228,8 +217,8 @@ class StaticTransforms:
                 f'{z:g}, {w:g}) of length {math.sqrt(squared):.3g}, expected length 1',
                 'correct the node that publishes it')
         rotation = rotation_from_quaternion(quaternion)
-        before = self._parents.get(child)
-        self._parents[child] = (parent, rotation)
+        before = self.parents.get(child)
+        self.parents[child] = (parent, rotation)
         return before is None or before[0] != parent or not np.array_equal(before[1], rotation)
 
     def rotation(self, base: str, frame: str) -> Floats | None:
@@ -244,8 +233,8 @@ class StaticTransforms:
     def _rotations_above(self, frame: str) -> dict[str, Floats]:
         """Return the rotation from a frame to itself and to each frame above it, nearest first."""
         found: dict[str, Floats] = {frame: np.eye(3)}
-        while frame in self._parents:
-            parent, mat_parent_frame = self._parents[frame]
+        while frame in self.parents:
+            parent, mat_parent_frame = self.parents[frame]
             found[parent] = mat_parent_frame @ found[frame]
             frame = parent
         return found

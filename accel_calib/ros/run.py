@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from difflib import get_close_matches
 from functools import partial
 import gc
 from importlib import import_module
@@ -113,8 +114,6 @@ def _spin(node: Any, came: int) -> None:
     """Run a node until a signal came."""
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
     from rclpy.task import Future
-
-    from .declare import misspelt
     try:
         from rclpy.experimental import EventsExecutor as Executor  # it has the least overhead
     except ImportError:
@@ -130,8 +129,12 @@ def _spin(node: Any, came: int) -> None:
     sys.setswitchinterval(_SWITCH)
     try:
         node.start()
-        for line in misspelt(node):
-            node.get_logger().error(line)
+        known = list(node.get_parameters_by_prefix(''))
+        for name in node._parameter_overrides:
+            if not name.startswith('qos_overrides.') and not node.has_parameter(name):
+                near = ' or '.join(get_close_matches(name, known)) or 'one of ros2 param list'
+                node.get_logger().error(
+                    f'there is no parameter {name}, expected {near}: correct the name')
         gc.freeze()  # permanent objects are not scanned again, which would take tens of ms
         Thread(target=end, daemon=True).start()
         while node.context.ok() and not ended.done():

@@ -34,10 +34,10 @@ from .declare import published_by_others, SENSOR
 from ..errors import AccelCalibError, InputError
 from ..logs import (
     ACCELERATION, field_of, IMU_DOUBLES, joined, Layout, layout_of, LITTLE_ENDIAN, NAME_AT,
-    samples_of, THREE, topic_and_field)
+    named_topics, samples_of, THREE, topic_and_field)
 from ..messages.correction import motion_of, output_frame, Rewriter
 from ..messages.one_reading import Triple
-from ..session import Around, BATCH, CalibratorSettings, columns_of, context_topics, Session
+from ..session import Around, BATCH, CalibratorSettings, columns_of, Session
 from ..table import Floats
 from ..text import some
 
@@ -102,7 +102,7 @@ class ContextTopics:
 
     def __init__(self, node: Node, settings: CalibratorSettings) -> None:
         self._node, self._waiting, self._missing = node, dict[str, str](), dict[str, str]()
-        for column, asked in context_topics(settings).items():
+        for column, asked in named_topics(settings.context).items():
             topic, _, field = asked.rpartition('/')  # a field within a field is no name
             whole, field = (topic, f'/{field}') if '.' in field and topic else (asked, '')
             try:

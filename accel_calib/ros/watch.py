@@ -49,7 +49,7 @@ class _Receiver(Node):
     def __init__(self, name: str) -> None:
         # A leading underscore hides the node from ros2 node list.
         super().__init__('_accel_calib_watch', enable_rosout=False, start_parameter_services=False)
-        self._arrived = monotonic()
+        self.arrived = monotonic()  # of the last message, or the start
         self.progress: Progress | None = None
         self.received = 0
         try:
@@ -63,17 +63,12 @@ class _Receiver(Node):
 
     def _on_message(self, message: DiagnosticStatus) -> None:
         self.progress = Progress.from_figures({each.key: each.value for each in message.values})
-        self._arrived = monotonic()
+        self.arrived = monotonic()
         self.received += 1
-
-    @property
-    def silence(self) -> float:
-        """Time since the last message, or since the start [s]."""
-        return monotonic() - self._arrived
 
     def problem(self) -> tuple[str, ...]:
         """Return what was found and expected, and what to do, if a message is overdue."""
-        if self.silence <= (_SILENT if self.received else _FIRST):
+        if monotonic() - self.arrived <= (_SILENT if self.received else _FIRST):
             return ()
         topic = self._topic
         others = [name.removesuffix(_SUFFIX) for name, kinds in self.get_topic_names_and_types()
@@ -122,7 +117,7 @@ def current(name: str, is_over: Callable[[], bool], args: Sequence[str] = ()
     with _receiver(name, args) as (receiver, spin):
         while receiver.received < 2 and not is_over():
             spin()
-            if receiver.received and receiver.silence > _NEXT:
+            if receiver.received and monotonic() - receiver.arrived > _NEXT:
                 break
             if problem := receiver.problem():
                 raise InputError(*problem)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -48,9 +49,9 @@ class ChangedError(AccelCalibError):
 
 
 def run(session: Holder, name: str, *, offers: bool = False) -> Task:
-    """Run one of `COMMANDS`, and note why it is refused; `offers`: only offer what is new."""
+    """Run one of `BUTTONS`, and note why it is refused; `offers`: only offer what is new."""
     try:
-        found = COMMANDS[name](session)
+        found = BUTTONS[name](session)
         if isinstance(found, Generator):
             found = yield from found
         if isinstance(found, Fitted):
@@ -212,7 +213,7 @@ def set_level(session: Holder) -> Fitted:
     state, rest = session.state, _rest(session.state)
     calibration = state.sensor.present or state.with_given(mounting_only(
         poses_from([rest]), state.units, sensor=state.name, date=now()))
-    return _levelled(state, calibration, rest, 'the mounting is levelled by this pose')
+    return _mount(state, calibration, 'the mounting is levelled by this pose', rest)
 
 
 def set_heading(session: Holder) -> Fitted:
@@ -227,7 +228,7 @@ def set_heading(session: Holder) -> Fitted:
     if headed.rotation[:, 0] @ calibration.rotation[:, 0] < 0.0:
         words += ('; the front of the robot is now on the other side of the sensor: if the '
                   'nose was up, tilt it down and call ~/set_heading again')
-    return _mounted(session.sensor, headed, words)
+    return _mount(session.state, headed, words)
 
 
 def calibrate_at_rest(session: Holder) -> Fitted:
@@ -245,26 +246,24 @@ def calibrate_at_rest(session: Holder) -> Fitted:
     if gyro is not None:
         bias = ', '.join(f'{np.degrees(part):+.3f}' for part in gyro.bias)
         words += f', gyro bias ({bias}) °/s'
-    return _levelled(state, state.with_given(replace(found, gyro=gyro)), rest, words)
+    return _mount(state, state.with_given(replace(found, gyro=gyro)), words, rest)
 
 
-def _levelled(state: State, calibration: Calibration, rest: Dwell, words: str) -> Fitted:
-    """Return a calibration levelled by a rest; check it against the given mounting."""
-    levelled = level(calibration, rest.mean, state.frame,
-                     state.sensor.context_of(rest, calibration))
-    if not np.allclose(state.with_given(levelled).rotation[:, 2], levelled.rotation[:, 2]):
-        raise InputError('this pose differs by more than 10° of tilt from the mounting in '
-                         'mounting_rpy or base_frame', 'place the robot level, or correct the '
-                         'given mounting and restart the node')
-    return _mounted(state.sensor, levelled, words)
-
-
-def _mounted(sensor: Sensor, calibration: Calibration, words: str) -> Fitted:
-    """Return a calibration with a new mounting, and the answer."""
-    details = [change_words(sensor.present, calibration), *(
+def _mount(state: State, calibration: Calibration, words: str, rest: Dwell | None = None
+           ) -> Fitted:
+    """Return a calibration with a new mounting, levelled by a rest if there is one."""
+    if rest is not None:
+        calibration = level(calibration, rest.mean, state.frame,
+                            state.sensor.context_of(rest, calibration))
+        up = calibration.rotation[:, 2]
+        if not np.allclose(state.with_given(calibration).rotation[:, 2], up):
+            raise InputError('this pose differs by more than 10° of tilt from the mounting in '
+                             'mounting_rpy or base_frame', 'place the robot level, or correct the '
+                             'given mounting and restart the node')
+    details = [change_words(state.sensor.present, calibration), *(
         each.words for each in calibration.noted if each.kind in ('flat_pose', 'heading'))]
     return Fitted(calibration, f'{words}; {angle_words(calibration.rotation)}', details,
-                  refinement=sensor.refinement)
+                  refinement=state.sensor.refinement)
 
 
 def _rest(state: State) -> Dwell:
@@ -365,7 +364,7 @@ def _alone(session: Holder, step: Parse) -> Part[Any]:
 COMMANDS: dict[str, Callable[[Holder], Any]] = {each.__name__: each for each in (
     capture_pose, undo_pose, fit, refine, set_level, set_heading, calibrate_at_rest, save, undo,
     load, reset)}
-"""The commands without an argument, which are services of the node and buttons of the page."""
+"""The commands without an argument, which are services of the node."""
 
 
 def enable(session: Holder, on: bool) -> str:
@@ -378,3 +377,8 @@ def enable(session: Holder, on: bool) -> str:
         return (f'the correction is on, but there is no calibration yet: {published} '
                 'published; capture poses and call ~/fit')
     return 'the correction is on: corrected messages are published'
+
+
+BUTTONS: dict[str, Callable[[Holder], Any]] = {
+    **COMMANDS, 'enable': partial(enable, on=True), 'disable': partial(enable, on=False)}
+"""The commands of the page."""

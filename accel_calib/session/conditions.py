@@ -20,11 +20,11 @@ from typing import Any
 
 from .core import State
 from .pose_guide import Guide
-from .settings import context_topics
 from .stream import SILENT
 from ..comparison import status
 from ..finding import Finding, NextStep
 from ..findings import outside_words, request_words, USES_LIMIT
+from ..logs import named_topics
 from ..pipeline import FEWEST_IN_CONE, is_partial
 from ..table import column_of, CONTEXT, is_quantity
 from ..text import counted
@@ -213,7 +213,7 @@ def _check_context(state: State) -> Iterator[Finding]:
     """Yield the columns of the context that are missing, why, and what follows."""
     calibration, around, outside = state.sensor.calibration, state.around, state.surroundings
     needs = () if calibration is None else calibration.model.needs
-    wanted = [*context_topics(state.settings), *(
+    wanted = [*named_topics(state.settings.context), *(
         key for key in needs if key in CONTEXT or is_quantity(key))]
     for column in filter(around.is_missing, dict.fromkeys(wanted)):
         why = outside.missing.get(column) or (

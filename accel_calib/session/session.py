@@ -24,13 +24,14 @@ from .conditions import APART, CONCERNS, conditions, next_step, slow_turn, therm
 from .core import Holder
 from .live_capture import Change
 from .sensor import new_sensor
-from .settings import CalibratorSettings, context_topics
+from .settings import CalibratorSettings
 from .store import Identity, SensorFiles, store_of
 from .stream import AGAIN, SILENT
 from .use import adopt, open_files, show_mounting, show_poses
 from .worker import answered, ShowPoses, Still, Task
 from ..comparison import status
 from ..findings import mounting_words
+from ..logs import named_topics
 from ..table import Floats
 from ..text import counted, LONGEST_NAME, one_line
 
@@ -119,7 +120,7 @@ class Session(Holder):
         if over and statistics.rate and all(kind in CONCERNS for kind, _ in now):
             self.log('info', f'messages arrive as expected, {statistics.rate:.1f} Hz')
         self._told = list(now)
-        topics = context_topics(state.settings)
+        topics = named_topics(state.settings.context)
         if (turn := slow_turn(state)) and state.settings.auto_capture:
             self.log('info', f'no pose yet: {turn}', 'slow_turn', AGAIN)
         if (state.surroundings.thermometers and statistics.messages

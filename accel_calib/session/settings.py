@@ -220,14 +220,9 @@ class CalibratorSettings:
         'without encryption')
 
 
-def context_topics(settings: CalibratorSettings) -> dict[str, str]:
-    """Return the topic of each column of `context`, as `logs.named_topics`."""
-    return named_topics(settings.context)
-
-
 def columns_of(settings: CalibratorSettings) -> tuple[str, ...]:
     """Return the columns of the context of a sample."""
-    return tuple(dict.fromkeys((*CONTEXT, *context_topics(settings))))
+    return tuple(dict.fromkeys((*CONTEXT, *named_topics(settings.context))))
 
 
 def capture_settings(settings: CalibratorSettings) -> CaptureSettings:

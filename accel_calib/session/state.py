@@ -21,11 +21,11 @@ import numpy as np
 from .conditions import CONCERNS, conditions, next_step, thermometer_words
 from .core import State
 from .sensor import title
-from .settings import context_topics
 from .stream import SILENT
 from ..comparison import status
 from ..errors import InputError
 from ..finding import has, Level, LEVELS
+from ..logs import named_topics
 from ..messages.one_reading import Triple
 from ..pipeline import is_partial
 from ..table import column_of
@@ -247,7 +247,7 @@ def figures(state: State) -> Iterator[tuple[str, str]]:
         f'{sum(each.end - each.start for each in live.detector.missing):.1f}')
     yield 'temperature [°C]', (_number(warm) if math.isfinite(warm)
                                else f'not known: {thermometer_words(state)}')
-    for column in context_topics(state.settings):
+    for column in named_topics(state.settings.context):
         unit = column_of(column).unit
         if column != 'temperature':
             yield f'{column} [{unit}]' if unit else column, _number(

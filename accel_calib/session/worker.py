@@ -365,7 +365,8 @@ class Worker:
         while self._events:
             event = self._events.popleft()
             if isinstance(event, Generator):
-                self.run(event, self._log_answer)
+                self.run(event, lambda success, words: self.log(
+                    'info' if success else 'warning', words))
             else:
                 self._show(event)
 
@@ -374,15 +375,12 @@ class Worker:
         self._events += [Log(severity, words)] if words else []
         self.handle_events()
 
-    def _log_answer(self, success: bool, words: str) -> None:
-        self.log('info' if success else 'warning', words)
-
     def do(self, name: str, command: Task, answer: Answer) -> None:
         """Begin a command when no files are used, run its steps, log its words, and `answer`."""
         def done(success: bool, found: Any) -> None:
             self.running.remove(name)
             if isinstance(found, str):
-                self._log_answer(success, found)
+                self.log('info' if success else 'warning', found)
             answer(success, found)
 
         def fresh() -> Task:
