@@ -80,7 +80,7 @@ class Driver:
 
     @property
     def poses(self) -> Any:
-        return self.session.sensor.live.book.poses()
+        return self.session.sensor.live.poses()
 
     def feed(self, readings: Any, frame_id: str = 'imu_link', **context: float) -> int:
         """Push readings [m/s²] with their context, and return the number of accepted messages."""

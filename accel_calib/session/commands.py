@@ -71,7 +71,7 @@ def capture_pose(session: Holder) -> Task:
     sensor.live.capture(dwell)
     session.change_sensor(guide=replace(sensor.guide, rest=dwell.start))  # the answer is its line
     poses_changed(session, ended=False)
-    poses = sensor.live.book.poses()
+    poses = sensor.live.poses()
     words = (f'{counted(len(poses), "pose")}: the sensor has been still for '
              f'{dwell.end - dwell.start:.1f} s')
     if session.state.computing:
@@ -90,7 +90,7 @@ def undo_pose(session: Holder) -> Task:
     if not session.sensor.live.undo():
         raise InputError('there are no poses to remove', 'capture a pose first')
     poses_changed(session, ended=False)
-    count = len(session.sensor.live.book.poses())
+    count = len(session.sensor.live.poses())
     yield Files(nothing)  # until the poses are stored
     return f'the last pose is removed; remaining: {counted(count, "pose")}'
 
@@ -99,7 +99,7 @@ def poses_changed(session: Holder, *, ended: bool, new_rest: Dwell | None = None
     """Draw and store the poses, and fit if auto_fit is set; `ended`: a rest has ended."""
     sensor = session.sensor
     show_poses(session, store=session.state.files.lock is not None, new_rest=new_rest)
-    if ended or len(sensor.live.book.poses()) > sensor.fitted_poses:
+    if ended or len(sensor.live.poses()) > sensor.fitted_poses:
         session.change_sensor(auto_fit_waits=True)
     fit_if_due(session)
 
@@ -108,7 +108,7 @@ def fit_if_due(session: Holder) -> None:
     """Add an automatic fit to the events if one is due."""
     sensor, settings = session.sensor, session.state.settings
     if (settings.auto_fit and sensor.auto_fit_waits and session.state.files.lock is not None
-            and len(sensor.live.book.poses()) >= settings.auto_fit_poses
+            and len(sensor.live.poses()) >= settings.auto_fit_poses
             and session.throttle.passes('auto_fit', _AUTO_FIT_EVERY)):
         session.change_sensor(auto_fit_waits=False)
         session.events.append(_auto_fit(session, sensor))
@@ -157,8 +157,8 @@ def _compute(session: Holder, function: Callable[..., Fitted], **given: Any) -> 
     state, sensor, name = session.state, session.sensor, function.__name__
     session.change(computing=state.computing + 1)
     try:
-        poses = sensor.live.poses(state.found)
-        count = len(sensor.live.book.poses())
+        poses = sensor.live.poses_for_fit(state.found)
+        count = len(sensor.live.poses())
         found = yield Compute(function, poses, units=state.units, sensor=state.name,
                               before=sensor.present, **given)
     except RefusedFitError as error:
@@ -302,7 +302,7 @@ def save(session: Holder) -> Task:
     if calibration is None:
         raise InputError('there is no calibration', 'capture poses and call ~/fit first')
     yield Files(store.write, Parse(store.prepared, calibration))
-    yield Files(store.save_poses, sensor.live.book.poses())
+    yield Files(store.save_poses, sensor.live.poses())
     if session.sensor.live is sensor.live:
         session.change_sensor(unsaved=False)
         if session.sensor.offered is calibration:

@@ -145,7 +145,7 @@ class State:
     def situation_of(self, command: str) -> tuple[object, ...]:
         """Return what a refusal of a command depends on."""
         live, rests = self.sensor.live, command in ('set_level', 'calibrate_at_rest')
-        return (live, len(live.book.poses()), self.sensor.changes,
+        return (live, len(live.poses()), self.sensor.changes,
                 rests and live.detector.current() is None)
 
     def with_given(self, calibration: Calibration) -> Calibration:

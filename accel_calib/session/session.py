@@ -25,7 +25,7 @@ from .core import Holder
 from .live_capture import Change
 from .sensor import new_sensor
 from .settings import CalibratorSettings
-from .store import Identity, SensorFiles, store_of
+from .store import SensorFiles, store_of
 from .stream import AGAIN, SILENT
 from .use import adopt, open_files, show_mounting, show_poses
 from .worker import answered, ShowPoses, Still, Task
@@ -33,7 +33,7 @@ from ..comparison import status
 from ..findings import mounting_words
 from ..logs import named_topics
 from ..table import Floats
-from ..text import counted, LONGEST_NAME, one_line
+from ..text import counted
 
 BATCH = 0.3
 """
@@ -128,7 +128,7 @@ class Session(Holder):
             self.log('warning', f'no temperature arrives; {thermometer_words(state)}',
                      'thermometers', 10.0 * _FAULT_AGAIN)
         for column in topics:
-            lack, have = state.sensor.live.book.lacking(column)
+            lack, have = state.sensor.live.lacking(column)
             if lack and have:
                 self.log('info', f'{lack} of {counted(lack + have, "pose")} have no {column}, '
                          'so that ~/refine cannot use it', f'poses without {column}',
@@ -277,10 +277,7 @@ class Session(Holder):
     def _find_store(self) -> None:
         """Go on with the files of the sensor, locked unless another node uses them."""
         state, before = self.state, self.state.files
-        settings = state.settings
-        identity = Identity(one_line(state.name).strip()[:LONGEST_NAME], state.topic,
-                            bool(settings.sensor))
-        store = store_of(settings.calibration_file, identity, settings.units, state.own)
+        store = store_of(state.settings, state.name, state.topic, state.own)
         files = replace(before, store=store)
         if before.path != files.path:
             before.release()

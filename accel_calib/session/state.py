@@ -177,7 +177,7 @@ def diagnostics(state: State) -> list[Check]:
             'drift': 'no calibration yet' if drift is None else status(drift),
             'storage': state.files.path}
     if sensor.calibration is None and sensor.offered is None:
-        count = counted(len(sensor.live.book.poses()), 'pose')
+        count = counted(len(sensor.live.poses()), 'pose')
         fine['calibration'] = f'no calibration yet, captured {count}'
     for concern, words in fine.items():
         wrong = [each for each in all_found if each.level != 'GOOD'
@@ -236,7 +236,7 @@ def figures(state: State) -> Iterator[tuple[str, str]]:
             yield 'temperature when calibrated [°C]', f'{low:.1f} to {high:.1f}'
     yield 'since last rest [s]', _number(math.nan if rest is None else (
         0.0 if live.still else max(0.0, counts.stamp - rest.end)))
-    poses, breaks = live.book.poses(), live.detector.interruptions
+    poses, breaks = live.poses(), live.detector.interruptions
     yield 'poses captured', str(len(poses))
     yield 'poses doubtful', str(int(np.sum(poses['doubtful'])) if 'doubtful' in poses else 0)
     yield 'next', next_step(state).text or 'turn the sensor'

@@ -107,7 +107,7 @@ def _report_rating(session: Holder, calibration: Calibration, refinement: Refine
 def show_poses(session: Holder, *, store: bool, new_rest: Dwell | None = None) -> None:
     """Add a task that stores the poses, and draws them with the next pose."""
     sensor, guide = session.sensor, session.sensor.guide
-    poses = sensor.live.book.poses()
+    poses = sensor.live.poses()
     if len(poses) != guide.count:
         session.change_sensor(guide=replace(
             guide, count=len(poses), new_at=session.state.statistics.stamp))
@@ -162,9 +162,9 @@ def open_files(session: Holder, store: Store, sensor: Sensor) -> Task:
         session.change(is_refused=isinstance(error, StoredCalibrationError) and not isinstance(
             error, DamagedCalibrationError))
         problem = yield Files(unusable, store.calibration, error)
-    if calibration is not None and calibration.stream not in ('', store.identity.topic):
+    if calibration is not None and calibration.stream not in ('', store.topic):
         notes.append(f'{store.calibration} was made for {calibration.stream}, but it is used '
-                     f'for {store.identity.topic}')
+                     f'for {store.topic}')
     try:
         poses = yield Files(store.load_poses)
     except Exception as error:
@@ -174,7 +174,7 @@ def open_files(session: Holder, store: Store, sensor: Sensor) -> Task:
     session.change_sensor(owners=frozenset(
         each.sensor for each in (calibration, poses) if each is not None and each.sensor))
     if poses is not None:
-        sensor.live.book.add_stored(poses)
+        sensor.live.add_stored(poses)
         session.log('info', f'read {counted(len(poses), "pose")} from the store')
     if calibration is not None:
         adopt(session, calibration)

@@ -66,7 +66,7 @@ class _Driver(Driver):
         return [state.progress(self.session.state), dict(health_figures(self.session.state)),
                 diagnostics(self.session.state)[1:], self.shown and {
                     **those(self.shown, 'up frame_id'), 'asked': of_next_pose(self.shown.asked)},
-                self.session.sensor.live.book.poses(),
+                self.session.sensor.live.poses(),
                 drift and {'covariance': drift.calibration.covariance, **those(
                     drift, 'repeats temperatures rests count scatter change since without')}]
 
