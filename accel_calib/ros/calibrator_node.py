@@ -17,7 +17,7 @@ EventsExecutor.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial, partialmethod
 from queue import SimpleQueue
 from time import monotonic
@@ -185,13 +185,11 @@ class Calibrator:
 
     def _on_transforms(self) -> None:
         """Take the mounting from the static transforms, as soon as they connect the frames."""
-        session = self.session
-        frame_id, base = session.state.frame_id, session.state.settings.base_frame
-        if self._transforms is None or not frame_id:
-            return
-        rotation = self._transforms.rotation(base, frame_id)
-        if rotation is not None:
-            session.set_mounting(rotation.T)
+        state = self.session.state
+        if self._transforms is not None and state.frame_id:
+            rotation = self._transforms.rotation(state.settings.base_frame, state.frame_id)
+            if rotation is not None:
+                self.session.set_mounting(rotation.T)
 
     def _on_tick(self) -> None:
         node = self._node
@@ -206,18 +204,19 @@ class Calibrator:
         self._on_samples()
         if self._diagnostics.get_subscription_count():
             state = self.session.state
-            first, *others = map(self._status, diagnostics(state))
-            first.values = [KeyValue(key=key, value=value) for key, value in figures(state)]
-            array = DiagnosticArray(status=[first, *others])
-            array.header.stamp = self._node.get_clock().now().to_msg()
+            first, *others = diagnostics(state)
+            array = DiagnosticArray(status=[
+                self._status(first, figures(state)), *map(self._status, others)])
+            array.header.stamp = node.get_clock().now().to_msg()
             self._diagnostics.publish(array)
         if self._page is not None:
             self._page.show_state()
 
-    def _status(self, check: Check) -> DiagnosticStatus:
+    def _status(self, check: Check, shown: Iterable[tuple[str, str]] = ()) -> DiagnosticStatus:
         return DiagnosticStatus(
             level=bytes([LEVELS.index(check.level)]), name=f'{self._name}: {check.concern}',
-            message=check.words, hardware_id=self.session.state.name)
+            message=check.words, hardware_id=self.session.state.name,
+            values=[KeyValue(key=key, value=value) for key, value in shown])
 
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> Any:
         response.success, response.message = True, enable(self.session, request.data)
@@ -240,10 +239,8 @@ class Calibrator:
     def _show_progress(self) -> None:
         self._progress_at, now = monotonic(), self.session.state
         first = conditions(now)[0]
-        status = self._status(Check('progress', first.text, first.level))
-        status.values = [KeyValue(key=key, value=value)
-                         for key, value in progress(now).figures()]
-        self._progress.publish(status)
+        self._progress.publish(self._status(
+            Check('progress', first.text, first.level), progress(now).figures()))
 
     def _show(self, event: Event) -> None:
         if self._page is not None:

@@ -17,7 +17,7 @@ succeeds on a slow machine.
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import takewhile
 import json
@@ -80,17 +80,15 @@ _NODE = {'sensor': 'demo', 'still_window': 0.25, 'min_dwell': 0.6}
 _SERVICES = ('calibrator/fit', 'calibrator/refine', 'calibrator/set_level', 'simulator/flat',
              'simulator/next')
 
-_KINDS = ('raw', 'corrected', 'truth')
-"""Kinds of messages that are compared: before and after the correction, and the truth."""
+_KINDS = {'raw': ('imu/data_raw', Imu), 'corrected': ('imu/data_calibrated', Imu),
+          'truth': ('simulator/truth', Vector3Stamped)}
+"""Topics and types that are compared: before and after the correction, and the truth."""
 
 _PATIENCE = 120.0
 """Longest time that a step may take, on the slowest machine [s]."""
 
 _LOOK_EVERY = 0.05
 """Interval at which conditions are checked [s]."""
-
-Rest = dict[str, Floats]
-"""Means of raw, corrected and true acceleration over a rest [g], (3,) arrays."""
 
 
 @dataclass(frozen=True)
@@ -152,9 +150,7 @@ class User(Node):
         self.create_subscription(
             Temperature, 'temperature',
             lambda message: setattr(self, '_temperature', message.temperature), SENSOR)
-        for name, topic, kind in (('raw', 'imu/data_raw', Imu),
-                                  ('corrected', 'imu/data_calibrated', Imu),
-                                  ('truth', 'simulator/truth', Vector3Stamped)):
+        for name, (topic, kind) in _KINDS.items():
             self.create_subscription(kind, topic, partial(self._keep, name), SENSOR)
         # Made once: DDS drops an answer to a client that the node has not discovered yet.
         self._triggers = {name: self.create_client(Trigger, name) for name in _SERVICES}
@@ -207,18 +203,19 @@ class User(Node):
             if done % 4 == 0:
                 self._report(f'captured {done} poses')
 
-    def measure(self, count: int) -> list[Rest]:
-        """Return the means over the rests in this number of further poses."""
+    def measure(self, count: int) -> Floats:
+        """Return the means over the rests in this number of further poses, (kinds, count, 3)."""
         rests = []
         for done in range(1, count + 1):
             self.turn()
             self._spin(lambda: len(self._rest(*_KINDS)) >= _SAMPLES and self._has_captured(),
                        f'rest {done}')
-            rests.append(dict(zip(_KINDS, self._rest(*_KINDS).mean(axis=0))))
-            error = np.linalg.norm(rests[-1]['corrected'] - rests[-1]['truth']) * MG
+            rests.append(self._rest(*_KINDS).mean(axis=0))
+            _, corrected, truth = rests[-1]
+            error = np.linalg.norm(corrected - truth) * MG
             self._report(f'  rest {done:2d} of {count}, now {self._temperature:.1f} °C: '
                          f'imu/data_calibrated is {error:5.2f} mg from the truth')
-        return rests
+        return np.stack(rests, axis=1)
 
     def level(self) -> str:
         """Put the robot flat, and call ``~/set_level`` as soon as the rest is long enough."""
@@ -280,27 +277,27 @@ def demonstrate(report: Callable[[str], None], hidden: str = '') -> Outcome:
         demo.capture(_POSES_HIDDEN if hidden else _POSES)
         report(f'~/fit: {demo.call("calibrator/fit")}')
         report(f'~/set_level: {demo.level()}')
-        rests = demo.measure(_CHECKED_HIDDEN if hidden else _CHECKED)
-        raw, calibrated = (_errors(rests, name) for name in ('raw', 'corrected'))
+        raw, corrected, truth = demo.measure(_CHECKED_HIDDEN if hidden else _CHECKED)
+        outcome = Outcome(len(truth), before=_errors(raw, truth), after=_errors(corrected, truth),
+                          seconds=time.monotonic() - began)
         if not hidden:
-            return Outcome(len(rests), raw, calibrated, seconds=time.monotonic() - began)
+            return outcome
         stored = folder / 'accel_calib' / 'demo.yaml'
         fitted = read_calibration(stored).model
         report(f'~/refine: {demo.call("calibrator/refine")}')
         report(f'~/set_level: {demo.level()}')
         refined = read_calibration(stored).model
         lag = refined.lags.get('temperature_of_offset')
-        again = _errors(demo.measure(_CHECKED_HIDDEN), 'corrected')
-        return Outcome(
-            len(rests), calibrated, again, time.monotonic() - began,
-            hidden=parse_effect(hidden)[0],
+        _, corrected, truth = demo.measure(_CHECKED_HIDDEN)
+        return replace(
+            outcome, before=outcome.after, after=_errors(corrected, truth),
+            seconds=time.monotonic() - began, hidden=parse_effect(hidden)[0],
             found=tuple(str(name) for name in refined.effects if name not in fitted.effects),
             lag_s=0.0 if lag is None else lag.seconds)
 
 
-def _errors(rests: Sequence[Rest], name: str) -> Errors:
-    truth = np.array([rest['truth'] for rest in rests])
-    values = np.array([rest[name] for rest in rests])
+def _errors(values: Floats, truth: Floats) -> Errors:
+    """Return the errors of mean accelerations [g], (n, 3)."""
     sizes = np.linalg.norm(values, axis=1)
     errors = (sizes - 1.0) * MG
     cosines = np.sum(values * truth, axis=1) / sizes / np.linalg.norm(truth, axis=1)
