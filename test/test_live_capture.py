@@ -58,7 +58,7 @@ def test_the_first_poses_at_a_limit_are_marked_as_in_a_recording(seed: int) -> N
     push_all(live, reading)
     columns = {'time': np.arange(len(reading)) / 50.0, 'reading': reading}
     whole = capture(Recording(columns, numbered(columns)), MPS2).poses
-    poses = live.poses(())
+    poses = live.poses_for_fit(())
     assert poses['at_limit'].tolist() == whole['at_limit'][:len(poses)].tolist()
     assert poses['at_limit'].tolist() == [1.0, 1.0, 1.0, *[0.0] * (len(poses) - 3)]
 

@@ -47,7 +47,7 @@ from ..stored.exports import FORMATS
 from ..text import plain
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable
 
 _REQUEST_S = 10.0
 """Time within which a connection must send its request [s]."""
@@ -82,34 +82,6 @@ _ITS_LINK = 'open the link with the token, which the program showed on its termi
 _NO_TOKEN = f'this link has no token, so it only shows; {_ITS_LINK}'
 _WRONG_TOKEN = 'the token of this link is of another start of the program, so it only shows; ' \
                f'{_ITS_LINK}'
-
-
-class Address:
-    """The port, names and versions of IP by which a browser may call what listens on sockets."""
-
-    def __init__(self, sockets: Iterable[socket.socket]) -> None:
-        bound = [each.getsockname() for each in sockets]
-        own = socket.gethostname().lower()
-        names = {own, own.split('.')[0]}
-        self.port: int = bound[0][1]
-        self._hosts = {'localhost', *names, *(f'{name}.local' for name in names)}
-        self._versions = {ip_address(each[0].split('%')[0]).version for each in bound}
-
-    def refusal(self, request: web.BaseRequest) -> str:
-        """Return why a request is refused by its Host or Origin; empty if it is not."""
-        hosts, origins = (request.headers.getall(name, []) for name in ('Host', 'Origin'))
-        host, is_own = hosts[0] if len(hosts) == 1 else '', False
-        with suppress(ValueError):  # it cannot be parsed
-            parts = urlsplit(f'//{host}')
-            name, port = (parts.hostname or '').removesuffix('.'), parts.port or 80
-            is_own = name in self._hosts or ip_address(name).version in self._versions
-            is_own &= port == self.port and not (
-                '@' in host or parts.path or parts.query or parts.fragment)
-        if not is_own:
-            return 'the header Host is not an address of this server; open its own link'
-        if origins and [each.lower() for each in origins] != [f'http://{host.lower()}']:
-            return 'the header Origin is of another site; open the link of this server'
-        return ''
 
 
 class Connection(web.RequestHandler):
@@ -269,8 +241,13 @@ class PageServer:
         except Exception as error:  # `start` raises it, in its own thread
             started.set_exception(error)
             return
-        self._address = Address(listener.sockets)
-        self._port = self._address.port
+        bound, own = [each.getsockname() for each in listener.sockets], (
+            socket.gethostname().lower())
+        names = {own, own.split('.')[0]}
+        # By these names and versions of IP a browser may call.
+        self._hosts = {'localhost', *names, *(f'{name}.local' for name in names)}
+        self._versions = {ip_address(each[0].split('%')[0]).version for each in bound}
+        self._port = bound[0][1]
         started.set_result(None)
         while not self._over.is_set():
             if self.viewers and self.board.history:
@@ -312,7 +289,18 @@ class PageServer:
     async def _answer(self, request: web.BaseRequest) -> web.StreamResponse:
         connection = cast('Connection', request.protocol)
         connection.stage = 1
-        refusal = self._address.refusal(request)
+        hosts, origins = (request.headers.getall(name, []) for name in ('Host', 'Origin'))
+        host, is_own, refusal = hosts[0] if len(hosts) == 1 else '', False, ''
+        with suppress(ValueError):  # the Host cannot be parsed
+            parts = urlsplit(f'//{host}')
+            name, port = (parts.hostname or '').removesuffix('.'), parts.port or 80
+            is_own = name in self._hosts or ip_address(name).version in self._versions
+            is_own &= port == self._port and not (
+                '@' in host or parts.path or parts.query or parts.fragment)
+        if not is_own:
+            refusal = 'the header Host is not an address of this server; open its own link'
+        elif origins and [each.lower() for each in origins] != [f'http://{host.lower()}']:
+            refusal = 'the header Origin is of another site; open the link of this server'
         if refusal:
             return secured(web.Response(status=403, text=f'{refusal}\n'))
         path = request.rel_url.raw_path if request.method == 'GET' else ''

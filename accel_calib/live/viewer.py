@@ -19,6 +19,7 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass, field
 import io
 from ipaddress import ip_address
 import json
@@ -141,13 +142,14 @@ def secured(response: Answered) -> Answered:
     return response
 
 
+@dataclass(frozen=True)
 class Board:
     """What viewers are shown: the newest message of each kind, log lines, and the history."""
 
-    def __init__(self) -> None:
-        self.newest: dict[str, Message] = {}
-        self.history: deque[Message] = deque(maxlen=int(_HISTORY_S / PERIOD))
-        self.lines: deque[Message] = deque(maxlen=_LINES)
+    newest: dict[str, Message] = field(default_factory=dict)
+    lines: deque[Message] = field(default_factory=lambda: deque(maxlen=_LINES))
+    history: deque[Message] = field(
+        default_factory=lambda: deque(maxlen=int(_HISTORY_S / PERIOD)))
 
     def take(self, message: Message) -> bool:
         """Keep a message; return whether it is new."""

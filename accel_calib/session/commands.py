@@ -147,7 +147,8 @@ def refine(session: Holder) -> Part[Fitted]:
     state = session.state
     hint = '' if 'temperature' in state.around.values else thermometer_words(state)
     fitted = yield from _compute(session, fitting.refine, hint=hint, own=state.own)
-    session.change_sensor(guide=session.sensor.guide.follow(fitted.refinement.plan.poses))
+    guide, planned = session.sensor.guide, fitted.refinement.plan.poses
+    session.change_sensor(guide=replace(guide, planned=planned or None, begun=guide.poses))
     return fitted
 
 

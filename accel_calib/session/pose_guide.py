@@ -16,7 +16,6 @@ request is not repeated.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 import math
 
@@ -119,10 +118,6 @@ class Guide:
             new = plan.up[self.begun:]
             planned = tuple(each for each in planned if not np.any(new @ each.up >= TAKEN))
         return replace(self, chosen=plan, planned=planned, is_stale=False)
-
-    def follow(self, planned: Sequence[PlannedPose]) -> Guide:
-        """Ask for these poses of a refinement next; for none, ask for poses for a fit."""
-        return replace(self, planned=tuple(planned) or None, begun=self.poses)
 
     @property
     def poses(self) -> int:

@@ -141,7 +141,7 @@ class Sensor:
             and not np.array_equal(before.model.rotation, calibration.model.rotation))
         if not only_levelled:
             past, counted = None if calibration is None else Drift(calibration), self.rest
-        self.temperatures.forget()
+        self.temperatures.followed.clear()  # but for models that are asked for from now on
         return replace(self.offer(None, settings), calibration=calibration, unsaved=False,
                        drift=past, past=past, counted=counted).turn(settings)
 
@@ -264,23 +264,16 @@ class Sensor:
 
     def force_of(self, reading: Triple, known: Known) -> Triple | None:
         """Return the force of a reading by the `present` calibration [g]; None: not known."""
-        calibration, corrected = self.present, self._corrected
-        if calibration is None or corrected is None:
-            return None
-        context = {**calibration.model.neutral, 'std': _AT_REST, 'previous': _AT_REST,
-                   'rate': _AT_REST, **self.temperatures.columns_of(calibration.model), **known}
-        try:
-            return corrected.at(context).correct(*reading)
-        except InputError:
-            return None  # a quantity is not known yet, or the reading is out of range
-
-    @cached_property
-    def _corrected(self) -> OneReading | None:
-        """Return what corrects one reading by the `present` calibration."""
         calibration = self.present
         if calibration is None:
             return None
-        return OneReading(calibration, 1.0 / calibration.force_per_g)
+        context = {**calibration.model.neutral, 'std': _AT_REST, 'previous': _AT_REST,
+                   'rate': _AT_REST, **self.temperatures.columns_of(calibration.model), **known}
+        prepared = OneReading(calibration, 1.0 / calibration.force_per_g)
+        try:
+            return prepared.at(context).correct(*reading)
+        except InputError:
+            return None  # a quantity is not known yet, or the reading is out of range
 
 
 def new_sensor(settings: CalibratorSettings, units: Units) -> Sensor:

@@ -35,7 +35,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
 import math
@@ -313,19 +313,19 @@ Event = Log | Mounting | Result | Still | ShowPoses | Task
 """What a session reports: log lines, what to publish, and tasks to run."""
 
 
+@dataclass(frozen=True)
 class Throttle:
     """Decide what is due, such as log lines: of each kind, at most one within a time."""
 
-    def __init__(self, clock: Callable[[], float] = monotonic) -> None:
-        self._clock = clock
-        self._last: dict[str, float] = {}
+    clock: Callable[[], float] = monotonic
+    last: dict[str, float] = field(default_factory=dict)
 
     def passes(self, kind: str, once_in: float) -> bool:
         """Return whether one of this kind is due, at most once in `once_in` [s]; note it."""
-        now = self._clock()
-        if now - self._last.get(kind, -math.inf) < once_in:
+        now = self.clock()
+        if now - self.last.get(kind, -math.inf) < once_in:
             return False
-        self._last[kind] = now
+        self.last[kind] = now
         return True
 
 
