@@ -58,7 +58,7 @@ class Exchange:
         self.problem = ''
         self._shown: Calibration | None = None
         self._number = 0
-        self._drawing: tuple[int, Future[tuple[bool, str]]] = -1, Future()
+        self._page: Future[tuple[bool, str]] | None = None
         self._line = int(time()) * 1000  # a viewer of an earlier server has smaller numbers
 
     # The session has news
@@ -90,8 +90,7 @@ class Exchange:
         state, sensor = self._session.state, self._session.sensor
         in_use, shown, rating = sensor.calibration, sensor.present, sensor.rating
         if shown is not self._shown:
-            self._shown = shown
-            self._number += 1
+            self._shown, self._page, self._number = shown, None, self._number + 1
         found = [each for each in conditions(state) if each.level == 'BAD' or (
             each.level == 'USABLE' and each.kind not in APART)]
         worst = max(found, key=lambda each: LEVELS.index(each.level), default=None)
@@ -141,18 +140,17 @@ class Exchange:
         if self._shown is None:
             answer(False, str(_NO_CALIBRATION))
             return
-        number, page = self._drawing
-        if number != self._number or (page.done() and not page.result()[0]):
-            page = Future()
-            self._drawing, store = (self._number, page), self._session.state.files.store
-            self._worker.run(
-                self._drawn(self._shown, store.calibration.name if store else STORED),
-                lambda *found: page.set_result(found))
+        page = self._page
+        if page is None or (page.done() and not page.result()[0]):
+            page = self._page = Future()
+            self._worker.run(self._drawn(self._shown), lambda *found: page.set_result(found))
         page.add_done_callback(lambda done: answer(*done.result()))
 
-    def _drawn(self, calibration: Calibration, stored: str) -> Task:
+    def _drawn(self, calibration: Calibration) -> Task:
+        state = self._session.state
+        stored = state.files.store.calibration.name if state.files.store else STORED
         return (yield Compute(calibration_page, calibration, Compute(rate, calibration),
-                              self._session.state.topic, stored=stored))
+                              state.topic, stored=stored))
 
     def export(self, name: str, answer: Answer) -> None:
         """Call `answer` with an export of the calibration in use, or why there is none."""

@@ -279,9 +279,16 @@ class PageServer:
             self._exchange.call_soon(lambda: self._exchange.log('warning', words))
 
     def _take(self, message: Message) -> None:
-        if self.board.take(message):
-            for viewer in self.viewers:
-                viewer.news.set()
+        """Show a message, unless the newest one of its kind is equal."""
+        kind, newest = message['kind'], self.board.newest
+        if kind == 'log':
+            self.board.lines.append(message)
+        elif message == newest.get(kind):
+            return
+        else:
+            newest[kind] = message
+        for viewer in self.viewers:
+            viewer.news.set()
 
     def _is_token(self, given: str) -> bool:
         return hmac.compare_digest(given.encode(errors='replace'), self.token.encode())

@@ -151,16 +151,6 @@ class Board:
     history: deque[Message] = field(
         default_factory=lambda: deque(maxlen=int(_HISTORY_S / PERIOD)))
 
-    def take(self, message: Message) -> bool:
-        """Keep a message; return whether it is new."""
-        if message['kind'] == 'log':
-            self.lines.append(message)
-        elif message == self.newest.get(message['kind']):
-            return False
-        else:
-            self.newest[message['kind']] = message
-        return True
-
 
 class TooManyError(InputError):
     """There are too many viewers."""

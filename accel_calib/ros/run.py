@@ -67,8 +67,10 @@ def run(node: str, args: Sequence[str] | None = None) -> int:
     signal.set_wakeup_fd(written, warn_on_full_buffer=False)
     for number in _SIGNALS:
         signal.signal(number, lambda number, frame: None)  # Python writes to the pipe
+    module, name = node.split(':')
     try:
-        _start(node, args, came)
+        with started(args, 'check the parameters and arguments'):
+            _spin(getattr(import_module(module, __package__), name)(), came)
     except AccelCalibError as error:
         print(f'accel-calib: {error}', file=sys.stderr)
         return _BAD_INPUT
@@ -89,8 +91,9 @@ EXECUTABLES = {'calibrator': calibrator, 'calibrator_lifecycle': calibrator_life
 """The executables by name: ``python -m accel_calib.ros.run calibrator``."""
 
 
-def _start(node: str, args: Sequence[str] | None, came: int) -> None:
-    """Start ROS, run the node, and shut down ROS."""
+@contextmanager
+def started(args: Sequence[str] | None, advice: str) -> Iterator[None]:
+    """Start ROS, and shut it down at the end; the process keeps its signal handlers."""
     try:
         import rclpy
     except ImportError as error:
@@ -100,11 +103,9 @@ def _start(node: str, args: Sequence[str] | None, came: int) -> None:
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:
-        raise InputError(f'ROS 2 does not start: {str(error).splitlines()[0]}',
-                         'check the parameters and arguments') from error
+        raise InputError(f'ROS 2 does not start: {str(error).splitlines()[0]}', advice) from error
     try:
-        module, name = node.split(':')
-        _spin(getattr(import_module(module, __package__), name)(), came)
+        yield
     finally:
         # rclpy.try_shutdown() would also restore signal handlers, for an instant the default ones.
         rclpy.get_default_context().try_shutdown()

@@ -15,13 +15,12 @@ from functools import partial
 from time import monotonic
 
 from diagnostic_msgs.msg import DiagnosticStatus
-import rclpy
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 
 from .declare import LATCHED
+from .run import started
 from ..errors import InputError
 from ..session import Progress
 
@@ -126,16 +125,9 @@ def current(name: str, is_over: Callable[[], bool], args: Sequence[str] = ()
 
 @contextmanager
 def _receiver(name: str, args: Sequence[str]) -> Iterator[tuple[_Receiver, Callable[[], None]]]:
-    """Yield a receiver, and what waits for its messages; the process keeps its signal handlers."""
-    try:
-        rclpy.init(args=list(args), signal_handler_options=SignalHandlerOptions.NO)
-    except RuntimeError as err:
-        raise InputError(f'ROS 2 does not start: {str(err).splitlines()[0]}',
-                         'check the arguments after --ros-args') from err
-    try:
+    """Yield a receiver, and what waits for its messages."""
+    with (started(list(args), 'check the arguments after --ros-args'),
+          SingleThreadedExecutor() as executor):
         receiver = _Receiver(name)
-        with SingleThreadedExecutor() as executor:
-            executor.add_node(receiver)
-            yield receiver, partial(executor.spin_once, timeout_sec=_LOOK_EVERY)
-    finally:
-        rclpy.try_shutdown()
+        executor.add_node(receiver)
+        yield receiver, partial(executor.spin_once, timeout_sec=_LOOK_EVERY)

@@ -37,29 +37,28 @@ def adopt(session: Holder, calibration: Calibration | None, refinement: Refineme
           rating: Rating | None = None) -> None:
     """Correct with this calibration, and with the given mounting if there is one."""
     session.change(problem='', is_refused=False)
+    state, settings = session.state, session.state.settings
     if calibration is None:
-        session.change(sensor=session.sensor.adopt(None, session.state.settings))
-        session.state.around.assume({})
+        session.change(sensor=session.sensor.adopt(None, settings))
+        state.around.assume({})
         rate(session, None)
         return
     levelled = calibration.is_levelled
-    if levelled and calibration.frame != session.state.frame:
+    if levelled and calibration.frame != state.frame:
         session.log('warning', f'the stored mounting is for the frame {calibration.frame}, but '
-                    f'frame is {session.state.settings.frame}: it is turned, and a measured '
-                    'heading is kept')
-        calibration = in_frame(calibration, session.state.frame)
-    stored, calibration = calibration, session.state.with_given(calibration)
+                    f'frame is {settings.frame}: it is turned, and a measured heading is kept')
+        calibration = in_frame(calibration, state.frame)
+    stored, calibration = calibration, state.with_given(calibration)
     if levelled and not np.allclose(stored.rotation[:, 2], calibration.rotation[:, 2]):
         session.log('warning', 'the stored mounting differs from the given one by more than 10° '
                     'of tilt: the given mounting is used; call ~/set_level with the robot level')
-    session.change(sensor=session.sensor.adopt(calibration, session.state.settings))
-    session.state.around.assume({
-        key: value for key, value in calibration.typical.items()
-        if key in CONTEXT or is_quantity(key)})
+    session.change(sensor=session.sensor.adopt(calibration, settings))
+    state.around.assume({key: value for key, value in calibration.typical.items()
+                         if key in CONTEXT or is_quantity(key)})
     rate(session, refinement, rating)
-    turned = calibration.is_levelled and session.state.settings.rotate
+    turned = calibration.is_levelled and settings.rotate
     session.log('info', f'correcting with {title(calibration)}; messages are in the frame '
-                f'{session.state.settings.frame if turned else "of the sensor"}')
+                f'{settings.frame if turned else "of the sensor"}')
     for finding in calibration.noted:
         session.log(_SEVERITY[finding.level], finding.words)
     show_mounting(session)
