@@ -44,14 +44,6 @@ class Fitted:
     rating: Rating | None = None
     refinement: Refinement | None = None
 
-    @property
-    def refusal(self) -> tuple[str, ...]:
-        """Return why it must not be used, and what to do instead; empty if it can be used."""
-        if self.refinement is not None and self.refinement.refusal:
-            return self.refinement.refusal
-        rating = self.rating
-        return (rating.reason, rating.next.text) if rating and rating.name == 'BAD' else ()
-
 
 def fit(poses: Poses, units: Units, settings: CalibratorSettings, sensor: str,
         before: Calibration | None) -> Fitted:
