@@ -42,7 +42,7 @@ import numpy as np
 import scipy
 
 from .recording import Row, UNKNOWN
-from .sensors import alike, model_of, Store
+from .sensors import alike, model_of, read_parquet, Store
 from ..calibration import FleetPrior
 from ..comparison import NAMES
 from ..effects import LADDER
@@ -141,7 +141,7 @@ class Digest:
 
 def digest_of(name: str, store: Store) -> Digest:
     """Return the digest of a sensor by the name of its folder; it runs on a worker."""
-    return digest(unquote(name), store.of_sensor(name, COLUMNS))
+    return digest(unquote(name), read_parquet(store.data(name), COLUMNS))
 
 
 def digest(sensor: str, rows: Sequence[Row]) -> Digest:
@@ -158,10 +158,11 @@ def digest(sensor: str, rows: Sequence[Row]) -> Digest:
         differences = [(row['date'][:7], change) for row, change in zip(good, away, strict=True)
                        if row.get('date') and len(good) > 1]
     return Digest(
-        sensor, model_of(rows), Counter(row['rating'] or row['status'] for row in rows),
-        [row for row in rows if row['status'] != 'ok'][:MOST_ERRORS],
-        sum(bool(row['calibration']) for row in rows) - len(good), known, differences,
-        typical_of(named))
+        sensor=sensor, model=model_of(rows), values=known, differences=differences,
+        counts=Counter(row['rating'] or row['status'] for row in rows),
+        errors=[row for row in rows if row['status'] != 'ok'][:MOST_ERRORS],
+        left_out=sum(bool(row['calibration']) for row in rows) - len(good),
+        typical=typical_of(named))
 
 
 @dataclass(frozen=True)
