@@ -54,7 +54,7 @@ from numpy.polynomial import Polynomial
 
 from .c_header import name_of
 from .made import (
-    frame_words, Made, Options, plain_text, polynomial, single, steady_at, steady_grid,
+    frame_words, Made, Options, plain_text, polynomial, single, steady_context, steady_grid,
     temperature_range, unit_in_ascii)
 from .plain_yaml import beginning_of, decoded, shown
 from ..calibration import Calibration
@@ -99,7 +99,8 @@ def _fit_by_axis(calibration: Calibration, options: Options, reference: float | 
     reference = middle if reference is None else reference
     grid, degree = steady_grid(calibration), 0
     if high > low:
-        vec_v = np.broadcast_to(steady_at(calibration, np.linspace(low, high, 9)).vec_v, (9, 3))
+        context = steady_context(calibration, np.linspace(low, high, 9))
+        vec_v = np.broadcast_to(calibration.model.at(context).vec_v, (9, 3))
         degree = len(polynomial(np.linspace(-1.0, 1.0, 9), vec_v, _EXACT_G, DEGREE)) - 1
     s = (grid.temperature - middle) / half if degree else grid.temperature
     columns = np.vander(s, degree + 1, increasing=True)
