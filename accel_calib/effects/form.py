@@ -95,9 +95,6 @@ class Zone(NamedTuple):
             size = (x * x + y * y + z * z + 1e-300) ** 0.5
             return (a * x + b * y + d * z) / size, size
 
-        def value(axis: int, *u: Any) -> Any:
-            return u[axis] * _horner(self.polynomial, cosine(*u)[0])
-
         def gradient(axis: int, *u: Any) -> tuple[Any, Any, Any]:
             c, size = cosine(*u)
             steep = u[axis] / size * _horner(slope, c)
@@ -106,7 +103,8 @@ class Zone(NamedTuple):
                        for k, (towards, part) in enumerate(zip(self.towards, u)))
             return x, y, z
 
-        return [Monomial(partial(value, axis), partial(gradient, axis)) for axis in range(3)]
+        return [Monomial(lambda *u, axis=axis: u[axis] * _horner(self.polynomial, cosine(*u)[0]),
+                         partial(gradient, axis)) for axis in range(3)]
 
 
 ZONES = [Zone(degree, towards, leg2poly([0.0] * degree + [1.0]).tolist())

@@ -265,23 +265,18 @@ class _RateFilter:
     """Kalman filter of temperature, rate and bend (°C/s²) from averages of past samples."""
 
     def __init__(self, time: float, temperature: float) -> None:
-        self._time = time
-        self._state = np.array([temperature, 0.0, 0.0])
+        self.time = time
+        self.state = np.array([temperature, 0.0, 0.0])
         self._spread = np.diag(np.square([_ERROR, _START_RATE, _START_BEND]))
 
     def add(self, time: float, temperature: float) -> None:
-        moved, added = (each[0] for each in _motion(np.array([time - self._time])))
-        state = moved @ self._state
+        moved, added = (each[0] for each in _motion(np.array([time - self.time])))
+        state = moved @ self.state
         spread = moved @ self._spread @ moved.T + added
         gain = spread[:, 0] / (spread[0, 0] + _ERROR ** 2)
-        self._state = state + gain * (temperature - state[0])
+        self.state = state + gain * (temperature - state[0])
         self._spread = spread - np.outer(gain, spread[0])
-        self._time = time
-
-    def line(self, start: float) -> tuple[float, float]:
-        """Return rate [°C/s] and bend [°C/s²] at a time."""
-        _, rate, bend = self._state.tolist()
-        return rate + bend * (start - self._time), bend
+        self.time = time
 
 
 class ThermalStream:
@@ -336,7 +331,8 @@ class ThermalStream:
             else:
                 self._filter.add(middle, mean)
             self._begin, self._count, self._times, self._sum = time, 0, 0.0, 0.0
-            self._line = self._filter.line(time)
+            _, rate, bend = self._filter.state.tolist()
+            self._line = rate + bend * (time - self._filter.time), bend
         self._count += 1
         self._times += time - self._begin
         self._sum += temperature

@@ -284,7 +284,7 @@ def mapped(client: Client, function: Callable[..., Any], items: Iterable[_Item],
     rest, suspects = iter(items), list[_Item]()
     size, mean_s = 1, _TASK_S  # number of items per task, and the mean duration of an item [s]
     waiting: dict[Any, list[_Item]] = {}
-    done, workers = as_completed(loop=client.loop), _Workers(client)
+    done, workers = as_completed(loop=client.loop), _Workers(client.cluster, time.monotonic())
     limit = _AHEAD * max(sum(client.nthreads().values()), 1)
     alone = False
     while True:
@@ -318,6 +318,7 @@ def mapped(client: Client, function: Callable[..., Any], items: Iterable[_Item],
         yield from zip(batch, results, strict=True)
 
 
+@dataclass
 class _Workers:
     """
     Starts a worker of a cluster of this machine if none has been there for some time.
@@ -326,17 +327,16 @@ class _Workers:
 
     """
 
-    def __init__(self, client: Client) -> None:
-        self._cluster = client.cluster
-        self._seen = time.monotonic()
+    cluster: Any
+    seen: float
 
     def look(self) -> None:
         now = time.monotonic()
-        if self._cluster is None or self._cluster.scheduler.workers:
-            self._seen = now
-        elif now - self._seen > _ABSENT_S:
-            self._seen = now
-            self._cluster.scale(len(self._cluster.workers) + 1)
+        if self.cluster is None or self.cluster.scheduler.workers:
+            self.seen = now
+        elif now - self.seen > _ABSENT_S:
+            self.seen = now
+            self.cluster.scale(len(self.cluster.workers) + 1)
 
 
 def _result_of(client: Client, future: Any, workers: _Workers) -> tuple[list[Any], float]:
@@ -397,7 +397,7 @@ def calibrate_recording(found: Input, options: Options, store: Store, limit_s: f
         with on_disk(found.path) as path:
             content = content_hash(path)
             key = key_of(content, found, options)
-            if store.has(key):
+            if store.mark(key).exists():
                 return 'skipped'
             row, calibration = _apart.process.call(
                 row_of, found, path, options, limit_s=limit_s)

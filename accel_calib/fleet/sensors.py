@@ -86,10 +86,6 @@ class Store:
         """Return the Parquet file of a sensor, by the name of its folder."""
         return self.folder / 'recordings' / f'sensor={name}' / _DATA
 
-    def has(self, key: str) -> bool:
-        """Return whether the result with this key is in the data set."""
-        return self._mark(key).exists()
-
     def add(self, row: Row) -> None:
         """
         Write a row, to be merged into the data set; raise OSError if it fails.
@@ -128,9 +124,9 @@ class Store:
                 row['date'] or '', row['recording'])), schema())
         for row in (*old, *new):
             if newest.get(row['content'], row)['key'] != row['key']:
-                self._mark(row['key']).unlink(missing_ok=True)
+                self.mark(row['key']).unlink(missing_ok=True)
         for row in new:
-            mark = self._mark(row['key'])
+            mark = self.mark(row['key'])
             mark.parent.mkdir(parents=True, exist_ok=True)
             mark.write_text(f'{name}\n{row.get("calibration", "")}', encoding='utf-8')
 
@@ -140,7 +136,7 @@ class Store:
         if not folder.exists():
             return
         for path in folder.iterdir():  # with temporary files of killed workers
-            if path.suffix != '.json' or self.has(path.stem):
+            if path.suffix != '.json' or self.mark(path.stem).exists():
                 path.unlink(missing_ok=True)
         if not any(folder.iterdir()):  # a worker of a killed program may still write
             folder.rmdir()
@@ -185,7 +181,8 @@ class Store:
         names = (each.name.partition('=')[2] for each in self.folder.glob('recordings/sensor=*'))
         return sorted(name for name in names if name != UNREAD)
 
-    def _mark(self, key: str) -> Path:
+    def mark(self, key: str) -> Path:
+        """Return the file that is there if the result with this key is in the data set."""
         return self.folder / 'done' / key[:2] / key
 
 
