@@ -68,6 +68,8 @@ COLUMNS: dict[str, Column] = {
                         'true specific force (known orientation); in g for native units'),
     'previous': Column(('from_x', 'from_y', 'from_z'), '', 'unit vector towards the previous '
                        'pose; computed from the order of the poses'),
+    'earlier': Column(('earlier_x', 'earlier_y', 'earlier_z'), '', 'unit vector towards the '
+                      'previous pose, at the turn before the last one', made=True),
     'duration': Column(('duration',), 's', 'time from the first to the last sample of a pose'),
     'since_turn': Column(('since_turn',), 's', 'time from the last turn to the start of a pose; '
                          'computed from the times'),

@@ -267,9 +267,10 @@ class Effect:
         return values[:len(self.parameters)], values[len(self.parameters):]
 
     def filled(self, values: Floats) -> Floats:
-        """Return (p,) or (p + s,) values as (p + s,), with the usual shape where none is given."""
-        if self.usual and np.shape(values) == (len(self.parameters),):
-            return np.concatenate([values, self.usual])
+        """Return (p,) to (p + s,) values as (p + s,), with the usual shape where none is given."""
+        missing = len(self.values) - len(values)
+        if self.usual and 0 < missing <= len(self.shape):
+            return np.concatenate([values, self.usual[-missing:]])
         return values
 
     def shown(self, values: Floats) -> dict[str, float]:
@@ -307,7 +308,7 @@ EffectKey = str | EffectRecord
 AT_POSES = ('since_turn', 'duration')
 """Columns that only poses have."""
 
-_FITTED_SHAPES = ('tau', 'lag')
+_FITTED_SHAPES = ('tau', 'lag', 'memory')
 """Shape constants of the catalogue that a fit changes; the others are found once."""
 
 _SHAPE_STEP = 1e-4

@@ -69,7 +69,7 @@ _LEAST_MOMENTS = 5
 _LEAST_LEVELS = 4
 """Smallest number of temperatures that occur more than once, by which steps are known."""
 
-_COARSEST = 0.51
+_COARSEST = 1.01
 """Largest step of a thermometer [°C]: larger ones may be exact temperatures that were set."""
 
 _REPEATED = 0.5
