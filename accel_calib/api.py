@@ -436,11 +436,14 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
         out of range, or makes readings beyond any sensor.
 
     """
-    _check_within(poses=(poses, 1, _MOST_ROWS), samples=(samples, 1, _MOST_ROWS),
-                  noise=(noise, 0, LARGEST), seed=(seed, 0, math.inf))
-    if recording:
-        count = poses * (dwell + turn) * rate
-        _check_within(**{'poses * (dwell + turn) * rate': (count, 0, _MOST_ROWS)})
+    rows = min(poses, _MOST_ROWS) * (dwell + turn) * rate if recording else 0
+    for name, value, least, most in (
+            ('poses', poses, 1, _MOST_ROWS), ('samples', samples, 1, _MOST_ROWS),
+            ('noise', noise, 0, LARGEST), ('seed', seed, 0, math.inf),
+            ('poses * (dwell + turn) * rate', rows, 0, _MOST_ROWS)):
+        if not least <= value <= most:
+            raise InputError(f'{name} is {str(value)[:40]}, expected {least:g} to '
+                             f'{most:g}', f'correct {name}')
     known = units_of(units, gravity)
     # The attitude transforms from sensor to robot axes, ΔR from robot to sensor axes.
     rotation = rotation_from_rpy(*np.radians(np.asarray(mounting, float))).T
@@ -475,14 +478,6 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
                          f'below {LARGEST:g}', 'use smaller effects, noise and temperatures')
     kept = found if reference else found.without_columns('reference')
     return replace(kept, units=units)  # type: ignore[return-value]
-
-
-def _check_within(**numbers: tuple[float, float, float]) -> None:
-    """Check numbers by their names, each with its least and its largest value."""
-    for name, (value, least, most) in numbers.items():
-        if not least <= value <= most:
-            raise InputError(f'{name} is {str(value)[:40]}, expected {least:g} to '
-                             f'{most:g}', f'correct {name}')
 
 
 def _is_log(given: object) -> bool:

@@ -35,13 +35,13 @@ from ..effects import (
     AXES, EffectKey, EmpiricalCurve, entry_of, REFERENCE_TEMPERATURE, value_unit, variable_words,
     with_vector)
 from ..findings import (
-    effect_figures, mounting_figures, outlook, rate_refinement, Rating, request_words,
-    residual_figures, verdict_words)
+    effect_figures, mounting_figures, outlook, rate, Rating, request_words, residual_figures,
+    verdict_words)
 from ..geometry import coverage
 from ..pipeline import ThermalOutcome
 from ..refinement import Refinement
 from ..table import Floats, Poses
-from ..text import counted, milli, percentage, short, signed, with_minus
+from ..text import counted, milli, short, signed, with_minus
 from ..units import MG
 
 STORED = 'calibration.yaml'
@@ -60,7 +60,8 @@ _SMALL = 1e-3
 
 def refinement_page(result: Refinement, source: str) -> str:
     """Return the page of a refinement of the poses in the file `source`, as HTML."""
-    return calibration_page(result.calibration, rate_refinement(result), source, refinement=result)
+    rating = rate(result.calibration, refinement=result)
+    return calibration_page(result.calibration, rating, source, refinement=result)
 
 
 def calibration_page(calibration: Calibration, rating: Rating, source: str, *,
@@ -111,11 +112,11 @@ def calibration_page(calibration: Calibration, rating: Rating, source: str, *,
     sensor = calibration.sensor and f'sensor {calibration.sensor}'
     return page(
         'calibration', f'{what} of {name}' if name else what,
-        (source, sensor, _fitted(calibration)), rating,
+        (source, sensor, calibration.date and f'fitted {calibration.date}'), rating,
         more='' if used is None else verdict_words(used),
         key_numbers=[*figures, ('poses used', str(len(residuals.poses_g))),
                      *([('poses left out', str(left_out))] if left_out else ()),
-                     ('coverage', percentage(covered))],
+                     ('coverage', f'{100.0 * covered:.0f} %')],
         searched={} if refinement is None else search_values(refinement, residuals),
         used=used is not None, refusal=refusal, refused=bool(refused),
         coverage=of_coverage(residuals, covered, None if asked is None else asked.direction),
@@ -127,10 +128,6 @@ def calibration_page(calibration: Calibration, rating: Rating, source: str, *,
         left_out=[f'row {row}: {reason}' for row, reason in sorted(residuals.reasons.items())],
         remainder=of_remainder(residuals), head=head, poses=rows, notes=notes,
         **_values(calibration, stored))
-
-
-def _fitted(calibration: Calibration) -> str:
-    return calibration.date and f'fitted {calibration.date}'
 
 
 def thermal_page(outcome: ThermalOutcome, sources: Sequence[str], *, stored: str = STORED,
@@ -153,17 +150,17 @@ def thermal_page(outcome: ThermalOutcome, sources: Sequence[str], *, stored: str
     low, high = curve.range_c
     return page(
         'thermal', f'Offset over temperature of {calibration.sensor or names}',
-        (', '.join(sources), _fitted(calibration)), outcome.rating,
+        (', '.join(sources), calibration.date and f'fitted {calibration.date}'), outcome.rating,
         key_numbers=[('range', f'{low:.1f} to {high:.1f} °C'), ('degree', str(curve.degree)),
                      ('change', f'{short(curve.change_mg)} mg'),
                      ('residual', f'{short(curve.residual_mg)} mg'),
                      ('uncertainty up to', f'{short(curve.band_mg)} mg')],
-        drawings=(_of_axis(curve, axis) for axis in range(3)),
+        drawings=(_draw_axis(curve, axis) for axis in range(3)),
         held_out=[(name or 'none', short(error)) for name, error in curve.held_out_mg.items()],
         notes=notes, **_values(calibration, stored))
 
 
-def _of_axis(curve: Curve, axis: int) -> Drawing:
+def _draw_axis(curve: Curve, axis: int) -> Drawing:
     """Draw the change of the reading of one axis over the temperature, with the curve."""
     grid = np.linspace(*curve.range_c, 100)
     line = curve.at(grid)[:, axis] * MG
@@ -192,7 +189,27 @@ def _of_axis(curve: Curve, axis: int) -> Drawing:
 
 def _values(calibration: Calibration, stored: str) -> dict[str, Any]:
     """Return what a page shows of the values of a calibration, and of its file `stored`."""
-    rows = [*_linear_rows(calibration), *_effect_rows(calibration)]
+    rows, by_name = [*_linear_rows(calibration)], {
+        str(effect): effect for effect in calibration.model.effects}
+    for curve in by_name.values():  # a curve has many values
+        if isinstance(curve, EmpiricalCurve):
+            mode = 'degree' if curve.variable == 'direction' else 'wave'
+            rows.append((f'curve of {curve.changed} over {variable_words(curve.variable)}',
+                         counted(len(curve.modes), mode), ''))
+    for figure in effect_figures(calibration):
+        name, _, part = figure.key.rpartition('.')
+        if isinstance(by_name[name], EmpiricalCurve) or not (figure.value or figure.sd):
+            continue
+        label, effect = f'{name.replace("_", " ")} {part}', entry_of(by_name[name])
+        if part not in effect.parameters:
+            rows.append((label, f'{figure.value:.5g} {figure.unit}'.rstrip(), ''))
+            continue
+        unit, scale = value_unit(by_name[name], part)
+        typical, factor = effect.typical * scale, 1.0
+        if unit.startswith('g') and 0.0 < typical < _SMALL:
+            unit, factor = f'µ{unit}', MG ** 2
+        rows.append((label, signed(figure.value * factor, figure.sd * factor, unit),
+                     f'±{short(typical * factor)} {unit}' if 0.0 < typical < np.inf else ''))
     if calibration.is_levelled:
         found = mounting_figures(calibration.rotation, calibration.sensor)
         rows += [(f'mounting, {name}', with_minus(f'{np.degrees(found[name]):+.2f}°'), '')
@@ -239,30 +256,6 @@ def _linear_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
             words = signed(value - 90.0, sd)
             yield (f'angle {AXES[i]} to {AXES[j]}', f'90° {words[0]} {words[1:]}°',
                    _USUAL['angle'])
-
-
-def _effect_rows(calibration: Calibration) -> Iterator[tuple[str, str, str]]:
-    """Yield the values of the other effects; a curve, which has many, is one row."""
-    by_name = {str(effect): effect for effect in calibration.model.effects}
-    for curve in by_name.values():
-        if isinstance(curve, EmpiricalCurve):
-            mode = 'degree' if curve.variable == 'direction' else 'wave'
-            yield (f'curve of {curve.changed} over {variable_words(curve.variable)}',
-                   counted(len(curve.modes), mode), '')
-    for figure in effect_figures(calibration):
-        name, _, part = figure.key.rpartition('.')
-        if isinstance(by_name[name], EmpiricalCurve) or not (figure.value or figure.sd):
-            continue
-        label, effect = f'{name.replace("_", " ")} {part}', entry_of(by_name[name])
-        if part not in effect.parameters:
-            yield label, f'{figure.value:.5g} {figure.unit}'.rstrip(), ''
-            continue
-        unit, scale = value_unit(by_name[name], part)
-        typical, factor = effect.typical * scale, 1.0
-        if unit.startswith('g') and 0.0 < typical < _SMALL:
-            unit, factor = f'µ{unit}', MG ** 2
-        yield (label, signed(figure.value * factor, figure.sd * factor, unit),
-               f'±{short(typical * factor)} {unit}' if 0.0 < typical < np.inf else '')
 
 
 def _pose_table(residuals: Residuals, calibration: Calibration

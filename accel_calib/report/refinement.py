@@ -13,22 +13,22 @@ shown relative to its mean over the poses, because offset and gain contain the m
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from .residuals import (
-    against, are_spread, limit_mg, of_remainder, Residuals, residuals_of_refinement, sphere_map,
-    variable_of, variables_of, with_thermal)
+    against, limit_mg, of_remainder, Residuals, residuals_of_refinement, sphere_map, variable_of,
+    variables_of, with_thermal)
 from .sheet import (
     ACCENT, add_band, AFTER, AXIS_COLOURS, BAND, BEFORE, Drawing, drawn, FAINT, HEIGHT_INCHES, INK,
-    PAPER, save)
-from ..effects import AXES, EMPIRICAL, EmpiricalCurve, entry_of, parameter_names, variable_words
+    PAPER, styled)
+from ..effects import AXES, EmpiricalCurve, entry_of, parameter_names, variable_words
 from ..findings import base_words, chance_words, odds_words, value_words, verdict_words
-from ..refinement import named_entries, Refinement, Step
-from ..statistics import over_axes
+from ..refinement import named_entries, Refinement
+from ..statistics import over_axes, rms
 from ..table import Floats
 from ..text import short
 from ..units import MG
@@ -44,7 +44,7 @@ def search_values(result: Refinement, residuals: Residuals) -> dict[str, Any]:
 
     """
     left, entries = residuals_of_refinement(result), named_entries(result.also)
-    same = np.isclose(left.rms_mg, residuals.rms_mg, rtol=0.01)
+    same = np.isclose(rms(left.after_mg), rms(residuals.after_mg), rtol=0.01)
     return {
         'verdict': verdict_words(result), 'ladder': ladder(result) if result.steps else None,
         'rows': [(str(number), step.effect,
@@ -53,29 +53,24 @@ def search_values(result: Refinement, residuals: Residuals) -> dict[str, Any]:
                   chance_words(step.p_value)) for number, step in enumerate(result.steps, 1)],
         'steps': [{'step': step, 'effect': entry_of(step.name), 'rivals': odds_words(step),
                    'chance': chance_words(step.p_value),
-                   'values': value_words(step), 'drawings': of_step(result, k),
-                   'curve': [of_curve(result, k)] if _is_drawn(step) else []}
+                   'values': value_words(step), 'drawings': draw_step(result, left, k),
+                   'curve': draw_curve(result, k)}
                   for k, step in enumerate(result.steps)],
         'left': None if same else of_remainder(left, 'refined'),
         'not_testable': [(f'{entries[name].words} ({name})', needs)
                          for name, needs in result.not_testable]}
 
 
-def _is_drawn(step: Step) -> bool:
-    """Return whether a step is a curve over one variable; one over directions is on the sphere."""
-    return step.effect == EMPIRICAL and step.variable != 'direction'
-
-
 # ----------------------------------------------------------------------------- figures
 
 def all_drawings(result: Refinement) -> Iterator[Drawing]:
     """Yield all figures of the report."""
+    kept = residuals_of_refinement(result)
     yield ladder(result)
     for step in range(len(result.steps)):
-        yield from of_step(result, step)
-        if _is_drawn(result.steps[step]):
-            yield of_curve(result, step)
-    yield from of_remainder(residuals_of_refinement(result))
+        yield from draw_step(result, kept, step)
+        yield from draw_curve(result, step)
+    yield from of_remainder(kept)
 
 
 def write_figures(folder: Path, result: Refinement) -> list[Path]:
@@ -85,29 +80,28 @@ def write_figures(folder: Path, result: Refinement) -> list[Path]:
     for drawing in all_drawings(result):
         for suffix in ('svg', 'png'):
             paths.append(folder / f'{drawing.name}.{suffix}')
-            save(drawing, paths[-1])
+            with styled():
+                drawing.figure.savefig(paths[-1], dpi=160, facecolor='white')
     return paths
 
 
-def of_step(result: Refinement, step: int) -> Iterator[Drawing]:
-    """Yield figures of the residuals before and after a step, with equal scales."""
+def draw_step(result: Refinement, kept: Residuals, step: int) -> Iterator[Drawing]:
+    """Yield the residuals of the kept poses before and after a step, with equal scales."""
     before, after = result.stages[step], result.stages[step + 1]
-    kept = residuals_of_refinement(result)
     first = base_words(result) if step == 0 else f'+ {before.name}'
-    stages = (('before', first, kept.at(before), BEFORE),
-              ('after', f'+ {after.name}', kept.at(after), AFTER))
-    limit = limit_mg(*(residuals for _, _, residuals, _ in stages))
-    titles = [f'{when.capitalize()}: {words}, {short(residuals.rms_mg)} mg RMS'
-              for when, words, residuals, _ in stages]
+    stages = [(when, replace(kept, after_mg=stage.residual_mg), colour,
+               f'{when.capitalize()}: {words}, {short(rms(stage.residual_mg))} mg RMS')
+              for when, words, stage, colour in (
+                  ('before', first, before, BEFORE), ('after', f'+ {after.name}', after, AFTER))]
+    limit = limit_mg(*(residuals for _, residuals, _, _ in stages))
     name, effect = f'step{step + 1}_{after.name}', result.steps[step].name
     values = result.calibration.model.values.get(effect)
     shape = None if values is None else entry_of(effect).split(values)[1]
     variables = variables_of(effect, result.poses_g, result.force, shape)
-    if are_spread(result.force):
-        for title, (when, _, residuals, _) in zip(titles, stages, strict=True):
-            yield sphere_map(residuals, f'{name}_sphere_{when}', title, limit)
-    for title, (when, _, residuals, colour) in zip(titles, stages, strict=True):
-        yield against(residuals, variables, f'{name}_variable_{when}', title, limit, colour)
+    for when, residuals, _, title in stages:
+        yield from sphere_map(residuals, f'{name}_sphere_{when}', title, limit)
+    for when, residuals, colour, title in stages:
+        yield against(residuals, variables, f'{name}_variable_{when}', title, limit, colour=colour)
 
 
 # ----------------------------------------------------------------------------- curves
@@ -144,8 +138,11 @@ def curve_parts(result: Refinement, curve: EmpiricalCurve) -> list[CurvePart]:
     for k, own in enumerate(names):
         poses = (result.force[:, AXES.index(own)] if variable == 'force'
                  else over_axes(with_thermal(result.poses_g, '', np.zeros(0))[variable]))
-        waves = _waves(modes, at, low, high)
-        waves = waves - np.mean(_waves(modes, poses, low, high), axis=1, keepdims=True)
+        # The cosines of the curve, which is constant outside of its range.
+        share = np.clip((np.concatenate([at, poses]) - low) / (high - low), 0.0, 1.0)
+        waves, at_poses = np.split(
+            np.cos(np.pi * np.multiply.outer(np.array(modes), share)), [len(at)], axis=1)
+        waves = waves - np.mean(at_poses, axis=1, keepdims=True)
         rows = first + k + len(names) * np.arange(len(modes))
         spread = calibration.covariance[np.ix_(rows, rows)]
         variance = np.einsum('kg,kl,lg->g', waves, spread, waves)
@@ -154,15 +151,16 @@ def curve_parts(result: Refinement, curve: EmpiricalCurve) -> list[CurvePart]:
     return parts
 
 
-def _waves(modes: Sequence[int], values: Floats, low: float, high: float) -> Floats:
-    """Return the (k, n) cosines of a curve, constant outside of its range."""
-    share = np.clip((values - low) / (high - low), 0.0, 1.0)
-    return np.cos(np.pi * np.multiply.outer(np.array(modes), share))
+def draw_curve(result: Refinement, step: int) -> Iterator[Drawing]:
+    """
+    Yield the empirical curve of a step, with its 95 % band and ticks at the poses.
 
+    A step is no such curve, or is on the sphere as one over directions.
 
-def of_curve(result: Refinement, step: int) -> Drawing:
-    """Draw the empirical curve of a step with its 95 % band, and ticks at the poses."""
-    curve = cast(EmpiricalCurve, result.steps[step].name)
+    """
+    curve = result.steps[step].name
+    if not isinstance(curve, EmpiricalCurve) or curve.variable == 'direction':
+        return
     variable = curve.variable
     words = 'gain of all axes' if curve.carrier == 'force' else curve.carrier.replace('_', '-')
     words += f' of {curve.part}' if curve.part else ''
@@ -180,7 +178,7 @@ def of_curve(result: Refinement, step: int) -> Drawing:
         panel.set_xlabel(both.label)
         panel.set_ylabel(f'change from the mean [m{curve.unit}]')
         panel.legend(ncols=len(parts))
-    return Drawing(f'step{step + 1}_curve', title, figure)
+    yield Drawing(f'step{step + 1}_curve', title, figure)
 
 
 # ----------------------------------------------------------------------------- the ladder
