@@ -11,14 +11,15 @@ from typing import Any
 
 from rich.table import Table
 
-from .frame import (
-    Done, FAILED, intake, log_options, rated, read_lines, rows_between, stored_calibration)
+from .commands import next_command
+from .frame import Done, FAILED, intake, log_options, read_lines, rows_between, stored_calibration
 from .output import NARROW, progress, short_if_known, table, Verdict
 from ..calibration import verify
 from ..comparison import compare, history_of
 from ..errors import InputError
 from ..findings import (
-    change_words, GAINS, in_words, OFFSETS, rate_comparison, rate_noise, rate_verification)
+    change_words, GAINS, in_words, OFFSETS, rate_comparison, rate_noise, rate_verification,
+    rating_json)
 from ..logs import open_log
 from ..noise import check_allantools, duration, noise_of, to_json, whole
 from ..pipeline import Correction
@@ -44,10 +45,10 @@ def run_verify(args: argparse.Namespace) -> Done:
     lines = [*found.lines, *(each.words for each in poses.findings)]
     page = partial(calibration_page, calibration, rating, str(args.poses), notes=lines,
                    verification=(verification, poses), stored=str(args.calibration))
-    judged = rated(rating, args)
-    command = judged['next']['command']
-    result = {'file': args.poses, 'poses': len(poses), **asdict(verification), **judged,
-              'read_as': found.read_as, 'read_lines': lines,
+    command = next_command(rating.next, args)
+    result = {'file': args.poses, 'poses': len(poses), **asdict(verification),
+              **rating_json(rating, rating.next, command), 'read_as': found.read_as,
+              'read_lines': lines,
               'rating_lines': [*rating.lines, *([f'      {command}'] if command else [])]}
     above = args.max is not None and not verification.rms_after_mg <= args.max
     result |= {} if args.max is None else {'max_mg': args.max, 'above_max': above}
@@ -123,7 +124,8 @@ def run_history(args: argparse.Namespace) -> Done:
             'from': number, 'to': number + 1, 'agree': comparison.agree,
             'p_value': comparison.p_value, 'rms_mg': comparison.runs[1].rms_mg,
             'largest_mg': comparison.runs[1].largest_mg, 'parameter': change.parameter,
-            'change': change.change, 'change_sd': change.sd, **rated(rating, args)})
+            'change': change.change, 'change_sd': change.sd,
+            **rating_json(rating, rating.next, next_command(rating.next, args))})
         verdict = 'agree' if comparison.agree else 'differ'
         lines.append(f'{labels[number - 1]} to {labels[number]}: {verdict} (p = '
                      f'{comparison.p_value:.2g}), {rating.name}; largest change: {most}')

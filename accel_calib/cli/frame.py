@@ -171,7 +171,9 @@ def _carry_out(args: argparse.Namespace) -> Done:
                      'error': known.message, 'advice': known.advice,
                      **({'read_as': known.read_as} if known.read_as else {})}, error=err)
     if done.rating is not None:
-        done = replace(done, result={**done.result, **rated(done.rating, args)})
+        step = done.rating.next
+        judged = rating_json(done.rating, step, next_command(step, args))
+        done = replace(done, result={**done.result, **judged})
     return done
 
 
@@ -208,12 +210,6 @@ def _attempt(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
         return BAD_INPUT, {'file': str(args.poses), **plain(done.result)}
     refused = dict(zip(('error', 'advice'), done.refusal))
     return BAD_INPUT if refused else done.status, {**plain(done.result), **refused}
-
-
-def rated(rating: Rating, args: argparse.Namespace) -> dict[str, Any]:
-    """Return a rating for JSON."""
-    step = rating.next
-    return rating_json(rating, step.kind, step.text, next_command(step, args))
 
 
 def write_json(target: str | None, result: object) -> None:

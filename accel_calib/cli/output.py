@@ -30,8 +30,6 @@ from ..logs import Progress
 from ..text import short
 
 _NO_BREAK = '\N{NO-BREAK SPACE}'
-_MARK = '\ue000'
-"""Stands for a letter of the rating while a line is broken."""
 
 _COLOURS = {'GOOD': 'bold green', 'USABLE': 'bold yellow', 'BAD': 'bold red'}
 
@@ -62,22 +60,20 @@ class Output(Console):
         if len(objects) != 1 or not isinstance(given := objects[0], str | Verdict):
             super().print(*objects, **options)
             return
-        if isinstance(given, Verdict):
-            line, rating, start = given
-            mark = _MARK * len(rating)
-            before, _, after = self._broken(
-                f'{line[:start]}{mark}{line[start + len(rating):]}').partition(mark)
-            text = Text.assemble(self.render_str(before), (rating, _COLOURS[rating]),
-                                 self.render_str(after))
-        else:
-            text = self.render_str('\n'.join(map(self._broken, given.split('\n'))))
+        line, rating, start = given if isinstance(given, Verdict) else (given, '', 0)
+        text = self._broken(line)
+        if rating:
+            end = len(self._broken(line[:start + len(rating)]))
+            text.stylize(_COLOURS[rating], end - len(rating), end)
         super().print(text, soft_wrap=True, **options)
 
-    def _broken(self, line: str) -> str:
-        tied = re.sub(_TIED, _NO_BREAK, line)
-        parts = wrap(tied, self.width, subsequent_indent='  ', break_long_words=False,
-                     break_on_hyphens=False)
-        return '\n'.join(parts).replace(_NO_BREAK, ' ') or line
+    def _broken(self, text: str) -> Text:
+        lines = []
+        for line in text.split('\n'):
+            parts = wrap(re.sub(_TIED, _NO_BREAK, line), self.width, subsequent_indent='  ',
+                         break_long_words=False, break_on_hyphens=False)
+            lines.append('\n'.join(parts).replace(_NO_BREAK, ' ') or line)
+        return self.render_str('\n'.join(lines))
 
 
 def shown(text: str, encoding: str) -> str:

@@ -36,7 +36,7 @@ from ..effects import (
     AXES, effect_named, EffectKey, entry_of, LADDER, Model, MODELS, ParameterName, predict,
     value_unit)
 from ..estimate import pose_noise, sensing_axes, variance_factor
-from ..finding import Rating
+from ..finding import NextStep, Rating
 from ..statistics import rms
 from ..text import signed
 from ..units import MG
@@ -235,11 +235,11 @@ def refinement_json(result: Refinement) -> dict[str, Any]:
         'refusal': result.refusal[0] if result.refusal else None}
 
 
-def rating_json(rating: Rating, kind: str, text: str, command: str) -> dict[str, Any]:
-    """Return a rating for JSON, with the kind of the next step, its words and its command."""
+def rating_json(rating: Rating, step: NextStep, command: str) -> dict[str, Any]:
+    """Return a rating for JSON, with the next step and its command."""
     return {'rating': rating.name, 'rating_reason': rating.reason,
             'findings': [each.stated for each in rating.findings],
-            'next': {'kind': kind, 'text': text, 'command': command}}
+            'next': {'kind': step.kind, 'text': step.text, 'command': command}}
 
 
 # ----------------------------------------------------------------------------- expected error
