@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 import math
 import signal
@@ -210,7 +210,7 @@ def run_watch(args: argparse.Namespace) -> Done:
                              NEEDS_ROS) from err
         for_ros = [args.command, *args.for_ros]
         if not args.once:
-            with _shown(args.bell) as show:
+            with _open_screen(args.bell) as show:
                 watch.watch(args.node, show, is_over, for_ros)
             return Done()
         node, progress = watch.current(args.node, is_over, for_ros)
@@ -222,14 +222,15 @@ def run_watch(args: argparse.Namespace) -> Done:
 
 
 @contextmanager
-def _shown(bell: bool) -> Iterator[Show]:
+def _open_screen(bell: bool) -> Iterator[Show]:
     """Yield the function that shows the progress: on the screen, or by a line for each change."""
     console, before = Output(), ''
     last: Progress | None = None
     view: RenderableType | None = None
-    is_drawn = sys.stdout.isatty() and not console.is_dumb_terminal
-    with Live(console=console, auto_refresh=False, screen=True) if is_drawn else nullcontext(
-            ) as live:
+    terminal: AbstractContextManager[Live | None] = nullcontext()
+    if sys.stdout.isatty() and not console.is_dumb_terminal:
+        terminal = Live(console=console, auto_refresh=False, screen=True)
+    with terminal as live:
         def show(node: str, progress: Progress | None, problem: str) -> None:
             nonlocal last, before, view
             if live is not None:

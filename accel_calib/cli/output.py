@@ -61,13 +61,13 @@ class Output(Console):
             super().print(*objects, **options)
             return
         line, rating, start = given if isinstance(given, Verdict) else (given, '', 0)
-        text = self._broken(line)
+        text = self._break_lines(line)
         if rating:
-            end = len(self._broken(line[:start + len(rating)]))
+            end = len(self._break_lines(line[:start + len(rating)]))
             text.stylize(_COLOURS[rating], end - len(rating), end)
         super().print(text, soft_wrap=True, **options)
 
-    def _broken(self, text: str) -> Text:
+    def _break_lines(self, text: str) -> Text:
         lines = []
         for line in text.split('\n'):
             parts = wrap(re.sub(_TIED, _NO_BREAK, line), self.width, subsequent_indent='  ',
