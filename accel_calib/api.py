@@ -158,7 +158,8 @@ def capture(recording: Source | Recording | Data, *, units: UnitName | None = No
         out of range.
 
     """
-    if not isinstance(recording, Recording) and not _is_log(recording):
+    if not isinstance(recording, str | PathLike | Recording) and (
+            isinstance(recording, Table) or not hasattr(recording, 'columns')):
         raise InputError(f'found {type(recording).__name__}, expected a recording',
                          'pass a path, a Recording, or a DataFrame with times')
     found, _ = captured_from(*_asked(recording, units, gravity, {
@@ -480,12 +481,6 @@ def simulate(effects: Mapping[str, ArrayLike] = {}, *, recording: bool = False, 
     return replace(kept, units=units)  # type: ignore[return-value]
 
 
-def _is_log(given: object) -> bool:
-    """Return whether this is a path or a DataFrame, and no table or array."""
-    return isinstance(given, str | PathLike) or (
-        hasattr(given, 'columns') and not isinstance(given, Table))
-
-
 def _asked(given: Source | Poses | Recording | Data, units: UnitName | None,
            gravity: float = STANDARD_GRAVITY, settings: Mapping[str, Any] = {}
            ) -> tuple[Any, LogOptions, dict[str, Any]]:
@@ -494,8 +489,10 @@ def _asked(given: Source | Poses | Recording | Data, units: UnitName | None,
     options = LogOptions(units=units or '', gravity=gravity,
                          **{name: settings[name] for name in of_log})
     source: Any = given
-    if _is_log(given):
-        source = Path(given) if isinstance(given, str | PathLike) else Frame(given)
+    if isinstance(given, str | PathLike):
+        source = Path(given)
+    elif hasattr(given, 'columns') and not isinstance(given, Table):
+        source = Frame(given)
     elif not isinstance(given, Table):
         columns = {'reading': np.asarray(given, float)}
         shape = columns['reading'].shape

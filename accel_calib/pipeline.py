@@ -70,6 +70,12 @@ class Intake:
     ramp: Ramp | None = None
 
     @property
+    def said(self) -> str:
+        """Return how the log was read and captured, in one line, for an error about it."""
+        left_out = (each.text for each in self.poses.findings if each.kind == 'missing')
+        return ', '.join(filter(None, (self.read_as, *self.captured, *left_out)))
+
+    @property
     def lines(self) -> tuple[str, ...]:
         """Return `read_as` and the notes, for the terminal and the page."""
         return tuple(filter(None, (self.read_as and f'read as: {self.read_as}', *self.notes,

@@ -147,9 +147,9 @@ def _same(one: Any, other: Any) -> bool:
         return one.keys() == other.keys() and all(_same(one[key], other[key]) for key in one)
     if isinstance(one, tuple):
         return len(one) == len(other) and all(map(_same, one, other))
+    related = type(one) is type(other) or (isinstance(one, Record) and (
+        isinstance(other, type(one)) or isinstance(one, type(other))))
     if is_dataclass(one):
-        related = type(one) is type(other) or (isinstance(one, Record) and (
-            isinstance(other, type(one)) or isinstance(one, type(other))))
         return related and all(_same(getattr(one, each.name), getattr(other, each.name))
                                for each in fields(one) if each.compare)
     return bool(one == other or (one != one and other != other))

@@ -167,7 +167,7 @@ def _page(args: argparse.Namespace, log: Path, found: Intake, outcome: Outcome) 
                             stored=str(args.output or 'calibration.yaml'))
 
 
-def several_fit(results: Sequence[dict[str, Any]]) -> Iterator[str]:
+def several_fit(results: Sequence[dict[str, Any]]) -> Iterator[str | Verdict]:
     """Yield a line for each of several results."""
     for result in results:
         if 'error' in result:

@@ -324,8 +324,7 @@ def intake(args: argparse.Namespace, path: Path, calibration: Calibration | None
     with progress('samples') as moved:
         found = poses_of(path, log_options(args, calibration),
                          given(CaptureSettings, args), moved)
-    left_out = (each.text for each in found.poses.findings if each.kind == 'missing')
-    with saying(', '.join(filter(None, (found.read_as, *found.captured, *left_out)))):
+    with saying(found.said):
         yield found
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 import math
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -37,9 +37,8 @@ if TYPE_CHECKING:
     from ..noise import NoiseFigures
     from ..refinement import Refinement
 
-_REFINE = NextStep('refine', 'run refine to find the missing effect')
-_CHECK = NextStep('poses', 'check what differs between the poses, clamp the sensor, and take the '
-                  'poses again')
+_REFINE = 'run refine to find the missing effect'
+_CHECK = 'check what differs between the poses, clamp the sensor, and take the poses again'
 
 
 def rate(calibration: Calibration, *, refinement: Refinement | None = None) -> Rating:
@@ -79,28 +78,27 @@ def _find_failures(expected: Expected, refinement: Refinement | None) -> Iterato
             and expected.calibration.model.effects == refinement.calibration.model.effects):
         message, advice = refinement.refusal
         yield Finding('refused', message, advice, 'BAD')
-    own, remedy = expected.own_mg, _remedy(expected, refinement)
-    before, calibrated = expected.before_mg, bool(expected.calibration.model.effects)
+    own, before, is_partial = expected.own_mg, expected.before_mg, expected.is_partial
     if expected.noise_mg is None and expected.dof < TO_CHECK.value:
         return  # the uncertainty is hardly known
     if own > BAD_ERROR.value:
         yield Finding('error', f'the error in new orientations is {mg(own)}, expected at most '
-                      f'{mg(BAD_ERROR.value)}', remedy.text, 'BAD', step=remedy.kind)
-    elif calibrated and before is not None and own > max(before, MATTERS.value) and (
-            not expected.is_partial):
+                      f'{mg(BAD_ERROR.value)}', level='BAD', **_remedy(expected, refinement))
+    elif (expected.calibration.model.effects and not is_partial and before is not None
+          and own > max(before, MATTERS.value)):
         yield Finding('no_gain', f'the error in new orientations is {mg(own)}, and {mg(before)} '
-                      'without the calibration', remedy.text,
-                      'BAD' if own > WORST_ERROR.value else 'USABLE', step=remedy.kind)
+                      'without the calibration', level='BAD' if own > WORST_ERROR.value else
+                      'USABLE', **_remedy(expected, refinement))
 
 
 def _find_wild_figures(expected: Expected, refinement: Refinement | None) -> Iterator[Finding]:
     """Yield a finding for each figure of the first line that no useful calibration has."""
-    quality, remedy = expected.quality, _remedy(expected, refinement)
+    quality = expected.quality
     held_out, noise = quality.held_out_rms_mg, quality.noise_floor_mg
     if held_out is not None and held_out > BAD_ERROR.value and not expected.is_partial:
         yield Finding('held_out', 'orientations that the fit has not seen are wrong by '
-                      f'{mg(held_out)}, expected at most {mg(BAD_ERROR.value)}', remedy.text,
-                      'BAD', step=remedy.kind)
+                      f'{mg(held_out)}, expected at most {mg(BAD_ERROR.value)}', level='BAD',
+                      **_remedy(expected, refinement))
     if noise is None or expected.dof < TO_CHECK.value or not expected.calibration.model.effects:
         return
     rows = expected.outliers
@@ -108,8 +106,8 @@ def _find_wild_figures(expected: Expected, refinement: Refinement | None) -> Ite
     if many and quality.rms_after_mg > FAR_OFF.value * noise:
         yield Finding('far_off', f'the residual is {quality.rms_after_mg / noise:.0f} times the '
                       f'noise beside {counted(len(rows), "outlier")}: the model does not hold, '
-                      f'expected at most {FAR_OFF.value:.0f} times', remedy.text, 'BAD', rows,
-                      step=remedy.kind)
+                      f'expected at most {FAR_OFF.value:.0f} times', level='BAD', rows=rows,
+                      **_remedy(expected, refinement))
     elif quality.rms_after_mg * TOO_EXACT.value < noise:
         yield Finding('too_exact', f'the residual is {mg(quality.rms_after_mg)}, far '
                       f'below the noise of {mg(noise)}: these readings are computed, not measured',
@@ -179,7 +177,7 @@ def _find_missing(expected: Expected, refinement: Refinement | None) -> Iterator
         begin, step = f'{mg(expected.hidden_mg)} of the residual are not noise', 'poses'
         if refinement is None:
             what = f'{begin}: an effect is missing, or poses moved'
-            advice, step = _REFINE.text, _REFINE.kind
+            advice, step = _REFINE, 'refine'
         elif refinement.steps and effects != refinement.calibration.model.effects:
             names = ' and '.join(step.effect for step in refinement.steps)
             what = f'{begin}; the model lacks {names}'
@@ -192,7 +190,7 @@ def _find_missing(expected: Expected, refinement: Refinement | None) -> Iterator
             what = f'{begin}: the offset changed slowly with time ({WANDER})'
             advice = 'let the sensor warm up, and take the poses within a few minutes'
         else:
-            what, advice = f'{begin}, and no effect explains them', _CHECK.text
+            what, advice = f'{begin}, and no effect explains them', _CHECK
         yield Finding('beyond_noise', what, advice, 'USABLE', step=step)
     for name, size in expected.not_corrected:
         if size <= MATTERS.value:
@@ -221,10 +219,9 @@ def _find_inexact(expected: Expected, error: float, refinement: Refinement | Non
         yield Finding('omitted', f'model {expected.omits} omits what these poses do not '
                       f'determine: the error may be {mg(error)}', _more_poses(expected), 'USABLE')
     elif large:
-        remedy = _remedy(expected, refinement)
         yield Finding('new_orientations', f'the error in new orientations is up to {mg(error)}, '
-                      f'expected at most {mg(GOOD_ERROR.value)}', remedy.text, 'USABLE',
-                      step=remedy.kind)
+                      f'expected at most {mg(GOOD_ERROR.value)}', level='USABLE',
+                      **_remedy(expected, refinement))
     elif expected.worst_mg > WORST_ERROR.value:
         yield Finding('far_from_poses', f'the error is up to {mg(expected.worst_mg)} where there '
                       f'is no pose, expected at most {mg(WORST_ERROR.value)}',
@@ -240,16 +237,15 @@ def _more_poses(expected: Expected) -> str:
     return f'take {poses}: {request_words(asked)}'
 
 
-def _remedy(expected: Expected, refinement: Refinement | None) -> NextStep:
-    """Return what reduces the larger part of the error."""
+def _remedy(expected: Expected, refinement: Refinement | None) -> dict[str, Any]:
+    """Return advice and step of a finding: what reduces the larger part of the error."""
     if expected.hidden_mg <= BOUND * expected.stated_mg:
-        return NextStep('poses', _more_poses(expected))
+        return {'advice': _more_poses(expected), 'step': 'poses'}
     if refinement is not None:
-        return _CHECK
-    if expected.noise_mg is None:
-        return NextStep('refine', 'hold the sensor still in each pose, record std and count, and '
-                        'run refine to find what is missing')
-    return _REFINE
+        return {'advice': _CHECK, 'step': 'poses'}
+    return {'step': 'refine', 'advice': _REFINE if expected.noise_mg is not None else
+            'hold the sensor still in each pose, record std and count, and run refine to find '
+            'what is missing'}
 
 
 def step_after(calibration: Calibration) -> NextStep:
