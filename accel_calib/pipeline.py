@@ -57,8 +57,7 @@ class Intake:
     Poses of a table or captured from a recording, with the unit of their readings.
 
     `read_as` is how the log was read, empty if nothing was assumed. `notes` are what was left out
-    of the log, and `captured` how the poses were captured, if they were. With a `ramp` of a still
-    board, the poses are its stretches [g].
+    of the log, and `captured` how the poses were captured, if they were.
 
     """
 
@@ -67,7 +66,6 @@ class Intake:
     read_as: str = ''
     notes: tuple[str, ...] = ()
     captured: tuple[str, ...] = ()
-    ramp: Ramp | None = None
 
     @property
     def said(self) -> str:
@@ -200,6 +198,13 @@ def _nothing_still(source: str, found: Captured, units: Units, asked: CaptureSet
                       f'hold the sensor still in each pose for some seconds; {tried}')
 
 
+@dataclass(frozen=True)
+class RampIntake(Intake):
+    """The ramp of a still board; the poses are its stretches [g]."""
+
+    ramp: Ramp = field(kw_only=True)
+
+
 def ramp_or_poses(source: Path | Piped | Frame, options: LogOptions = LogOptions(),
                   settings: Mapping[str, Any] = {},
                   progress: Progress = lambda done, count: None) -> Intake:
@@ -218,13 +223,13 @@ def ramp_or_poses(source: Path | Piped | Frame, options: LogOptions = LogOptions
     return poses_of(source, options, settings, progress)
 
 
-def _ramp_intake(cells: Poses, log: OpenLog) -> Intake:
+def _ramp_intake(cells: Poses, log: OpenLog) -> RampIntake:
     """Return the ramp of a still board from the samples of a log in cells."""
     ramp = ramp_of(cells)
     low, high = range_of(ramp.stretches, 'temperature')
     words = f'a still board for {ramp.seconds / 60.0:.0f} min, from {low:.1f} to {high:.1f} °C'
-    return Intake(ramp.stretches, log.units, log.read_as,
-                  captured=(words, *log.notes, *ramp.notes), ramp=ramp)
+    return RampIntake(ramp.stretches, log.units, log.read_as,
+                      captured=(words, *log.notes, *ramp.notes), ramp=ramp)
 
 
 def _cells(log: OpenLog, samples: Iterable[Recording]) -> Poses | None:
@@ -422,7 +427,7 @@ def thermally_calibrated(logs: Sequence[Intake], plan: Plan = Plan()) -> Thermal
 
     Parameters
     ----------
-    logs : sequence of Intake
+    logs : sequence of Intake or RampIntake
         One or more ramps, each in its own orientation, and at most one log of poses of the same
         sensor in many directions, with their temperature. Its unit is that of the calibration.
     plan : Plan
@@ -436,7 +441,7 @@ def thermally_calibrated(logs: Sequence[Intake], plan: Plan = Plan()) -> Thermal
     """
     read_as = ', '.join(dict.fromkeys(each.read_as for each in logs if each.read_as))
     with saying(read_as):
-        turned = [each for each in logs if each.ramp is None]
+        turned = [each for each in logs if not isinstance(each, RampIntake)]
         if len(turned) == len(logs):
             raise InputError(f'{counted(len(turned), "log")} of poses in many directions, '
                              'expected one of a still board whose temperature changes', 'record '
@@ -454,7 +459,7 @@ def thermally_calibrated(logs: Sequence[Intake], plan: Plan = Plan()) -> Thermal
                 several = ', '.join(sorted(map(str, known)))
                 raise InputError(f'the logs are of the sensors {several}, expected one sensor',
                                  'choose one with --sensor, or give the logs of one sensor')
-        curve = curve_of([each.ramp for each in logs if each.ramp is not None])
+        curve = curve_of([each.ramp for each in logs if isinstance(each, RampIntake)])
         if turned:
             rows, units = turned[0].poses, turned[0].units
             fitted = calibrated(without_curve(curve, rows, units), units, replace(

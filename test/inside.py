@@ -67,7 +67,7 @@ from accel_calib.noise.components import COMPONENTS as ALLAN_COMPONENTS, fit_com
 from accel_calib.noise.curve import allan_variances, longest_rest, octaves, shares, spread_of
 from accel_calib.pipeline import (
     calibrated as calibrated_by, Correction, Intake, is_partial, Plan as FitPlan, poses_of,
-    thermally_calibrated)
+    RampIntake, thermally_calibrated)
 from accel_calib.refinement import base as refine_base
 from accel_calib.refinement.base import clipped, grid_step, off_grid, sampled, unclipped
 from accel_calib.refinement.beam import accepted, explored, reshaped

@@ -26,7 +26,7 @@ from accel_calib.stored import read_calibration, write_calibration
 from accel_calib.table import Recording
 from accel_calib.units import MG
 from faults.sample import sample
-from inside import export, Intake, thermally_calibrated
+from inside import export, Intake, RampIntake, thermally_calibrated
 import numpy as np
 import pytest
 from ramps import BENT, G, LINE, offset_at, ramp, twelve_poses, TWISTED, UP, warming, write_ulog
@@ -47,7 +47,7 @@ def curve(*logs: Recording) -> Curve:
 def thermal(*logs: Recording | Intake):
     ramps = [None if isinstance(log, Intake) else stretches(log) for log in logs]
     return thermally_calibrated([
-        log if found is None else Intake(found.stretches, MPS2, ramp=found)
+        log if found is None else RampIntake(found.stretches, MPS2, ramp=found)
         for log, found in zip(logs, ramps)])
 
 

@@ -36,7 +36,7 @@ from ..findings import (
 from ..logs import is_bag, open_log, write_blocks, write_table
 from ..pipeline import (
     calibrated, calibrated_log, captured_from, Correction, Intake, Outcome, Plan, ramp_or_poses,
-    thermally_calibrated, ThermalOutcome)
+    RampIntake, thermally_calibrated, ThermalOutcome)
 from ..stillness import CaptureSettings
 from ..stored import read_prior, write_calibration
 from ..text import counted, listed, now, short, with_sd
@@ -98,7 +98,7 @@ def _store_thermal(args: argparse.Namespace, logs: Sequence[Path], outcome: Ther
 
     calibration = outcome.calibration
     lines = [*(line for each in outcome.logs for line in each.lines), *notes]
-    is_whole = any(each.ramp is None for each in outcome.logs)
+    is_whole = any(not isinstance(each, RampIntake) for each in outcome.logs)
     curve, values = outcome.curve, Table(title='Effects of temperature', show_header=False)
     for each in effect_figures(calibration):
         values.add_row(each.label, with_sd(each.value, each.sd), each.unit)
