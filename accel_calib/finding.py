@@ -218,11 +218,10 @@ def explained_by(findings: Iterable[Finding]) -> Iterator[None]:
     try:
         yield
     except RefusedFitError as err:
-        for each in findings:
-            if each.next.kind != 'record':
-                continue
-            raise RefusedFitError(f'{err.message}; {each.text}', each.advice) from None
-        raise
+        found = next((each for each in findings if each.next.kind == 'record'), None)
+        if found is None:
+            raise
+        raise RefusedFitError(f'{err.message}; {found.text}', found.advice) from None
 
 
 @dataclass(frozen=True)

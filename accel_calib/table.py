@@ -198,7 +198,7 @@ class Autopilot:
 
 def name_from(text: str, what: str) -> str:
     """Return a name or a text from outside as one line; InputError if it is too long."""
-    name = one_line(text).strip()
+    name = text and one_line(text).strip()
     if len(name) > LONGEST_NAME:
         raise InputError(f'{what} has {len(name)} characters, expected at most {LONGEST_NAME}',
                          'shorten it')
@@ -243,8 +243,7 @@ class Table(Record):
     def __post_init__(self) -> None:
         if 'reading' not in self.columns:
             raise ValueError('the table has no readings, expected the column reading')
-        if self.sensor:
-            object.__setattr__(self, 'sensor', name_from(self.sensor, 'the name of the sensor'))
+        object.__setattr__(self, 'sensor', name_from(self.sensor, 'the name of the sensor'))
         object.__setattr__(self, 'columns', {key: read_only(values)
                                              for key, values in self.columns.items()})
         for key, values in self.columns.items():

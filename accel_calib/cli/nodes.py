@@ -242,8 +242,9 @@ def _open_screen(bell: bool) -> Iterator[Show]:
             else:
                 if problem != before:
                     print(problem or f'messages from {node} arrive again', flush=True)
-                for line in () if progress is None else changes(node, last, progress):
-                    print(line, flush=True)
+                if progress is not None:
+                    for line in changes(node, last, progress):
+                        print(line, flush=True)
             last, before = progress, problem
 
         yield show
@@ -287,13 +288,12 @@ def state(node: str, progress: Progress) -> Iterator[str]:
 def changes(node: str, before: Progress | None, now: Progress) -> Iterator[str]:
     """Yield a line for each change that the user must know; all is new if `before` is None."""
     if before is None or (before.poses, before.advice) != (now.poses, now.advice):
-        is_new, words = before is not None and now.poses > before.poses, {
-            row.label: row.words for row in _rows(now)}
+        what = 'captured pose' if before is not None and now.poses > before.poses else 'poses:'
+        words = {row.label: row.words for row in _rows(now)}
         command = '' if now.step == 'poses' else now.command  # a pose comes first
         call = f': {_SERVICE.format(node, command)}' if command else ''
-        yield (f'{"captured pose" if is_new else "poses:"} {words["poses"]}; coverage '
-               f'{now.coverage:.0%}; accuracy {words["accuracy"]}; next: {now.advice or "wait"}'
-               f'{call}')
+        yield (f'{what} {words["poses"]}; coverage {now.coverage:.0%}; accuracy '
+               f'{words["accuracy"]}; next: {now.advice or "wait"}{call}')
     if before is None or before.still != now.still:
         yield f'still: hold it for {now.min_dwell:g} s' if now.still else 'moving'
 
