@@ -80,8 +80,7 @@ from accel_calib.refinement.search import (
     _is_better as is_better_than_walk, _less as less, search as search_effects)
 from accel_calib.refinement.state import beginning, candidates, fitted_state, linearised, WORTH
 from accel_calib.refinement.steps import remarks_on
-from accel_calib.report.page import axis_figures
-from accel_calib.report.refinement import all_drawings, curve_parts
+from accel_calib.report.page import all_drawings, axis_figures, curve_parts
 from accel_calib.report.residuals import residuals_of
 from accel_calib.report.sheet import page as page_of
 from accel_calib.report.stability import comparison_page

@@ -13,6 +13,7 @@ does not show; `sensors.parquet` and the rows of the recordings have all of them
 
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
+from importlib.util import find_spec
 from itertools import islice
 from typing import Any
 from urllib.parse import unquote
@@ -26,11 +27,11 @@ from .sensors import alike, read_parquet, Store
 from ..calibration import FleetPrior
 from ..comparison import NAMES
 from ..effects import MODELS, parameter_names
-from ..findings import CROSS, scale_of
+from ..findings import change_words, CROSS, scale_of
 from ..report.sheet import (
-    ACCENT, add_band, AFTER, BAND, BEFORE, Drawing, drawn, EDGE, FAINT, has_matplotlib,
-    legend_below, Mark, Marks, page, THIRD, write_page)
-from ..report.stability import change_words, GROUPS, label_dates, named_words, places_of, spoken
+    ACCENT, add_band, AFTER, BAND, BEFORE, Drawing, drawn, EDGE, FAINT, legend_below, Mark, Marks,
+    page, THIRD, write_page)
+from ..report.stability import GROUPS, label_dates, named_words, places_of
 from ..table import Floats
 from ..text import short, with_minus
 
@@ -58,7 +59,8 @@ _DRIFTS = 0.05
 def write_fleet_page(store: Store, known: Overview, sensors: Sequence[Row],
                      priors: Mapping[str, FleetPrior]) -> None:
     """Write the page of all sensors, with typical values by model; raise OSError if it fails."""
-    differ, drawn_too, odd_names = not_agreeing(sensors), has_matplotlib(), list[str]()
+    differ, odd_names = not_agreeing(sensors), list[str]()
+    drawn_too = find_spec('matplotlib') is not None
     models = []
     for number, (name, own) in enumerate(sorted(
             known.models.items(), key=lambda each: (-len(each[1].values), each[0]))):
@@ -84,8 +86,8 @@ def _section(known: OfModel, odd: Sequence[Odd], prior: FleetPrior | None, prefi
     for name, column in zip(NAMES, table.T, strict=True):
         zero, factor, unit = scale_of(name)
         parts = (np.quantile(column, [0.0, 0.1, 0.5, 0.9, 1.0]) - zero) * factor
-        distribution.append((f'{spoken(name)} [{unit}]',
-                             *(with_minus(short(part)) for part in parts)))
+        label = f'{name.replace(".", " ")} [{unit}]'
+        distribution.append((label, *(with_minus(short(part)) for part in parts)))
     if prior is not None:
         spread = np.sqrt(np.diag(prior.prior.covariance))
         for name, mean, sd in zip(parameter_names(MODELS['10'].effects), prior.prior.mean, spread,

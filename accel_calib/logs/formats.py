@@ -253,7 +253,7 @@ def _text(path: Path, text: TextTable, options: LogOptions) -> OpenLog:
         head = next(blocks)
         check_units(head, quantities.units, str(path))
         if 'time' in head and are_samples(head.columns):
-            samples = (block.as_recording() for block in chain((head,), blocks))
+            samples = (Recording(**vars(block)) for block in chain((head,), blocks))
             count = len(head)
             if text.more:  # the size of the file, and the rows of this block, tell about how many
                 width = 2 if text.layout.encoding.startswith('utf-16') else 1
@@ -286,7 +286,7 @@ def _as_samples(path: Path, poses: Poses) -> Iterator[Recording]:
     if 'time' not in poses:
         raise InputError(f'{path} has no column time, expected a recording', 'add the times of '
                          'the samples, or name their column with --columns time=NAME')
-    yield poses.as_recording()
+    yield Recording(**vars(poses))
 
 
 # ---------------------------------------------------------------------------------- formats

@@ -99,7 +99,7 @@ def _report_rating(session: Holder, calibration: Calibration, refinement: Refine
                 session.state.settings.base_frame)
         command = action.command and f'~/{action.command}'
         session.events.append(Result(json.dumps({
-            **found, **rating_json(rating, action.kind, action.text, command)})))
+            **found, **rating_json(rating, action, command)})))
     return ''
 
 
