@@ -84,6 +84,7 @@ def test_effects_by_hand():
     context = {'temperature': np.array([35.0]), 'std': np.array([[0.1, 0.2, 0.3]]),
                'time': np.array([7300.0]), 'supply_voltage': np.array([3.63]),
                'rate': np.array([[0.0, 0.0, 2.0]]), 'previous': np.array([[0.6, 0.0, -0.8]]),
+               'earlier': np.array([[0.0, 0.8, 0.6]]),
                'since_turn': np.array([20.0]), 'duration': np.array([10.0]),
                'temperature_rate': np.array([0.01])}
     cases = {
@@ -96,8 +97,9 @@ def test_effects_by_hand():
         'supply_ratio=1,0,0,2': (0.05, -0.2, 0.5), 'offset_drift=1,2,3,100': (2, 4, 6),
         'warm_up=1,2,3,100,7200': (np.exp(-1), 2 * np.exp(-1), 3 * np.exp(-1)),
         'offset_step=1,2,3,7300': (1, 2, 3), 'vibration_rectification=1': (0.01, 0.04, 0.09),
-        'hysteresis=1': (0.6, 0.0, -0.8), 'creep=1,2,3,10': np.array([0.6, 0.0, -2.4]) * (
-            np.exp(-2) - np.exp(-3)), 'temperature_rate=1,2,3': (0.01, 0.02, 0.03),
+        'hysteresis=1,1,1,0,0.5': (0.6, 0.4, -0.5),
+        'creep=1,2,3,10': np.array([0.6, 0.0, -2.4]) * (np.exp(-2) - np.exp(-3)),
+        'temperature_rate=1,2,3': (0.01, 0.02, 0.03),
         'offset_temperature_quadratic=1': (100, 100, 100),
         'offset_temperature_cubic=1': (1000, 1000, 1000), 'gain_drift=1,2,3,100': (1, -8, 18),
         'gain_step=1,2,3,7300': (0.5, -4, 9), 'lever_arm=0.980665,0,9.80665': (-0.4, 0, 0),
@@ -135,8 +137,8 @@ def test_model_refuses_what_is_not_in_the_catalogue(values):
 
 @pytest.mark.parametrize(('text', 'values'), [
     ('offset_temperature=1', [1, 1, 1, 0, 0]), ('offset_temperature=1,2,3', [1, 2, 3, 0, 0]),
-    ('gain_temperature=1,2,3,60,1', [1, 2, 3, 60, 1]), ('hysteresis=1,2,3', [1, 2, 3, 0]),
-    ('hysteresis=1,2,3,1', [1, 2, 3, 1])])
+    ('gain_temperature=1,2,3,60,1', [1, 2, 3, 60, 1]), ('hysteresis=1,2,3', [1, 2, 3, 0, 0]),
+    ('hysteresis=1,2,3,1', [1, 2, 3, 1, 0]), ('hysteresis=1,2,3,1,0.5', [1, 2, 3, 1, 0.5])])
 def test_shape_that_is_not_stated_has_its_usual_value(text, values):
     name, found = parse_effect(text)
     np.testing.assert_array_equal(found, values)
