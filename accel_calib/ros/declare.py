@@ -139,7 +139,7 @@ def mismatches(node: Node) -> tuple[str, ...]:
              for other in node.get_publishers_info_by_topic(own.topic_name)]
     pairs += [(own, other, False) for own in node.publishers
               for other in node.get_subscriptions_info_by_topic(own.topic_name)]
-    lines = {}
+    lines: dict[str, None] = {}
     for own, other, receives in pairs:
         offered, wanted = own.qos_profile, other.qos_profile
         if receives:
