@@ -11,7 +11,7 @@ import signal
 from typing import Any
 
 from accel_calib.errors import InputError
-from accel_calib.session import COMMANDS, conditions, enable, next_step, state
+from accel_calib.session import BUTTONS, conditions, enable, next_step, state
 from driven import Driver, GRAVITY, Person
 from inside import spread_directions
 import numpy as np
@@ -96,7 +96,7 @@ def test_every_person_ends_in_a_calibration_or_in_one_named_reason(
     case, driver = PERSONS[name], Driver()
     case.change(driver)
     for command in case.refuses:
-        monkeypatch.setitem(COMMANDS, command, refused)
+        monkeypatch.setitem(BUTTONS, command, refused)
     person = Person(driver, case.sensor, **case.about)
     assert person.follow(seconds=case.seconds) == case.ends, person.steps
     driver.tick()
