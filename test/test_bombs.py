@@ -30,8 +30,7 @@ import numpy as np
 import pytest
 from rosbags import rosbag2
 from rosbags.rosbag2 import StoragePlugin
-import shared
-from shared import LOG_CORPUS, table
+from shared import children, data, known, little_memory, LOG_CORPUS, refused, table, wait
 
 pytestmark = pytest.mark.usefixtures('in_time')
 
@@ -47,7 +46,7 @@ def test_a_bomb_ends_in_one_line_with_little_memory(bomb: Path, tmp_path: Path,
     copy = shutil.copytree if bomb.is_dir() else shutil.copy
     path = Path(copy(bomb, tmp_path / bomb.name))
     before = {*tmp_path.rglob('*')}
-    with shared.little_memory(), pytest.raises(InputError) as found:
+    with little_memory(), pytest.raises(InputError) as found:
         read_recording(path)
     assert str(path) in str(found.value)
     assert '\n' not in str(found.value)
@@ -58,7 +57,7 @@ def test_a_json_file_is_read_up_to_a_size(tmp_path: Path) -> None:
     path = tmp_path / 'log.json'
     path.write_bytes(b'[{"a": 1}]')
     os.truncate(path, (1 << 25) + 1)
-    with shared.little_memory(), pytest.raises(InputError, match='JSON file of at most'):
+    with little_memory(), pytest.raises(InputError, match='JSON file of at most'):
         read_recording(path)
 
 
@@ -75,7 +74,7 @@ def test_data_that_compress_well_are_read(tmp_path: Path) -> None:
     black = [(2, RAWS[0][1] + k, bytes(8 << 20)) for k in range(4)]  # pictures
     path = McapFile(TOPICS, 'zstd', chunk=16 << 20).write(tmp_path / 'bag.mcap', [*RAWS, *black])
     assert len(read_recording(path)) == COUNT
-    assert correct_bag(path, shared.known(), tmp_path / 'out') == COUNT
+    assert correct_bag(path, known(), tmp_path / 'out') == COUNT
 
 
 def test_correcting_leaves_a_database_as_it_is_and_refuses_a_copy_that_lacks_messages(
@@ -92,11 +91,11 @@ def test_correcting_leaves_a_database_as_it_is_and_refuses_a_copy_that_lacks_mes
         return {each: (each.read_bytes(), each.stat().st_mtime_ns) for each in path.iterdir()}
 
     before = state()
-    assert correct_bag(path, shared.known(), tmp_path / 'whole') == COUNT
+    assert correct_bag(path, known(), tmp_path / 'whole') == COUNT
     assert state() == before
     monkeypatch.setattr(rosbag2.Writer, 'write', losing)
     with pytest.raises(InputError, match='the copy holds 83 of 84 messages'):
-        correct_bag(path, shared.known(), tmp_path / 'out')
+        correct_bag(path, known(), tmp_path / 'out')
     assert sorted(each.name for each in tmp_path.iterdir()) == ['bag', 'whole']
 
 
@@ -126,10 +125,10 @@ def test_a_pipe_ends_every_command_in_one_line(
         command: str, suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pipe, stored, out = tmp_path / f'pipe{suffix}', tmp_path / 'c.yaml', tmp_path / 'out'
     os.mkfifo(pipe)
-    write_calibration(stored, shared.known())
+    write_calibration(stored, known())
     given = [each.replace('{out}', str(out)).replace('{yaml}', str(stored)).replace(
         '{}', str(pipe)) for each in command.split()]
-    assert '(FIFO)' in shared.refused(capsys, *given).partition(str(pipe))[2]
+    assert '(FIFO)' in refused(capsys, *given).partition(str(pipe))[2]
     assert not out.exists()
 
 
@@ -192,7 +191,7 @@ def test_whatever_ends_a_child_is_one_line_that_names_the_file(
 
 def readers() -> list[int]:
     """Return the ids of the children that read files for this process."""
-    return shared.children(server_of_children())
+    return children(server_of_children())
 
 
 @pytest.mark.parametrize('kind', ['mcap', 'sqlite3', 'ros1'])
@@ -253,7 +252,7 @@ def test_no_process_outlives_one_that_is_killed(tmp_path: Path) -> None:
         found = list(map(int, run.stdout.readline().split()))
         assert len(found) == 2
         run.kill()
-    shared.wait(lambda: not any(map(is_running, found)))
+    wait(lambda: not any(map(is_running, found)))
 
 
 def is_running(pid: int) -> bool:
@@ -265,9 +264,9 @@ def is_running(pid: int) -> bool:
 
 def test_one_wrong_byte_of_a_matlab_file_does_not_end_the_command(
         capsys: pytest.CaptureFixture[str]) -> None:
-    path = shared.data('foreign/one_byte.mat')
+    path = data('foreign/one_byte.mat')
     for _ in range(2):
-        error = shared.refused(capsys, 'calibrate', path)
+        error = refused(capsys, 'calibrate', path)
         assert f'{path} is damaged (its reader ended by SIGSEGV), expected a MATLAB file' in error
 
 
