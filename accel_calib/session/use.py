@@ -27,8 +27,8 @@ from ..calibration import Calibration, in_frame, on_topics, plan_session
 from ..effects import OwnEffect, shown_name
 from ..errors import DamagedCalibrationError, StoredCalibrationError
 from ..findings import (
-    calibration_json, mounting_figures, outlook, rate as rating_of, Rating,
-    rating_json, refinement_json, rival_words, verdict_words)
+    calibration_json, mounting_figures, outlook, rate as rating_of, Rating, rating_json,
+    refinement_json, rival_words, verdict_words)
 from ..geometry import angle_of, spread_directions
 from ..pipeline import calibrated, is_partial, is_refined, Plan
 from ..refinement import refine as refine_poses, Refinement
