@@ -235,8 +235,8 @@ def _curve_words(figures: Mapping[str, Any]) -> str:
 _PLACES: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
     'curve': _curve_words,
     'range': lambda of: (
-        'over {} {:.4g} to {:.4g} {}'.format(
-            of['column'].replace('_', ' '), *of['range'], unit_of(of['column'])).rstrip()
+        f'over {of["column"].replace("_", " ")} '
+        + '{:.4g} to {:.4g}'.format(*of['range']) + f' {unit_of(of["column"])}'.rstrip()
         + ': {:.2g} mg RMS in the lowest fifth of the poses, {:.2g} mg in the highest'.format(
             *of['ends_mg'])),
     'instant': lambda of: (
