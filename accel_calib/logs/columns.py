@@ -159,11 +159,6 @@ class Chosen:
     dates: tuple[int, ...]
     quantities: Mapping[str, int]
 
-    @property
-    def numeric(self) -> tuple[int, ...]:
-        """Return the indices of all columns of numbers."""
-        return (*self.needed, *self.context, *self.quantities.values())
-
     def numbers(self, cells: Cells, key: str) -> Floats:
         """Return the (n, k) numbers of a key as in the file; divided, if its maker says so."""
         values = np.column_stack([cells.numbers[source.index] for source in self.sources[key]])

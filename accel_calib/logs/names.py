@@ -361,15 +361,14 @@ _FRD = ('Axes are x forward, y right, z down, so that a level vehicle reads -1 g
         'turns them to x forward, y left, z up.')
 
 
-def _numbered(name: str) -> tuple[str, ...]:
-    return tuple(f'{name}[{k}]' for k in range(3))
-
-
 PX4_FIELDS: dict[str, dict[str, tuple[str, ...]]] = {
-    'sensor_accel': {'reading': _LOWER},
-    'sensor_combined': {'reading': _numbered('accelerometer_m_s2'), 'rate': _numbered('gyro_rad')},
-    'vehicle_imu': {'reading': _numbered('delta_velocity'), 'rate': _numbered('delta_angle')},
-    'vehicle_acceleration': {'reading': _numbered('xyz')}}
+    message: {key: (*_axes(pattern, names=names).values(),) for key, pattern in patterns.items()}
+    for message, names, patterns in (
+        ('sensor_accel', _LOWER, {'reading': '{}'}),
+        ('sensor_combined', _BY_NUMBER, {'reading': 'accelerometer_m_s2[{}]',
+                                         'rate': 'gyro_rad[{}]'}),
+        ('vehicle_imu', _BY_NUMBER, {'reading': 'delta_velocity[{}]', 'rate': 'delta_angle[{}]'}),
+        ('vehicle_acceleration', _BY_NUMBER, {'reading': 'xyz[{}]'}))}
 """Fields of the messages with accelerations, in order of preference, by key of `COLUMNS`."""
 
 PX4_SPANS = {'reading': 'delta_velocity_dt', 'rate': 'delta_angle_dt'}

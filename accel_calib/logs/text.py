@@ -123,6 +123,8 @@ class TextTable:
                  encoding: str = 'utf-8', size: int = 0) -> None:
         self.layout = layout_of(path, head, partial(is_log_header, options), encoding)
         self.columns, self.size = chosen(self.layout, options), size
+        self._numeric = (*self.columns.needed, *self.columns.context,
+                         *self.columns.quantities.values())
         self._lines, self._skip_bad = chain(head[self.layout.start:], rest), options.skip_bad
         self._line, self._row = self.layout.start, 0
         self._bad = self._cut = ''
@@ -153,12 +155,12 @@ class TextTable:
 
     def read(self, lines: Sequence[str], *, last: bool = False) -> Cells:
         """Return the rows of the next lines; a row that is cut at the last line is left out."""
-        dialect, numeric = self.layout.dialect, self.columns.numeric
+        dialect, numeric = self.layout.dialect, self._numeric
         kept = list(filter(dialect.is_row, lines))
         rows, k = ([], 0) if '"' in ''.join(kept) else (kept, len(kept))
         while k < len(kept):  # a quoted cell can have several lines, at most 20
-            last = min(k + 20, len(kept)) if kept[k].count('"') % 2 else k
-            end = next((j for j in range(k + 1, last) if kept[j].count('"') % 2), k)
+            most = min(k + 20, len(kept)) if kept[k].count('"') % 2 else k
+            end = next((j for j in range(k + 1, most) if kept[j].count('"') % 2), k)
             rows.append(''.join(kept[k:end + 1]))
             k = end + 1
         is_joined = len(rows) < len(kept)
@@ -188,7 +190,7 @@ class TextTable:
 
     def _parsed(self, lines: list[str]) -> Floats | None:
         """Return the numbers of rows, or None if one may have a fault."""
-        layout, columns = self.layout, self.columns.numeric
+        layout, columns = self.layout, self._numeric
         dialect, delimiter = layout.dialect, layout.dialect.delimiter
         texts, breaks = lines, layout.width - 1
         if dialect.monitor or dialect.labelled or dialect.prefix or '"' in ''.join(lines):
@@ -278,13 +280,12 @@ class LineReader:
         self.units = self._quantities.units
         rate = f'no times, {rate_hz:.4g} Hz ({"stated" if options.rate else "measured"})'
         self.read_as = ', '.join([*self._quantities.said, *(() if timed else (rate,))])
-        self.first, self.findings = self._recording(first), tuple(self._quantities.findings)
+        self.first = Recording(*self._quantities.columns(first, name), self.units.name)
+        self.findings = tuple(self._quantities.findings)
 
     def samples(self, lines: Sequence[str]) -> Recording | None:
         """Return the samples of the next complete lines; None if there are none."""
-        return self._recording(self._table.read([f'{line}\n' for line in lines]))
-
-    def _recording(self, cells: Cells) -> Recording | None:
+        cells = self._table.read([f'{line}\n' for line in lines])
         if not len(cells.row):
             return None
         columns, row = self._quantities.columns(cells, self._name)
