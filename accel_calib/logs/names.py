@@ -289,12 +289,6 @@ class LogFormat:
         given = {folded(name) for name in header}
         return [name for name in self.needed if folded(name) not in given]
 
-    def present(self, header: Sequence[str]) -> dict[str, str]:
-        """Return the columns of this layout in a header, with the spelling of the header."""
-        spelled = {folded(name): name for name in reversed(header)}
-        return {key: spelled[folded(name)] for key, name in self.columns.items()
-                if folded(name) in spelled}
-
 
 def folded(name: str) -> str:
     """Return a name without quotes, in lower case, with single spaces."""

@@ -4,7 +4,7 @@
 """
 Quantities of a text log: the conversion of its columns to our units.
 
-`decided` looks at the first block of numbers and decides the unit of each column: what the user,
+`decide_quantities` decides the unit of each column from the first block of numbers: what the user,
 a comment of the file, the maker's layout or the name states, in this order, or else what the
 readings at rest and the rate of the samples show. Each assumption is in `Quantities.said`.
 
@@ -112,7 +112,7 @@ _LIKELY_TEMPERATURE_C = (-60.0, 150.0)
 @dataclass
 class Quantities:
     """
-    The conversion of the columns of a log; `decided` makes it.
+    The conversion of the columns of a log; `decide_quantities` makes it.
 
     `clock` converts the times; `rate_hz` is the rate of samples without times. By key of
     `COLUMNS`, `scales` are the factor to our unit and our value at 0, and `modulus` is 2ⁿ where
@@ -173,7 +173,7 @@ class Quantities:
 
 
 @np.errstate(over='ignore', invalid='ignore')  # numbers beyond any sensor are refused later
-def decided(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
+def decide_quantities(columns: Chosen, first: Cells, options: LogOptions) -> Quantities:
     """Return the conversion of the columns, from the first block of a log; see above."""
     made = Quantities(columns, units_of('m/s2', options.gravity), Clock(columns))
     if columns.maker is not None:

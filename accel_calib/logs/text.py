@@ -30,9 +30,9 @@ from typing import Any, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from .columns import chosen, is_log_header, LogOptions
+from .columns import choose_columns, is_log_header, LogOptions
 from .dialect import Cells, Dialect, is_clock, is_number, layout_of, short
-from .quantities import decided
+from .quantities import decide_quantities
 from ..disk import write_atomically
 from ..errors import InputError
 from ..table import column_of, COLUMNS, Floats, Recording, Table
@@ -122,7 +122,7 @@ class TextTable:
     def __init__(self, path: Path, head: Sequence[str], rest: Iterator[str], options: LogOptions,
                  encoding: str = 'utf-8', size: int = 0) -> None:
         self.layout = layout_of(path, head, partial(is_log_header, options), encoding)
-        self.columns, self.size = chosen(self.layout, options), size
+        self.columns, self.size = choose_columns(self.layout, options), size
         self._numeric = (*self.columns.needed, *self.columns.context,
                          *self.columns.quantities.values())
         self._lines, self._skip_bad = chain(head[self.layout.start:], rest), options.skip_bad
@@ -275,8 +275,8 @@ class LineReader:
                              'check the format of the lines')
         timed = 'time' in self._table.columns.sources
         rate_hz = options.rate or len(first.row) / len(rows) / interval
-        self._quantities = decided(self._table.columns, first, options if timed else
-                                   replace(options, rate=rate_hz))
+        self._quantities = decide_quantities(
+            self._table.columns, first, options if timed else replace(options, rate=rate_hz))
         self.units = self._quantities.units
         rate = f'no times, {rate_hz:.4g} Hz ({"stated" if options.rate else "measured"})'
         self.read_as = ', '.join([*self._quantities.said, *(() if timed else (rate,))])

@@ -16,8 +16,7 @@ from .account import account_of, Rest
 from .chunks import CaptureSettings, REPEATED, Repeated, settings_from
 from .detector import capture, Captured, poses_from, samples_of, select, StillDetector
 from .dwell import Dwell
-from .ramp import (
-    cells_of, is_turned_over, LEAST_RANGE, LEAST_RESTS, Ramp, ramp_of, rests_in_cells)
+from .ramp import cells_of, is_turned_over, LEAST_RANGE, LEAST_RESTS, Ramp, ramp_of, rests_in_cells
 from .rule import rounding_left
 from .sensor import check_axes, check_measured, is_one_direction
 
