@@ -57,8 +57,7 @@ docs: $(VENV)/extra-docs
 faults: $(VENV)/extra-test $(VENV)/package
 	@ACCEL_CALIB_TRIALS=5 test/run $(BIN)/python -n 2 test/faults test/test_*damage*.py \
 		$$(grep -l '^from faults.sample' test/test_*.py)
-	@for seed in 1 2 3 4 5; do \
-		$(BIN)/python test/faults/fuzz.py --count 2000 --seed $$seed || exit 1; done
+	@ACCEL_CALIB_TRIALS=300 test/run $(BIN)/python -n 2 test/faults/test_fuzz.py
 
 mutants: $(VENV)/extra-test $(VENV)/extra-mutants $(VENV)/package
 	@$(BIN)/python benchmarks/figures.py mutants --markdown docs/figures/mutants.md

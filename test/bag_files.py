@@ -14,14 +14,13 @@ from accel_calib.errors import InputError
 from accel_calib.logs import IMU_DOUBLES, LogOptions, read_recording
 from accel_calib.messages import correct_bag
 from accel_calib.table import Recording
-from accel_calib.units import units_of
 import lz4.frame
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer as Writer2
 from rosbags.typesys import get_typestore, Stores
-from shared import known
+from shared import known, MPS2
 
 try:
     from compression import zstd
@@ -86,7 +85,7 @@ def write_bag(path: Path, kind: str, recording: Recording,
               topics: Sequence[str] = ('/imu/data_raw',)) -> Path:
     """Write the samples [g] of a recording with Imu, temperature and text."""
     writer, store = writer_of(path, kind)
-    reading, count = units_of('m/s2').from_g(recording.reading), len(topics)
+    reading, count = MPS2.from_g(recording.reading), len(topics)
 
     def made() -> Iterator[tuple[int, int, Any]]:
         for k, time in enumerate(recording['time']):

@@ -30,7 +30,8 @@ import numpy as np
 import pytest
 from shared import GRAVITY, KNOWN, known, ROOT
 
-sys.path.append(str(ROOT / 'benchmarks'))  # some tests are the short form of a benchmark
+sys.path[:0] = [str(ROOT / 'benchmarks'), str(ROOT / 'docs')]
+"""Some tests are the short form of a benchmark, and others check what makes a page."""
 
 UDP = ROOT / 'config' / 'fast_dds_udp.xml'
 """Profile of Fast DDS with the discovery range of LOCALHOST, and without shared memory."""
@@ -51,6 +52,22 @@ RATE = 50.0
 _BATCH = 20
 
 
+class Process(subprocess.Popen[str]):
+    """A process with its output in a file: a pipe that nobody reads would stop it."""
+
+    def __init__(self, arguments: Iterable[str], path: Path, environment: Mapping[str, str]
+                 ) -> None:
+        self._path = path
+        with path.open('w', encoding='utf-8') as file:
+            super().__init__([sys.executable, *arguments], cwd=ROOT, env=environment, stdout=file,
+                             stderr=subprocess.STDOUT, text=True)
+
+    @property
+    def printed(self) -> str:
+        """Output so far."""
+        return self._path.read_text(encoding='utf-8')
+
+
 class Bench:
     """
     A node that drives and observes the nodes under test.
@@ -66,11 +83,11 @@ class Bench:
     deep: Mapping[str, int] = {'qos_overrides./imu/data_raw.subscription.depth': 5000}
 
     def __init__(self, folder: Path, domain: int) -> None:
-        self.home = folder / 'home'
+        self.home, self._folder = folder / 'home', folder
         self._domain = domain
         self._environment = {**os.environ, 'ROS_HOME': str(self.home),
                              'ROS_DOMAIN_ID': str(domain)}
-        self._processes: list[subprocess.Popen[str]] = []
+        self._processes: list[Process] = []
         self.stamp = 1000.0
         self._join()
 
@@ -84,7 +101,7 @@ class Bench:
         self.node = Node('bench', context=self._context, enable_rosout=False)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
-        self._clients: dict[str, Any] = {}
+        self._clients: dict[tuple[str, str, int], Any] = {}
         self._imu: Any = None
 
     def _leave(self) -> None:
@@ -110,21 +127,19 @@ class Bench:
         self._environment |= {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SYSTEM_DEFAULT',
                               'FASTRTPS_DEFAULT_PROFILES_FILE': str(UDP)}
 
-    def start(self, name: str, **parameters: Any) -> subprocess.Popen[str]:
+    def start(self, name: str, **parameters: Any) -> Process:
         """Start a node of the package as a process."""
         given = [part for key, value in parameters.items() for part in (
             '-p', f'{key}:={str(value).lower() if isinstance(value, bool) else value}')]
         return self.run(*NODES[name], '--ros-args', *given)
 
-    def run(self, *arguments: str) -> subprocess.Popen[str]:
+    def run(self, *arguments: str) -> Process:
         """Start Python as a process in the domain of this bench."""
-        process = subprocess.Popen(
-            [sys.executable, *arguments], cwd=ROOT, env=self._environment,
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-        self._processes.append(process)
-        return process
+        path = self._folder / f'output{len(self._processes)}.txt'
+        self._processes.append(Process(arguments, path, self._environment))
+        return self._processes[-1]
 
-    def calibrator(self, **parameters: Any) -> subprocess.Popen[str]:
+    def calibrator(self, **parameters: Any) -> Process:
         """Start a calibrator and wait until it listens."""
         from sensor_msgs.msg import Imu
         process = self.start('calibrator', **parameters)
@@ -135,11 +150,10 @@ class Bench:
         self.client('self_test')
         return process
 
-    def end(self, process: subprocess.Popen[str], number: int) -> tuple[int, str]:
-        """Send a signal, and return the exit status and the output."""
+    def end(self, process: Process, number: int = 0) -> tuple[int, str]:
+        """Send a signal if it is not 0, and return the exit status and the output."""
         process.send_signal(number)
-        printed = process.communicate(timeout=PATIENCE)[0]
-        return process.returncode, printed
+        return process.wait(PATIENCE), process.printed
 
     def spin(self, until: Callable[[], Any], seconds: float = PATIENCE) -> None:
         """Spin until a condition holds."""
@@ -166,15 +180,16 @@ class Bench:
         self.node.create_subscription(kind, topic, heard.append, qos)
         return heard
 
-    def client(self, name: str) -> Any:
-        """Wait for a service of the calibrator, and return its client."""
+    def client(self, name: str, node: str = 'calibrator', number: int = 0) -> Any:
+        """Wait for a service of a node, and return one of its clients."""
         from diagnostic_msgs.srv import SelfTest
         from std_srvs.srv import SetBool, Trigger
         kind = {'enable': SetBool, 'self_test': SelfTest}.get(name, Trigger)
-        if name not in self._clients:
-            self._clients[name] = self.node.create_client(kind, f'calibrator/{name}')
-        self.spin(self._clients[name].service_is_ready)
-        return self._clients[name]
+        key = name, node, number
+        if key not in self._clients:
+            self._clients[key] = self.node.create_client(kind, f'{node}/{name}')
+        self.spin(self._clients[key].service_is_ready)
+        return self._clients[key]
 
     def ask(self, kind: Any, name: str, **fields: Any) -> Any:
         """Call any service, and return its answer."""
@@ -281,9 +296,8 @@ class Bench:
         """Leave DDS, and kill all started processes."""
         self._leave()  # first, because a killed process leaves its shared memory unchanged
         for process in self._processes:
-            if process.poll() is None:
-                process.kill()
-            sys.stdout.write(process.communicate()[0])  # pytest shows it if a test fails
+            process.kill()
+            sys.stdout.write(self.end(process)[1])  # pytest shows it if a test fails
 
 
 def _came(message: Any, heard: list[Any]) -> bool:

@@ -24,9 +24,9 @@ from inside import Host, model_with, predict, unit
 import numpy as np
 from playwright.sync_api import Browser, expect, Page, sync_playwright
 import pytest
+from shared import GRAVITY
 from viewer import hosted
 
-GRAVITY = 9.80665
 TRUTH = {'offset': (0.03, -0.02, 0.04), 'axis_gain': (0.01, -0.02, 0.005)}
 SIZES = ((360, 740), (740, 360), (820, 1180), (1440, 900), (2560, 1440))
 PATIENCE = 120_000

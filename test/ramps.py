@@ -71,10 +71,4 @@ def twelve_poses(seed: int, curve: Curve = BENT) -> Recording:
 
 def write_ulog(path: Path, samples: Recording, device: int = 1310988) -> None:
     """Write the samples as sensor_accel of PX4."""
-    stamps = make.stamps_us(samples)
-    fields = {'timestamp': ('uint64_t', stamps), 'timestamp_sample': ('uint64_t', stamps),
-              'device_id': ('uint32_t', [device] * len(samples)),
-              **{axis: ('float', values) for axis, values in zip(
-                  'xyz', samples.reading.T.tolist())},
-              'temperature': ('float', samples['temperature'].tolist())}
-    path.write_bytes(make.ulog_bytes([('sensor_accel', 0, fields)]))
+    path.write_bytes(make.ulog_bytes([('sensor_accel', 0, make.accel_fields(samples, device))]))

@@ -16,16 +16,18 @@ import sys
 from tempfile import TemporaryFile
 import time
 import tracemalloc
-from typing import Any
+from typing import Any, TypeVar
 
 from accel_calib import simulate
 from accel_calib.calibration import Calibration, fit_poses
 from accel_calib.effects import EffectKey, entry_of
 from accel_calib.geometry import unit
 from accel_calib.session import Step
-from accel_calib.table import Floats, Poses
+from accel_calib.table import Floats, numbered, Poses, Recording
 from accel_calib.units import units_of
-from inside import COMMAND, main, Model, model_with, OVER_THE_SPHERE, predict, spread_directions
+from inside import (
+    COMMAND, main, Model, model_with, OVER_THE_SPHERE, predict, rotation_from_rpy,
+    spread_directions)
 import numpy as np
 import pytest
 import yaml
@@ -33,10 +35,14 @@ import yaml
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / 'shared' / 'data'
 LOGS = ROOT / 'test' / 'data' / 'logs'
+LOG_CORPUS = ROOT / 'test' / 'corpus' / 'logs'
+"""Small logs, by what they show, and the options with which they are read."""
+
 GRAVITY = 9.80665
 FACES = np.vstack([np.eye(3), -np.eye(3)])
 G, MPS2, NATIVE = map(units_of, ('g', 'm/s2', 'native'))
 
+TableT = TypeVar('TableT', Poses, Recording)
 Readings = Callable[..., Any]
 Stored = Callable[..., Path]
 """Types of the fixtures of these names."""
@@ -49,6 +55,18 @@ KNOWN = {'offset': [0.03, -0.02, 0.04], 'axis_gain': [0.012, -0.015, 0.008],
          'cross_axis': [0.006, -0.004, 0.003]}
 """Effects of the sensor of `known`."""
 
+OWN = """
+import accel_calib as ac
+import numpy as np
+
+dead_band = ac.Effect(
+    'dead_band', 'dead band of each axis', typical=0.003, unit='g',
+    form=lambda u: np.clip(u / 0.05, -1.0, 1.0), slope=lambda u: (abs(u) < 0.05) / 0.05)
+field = ac.Effect('field_of_motor', 'field of the motor', typical=0.001, unit='g/A',
+                  variable='motor_current', change=lambda current: abs(current - 25.0))
+"""
+"""File of effects of a user."""
+
 OPTIONS = [part for name, values in SENSOR.items()
            for part in ('--effect', f'{name}={",".join(map(str, values))}')]
 """Options of ``simulate`` for this sensor."""
@@ -58,6 +76,12 @@ def table(name: str) -> Any:
     """Return the rows of a table of the corpus."""
     path = ROOT / 'test' / 'corpus' / 'tables' / f'{name}.yaml'
     return yaml.safe_load(path.read_text(encoding='utf-8'))
+
+
+def options_of(log: Path) -> list[dict[str, Any]]:
+    """Return the options with which a log of the corpus is read, each time."""
+    options = yaml.safe_load((LOG_CORPUS / 'options.yaml').read_text(encoding='utf-8'))
+    return options.get(f'{log.parent.name}/{log.name}', [{}])
 
 
 def data(name: str) -> Path:
@@ -116,16 +140,40 @@ def context_of(rng: np.random.Generator, count: int) -> dict[str, Floats]:
             'temperature_rate': rng.uniform(-0.1, 0.1, count)}
 
 
+def attitudes(rng: np.random.Generator, count: int) -> Floats:
+    """Return directions that are spread over the sphere, turned at random."""
+    return spread_directions(count) @ rotation_from_rpy(*rng.uniform(-3, 3, 3)).T
+
+
 def random_directions(count: int, rng: np.random.Generator) -> Floats:
     """Return (count, 3) unit vectors, uniformly distributed over the sphere."""
     return unit(rng.normal(size=(count, 3)))
 
 
-def changed(poses: Poses, rows: Any, times: Any = 1.0, plus: Any = 0.0) -> Poses:
-    """Return poses with the readings of these rows changed."""
+def changed(poses: TableT, rows: Any = slice(None), times: Any = 1.0, plus: Any = 0.0) -> TableT:
+    """Return poses or samples with the readings of these rows, 0-based, changed."""
     reading = poses.reading.copy()
     reading[rows] = reading[rows] * times + plus
     return poses.with_columns(reading=reading)
+
+
+def poses_of(reading: Any, units: str = '', **columns: Any) -> Poses:
+    """Return poses with these (n, 3) readings, and perhaps other columns."""
+    made = {key: np.asarray(each, float) for key, each in {'reading': reading, **columns}.items()}
+    return Poses(made, numbered(made), units)
+
+
+def samples_of(time: Any, reading: Any, units: str = '', **columns: Any) -> Recording:
+    """Return a recording of these (n,) times [s] and (n, 3) readings."""
+    made = {'time': np.asarray(time, float), 'reading': np.asarray(reading, float), **columns}
+    return Recording(made, numbered(made), units)
+
+
+def rows_of(time: Any, reading: Any, rate: Any = np.nan, temperature: Any = np.nan) -> Floats:
+    """Return the (n, 9) samples of a stream: time, reading, rate, temperature, supply."""
+    rows = np.full((len(time), 9), np.nan)
+    rows[:, 0], rows[:, 1:4], rows[:, 4:7], rows[:, 7] = time, reading, rate, temperature
+    return rows
 
 
 def rms(values: Any, axis: int | None = None) -> Any:

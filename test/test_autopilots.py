@@ -85,14 +85,9 @@ def ardupilot_log(path: Path, samples: Recording, parameters: Mapping[str, float
 
 def px4_log(path: Path, samples: Recording, parameters: Mapping[str, float]) -> Path:
     """Write sensor_combined, with a slow sensor_accel for the device and its temperature."""
-    slow = samples.take(slice(0, None, 20))
-    time, count = make.stamps_us(slow), len(slow)
-    accel = {'timestamp': ('uint64_t', time), 'timestamp_sample': ('uint64_t', time),
-             'device_id': ('uint32_t', [DEVICE] * count),
-             **{axis: ('float', values) for axis, values in zip(
-                 'xyz', (slow.reading * G).T.tolist())},
-             'temperature': ('float', slow['temperature'].tolist())}
-    selected = {'timestamp': ('uint64_t', time[:1]), 'accel_device_id': ('uint32_t', [DEVICE]),
+    accel = make.accel_fields(samples.take(slice(0, None, 20)), DEVICE, G)
+    selected = {'timestamp': ('uint64_t', make.stamps_us(samples)[:1]),
+                'accel_device_id': ('uint32_t', [DEVICE]),
                 'gyro_device_id': ('uint32_t', [DEVICE + 1])}
     path.write_bytes(make.ulog_bytes([
         ('sensor_combined', 0, make.combined_fields(samples)), ('sensor_accel', 0, accel),

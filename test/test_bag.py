@@ -1,32 +1,40 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Bags of every kind, read and corrected without ROS, and by `rosbags` for comparison."""
+"""
+Bags of every kind, read and corrected without ROS, and by `rosbags` for comparison.
+
+The golden case `logs_bags` reads topics of any type: temperature, supply voltage and others.
+
+"""
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 import re
 
 from accel_calib.calibration import fit_poses, level
 from accel_calib.errors import InputError, StoredCalibrationError
-from accel_calib.logs import LogOptions, open_log, read_recording
+from accel_calib.logs import field_of, LogOptions, open_log, read_recording
 from accel_calib.messages import correct_bag
 from accel_calib.stillness import capture
-from accel_calib.units import units_of
+from accel_calib.stored import write_calibration
+from accel_calib.table import Recording
 from bag_files import (
     check_refused, header, IMU, imu, MAKES, McapFile, RATE_NS, rosbag2, START, STORE, STRING,
     TEMPERATURE, write_bag)
 from inside import (
-    BLOCK_OF_A_BAG, rotation_from_rpy, ROWS_OF_A_BAG, simulate_recording, spread_directions)
+    BLOCK_OF_A_BAG, read_log, rotation_from_rpy, ROWS_OF_A_BAG, simulate_recording,
+    spread_directions)
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionMode, Reader, StoragePlugin
 from scipy.spatial.transform import Rotation
-from shared import known, sensor
+from shared import known, LOG_CORPUS, MPS2, run, sensor, table, with_effects
 import yaml
 
-UNITS, ON_A = units_of('m/s2'), LogOptions(topic='/imu/a')
+ON_A = LogOptions(topic='/imu/a')
 
 
 @pytest.fixture(scope='module')
@@ -40,8 +48,8 @@ def recording():
 def ros1(recording, tmp_path_factory):
     """Return a ROS 1 bag of the recording, its poses, and their calibration."""
     path = write_bag(tmp_path_factory.mktemp('ros1') / 'recording.bag', 'bag', recording)
-    poses = capture(read_recording(path), UNITS).poses
-    return path, poses, fit_poses(poses, UNITS, sensor='imu_link')
+    poses = capture(read_recording(path), MPS2).poses
+    return path, poses, fit_poses(poses, MPS2, sensor='imu_link')
 
 
 @pytest.mark.parametrize('kind', ['mcap', 'sqlite3', 'bag'])
@@ -52,24 +60,10 @@ def test_every_kind_of_bag_and_the_file_in_it_have_the_same_samples(kind, record
     for each in (path, *inside):
         found = read_recording(each)
         assert (found.units, found.sensor) == ('m/s2', 'imu_link')
-        np.testing.assert_array_equal(found.reading, UNITS.from_g(recording.reading))
+        np.testing.assert_array_equal(found.reading, MPS2.from_g(recording.reading))
         np.testing.assert_array_equal(found['rate'], recording['rate'])
         np.testing.assert_allclose(found['time'], recording['time'] + 100.0, atol=1e-6)
         np.testing.assert_allclose(found['temperature'], recording['temperature'], atol=0.2)
-
-
-@pytest.mark.parametrize(('topics', 'asked', 'words'), [
-    (['/a', '/b'], '', 'has 2 Imu topics, expected one: /a, /b; choose one'),
-    (['/a', '/b'], '/c', 'has the Imu topics /a, /b, expected /c'),
-    ([f'/robot_{number}/imu' for number in range(300)], '',
-     '300 Imu topics, expected one: .* and 288 more'),
-    ([], '', 'expected a topic of type sensor_msgs/msg/Imu')])
-def test_an_imu_topic_that_is_not_clear_is_refused_in_a_short_line(topics, asked, words, recording,
-                                                                   tmp_path):
-    path = write_bag(tmp_path / 'in', 'mcap', recording.take(slice(0, 60)), topics)
-    with pytest.raises(InputError, match=words) as refusal:
-        read_recording(path, asked)
-    assert len(str(refusal.value)) < 500 + len(str(path))
 
 
 @pytest.mark.parametrize('file', ['x.bag', 'x.mcap', 'x.db3'])
@@ -118,7 +112,7 @@ def test_a_corrected_bag_of_ros_1_differs_only_in_the_acceleration(ros1, tmp_pat
     path, poses, calibration = ros1
     assert correct_bag(path, calibration, tmp_path / 'out.bag') == len(read_recording(path))
     check_copy(path, tmp_path / 'out.bag', '/imu/data_raw', calibration)
-    still = capture(read_recording(tmp_path / 'out.bag'), UNITS).poses
+    still = capture(read_recording(tmp_path / 'out.bag'), MPS2).poses
     assert len(still) == len(poses)
     assert np.linalg.norm(still.reading, axis=1) == pytest.approx(9.80665, abs=0.01)
 
@@ -311,23 +305,56 @@ def test_a_topic_without_messages_is_reported_in_one_line(make, tmp_path):
     check_refused(path, 'has no message on /imu/a', '/imu/a')
 
 
-def test_messages_of_one_receipt_have_no_rate(tmp_path):
-    path = write(tmp_path, 'mcap', [(topic, START, raw) for topic, _, raw in messages(12)])
-    with open_log(path, LogOptions(topic='/imu/a')) as stream:
-        assert '/imu/a' in stream.read_as
-        assert 'Hz' not in stream.read_as
-
-
 def test_poses_do_not_depend_on_the_size_of_blocks(recording, tmp_path, monkeypatch):
     path = write_bag(tmp_path / 'in', 'mcap', recording)
-    whole = capture(read_recording(path), UNITS)
+    whole = capture(read_recording(path), MPS2)
     monkeypatch.setattr(*ROWS_OF_A_BAG, 50)
     monkeypatch.setattr(*BLOCK_OF_A_BAG, 20)
     with open_log(path, LogOptions(in_child=False)) as stream:
         assert stream.samples == len(recording)
         assert re.search(r'/\S+.* \d+ Hz.*m/s2$', stream.read_as)
-        found = capture(stream.blocks, UNITS)
+        found = capture(stream.blocks, MPS2)
     assert len(whole.poses) == 12
     assert (found.recorded, found.seconds) == (len(recording), whole.seconds)
     for key in whole.poses.columns:
         np.testing.assert_allclose(found.poses[key], whole.poses[key], rtol=1e-12)
+
+
+# Temperature and supply voltage
+
+
+BAG, SAMPLES = LOG_CORPUS / 'bags' / 'float64_mcap.mcap', 40
+WARM = LogOptions(context={'temperature': '/imu/temp'})
+
+
+@pytest.mark.parametrize(('column', 'numbers', 'asked', 'field'), table('fields_of_columns'))
+def test_a_field_is_read_only_if_one_can_hold_the_column(
+        column: str, numbers: tuple[str, ...], asked: str, field: str) -> None:
+    assert field_of(column, numbers, asked) == field
+
+
+def test_a_bag_is_corrected_with_a_named_temperature(tmp_path: Path) -> None:
+    thermal = with_effects(known('g'), {'offset_temperature': (0.01, -0.005, 0.015)},
+                           temperature=np.linspace(10.0, 40.0, 20))
+    out = tmp_path / 'out'
+    with pytest.raises(InputError, match='name the topic with'):
+        correct_bag(BAG, thermal, out)
+    notes: list[str] = []
+    assert correct_bag(BAG, thermal, out, WARM, note=notes.append) == SAMPLES
+    assert len(notes) == 1  # the temperatures have no stamp
+    raw, found = read_log(BAG, WARM).table, read_recording(out)
+    assert isinstance(raw, Recording)
+    expected = thermal.correct(raw.reading / 9.80665, {'temperature': raw['temperature']})
+    np.testing.assert_allclose(found.reading, expected * 9.80665, atol=1e-9)
+    assert np.ptp(found.reading, axis=0).max() > 0.05
+
+    write_calibration(tmp_path / 'c.yaml', thermal)
+    given = 'apply', BAG, '-c', tmp_path / 'c.yaml', '-o', tmp_path / 'other'
+    assert run(*given) == 2
+    assert run(*given, '--context', 'temperature:=/imu/temp') == 0
+
+
+def test_a_calibration_without_temperature_needs_no_topic(tmp_path: Path) -> None:
+    notes: list[str] = []
+    assert correct_bag(BAG, known('g'), tmp_path / 'out', note=notes.append) == SAMPLES
+    assert notes == []

@@ -1,163 +1,64 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A small file can't take much memory or work: it ends in one line, or in a result."""
+"""
+A small file can't take much memory or work: it ends in one line, or in a result.
 
-from collections.abc import Callable
-import gzip
+Binary files are read in a child process; however it ends, the result is one line.
+
+"""
+
+from collections.abc import Generator, Iterator
+from concurrent.futures import ThreadPoolExecutor
 import os
 from pathlib import Path
+import shutil
+import signal
 import socket
-import struct
+import subprocess
+import sys
 from typing import Any
-import zipfile
 
 from accel_calib.errors import InputError
-from accel_calib.logs import read_recording
+from accel_calib.logs import BAG, parts_of, read_recording
 from accel_calib.messages import correct_bag
 from accel_calib.stored import write_calibration
-from bag_files import (
-    COMPRESS, COUNT, execute, fill, McapFile, messages, raw_messages, rosbag2 as folder_of, TOPICS,
-    zstd)
-from inside import check_regular, open_bag, PATIENCE_WITH_A_CHILD
+from bag_files import COUNT, MAKES, McapFile, raw_messages, rosbag2 as folder_of, TOPICS
+from inside import (
+    check_regular, open_bag, open_log_parts, PATIENCE_WITH_A_CHILD, server_of_children)
 import numpy as np
-import openpyxl
 import pytest
 from rosbags import rosbag2
-from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import CompressionMode, StoragePlugin
-from rosbags.typesys import get_typestore, Stores
-import scipy.io
-import shared
-from test_logs import write
+from rosbags.rosbag2 import StoragePlugin
+from shared import children, data, known, little_memory, LOG_CORPUS, refused, table, wait
 
 pytestmark = pytest.mark.usefixtures('in_time')
 
-BOMB_SIZE = 1 << 31
-ZSTD_BOMB = zstd.compress(bytes(1 << 26)) * (BOMB_SIZE >> 26)
 RAWS = raw_messages()
-BILLION = '\n'.join(['a0: &a0 [x, x, x, x, x, x, x, x, x, x]', *(
-    f'a{k}: &a{k} [{", ".join([f"*a{k - 1}"] * 10)}]' for k in range(1, 10))])
-ENDLESS = 'WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c) SELECT x'
+BOMBS = LOG_CORPUS / 'bombs'
+"""Small logs that would take 130 MB to 2 GB, or endless work, if they were read as a whole."""
 
 
-def chunk(folder: Path, *, summary: bool = True) -> Path:
-    """Write a chunk that holds 2 GB more than it states."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(COMPRESS, 'zstd', lambda data: zstd.compress(data) + ZSTD_BOMB)
-        return McapFile(TOPICS, 'zstd', summary=summary, chunk=10 ** 6).write(
-            folder / 'bag.mcap', RAWS)
-
-
-def length(folder: Path) -> Path:
-    """Write a message that states 2 GB."""
-    path = McapFile(TOPICS, in_chunks=False).write(folder / 'bag.mcap', RAWS)
-    data = bytearray(path.read_bytes())
-    place = data.index(struct.pack('<BQ', 5, len(RAWS[0][2]) + 22))
-    data[place + 1:place + 9] = struct.pack('<Q', 1 << 40)
-    path.write_bytes(data)
-    return path
-
-
-def message(folder: Path) -> Path:
-    path = folder_of(StoragePlugin.SQLITE3, CompressionMode.MESSAGE)(folder)
-    execute(path / 'bag.db3', 'UPDATE messages SET data = ? WHERE id = 9', ZSTD_BOMB)
-    return path
-
-
-def whole_file(folder: Path) -> Path:
-    path = folder_of(StoragePlugin.MCAP, CompressionMode.FILE)(folder)
-    next(path.glob('*.zst*')).write_bytes(ZSTD_BOMB)
-    return path
-
-
-def ros1(folder: Path) -> Path:
-    store, path = get_typestore(Stores.ROS1_NOETIC), folder / 'bag.bag'
-    writer = Writer1(path)
-    writer.set_compression(Writer1.CompressionFormat.BZ2)
-    pack = writer.compressor
-    bomb = pack(bytes(1 << 26)) * 32
-    writer.compressor = lambda data: pack(data) + bomb
-    fill(writer, store, TOPICS, messages(store))
-    return path
-
-
-def metadata(text: str) -> Callable[[Path], Path]:
-    def write(folder: Path) -> Path:
-        path = folder_of(StoragePlugin.MCAP)(folder)
-        (path / 'metadata.yaml').write_text(text)
-        return path
-    return write
-
-
-def database(*statements: str) -> Callable[[Path], Path]:
-    def write(folder: Path) -> Path:
-        path = folder_of(StoragePlugin.SQLITE3)(folder)
-        for each in statements:
-            execute(path / 'bag.db3', each)
-        return path
-    return write
-
-
-def file(name: str, save: Callable[[Path], object]) -> Callable[[Path], Path]:
-    return lambda folder: write(folder, save, name)
-
-
-def archive(path: Path) -> None:
-    with zipfile.ZipFile(path, 'w', zipfile.ZIP_DEFLATED) as made, made.open('a.csv', 'w') as one:
-        for _ in range(8):
-            one.write(b'1' * (1 << 24))
-
-
-def far_row(path: Path) -> None:
-    book = openpyxl.Workbook()
-    book.active.append(['ax', 'ay', 'az', *[None] * 16, 'note'])
-    book.active.cell(1 << 20, 1, 1.0)
-    book.save(path)
-
-
-def arrow(path: Path) -> None:
-    pa = pytest.importorskip('pyarrow')
-    pytest.importorskip('pyarrow.parquet').write_table(
-        pa.table({name: np.zeros(1 << 22) for name in ('t', 'ax', 'ay', 'az')}), path)
-
-
-def hdf5(path: Path) -> None:
-    with pytest.importorskip('h5py').File(path, 'w') as made:
-        made.create_dataset('acc', (10 ** 9, 3), 'f8', compression='gzip')
-
-
-BOMBS: dict[str, Callable[[Path], Path]] = {
-    'chunk': chunk, 'chunk without summary': lambda folder: chunk(folder, summary=False),
-    'length': length, 'message': message, 'file': whole_file, 'bz2': ros1,
-    'aliases': metadata(BILLION), 'nested': metadata('a: ' + '[' * 100_000),
-    'view': database('DROP TABLE messages', 'CREATE VIEW messages(id, topic_id, timestamp, data) '
-                     f"AS SELECT x, 1, x, x'00' FROM ({ENDLESS} FROM c)"),
-    'computed': database('CREATE TABLE other AS SELECT id, topic_id, timestamp FROM messages',
-                         'DROP TABLE messages', 'ALTER TABLE other RENAME TO messages',
-                         'ALTER TABLE messages ADD COLUMN data BLOB AS (zeroblob(900000000))'),
-    'gzip': file('log.csv.gz', lambda path: path.write_bytes(
-        gzip.compress(b'ax,ay,az\n') + gzip.compress(b'1' * (1 << 26)) * 32)),
-    'zip': file('log.zip', archive), 'xlsx': file('log.xlsx', far_row),
-    'mat': file('log.mat', lambda path: scipy.io.savemat(
-        path, {'acc': np.zeros((1 << 25, 3), np.int8)}, do_compression=True)),
-    'npz': file('log.npz', lambda path: np.savez_compressed(
-        path, acc=np.zeros((1 << 25, 3), np.int8))),
-    'parquet': file('log.parquet', arrow), 'hdf5': file('log.h5', hdf5)}
-"""Functions that write a bomb into a folder."""
-
-
-@pytest.mark.parametrize('kind', BOMBS)
-def test_a_bomb_ends_in_one_line_with_little_memory(kind: str, tmp_path: Path,
+@pytest.mark.parametrize('bomb', sorted(BOMBS.iterdir()), ids=lambda path: path.name)
+def test_a_bomb_ends_in_one_line_with_little_memory(bomb: Path, tmp_path: Path,
                                                     monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(*PATIENCE_WITH_A_CHILD, 2)
-    path = BOMBS[kind](tmp_path)
+    copy = shutil.copytree if bomb.is_dir() else shutil.copy
+    path = Path(copy(bomb, tmp_path / bomb.name))
     before = {*tmp_path.rglob('*')}
-    with shared.little_memory(), pytest.raises(InputError) as found:
+    with little_memory(), pytest.raises(InputError) as found:
         read_recording(path)
     assert str(path) in str(found.value)
     assert '\n' not in str(found.value)
     assert {*tmp_path.rglob('*')} == before
+
+
+def test_a_json_file_is_read_up_to_a_size(tmp_path: Path) -> None:
+    path = tmp_path / 'log.json'
+    path.write_bytes(b'[{"a": 1}]')
+    os.truncate(path, (1 << 25) + 1)
+    with little_memory(), pytest.raises(InputError, match='JSON file of at most'):
+        read_recording(path)
 
 
 def test_blocks_of_large_messages_are_short(tmp_path: Path) -> None:
@@ -173,7 +74,7 @@ def test_data_that_compress_well_are_read(tmp_path: Path) -> None:
     black = [(2, RAWS[0][1] + k, bytes(8 << 20)) for k in range(4)]  # pictures
     path = McapFile(TOPICS, 'zstd', chunk=16 << 20).write(tmp_path / 'bag.mcap', [*RAWS, *black])
     assert len(read_recording(path)) == COUNT
-    assert correct_bag(path, shared.known(), tmp_path / 'out') == COUNT
+    assert correct_bag(path, known(), tmp_path / 'out') == COUNT
 
 
 def test_correcting_leaves_a_database_as_it_is_and_refuses_a_copy_that_lacks_messages(
@@ -190,11 +91,11 @@ def test_correcting_leaves_a_database_as_it_is_and_refuses_a_copy_that_lacks_mes
         return {each: (each.read_bytes(), each.stat().st_mtime_ns) for each in path.iterdir()}
 
     before = state()
-    assert correct_bag(path, shared.known(), tmp_path / 'whole') == COUNT
+    assert correct_bag(path, known(), tmp_path / 'whole') == COUNT
     assert state() == before
     monkeypatch.setattr(rosbag2.Writer, 'write', losing)
     with pytest.raises(InputError, match='the copy holds 83 of 84 messages'):
-        correct_bag(path, shared.known(), tmp_path / 'out')
+        correct_bag(path, known(), tmp_path / 'out')
     assert sorted(each.name for each in tmp_path.iterdir()) == ['bag', 'whole']
 
 
@@ -217,30 +118,17 @@ def test_only_regular_files_are_read(tmp_path: Path) -> None:
         check_regular(tmp_path / 'missing')
 
 
-COMMANDS = [('fit', '{}'), ('fit', '{}', '--rows', '1:9'), ('verify', '{}', '-c', '{yaml}'),
-            ('verify', '{yaml}', '-c', '{}'),
-            ('refine', '{}'), ('calibrate', '{}', '-o', '{out}'), ('capture', '{}', '-o', '{out}'),
-            ('noise', '{}'), ('thermal', '{}', '-o', '{out}'),
-            ('apply', '{}', '-c', '{yaml}', '-o', '{out}'),
-            ('report', '{}', '-o', '{out}'), ('compare', '{}', '{}'), ('history', '{}'),
-            ('export', '{}', '--to', 'c'),
-            ('export', '{yaml}', '--to', 'kalibr', '--noise', '{}'),
-            ('verify', '{yaml}', '-c', '{yaml}', '--also', '{}'), ('fleet', '@{}', '-o', '{out}')]
-
-
 @pytest.mark.parametrize(('command', 'suffix'), [
-    *((command, '') for command in COMMANDS),
-    *((('capture', '{}', '-o', '{out}'), suffix)
-      for suffix in ('.bag', '.mcap', '.db3', '.ulg', '.bin'))])
+    *((command, '') for command in table('commands_of_one_file')),
+    *(('capture {} -o {out}', suffix) for suffix in ('.bag', '.mcap', '.db3', '.ulg', '.bin'))])
 def test_a_pipe_ends_every_command_in_one_line(
-        command: tuple[str, ...], suffix: str, tmp_path: Path,
-        capsys: pytest.CaptureFixture[str]) -> None:
+        command: str, suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pipe, stored, out = tmp_path / f'pipe{suffix}', tmp_path / 'c.yaml', tmp_path / 'out'
     os.mkfifo(pipe)
-    write_calibration(stored, shared.known())
+    write_calibration(stored, known())
     given = [each.replace('{out}', str(out)).replace('{yaml}', str(stored)).replace(
-        '{}', str(pipe)) for each in command]
-    assert '(FIFO)' in shared.refused(capsys, *given).partition(str(pipe))[2]
+        '{}', str(pipe)) for each in command.split()]
+    assert '(FIFO)' in refused(capsys, *given).partition(str(pipe))[2]
     assert not out.exists()
 
 
@@ -251,3 +139,139 @@ def test_a_pipe_in_the_folder_of_a_bag_is_refused(name: str, tmp_path: Path) -> 
     os.mkfifo(path / name)
     with pytest.raises(InputError, match=f'{name} is a pipe'):
         read_recording(path)
+
+
+# The child process that reads binary files
+
+
+def misbehaving(path: Path, how: str) -> Generator[Any]:
+    """Yield an array, and then do what no reader should."""
+    yield np.arange(6.0).reshape(2, 3)
+    sys.stdout.write('words of a library')
+    sys.stdout.flush()
+    if how == 'signal':
+        os.kill(os.getpid(), signal.SIGSEGV)
+    elif how == 'exit':
+        os._exit(3)
+    elif how == 'system exit':
+        sys.exit('enough')
+    elif how == 'error':
+        raise KeyError('a\nb')
+    elif how == 'memory':
+        bytearray(1 << 33)
+    elif how == 'file':
+        os.truncate(path, 1 << 29)
+    elif how == 'object':
+        yield np.array([{}])
+    while how == 'loop':
+        pass
+    while how == 'many':
+        yield np.zeros(1 << 20)
+
+
+@pytest.mark.parametrize(('how', 'words'), [
+    ('signal', 'SIGSEGV'), ('exit', 'status 3'), ('system exit', 'status 1'),
+    ('error', "KeyError 'a"), ('memory', 'more memory'), ('file', 'File too large'),
+    ('loop', '4 s'), ('object', 'array of object'), ('many', 'more than 2[0-9]+ bytes')])
+def test_whatever_ends_a_child_is_one_line_that_names_the_file(
+        how: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+        capfd: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(*PATIENCE_WITH_A_CHILD, 3)
+    path = tmp_path / 'log.mcap'
+    path.write_bytes(b'12')
+    with parts_of(BAG.file(path), misbehaving, how, in_child=True) as parts:
+        assert next(parts).shape == (2, 3)
+        with pytest.raises(InputError, match=words) as found:
+            list(map(np.sum, parts))
+    assert str(path) in str(found.value)
+    assert '\n' not in str(found.value)
+    assert capfd.readouterr() == ('', '')
+    assert not readers()
+
+
+def readers() -> list[int]:
+    """Return the ids of the children that read files for this process."""
+    return children(server_of_children())
+
+
+@pytest.mark.parametrize('kind', ['mcap', 'sqlite3', 'ros1'])
+def test_a_child_reads_what_this_process_reads(kind: str, tmp_path: Path) -> None:
+    path = MAKES[kind](tmp_path)
+    assert open_log_parts(path, in_child=True) == open_log_parts(path, in_child=False)
+    with pytest.raises(PermissionError) if os.geteuid() else pytest.raises(InputError):
+        open_log_parts(without_rights(path), in_child=True)
+
+
+def test_a_path_is_that_of_the_folder_in_which_this_process_is(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ('one', 'two'):
+        (tmp_path / name).mkdir()
+        monkeypatch.chdir(MAKES['mcap'](tmp_path / name).parent)
+        assert open_log_parts(Path('bag.mcap'), in_child=True)
+
+
+def without_rights(path: Path) -> Path:
+    """Return a bag that may not be read; root, who may read all, gets an empty one."""
+    for each in path.iterdir() if path.is_dir() else [path]:
+        each.write_bytes(b'')
+        each.chmod(0)
+    return path
+
+
+@pytest.mark.parametrize('how', [None, KeyboardInterrupt, ValueError])
+def test_a_log_that_is_left_early_ends_its_child(how: Any, tmp_path: Path) -> None:
+    path = MAKES['mcap'](tmp_path)
+    before = readers()
+    try:
+        with parts_of(BAG.file(path), endless, in_child=True) as parts:
+            next(parts)
+            assert len(readers()) == len(before) + 1
+            if how is not None:
+                raise how
+    except (KeyboardInterrupt, ValueError):
+        pass
+    assert readers() == before
+
+
+def endless(path: Path) -> Iterator[int]:
+    """Yield a number without end, with more and more work between."""
+    for k in range(1 << 40):
+        yield sum(range(k))
+
+
+def test_no_process_outlives_one_that_is_killed(tmp_path: Path) -> None:
+    path = MAKES['mcap'](tmp_path)
+    code = (f'import sys, time; sys.path[:] = {sys.path!r}\n'
+            'import test_bombs as t; from pathlib import Path\n'
+            f'with t.parts_of(t.BAG.file(Path({str(path)!r})), t.endless, in_child=True) as parts:'
+            '\n    next(parts); print(t.server_of_children(), *t.readers(), flush=True)\n'
+            '    time.sleep(600)')
+    with subprocess.Popen([sys.executable, '-c', code], stdout=subprocess.PIPE, text=True,
+                          env={**os.environ, 'TMPDIR': str(tmp_path)}) as run:
+        assert run.stdout is not None
+        found = list(map(int, run.stdout.readline().split()))
+        assert len(found) == 2
+        run.kill()
+    wait(lambda: not any(map(is_running, found)))
+
+
+def is_running(pid: int) -> bool:
+    try:
+        return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
+    except FileNotFoundError:
+        return False
+
+
+def test_one_wrong_byte_of_a_matlab_file_does_not_end_the_command(
+        capsys: pytest.CaptureFixture[str]) -> None:
+    path = data('foreign/one_byte.mat')
+    for _ in range(2):
+        error = refused(capsys, 'calibrate', path)
+        assert f'{path} is damaged (its reader ended by SIGSEGV), expected a MATLAB file' in error
+
+
+def test_logs_of_several_threads_are_read_at_once(tmp_path: Path) -> None:
+    path = MAKES['mcap'](tmp_path)
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda _: open_log_parts(path, in_child=True), range(12)))
+    assert found == [found[0]] * 12

@@ -4,6 +4,7 @@
 """Calibrations, or rests, of one sensor agree, and those of a changed sensor do not."""
 
 from dataclasses import replace
+import re
 from typing import Any
 
 from accel_calib.calibration import Calibration, fit_poses, level
@@ -14,16 +15,12 @@ from accel_calib.stillness import capture
 from accel_calib.table import Floats, Poses
 from accel_calib.units import units_of
 from inside import (
-    DRIFT_MEMORY, model_with, on_one_scale, predict, repeatability_of, rotation_free,
-    rotation_from_rpy, Runs, simulate_poses, spread_directions, unit, with_vector)
+    DRIFT_MEMORY, model_with, on_one_scale, predict, repeatability_of, rotation_free, Runs,
+    simulate_poses, spread_directions, unit, with_vector)
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
-from shared import data, G, random_directions, sensor
-
-
-def attitudes(rng, count):
-    return spread_directions(count) @ rotation_from_rpy(*rng.uniform(-3, 3, 3)).T
+from shared import attitudes, data, G, random_directions, sensor
 
 
 def runs_of(model, rng, count, poses=12, name='10'):
@@ -168,7 +165,6 @@ def test_a_history_compares_each_pair_with_the_uncertainty_of_the_largest_model(
     pair = history.between(0, 1)
     assert pair.p_value == history.changes[0].comparison.p_value
     assert [each.stated_sd[0] > 0.0 for each in pair.parameters] == [True] * 9
-    assert all('model 10' in note for note in pair.notes if 'omits' in note)
     assert compare(calibrations[:2]).parameters[6].stated_sd[0] == 0.0
 
 
@@ -188,7 +184,6 @@ def test_runs_at_other_temperatures_agree_when_they_correct_for_it():
     assert compare([cold[1], warm[1]]).agree
     found = compare([cold[0], warm[0]])
     assert not found.agree
-    assert any('taken at 1' in note and 'temperature' in note for note in found.notes)
 
 
 LEAST, NOISE = 0.001, 0.0003
@@ -332,18 +327,15 @@ def test_changes_too_small_to_matter_are_ignored() -> None:
     assert watched.rest([UP] * 20, 0.0016 * UP).change is not None
 
 
-@pytest.mark.parametrize(('temperature', 'words'), [
-    (38.2, 'the temperature is 38.2 °C, but the sensor was calibrated at 24.0 to 25.3 °C: capture '
-           'poses at this temperature and call ~/refine'),
-    (26.0, 'call ~/reset, capture poses and call ~/fit'),
-    (np.nan, 'call ~/reset, capture poses and call ~/fit')])
-def test_advice_names_the_temperature_where_it_changed(temperature: float, words: str) -> None:
+@pytest.mark.parametrize(('temperature', 'asked'), [
+    (38.2, ['38.2', '24.0', '25.3', '~/refine']), (26.0, ['~/reset', '~/fit']),
+    (np.nan, ['~/reset', '~/fit'])])
+def test_advice_names_the_temperature_where_it_changed(temperature: float, asked: list[str]
+                                                       ) -> None:
     watched = Watched(9, temperature=np.linspace(24.0, 25.3, 12))
-    assert 'stated uncertainty' in status(watched.rest([UP] * 4, temperature=temperature))
+    watched.rest([UP] * 4, temperature=temperature)
     line = status(watched.rest([UP] * 3, -0.005 * UP, temperature=temperature))
-    assert ' differed by -' in line
-    assert 'for 3 rests' in line
-    assert line.endswith(words)
+    assert re.findall(r'\d+\.\d(?= (?:°C|to))|~/\w+', line) == asked
 
 
 @pytest.mark.parametrize(('name', 'unit_name'), [

@@ -5,7 +5,6 @@
 
 import ast
 from dataclasses import fields
-import importlib
 import inspect
 from pydoc import locate
 import re
@@ -14,10 +13,14 @@ from xml.etree import ElementTree
 
 import accel_calib as ac
 from accel_calib.session import CalibratorSettings
+import evidence
 from faults.sample import FACTOR
-from inside import EXPORT_FORMATS, LOG_FORMATS, parser
+from inside import export, EXPORT_FORMATS, LOG_FORMATS, parser
+import numpy as np
+import pictures
 import pytest
-from shared import ROOT, text_of
+from shared import data, GRAVITY, rms, ROOT, text_of
+import tables
 from test_policy import names_of_the_calibrator
 import yaml
 
@@ -26,19 +29,12 @@ PAGES = ['README.md', 'CONTRIBUTING.md', 'QUALITY_DECLARATION.md', 'SECURITY.md'
 OWN_PAGES = [page for page in PAGES if 'figures' not in page]
 
 
-@pytest.fixture
-def tables(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / 'docs'))
-    return importlib.import_module('tables')
-
-
-@pytest.fixture
-def built(tables):
+def built(page):
     """Return the text of a page as the site has it, with the tables of the code."""
-    return lambda page: tables.with_tables(text_of(page))
+    return tables.with_tables(text_of(page))
 
 
-def test_parameter_file_describes_all_parameters_and_has_their_defaults(tables):
+def test_parameter_file_describes_all_parameters_and_has_their_defaults():
     text = tables.PARAMETERS.read_text(encoding='utf-8')
     assert text.splitlines() == [*tables.parameters()], 'run: python docs/tables.py'
     given = yaml.safe_load(text)['/**']['ros__parameters']
@@ -48,11 +44,11 @@ def test_parameter_file_describes_all_parameters_and_has_their_defaults(tables):
 
 @pytest.mark.parametrize(('page', 'names'), [
     ('docs/exports.md', EXPORT_FORMATS), ('docs/log_formats.md', LOG_FORMATS)])
-def test_every_format_is_in_its_page(page, names, built):
+def test_every_format_is_in_its_page(page, names):
     assert not [name for name in names if f'`{name}`' not in built(page)]
 
 
-def test_every_table_of_the_code_is_in_a_page_of_the_site_and_none_is_stored(tables, built):
+def test_every_table_of_the_code_is_in_a_page_of_the_site_and_none_is_stored():
     for name, table in tables.TABLES.items():
         rows = '\n'.join(table())
         assert any(f'<!-- {name} -->\n\n{rows}\n' in built(page) for page in OWN_PAGES), name
@@ -166,22 +162,16 @@ LARGEST = 300_000  # bytes
 RUN_AGAIN = 'run: python docs/pictures.py'
 
 
-@pytest.fixture
-def pictures(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / 'docs'))
-    return importlib.import_module('pictures')
-
-
 def without_numbers(text):
     return re.sub(r'[-−]?[\d.]+(e-?\d+)?', '#', text)
 
 
-def test_the_picture_of_the_poses_is_drawn_from_the_planner(pictures):
+def test_the_picture_of_the_poses_is_drawn_from_the_planner():
     assert (FOLDER / 'poses.svg').read_text('utf-8') == pictures.poses_svg(), RUN_AGAIN
 
 
 @pytest.mark.skipif(FACTOR == 1, reason='commands run for half a minute: .ci/run')
-def test_terminals_show_what_the_commands_print(pictures, tmp_path):
+def test_terminals_show_what_the_commands_print(tmp_path):
     pictures.prepare(tmp_path)
     for name, commands in pictures.TERMINALS.items():
         drawn = pictures.terminal_svg(name, pictures.recorded(commands, tmp_path))
@@ -199,3 +189,52 @@ def test_pictures_are_small_and_need_no_network(path):
         assert root.get('aria-label') or root.get('aria-labelledby')
         text = path.read_text('utf-8').replace('http://www.w3.org/2000/svg', '')
         assert 'http' not in text
+
+
+# The page of evidence states what its commands find in real recordings
+
+
+NUMBER = re.compile(r'[-−]?\d+(?:\.\d+)?')
+
+
+@pytest.fixture(scope='module')
+def cases():
+    return evidence.cases_of(data('README.md').parent)
+
+
+def test_the_table_states_what_the_commands_find(cases):
+    stated, found = evidence.PAGE.read_text('utf-8'), evidence.with_table(cases)
+    assert NUMBER.sub('#', found) == NUMBER.sub('#', stated), 'run: python docs/evidence.py'
+    numbers = [[float(each.replace('−', '-')) for each in NUMBER.findall(text)]
+               for text in (found, stated)]
+    np.testing.assert_allclose(*numbers, rtol=0.1)
+
+
+def test_the_slopes_of_the_sense_hat_are_those_of_an_independent_analysis(cases):
+    slopes = cases[0].calibration.model.values['offset_temperature'][:3]
+    np.testing.assert_allclose(1e3 * slopes, [0.57, 0.41, -0.41], atol=0.01)
+
+
+def test_the_sensor_that_steps_when_it_is_heated_has_the_step_and_the_slope(cases):
+    found = cases[1].calibration.model.values
+    assert found['offset_step'][3] == pytest.approx(146.0, abs=3.0)
+    assert found['offset_step'][2] == pytest.approx(2.5e-3, abs=1e-3)
+    assert found['offset_temperature'][2] == pytest.approx(5e-4, abs=2e-4)
+
+
+def test_the_effects_of_the_cycle_leave_a_third_of_the_polynomial_of_its_publisher(cases):
+    columns = np.genfromtxt(data('poses/thermal_cycle_poses.csv'), delimiter=',', names=True,
+                            skip_header=1)
+    warm = columns['temperature']
+    left = [columns[name] - np.polyval(np.polyfit(warm, columns[name], 3), warm)
+            for name in ('ax', 'ay', 'az')]
+    cubic_mg = 1e3 * rms(np.linalg.norm(left, axis=0)) / GRAVITY
+    assert cubic_mg == pytest.approx(4.8, abs=0.05)
+    result = cases[2].result
+    assert result['rms_after_mg'] == result['thermal']['residual_mg'] < 0.4 * cubic_mg
+    for vendor in ('px4', 'ardupilot'):
+        assert any('lag' in each for each in export(cases[2].calibration, vendor).losses)
+
+
+def test_nothing_is_named_in_the_null_controls(cases):
+    assert [case.result['verdict'] for case in cases[3:]] == ['explained'] + ['no_gap'] * 4

@@ -119,7 +119,7 @@ FILES = {
 
 @pytest.mark.parametrize('page', sample([page for page in PAGES if any(
     block.commands for block in blocks_of(text_of(page))[1])
-    and page != 'docs/evidence.md'], 5))  # test_evidence.py runs it
+    and page != 'docs/evidence.md'], 5))  # test_docs.py runs it
 def test_commands_of_the_blocks_run(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     files, blocks = blocks_of(text_of(page))

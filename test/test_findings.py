@@ -18,7 +18,7 @@ from inside import (
     format_calibration, main, Model, model_with, number, parse_calibration, spread_directions)
 import numpy as np
 import pytest
-from shared import error_mg, FACES, G, MPS2, random_directions
+from shared import changed, error_mg, FACES, G, MPS2, random_directions
 
 TIME = 20.0 * np.arange(30)
 WARM = 27.0 + 3.5 * np.sin(TIME / 60.0)
@@ -37,9 +37,7 @@ def poses_of(count=24, **options):
 
 
 def moved(poses, rows, by):
-    reading = poses.reading.copy()
-    reading[np.asarray(rows) - 1] += by
-    return poses.with_columns(reading=reading)
+    return changed(poses, np.subtract(rows, 1), plus=by)
 
 
 def upside_down():
@@ -135,7 +133,6 @@ def test_the_error_of_a_good_calibration_is_below_the_stated_one(poses, noise, s
     rating = rate(calibration)
     assert rating.name == 'GOOD', rating
     stated = Expected(calibration).error_mg
-    assert f' {stated:.2g} mg (' in rating.reason
     assert error_mg(calibration, model_with(COMMON)) < min(1.2 * stated, GOOD_MG)
 
 
@@ -143,7 +140,6 @@ def test_a_model_without_cross_axis_is_usable_if_the_poses_do_not_determine_it()
     up = np.vstack([FACES, FACES[[0, 1, 2]]]) + 1e-3
     rating = rate(ac.fit(simulated(directions=up)))
     assert rating.name == 'USABLE'
-    assert 'model 7 omits' in rating.reason
 
 
 @pytest.mark.parametrize(('kind', 'figures', 'outliers'), [
@@ -164,8 +160,7 @@ def test_half_of_the_sphere_is_not_good_because_nothing_checks_the_model_in_the_
     calibration = ac.fit(simulated(directions=up[up[:, 2] > 0.0], noise=0.001))
     rating = rate(calibration)
     assert error_mg(calibration, model_with(COMMON)) < GOOD_MG
-    assert rating.name == 'USABLE'
-    assert rating.findings[0].kind == 'not_covered'
+    assert (rating.name, rating.findings[0].kind) == ('USABLE', 'not_covered')
     assert rating.next.kind == 'poses'
 
 
@@ -175,16 +170,13 @@ def test_half_of_the_sphere_is_not_good_because_nothing_checks_the_model_in_the_
 def test_a_hidden_effect_makes_a_fit_usable_and_its_refinement_good(effects, context):
     table = simulated({**COMMON, **effects}, poses=30, **context)
     rating = rate(ac.fit(table))
-    assert rating.name == 'USABLE'
-    assert 'are not noise' in rating.reason
-    assert rating.next.kind == 'refine'
+    assert (rating.name, rating.next.kind) == ('USABLE', 'refine')
     result = ac.refine(table)
     assert [step.effect for step in result.steps] == list(effects)
     assert rate(result.calibration, refinement=result).name == 'GOOD'
     base = rate(ac.fit(table), refinement=result)
-    assert base.name == 'USABLE'
+    assert (base.name, base.next.kind) == ('USABLE', 'refine')
     assert next(iter(effects)) in base.reason
-    assert base.next.kind == 'refine'
 
 
 def test_a_residual_far_above_the_noise_is_ignored_below_a_milli_g():
@@ -193,7 +185,6 @@ def test_a_residual_far_above_the_noise_is_ignored_below_a_milli_g():
     assert calibration.quality.chi2_per_dof > 400.0
     assert Expected(calibration).hidden_mg < 1.0
     assert rate(calibration).name == 'GOOD'
-    assert any('run refine' in warning for warning in calibration.warnings)
 
 
 def test_a_fit_beside_a_refused_refinement_is_not_bad():
@@ -203,7 +194,6 @@ def test_a_fit_beside_a_refused_refinement_is_not_bad():
     refused = replace(result, refusal=('the poses do not determine it', 'take more poses'))
     rating = rate(ac.fit(table), refinement=refused)
     assert rating.name == 'USABLE'
-    assert 'that explains them is refused' in rating.reason
     assert rating.next == NextStep('poses', 'take more poses')
     assert rate(refused.calibration, refinement=refused).name == 'BAD'
 
@@ -215,8 +205,7 @@ def test_many_knocked_poses_are_usable_and_one_of_many_is_good():
     assert len(ac.fit(one).rejected) == 1
     assert rate(ac.fit(one)).name == 'GOOD'
     rating = rate(ac.fit(many))
-    assert rating.name == 'USABLE'
-    assert rating.next.kind == 'poses'
+    assert (rating.name, rating.next.kind) == ('USABLE', 'poses')
 
 
 def test_a_calibration_that_is_worse_than_none_is_bad():
@@ -225,14 +214,12 @@ def test_a_calibration_that_is_worse_than_none_is_bad():
     assert error_mg(calibration, model_with(ideal)) > 5.0
     rating = rate(calibration)
     assert rating.name == 'BAD'
-    assert 'without the calibration' in rating.reason
 
 
 @pytest.mark.parametrize(('noise', 'expected'), [(0.001, 'GOOD'), (0.02, 'USABLE')])
 def test_a_sensor_that_was_right_before_is_good_if_the_error_does_not_matter(noise, expected):
     rating = rate(ac.fit(simulated({'offset': [1e-4, 0.0, -1e-4]}, poses=12, noise=noise)))
     assert rating.name == expected
-    assert ('without the calibration' in rating.reason) == (expected == 'USABLE')
 
 
 def tilted():
@@ -285,9 +272,7 @@ def test_a_verification_of_few_directions_does_not_improve_the_rating():
 def test_calibrations_that_differ_are_usable_or_bad(offset, expected):
     runs = [ac.fit(simulated(poses=24)),
             ac.fit(simulated({**COMMON, 'offset': [offset, -0.02, 0.04]}, poses=24, seed=7))]
-    rating = rate_comparison(ac.compare(runs))
-    assert rating.name == expected
-    assert '2 calibrations' in rating.figures
+    assert rate_comparison(ac.compare(runs)).name == expected
 
 
 def test_calibrations_that_are_too_uncertain_to_differ_are_usable():

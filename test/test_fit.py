@@ -16,21 +16,21 @@ from accel_calib.estimate import (
 from accel_calib.finding import has
 from accel_calib.findings import outlook
 from accel_calib.geometry import ATTITUDES
-from accel_calib.table import numbered, Poses
-from accel_calib.units import units_of
+from accel_calib.table import numbered
 from inside import (
     agreeing, look_alikes, Model, MODELS, predict, rotation_from_rpy, simulate_poses,
     spread_directions, unit)
 import numpy as np
 import pytest
-from shared import changed, error_mg, G, random_directions, sensor
+from shared import (
+    attitudes, changed, error_mg, G, MPS2, NATIVE, poses_of, random_directions, sensor)
 
 
 def simulated(seed, count, *effects, known=False):
     """Return a random sensor with these effects, and its poses, of known orientation or not."""
     rng = np.random.default_rng(seed)
     model = sensor(rng, *effects)
-    directions = spread_directions(count) @ rotation_from_rpy(*rng.uniform(-3, 3, 3)).T
+    directions = attitudes(rng, count)
     return model, simulate_poses(model, directions, rng,
                                  context={'reference': directions} if known else None)
 
@@ -53,7 +53,7 @@ def test_native_units_find_their_own_scale():
     model, poses = simulated(3, 20)
     shifted = poses.with_columns(reading=poses.reading * 4060.0 + 33000.0,
                                  std=poses['std'] * 4060.0)
-    calibration = fit_poses(shifted, units_of('native'))
+    calibration = fit_poses(shifted, NATIVE)
     true_w, true_v = model.linear_part
     assert np.all(np.abs(calibration.gain - true_w * 4060.0) < 4 * calibration.gain_sd)
     assert np.all(np.abs(calibration.offset - true_v * 4060.0 - 33000.0)
@@ -170,9 +170,7 @@ def test_columns_that_repeat_others_do_not_change_a_scatter():
 def test_knocked_poses_are_left_out_beside_a_scatter():
     for seed in range(5):
         poses = scattering(seed, 7e-4)[1]
-        knocked = poses.reading.copy()
-        knocked[[7, 30, 51]] *= 1.02
-        fit = fit_poses(poses.with_columns(reading=knocked), G, model='10')
+        fit = fit_poses(changed(poses, [7, 30, 51], 1.02), G, model='10')
         assert [each.row for each in fit.rejected] == [8, 31, 52]
 
 
@@ -180,9 +178,8 @@ def test_knocked_poses_are_left_out_beside_a_scatter():
 def test_a_few_knocked_poses_among_many_are_left_out(seed):
     rng = np.random.default_rng(seed)
     poses = simulate_poses(sensor(rng), random_directions(2500, rng), rng)
-    knocked, rows = poses.reading.copy(), rng.choice(2500, 3, replace=False)
-    knocked[rows] *= 1.02
-    fit = fit_poses(poses.with_columns(reading=knocked), G, model='10')
+    rows = rng.choice(2500, 3, replace=False)
+    fit = fit_poses(changed(poses, rows, 1.02), G, model='10')
     assert set(rows + 1) <= {each.row for each in fit.rejected}
 
 
@@ -280,7 +277,7 @@ def test_poses_are_left_as_they_were():
     poses = simulated(18, 20)[1]
     before = deepcopy(poses)
     fit_poses(poses, G)
-    in_g(poses, units_of('m/s2'))
+    in_g(poses, MPS2)
     assert poses == before
 
 
@@ -296,9 +293,9 @@ def test_a_reader_cannot_change_a_calibration():
 
 @pytest.mark.parametrize('model', ['4', '7', '10', 'auto'])
 def test_readings_without_any_noise_are_fitted(model):
-    units = units_of('m/s2')
-    columns = {'reading': ATTITUDES[6:18] * units.per_g + [0.3, 0.0, 0.0]}  # the edges
-    calibration = fit_poses(Poses(columns, numbered(columns)), units, model=model)
+    units = MPS2
+    edges = poses_of(ATTITUDES[6:18] * units.per_g + [0.3, 0.0, 0.0])
+    calibration = fit_poses(edges, units, model=model)
     np.testing.assert_allclose(calibration.offset, [0.3, 0.0, 0.0], atol=1e-12)
     assert outlook(calibration, model).uncertainty_mg == pytest.approx(0.0, abs=1e-9)
 
@@ -482,10 +479,8 @@ def test_readings_that_were_measured_again_are_not_copies():
 
 def test_all_copies_of_readings_on_a_coarse_grid_are_found():
     reading = np.repeat([*product(np.arange(-9, 10) * 1e-3, repeat=3)], 2, axis=0)
-    columns = {'reading': reading, 'std': np.full(reading.shape, 0.1),
-               'count': np.full(len(reading), 100.0)}
-    np.testing.assert_array_equal(originals(Poses(columns, numbered(columns))),
-                                  np.arange(len(reading)) // 2 * 2)
+    poses = poses_of(reading, std=np.full(reading.shape, 0.1), count=np.full(len(reading), 100.0))
+    np.testing.assert_array_equal(originals(poses), np.arange(len(reading)) // 2 * 2)
 
 
 def test_poses_that_count_once_are_too_few_for_the_model():

@@ -10,22 +10,14 @@ from pathlib import Path
 from accel_calib.calibration import fit_poses, gated
 from accel_calib.errors import RefusedFitError
 from accel_calib.stored import OF_FILE, read_calibration
-from accel_calib.table import Poses
 from inside import format_calibration, Model, parse_calibration, simulate_poses, spread_directions
 import numpy as np
 import pytest
-from shared import G, MPS2, sensor
+from shared import G, MPS2, poses_of, sensor, table
 
 STORED = Path(__file__).parent / 'data'
 
-TWELVE = np.array([
-    (-5, -7.9, 3), (7.3, 6.2, -2), (-0.5, -2, 9.6), (7.6, 0.5, 6.2), (7.5, 2.1, -6),
-    (-0.4, -2.5, -9.5), (-8.7, 0.6, -4.4), (3.4, -6.5, 6.5), (5.6, 2.4, -7.6), (-6.8, 7.1, -0.2),
-    (8.5, -1, -4.9), (0, -9.8, 0.4)])
-
-
-def table(reading):
-    return Poses({'reading': np.asarray(reading, float)}, np.arange(1, len(reading) + 1))
+TWELVE = table('twelve_readings')
 
 
 def left_out(calibration):
@@ -36,8 +28,8 @@ def left_out(calibration):
     (0.0, 0.0, 0.0), *((7.6, value, 6.2) for value in (1e150, -1e300, 1e20, 1e6))])
 @pytest.mark.parametrize('model', ['auto', '4', '7', '9', '10'])
 def test_an_impossible_reading_is_left_out_and_named(model, row):
-    expected = fit_poses(table(TWELVE), MPS2, model=model)
-    found = fit_poses(table([*TWELVE, row]), MPS2, model=model)
+    expected = fit_poses(poses_of(TWELVE), MPS2, model=model)
+    found = fit_poses(poses_of([*TWELVE, row]), MPS2, model=model)
     assert left_out(found) == [13]
     np.testing.assert_allclose(found.offset, expected.offset, rtol=1e-6)
     np.testing.assert_allclose(found.gain, expected.gain, rtol=1e-6)
@@ -46,7 +38,7 @@ def test_an_impossible_reading_is_left_out_and_named(model, row):
 @pytest.mark.parametrize('value', [1e150, -1e300, 1e20, 1e6])
 def test_an_impossible_reading_is_refused_where_every_row_is_kept(value):
     with pytest.raises(RefusedFitError, match='row 13: the reading'):
-        fit_poses(table([*TWELVE, (7.6, value, 6.2)]), MPS2, model='4', method='algebraic')
+        fit_poses(poses_of([*TWELVE, (7.6, value, 6.2)]), MPS2, model='4', method='algebraic')
 
 
 @pytest.mark.parametrize('absurd', [
@@ -75,11 +67,7 @@ def test_a_residual_that_is_not_a_number_is_refused(calibration):
         gated(replace(calibration, quality=quality))
 
 
-@pytest.mark.parametrize('values', [
-    {'offset': [1e308, 1e308, 0.0]}, {'axis_gain': [1e308, -1e308, 1e308]},
-    {'axis_gain': [1.7e308] * 3}, {'cross_axis': [1.7e308] * 3}, {'cross_axis': [1e200] * 3},
-    {'cubic': [1e308] * 3}, {'cubic': [1.7e308, -1.7e308, 0.0]},
-    {'cross_coupling': [1.7e308, -1.7e308, 1e308, 0.0, 1.7e308, 1.0]}])
+@pytest.mark.parametrize('values', table('overflowing_effects'))
 def test_values_that_overflow_are_refused(values, calibration):
     changed = Model({name: np.array(part) for name, part in {**calibration.model.values,
                                                              **values}.items()})

@@ -4,17 +4,20 @@
 
 import re
 
-from accel_calib.calibration import dilution, error_left_in, fit_poses, identifiability, next_pose
-from accel_calib.errors import RefusedFitError
+from accel_calib.calibration import (
+    dilution, error_left_in, fit_poses, flat_direction, identifiability, next_pose)
+from accel_calib.errors import InputError, RefusedFitError
 from accel_calib.findings import request_words
-from accel_calib.geometry import sphere_through
+from accel_calib.geometry import angle_of, sphere_through
 from accel_calib.table import Poses
+from accel_calib.units import FRAMES
 from inside import (
-    determines, missing_poses, model_with, poses_needed, predict, refuse_if_unfit,
-    rotation_from_rpy, rows_of, simulate_poses, spread_directions, unit)
+    axes_of, determines, fault_of, missing_poses, model_with, MODELS, mounting, poses_needed,
+    predict, refuse_if_unfit, rotation_from_rpy, rows_of, simulate_poses, spread_directions, unit,
+    with_heading, with_heading_of)
 import numpy as np
 import pytest
-from shared import FACES, G, random_directions
+from shared import attitudes, changed, FACES, G, random_directions, sensor
 
 TURN = 2.0 * np.pi * np.arange(12) / 12.0
 RING = np.column_stack([np.cos(TURN), np.sin(TURN), np.zeros(12)])
@@ -82,12 +85,11 @@ def test_poses_are_refused_where_a_fit_would_be_wrong_and_only_there(draw, least
 
 
 @pytest.mark.parametrize(('directions', 'message'), [
-    (np.repeat(FACES, 2, axis=0), 'have 6 directions'), (FACES[:1], '1 pose, expected'),
-    (FACES, '6 poses, expected at least 9 poses .* model 10'), (RING, 'lie in a plane'),
-    (RING @ rotation_from_rpy(1, 2, 3).T, 'lie in a plane'),
-    (cone(45.0, np.random.default_rng(4)), 'lie within'),
-    (np.repeat(FACES[:1], 12, axis=0), 'all have the same orientation'),
-    (np.repeat(spread_directions(5), 3, axis=0), 'have 5 directions')])
+    (np.repeat(FACES, 2, axis=0), '6 directions'), (FACES[:1], '1 pose'), (FACES, '6 poses'),
+    (RING, 'in a plane'), (RING @ rotation_from_rpy(1, 2, 3).T, 'in a plane'),
+    (cone(45.0, np.random.default_rng(4)), 'within'),
+    (np.repeat(FACES[:1], 12, axis=0), 'same orientation'),
+    (np.repeat(spread_directions(5), 3, axis=0), '5 directions')])
 @pytest.mark.parametrize('model', ['4', '7', '10'])
 def test_a_refusal_says_what_is_wrong_and_asks_for_poses_that_make_the_fit_possible(
         model, directions, message):
@@ -121,8 +123,6 @@ def test_error_of_a_smaller_model_is_that_of_fits_to_common_sensors(smaller, dir
 
 
 def test_next_poses_have_words_and_are_far_fewer_than_random_poses():
-    asked = next_pose(np.delete(FACES, 1, axis=0), '7')
-    assert 'left side' in request_words(asked)
     directions = np.zeros((0, 3))
     while len(directions) < 12:
         asked = next_pose(directions)
@@ -143,3 +143,92 @@ def test_points_on_a_sphere_or_a_circle_have_its_radius(directions):
 
 def test_points_that_are_all_the_same_have_no_radius():
     assert sphere_through(np.zeros((6, 3))) == (0.0, 0.0)
+
+
+# The mounting: levelling, heading, and axes that are wired wrongly
+
+
+@pytest.mark.parametrize('frame', FRAMES)
+@pytest.mark.parametrize('rpy', [
+    (0, 0, 0), (90, 0, 0), (-90, 0, 0), (180, 0, 0), (0, 90, 0), (0, -90, 0), (0, 180, 0),
+    (0, 0, 90), (20, -30, 40), (90, 90, 90), (179.9, 0.1, 0)])
+def test_flat_pose_is_levelled_by_a_proper_rotation(frame, rpy):
+    flat = rotation_from_rpy(*np.radians(rpy)) @ flat_direction(frame) * 9.81
+    rotation = mounting(flat, frame)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1.0)
+    np.testing.assert_allclose(rotation.T @ flat / 9.81, flat_direction(frame), atol=1e-12)
+
+
+@pytest.mark.parametrize('frame', ['ned', 'android', 'ros'])
+def test_columns_are_those_of_an5286(frame):
+    for x, y, z in random_directions(50, np.random.default_rng(1)) * 2.0:
+        rotation, root, size = mounting(np.array([x, y, z]), frame), np.hypot(y, z), 2.0
+        np.testing.assert_allclose(rotation[:, 2] * size, (x, y, z))
+        np.testing.assert_allclose(rotation[:, 0] * size, (root, -x * y / root, -x * z / root))
+
+
+@pytest.mark.parametrize(('frame', 'nose_down'), [
+    ('ros', (-0.8, 0.0, 0.6)), ('ned', (0.8, 0.0, 0.6)), ('android', (0.0, -0.8, 0.6)),
+    ('win8', (0.0, 0.8, -0.6)), ('ros', (-0.6, 0.0, -0.8))])
+@pytest.mark.parametrize('rpy', [(170.0, 35.0, -120.0), (0.0, 90.0, 0.0), (90.0, 0.0, 45.0)])
+def test_a_pose_with_the_nose_down_fixes_the_heading(rpy, frame, nose_down):
+    truth = rotation_from_rpy(*np.radians(rpy))
+    levelled = mounting(truth @ flat_direction(frame), frame)
+    found = with_heading(levelled, truth @ nose_down, frame)
+    np.testing.assert_allclose(found, truth, atol=1e-12)
+
+
+def test_levelling_again_keeps_the_heading():
+    before = rotation_from_rpy(*np.radians((10.0, -20.0, 130.0)))
+    level = mounting(rotation_from_rpy(*np.radians((3.0, 2.0, 0.0))) @ before[:, 2])
+    found, upright = with_heading_of(before, level), mounting(before[:, 0])
+    np.testing.assert_allclose(found[:, 2], level[:, 2], atol=1e-12)
+    assert np.linalg.det(found) == pytest.approx(1.0)
+    assert angle_of(found.T @ before) < 4.0
+    np.testing.assert_array_equal(with_heading_of(before, upright), upright)
+
+
+def test_a_second_pose_near_the_first_and_a_flat_pose_without_gravity_are_refused():
+    with pytest.raises(InputError, match='within 10° of the flat pose'):
+        with_heading(np.eye(3), np.array([0, 0.05, 1.0]))
+    for flat in ((0, 0, 0), (np.nan, 0, 1)):
+        with pytest.raises(InputError, match='expected about 1 g'):
+            mounting(np.array(flat, float))
+
+
+def wired(mat_p, seed=1):
+    """Return poses of known orientation whose axes are permuted by mat_p."""
+    rng = np.random.default_rng(seed)
+    directions = attitudes(rng, 16)
+    poses = simulate_poses(sensor(rng, *MODELS['12'].effects), directions, rng)
+    return poses.with_columns(reading=poses.reading @ mat_p.T, reference=directions)
+
+
+SWAP_XY = np.eye(3)[[1, 0, 2]]
+ABOUT_Z = rotation_from_rpy(0.0, 0.0, np.radians(45.0))
+
+
+@pytest.mark.parametrize(('mat_p', 'words'), [
+    (np.diag([-1.0, 1, 1]), 'x reads -x'), (SWAP_XY, 'x and y'), (ABOUT_Z.T, '45° about z'),
+    (ABOUT_Z @ np.diag([1.0, 1, -1]), 'a mirror image')])
+def test_a_wiring_fault_is_named_and_model_12_corrects_it(mat_p, words):
+    poses = wired(mat_p)
+    calibration = fit_poses(poses, G)
+    assert calibration.name == '12'
+    assert calibration.noted[0].kind == 'wiring'
+    assert words in calibration.noted[0].text
+    np.testing.assert_allclose(calibration.correct(poses.reading), poses['reference'], atol=3e-3)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_correct_wiring_causes_no_warning(seed):
+    assert not fit_poses(wired(np.eye(3), seed), G).warnings
+    tilted = wired(rotation_from_rpy(*np.radians((8.0, -5.0, 10.0))), seed)
+    assert fault_of(axes_of(tilted.reading, tilted['reference'])) is None
+
+
+def test_a_knocked_pose_does_not_hide_the_fault():
+    poses = wired(np.diag([1.0, -1, 1]))
+    poses = changed(poses, 3, plus=0.3)
+    assert 'y reads -y' in fit_poses(poses, G).warnings[0]

@@ -36,12 +36,23 @@ class Context:
         self.declared: dict[str, DeclareLaunchArgument] = {}
 
 
-@dataclass(frozen=True)
-class LaunchConfiguration:
-    name: str
+def record(name: str, *members: str, kw_only: bool = True, **methods: Any) -> Any:
+    """Return a class with these members, whose visit starts nothing if it is not given."""
+    return make_dataclass(name, members, kw_only=kw_only, frozen=True,
+                          namespace={'visit': lambda self, context: [], **methods})
 
-    def perform(self, context: Context) -> str:
-        return context.values[self.name]
+
+LaunchConfiguration = record('LaunchConfiguration', 'name', kw_only=False,
+                             perform=lambda self, context: context.values[self.name])
+OpaqueFunction = record('OpaqueFunction', 'function',
+                        visit=lambda self, context: self.function(context))
+IfCondition = record('IfCondition', 'predicate', kw_only=False, evaluate=lambda self, context: {
+    'true': True, 'false': False}[self.predicate.perform(context).lower()])
+ChangeState = record('ChangeState', 'lifecycle_node_matcher', 'transition_id')
+EmitEvent = record('EmitEvent', 'event')
+OnStateTransition = record('OnStateTransition', 'target_lifecycle_node', 'start_state',
+                           'goal_state', 'entities', 'handle_once')
+RegisterEventHandler = record('RegisterEventHandler', 'event_handler', kw_only=False)
 
 
 @dataclass(frozen=True)
@@ -59,14 +70,6 @@ class DeclareLaunchArgument:
 
 
 @dataclass(frozen=True)
-class OpaqueFunction:
-    function: Callable[[Context], list[Any]] = field(kw_only=True)
-
-    def visit(self, context: Context) -> list[Any]:
-        return self.function(context)
-
-
-@dataclass(frozen=True)
 class IncludeLaunchDescription:
     source: str
     launch_arguments: Iterable[tuple[str, Any]] = field(default=(), kw_only=True)
@@ -75,14 +78,6 @@ class IncludeLaunchDescription:
         for name, value in self.launch_arguments:
             context.values[name] = value_of(value, context)
         return runpy.run_path(self.source)['generate_launch_description']()
-
-
-@dataclass(frozen=True)
-class IfCondition:
-    predicate: LaunchConfiguration
-
-    def evaluate(self, context: Context) -> bool:
-        return {'true': True, 'false': False}[self.predicate.perform(context).lower()]
 
 
 @dataclass(frozen=True)
@@ -125,19 +120,6 @@ class Node:
 
 class LifecycleNode(Node):
     """A managed node."""
-
-
-def record(name: str, *members: str, kw_only: bool = True) -> Any:
-    """Return a class with these members, whose visit starts nothing."""
-    return make_dataclass(name, members, kw_only=kw_only, frozen=True,
-                          namespace={'visit': lambda self, context: []})
-
-
-ChangeState = record('ChangeState', 'lifecycle_node_matcher', 'transition_id')
-EmitEvent = record('EmitEvent', 'event')
-OnStateTransition = record('OnStateTransition', 'target_lifecycle_node', 'start_state',
-                           'goal_state', 'entities', 'handle_once')
-RegisterEventHandler = record('RegisterEventHandler', 'event_handler', kw_only=False)
 
 
 def value_of(value: Any, context: Context) -> Any:
@@ -209,15 +191,7 @@ TOPICS = {'imu': 'imu/data_raw', 'output': 'imu/data_calibrated', 'temperature':
           'linear_acceleration': '~/linear_acceleration'}
 
 
-@pytest.mark.parametrize(('given', 'topics'), [
-    ({}, ['/imu/data_raw', '/imu/data_calibrated', '/temperature',
-          '/calibrator/linear_acceleration']),
-    ({'namespace': 'left'}, ['/left/imu/data_raw', '/left/imu/data_calibrated', '/temperature',
-                             '/left/calibrator/linear_acceleration']),
-    ({'namespace': 'left', **{name: f'x/{name}' for name in TOPICS}},
-     [f'/left/x/{name}' for name in TOPICS]),
-    ({'namespace': 'left', **{name: f'/x/{name}' for name in TOPICS}},
-     [f'/x/{name}' for name in TOPICS])])
+@pytest.mark.parametrize(('given', 'topics'), table('topics_of_launch'))
 def test_each_topic_has_an_argument_and_is_in_the_namespace_without_a_leading_slash(
         given: dict[str, str], topics: list[str], started: Any) -> None:
     node = started(**given).node
@@ -324,16 +298,7 @@ def test_filters_are_connected_from_the_raw_readings_to_the_odometry(
 
 NAV2 = ROOT / 'docs' / 'guides' / 'nav2.md'
 
-THEIRS = {
-    # robot_localization, src/ros_filter.cpp
-    'frequency', 'two_d_mode', 'publish_tf', 'world_frame', 'odom_frame', 'base_link_frame',
-    'gravitational_acceleration', 'imu0', 'imu0_config', 'imu0_remove_gravitational_acceleration',
-    'odom0', 'odom0_config',
-    # imu_filter_madgwick, src/imu_filter_ros.cpp
-    'use_mag', 'orientation_stddev',
-    # nav2_lifecycle_manager, src/lifecycle_manager.cpp, and nav2_bt_navigator
-    'node_names', 'autostart', 'bond_timeout', 'odom_topic'}
-"""Names of parameters that users of this package need, at the commits in `NAV2`."""
+THEIRS = {name for names in table('parameters_of_others').values() for name in names}
 
 
 def test_parameters_of_other_packages_have_their_names(started: Any) -> None:

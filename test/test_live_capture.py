@@ -11,14 +11,12 @@ from accel_calib.calibration import fit_poses, level
 from accel_calib.session import CalibratorSettings
 from accel_calib.stillness import capture, CaptureSettings, Dwell, poses_from
 from accel_calib.stored import read_calibration
-from accel_calib.table import numbered, Recording
-from accel_calib.units import units_of
 from inside import (
     LiveCapture, model_with, new_sensor, rest_after, simulate_recording, spread_directions,
     with_temperature)
 import numpy as np
 import pytest
-from shared import GRAVITY, MPS2, Readings, Stored
+from shared import GRAVITY, MPS2, NATIVE, Readings, rows_of, samples_of, Stored
 
 SETTINGS = CalibratorSettings()
 
@@ -26,12 +24,9 @@ FACES = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
 
 
 def push_all(live: LiveCapture, readings: Any, *, start: float = 0.0, rate: float = 50.0,
-             capture: bool = True, omega: Any = None, block: int = 5) -> list[Any]:
+             capture: bool = True, omega: Any = np.nan, block: int = 5) -> list[Any]:
     """Push readings in small blocks, and return the changes."""
-    samples = np.full((len(readings), 9), np.nan)
-    samples[:, 0], samples[:, 1:4] = start + np.arange(len(readings)) / rate, readings
-    if omega is not None:
-        samples[:, 4:7] = omega
+    samples = rows_of(start + np.arange(len(readings)) / rate, readings, omega)
     blocks = np.array_split(samples, max(1, len(samples) // block))
     return [change for block in blocks for change in live.push(block, capture)]
 
@@ -56,8 +51,7 @@ def test_the_first_poses_at_a_limit_are_marked_as_in_a_recording(seed: int) -> N
     reading = np.minimum(GRAVITY * (up + 0.003 * rng.normal(size=up.shape)), 0.8 * GRAVITY)
     live = LiveCapture(CaptureSettings(), MPS2)
     push_all(live, reading)
-    columns = {'time': np.arange(len(reading)) / 50.0, 'reading': reading}
-    whole = capture(Recording(columns, numbered(columns)), MPS2).poses
+    whole = capture(samples_of(np.arange(len(reading)) / 50.0, reading), MPS2).poses
     poses = live.poses_for_fit(())
     assert poses['at_limit'].tolist() == whole['at_limit'][:len(poses)].tolist()
     assert poses['at_limit'].tolist() == [1.0, 1.0, 1.0, *[0.0] * (len(poses) - 3)]
@@ -69,10 +63,9 @@ def test_the_first_poses_at_a_limit_are_marked_as_in_a_recording(seed: int) -> N
 @pytest.mark.parametrize('seed', range(3))
 def test_a_board_that_sends_counts_is_still_within_3_s(up: Any, noise: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    live, times = LiveCapture(CaptureSettings(), units_of('native')), np.arange(1200) / 84.0
-    samples = np.full((len(times), 9), np.nan)
-    samples[:, 0] = np.round(times, 3)
-    samples[:, 1:4] = np.round(np.array(up) + rng.normal(0.0, noise, (len(times), 3)))
+    live, times = LiveCapture(CaptureSettings(), NATIVE), np.arange(1200) / 84.0
+    samples = rows_of(np.round(times, 3),
+                      np.round(np.array(up) + rng.normal(0.0, noise, (len(times), 3))))
     still = []
     for block in np.array_split(samples, 150):
         list(live.push(block, True))
@@ -279,7 +272,6 @@ def test_poses_of_a_noisier_time_are_marked_and_kept() -> None:
     calibration = fit_poses(poses, MPS2, model='10')
     assert [each.row for each in calibration.rejected] == list(range(1, 13))
     assert list(calibration.used_poses.row) == list(range(13, 25))
-    assert 'doubtful' in calibration.rejected[0].reason
     needed = fit_poses(poses.take(slice(0, 13)), MPS2, model='10')
     assert not needed.rejected
     assert [each.rows for each in needed.noted if each.kind == 'doubtful'] == [tuple(range(1, 13))]

@@ -15,39 +15,14 @@ from live_bench import GRAVITY, live_page, LivePage, SIZES, TRUTH, Viewers
 import numpy as np
 from playwright.sync_api import Browser, expect, Locator, Page
 import pytest
-from shared import wait
+from shared import text_of, wait
 
-_SHOW_WAKE_LOCK = """
-const request = WakeLock.prototype.request;
-WakeLock.prototype.request = async function (kind) {
-  const lock = await request.call(this, kind);
-  const show = () => { document.documentElement.dataset.awake = `${!lock.released}`; };
-  lock.addEventListener('release', show);
-  show();
-  return lock;
-};
-"""
+
+def script(name: str) -> str:
+    return text_of(f'test/data/scripts/{name}.js')
+
 
 _MARKUP = '<img src=x onerror="document.title=1"><b>\u202e\x07\n</b>' + 'w' * 200
-
-_CONTRASTS = """() => {
-  const parts = (text) => text.match(/[\\d.]+/g).map(Number);
-  const light = ([r, g, b]) => [r, g, b].map((part) => part / 255).map((part) => part <= 0.03928
-    ? part / 12.92 : ((part + 0.055) / 1.055) ** 2.4)
-    .reduce((sum, part, k) => sum + [0.2126, 0.7152, 0.0722][k] * part, 0);
-  const back = (element) => {
-    for (let each = element; each; each = each.parentElement) {
-      const found = parts(getComputedStyle(each).backgroundColor);
-      if (found.length < 4 || found[3] > 0) return found;
-    }
-  };
-  return [...document.querySelectorAll('body *')].filter((each) => each.checkVisibility()
-    && [...each.childNodes].some((node) => node.nodeType === 3 && node.textContent.trim()))
-    .map((each) => {
-      const [a, b] = [light(parts(getComputedStyle(each).color)), light(back(each))];
-      return [(Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05), each.textContent.slice(0, 40)];
-    });
-}"""
 
 
 @pytest.fixture
@@ -202,12 +177,7 @@ def test_more_poses_after_a_good_calibration_change_nothing_and_reset_asks_first
 def test_the_keyboard_alone_performs_a_fit_that_blocks_the_buttons_of_other_viewers(
         with_poses: LivePage, viewers: Viewers) -> None:
     page, other = (viewers.visit(with_poses.link) for _ in range(2))
-    other.evaluate("""() => {
-      const button = document.querySelector('[data-command=refine]');
-      window.seen = [];
-      new MutationObserver(() => window.seen.push(button.getAttribute('aria-disabled')))
-        .observe(button, { attributeFilter: ['aria-disabled'] });
-    }""")
+    other.evaluate(script('watch_refine_button'))
     page.keyboard.press('Tab')
     expect(page.get_by_text('Skip to the commands')).to_be_focused()
     page.keyboard.press('Enter')
@@ -226,7 +196,7 @@ def test_the_keyboard_alone_performs_a_fit_that_blocks_the_buttons_of_other_view
     expect(page.locator('#verdict strong')).to_have_text('GOOD')
     for scheme in ('light', 'dark'):
         page.emulate_media(color_scheme=scheme)  # type: ignore[arg-type]
-        found = page.evaluate(_CONTRASTS)
+        found = page.evaluate(script('contrasts'))
         assert len(found) > 30
         assert [each for each in found if each[0] < 4.5] == [], scheme
 
@@ -256,7 +226,8 @@ def test_all_viewers_see_the_same_and_change_nothing_without_the_token(
 
 def test_a_viewer_that_sleeps_has_lost_nothing(live: LivePage, browser: Browser) -> None:
     viewers = Viewers(browser)  # a lost connection is an error in the console
-    asleep, awake = viewers.visit(live.link, script=_SHOW_WAKE_LOCK), viewers.visit(live.link)
+    asleep = viewers.visit(live.link, script=script('show_wake_lock'))
+    awake = viewers.visit(live.link)
     expect(asleep.locator('#log li').first).to_be_attached()
     expect(asleep.locator('html')).to_have_attribute('data-awake', 'true')
     before = log_numbers(asleep)
@@ -390,16 +361,7 @@ def test_labels_of_drawings_change_at_most_every_two_seconds(
     page = viewers.visit(idle.link)
     page.clock.install()
     page.clock.pause_at(page.evaluate('Date.now() + 10'))
-    page.evaluate("""async () => {
-      const { label } = await import('/page/canvas.js');
-      const drawing = document.createElement('canvas');
-      window.found = [];
-      window.show = (...all) => {
-        for (const words of all) label(drawing, words);
-        window.found.push(drawing.getAttribute('aria-label'));
-      };
-      window.show('first', 'second', 'third');
-    }""")
+    page.evaluate(script('label_a_drawing'))
     for passed, words in ((1999, []), (1, []), (1999, ['fourth']), (1, [])):
         page.clock.run_for(passed)
         page.evaluate('(words) => window.show(...words)', words)

@@ -19,14 +19,13 @@ import time
 from accel_calib.errors import InputError
 from accel_calib.session import CalibratorSettings
 from accel_calib.table import Floats
-from accel_calib.units import units_of
 from inside import (
     BUTTONS, CALIBRATION_ALONE, Host, LARGEST_LIVE_MESSAGE, LIVE_PERIOD, model_with, PAGE_FOLDER,
     PageServer, PATIENCE_FOR_A_HELLO, PATIENCE_FOR_A_REQUEST, PERIOD_OF_A_COMPLAINT, qr_code,
     reachable, simulate_recording, Source, spread_directions, STUCK)
 import numpy as np
 import pytest
-from shared import children, GRAVITY, wait
+from shared import children, GRAVITY, MPS2, rows_of, table, wait
 from viewer import fetch, hosted, Viewer
 
 OFFSET = (0.03, -0.02, 0.04)
@@ -35,14 +34,12 @@ UPGRADE = 'Upgrade: websocket\r\nConnection: Upgrade\r\n'
 VERSION = 'Sec-WebSocket-Version: 13\r\n'
 
 
-def rows_of(directions: Floats) -> Floats:
+def turned_to(directions: Floats) -> Floats:
     """Return the samples of a sensor that is turned; its temperature is 21 °C."""
     recording = simulate_recording(
         model_with({'offset': np.array(OFFSET)}), directions, np.random.default_rng(7),
         noise_g=0.0005, rate_hz=50.0, dwell=1.8, turn=0.4)
-    rows = np.full((len(recording), 9), np.nan)
-    rows[:, 0], rows[:, 1:4], rows[:, 7] = recording['time'], recording.reading * GRAVITY, 21.0
-    return rows
+    return rows_of(recording['time'], recording.reading * GRAVITY, temperature=21.0)
 
 
 def played(rows: Floats, over: Event) -> Iterator[Floats]:
@@ -59,8 +56,8 @@ class Bench:
     def __init__(self, stack: ExitStack, folder: Path, poses: int = 1,
                  blocks: Callable[[Floats, Event], Iterator[Floats]] = played) -> None:
         self._stack, self.path, self.played = stack, folder / 'c.yaml', Event()
-        source = Source('bench.csv', 'imu_link', units_of('m/s2'), '',
-                        blocks(rows_of(spread_directions(poses)), self.played))
+        source = Source('bench.csv', 'imu_link', MPS2, '',
+                        blocks(turned_to(spread_directions(poses)), self.played))
         self.host, self.logged = stack.enter_context(
             hosted(source, calibration_file=str(self.path)))
         self.base = self.host.server.link.partition('/#')[0]
@@ -150,7 +147,6 @@ def test_a_calibration_is_offered_to_all_viewers_and_stored_when_it_is_accepted(
         wait(lambda: viewer.answer(numbers[1]) and other.state['busy'] == 'fit')
     wait(lambda: all(map(viewer.answer, numbers)))
     assert sorted(viewer.answer(each)['success'] for each in numbers) == [False, True]
-    assert any('still running' in viewer.answer(each)['words'] for each in numbers)
     wait(lambda: viewer.state['busy'] == '')
     assert viewer.ask('undo')['success']
     wait(lambda: not viewer.state['preview'])
@@ -219,8 +215,7 @@ def test_a_page_that_is_asked_for_after_a_change_is_that_of_the_new_state(turned
     for ask in (exchange.page, partial(exchange.ask, 'undo'), exchange.page):
         exchange.call_soon(partial(ask, lambda success, words: answers.append(words)))
     wait(lambda: len(answers) == 3)
-    undone, offered, stored = answers
-    assert 'discarded' in undone
+    _, offered, stored = answers
     assert fetch(f'{turned.base}/calibration.html')[2].decode() == stored != offered
 
 
@@ -237,11 +232,7 @@ def test_without_the_token_the_page_only_shows(shared: Bench, token: str, words:
     assert shared.host.server.token not in str(viewer.got)
 
 
-@pytest.mark.parametrize('headers', [
-    {'Host': 'evil.example'}, {'Host': 'localhost.evil.example:{port}'}, {'Host': 'localhost:1'},
-    {'Host': '[::1]:{port}'}, {'Host': '127.0.0.1'}, {'Host': 'x@127.0.0.1:{port}'},
-    {'Origin': 'http://evil.example'}, {'Origin': 'null'}, {'Origin': 'https://127.0.0.1:{port}'},
-    {'Origin': 'http://127.0.0.1'}, {'Origin': 'http://localhost:{port}'}])
+@pytest.mark.parametrize('headers', table('foreign_requests'))
 def test_a_foreign_host_or_origin_is_refused(shared: Bench, headers: dict[str, str]) -> None:
     given = {name: value.format(port=shared.port) for name, value in headers.items()}
     for path in ('/', '/stream', '/calibration.html', '/export/c', '/none'):
@@ -280,10 +271,7 @@ def test_the_page_consists_of_its_files_and_nothing_else(shared: Bench) -> None:
         assert (status, content) == (200, file.read_bytes())
         assert headers['Content-Type'].split(';')[0] == {
             '.js': 'text/javascript', '.css': 'text/css', '.html': 'text/html'}[file.suffix]
-    for path in ('/page/', '/page', '/page/../__init__.py', '/page/..%2f__init__.py',
-                 '/page/%2e%2e/__init__.py', '/__init__.py', '//etc/passwd', '/page//etc/passwd',
-                 '/page/main.js/', '/page/main.js%00', '/export/', '/export/../c', '/export/exe',
-                 '/stream/', '/index.html', '/calibration.html/'):
+    for path in table('routes_without_a_page'):
         assert shared.sent(request(shared, 'GET', path)).split()[1] == b'404', path
     for method in ('POST', 'PUT', 'DELETE', 'OPTIONS', 'HEAD', 'TRACE'):
         assert shared.sent(request(shared, method, '/')).split()[1] == b'404', method
@@ -397,7 +385,7 @@ def test_a_viewer_without_hello_is_closed(bench: Bench, monkeypatch: pytest.Monk
 def test_a_port_in_use_is_an_error_in_one_line(shared: Bench, tmp_path: Path) -> None:
     settings = CalibratorSettings(calibration_file=str(tmp_path / 'd.yaml'), web_port=shared.port)
     with pytest.raises(InputError, match=f'port {shared.port} of 127.0.0.1 is in use'):
-        Host(Source('bench.csv', '', units_of('m/s2'), '', iter(())), settings, print)
+        Host(Source('bench.csv', '', MPS2, '', iter(())), settings, print)
     with pytest.raises(InputError, match='cannot be served at 192.0.2.7'):
         PageServer(shared.host.exchange, '192.0.2.7', 0).start()
 

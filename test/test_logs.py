@@ -1,22 +1,30 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Large and hostile logs; the golden cases `logs_…` read small ones of all dialects."""
+"""
+Large and hostile logs, and a small log in each format, which is read as the same table.
+
+The golden cases `logs_…` read small ones of all dialects, what is refused, and what is special.
+
+"""
 
 from pathlib import Path
+import sys
 import tracemalloc
 from typing import Any
+import zipfile
 
 from accel_calib.calibration import fit_poses
 from accel_calib.errors import InputError
-from accel_calib.logs import open_log
+from accel_calib.fleet import recordings
+from accel_calib.logs import FORMATS, LogOptions, open_log, SUFFIXES
 from accel_calib.stillness import capture
 from accel_calib.table import Recording
 from inside import model_with, read_log, simulate_recording, spread_directions
 import numpy as np
 import pytest
+from shared import data, GRAVITY as G, little_memory, LOG_CORPUS, options_of, run_json
 
-G = 9.80665
 RATE_HZ = 100.0
 OFFSET = np.array([0.03, -0.02, 0.05])
 GAIN = np.array([1.01, 0.98, 1.02])
@@ -53,16 +61,6 @@ def write(folder: Path, content: Any, name: str = 'log.csv') -> Path:
     else:
         path.write_bytes(content.encode() if isinstance(content, str) else content)
     return path
-
-
-def check(log: Any, reading: np.ndarray | None = None, time: np.ndarray | None = None,
-          within_s: float = 1e-9) -> None:
-    """Compare what is read with what was written, and the times since the first sample [s]."""
-    if reading is not None:
-        np.testing.assert_allclose(log.table.reading, reading, rtol=1e-8)
-    if time is not None:
-        np.testing.assert_allclose(log.table['time'] - log.table['time'][0], time - time[0],
-                                   atol=within_s)
 
 
 def test_the_log_of_a_microcontroller_is_calibrated_in_counts(tmp_path: Path) -> None:
@@ -133,3 +131,77 @@ def test_a_long_log_is_read_in_blocks_of_flat_memory_as_at_once(tmp_path: Path) 
     np.testing.assert_array_equal(np.concatenate([part.reading for part in parts]), whole.reading)
     assert whole['time'][-1] == pytest.approx((len(lines) - 1) * 0.01)
     assert whole.row[-1] == len(lines)
+
+
+# A small log in each format
+
+
+SAME = sorted(path for folder in ('formats', 'containers')
+              for path in (LOG_CORPUS / folder).iterdir())
+"""Logs of one table: the times and readings of `TABLE`; in native units, 8192 counts per g."""
+
+NOT_READ = sorted((LOG_CORPUS / 'refused').iterdir())
+TABLE = np.loadtxt(LOG_CORPUS / 'formats' / 'table.csv', delimiter=',', skiprows=1)
+LIBRARIES = {'.parquet': 'pyarrow', '.feather': 'pyarrow', '.h5': 'h5py'}
+
+
+@pytest.mark.parametrize('path', SAME, ids=lambda path: path.name)
+def test_a_log_in_any_format_is_read_as_the_same_table(path: Path) -> None:
+    pytest.importorskip(LIBRARIES.get(path.suffix, 'numpy'))
+    options = LogOptions(**options_of(path)[0])
+    log, expected = read_log(path, options), TABLE[:, 1:]
+    if options.units == 'native':
+        expected = np.round(expected / 9.80665 * 8192.0)
+    np.testing.assert_allclose(log.table.reading, expected, rtol=1e-6)
+    np.testing.assert_allclose(log.table['time'] - log.table['time'][0], TABLE[:, 0] - TABLE[0, 0],
+                               atol=1e-6)
+
+
+# Formats that other tests write: bags, flight logs, old Excel.
+ELSEWHERE = {'.mcap', '.ulg', '.bin', '.log', '.xls', '.json'}
+
+
+def test_every_format_is_tested_and_fleet_finds_what_is_read(tmp_path: Path) -> None:
+    tested = {path.suffix.lower() for path in (*SAME, *NOT_READ)}
+    assert not [each.name for each in FORMATS
+                if each.suffixes and not {*each.suffixes} & (tested | ELSEWHERE)]
+    names = [f'log{suffix}' for suffix in SUFFIXES]
+    for name in (*names, 'notes.md', 'log.tlog'):
+        (tmp_path / name).touch()
+    assert sorted(each.inside for each in recordings([str(tmp_path)])) == sorted(names)
+
+
+@pytest.mark.parametrize('suffix', ['.h5', '.feather'])
+def test_a_missing_library_is_named(suffix: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = next(path for path in SAME if path.suffix == suffix)
+    monkeypatch.setitem(sys.modules, LIBRARIES[suffix], None)
+    with pytest.raises(InputError, match=f'needs it .*pip install {LIBRARIES[suffix]}'):
+        read_log(path)
+
+
+@pytest.mark.parametrize('path', [*NOT_READ, *sorted((LOG_CORPUS / 'damaged').iterdir())],
+                         ids=lambda path: path.name)
+def test_what_is_not_read_is_refused_in_one_line_with_little_memory(path: Path) -> None:
+    with little_memory(), pytest.raises(InputError) as found:
+        read_log(path)
+    assert str(path) in found.value.message
+    assert '\n' not in str(found.value)
+    assert ('is damaged' in found.value.message) is (path.parent.name == 'damaged')
+
+
+def test_a_long_name_in_a_damaged_archive_is_not_shown_whole(tmp_path: Path) -> None:
+    path = tmp_path / 'log.zip'
+    with zipfile.ZipFile(path, 'w', zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(f'{60_000 * "a"}.csv', '1,2,3\n')
+    path.write_bytes(path.read_bytes().replace(b'aaa', b'bbb', 1))
+    with pytest.raises(InputError, match='is damaged') as caught:
+        read_log(path)
+    assert len(str(caught.value)) < 1000
+
+
+@pytest.mark.parametrize(('name', 'poses'), [('arrays.npz', 14), ('gcdc_x16.csv', 14)])
+def test_logs_of_others_become_poses(name: str, poses: int, tmp_path: Path,
+                                     capsys: pytest.CaptureFixture[str]) -> None:
+    path = data(f'logs/{name}')
+    _, made = run_json(capsys, 'capture', path, '-o', tmp_path / 'poses.csv')
+    assert made['poses'] == poses

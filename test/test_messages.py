@@ -28,7 +28,7 @@ from inside import frame_ids, Model, OneReading, rotation_from_rpy, stamps_of
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from shared import known, random_directions, values_of, with_effects
+from shared import known, random_directions, table, values_of, with_effects
 
 COUNT = int(os.environ.get('IMU_MESSAGES', '800'))
 COVARIANCES = ORIENTATION_COVARIANCE, ANGULAR_VELOCITY_COVARIANCE, ACCELERATION_COVARIANCE
@@ -39,17 +39,8 @@ NAMES = ('', 'i', 'imu', 'imu_li', 'imu_link', 'base/imu_link_7', 'a b', 'übung
 TEMPERATURES = (25.0, -40.0, 125.0, -273.15, 1e4)
 SECONDS = (0, 1, -1, 2 ** 31 - 1, -2 ** 31, 1_700_000_000)
 NANOSECONDS = (0, 1, 999_999_999, 2 ** 32 - 1)
-LAGS = {'offset_temperature': [1e-3, 2e-3, -1e-3, 8.0, 1.0],
-        'gain_temperature': [1e-3, -1e-3, 5e-4, 5.0, 0.0],
-        'temperature_rate': [0.02, -0.03, 0.01]}
-CASES = {
-    'linear': {},
-    'bent': {'quadratic': [1e-3, -2e-3, 1e-3], 'cubic': [1e-4, 2e-4, -1e-4],
-             'odd_quadratic': [1e-4, -1e-4, 2e-4], 'gain_asymmetry': [1e-3, -1e-3, 2e-3]},
-    'context': {'gain_temperature': [3e-4, -2e-4, 1e-4], 'lever_arm': [0.1, -0.05, 0.02],
-                'offset_temperature': [1e-3, 2e-3, -1e-3],
-                'warm_up': [0.01, 0.005, -0.01, 900.0, 600.0]},
-    'lag': LAGS}
+CASES = table('effects_of_messages')
+LAGS = CASES['lag']
 
 
 def calibration_of(effects, *, unit='m/s2', turned=False):

@@ -10,7 +10,7 @@ from inside import (
     with_vector)
 import numpy as np
 import pytest
-from shared import context_of, random_directions, values_of
+from shared import context_of, random_directions, table, values_of
 
 
 @pytest.fixture
@@ -88,22 +88,9 @@ def test_effects_by_hand():
                'since_turn': np.array([20.0]), 'duration': np.array([10.0]),
                'temperature_rate': np.array([0.01])}
     cases = {
-        'offset=1,2,3': (1, 2, 3), 'gain=0.1': (0.05, -0.2, 0.3),
-        'axis_gain=0.1,0.2,0.3': (0.05, -0.4, 0.9), 'cross_axis=1,0,0': (-2.0, 0.5, 0),
-        'misalignment=0,0,1': (2.0, 0.5, 0), 'quadratic=1': (0.25, 4, 9),
-        'cubic=1': (0.125, -8, 27), 'odd_quadratic=1': (0.25, -4, 9),
-        'gain_asymmetry=1': (0.5, 2, 3), 'cross_coupling=1,0,0,0,0,10': (-1, 0, -60),
-        'offset_temperature=1': (10, 10, 10), 'gain_temperature=1': (5, -20, 30),
-        'supply_ratio=1,0,0,2': (0.05, -0.2, 0.5), 'offset_drift=1,2,3,100': (2, 4, 6),
+        **table('effects_by_hand'),
         'warm_up=1,2,3,100,7200': (np.exp(-1), 2 * np.exp(-1), 3 * np.exp(-1)),
-        'offset_step=1,2,3,7300': (1, 2, 3), 'vibration_rectification=1': (0.01, 0.04, 0.09),
-        'hysteresis=1,1,1,0,0.5': (0.6, 0.4, -0.5),
-        'creep=1,2,3,10': np.array([0.6, 0.0, -2.4]) * (np.exp(-2) - np.exp(-3)),
-        'temperature_rate=1,2,3': (0.01, 0.02, 0.03),
-        'offset_temperature_quadratic=1': (100, 100, 100),
-        'offset_temperature_cubic=1': (1000, 1000, 1000), 'gain_drift=1,2,3,100': (1, -8, 18),
-        'gain_step=1,2,3,7300': (0.5, -4, 9), 'lever_arm=0.980665,0,9.80665': (-0.4, 0, 0),
-    }
+        'creep=1,2,3,10': np.array([0.6, 0.0, -2.4]) * (np.exp(-2) - np.exp(-3))}
     assert {case.partition('=')[0] for case in cases} == set(ADDED)
     for text, added in cases.items():
         model = Model(dict([parse_effect(text)]))

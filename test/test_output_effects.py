@@ -6,13 +6,12 @@
 from accel_calib.calibration import fit_poses, in_g
 from accel_calib.logs import read_recording
 from accel_calib.stillness import capture
-from accel_calib.table import Poses
 from accel_calib.units import STANDARD_GRAVITY, Units
 from inside import (
     clipped, grid_step, Model, off_grid, simulate_recording, spread_directions, unclipped)
 import numpy as np
 import pytest
-from shared import data, G, MPS2, NATIVE, random_directions, sensor
+from shared import data, G, MPS2, NATIVE, poses_of, random_directions, sensor
 
 COUNTS_PER_G = 4056.0
 IMU, COUNTS = 'mpu9150_imu0.csv', 'xsens_mti_counts.csv'
@@ -131,5 +130,4 @@ def test_the_coarsest_grid_that_holds_the_means_is_that_of_a_table_without_noise
     steps = np.random.default_rng(2).choice(np.atleast_1d(apart), (60, 3))
     reading = 2e-3 * np.cumsum(steps, axis=0)
     expected = 2e-3 if isinstance(apart, tuple) else 2e-3 * apart
-    poses = Poses({'reading': reading}, np.arange(1, 61))
-    assert grid_step(poses) == pytest.approx(expected)
+    assert grid_step(poses_of(reading)) == pytest.approx(expected)

@@ -17,8 +17,6 @@ from shared import ROOT, table
 
 EXECUTABLES = ('accel-calib', 'calibrator', 'calibrator_lifecycle', 'simulator')
 
-ROSDEP_KEYS = table('rosdep_keys')
-
 
 @pytest.fixture
 def setup_py(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
@@ -98,7 +96,7 @@ def test_package_xml_lists_each_requirement_and_all_imports_of_the_nodes(
         setup_py: dict[str, Any], package_xml: ElementTree.Element) -> None:
     extras, listed = setup_py['extras_require'], {*texts(package_xml, 'exec_depend')}
     required = setup_py['install_requires'] + extras['report'] + extras['live']
-    wanted = {ROSDEP_KEYS[name] for name in distributions(required)} - {''}
+    wanted = {table('rosdep_keys')[name] for name in distributions(required)} - {''}
     assert wanted == {key for key in listed if key.startswith('python3-')}
     pattern = re.compile(r'^\s*(?:from|import) (rclpy|\w+_(?:msgs|srvs|interfaces))\b', re.M)
     assert {name for source in sources('ros') for name in pattern.findall(source)} <= listed

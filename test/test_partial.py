@@ -11,14 +11,13 @@ from accel_calib.calibration import (
 from accel_calib.errors import InputError, RefusedFitError
 from accel_calib.estimate import estimate
 from accel_calib.refinement import refine
-from accel_calib.table import Poses
 from faults.sample import sample
 from inside import (
     calibrated_by, common_sensors, FitPlan, Model, MODELS, predict, sensor_force, simulate_poses,
     spread_directions, unit, with_vector)
 import numpy as np
 import pytest
-from shared import changed, G, NATIVE, rms
+from shared import changed, G, NATIVE, poses_of, rms
 
 UP, Z = spread_directions(200), np.array([[0.0, 0.0, 1.0]])
 SPREAD = np.sqrt(np.diag(common_sensors().covariance))
@@ -175,9 +174,8 @@ def test_poses_of_a_cone_are_for_the_partial_fit_and_those_of_the_sphere_for_the
 @pytest.mark.parametrize('make', [fit_partial, mounting_only])
 def test_native_readings_and_a_sensor_that_was_never_at_rest_are_refused(make):
     _, poses = tilting(10)
-    with pytest.raises(InputError, match='native units.*expected readings in m/s2 or g') as err:
+    with pytest.raises(InputError, match='native units.*expected readings in m/s2 or g'):
         make(poses, NATIVE)
-    assert 'turn the sensor' in err.value.advice
     moved = poses.with_columns(std=np.full_like(poses.reading, 100.0))
     with pytest.raises(RefusedFitError, match='found 0 sound poses of 7 rows'):
         make(moved, G)
@@ -189,14 +187,13 @@ def test_a_reading_of_another_length_is_left_out_and_named():
     poses = changed(poses, 2, 0.0)
     found = fit_partial(poses, G)
     assert [each.row for each in found.rejected] == [3]
-    assert ' 0 g' in found.rejected[0].reason
     np.testing.assert_allclose(found.model.vector, expected.model.vector)
 
 
 def test_a_mounting_levels_the_raw_reading():
     tilt = np.radians(12.0)
     reading = 1.07 * np.array([[np.sin(tilt), 0.0, np.cos(tilt)]])
-    found = level(mounting_only(Poses({'reading': reading}, np.array([1])), G), reading[0], 'ros')
+    found = level(mounting_only(poses_of(reading), G), reading[0], 'ros')
     np.testing.assert_allclose(found.correct(reading), [[0.0, 0.0, 1.07]], atol=1e-12)
     others = np.random.default_rng(12).normal(size=(5, 3))
     np.testing.assert_allclose(np.linalg.norm(found.correct(others), axis=1),
@@ -211,7 +208,6 @@ def test_level_and_the_offset_along_gravity_come_from_one_rest():
     _, poses = tilting(13, 1, 0.1)
     found = level(fit_partial(poses, G), poses.reading[0], 'ros')
     np.testing.assert_allclose(found.correct(poses.reading), [[0.0, 0.0, 1.0]], atol=1e-3)
-    assert 'offset and gain' in found.reason
 
 
 @pytest.mark.parametrize('make', [fit_partial, mounting_only])

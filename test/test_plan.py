@@ -10,12 +10,11 @@ import json
 from accel_calib.calibration import NextPose, PlannedPose, SessionPlan
 from accel_calib.findings import NOTHING_TO_PLAN, rival_words
 from accel_calib.refinement import refine
-from accel_calib.table import Poses
 from generator import Setup, simulate, write_csv
 from inside import attitude_words, choose_levels, Guide, model_with, simulate_poses, step_of
 import numpy as np
 import pytest
-from shared import G, random_directions, run, run_json
+from shared import G, poses_of, random_directions, run, run_json
 
 
 def read_plan(path):
@@ -76,14 +75,13 @@ def test_without_rivals_nothing_is_written(tmp_path, capsys):
 def test_temperature_and_drift_are_separated_at_other_temperatures(tmp_path, capsys):
     path, rivals = tmp_path / 'plan.csv', table(
         tmp_path / 'rivals.csv', 'offset_temperature', size=2, seed=[0, 2], temperature='rising')
-    status, result = run_json(capsys, 'refine', rivals, '--plan', path)
+    status, _ = run_json(capsys, 'refine', rivals, '--plan', path)
     poses = read_plan(path)
     assert status == 0
     pair = {'offset_temperature', 'offset_drift'}
     assert all(pair <= set(pose['separates'].split(' / ')) for pose in poses)
     assert all(-20.0 <= float(pose['temperature']) <= 70.0 for pose in poses)
     assert float(poses[-1]['expected_probability']) > 0.9
-    assert ' °C' in ' '.join(result['plan'])
     waits = [float(pose['wait']) for pose in poses]
     assert waits == sorted(waits)
 
@@ -108,8 +106,7 @@ def test_voltages_of_a_plan_are_the_ends_and_the_middle_of_those_of_the_poses():
     ([-10.0, np.nan, 60.0], [25.0, -10.0, 60.0, -20.0, 70.0]),
     ([62.0, 66.0], [64.0, 62.0, 66.0, 60.0, 68.0])])
 def test_temperatures_of_a_plan_are_those_of_the_poses_and_some_beyond(taken, expected):
-    poses = Poses({'reading': np.eye(3)[:len(taken)], 'temperature': np.array(taken)},
-                  np.arange(len(taken)))
+    poses = poses_of(np.eye(3)[:len(taken)], temperature=taken)
     assert choose_levels('temperature', poses) == expected
 
 
@@ -161,9 +158,7 @@ def test_the_node_asks_for_the_poses_of_the_plan_and_then_for_refine():
         planned((0.0, 0.0, 1.0)), planned((0.0, 1.0, 0.0), temperature=40.0)), begun=1), [
             (0, 0, -1)])
     assert guide.plan.asked.direction.tolist() == [0.0, 0.0, 1.0]
-    assert step_of(guide).text.endswith(' cubic from odd_quadratic')
     guide = guide_at(guide, [(0, 0, -1), (0, 0.1, 1)])
-    assert ' at 40 °C' in step_of(guide).text
     assert guide.plan.asked.direction.tolist() == [0.0, 1.0, 0.0]
     guide = guide_at(guide, [(0, 0, -1), (0, 0.1, 1), (0, 1, 0)])
     assert (step_of(guide).step, step_of(guide).command) == ('refine', 'refine')

@@ -7,7 +7,6 @@ import re
 
 import accel_calib as ac
 from accel_calib.effects import between_steps
-from accel_calib.findings import value_words, verdict_words
 from accel_calib.logs import read_poses
 from accel_calib.refinement import refine
 import generator
@@ -90,8 +89,6 @@ def test_steps_state_the_values_and_deviations_of_the_final_model(taken):
         assert [step.parameters[axis] for axis in 'xyz'] == values.tolist()
         assert [step.parameters_sd[axis] for axis in 'xyz'] == pytest.approx(
             [deviations[f'{step.effect}.{axis}'] for axis in 'xyz'])
-        shown = dict(value_words(step))
-        assert all('±' in shown[axis] for axis in 'xyz')
 
 
 @pytest.mark.parametrize(('seed', 'poses'), [(0, 24), (1, 24), (0, 60)])
@@ -193,10 +190,14 @@ def test_a_temperature_in_steps_is_estimated_within_half_a_step(step):
 
 
 @pytest.mark.parametrize('seed', range(3))
-def test_a_supply_that_scales_gains_that_differ_leaves_no_gap(seed, taken):
-    hidden = {'supply_ratio': 100.0, 'offset_temperature': 3.0}
-    found = refine(taken([5, seed], hidden, poses=60, noise_mg=1.0)[0], MPS2, base='10')
+@pytest.mark.parametrize(('hidden', 'base', 'setup'), [
+    ({'supply_ratio': 100.0, 'offset_temperature': 3.0}, '10', {'noise_mg': 1.0}),
+    ({'quadratic': 10.0, 'cubic': 6.0}, 'auto', {})])
+def test_two_effects_leave_no_gap_and_are_not_one_curve(hidden, base, setup, seed, taken):
+    poses, _ = taken([5 if 'noise_mg' in setup else 3, seed], hidden, poses=60, **setup)
+    found = refine(poses, MPS2, base=base)
     assert (sorted(names(found)), found.verdict) == (sorted(hidden), 'explained')
+    assert found.one_curve == ()
 
 
 @pytest.mark.parametrize(('effect', 'poses'), [('quintic', 60), ('oblique_hinge', 200)])
@@ -206,18 +207,10 @@ def test_a_form_outside_of_the_catalogue_is_not_named_after_its_nearest_effect(
     assert names(found) == ['empirical']
 
 
-@pytest.mark.parametrize('seed', range(3))
-def test_two_nonlinearities_with_directions_of_their_own_are_explained(seed, taken):
-    found = refine(taken([3, seed], {'quadratic': 10.0, 'cubic': 6.0}, poses=60)[0], MPS2)
-    assert names(found) == ['quadratic', 'cubic']
-    assert (found.verdict, found.one_curve) == ('explained', ())
-
-
 def test_a_curve_is_not_explained_by_the_one_part_of_it_that_is_named(taken):
     found = refine(taken([3, 1], {'quartic': 3.0}, poses=60)[0], MPS2, base='10')
     assert names(found) == ['quadratic']
     assert (found.undecided, found.one_curve) == (True, ('quadratic', 'gain_asymmetry'))
-    assert 'beside quadratic, gain_asymmetry' in verdict_words(found)
 
 
 @pytest.mark.parametrize('effect', ['repeatability', 'quartic', 'quintic', 'dead_zone',
@@ -230,10 +223,7 @@ def test_a_gap_that_no_effect_explains_is_described_or_unexplained(effect, taken
         assert found.verdict in ('described', 'unexplained')
     if effect == 'quartic':  # at 1 g, quadratic and gain_asymmetry together imitate it
         assert (found.undecided, found.one_curve) == (True, ('quadratic', 'gain_asymmetry'))
-        assert 'quadratic and gain_asymmetry' in verdict_words(found)
     assert ('empirical' in names(found)) or found.verdict != 'described'
-    if found.verdict == 'unexplained' and not found.undecided:
-        assert any('gap remains' in line or 'repeat' in line for line in found.advice)
     for step in found.steps:  # each is significant beside the others
         assert step.p_value < 0.01
         assert step.probabilities[step.effect] == max(step.probabilities.values())

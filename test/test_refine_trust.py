@@ -11,7 +11,6 @@ import accel_calib as ac
 from accel_calib.calibration import fit_poses, verify
 from accel_calib.effects import add_history
 from accel_calib.errors import RefusedFitError
-from accel_calib.findings import verdict_words
 from accel_calib.logs import read_recording, write_table
 from accel_calib.refinement import refine
 from accel_calib.stored import write_calibration
@@ -22,7 +21,7 @@ from inside import (
 import numpy as np
 import pandas as pd
 import pytest
-from shared import data, G, random_directions, run, run_json, sensor
+from shared import changed, data, G, random_directions, run, run_json, sensor
 
 OFFSET = np.array([0.02, -0.01, 0.03])
 WARM = np.array([6e-4, -4e-4, 5e-4])
@@ -44,10 +43,6 @@ def near_up(rng, degrees):
     near = random_directions(400, rng)
     near = near[near[:, 2] > np.cos(np.radians(degrees))][:30]
     return poses_of(with_effects(rng, **TCO), rng, near, temperature=rng.uniform(15, 35, 30))
-
-
-def plus(poses, added_g):
-    return poses.with_columns(reading=poses.reading + added_g)
 
 
 def table(seed, hidden, **setup):
@@ -107,7 +102,6 @@ def test_findings_of_one_orientation_are_reported_and_not_stored(tmp_path, capsy
     assert {'offset_temperature', 'offset_drift'} & {
         name for step in result['steps'] for name in (step['effect'], *step['rivals'])}
     assert 'same orientation' in result['refusal']
-    assert 'is not written' in printed.err.splitlines()[-1]
     assert not stored.exists()
 
 
@@ -122,7 +116,6 @@ def test_six_faces_report_what_they_cannot_show(arguments, tmp_path, capsys):
     named = {name for step in result['steps'] for name in (step['effect'], *step['rivals'])}
     assert named <= {'offset', 'gain', 'axis_gain'}
     assert 'cross_axis' in [entry['effect'] for entry in result['not_testable']]
-    assert any('6 poses leave' in line for line in result['advice'])
     assert result['remaining_gap_mg'] < 2.0
     assert page.read_text().startswith('<!DOCTYPE html>')
 
@@ -143,7 +136,6 @@ def test_effects_that_look_alike_end_in_a_result(seed):
 def test_poor_repeatability_is_reported_with_its_size():
     found = ac.refine(table(6, {'repeatability': 4.0}), base='10')
     assert found.verdict == 'unexplained'
-    assert not any('gap remains' in line for line in found.advice)
     line, = (line for line in found.advice if line.startswith('poses repeat '))
     assert float(line.split()[2]) == pytest.approx(np.hypot(1.0, 4.0), rel=0.3)
 
@@ -152,7 +144,7 @@ def test_poor_repeatability_is_reported_with_its_size():
 def test_structure_that_is_not_understood_remains_a_gap(structure):
     rng = np.random.default_rng(1)
     poses = poses_of(with_effects(rng), rng, 60)
-    scattered = plus(poses, 0.002 * rng.normal(size=(60, 3)))
+    scattered = changed(poses, plus=0.002 * rng.normal(size=(60, 3)))
     found = search_effects(add_history(scattered, Model({})),
                            fit_poses(poses, G, model='10').model)
     kinds = [{each.kind for each in remarks_on(what, (), (), 0, unexplained=True)}
@@ -237,7 +229,7 @@ def test_a_stored_calibration_with_an_effect_of_time_is_compared_as_stored():
     assert 'warm_up' in base.model.values
     later = poses_of(truth, rng, 20, time=time[-20:] + 4000.0)
     assert refine(later, G, base=base).verdict == 'no_gap'
-    moved = refine(plus(later, [0.02, 0.0, 0.0]), G, base=base)
+    moved = refine(changed(later, plus=[0.02, 0.0, 0.0]), G, base=base)
     assert moved.gap_mg > 5.0
     assert names(moved) == ['offset']
     assert moved.steps[0].parameters['x'] == pytest.approx(0.02, abs=2e-3)
@@ -254,7 +246,6 @@ def test_a_file_that_was_edited_is_compared_with_its_own_poses(stored, tmp_path,
     assert run('refine', table, '-c', path, '--units', 'g', '--json', '-') == 0
     printed = capsys.readouterr()
     result = json.loads(printed.out)
-    assert 'edited by hand' in printed.err
     assert result['gap_mg'] > 20.0
     assert [step['effect'] for step in result['steps']] == ['offset']
     assert result['steps'][0]['parameters']['x'] == pytest.approx(-0.05, abs=2e-3)
@@ -265,7 +256,7 @@ def test_without_a_gap_the_calibration_is_that_of_the_fit(seed):
     rng = np.random.default_rng([31, seed])
     poses = poses_of(with_effects(rng), rng, 30)
     shift = rng.normal(size=3) * 2.2e-3 * rng.uniform(0.5, 1.5)
-    poses = plus(poses, shift * (np.arange(30) == 4)[:, np.newaxis])
+    poses = changed(poses, plus=shift * (np.arange(30) == 4)[:, np.newaxis])
     found, fitted = refine(poses, G), fit_poses(poses, G)
     assert found.verdict == 'no_gap'
     np.testing.assert_array_equal(found.calibration.model.vector, fitted.model.vector)
@@ -283,7 +274,8 @@ def test_a_stored_curve_over_the_rate_of_temperature_is_compared_with_new_poses(
         time = np.cumsum(rng.uniform(10.0, 40.0, count))
         warm = 25.0 + 8.0 * np.sin(time / 300.0 + rng.uniform(0.0, 6.0))
         poses = poses_of(model, rng, count, temperature=warm, time=time)
-        return plus(poses, np.outer(np.tanh(np.gradient(warm, time) / 0.008), axes) + offset)
+        slow = np.tanh(np.gradient(warm, time) / 0.008)
+        return changed(poses, plus=np.outer(slow, axes) + offset)
 
     first = refine(taken(80), G)
     assert [step.variable for step in first.steps] == ['temperature_rate']
@@ -301,15 +293,13 @@ def test_twelve_poses_that_cannot_tell_explain_nothing(seed):
     many = any(len(step.rivals) > 3 for step in found.steps)
     assert found.undecided == bool(found.steps and (many or found.refusal or found.one_curve))
     assert not found.undecided or found.verdict == 'unexplained'
-    assert ('Not enough poses' in verdict_words(found)) == found.undecided
-    assert not any('clamp' in line or 'a gap remains' in line for line in found.advice)
 
 
 def test_a_walk_beside_an_effect_is_a_step_of_its_own_which_no_calibration_corrects():
     rng = np.random.default_rng([41, 2])
     model = with_effects(rng, quadratic=np.array([0.012, -0.009, 0.01]))
     poses = poses_of(model, rng, 60, time=np.arange(60) * 30.0)
-    found = refine(plus(poses, np.cumsum(rng.normal(size=(60, 3)), axis=0) * 1.5e-3), G)
+    found = refine(changed(poses, plus=np.cumsum(rng.normal(size=(60, 3)), axis=0) * 1.5e-3), G)
     assert (found.verdict, names(found)) == ('drifts', ['quadratic', 'offset_wander'])
     first, second = found.steps
     assert second.gap_before_mg == pytest.approx(first.gap_after_mg)
@@ -325,7 +315,7 @@ def test_a_swing_of_what_is_not_recorded_is_not_explained_by_several_slow_effect
     warm = 25.0 + 15.0 * np.sin(time / 1500.0 + rng.uniform(0.0, 6.0))
     poses = poses_of(with_effects(rng), rng, 60, time=time, temperature=warm)
     swing = np.sin(time / 500.0 + rng.uniform(0.0, 6.0))
-    found = refine(plus(poses, 0.004 * np.outer(swing, random_directions(1, rng)[0])), G)
+    found = refine(changed(poses, plus=0.004 * np.outer(swing, random_directions(1, rng)[0])), G)
     assert (found.verdict, names(found)) == ('described', ['empirical'])
 
 
@@ -338,11 +328,9 @@ def test_what_is_not_recorded_is_not_taken_for_a_temperature_that_resembles_it(s
     poses = poses_of(with_effects(rng, **effects), rng, 100, time=3000.0 * share,
                      temperature=25.0 + 5.0 * np.sum(np.sin(waves), axis=1))
     swing = np.sin(2.0 * np.pi * share / rng.uniform(0.1, 0.3) + rng.uniform(0.0, 6.0))
-    found = refine(plus(poses, 0.004 * np.outer(swing, random_directions(1, rng)[0])), G)
+    found = refine(changed(poses, plus=0.004 * np.outer(swing, random_directions(1, rng)[0])), G)
     assert found.verdict in ('described', 'unexplained')
     assert {*names(found)} - {'empirical', 'offset_wander'} == {*effects}
-    if found.verdict == 'unexplained' and not effects:
-        assert 'only a part' in ' '.join(found.advice)
 
 
 @pytest.mark.parametrize('seed', range(2))
@@ -380,12 +368,12 @@ def test_new_poses_noisier_than_stated_are_no_walk_and_a_wave_in_them_is_found(n
         base = fit_poses(poses_of(model, rng, 60), G)
         noise = 0.003 / 10.0  # of the mean of a pose [g]
         new = poses_of(model, rng, 40, time=np.arange(40) * 20.0)
-        new = plus(new, rng.normal(size=(40, 3)) * noise * np.sqrt(noisier ** 2 - 1.0))
+        new = changed(new, plus=rng.normal(size=(40, 3)) * noise * np.sqrt(noisier ** 2 - 1.0))
         found = refine(new, G, base=base)
         assert found.steps == ()
         assert found.verdict != 'explained'
     wave = np.outer(np.sin(new['time'] / 150.0), [0.006, -0.005, 0.004])
-    found = refine(plus(new, wave), G, base=base)
+    found = refine(changed(new, plus=wave), G, base=base)
     assert found.steps
     assert found.remaining_gap_mg < 0.5 * found.gap_mg
 

@@ -11,13 +11,12 @@ from accel_calib.logs import read_poses, read_recording, write_table
 from accel_calib.refinement import refine
 from accel_calib.stillness import capture
 from accel_calib.table import Poses, Recording
-from accel_calib.units import units_of
 from inside import (
     format_calibration, Model, parse_calibration, simulate_poses, simulate_recording,
     spread_directions)
 import numpy as np
 import pytest
-from shared import data, G
+from shared import data, G, MPS2
 
 BIAS = np.array([0.01, -0.02, 0.03])
 TURNING = np.array([0.3, -0.2, 0.9])
@@ -154,7 +153,7 @@ def test_a_negative_noise_of_the_rate_is_refused(tmp_path):
 @pytest.mark.parametrize('name', ['mpu9150_imu0.csv', 'mpu9150_imu1.csv'])
 def test_a_real_gyro_has_the_bias_of_its_quietest_seconds(name):
     samples = read_recording(data(name))
-    gyro = found(capture(samples, units_of('m/s2')).poses)
+    gyro = found(capture(samples, MPS2).poses)
     seconds = samples['rate'][:len(samples) // 100 * 100].reshape(-1, 100, 3)
     spread = seconds.std(axis=1).max(axis=1)
     quiet = np.median(seconds[spread < np.quantile(spread, 0.25)].mean(axis=1), axis=0)

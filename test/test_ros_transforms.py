@@ -83,20 +83,16 @@ def test_rounded_quaternions_give_proper_rotations() -> None:
 
 
 @pytest.mark.parametrize(('parent', 'child', 'quaternion', 'words'), [
-    ('mast', 'imu', (0.0, 0.0, 0.0, 0.0), '(0, 0, 0, 0) of length 0'),
-    ('mast', 'imu', (0.0, math.nan, 0.0, 1.0), 'of length nan'),
-    ('mast', 'imu', (0.0, 0.0, math.inf, 1.0), 'of length inf'),
-    ('mast', 'imu', (1.0, 1.0, 1.0, 1.0), 'of length 2'),
-    ('', 'imu', UNIT, 'empty frame name'), ('mast', '/', UNIT, 'empty frame name'),
-    ('imu', 'base', UNIT, 'imu to base makes a loop'),
-    ('imu', 'imu', UNIT, 'imu to imu makes a loop'),
-])
+    ('mast', 'imu', (0.0, 0.0, 0.0, 0.0), 'length 0'),
+    ('mast', 'imu', (0.0, math.nan, 0.0, 1.0), 'length nan'),
+    ('mast', 'imu', (0.0, 0.0, math.inf, 1.0), 'length inf'),
+    ('mast', 'imu', (1.0, 1.0, 1.0, 1.0), 'length 2'), ('', 'imu', UNIT, 'empty'),
+    ('mast', '/', UNIT, 'empty'), ('imu', 'base', UNIT, 'loop'), ('imu', 'imu', UNIT, 'loop')])
 def test_invalid_transforms_are_refused_and_change_nothing(
         parent: str, child: str, quaternion: tuple[float, ...], words: str) -> None:
     tree = robot()
-    with pytest.raises(InputError) as refusal:
+    with pytest.raises(InputError, match=words):
         tree.add(parent, child, quaternion)
-    assert words in str(refusal.value)
     np.testing.assert_allclose(tree.rotation('footprint', 'imu'), BASE @ MAST @ IMU, atol=1e-12)
 
 
@@ -105,10 +101,9 @@ def test_invalid_transforms_are_refused_and_change_nothing(
 def test_without_tf2_msgs_its_parameters_are_refused(
         without_tf2: None, bench: Any, parameter: str, value: Any, instead: str) -> None:
     node = bench.start('calibrator', **{parameter: value})
-    printed = node.communicate(timeout=60)[0]
-    assert f'the parameter {parameter}' in printed
-    assert re.search(f'ros-jazzy-tf2-msgs, .*{instead}', printed)
-    assert node.returncode == 2
+    status, printed = bench.end(node)
+    assert status == 2
+    assert re.search(f'the parameter {parameter}.* ros-jazzy-tf2-msgs, .*{instead}', printed)
 
 
 def test_late_subscriber_receives_the_transforms_of_all_publishers(
@@ -133,7 +128,6 @@ def test_invalid_transform_is_logged_and_the_rest_of_its_message_is_used(
     np.testing.assert_allclose(tree.rotation('base', 'imu'), IMU, atol=1e-12)
     assert tree.rotation('base', 'mast') is None
     log = capfd.readouterr().err
-    assert '[WARN]' in log
     assert 'base to mast' in log
 
 

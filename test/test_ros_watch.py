@@ -10,7 +10,6 @@ import os
 from pathlib import Path
 import pty
 import re
-import select
 import signal
 import socket
 import struct
@@ -35,15 +34,6 @@ WATCH = (*COMMAND, 'watch')
 ATTITUDES = ([0, 0, 1], [1, 0, 0], [0, 1, 0])
 
 
-def lines_of(process: subprocess.Popen[str]) -> tuple[list[str], threading.Thread]:
-    """Return a list to which the lines of a process are added, and the thread that adds them."""
-    lines: list[str] = []
-    assert process.stdout is not None
-    thread = threading.Thread(target=lines.extend, args=(process.stdout,), daemon=True)
-    thread.start()
-    return lines, thread
-
-
 def turn(bench: Any, readings: Readings, seen: Callable[[int], bool]) -> None:
     """Turn the sensor; each attitude waits until the pose before it is seen."""
     for count, attitude in enumerate(ATTITUDES, 1):
@@ -52,23 +42,21 @@ def turn(bench: Any, readings: Readings, seen: Callable[[int], bool]) -> None:
 
 
 @pytest.mark.parametrize('number', sample([signal.SIGINT, signal.SIGTERM], 1))
-def test_pipe_gets_a_line_for_each_pose_and_for_a_silence_of_the_node(
+def test_a_file_gets_a_line_for_each_pose_and_for_a_silence_of_the_node(
         bench: Any, readings: Readings, number: int) -> None:
     node = bench.calibrator(sensor='arm', passthrough=True)
     process = bench.run(*WATCH)
-    lines, thread = lines_of(process)
-    bench.spin(lambda: any(line.startswith('poses: 0 of about 12; ') for line in lines))
-    turn(bench, readings, lambda count: any(f'captured pose {count} of' in x for x in lines))
-    assert all(character.isprintable() for line in lines for character in line.rstrip('\n'))
-    assert {'moving', 'still'} <= {line.rstrip('\n').partition(': ')[0] for line in lines}
+    bench.spin(lambda: 'poses: 0 of about 12; ' in process.printed)
+    turn(bench, readings, lambda count: f'captured pose {count} of' in process.printed)
+    lines = process.printed.splitlines()
+    assert all(map(str.isprintable, lines))
+    assert {'moving', 'still'} <= {line.partition(': ')[0] for line in lines}
     bench.end(node, signal.SIGINT)
-    bench.spin(lambda: any('expected a message' in line for line in lines))
+    bench.spin(lambda: 'expected a message' in process.printed)
     bench.calibrator(sensor='arm')
-    bench.spin(lambda: any(line.endswith('arrive again\n') for line in lines))
-    process.send_signal(number)
-    assert process.wait(60) == 0
-    thread.join()
-    assert not any('Traceback' in line for line in lines)
+    bench.spin(lambda: 'arrive again\n' in process.printed)
+    status, printed = bench.end(process, number)
+    assert (status, 'Traceback' in printed) == (0, False)
 
 
 def test_terminal_is_drawn_with_a_bell_for_each_pose(bench: Any, readings: Readings) -> None:
@@ -108,9 +96,7 @@ def test_terminal_is_drawn_with_a_bell_for_each_pose(bench: Any, readings: Readi
 
 def test_node_is_found_by_its_name_or_what_is_there_is_named(bench: Any) -> None:
     def once(*arguments: str) -> tuple[int, str]:
-        process = bench.run(*WATCH, '--once', *arguments)
-        printed = process.communicate(timeout=60)[0]
-        return process.returncode, printed
+        return bench.end(bench.run(*WATCH, '--once', *arguments))
 
     status, printed = once()
     assert (status, printed.count('\n')) == (2, 1)
@@ -135,13 +121,10 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def printed_until(node: Any, words: str) -> str:
-    """Return the first line of a node that contains some words."""
-    text = ''
-    while words not in text:
-        assert select.select([node.stdout], [], [], 60.0)[0]
-        text = node.stdout.readline()
-    return text
+def page_link(bench: Any, node: Any, count: int = 1) -> str:
+    """Return the link of the last page of a node, once it has served so many."""
+    bench.spin(lambda: node.printed.count('live page: ') == count)
+    return link_of(node.printed.rpartition('live page: ')[2].splitlines()[0])
 
 
 @pytest.fixture
@@ -149,7 +132,7 @@ def viewer(bench: Any, tmp_path: Path) -> Iterator[Viewer]:
     """Yield a viewer of a calibrator with a page."""
     node = bench.calibrator(calibration_file=tmp_path / 'c.yaml', web_port=free_port(),
                             passthrough=True)
-    made = Viewer(link_of(printed_until(node, 'live page: ')))
+    made = Viewer(page_link(bench, node))
     made.node = node  # type: ignore[attr-defined]
     yield made
     made.close()
@@ -213,7 +196,7 @@ def test_a_node_whose_port_is_in_use_says_so_and_works_on(
         port = taken.getsockname()[1]
         node = bench.calibrator(calibration_file=tmp_path / 'c.yaml', web_port=port,
                                 passthrough=True)
-        printed_until(node, f'the port {port} of 127.0.0.1 is in use')
+        bench.spin(lambda: f'the port {port} of 127.0.0.1 is in use' in node.printed)
         still = readings(DIRECTIONS[:1])
         bench.feed(still)
         assert 'pose' in bench.call_while('capture_pose', lambda: bench.imu(still[-1])).message
@@ -224,9 +207,9 @@ def test_the_managed_node_serves_the_page_while_it_is_configured(
         bench: Any, stored: Stored) -> None:
     node = bench.start('calibrator_lifecycle', calibration_file=stored(), web_port=free_port())
     publisher = bench.node.create_publisher(Imu, 'imu/data_raw', 100)
-    for _ in range(2):  # the second page is at the same port
+    for count in (1, 2):  # the second page is at the same port
         bench.go(Transition.TRANSITION_CONFIGURE)
-        viewer = Viewer(link_of(printed_until(node, 'live page: ')))
+        viewer = Viewer(page_link(bench, node, count))
         bench.spin(lambda viewer=viewer: viewer.of('state') and viewer.state['calibration'])
         bench.go(Transition.TRANSITION_ACTIVATE)
         bench.spin(lambda viewer=viewer: publisher.publish(bench.imu([0.1, 0.2, 9.8])) or any(

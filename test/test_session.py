@@ -24,7 +24,7 @@ from inside import (
     spread_directions, store_of, StreamStatistics, use_calibration, writing_advice)
 import numpy as np
 import pytest
-from shared import GRAVITY, python, Readings, ROOT, Stored, table, with_effects
+from shared import GRAVITY, python, Readings, ROOT, rows_of, Stored, table, with_effects
 
 UP, LEFT, FORWARD = [0, 0, 1], [0, 1, 0], [1, 0, 0]
 NOSE_DOWN = [-0.6, 0.0, 0.8]
@@ -95,7 +95,7 @@ def test_files_that_cannot_be_used_are_never_overwritten(tmp_path: Path, stored:
     (tmp_path / '.use.yaml.12345.tmp').write_text('of a process that was killed')
     driver = Driver(calibration_file=str(tmp_path / 'use.yaml'))
     driver.feed(readings(spread_directions(12)))
-    assert "sensor 'another'" in driver.finding('calibration').words
+    assert driver.finding('calibration').level == 'BAD'
     assert (tmp_path / 'use.yaml').read_text() == other
     assert (tmp_path / 'use_poses.csv.damaged1').read_text() == table
     assert not (tmp_path / '.use.yaml.12345.tmp').exists()
@@ -131,7 +131,6 @@ def test_messages_of_another_sensor_are_dropped_and_end_the_rest(readings: Readi
     assert driver.sensor.live.detector.still
     assert driver.feed(rest[:1], 'another') == 0
     assert not driver.sensor.live.detector.still
-    assert "'another', expected 'imu_link'" in driver.logged()
     assert driver.feed(rest[100:]) == len(rest) - 100
     assert driver.session.state.statistics.dropped['foreign'] == 1
     assert driver.finding('stream').level == 'USABLE'
@@ -167,7 +166,6 @@ def test_silent_sensor_can_be_replaced_by_another_with_its_own_files(
     assert driver.session.state.name == 'another'
     assert driver.calibration is None
     assert len(driver.poses) < 2
-    assert "'another'" in driver.logged('warning')
     driver.now += 3.0
     driver.feed(turned[:50])
     assert driver.calibration is not None
@@ -178,10 +176,10 @@ def test_nothing_is_captured_from_a_sensor_that_fell_silent(stored: Stored, read
                                                             ) -> None:
     driver = Driver(calibration_file=str(stored()))
     rest = readings([UP], dwell=6.0)
-    driver.refuses('no Imu message yet', 'capture_pose', 'set_level')
+    driver.refuses('no Imu message', 'capture_pose', 'set_level')
     driver.feed(rest[:150])
     driver.now += 6.0
-    driver.refuses(r'arrived 6\.0 s ago, expected one within', 'capture_pose', 'set_level')
+    driver.refuses('6.0 s ago', 'capture_pose', 'set_level')
     driver.feed(rest[150:160])
     assert driver.ask('capture_pose').startswith('1 pose:')
     driver.ask('set_level')
@@ -214,10 +212,9 @@ def test_nothing_of_a_rest_before_a_silence_is_used_after_it(readings: Readings)
     assert 'jumped' not in driver.logged('warning')  # the stamps are as late as the messages
 
 
-@pytest.mark.parametrize(('jump', 'words'), [
-    (-3600.0, 'jumped back by 3600'), (86400.0, 'jumped ahead by 864'), (None, 'jumped back by')])
+@pytest.mark.parametrize('jump', [-3600.0, 86400.0, None])
 def test_a_jump_of_the_clock_is_logged_and_no_pose_counts_twice(
-        jump: float | None, words: str, readings: Readings) -> None:
+        jump: float | None, readings: Readings) -> None:
     driver = Driver()
     driver.stamp = 10_000.0
     turned = readings([UP, LEFT, FORWARD, UP], dwell=2.5)
@@ -225,7 +222,7 @@ def test_a_jump_of_the_clock_is_logged_and_no_pose_counts_twice(
         driver.feed(turned)
         driver.stamp = 10_000.0 if jump is None else driver.stamp + jump  # a recording in a loop
     assert captured(driver) == [UP, LEFT, FORWARD]
-    assert driver.logged('warning').count(words) == 1  # of two within a minute
+    assert driver.logged('warning').count('jumped') == 1  # of two within a minute
     assert len(driver.sensor.live.detector.interruptions) == 2
     assert jump or np.all(driver.poses['count'] < 2.0 * 2.5 * RATE * 1.1)
 
@@ -233,13 +230,12 @@ def test_a_jump_of_the_clock_is_logged_and_no_pose_counts_twice(
 def test_a_rest_is_not_used_while_the_stamps_stand(readings: Readings) -> None:
     driver = Driver()
     driver.feed(readings([UP], dwell=3.0))
-    rows = np.full((15, 9), np.nan)
-    rows[:, 0], rows[:, 1:4] = driver.stamp, [GRAVITY, 0.0, 0.0]
+    rows = rows_of(np.full(15, driver.stamp), [GRAVITY, 0.0, 0.0])
     for _ in range(12):
         driver.now += 0.3
         driver.session.push(rows, driver.now)
         driver.handle()
-    driver.refuses('the stamps have not changed for', 'set_level')
+    driver.refuses('stamps', 'set_level')
     driver.feed(readings([LEFT, UP], dwell=3.0))
     assert captured(driver) == [UP, LEFT]
 
@@ -255,21 +251,20 @@ def test_a_level_pose_that_contradicts_the_given_mounting_is_refused(
         stored: Stored, readings: Readings) -> None:
     driver = Driver(calibration_file=str(stored()), mounting_rpy=[0.5, 0.0, 0.0])
     driver.feed(readings([UP], dwell=6.0)[:200])
-    driver.refuses('differs by more than 10° of tilt from the mounting', 'set_level')
+    driver.refuses('10° of tilt', 'set_level')
 
 
-@pytest.mark.parametrize(('old', 'new', 'words'), [
-    ('version: 3', 'version: 999', 'version 999'),
-    ('readings: m/s2', 'readings: native', 'native'),
-    ('sensor: imu_link', 'sensor: another', "belongs to sensor 'another'")])
+@pytest.mark.parametrize(('old', 'new'), [
+    ('version: 3', 'version: 999'), ('readings: m/s2', 'readings: native'),
+    ('sensor: imu_link', 'sensor: another')])
 def test_a_load_that_is_refused_keeps_the_calibration_in_use(
-        old: str, new: str, words: str, stored: Stored, readings: Readings) -> None:
+        old: str, new: str, stored: Stored, readings: Readings) -> None:
     path = stored(sensor='imu_link')
     driver = Driver(calibration_file=str(path))
     driver.feed(readings([UP])[:30])
     used = driver.calibration
     path.write_text(path.read_text().replace(old, new, 1))
-    with pytest.raises(StoredCalibrationError, match=words):
+    with pytest.raises(StoredCalibrationError, match=new.split(': ')[1]):
         driver.ask('load')
     assert driver.calibration is used is not None
 
@@ -371,9 +366,7 @@ def statistics_of(*batches: Any, pause: float = 0.3) -> StreamStatistics:
     found = StreamStatistics(lambda: now)
     for stamps in batches:
         now += pause
-        rows = np.full((len(stamps), 9), np.nan)
-        rows[:, 0], rows[:, 1:4] = stamps, 1.0
-        found.add(rows, now)
+        found.add(rows_of(stamps, [1.0, 1.0, 1.0]), now)
     return found
 
 
@@ -437,12 +430,9 @@ def test_a_step_that_cannot_be_used_leaves_the_file_in_use(stored: Stored) -> No
     assert step.exists()
 
 
-@pytest.mark.parametrize(('number', 'words'), [
-    (errno.ENOSPC, 'free space on the disk'), (errno.EROFS, 'mount the file system'),
-    (errno.EACCES, 'correct the permissions')])
-def test_advice_about_a_file_that_cannot_be_written_fits_the_reason(number: int, words: str
-                                                                    ) -> None:
-    assert words in writing_advice(OSError(number, 'reason'))
+def test_advice_about_a_file_that_cannot_be_written_differs_by_the_reason() -> None:
+    reasons = errno.ENOSPC, errno.EROFS, errno.EACCES
+    assert len({writing_advice(OSError(each, 'reason')) for each in reasons}) == len(reasons)
 
 
 @pytest.mark.parametrize('of_sensor', [0.0, 1.0])
@@ -490,7 +480,7 @@ def test_the_heading_needs_a_level_mounting_and_the_nose_down(
         stored: Stored, readings: Readings) -> None:
     driver = Driver(calibration_file=str(stored()))
     put(driver, readings, UP)
-    driver.refuses(r'not levelled; .*~/set_level first', 'set_heading')
+    driver.refuses('not levelled', 'set_heading')
     driver.ask('set_level')
     driver.refuses('within 10° of the flat pose', 'set_heading')
     put(driver, readings, NOSE_DOWN)
@@ -558,7 +548,7 @@ def test_a_quantity_is_a_column_of_poses_and_its_last_value_holds_when_it_stops(
     driver.feed(readings([UP])[:15], motor_current=6.0)
     poses, around = driver.poses, driver.session.state.around
     assert np.ptp(poses['motor_current']) > 8.0
-    assert 'motor_current' in driver.ask('refine')
+    driver.ask('refine')
     assert Covariate('offset', ('motor_current',)) in driver.calibration.model.effects
 
     def force(current: float) -> Any:
@@ -579,7 +569,6 @@ def test_a_quantity_is_a_column_of_poses_and_its_last_value_holds_when_it_stops(
         driver.sensor.force_of(reading, {'motor_current': 10.0}))
     around.take('motor_current', 3.0)
     driver.tick()
-    assert 'motor_current arrives' in driver.logged('info')
     assert 'motor_current' not in driver.finding('stream').words
     driver.session.close()
     np.testing.assert_allclose(Driver(sensor='arm', context=[MOTOR]).poses['motor_current'],

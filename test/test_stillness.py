@@ -9,7 +9,6 @@ from accel_calib.errors import InputError
 from accel_calib.logs import read_recording
 from accel_calib.stillness import (
     capture, Captured, CaptureSettings, poses_from, select, StillDetector)
-from accel_calib.table import numbered, Recording
 from accel_calib.units import units_of
 from inside import (
     excess_of_means, lines, long_run, Model, oscillation, repeated_extremes, simulate_recording)
@@ -17,7 +16,7 @@ import numpy as np
 import pytest
 from scipy.signal import butter, lfilter
 from scipy.spatial.transform import Rotation, Slerp
-from shared import data, G
+from shared import data, G, NATIVE, rows_of as rows, samples_of, table
 
 
 def still(seed, seconds, rate=100.0, noise=2e-3):
@@ -51,8 +50,7 @@ def turned(seed, rate=100.0, noise=2e-3, correlation=0.0, step=0.0, dwell=(1.5, 
 
 
 def captured(time, reading, units=G, settings=CaptureSettings(), **columns) -> Captured:
-    table = {'time': time, 'reading': units.from_g(reading), **columns}
-    return capture(Recording(table, numbered(table)), units, settings)
+    return capture(samples_of(time, units.from_g(reading), **columns), units, settings)
 
 
 def pushed(samples, block=60, keep=None) -> StillDetector:
@@ -62,14 +60,6 @@ def pushed(samples, block=60, keep=None) -> StillDetector:
         detector.push(samples[start:start + block])
     detector.close()
     return detector
-
-
-def rows(time, reading, rate=np.nan, temperature=np.nan):
-    """Return samples as `StillDetector.push` takes them."""
-    samples = np.full((len(time), 9), np.nan)
-    samples[:, 0], samples[:, 1:4], samples[:, 7] = time, reading, temperature
-    samples[:, 4:7] = rate
-    return samples
 
 
 def assert_all_found(result: Captured, truth):
@@ -270,7 +260,7 @@ def test_shaking_in_counts_is_not_a_pose(size, poses):
     reading = np.concatenate([np.concatenate([shaken(seed, 1.5, size, 8.0)[1], moved[seed]])
                               for seed in range(6)])
     time = np.arange(len(reading)) / 100.0
-    assert len(captured(time, 4000.0 * reading, units=units_of('native')).poses) == poses
+    assert len(captured(time, 4000.0 * reading, units=NATIVE).poses) == poses
 
 
 @pytest.mark.parametrize('seed', range(2))
@@ -434,11 +424,7 @@ def test_few_samples_or_stamps_that_stop_make_no_pose(count, step, interruptions
     assert [each.kind for each in result.interruptions] == interruptions
 
 
-@pytest.mark.parametrize('settings', [
-    {'still_window': 0.0}, {'min_dwell': -1.0}, {'max_dwell': 0.5}, {'still_std_max': -1.0},
-    {'still_gyro_max': float('nan')}, {'still_norm_tolerance': 0.0}, {'min_pose_angle': 4.0},
-    {'repeated': 'forget'}, {'still_std_max': 1e308}, {'still_gyro_max': 1e308},
-    {'min_dwell': 1e308, 'max_dwell': np.inf}])
-def test_settings_out_of_range_are_refused_by_name(settings):
-    with pytest.raises(ValueError, match=f'{next(iter(settings))} is'):
-        CaptureSettings(**settings)
+@pytest.mark.parametrize(('name', 'value'), table('capture_settings_out_of_range'))
+def test_settings_out_of_range_are_refused_by_name(name, value):
+    with pytest.raises(ValueError, match=f'{name} is'):
+        CaptureSettings(**{'max_dwell': np.inf, name: value})

@@ -101,7 +101,6 @@ def works(path: Path, readings: Readings) -> None:
     driver = Driver(calibration_file=str(path))
     driver.feed(readings(spread_directions(10)))
     assert driver.ask('fit')
-    assert 'stored in' in driver.logged('info')
     driver.session.close()
     after = Driver(calibration_file=str(path))
     after.feed(readings([[0, 0, 1]])[:10])
@@ -122,7 +121,6 @@ def test_whatever_is_in_place_of_a_file_is_kept_and_replaced(
     found = kept(path)
     driver = Driver(calibration_file=str(store.calibration))
     assert path.name in driver.logged()
-    assert 'kept as' in driver.logged() or ('is renamed when' in driver.logged() and not of_poses)
     assert (driver.session.sensor.calibration is not None) is of_poses
     assert len(driver.session.sensor.live.poses()) == (0 if of_poses else 12)
     driver.session.close()
@@ -202,8 +200,7 @@ def test_a_folder_without_rights_is_reported_and_nothing_is_lost(
     (inner / '.imu.yaml.123.tmp').write_text('left behind')
     (inner / 'imu_poses.csv').write_text('ax,ay,az\n1,2,words\n')
     inner.chmod(mode)
-    said, level = works_without_storing(inner / 'imu.yaml', readings)
-    assert 'Permission denied' in said
+    _, level = works_without_storing(inner / 'imu.yaml', readings)
     assert level == 'BAD'
     inner.chmod(0o700)
     assert (inner / 'imu_poses.csv').read_text() == 'ax,ay,az\n1,2,words\n'

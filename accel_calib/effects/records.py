@@ -13,7 +13,6 @@ text form, such as ``empirical-gain.z-temperature-1-2``; `effect_named` reads it
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from itertools import combinations
 import math
 from typing import Any
 
@@ -179,19 +178,6 @@ def curves_over(quantities: Iterable[str] = ()) -> Iterator[EmpiricalCurve]:
         for carrier in CARRIERS:
             if carrier == {'force': 'offset', 'direction': 'force'}.get(variable, carrier):
                 yield EmpiricalCurve(carrier, variable, tuple(modes_of(variable)))
-
-
-def covariates_of(quantities: Iterable[str]) -> Iterator[Covariate]:
-    """Yield the covariates of quantities, each without and with a square."""
-    for quantity in quantities:
-        for part in COVARIATES:
-            yield from (Covariate(part, (quantity,), power) for power in (1, 2))
-
-
-def products_of(columns: Iterable[str]) -> Iterator[Covariate]:
-    """Yield the covariates of the products of two columns."""
-    for pair in combinations(sorted(columns), 2):
-        yield from (Covariate(part, pair) for part in COVARIATES)
 
 
 @lru_cache(maxsize=2048)

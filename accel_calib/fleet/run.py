@@ -253,8 +253,7 @@ def _merge(client: Client, store: Store, own: tuple[OwnEffect, ...]) -> list[Row
     if not names:
         return read_parquet(store.folder / SENSORS)
     found = write_sensors(store, list(_in_order(client, merge_sensor, names, store, own)))
-    for _ in _in_order(client, store.finish, names):
-        pass
+    deque(_in_order(client, store.finish, names), 0)
     return found
 
 

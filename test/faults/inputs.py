@@ -20,12 +20,10 @@ from accel_calib.stored import write_calibration
 import bag_files as bags
 from inside import read_log
 import numpy as np
-import test_containers as containers
-import test_formats as formats
+from shared import LOG_CORPUS, LOGS, table
 import yaml
 
 STORED = Path(__file__).parents[1] / 'data'
-LOGS = STORED / 'logs'
 BAGS = {'mcap': ('mcap', 'mcap without chunks', 'mcap without summary', 'mcap folder'),
         'sqlite3': ('sqlite3',),
         'compressed': ('mcap lz4', 'mcap zstd', 'sqlite3 messages', 'mcap file'),
@@ -79,8 +77,11 @@ def sound(kind: str) -> list[Files]:
             return _calibrations(folder)
         if kind == 'poses':
             return _tables(folder)
-        if kind == 'container':
-            return _containers(folder)
+        if kind == 'container':  # packed text, arrays, archives and sheets
+            return [*map(files_at, sorted((LOG_CORPUS / 'containers').iterdir())), *(
+                files_at(path) for path in sorted((LOG_CORPUS / 'formats').iterdir())
+                if path.suffix not in ('.json', '.jsonl', '.log', '.lp', '.txt', '.csv')),
+                files_at(LOGS / 'phyphox' / 'export.xls')]
         suffixes = {'csv': ('.csv', '.log', '.txt'), 'ulg': ('.ulg',), 'bin': ('.bin',)}[kind]
         paths = sorted(path for path in LOGS.rglob('*') if path.suffix in suffixes)
         return [_beginning(path, folder) if kind == 'csv' else files_at(path) for path in paths]
@@ -89,20 +90,6 @@ def sound(kind: str) -> list[Files]:
 def _bag(make: str, folder: Path) -> Files:
     (folder / make).mkdir()
     return files_at(bags.MAKES[make](folder / make))
-
-
-def _containers(folder: Path) -> list[Files]:
-    """Return packed text, arrays, archives and sheets."""
-    of_text = ('.json', '.jsonl', '.log', '.lp', '.txt', '.csv')
-    paths = [formats.write(folder, content, name) for name, content, _ in formats.READ
-             if not name.endswith(of_text)]
-    tables, reading = containers.tables_of('phyphox')
-    few = {name: '\n'.join(text.splitlines()[:300]) for name, text in tables.items()}
-    for kind in (*containers.PACKED, 'xlsx'):
-        (folder / kind).mkdir()
-        paths.append(containers.written(kind, folder / kind, few))
-    paths.append(containers.matlab(folder, {'acc': reading[:300], 'gyr': reading[:300]}))
-    return [files_at(path) for path in (*paths, LOGS / 'phyphox' / 'export.xls')]
 
 
 def _calibrations(folder: Path) -> list[Files]:
@@ -142,17 +129,11 @@ def _ends_in(path: Path) -> str:
 
 # ------------------------------------------------------------------------------ random inputs
 
-_NAMES = (('ax', 'ay', 'az'), ('acc_x', 'acc_y', 'acc_z'), ('AccX', 'AccY', 'AccZ'),
-          ('x', 'y', 'z'), ('Acceleration x (m/s^2)', 'Acceleration y (m/s^2)',
-                            'Acceleration z (m/s^2)'),
-          ('accel_mg_x', 'accel_mg_y', 'accel_mg_z'), ('ax [g]', 'ay [g]', 'az [g]'))
-_TIMES = ('time', 't', 'timestamp', 'Time (s)', 'time_ms', 'seconds_elapsed', 'date')
-_MORE = ('temperature', 'Temp [F]', 'gx', 'gy', 'gz', 'std_x', 'std_y', 'std_z', 'count', 'label',
-         'orientation', 'ref_x', 'ref_y', 'ref_z', 'supply_voltage', 'mag_x', 'b', '', 'doubtful')
+_OF_TABLES = table('random_tables')
+"""Names of columns, and comments."""
+
 _SCALES = (1.0, 9.80665, 1000.0, 16384.0, 1e-5, 1e150)
 _CODES = ('utf-8', 'utf-8-sig', 'utf-16', 'utf-16-le', 'cp1252')
-_COMMENTS = ('# units: g', '# units: m/s2', '# sensor: a', '#', '# units: [', '% a', '// b', 'a b',
-             'Date: 2026-01-01')
 
 
 def random_table(rng: Rng) -> Files:
@@ -173,7 +154,7 @@ def random_table(rng: Rng) -> Files:
     lines = [delimiter.join(row) for row in cells]
     for _ in range(int(one(rng, (0, 0, 0, 1, 3)))):
         lines.insert(int(rng.integers(len(lines) + 1)) if rng.random() < 0.3 else 0,
-                     one(rng, _COMMENTS))
+                     one(rng, _OF_TABLES['comments']))
     end = one(rng, ('\n', '\n', '\r\n', '\r'))
     text = end.join(lines) + (end if rng.random() < 0.8 else '')
     data = text.encode(one(rng, _CODES) if rng.random() < 0.2 else 'utf-8', errors='replace')
@@ -182,10 +163,11 @@ def random_table(rng: Rng) -> Files:
 
 def _header(rng: Rng) -> list[str]:
     """Return random names of columns, those of an accelerometer among them."""
-    header = list(one(rng, _NAMES))
+    header = list(one(rng, _OF_TABLES['accelerometers']))
     if rng.random() < 0.6:
-        header.append(one(rng, _TIMES))
-    header += [str(each) for each in rng.choice(_MORE, int(one(rng, (0, 0, 1, 3, 8))))]
+        header.append(one(rng, _OF_TABLES['times']))
+    count = int(one(rng, (0, 0, 1, 3, 8)))
+    header += [str(each) for each in rng.choice(_OF_TABLES['others'], count)]
     if rng.random() < 0.5:
         rng.shuffle(header)
     return header
@@ -197,7 +179,7 @@ def _row(rng: Rng, header: list[str], k: int) -> list[str]:
     force *= _SCALES[len(header) % len(_SCALES)] / np.linalg.norm(force)
     number, cells = iter(force.tolist()), []
     for name in header:
-        if name in _TIMES:
+        if name in _OF_TABLES['times']:
             cells.append(f'2026-01-01T00:00:{k % 60:02}.5' if name == 'date' else f'{0.25 * k}')
         elif name in ('count', 'orientation'):
             cells.append(str(1 + k))

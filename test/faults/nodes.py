@@ -1,18 +1,17 @@
 # Copyright 2026 The accel_calib authors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Poses before a node starts, messages while its services are called, and its output in a file."""
+"""Poses before a node starts, and calls of its services while messages arrive."""
 
 from collections.abc import Callable
 from pathlib import Path
-import subprocess
-import sys
+import time
 from typing import Any
 
 from accel_calib import simulate
 from accel_calib.logs import write_table
+from faults.order import Call
 from inside import spread_directions
-from shared import ROOT
 
 _AT_ONCE = 5
 """Number of messages between two looks at the services."""
@@ -36,28 +35,32 @@ def send_until(bench: Any, turned: Any, over: Callable[[], Any], seconds: float 
     bench.spin(sent, seconds)
 
 
-class Logged(subprocess.Popen[str]):
-    """A process with its output in a file: a pipe that nobody reads would stop it."""
+class Caller:
+    """
+    A client of a node that makes one call after the other; `calls` are those that have ended.
 
-    def __init__(self, command: list[str], path: Path, environment: dict[str, str]) -> None:
-        self._path = path
-        with path.open('w', encoding='utf-8') as file:
-            super().__init__(command, cwd=ROOT, env=environment, stdout=file,
-                             stderr=subprocess.STDOUT, text=True)
+    The calls of several callers overlap.
 
-    def communicate(self, input: str | None = None,  # noqa: A002
-                    timeout: float | None = None) -> tuple[str, str]:
-        """Wait for the end, and return the output so far."""
-        self.wait(timeout)
-        return self._path.read_text(encoding='utf-8'), ''
+    """
 
+    def __init__(self, bench: Any, number: int = 0, node: str = 'calibrator') -> None:
+        self._bench, self._number, self._node = bench, number, node
+        self.calls: list[Call] = []
+        self.last: Call | None = None
 
-def log_to_files(bench: Any, folder: Path) -> None:
-    """Let the processes of a bench write to files in a folder."""
-    def run(*arguments: str) -> Logged:
-        path = folder / f'output{len(bench._processes)}.txt'
-        process = Logged([sys.executable, *arguments], path, bench._environment)
-        bench._processes.append(process)
-        return process
+    def begin(self, name: str, **fields: Any) -> None:
+        """Call a service."""
+        client = self._bench.client(name, self._node, self._number)
+        self.name, self.last, self._begun = name, None, time.monotonic()
+        self._future = client.call_async(client.srv_type.Request(**fields))
 
-    bench.run = run
+    def poll(self) -> Call | None:
+        """Return the call if it has ended."""
+        if self.last is None and self._future.done():
+            answer, ended = self._future.result(), time.monotonic()
+            words = answer.message if hasattr(answer, 'message') else '; '.join(
+                f'{each.name}: {each.message}' for each in answer.status)
+            self.last = Call(self.name, self._begun, ended, words,
+                             bool(getattr(answer, 'success', True)))
+            self.calls.append(self.last)
+        return self.last

@@ -7,13 +7,12 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 import re
 import signal
-import sys
 import time
 from typing import Any
 
 from accel_calib.logs import read_poses
 from accel_calib.stored import read_calibration
-from faults.nodes import log_to_files, send_until, start_poses
+from faults.nodes import Caller, send_until, start_poses
 from faults.order import AFTER, Call, State
 from faults.sample import FACTOR
 from inside import CALIBRATOR, is_partial, spread_directions
@@ -64,6 +63,13 @@ class Stored:
             made.levelled is found.is_levelled and made.full is not is_partial(found))
 
 
+def after_call(states: Iterable[State], call: Call) -> list[State]:
+    """Return the states that a call with its response may leave."""
+    found = [after for state in states for after in AFTER[call.name](state, call)]
+    assert found, call
+    return found
+
+
 def after_kill(states: Iterable[State], name: str) -> list[State]:
     """Return the states that a call without a response may leave, if it was killed or done."""
     unknown, found = 'roll 999°, pitch 999°, yaw 999°', []
@@ -71,33 +77,27 @@ def after_kill(states: Iterable[State], name: str) -> list[State]:
         found.append(state)
         for count in {max(state.poses - 1, 0), state.poses, state.poses + 1}:
             for undone in ('', 'no calibration any more'):
-                call = Call(name, 0.0, 0.0, f'{count} poses; {unknown}; {undone}', good=True)
-                found += AFTER[name](state, call)
+                found += AFTER[name](state, Call(
+                    name, 0.0, 0.0, f'{count} poses; {unknown}; {undone}', good=True))
     return found
 
 
 def call_until_killed(bench: Any, node: Any, turned: Any, rng: np.random.Generator,
                       states: list[State]) -> list[State]:
     """Call services one after the other, kill the node, and return what may be stored."""
-    ends = time.monotonic() + rng.uniform(0.1, _LATEST_KILL_S)
+    ends, caller = time.monotonic() + rng.uniform(0.1, _LATEST_KILL_S), Caller(bench)
     while True:
-        name = str(rng.choice(COMMANDS))
-        client = bench.client(name)
-        future = client.call_async(client.srv_type.Request())
-        send_until(bench, turned, lambda future=future: (future.done() or time.monotonic() > ends))
-        if not future.done():
+        caller.begin(str(rng.choice(COMMANDS)))
+        send_until(bench, turned, lambda: caller.poll() or time.monotonic() > ends)
+        if caller.last is None:
             bench.end(node, signal.SIGKILL)
-            return after_kill(states, name)
-        answer = future.result()
-        call = Call(name, 0.0, 0.0, answer.message, answer.success)
-        states = [after for state in states for after in AFTER[name](state, call)]
-        assert states, call
+            return after_kill(states, caller.name)
+        states = after_call(states, caller.last)
 
 
 @pytest.fixture
-def folder(bench: Any, tmp_path: Path) -> Path:
+def folder(bench: Any) -> Path:
     """Return the folder of a store with poses; nodes may be killed."""
-    log_to_files(bench, tmp_path)
     bench.without_shared_memory()
     start_poses(bench.home / 'accel_calib' / 'arm_poses.csv', _POSES)
     return Path(bench.home / 'accel_calib')
@@ -112,8 +112,7 @@ def test_a_killed_node_has_stored_all_that_it_answered(
         bench.feed(turned[:100])
         found = call_until_killed(bench, node, turned, rng, states)
         bench.join_anew()
-        printed = node.communicate()[0]
-        assert 'Traceback' not in printed
+        assert 'Traceback' not in node.printed
         stored = Stored(folder)
         assert not stored.damaged
         states = [state for state in set(found) if stored.agrees(state)]
@@ -122,47 +121,32 @@ def test_a_killed_node_has_stored_all_that_it_answered(
 
 def test_of_two_nodes_one_stores_and_the_other_says_so(
         bench: Any, readings: Callable[..., Any], folder: Path) -> None:
-    from std_srvs.srv import Trigger
     turned, rng = readings(spread_directions(14), dwell=4.0), np.random.default_rng(FACTOR)
     first = bench.calibrator(**_SENSOR)
     other = bench.run(*CALIBRATOR, '--ros-args', '-r', '__node:=second', '-p', 'sensor:=arm',
                       '-p', 'passthrough:=true', '-p', 'auto_capture:=false')
     names = ('capture_pose', 'fit', 'undo', 'undo_pose', 'set_level', 'save', 'reset')
-    clients = {(node, name): bench.node.create_client(Trigger, f'{node}/{name}')
-               for node in ('calibrator', 'second') for name in names}
-    bench.spin(lambda: all(client.service_is_ready() for client in clients.values()))
-    states, ends, refused, called = [State(_POSES)], time.monotonic() + SECONDS, 0, 0
+    mine, others = Caller(bench), Caller(bench, node='second')
+    states, ends = [State(_POSES)], time.monotonic() + SECONDS
     while time.monotonic() < ends:
         name = str(rng.choice(names, p=[0.3, 0.2, 0.15, 0.1, 0.1, 0.1, 0.05]))
-        both = [clients[node, name].call_async(Trigger.Request())
-                for node in ('calibrator', 'second')]
-        send_until(bench, turned, lambda both=both: all(each.done() for each in both))
-        mine, others = (each.result() for each in both)
-        call = Call(name, 0.0, 0.0, mine.message, mine.success)
-        called += 1
-        states = [after for state in states for after in AFTER[name](state, call)]
-        assert states, call
-        assert not others.success, others.message
-        refused += f'process id {first.pid}' in others.message
+        for caller in (mine, others):
+            caller.begin(name)
+        send_until(bench, turned, lambda: all(caller.poll() for caller in (mine, others)))
+        states = after_call(states, mine.calls[-1])
     stored = Stored(folder)
     assert [state for state in states if stored.agrees(state)], stored.poses
-    assert refused > called // 2
+    assert not [call for call in others.calls if call.good]
+    refused = [call for call in others.calls if f'process id {first.pid}' in call.words]
+    assert len(refused) > len(others.calls) // 2
     bench.end(first, signal.SIGKILL)
-    assert takes_over(bench, turned, clients['second', 'capture_pose'])
-    assert bench.end(other, signal.SIGINT)[0] == 0
-    sys.stdout.write(f'{called} calls of each node\n')
-
-
-def takes_over(bench: Any, turned: Any, client: Any) -> bool:
-    """Return whether the second node stores poses after the first one has ended."""
-    answers: list[Any] = []
-    futures = [client.call_async(client.srv_type.Request())]
+    others.begin('capture_pose')  # the second node takes over
 
     def captured() -> bool:
-        if futures[-1].done():
-            answers.append(futures[-1].result())
-            futures.append(client.call_async(client.srv_type.Request()))
-        return bool(answers) and answers[-1].success
+        call = others.poll()
+        if call and not call.good:
+            others.begin('capture_pose')
+        return bool(call and call.good)
 
     send_until(bench, turned, captured)
-    return bool(answers[-1].success)
+    assert bench.end(other, signal.SIGINT)[0] == 0

@@ -23,14 +23,13 @@ from golden.record import parted, plain
 from golden.sweeps import SWEEPS
 from inside import main, meaning, poses_of, read_log
 import numpy as np
+from shared import LOG_CORPUS, options_of
 import yaml
 
 CASES: dict[str, Any] = yaml.safe_load(
     Path(__file__).with_name('cases.yaml').read_text(encoding='utf-8'))
 _WITHOUT_JSON = ('apply', 'report', 'simulate')
 _SETTINGS = ('run', 'look', 'units', 'session')
-CORPUS = Path(__file__).parents[1] / 'corpus' / 'logs'
-"""Small logs of all dialects, by what they show, and the options with which they are read."""
 
 
 def result_of(name: str, folder: Path) -> Any:
@@ -64,11 +63,10 @@ def _of_case(case: dict[str, Any]) -> Any:
 
 def _read(folder: str) -> Any:
     """Return what each log of a folder of the corpus holds, or its refusal."""
-    Path(folder).symlink_to(CORPUS / folder)
-    given = yaml.safe_load((CORPUS / 'options.yaml').read_text(encoding='utf-8'))
+    Path(folder).symlink_to(LOG_CORPUS / folder)
     found = {}
     for path in sorted(Path(folder).iterdir()):
-        for options in given.get(str(path), [{}]):
+        for options in options_of(path):
             log = attempt(read_log, path, LogOptions(**options))
             found[f'{path.stem} {options or ""}'.strip()] = (
                 [log, log.read_as] if isinstance(log, AccelCalibError) else

@@ -12,10 +12,9 @@ from accel_calib.logs import write_table
 from generator import Setup, simulate, write_csv
 import numpy as np
 import ramps
-from shared import data
+from shared import data, GRAVITY as G
 import yaml
 
-G = 9.80665
 READING, REFERENCE = ('ax', 'ay', 'az'), ('ref_x', 'ref_y', 'ref_z')
 SIDES = [*np.eye(3), *-np.eye(3), (1, 1, 1), (-1, 1, 1), (1, -1, 1), (1, 1, -1), (-1, -1, 1),
          (-1, 1, -1), (1, -1, -1), (-1, -1, -1)]

@@ -18,7 +18,7 @@ from accel_calib.estimate import estimate, Prior, variance_factor
 from accel_calib.finding import Finding, LEVELS
 from accel_calib.findings import Expected, LIMITS, rate
 from accel_calib.geometry import coverage
-from accel_calib.table import check_units, numbered, Poses
+from accel_calib.table import check_units
 from accel_calib.units import FRAMES, units_of
 from golden.driven import messages
 from golden.figures import attempt, of_expected, of_fit, of_next_pose, those
@@ -29,8 +29,8 @@ from inside import (
     rounding_left, Runs, sampled, shape_words, sound_rows, spread_directions, unit, with_heading,
     without_knocked)
 import numpy as np
+from shared import G, MPS2 as MS2, NATIVE, poses_of
 
-G, MS2, NATIVE = units_of('g'), units_of('m/s2'), units_of('native')
 SIDES = unit(np.array([each for each in product((1, 0, -1), repeat=3) if any(each)], float))
 SENSOR = {'offset': (0.03, -0.02, 0.04), 'axis_gain': (0.01, -0.02, 0.015),
           'cross_axis': (0.006, -0.004, 0.005)}
@@ -42,11 +42,6 @@ CONTEXT: dict[str, Any] = {
     'std': 2e-3 * (1.0 + np.column_stack([K % 3, K % 4, K % 5])),
     'since_turn': 40.0 * (K % 4),
     'previous': unit(np.column_stack([np.sin(K), np.cos(2 * K), np.sin(3 * K)]))}
-
-
-def _table(reading: Any, **columns: Any) -> Poses:
-    made = {key: np.asarray(each, float) for key, each in {'reading': reading, **columns}.items()}
-    return Poses(made, numbered(made))
 
 
 def _fitted(seed: int = 1, *, model: str = '10', units: Any = 'g', effects: Any = SENSOR,
@@ -119,18 +114,18 @@ def noise() -> Any:
     def copies(deviation: float) -> Any:
         near = np.array([0.123456789, 0.2, 0.9]) + steps[:, np.newaxis] * (
             1e-4 if deviation else 1e-7)
-        return originals(_table(
+        return originals(poses_of(
             np.vstack([near, SIDES[:12]]), std=np.full((21, 3), deviation), count=np.ones(21),
             temperature=np.where(np.arange(21) == 4, 20.000002, 20.0)))
 
     def sample(count: int, together: int) -> Any:
         known = {'orientation': np.arange(count) // together} if together else {}
-        return sampled(_table(np.ones((count, 3)), **known)).row
+        return sampled(poses_of(np.ones((count, 3)), **known)).row
 
     return [
         _grid(factor, (-1, 0, 1, 2, 3, 5, 9, 30, 200), (True, False)),
         _grid(copies, (1e-3, 0.0)), rounding_left(np.linspace(0.0, 0.6, 25)),
-        [believable(_table(SIDES[:6], std=each, count=np.full(6, 16.0)).noise) for each in (
+        [believable(poses_of(SIDES[:6], std=each, count=np.full(6, 16.0)).noise) for each in (
             std, std * [[1], [1], [1], [0.05], [0.2], [7]], std * 1e-8, std * 0.0)],
         _grid(sample, (1999, 2001, 6001, 9000), (0, 1, 3, 700, 2500))]
 
@@ -148,9 +143,9 @@ def wiring() -> Any:
         return [fault_of(matrix), fault_of(matrix @ skew)]
 
     def lengths(length: float) -> Any:
-        made = _table(SIDES * length, reference=SIDES)
+        made = poses_of(SIDES * length, reference=SIDES)
         return [attempt(check_units, *each) for each in (
-            (made, G), (made, MS2), (_table(SIDES * 1e4, reference=SIDES * length), NATIVE))]
+            (made, G), (made, MS2), (poses_of(SIDES * 1e4, reference=SIDES * length), NATIVE))]
 
     return [_grid(permuted, ((0, 1, 2), (1, 0, 2), (2, 0, 1), (0, 2, 1)), product(
         (1.0, -1.0), repeat=3)), _grid(turned, (20.0, 24.9, 25.1, 60.0, 150.0, 179.5), (0, 1, 2)),
@@ -238,12 +233,12 @@ def gyro() -> Any:
             k, [3e-5] * 3) * (kind == 'drift')
         more = {} if kind == 'bare' else {'count': np.full(count, 100.0), 'rate_std': np.full(
             (count, 3), 2e-3), 'time': 30.0 * k[::-1] if kind == 'turning' else 30.0 * k}
-        return gyro_bias_of(_table(rate, rate=rate, **more, **(
+        return gyro_bias_of(poses_of(rate, rate=rate, **more, **(
             {'temperature': 20.0 + k} if kind == 'warm' else {})))
 
     def sized(size: float) -> Any:
         rate = np.outer(np.cos(np.arange(9.0)) * size / 5.0 + size, [1.0, 0.5, -0.2])
-        return gyro_bias_of(_table(SIDES[:9], rate=rate))
+        return gyro_bias_of(poses_of(SIDES[:9], rate=rate))
 
     bias = of(14, 'warm')
     kinds = ('plain', 'turning', 'warm', 'drift', 'bare')
@@ -335,7 +330,7 @@ def rated_effects() -> Any:
         reading = SIDES * scale + zero
         reading[1:9] *= np.array([[0.0, 2.9, 3.1, 6.0, 15.0, 22.0, 1e6, 1e12]]).T
         std = np.outer(10.0 ** np.linspace(-3, 2, 26), [0.3, 1.0, 0.5]) * scale
-        sound, rejected = sound_rows(_table(reading, std=std, count=np.full(26, 4.0)), units)
+        sound, rejected = sound_rows(poses_of(reading, std=std, count=np.full(26, 4.0)), units)
         return [sound.row, rejected]
 
     return [[of(*each) for each in (
@@ -422,8 +417,8 @@ def near_models() -> Any:
     model = Model({**{key: np.array(each) for key, each in SENSOR.items()},
                    'quadratic': np.array([0.02, -0.01, 0.03]),
                    'offset_temperature': np.array([1e-3, 2e-3, -1e-3, 120.0, 0.0])})
-    made = _table(model.at(CONTEXT).reading(up) + 2e-3 * np.cos(np.arange(72.0)).reshape(24, 3),
-                  **CONTEXT, count=np.full(24, 9.0))
+    added = 2e-3 * np.cos(np.arange(72.0)).reshape(24, 3)
+    made = poses_of(model.at(CONTEXT).reading(up) + added, **CONTEXT, count=np.full(24, 9.0))
     found = {}
     for name, columns in {'alone': {}, 'known': {'reference': up}, 'shared': {
             'orientation': K // 2}, 'mixed': {'orientation': np.maximum(K // 2, 5) + (

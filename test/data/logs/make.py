@@ -95,6 +95,16 @@ def stamps_us(samples: Recording) -> list[int]:
     return [18_400_000 + round(each * 1e6) for each in samples['time'].tolist()]
 
 
+def accel_fields(samples: Recording, device: int, per_g: float = 1.0) -> Fields:
+    """Return sensor_accel."""
+    time, n = stamps_us(samples), len(samples)
+    reading = (samples.reading * per_g).T.tolist()
+    return {'timestamp': ('uint64_t', time), 'timestamp_sample': ('uint64_t', time),
+            'device_id': ('uint32_t', [device] * n),
+            **{axis: ('float', values) for axis, values in zip('xyz', reading)},
+            'temperature': ('float', samples['temperature'].tolist())}
+
+
 def combined_fields(samples: Recording) -> Fields:
     """Return sensor_combined; its accelerometer is sampled 1 ms before the gyro."""
     time, n = stamps_us(samples), len(samples)
