@@ -160,6 +160,13 @@ def test_a_scatter_is_estimated_where_the_noise_differs():
     assert not scatter_of(judge(model, poses)).shows
 
 
+def test_columns_that_repeat_others_do_not_change_a_scatter():
+    model, poses = scattering(0, 7e-4)
+    fit = judge(model, poses)
+    twice = judge(model, poses, np.hstack([fit.ties, fit.ties]))
+    assert scatter_of(twice) == pytest.approx(scatter_of(fit), rel=1e-6)
+
+
 def test_knocked_poses_are_left_out_beside_a_scatter():
     for seed in range(5):
         poses = scattering(seed, 7e-4)[1]
