@@ -5,7 +5,7 @@
 Effects: what each adds to the reading, and its properties.
 
 `form` defines what an effect is, and `catalogue` lists those with a known cause. `records` are
-effects beyond the catalogue: curves, which `formula` states for a paper or for firmware, and
+effects beyond the catalogue: curves, with their formulas for a paper or for firmware, and
 covariates. `own` are those of a user, and `model` computes with a list of them. `way` finds how
 each pose was reached, `thermal` how the temperature lags and what it is between the steps of a
 thermometer, and `simulate` makes poses and recordings.
@@ -39,7 +39,6 @@ from .catalogue import (
 from .form import (
     AFFINE, AXES, by_axis, Context, CUBE, Effect, EffectKey, EffectRecord, fitted_places, FORCE,
     MONOMIALS, ODD_SQUARE, ONE, PRODUCT, SIZE, SQUARE, TO_SEPARATE, WAVE, ZONAL, ZONES)
-from .formula import formula_of
 from .model import (
     AtContext, check_context, CONVERGED_G, correct, EachShape, factors_of, LARGEST_FORCE_G,
     LARGEST_ITERATIONS, length_rows, linear_model, Model, own_slope, predict, sensor_force, times,
