@@ -45,8 +45,9 @@ from .model import (
     too_large, with_vector)
 from .own import effects_of_file, own_effects, OwnEffect
 from .records import (
-    CARRIERS, Covariate, COVARIATES, curves_over, effect_named, EMPIRICAL, EmpiricalCurve, kind_of,
-    modes_of, shown_name, unchanged, unit_of, value_unit, variable_of, variable_words, VARIABLES)
+    CARRIERS, Covariate, COVARIATES, curves_over, effect_named, EMPIRICAL, EmpiricalCurve,
+    formula_of, kind_of, modes_of, shown_name, unchanged, unit_of, value_unit, variable_of,
+    variable_words, VARIABLES)
 from .simulate import model_with, parse_effect, simulate_poses, simulate_recording, turn_between
 from .thermal import acting_temperature, between_steps, rate_at, ThermalStream
 from .way import add_acting, add_history, context_of_samples, FROM_TEMPERATURE, thermal_stream
