@@ -171,7 +171,7 @@ def test_damaged_files_of_the_results_are_set_aside_and_made_again(
     store = Store(shutil.copytree(undisturbed, tmp_path / 'out'))
     for damage in damages if name == 'pending' else []:
         store.add({**rows_of(store.folder)[0], 'key': damage})
-    files = sorted(store.folder.rglob('pending/*/*' if name == 'pending' else name))
+    files = sorted(store.folder.rglob('*.json' if name == 'pending' else name))
     broken = {file: DAMAGE[damage](file.read_bytes()) for file, damage in zip(files, damages)}
     assert len(broken) == len(damages)
     for file, data in broken.items():
@@ -507,8 +507,8 @@ def scheduler_killed(site: Site) -> None:
 
 DISTURBANCES = {
     'worker killed': worker_killed,
-    'program killed at the first results': killed('pending/*/*.parquet', 2),
-    'program killed at the last results': killed('pending/*/*.parquet', COUNT - 2),
+    'program killed at the first results': killed('pending/*/*.json', 2),
+    'program killed at the last results': killed('pending/*/*.json', COUNT - 2),
     'program killed between two sensors': killed('recordings/*/data.parquet', 2),
     'program killed after the last sensor': killed('sensors.parquet', 1),
     'scheduler killed': scheduler_killed, 'disk full': full_disk}

@@ -5,7 +5,7 @@
 Effects: what each adds to the reading, and its properties.
 
 `form` defines what an effect is, and `catalogue` lists those with a known cause. `records` are
-effects beyond the catalogue: curves, which `formula` states for a paper or for firmware, and
+effects beyond the catalogue: curves, with their formulas for a paper or for firmware, and
 covariates. `own` are those of a user, and `model` computes with a list of them. `way` finds how
 each pose was reached, `thermal` how the temperature lags and what it is between the steps of a
 thermometer, and `simulate` makes poses and recordings.
@@ -39,15 +39,15 @@ from .catalogue import (
 from .form import (
     AFFINE, AXES, by_axis, Context, CUBE, Effect, EffectKey, EffectRecord, fitted_places, FORCE,
     MONOMIALS, ODD_SQUARE, ONE, PRODUCT, SIZE, SQUARE, TO_SEPARATE, WAVE, ZONAL, ZONES)
-from .formula import formula_of
 from .model import (
     AtContext, check_context, CONVERGED_G, correct, EachShape, factors_of, LARGEST_FORCE_G,
     LARGEST_ITERATIONS, length_rows, linear_model, Model, own_slope, predict, sensor_force, times,
     too_large, with_vector)
 from .own import effects_of_file, own_effects, OwnEffect
 from .records import (
-    CARRIERS, Covariate, COVARIATES, curves_over, effect_named, EMPIRICAL, EmpiricalCurve, kind_of,
-    modes_of, shown_name, unchanged, unit_of, value_unit, variable_of, variable_words, VARIABLES)
+    CARRIERS, Covariate, COVARIATES, curves_over, effect_named, EMPIRICAL, EmpiricalCurve,
+    formula_of, kind_of, modes_of, shown_name, unchanged, unit_of, value_unit, variable_of,
+    variable_words, VARIABLES)
 from .simulate import model_with, parse_effect, simulate_poses, simulate_recording, turn_between
 from .thermal import acting_temperature, between_steps, rate_at, ThermalStream
 from .way import add_acting, add_history, context_of_samples, FROM_TEMPERATURE, thermal_stream

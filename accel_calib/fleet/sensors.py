@@ -4,11 +4,11 @@
 """
 The rows on a disk: a Parquet data set with each result once; and each sensor over time.
 
-**Store.** A worker writes a row to ``pending/<sensor>/<key>.parquet``. `Store.merge` adds the rows
-of a sensor to its Parquet file, and then marks their keys as done. `Store.finish` removes the
-pending rows when all that depends on them is written. Each step replaces files atomically, and the
-rows are merged by content. So a run can stop anywhere, and the next run merges the same rows
-again. Errors of the store, such as a full disk, are raised: they concern all recordings.
+**Store.** A worker writes a row to ``pending/<sensor>/<key>.json``. `Store.merge` adds the rows of
+a sensor to its Parquet file, and then marks their keys as done. `Store.finish` removes the pending
+rows when all that depends on them is written. Each step replaces files atomically, and the rows
+are merged by content. So a run can stop anywhere, and the next run merges the same rows again.
+Errors of the store, such as a full disk, are raised: they concern all recordings.
 
 **Calibrations that are compared.** A calibration is compared as if its effects were known to be
 right. A search in few poses sometimes names another effect than in the other recordings, and
@@ -35,6 +35,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 import errno
 import fcntl
+from hashlib import blake2b
+import json
 import os
 from pathlib import Path
 import time
@@ -59,8 +61,7 @@ if TYPE_CHECKING:
 UNREAD = '~unread'
 """Folder of the rows of recordings that could not be read; no sensor has this folder."""
 
-_SUFFIX = '.parquet'
-_DATA = f'data{_SUFFIX}'
+_DATA = 'data.parquet'
 SENSORS = 'sensors.parquet'
 """File of the rows of all sensors."""
 
@@ -92,8 +93,13 @@ class Store:
         ValueError is raised for a row that the data set cannot hold.
 
         """
+        import pyarrow as pa
+
         folder = self.folder / 'pending' / as_folder(row['sensor'])
-        write_parquet(folder / f'{row["key"]}{_SUFFIX}', [row], schema())
+        folder.mkdir(parents=True, exist_ok=True)
+        text = json.dumps(row)
+        pa.Table.from_pylist([json.loads(text)], schema())
+        write_atomically(folder / f'{row["key"]}.json', lambda file: file.write(_sealed(text)))
 
     def waiting(self) -> list[str]:
         """Return the folders of sensors with pending rows, in order."""
@@ -108,8 +114,8 @@ class Store:
 
         """
         folder = self.folder / 'pending' / name
-        paths = sorted(folder.glob(f'*{_SUFFIX}'), key=lambda path: path.stat().st_mtime)
-        new = [row for path in paths for row in read_parquet(path)]
+        paths = sorted(folder.glob('*.json'), key=lambda path: path.stat().st_mtime)
+        new = [_pending_row(path) for path in paths]
         old, newest = read_parquet(self.data(name)), {row['content']: row for row in new}
         if new:
             kept = [row for row in old if row['content'] not in newest]
@@ -121,7 +127,7 @@ class Store:
         for row in new:
             mark = self.mark(row['key'])
             mark.parent.mkdir(parents=True, exist_ok=True)
-            mark.write_text(f'{name}\n{row["calibration"] or ""}', encoding='utf-8')
+            mark.write_text(f'{name}\n{row.get("calibration", "")}', encoding='utf-8')
 
     def finish(self, name: str) -> None:
         """Remove the pending rows of a sensor that are in the data set."""
@@ -129,14 +135,14 @@ class Store:
         if not folder.exists():
             return
         for path in folder.iterdir():  # with temporary files of killed workers
-            if path.suffix != _SUFFIX or self.mark(path.stem).exists():
+            if path.suffix != '.json' or self.mark(path.stem).exists():
                 path.unlink(missing_ok=True)
         if not any(folder.iterdir()):  # a worker of a killed program may still write
             folder.rmdir()
 
     def files(self) -> Iterator[Path]:
         """Yield all files with rows."""
-        for pattern in (SENSORS, f'recordings/*/{_DATA}', f'pending/*/*{_SUFFIX}'):
+        for pattern in (SENSORS, f'recordings/*/{_DATA}', 'pending/*/*.json'):
             yield from sorted(self.folder.glob(pattern))
 
     def set_aside(self, path: Path) -> Path:
@@ -207,6 +213,9 @@ def is_damaged(path: Path) -> bool:
     if path.parent.name == f'sensor={UNREAD}':
         needed = ('recording', 'status')
     try:
+        if path.suffix == '.json':
+            _pending_row(path)
+            return False
         return any(row[name] is None for row in read_parquet(path) for name in needed)
     except OSError as err:
         if err.errno is not None:
@@ -214,6 +223,21 @@ def is_damaged(path: Path) -> bool:
         return True
     except (ValueError, LookupError, pa.ArrowException):
         return True
+
+
+def _pending_row(path: Path) -> Row:
+    """Return a row that `Store.add` wrote; ValueError if the file is damaged."""
+    content = path.read_text(encoding='utf-8')
+    text = content.partition('\n')[0]
+    if content != _sealed(text):
+        raise ValueError('the row and its digest differ')
+    row: Row = json.loads(text)
+    return row
+
+
+def _sealed(text: str) -> str:
+    """Return a line with its digest; the page checksums of Parquet leave headers uncovered."""
+    return f'{text}\n{blake2b(text.encode(), digest_size=8).hexdigest()}\n'
 
 
 # ----------------------------------------------------------------------------- over time
