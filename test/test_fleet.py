@@ -34,7 +34,8 @@ from faults.sample import FACTOR, sample
 from fleet_case import (
     found_in, OFFSET, page_of, QUICK, rows_of, state_of, write_fleet, write_poses)
 from inside import (
-    alike, as_folder, COMMAND, content_hash, date_of, export, main, mapped, on_disk, sensor_of)
+    alike, as_folder, COMMAND, content_hash, date_of, digest_of, export, main, mapped, on_disk,
+    sensor_of)
 import numpy as np
 import pytest
 from shared import python, run_on_small_disk, run_snippets, wait
@@ -89,9 +90,9 @@ def test_each_recording_becomes_a_row_and_a_calibration_on_the_workers(
         client: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_fleet(tmp_path / 'in', 6, 2)
     (tmp_path / 'in' / 'bad.csv').write_text('nothing of use\n')
-    for where, name in (
-            (Store, 'merge'), (sys.modules['accel_calib.fleet.overview'], 'read_parquet')):
-        monkeypatch.setattr(where, name, None)  # in this process, which must not need them
+    # This process must neither merge rows nor read those of the sensors.
+    monkeypatch.setattr(Store, 'merge', None)
+    monkeypatch.setitem(digest_of.__globals__, 'read_parquet', None)
     summary = run(client, found_in(tmp_path / 'in'), QUICK, Store(tmp_path / 'out'))
     assert summary.counts == {'ok': 12, 'error': 1}
     assert summary.priors[''].sensors == 6
