@@ -34,7 +34,8 @@ from faults.sample import FACTOR, sample
 from fleet_case import (
     found_in, OFFSET, page_of, QUICK, rows_of, state_of, write_fleet, write_poses)
 from inside import (
-    alike, as_folder, COMMAND, content_hash, date_of, export, main, mapped, on_disk, sensor_of)
+    alike, as_folder, COMMAND, content_hash, date_of, digest_of, export, main, mapped, on_disk,
+    sensor_of)
 import numpy as np
 import pytest
 from shared import OWN, python, run_on_small_disk, run_snippets, table, wait
@@ -97,7 +98,9 @@ def test_each_recording_becomes_a_row_and_a_calibration_on_the_workers(
         calibrate: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_fleet(tmp_path / 'in', 6, 2)
     (tmp_path / 'in' / 'bad.csv').write_text('nothing of use\n')
-    monkeypatch.setattr(Store, 'merge', None)  # in this process, which must not need it
+    # This process must neither merge rows nor read those of the sensors.
+    monkeypatch.setattr(Store, 'merge', None)
+    monkeypatch.setitem(digest_of.__globals__, 'read_parquet', None)
     summary = calibrate()
     assert summary.counts == {'ok': 12, 'error': 1}
     assert summary.priors[''].sensors == 6
